@@ -256,9 +256,9 @@ def _candidates(
     for _ in range(ROUNDS):
         moved = points @ turns.transpose(0, 2, 1) + moves[:, None]
         turns, moves = _fitted(points, two.near(moved))
-    few, chamfer = two.points[:JUDGED], []
+    few, chamfer = Points(two.points[:JUDGED]), []
     for turn, move in zip(turns, moves):
-        moved = one.points[:JUDGED] @ turn.T + move
+        moved = Points(one.points[:JUDGED] @ turn.T + move)
         chamfer.append((nearest(moved, few)[0].mean() + nearest(few, moved)[0].mean()) / 2)
     return turns, moves + two.center - turns @ one.center, np.array(chamfer)
 

@@ -118,7 +118,7 @@ def noise_floor(truth: Mesh | Points, protocol: GeometryProtocol, points: Points
         one, two = halves(truth, protocol.num_points, protocol.seed)
     else:
         one, two = points, take_points(truth, protocol, protocol.seed + 1)
-    found = protocol.unit * nearest(two.positions, one.positions)[0].astype(np.float64)
+    found = protocol.unit * nearest(two, one)[0].astype(np.float64)
     return _chamfer(found, found, protocol.chamfer)
 
 
@@ -175,7 +175,8 @@ def chamfer_by_turn(
         turned = Points(predicted.motion.after(turn).points(points))
         if protocol.align:
             turned = match_moments(turned, true).apply(turned)
-        found[name] = float(np.mean([nearest(*way)[0].mean() for way in _ways(turned, true)]))
+        ways = nearest(turned, true), nearest(true, turned)
+        found[name] = float(np.mean([distances.mean() for distances, _ in ways]))
     return found
 
 
@@ -195,7 +196,8 @@ def surface_metrics(predicted: Points, truth: Points, protocol: GeometryProtocol
         ``normal_consistency`` (mean absolute cosine of nearest points' normals, both ways,
         averaged; None without normals).
     """
-    (there, there_at), (back, back_at) = (nearest(*way) for way in _ways(predicted, truth))
+    there, there_at = nearest(predicted, truth)
+    back, back_at = nearest(truth, predicted)
     there, back = (protocol.unit * found.astype(np.float64) for found in (there, back))
     fscore = {}
     for threshold in protocol.thresholds:
@@ -223,11 +225,6 @@ def _chamfer(there: np.ndarray, back: np.ndarray, form: ChamferForm) -> float:
         there, back = there**2, back**2
     total = float(there.mean() + back.mean())
     return total if form in ("sum", "squared-sum") else total / 2
-
-
-def _ways(predicted: Points, truth: Points) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Queries and points of both ways, from the predicted ones to the true ones first."""
-    return (predicted.positions, truth.positions), (truth.positions, predicted.positions)
 
 
 def volume_iou(a: np.ndarray, b: np.ndarray) -> float | None:

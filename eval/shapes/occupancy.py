@@ -61,10 +61,11 @@ def syncdreamer_grid(size: int = 64) -> Grid:
 def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
     inside = enclosed(mesh, grid)
+    if mesh.is_closed():
+        return inside
     parts = [part for part in connected_parts(mesh) if not part.is_closed()]
-    if parts:
-        inside |= majority(mesh, grid)
-    if len(parts) > 1 or (parts and len(parts[0].faces) < len(mesh.faces)):
+    inside |= majority(mesh, grid)
+    if len(parts) > 1 or len(parts[0].faces) < len(mesh.faces):
         points = grid.points()
         # only within a part's box can more than half of the rays cross it
         for part in parts:
@@ -142,37 +143,67 @@ def _crossings(scene, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def _majority_at(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    scene = mesh.scene()
-    votes = np.zeros(points.shape[:-1], np.int32)
-    for direction in directions():
-        votes += _crossings(scene, points, direction) % 2
-    return 2 * votes > VOTERS
+    """Asks rays from points ``[.., 3]``, of each until its majority can no longer change."""
+    scene, places = mesh.scene(), points.reshape(-1, 3)
+    votes, asked = np.zeros(len(places), np.int32), np.arange(len(places))
+    for left, direction in zip(range(VOTERS - 1, -1, -1), directions()):
+        votes[asked] += _crossings(scene, places[asked], direction) % 2
+        found = votes[asked]
+        asked = asked[(2 * found <= VOTERS) & (2 * (found + left) > VOTERS)]
+    return (2 * votes > VOTERS).reshape(points.shape[:-1])
 
 
 def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
+    from scipy.ndimage import label
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    scene, points = mesh.scene(), grid.points()
-    number = np.arange(points[..., 0].size).reshape(grid.shape)
-    starts, ends = [], []
+    scene = mesh.scene()
+    near = _near(mesh, grid)
+    # Places that no face is near to are one with their neighbours: what they form is a node each,
+    # and so is every place near a face.
+    node, count = label(~near)
+    node[near] = count + 1 + np.arange(np.count_nonzero(near))
+    links = []
     for axis in range(3):
-        cut = [slice(None)] * 3
-        cut[axis] = slice(None, -1)
-        origins = points[tuple(cut)]
-        step = np.zeros_like(origins)
-        step[..., axis] = grid.step
-        blocked = scene.test_occlusions(np.concatenate([origins, step], -1), 0.0, 1.0).numpy()
-        neighbours = np.roll(number, -1, axis)[tuple(cut)]
-        starts.append(number[tuple(cut)][~blocked])
-        ends.append(neighbours[~blocked])
-    start, end = np.concatenate(starts), np.concatenate(ends)
-    links = coo_array((np.ones(len(start), bool), (start, end)), shape=(number.size, number.size))
-    labels = connected_components(links, directed=False)[1].reshape(grid.shape)
+        start, end = ([slice(None)] * 3 for _ in range(2))
+        start[axis], end[axis] = slice(None, -1), slice(1, None)
+        steps = near[tuple(start)] | near[tuple(end)]
+        index = np.argwhere(steps)
+        rays = np.zeros((len(index), 6), np.float32)
+        rays[:, :3], rays[:, 3 + axis] = grid.origin + grid.step * index, grid.step
+        free = ~scene.test_occlusions(rays, 0.0, 1.0).numpy()
+        links.append([node[tuple(cut)][steps][free] for cut in (start, end)])
+    one, two = np.concatenate(links, axis=1)
+    size = node.max() + 1
+    graph = coo_array((np.ones(len(one), bool), (one, two)), shape=(size, size))
+    labels = connected_components(graph, directed=False)[1][node]
     border = np.ones(grid.shape, bool)
     border[1:-1, 1:-1, 1:-1] = False
     return ~np.isin(labels, np.unique(labels[border]))
+
+
+def _near(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Marks the points ``[X, Y, Z]`` bool of which one is at an end of any step that meets a face.
+
+    Those are in the boxes of the faces, and one step before each of them.
+    """
+    one, two, three = ((mesh.vertices - grid.origin) / grid.step)[mesh.faces.T]
+    last, room = np.array(grid.shape) - 1, 0.01  # for rounding
+    low = np.minimum(np.minimum(one, two), three) - room
+    high = np.maximum(np.maximum(one, two), three) + room
+    low, high = (np.floor(end).clip(0, last).astype(int) for end in (low, high))
+    # 1 where a box begins and -1 where it ends, along each axis, so that sums count the boxes
+    shape = np.array(grid.shape) + 1
+    count = np.zeros(shape.prod())
+    for ends in np.ndindex(2, 2, 2):
+        at = np.ravel_multi_index(tuple(np.where(ends, high + 1, low).T), tuple(shape))
+        count += (-1) ** sum(ends) * np.bincount(at, minlength=len(count))
+    count = count.reshape(shape)
+    for axis in range(3):
+        count = count.cumsum(axis)
+    return count[:-1, :-1, :-1] > 0
 
 
 def _is_flat(part: Mesh) -> bool:

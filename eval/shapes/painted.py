@@ -10,15 +10,21 @@ import torch
 
 from gamba_warp.cameras import intrinsics, orbit
 from gamba_warp.files import atomic_path, write_text
-from gamba_warp.images import load_rgba, save_image
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import load_rgba, save_image, to_uint8
 from gamba_warp.pages.page import Section, page_text
+from gamba_warp.versions import import_open3d
+from gamba_warp.viewer.page import write_viewer
 
 from ..report import OK
-from .shape import Mesh, Points, nearest
+from .shape import Mesh, Points, nearest, sample
 
 FAR = 0.1  # distance of the last colour; the truth's longest side is 1
 SIZE, GROUND = 160, 0.5  # of a picture, pixels; grey behind it
 _FINE, _FACES = 1 / 48, 40_000  # longest edge of a painted mesh, while it has no more faces
+_DISCS = 6000  # of a surface in the viewer
+# from the truth's z-up to y-down, z-forward: the reference camera's world, and the viewer's
+_TO_CAMERA = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 # From dark blue by green to yellow, each lighter than the one before: also without colour.
 _STOPS = np.array(
     [
@@ -29,7 +35,9 @@ _STOPS = np.array(
 
 
 def paint(name: str, predicted: Mesh | Points, truth: Mesh | Points, folder: Path) -> None:
-    """Paints a pair: FOLDER/painted/NAME.png and, of meshes, NAME.glb and NAME.truth.glb.
+    """Paints a pair: NAME.png, and for both sides pages with the viewer and, of meshes, ``.glb``.
+
+    They are FOLDER/painted/NAME.html and .glb, and of the truth NAME.truth.html and .glb.
 
     Args:
         name: of the object; it may have slashes.
@@ -44,17 +52,65 @@ def paint(name: str, predicted: Mesh | Points, truth: Mesh | Points, folder: Pat
 
     rows = []
     for end, shape, other in (("", predicted, truth), (".truth", truth, predicted)):
+        path = folder / "painted" / f"{name}{end}.glb"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        to = "prediction" if end else "truth"
+        note = f"distance to the {to}: dark 0, yellow {FAR:g} and more of the longest side"
+        view = (2.2, 34.0, 20.0)  # as in the pictures
+        page = path.with_suffix(".html")
+        write_viewer(page, f"{name}{end}", as_discs(shape, other), view=view, note=note)
         shape = refined(shape)
         colors = colors_of(distances(shape, other))
         rows.append(np.concatenate(list(pictures(shape, colors)), 1))
-        path = folder / "painted" / f"{name}{end}.glb"
-        path.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(shape, Mesh):
             y_up = shape.vertices[:, [0, 2, 1]] * [1, 1, -1]
             made = trimesh.Trimesh(y_up, shape.faces, vertex_colors=colors, process=False)
             with atomic_path(path) as unfinished:
                 made.export(unfinished, file_type="glb")
     save_image(folder / "painted" / f"{name}.png", np.concatenate(rows))
+
+
+def as_discs(shape: Mesh | Points, other: Mesh | Points) -> Gaussians:
+    """A surface as flat round Gaussians, painted by their distance to the other one.
+
+    Args:
+        shape: z up; of a cloud without normals they are balls.
+        other: z up.
+
+    Returns:
+        ``[N]``, y down as the viewer has it; N is at most 6,000.
+    """
+    points = _evenly(shape)
+    places = points.positions
+    others = places[min(1, len(places) - 1) :: 2]  # the nearest of the rest is a gap away
+    gap = float(np.median(nearest(Points(others), Points(places[::2]))[0]))
+    size = torch.full((len(places), 3), max(0.6 * gap, 1e-3))
+    quats = None
+    if points.normals is not None:
+        size[:, 2] /= 10
+        x, y, z = (points.normals * np.where(points.normals[:, 2:] < 0, -1, 1)).T
+        quats = torch.from_numpy(np.stack([1 + z, -y, x, 0 * z], 1)).float()  # z to the normal
+    colors = colors_of(distances(Points(places), other)) / 255
+    discs = Gaussians(
+        torch.from_numpy(places).float(),
+        quats,
+        size,
+        torch.full((len(places),), 0.98),
+        torch.from_numpy(colors).float(),
+    )
+    turn = torch.from_numpy(_TO_CAMERA).float()
+    return discs.transformed(turn, torch.zeros(3))
+
+
+def _evenly(shape: Mesh | Points) -> Points:
+    """At most ``_DISCS`` points of a shape, about equally far from each other."""
+    o3d = import_open3d()
+    many = sample(shape, 4 * _DISCS, 0)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(many.positions))
+    if many.normals is not None:
+        cloud.normals = o3d.utility.Vector3dVector(many.normals)
+    few = cloud.farthest_point_down_sample(min(_DISCS, len(many.positions)))
+    return Points(np.asarray(few.points), None if many.normals is None else np.asarray(few.normals))
 
 
 def refined(shape: Mesh | Points) -> Mesh | Points:
@@ -77,7 +133,7 @@ def distances(shape: Mesh | Points, other: Mesh | Points) -> np.ndarray:
     places = shape.vertices if isinstance(shape, Mesh) else shape.positions
     if isinstance(other, Mesh):
         return other.scene().compute_distance(places.astype(np.float32)).numpy()
-    return nearest(places, other.positions)[0]
+    return nearest(Points(places), other)[0]
 
 
 def colors_of(distance: np.ndarray) -> np.ndarray:
@@ -90,8 +146,7 @@ def colors_of(distance: np.ndarray) -> np.ndarray:
 def pictures(shape: Mesh | Points, colors: np.ndarray) -> np.ndarray:
     """Four views around a coloured shape, ``[4, SIZE, SIZE, 3]`` floats on the grey ground."""
     viewmats = orbit(torch.tensor([30.0, 120.0, 210.0, 300.0]), 20.0, 2.2).double().numpy()
-    # from y-down, z-forward (the reference camera's world) to the truth's z-up
-    viewmats = viewmats @ np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    viewmats[:, :3, :3] = viewmats[:, :3, :3] @ _TO_CAMERA
     K = intrinsics(SIZE, SIZE, 34.0).double().numpy()
     if isinstance(shape, Mesh):
         return np.stack([_cast(shape, colors / 255, viewmat, K) for viewmat in viewmats])
@@ -142,21 +197,24 @@ def painted_page(report: dict[str, Any], folder: Path, count: int) -> None:
     scale = np.broadcast_to(colors_of(np.linspace(0, FAR, 640)) / 255, (24, 640, 3))
     said = (
         f"Distances from 0 (dark) to {FAR:g} (yellow) and farther, in units of the truth's longest "
-        "side. Upper row: the prediction by its distance to the truth; lower row: the truth by its "
-        "distance to the prediction, so that what is missing shows there."
+        "side. First the prediction by its distance to the truth, then the truth by its "
+        "distance to the prediction, so that what is missing shows there. Either leads to "
+        "the surface in the viewer."
     )
     sections = [Section("", said, strip=scale)]
     for place in places:
         record, name = done[place], done[place]["name"]
         score = ", ".join(f"{k}: {v:.3f}" for k, v in record["fscore"].items())
         iou = "" if record["iou"] is None else f", Volume IoU {record['iou']:.3f}"
-        files = [f"painted/{name}.glb", f"painted/{name}.truth.glb"]
+        sides = [f"painted/{name}", f"painted/{name}.truth"]
+        picture = to_uint8(load_rgba(folder / "painted" / f"{name}.png")[..., :3])
+        rows = [np.concatenate(np.split(row, 2, axis=1)) for row in np.split(picture, 2)]
         sections.append(
             Section(
                 f"{place + 1} of {len(done)}: {name}",
                 f"Chamfer {record['chamfer']:.4f}{iou}, F-score at {score}",
-                strip=load_rgba(folder / "painted" / f"{name}.png")[..., :3],
-                files=[file for file in files if (folder / file).is_file()],
+                links=dict(zip(sides, rows)),
+                files=[f"{side}.glb" for side in sides if (folder / f"{side}.glb").is_file()],
             )
         )
     write_text(folder / "painted.html", page_text("Where the errors lie", "", sections))

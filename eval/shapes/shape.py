@@ -6,6 +6,7 @@ The process that only hands pairs to a child reads this module, so torch is impo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias, overload
 
 import numpy as np
@@ -34,6 +35,25 @@ class Points:
 
     positions: np.ndarray
     normals: np.ndarray | None = None
+
+    @cached_property
+    def _sorted(self) -> tuple[np.ndarray, np.ndarray]:
+        """The order of the points by the cells of a grid, and their places in it, float32.
+
+        What lies near each other then lies so in memory too, which halves the time of a search.
+        """
+        places = self.positions.astype(np.float32)
+        low, side = places.min(0), np.ptp(places, axis=0).max()
+        # 32 cells a side, so that a key has 16 bits, which numpy sorts in linear time
+        cells = ((places - low) / (side or 1) * 31.999).astype(np.uint16)
+        order = np.argsort(cells @ np.array([1024, 32, 1], np.uint16), kind="stable")
+        return order, places[order]
+
+    @cached_property
+    def _tree(self):
+        search = import_open3d().core.nns.NearestNeighborSearch(self._sorted[1])
+        search.knn_index()
+        return search
 
 
 @dataclass
@@ -177,17 +197,20 @@ def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
     return Points(np.asarray(cloud.points), np.asarray(cloud.normals))
 
 
-def nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the nearest of ``points [M, 3]`` to each of ``queries [N, 3]``, in float32.
+def nearest(queries: Points, points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the nearest of M points to each of N queries, in float32.
+
+    Both are sorted, and the points' tree is built, when they are first used so, and kept.
 
     Returns:
         Distances ``[N]`` float32 and indices ``[N]``.
     """
-    o3d = import_open3d()
-    search = o3d.core.nns.NearestNeighborSearch(np.ascontiguousarray(points, np.float32))
-    search.knn_index()
-    indices, squared = search.knn_search(np.ascontiguousarray(queries, np.float32), 1)
-    return np.sqrt(squared.numpy()[:, 0]), indices.numpy()[:, 0]
+    order, places = queries._sorted
+    found, squared = points._tree.knn_search(places, 1)
+    distances, indices = np.empty(len(order), np.float32), np.empty(len(order), np.int64)
+    distances[order] = np.sqrt(squared.numpy()[:, 0])
+    indices[order] = points._sorted[0][found.numpy()[:, 0]]
+    return distances, indices
 
 
 def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:

@@ -107,11 +107,15 @@ def default_up(path: str | Path) -> str:
     return "y" if Path(path).suffix.lower() in Y_UP else "z"
 
 
-def load_mesh(path: str | Path) -> TexturedMesh:
+def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
     """Reads a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
     texture without UV coordinates by its mean colour; ``warnings`` names each.
+
+    Args:
+        path: the file.
+        normals: whether they are made; without them, which are much of the time, they are 0.
 
     Raises:
         UserError: missing, unreadable, no faces, vertices not finite, or no extent.
@@ -128,7 +132,7 @@ def load_mesh(path: str | Path) -> TexturedMesh:
         count += len(mesh.faces) + len(mesh.vertices)  # a scene may hold one part many times
         if count > MAX_PARTS:
             raise UserError(f"{path}: over {MAX_PARTS} vertices and faces, the limit for a mesh")
-        part, material = _flatten(mesh, matrix, warnings, path, budget)
+        part, material = _flatten(mesh, matrix, warnings, path, budget, normals)
         part["material_ids"] = np.full(len(part["faces"]), len(materials))
         parts.append(part)
         materials.append(material)
@@ -255,7 +259,7 @@ def _absolute_indices(path: Path, text: bytes) -> bytes:
 
 
 def _flatten(
-    mesh, matrix: np.ndarray, warnings: list[str], path: Path, budget: Budget
+    mesh, matrix: np.ndarray, warnings: list[str], path: Path, budget: Budget, normals: bool
 ) -> tuple[dict, Material]:
     """The arrays of one part, moved to the scene's frame, and its material."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
@@ -294,7 +298,9 @@ def _flatten(
     part = {
         "vertices": vertices,
         "faces": faces,
-        "normals": _corner_normals(vertices, faces, mesh.vertex_normals, matrix),
+        "normals": _corner_normals(vertices, faces, mesh.vertex_normals, matrix)
+        if normals
+        else np.zeros((count, 3, 3), np.float32),
         "uvs": uvs,
         "colors": colors,
     }

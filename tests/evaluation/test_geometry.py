@@ -20,7 +20,7 @@ from gamba_warp.eval.shapes.occupancy import (
     syncdreamer_grid,
 )
 from gamba_warp.eval.shapes.protocol import PRESETS
-from gamba_warp.eval.shapes.shape import Mesh, Similarity, sample
+from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, nearest, sample
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.density import opacity_volume
@@ -209,6 +209,25 @@ def test_points_are_repeatable_and_area_uniform():
     top = np.mean(a.positions[:, 2] > 0.4999999)
     assert abs(top - 1 / 6) < 0.009  # four standard deviations
     assert np.abs(np.abs(a.normals).max(1) - 1).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "size, far", [(1.0, 0.0), (1e-42, 0.0), (1e17, 0.0), (0.0, 0.0), (1.0, 300.0)]
+)
+def test_nearest_points_are_those_of_every_pair(size, far):
+    """Of sets of any size and place, with repeated points, and in the order of the queries."""
+    drawn = np.random.default_rng(3)
+    queries, points = (size * drawn.uniform(-1, 1, (n, 3)) for n in (211, 97))
+    queries[5:9], points[20:30] = queries[4], points[19]
+    queries[:, 1] += far
+    queries, points = Points(queries), Points(points)
+    for one, two in ((queries, points), (points, queries), (queries, queries)):
+        distances, index = nearest(one, two)
+        here, there = (shape.positions.astype(np.float32) for shape in (one, two))
+        every = np.linalg.norm(here[:, None].astype(float) - there, axis=2)
+        assert distances == pytest.approx(every.min(1), rel=1e-6, abs=1e-20)
+        chosen = every[np.arange(len(index)), index]
+        assert chosen == pytest.approx(every.min(1), rel=1e-6, abs=1e-20)
 
 
 def test_similarity_moves_all_kinds_alike():

@@ -13,7 +13,17 @@ from lab.studies.drift import doubled, drift, known_shapes, with_flips, with_hol
 from gamba_warp.eval.shapes import occupancy
 from gamba_warp.eval.shapes.flags import tidied
 from gamba_warp.eval.shapes.metrics import compare, shape_iou, volume_iou
-from gamba_warp.eval.shapes.occupancy import RULES, connected_parts, grid_around, solid
+from gamba_warp.eval.shapes.occupancy import (
+    RULES,
+    VOTERS,
+    connected_parts,
+    directions,
+    enclosed,
+    grid_around,
+    majority,
+    solid,
+    syncdreamer_grid,
+)
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Similarity
 
@@ -63,6 +73,38 @@ def test_the_default_rule_does_not_mind_orientation():
         assert values["solid"] > 0.95 > 0.1 > values["winding"]
         values = drift(mesh, lambda m, seed: doubled(with_hole(m, 0.05, seed)), 16, 1)
         assert values["solid"] > 0.95
+
+
+def scattered(count, size, seed):
+    """Triangles anywhere in the unit cube, most of them across each other."""
+    drawn = np.random.default_rng(seed)
+    places = drawn.uniform(-0.5, 0.5, (count, 1, 3)) + drawn.normal(0, size, (count, 3, 3))
+    return Mesh(places.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("name", ["few", "many", "cube", "shell"])
+def test_steps_far_from_every_face_need_no_ray(name, monkeypatch):
+    """The same voxels are enclosed as where a ray is cast along every step of the grid."""
+    known = {"few": scattered(7, 0.4, 0), "many": scattered(900, 0.1, 1), "cube": cube((0.3, 0, 0))}
+    mesh = known.get(name) or SHAPES[name]
+    grids = grid_around(mesh, resolution=29), syncdreamer_grid(33)
+    found = [enclosed(mesh, grid) for grid in grids]
+    share = occupancy._near(mesh, grids[0]).mean()
+    assert 0 < share < 1 or name == "few"
+    monkeypatch.setattr(occupancy, "_near", lambda _, grid: np.ones(grid.shape, bool))
+    for ours, grid in zip(found, grids):
+        assert (ours == enclosed(mesh, grid)).all()
+    assert found[0].any() == (name != "few")
+
+
+def test_votes_that_are_decided_are_not_taken():
+    """Points are asked until the majority is known; the outcome is that of all rays."""
+    for mesh in (with_hole(SHAPES["torus"], 0.2, 0), scattered(40, 0.3, 2)):
+        grid = grid_around(mesh, resolution=13)
+        rays = [occupancy._rays(grid.points(), way) for way in directions()]
+        votes = sum(mesh.scene().count_intersections(part).numpy() % 2 for part in rays)
+        assert len(np.unique(votes)) > VOTERS // 2
+        assert (majority(mesh, grid) == (2 * votes > VOTERS)).all()
 
 
 def test_rules_agree_on_a_closed_ball():

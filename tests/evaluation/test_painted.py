@@ -4,12 +4,23 @@ import json
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
+from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
-from gamba_warp.eval.shapes.painted import FAR, SIZE, colors_of, distances, pictures, refined
+from gamba_warp.eval.shapes.painted import (
+    FAR,
+    SIZE,
+    as_discs,
+    colors_of,
+    distances,
+    pictures,
+    refined,
+)
 from gamba_warp.eval.shapes.shape import Mesh, Points
+from gamba_warp.render import render
 
 
 def as_mesh(mesh, move=(0.0, 0, 0)):
@@ -56,6 +67,34 @@ def test_pictures_show_the_colours_on_the_ground():
         assert (bottom[..., 0] >= bottom[..., 2]).mean() > 0.9  # yellow below
 
 
+@pytest.mark.parametrize("kind", ["mesh", "normals", "bare"])
+def test_discs_cover_the_surface_in_its_colours(kind):
+    """Upright in the viewer's axes, without holes, and thin where a normal is known."""
+    mesh = trimesh.creation.icosphere(4, 0.4)
+    ball, places = as_mesh(mesh), np.array(mesh.vertices)
+    shape = ball if kind == "mesh" else Points(places, places / 0.4 if kind == "normals" else None)
+    other = Mesh(ball.vertices * np.where(ball.vertices[:, 2:] > 0, 1.0, 0.5), ball.faces)
+    discs = as_discs(shape, other)
+    assert discs.num == (6000 if kind == "mesh" else len(places))
+    above = discs.means[:, 1] < -0.1  # y is down
+    blue = torch.tensor([68.0, 1, 84]) / 255
+    assert (discs.colors[above] - blue).abs().max() < 0.05
+    assert (discs.colors[discs.means[:, 1] > 0.1] - blue).abs().max(-1).values.min() > 0.2
+    viewmats = orbit(torch.tensor([0.0, 130.0, 250.0]), 20.0, 2.0)
+    cameras = Cameras(viewmats, intrinsics(96, 96, 34.0).expand(3, 3, 3), 96, 96)
+    alphas = render(discs, cameras).alpha[..., 0]
+    steps = torch.arange(96.0) - 47.5
+    away = torch.hypot(steps[:, None], steps)
+    radius = 0.4 / np.sqrt(2.0**2 - 0.4**2) * 48 / np.tan(np.radians(17))
+    assert (alphas[:, away < radius - 2] > 0.9).all()
+    assert (alphas[:, away > radius + 5] < 0.1).all()  # balls of 2,562 points stand out by 4
+
+
+def test_a_single_point_can_be_painted():
+    one = Points(np.array([[0.1, 0.2, 0.3]]))
+    assert as_discs(one, one).num == 1
+
+
 def test_the_page_goes_from_the_best_to_the_worst(tmp_path, capfd):
     for side in ("pred", "gt"):
         (tmp_path / side / "deep").mkdir(parents=True)
@@ -76,6 +115,10 @@ def test_the_page_goes_from_the_best_to_the_worst(tmp_path, capfd):
         loaded = trimesh.load(folder / f"{name}.glb", force="mesh")
         assert len(loaded.faces) > 1000 and loaded.visual.vertex_colors[:, :3].std() > 1
         assert f'href="painted/{name}.truth.glb"' in page
+        for side in (name, f"{name}.truth"):
+            assert f'href="painted/{side}.html"' in page
+            viewer = (folder / f"{side}.html").read_text()
+            assert 200_000 < len(viewer) < 400_000 and f'"title": "{side}"' in viewer
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "paint" in report["objects"][0]["seconds"]
     assert run("eval-geometry", [*words, "--paint", "3"]) == 2
