@@ -21,7 +21,7 @@ from gamba_warp.untrusted.documents import parse_document, read_bytes
 from gamba_warp.versions import __version__
 
 from .averages import BOOTSTRAP, LEVEL, summary_of
-from .report import OK, flat
+from .report import OK, csv_of, flat
 from .tables import Column, Lines, Row, figures, markdown
 
 FORMAT = "gamba_warp.compare.1"
@@ -32,6 +32,12 @@ _NAMED = 5  # objects of a method that a line names
 
 # Of shapes, what is compared, and of the table what the paper has besides pictures.
 OF_SHAPES = {"chamfer": Column("Chamfer ↓", 4), "iou": Column("Volume IoU ↑", 4)}
+_FSCORE = "fscore."  # before a threshold
+_MORE_OF_SHAPES = {
+    "accuracy": Column("accuracy ↓", 4),
+    "completeness": Column("completeness ↓", 4),
+    "normal_consistency": Column("normals ↑", 3),
+}
 # A field of the protocol that tells the kind of a report.
 _TELLS = {"max_psnr": VIEWS, "occupancy": SHAPES}
 # What of a protocol decides no number of one object: names, what is under test, and how a method's
@@ -68,9 +74,14 @@ Number = Annotated[float, msgspec.Meta(ge=-1e30, le=1e30)]
 Figures = dict[str, Number | None]
 
 
-def _keys() -> dict[str, list[str]]:
-    """The figures that are compared, by kind of report."""
-    return {VIEWS: list(all_figures()), SHAPES: list(OF_SHAPES)}
+def _keys(kind: str, protocol: dict[str, Any]) -> list[str]:
+    """The figures that are compared of a kind of report, nested ones with dots."""
+    if kind == VIEWS:
+        return list(all_figures())
+    known = protocol.get("thresholds")
+    thresholds = known if isinstance(known, list) else []
+    fscores = [f"{_FSCORE}{t:g}" for t in thresholds if isinstance(t, (int, float))]
+    return [*OF_SHAPES, *fscores, *_MORE_OF_SHAPES]
 
 
 class _OfViews(msgspec.Struct):
@@ -214,7 +225,8 @@ def read_report(path: Path) -> Report:
             continue
         try:
             report.records[name] = msgspec.convert(item, _RECORDS[kind])
-            values = {key: item.get(key) for key in _keys()[kind]}
+            found = flat(item)
+            values = {key: found.get(key) for key in _keys(kind, content.protocol)}
             report.figures[name] = msgspec.convert(values, Figures)
         except msgspec.ValidationError as error:
             raise UserError(f"{path}: {name}: {error}") from error
@@ -279,8 +291,9 @@ def join(compared: Compared, against: str | None) -> dict[str, Any]:
     # by figure, method and object; a method without any value of a figure does not have it
     values: dict[str, dict[str, dict[str, float]]] = {}
     common: dict[str, list[str]] = {}
-    for kind, keys in _keys().items():
-        reports = compared.reports[kind]
+    for kind, reports in compared.reports.items():
+        # the protocols are the same but for what decides no number
+        keys = _keys(kind, next((r.protocol for r in reports.values()), {}))
         for key in keys:
             found = {
                 name: {uid: value for uid, v in r.figures.items() if (value := v[key]) is not None}
@@ -355,8 +368,11 @@ def _missing(reports: dict[str, Report]) -> dict[str, dict[str, str]]:
     }
 
 
-def _columns() -> tuple[dict[str, Column], dict[str, Column]]:
-    """Those of the table, and of the one on other grounds."""
+def _columns(joined: dict[str, Any], paper: bool) -> tuple[dict[str, Column], ...]:
+    """Those of the table, of the one on other grounds, and of the one of more about shapes.
+
+    The first one has the kinds that were evaluated, and beside the paper's table all that it has.
+    """
     of_views, grounds = (
         {
             key: Column(f"{metric.title} {'↑' if metric.more_is_better else '↓'}", metric.digits)
@@ -365,18 +381,52 @@ def _columns() -> tuple[dict[str, Column], dict[str, Column]]:
         }
         for chosen in (METRICS, on_grounds())
     )
-    return of_views | OF_SHAPES, grounds
+    kinds = {kind for reports in joined["reports"].values() for kind in reports}
+    main = {
+        key: column
+        for kind, columns in ((VIEWS, of_views), (SHAPES, OF_SHAPES))
+        for key, column in columns.items()
+        if paper or kind in kinds
+    }
+    fscores = {
+        key: Column(f"F-score at {key.removeprefix(_FSCORE)} ↑", 4)
+        for key in joined["common"]
+        if key.startswith(_FSCORE)
+    }
+    return main, grounds, fscores | _MORE_OF_SHAPES
 
 
-def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
-    """Texts and tables in their order."""
-    columns, grounds = _columns()
-    lines = figures([""], columns, [Row([row["name"]], row) for row in joined["rows"]])
+def main_lines(joined: dict[str, Any], paper: bool) -> Lines:
+    """The lines of the first table: a method each, with its time; arguments as below."""
+    rows = [Row([row["name"]], row) for row in joined["rows"]]
+    lines = figures([""], _columns(joined, paper)[0], rows)
     lines[0].append("time [s] ↓")
     for line, row in zip(lines[1:], joined["rows"]):
         known = row["seconds"] is not None
         line.append(f"{row['seconds']:.3g} ({row['seconds_from']})" if known else "-")
-    yield lines
+    return lines
+
+
+def csv_text(joined: dict[str, Any]) -> str:
+    """The text of ``compare.csv``: a line for each method and each difference.
+
+    Figures have the columns ``KEY.mean``, ``KEY.low`` and ``KEY.high`` (of the interval).
+    """
+
+    def plain(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        low, high = value["interval"] or (None, None)
+        return {"mean": value["mean"], "low": low, "high": high}
+
+    rows = [*joined["rows"], *joined["differences"]]
+    return csv_of({"objects": [{k: plain(v) for k, v in row.items() if v} for row in rows]})
+
+
+def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
+    """Texts and tables in their order."""
+    columns, grounds, of_shapes = _columns(joined, paper)
+    yield main_lines(joined, paper)
     counts: dict[int, list[str]] = {}
     for key, column in columns.items():
         counts.setdefault(len(joined["common"][key]), []).append(column.title[:-2])
@@ -384,8 +434,8 @@ def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
     yield (
         f"Means over the objects that every method with the metric has ({of}), with "
         f"{100 * LEVEL:g} % bootstrap intervals over objects. Views: novel views, on white here. "
-        "Lengths: the longest side of the true shape is 1. Time: measured by the evaluation on its "
-        "machine (median), or stated by whoever made this table."
+        f"Lengths: the longest side of the true shape is {_unit(joined):g}. Time: measured by the "
+        "evaluation on its machine (median), or stated by whoever made this table."
     )
     for kind, methods in joined["missing"].items():
         for name, missing in methods.items():
@@ -401,11 +451,25 @@ def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
         count = _count(len(joined["common"][next(iter(grounds))]))
         yield f"The same novel views on black and on grey, of methods with alpha ({count}):"
         yield figures([""], grounds, [Row([row["name"]], row) for row in joined["rows"]])
+    if any(joined["common"].get(key) for key in of_shapes):
+        yield "More of the shapes, and its differences:"
+        rows = [Row([row["name"]], row) for row in joined["rows"]]
+        rows += [Row([row["name"]], row, True) for row in joined["differences"]]
+        yield figures([""], of_shapes, rows)
     if paper:
         yield CAVEAT
         head = ["", *(columns[key].title for key in _OF_TABLE_1), "time [s] ↓"]
         texts = [["-" if v is None else f"{v:g}" for v in row] for row in TABLE_1.values()]
         yield [head, *([name, *row] for name, row in zip(TABLE_1, texts))]
+
+
+def _unit(joined: dict[str, Any]) -> float:
+    """The length of the longest side of the true shape, in reports of shapes."""
+    protocols = (
+        kinds[SHAPES]["protocol"] for kinds in joined["reports"].values() if SHAPES in kinds
+    )
+    unit = next(protocols, {}).get("unit", 1)
+    return unit if isinstance(unit, (int, float)) else 1
 
 
 def _count(number: int) -> str:

@@ -37,15 +37,26 @@ def compare_command(
         against: The method that the others are subtracted from, object by object; the first one.
         seconds: NAME=SECONDS that a method takes for an object, where no report has measured it.
         paper: Also print the figures of the paper's Table 1, of other objects and protocol.
-        out: Folder for compare.json, compare.md and compare.html.
+        out: Folder for compare.json, compare.md, compare.html, compare.csv and, of the first table,
+            compare.tex.
         json: Print compare.json in place of the table.
     """
     if not reports:
         raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
     from gamba_warp.files import output_folder, write_json, write_text
 
-    from .compare import CAVEAT, TABLE_1, html_page, join, markdown_page, read_reports
+    from .compare import (
+        CAVEAT,
+        TABLE_1,
+        csv_text,
+        html_page,
+        join,
+        main_lines,
+        markdown_page,
+        read_reports,
+    )
     from .report import json_of
+    from .tables import latex
 
     joined = join(read_reports(reports, seconds), against)
     if paper:
@@ -55,5 +66,7 @@ def compare_command(
         write_json(folder / "compare.json", joined)
         write_text(folder / "compare.md", markdown_page(joined, paper))
         write_text(folder / "compare.html", html_page(joined, paper))
+        write_text(folder / "compare.csv", csv_text(joined))
+        write_text(folder / "compare.tex", latex(main_lines(joined, paper)))
     print(json_of(joined) if json else markdown_page(joined, paper), end="")
     return 0

@@ -69,7 +69,10 @@ def markdown(lines: Lines) -> str:
 
 def latex(lines: Lines) -> str:
     """A LaTeX ``tabular`` of lines, with the rules of booktabs."""
-    escaped = [[re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line] for line in lines]
+    arrows = str.maketrans({"↑": r"$\uparrow$", "↓": r"$\downarrow$"})
+    escaped = [
+        [re.sub(r"([&%$#_{}])", r"\\\1", cell).translate(arrows) for cell in line] for line in lines
+    ]
     head, *rows = (" & ".join(line) + r" \\" for line in escaped)
     columns = "l" + "r" * (len(lines[0]) - 1)
     parts = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", head, r"\midrule", *rows]

@@ -144,9 +144,12 @@ def _crossings(scene, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 def _majority_at(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     """Asks rays from points ``[.., 3]``, of each until its majority can no longer change."""
-    scene, places = mesh.scene(), points.reshape(-1, 3)
-    votes, asked = np.zeros(len(places), np.int32), np.arange(len(places))
-    for left, direction in zip(range(VOTERS - 1, -1, -1), directions()):
+    scene, places, ways = mesh.scene(), points.reshape(-1, 3), directions()
+    # Where a plane parts a point from the mesh, one ray of each opposite pair meets nothing.
+    reach, at = mesh.vertices @ ways.T, places @ ways.astype(np.float32).T
+    asked = np.flatnonzero((at <= reach.max(0) + 1e-5).all(1))
+    votes = np.zeros(len(places), np.int32)
+    for left, direction in zip(range(VOTERS - 1, -1, -1), ways):
         votes[asked] += _crossings(scene, places[asked], direction) % 2
         found = votes[asked]
         asked = asked[(2 * found <= VOTERS) & (2 * (found + left) > VOTERS)]

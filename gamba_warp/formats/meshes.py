@@ -219,7 +219,9 @@ def _checked_obj(path: Path, text: bytes) -> bytes:
         UserError: one is not.
     """
     text = text.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
-    text = _FLAT.sub(rb"\1 0", _THIN.sub(b"", text))
+    text = _THIN.sub(b"", text)
+    if b"vt" in text:
+        text = _FLAT.sub(rb"\1 0", text)
     bad = _BAD_OBJ.search(text)
     if bad:
         line = " ".join(bad[0][:60].decode("ascii", "replace").split())

@@ -1,12 +1,14 @@
 """``gamba compare``: several methods' reports in one table."""
 
 import copy
+import csv
 import json
 import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from gamba_warp.cli import run
 from gamba_warp.eval.averages import bootstrap
@@ -94,6 +96,59 @@ def test_means_intervals_and_paired_differences(files):
     assert said.out == (files.folder / "out" / "compare.md").read_text()
     page = (files.folder / "out" / "compare.html").read_text()
     assert "<td>24.00 <span>[" in page and "http:" not in page and "https:" not in page
+
+
+def test_methods_are_compared_by_their_shapes_alone(files):
+    """Every figure of shapes, object by object, in the unit of the protocol, as rows for others."""
+    reports = []
+    for offset in (0.0, 0.5, -1.0):
+        report = change(shapes_report(offset), thresholds=[0.01, 0.5], unit=2.0)
+        for i, record in enumerate(report["objects"]):
+            record["fscore"] = {"0.01": 0.3 + 0.1 * i, "0.5": 0.9 + 0.1 * offset * (i == 1)}
+            record |= {"accuracy": 0.1, "completeness": 0.2, "normal_consistency": None}
+        reports.append(report)
+    reports[2]["objects"][0] = {"name": "a", "status": "failed", "reason": "the mesh has no area"}
+    names = ("x", "y_1", "z")
+    words = [f"{name}={files.add(name, report)}" for name, report in zip(names, reports)]
+    code, said, joined = files.run(*words)
+    assert code == 0 and joined["common"]["fscore.0.5"] == ["b", "c", "d"]
+    second, third = joined["differences"]
+    assert second["fscore.0.5"]["mean"] == pytest.approx(0.05 / 3)
+    assert second["fscore.0.5"]["interval"] == pytest.approx([0, 0.05 / 3 * 3])
+    assert third["chamfer"]["mean"] == pytest.approx(-0.01)
+    assert joined["rows"][0]["fscore.0.01"]["mean"] == pytest.approx(0.5)
+    head, *_ = said.out.splitlines()
+    assert "Chamfer" in head and "Volume IoU" in head and "PSNR" not in head
+    assert "true shape is 2." in said.out and "z lacks 1 object (a: the mesh" in said.out
+    more = said.out.partition("More of the shapes")[2]
+    assert "F-score at 0.5 ↑" in more and "+0.0167 [" in more and "normals" in more
+    table = (files.folder / "out" / "compare.tex").read_text()
+    assert r"Chamfer $\downarrow$" in table and r"y\_1 & 0.0550 [" in table
+    rows = list(csv.DictReader((files.folder / "out" / "compare.csv").read_text().splitlines()))
+    assert [row["name"] for row in rows] == [*names, "y_1 - x", "z - x"]
+    assert float(rows[3]["fscore.0.5.high"]) == pytest.approx(0.05)
+    assert float(rows[2]["chamfer.mean"]) == pytest.approx(0.04)
+
+
+def test_reports_of_shapes_are_those_of_the_command(files, capsys):
+    """Two methods' folders, evaluated and compared by the commands themselves."""
+    words = []
+    for name, size in (("small", 0.8), ("right", 1.0)):
+        for folder, side in ((name, size), ("true", 1.0)):
+            (files.folder / folder).mkdir(exist_ok=True)
+            for uid, width in (("a", 0.5), ("b", 0.7)):
+                box = trimesh.creation.box((side, side * width, side))
+                box.export(files.folder / folder / f"{uid}.ply")
+        pred, true, out = (str(files.folder / part) for part in (name, "true", f"{name}-out"))
+        assert run("eval-geometry", [pred, true, "--points", "300", "--out", out]) == 0
+        words.append(f"{name}={out}")
+    capsys.readouterr()
+    code, _, joined = files.run(*words, "--against", "right")
+    assert code == 0
+    small, right = joined["rows"]
+    assert right["chamfer"]["mean"] == 0 and right["fscore.0.02"]["mean"] == 1
+    assert small["iou"]["mean"] < 0.7 and small["normal_consistency"]["mean"] < 1
+    assert joined["differences"][0]["fscore.0.02"]["interval"][1] < -0.1
 
 
 def test_what_a_method_lacks_counts_for_none_and_is_named(files):
