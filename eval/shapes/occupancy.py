@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -158,16 +158,16 @@ def _majority_at(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
 def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
-    from scipy.ndimage import label
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
+    from skimage.measure import label
 
     scene = mesh.scene()
     near = _near(mesh, grid)
     # Places that no face is near to are one with their neighbours: what they form is a node each,
     # and so is every place near a face.
-    node, count = label(~near)
-    node[near] = count + 1 + np.arange(np.count_nonzero(near))
+    node = cast(np.ndarray, label(~near, connectivity=1))
+    node[near] = node.max() + 1 + np.arange(np.count_nonzero(near))
     links = []
     for axis in range(3):
         start, end = ([slice(None)] * 3 for _ in range(2))

@@ -286,6 +286,38 @@ def test_batch_lists_every_failure(tmp_path):
     assert len((tmp_path / "out" / "objects.csv").read_text().splitlines()) == 8
 
 
+@pytest.mark.parametrize("name", ["default", "sf3d", "syncdreamer"])
+def test_what_a_protocol_needs_and_a_file_has_not(tmp_path, name):
+    """No volume, no normals, no extent, nothing to align: named, and the others are evaluated."""
+    box = trimesh.creation.box((1.0, 0.6, 0.8))
+    for uid in ("cloud", "good", "line", "open", "point", "sheet", "speck"):
+        export(tmp_path / "gt" / f"{uid}.ply", box)
+    corner = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
+    for uid, shape in {
+        "cloud": trimesh.PointCloud(box.sample(500)),
+        "good": box,
+        "line": trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False),
+        "open": trimesh.Trimesh(box.vertices, box.faces[:-1], process=False),
+        "point": trimesh.PointCloud(np.zeros((1, 3))),
+        "sheet": trimesh.Trimesh(box.vertices, box.faces[:1], process=False),
+        "speck": corner,
+    }.items():
+        export(tmp_path / "pred" / f"{uid}.ply", shape)
+    code, report = run_geometry(tmp_path, "--protocol", name)
+    reasons = {item["name"]: item["reason"] for item in report["failures"]}
+    done = {record["name"]: record for record in report["objects"] if record["status"] == "ok"}
+    # a single point has a place, but nothing that a search or ICP could align
+    lone = {"point"} if name == "sf3d" else set()
+    assert code == 1 and reasons.keys() == {"line", "speck", *lone}
+    said = {"line": "no area", "point": "align", "speck": "one point"}
+    assert all(said[uid] in reason for uid, reason in reasons.items())
+    assert done["good"]["chamfer"] == 0 and done["cloud"]["normal_consistency"] is None
+    assert done["cloud"]["iou"] is None and done["cloud"]["iou_reason"]
+    if name == "default":
+        assert done["open"]["iou"] > 0.9 and done["open"]["pred_flags"] == ["open"]
+        assert done["sheet"]["iou"] == 0
+
+
 def test_gaussians_against_a_ball(tmp_path):
     export(tmp_path / "gt" / "a.ply", trimesh.creation.icosphere(4, 0.5))
     (tmp_path / "pred").mkdir()

@@ -261,7 +261,7 @@ def backward(
         kernel = kernels.gradient_states_kernel(s.kind)
         s.run(kernel, [s.c, dout], [s.work(4 * y.span), _rows(local), _rows(product)])
         dlast = _carry(dlast, local.flip(0), product.flip(0)).flip(0)
-    dh, da = s.states() if need_h else None, s.states() if need_A else None
+    dh, da = s.states(), s.states()
     du, ddelta, dz = like(x.u, need_u), like(x.delta, need_delta), like(x.u, need_z)
     db, dc = parts(need_B), parts(need_C)
     make = torch.empty if x.packed is None else torch.zeros  # some have no chunk
@@ -270,8 +270,8 @@ def backward(
         kernels.backward_kernel(s.kind),
         [s.b, s.c, view(starts, lanes), dout, _rows(dlast if through else None)],
         [
-            s.work(3 * y.span), s.work(2 * chunk), _rows(dh), du, ddelta, dz, _rows(da), db, dc,
-            view(dchannel, lanes),
+            s.work(3 * y.span), s.work(2 * chunk), _rows(dh if need_h else None), du, ddelta, dz,
+            _rows(da if need_A else None), db, dc, view(dchannel, lanes),
         ],
         flags,
         [du, ddelta, dz],
