@@ -90,29 +90,15 @@ class Layout:
         self.tasks = self.segments * count
         self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
 
-    def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
-        """Brings ``[.., D, *]`` to float32 ``[.., blocks, *, W]``; None becomes zeros.
+    def pack(self, x: Tensor) -> Tensor:
+        """Brings ``[D, K]`` to float32 ``[blocks, K, W]``."""
+        x = x.float().view(self.groups, self.group_width, x.shape[1])
+        x = F.pad(x, (0, 0, 0, self.group_blocks * W - self.group_width))
+        return x.view(self.blocks, W, x.shape[2]).mT.contiguous()
 
-        The result may lie in the memory of ``x``.
-        """
-        if x is None:
-            return torch.zeros(*lead, self.blocks, W)
-        n = len(lead)
-        tail, x = tuple(x.shape[n + 1 :]), x.float()
-        if missing := self.group_blocks * W - self.group_width:
-            x = x.reshape(*lead, self.groups, self.group_width, *tail)
-            x = F.pad(x, (0, 0) * len(tail) + (0, missing))
-        x = x.reshape(*lead, self.blocks, W, *tail)
-        return x.movedim(n + 1, -1).contiguous()
-
-    def unpack(self, x: Tensor, lead: tuple[int, ...] = ()) -> Tensor:
-        """The inverse of ``pack``, dense, in the memory of ``x`` if that is its order."""
-        n = len(lead)
-        tail, x = tuple(x.shape[n + 1 : -1]), x.movedim(-1, n + 1)
-        if self.group_blocks * W > self.group_width:
-            x = x.reshape(*lead, self.groups, self.group_blocks * W, *tail)
-            x = x.narrow(n + 1, 0, self.group_width)
-        return x.reshape(*lead, self.channels, *tail).contiguous()
+    def unpack(self, x: Tensor) -> Tensor:
+        """Brings ``[blocks, W]`` to ``[D]``."""
+        return x.view(self.groups, self.group_blocks * W)[:, : self.group_width].flatten()
 
     def total(self, parts: Tensor) -> Tensor:
         """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
