@@ -51,6 +51,7 @@ _MOST_EDGE = 0.7  # share of the picture's border that an object may cover
 _UNSURE = 0.4  # largest share of an alpha's sum in pixels that are neither object nor background
 
 _HAZE = 0.1  # a fainter alpha than this is none
+_OPAQUE = 0.5  # an object whose alpha is nowhere as large is spoken of
 
 
 @dataclass
@@ -173,6 +174,8 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     how = _HOW[method].format(
         mask=Path(ways.mask or "").name, model=model and model.path.name, why=why
     )
+    if (most := rgba[..., 3].max()) < _OPAQUE:
+        how += f" It is nowhere more than {most:.0%} opaque, so what comes out is faint, too."
     colors = np.where(rgba[..., 3:] > 0, rgba[..., :3], source)
     editable = np.dstack([colors, rgba[..., 3]])
     return CutOut(centred, method, how, source, rgba[..., 3], editable)

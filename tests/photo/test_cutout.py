@@ -99,6 +99,15 @@ def test_sam_comes_before_the_matte(network, busy, monkeypatch):
     assert cut_out(path, ways).method == "matte"
 
 
+@pytest.mark.parametrize("alpha", [0.35, 0.8])
+def test_an_object_that_is_soft_everywhere_is_spoken_of(tmp_path, alpha):
+    rgba = np.zeros((40, 50, 4))
+    rgba[10:30, 8:40] = 0.9, 0.2, 0.1, alpha
+    Image.fromarray((rgba * 255).astype(np.uint8)).save(tmp_path / "soft.png")
+    said = "nowhere more than 35% opaque" in cut_out(tmp_path / "soft.png").how
+    assert said == (alpha < 0.5)
+
+
 def test_what_no_way_cuts_is_one_line(tmp_path):
     path = tmp_path / "noise.png"
     save_image(path, np.random.default_rng(0).random((40, 50, 3)))
