@@ -292,7 +292,6 @@ def test_what_a_protocol_needs_and_a_file_has_not(tmp_path, name):
     box = trimesh.creation.box((1.0, 0.6, 0.8))
     for uid in ("cloud", "good", "line", "open", "point", "sheet", "speck"):
         export(tmp_path / "gt" / f"{uid}.ply", box)
-    corner = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
     for uid, shape in {
         "cloud": trimesh.PointCloud(box.sample(500)),
         "good": box,
@@ -300,7 +299,7 @@ def test_what_a_protocol_needs_and_a_file_has_not(tmp_path, name):
         "open": trimesh.Trimesh(box.vertices, box.faces[:-1], process=False),
         "point": trimesh.PointCloud(np.zeros((1, 3))),
         "sheet": trimesh.Trimesh(box.vertices, box.faces[:1], process=False),
-        "speck": corner,
+        "speck": trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False),
     }.items():
         export(tmp_path / "pred" / f"{uid}.ply", shape)
     code, report = run_geometry(tmp_path, "--protocol", name)
