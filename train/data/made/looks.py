@@ -15,12 +15,12 @@ import numpy as np
 from manifold3d import Manifold, Mesh
 
 from gamba_warp.formats.materials import Material, to_linear
-from gamba_warp.formats.meshes import TexturedMesh
+from gamba_warp.formats.meshes import CREASE, TexturedMesh
 
 from . import textures
 from .solids import extent, joined, solid_of
 
-CREASE = 40.0  # degrees; a sharper edge is not shaded smoothly
+SHARP = 40.0  # degrees; a sharper edge is not shaded smoothly
 MAX_FACES = 60_000
 THINNEST = 2e-4  # least volume, as a share of a cube of the longest side
 # Of a skin, for faces that look along x, y and z: the axes of u and v, and the signs of u and v
@@ -235,7 +235,7 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     while whole.num_tri() > MAX_FACES:
         whole = whole.simplify(tolerance)
         tolerance *= 2
-    mesh = whole.calculate_normals(0, CREASE).to_mesh()
+    mesh = whole.calculate_normals(0, SHARP).to_mesh()
     points = np.asarray(mesh.vert_properties)
     corners = np.asarray(mesh.tri_verts).astype(np.int64)
     number = np.repeat(np.asarray(mesh.run_original_id), np.diff(mesh.run_index) // 3).astype(np.int64)
@@ -244,9 +244,13 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     used, faces = np.unique(same[corners], return_inverse=True)
     vertices = points[used, :3].astype(np.float64)
     faces = faces.reshape(-1, 3)
-    normals = points[corners, 3:6]
-    length = np.linalg.norm(normals, axis=2, keepdims=True)
-    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), np.float32([0, 1, 0]))
+    smooth = points[corners, 3:6]
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    flat = np.cross(b - a, c - a)
+    length = np.linalg.norm(flat, axis=1, keepdims=True)
+    flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])[:, None]
+    # Where a cut left slivers a vertex may have the normal of another side.
+    normals = np.where((smooth * flat).sum(2, keepdims=True) > CREASE, smooth, flat)
     uvs, ids, materials = _mapped(points[corners, 6:9], number, looks)
     return TexturedMesh(
         vertices=vertices,
