@@ -1,4 +1,4 @@
-"""The commands that make data: ``gamba data furniture``, ``primitives``, ``render`` and the others.
+"""The commands that make data: ``gamba data furniture``, ``made``, ``render`` and the others.
 
 They parse, call and print. What is there already is skipped, so a command that was stopped goes on;
 what fails is told on stderr, and the exit code is then 1.
@@ -86,10 +86,10 @@ def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None 
 
 
 @ranged
-def data_primitives_command(
+def data_made_command(
     out: Out, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
 ) -> int:
-    """Make objects of simple solids with made-up textures, free of anybody's rights (.glb).
+    """Make toys, animals, shoes, tools, packages, furniture, free of anybody's rights (.glb).
 
     An object depends on the seed and its number alone; those that are there already are kept.
 
@@ -98,9 +98,9 @@ def data_primitives_command(
         count: number of objects.
         seed: seed of all objects.
     """
-    from ..data.primitives import make_primitives
+    from ..data.made import make_files
 
-    make_primitives(out, count, seed)
+    make_files(out, count, seed)
     print(f"{count} models in {out}; next: gamba data render {out} --out DATA")
     return 0
 
