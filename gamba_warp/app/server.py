@@ -8,6 +8,7 @@ import queue
 import shutil
 import signal
 import socket
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -140,9 +141,15 @@ def work_folder() -> Iterator[Path]:
 
 
 def _remove_unheld(folder: Path) -> None:
-    if folder.is_symlink() or not folder.is_dir() or not os.access(folder, os.W_OK):
+    """Removes a folder that an ended ``gamba app`` of this user left; touches no other."""
+    try:
+        made, lock = folder.lstat(), (folder / ".lock").lstat()
+    except OSError:  # another process makes it just now, or it is not ours
         return
-    if not (folder / ".lock").is_file():  # another process makes it just now, or it is not ours
+    if not (stat.S_ISDIR(made.st_mode) and stat.S_ISREG(lock.st_mode)):
+        return
+    # Anybody may put a folder of this name there, and links into it.
+    if os.name == "posix" and (made.st_uid != os.geteuid() or made.st_mode & 0o077):
         return
     try:
         with only_process(folder, "serves"):

@@ -147,33 +147,61 @@ def test_nothing_of_the_environment_opens_the_server(monkeypatch, tmp_path):
     assert set(ours.values()) == {"False"}
 
 
-def test_the_folder_goes_and_so_do_those_of_the_killed(tmp_path, monkeypatch):
-    monkeypatch.setattr(server.tempfile, "gettempdir", lambda: str(tmp_path))
-    monkeypatch.setattr(server.tempfile, "tempdir", str(tmp_path))
-    killed, foreign = tmp_path / f"{server.PREFIX}killed", tmp_path / f"{server.PREFIX}foreign"
-    for folder in (killed, foreign):
-        folder.mkdir()
-        (folder / "picture.png").write_bytes(b"x")
-    (killed / ".lock").write_text("1\n")
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """The folder for temporary files, which is everybody's."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    monkeypatch.setattr(server.tempfile, "tempdir", str(folder))
+    return folder
+
+
+def left_folder(path, mode=0o700):
+    """What a killed process leaves."""
+    path.mkdir()
+    path.chmod(mode)
+    (path / "picture.png").write_bytes(b"x")
+    (path / ".lock").write_text("1\n")
+    return path
+
+
+def test_the_folder_goes_and_so_do_those_of_the_killed(temporary):
+    killed, foreign = (temporary / f"{server.PREFIX}{name}" for name in ("killed", "foreign"))
+    left_folder(killed)
+    (left_folder(foreign) / ".lock").unlink()
     with server.work_folder() as first:
         assert not killed.exists() and foreign.exists(), "without our lock it may be anybody's"
         (first / "sub").mkdir()
         with server.work_folder() as second:
             assert first.exists() and second != first, "another that runs keeps its own"
         assert not second.exists()
-    assert [p.name for p in tmp_path.iterdir()] == [foreign.name]
+    assert list(temporary.iterdir()) == [foreign]
 
 
-def test_a_link_is_not_followed(tmp_path, monkeypatch):
-    monkeypatch.setattr(server.tempfile, "gettempdir", lambda: str(tmp_path / "tmp"))
-    monkeypatch.setattr(server.tempfile, "tempdir", str(tmp_path / "tmp"))
-    (tmp_path / "tmp").mkdir()
-    home = tmp_path / "home"
-    home.mkdir()
-    (home / ".lock").touch()
-    os.symlink(home, tmp_path / "tmp" / f"{server.PREFIX}link")
+def test_a_link_is_not_followed(tmp_path, temporary):
+    """Neither one in a folder's place nor one in that of its lock, with any version of filelock."""
+    home = left_folder(tmp_path / "home")
+    (temporary / f"{server.PREFIX}folder").symlink_to(home)
+    left = left_folder(temporary / f"{server.PREFIX}lock")
+    (left / ".lock").unlink()
+    (left / ".lock").symlink_to(home / "picture.png")
     with server.work_folder():
-        assert home.exists()
+        assert (home / ".lock").exists() and left.exists()
+    assert (home / "picture.png").read_bytes() == b"x"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="folders have owners and modes on POSIX alone")
+def test_folders_of_others_are_left(temporary, monkeypatch):
+    ours = left_folder(temporary / f"{server.PREFIX}ours")
+    open_to_all = left_folder(temporary / f"{server.PREFIX}open", 0o777)
+    monkeypatch.setattr(server.os, "geteuid", lambda: os.getuid() + 1)
+    with server.work_folder():
+        assert ours.exists() and (ours / ".lock").read_text() == "1\n"
+    monkeypatch.undo()
+    monkeypatch.setattr(server.tempfile, "tempdir", str(temporary))
+    with server.work_folder():
+        assert not ours.exists() and open_to_all.exists()
+    assert (open_to_all / ".lock").read_text() == "1\n"
 
 
 def test_a_port_in_use_is_one_line():
