@@ -30,7 +30,8 @@ class Connection(H11Protocol):
         if len(self.connections) > CONNECTIONS:
             waiting = [c for c in self.connections if isinstance(c, Connection) and c._reading]
             oldest = min(waiting, key=lambda c: c._reading.when() if c._reading else 0.0)
-            oldest._end()
+            self.connections.discard(oldest)
+            oldest.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stops the clocks."""
@@ -62,7 +63,8 @@ class Connection(H11Protocol):
     def _look(self) -> None:
         if self.cycle is None or self.cycle.response_complete:
             if self._reading is None:
-                self._reading = self.loop.call_later(READ_SECONDS, self._end)
+                # What was answered before goes out first.
+                self._reading = self.loop.call_later(READ_SECONDS, self.transport.close)
         elif self._reading:
             self._reading.cancel()
             self._reading = None
@@ -72,12 +74,8 @@ class Connection(H11Protocol):
 
         def check() -> None:
             if self.transport.get_write_buffer_size() > left - PIECE:
-                self._end()
+                self.transport.abort()
             else:
                 self._await_taking()
 
         self._writing = self.loop.call_later(READ_SECONDS, check)
-
-    def _end(self) -> None:
-        self.connections.discard(self)
-        self.transport.abort()

@@ -139,15 +139,14 @@ class Guard:
             visitor = hashlib.sha256(token.encode()).hexdigest()[:32] if known else None
             scope[VISITOR] = visitor
             with self._shelf.visited(visitor or "") as at_once:
-                crowd = visitor is not None and at_once > _AT_ONCE
-                await self._answer(scope, receive, send, crowd)
+                await self._answer(scope, receive, send, at_once)
 
     async def _sweep(self) -> None:
         while True:
             await asyncio.sleep(KEPT / 6)
             await asyncio.to_thread(self._shelf.sweep)
 
-    async def _answer(self, scope: Message, receive: Receive, send: Send, crowd: bool) -> None:
+    async def _answer(self, scope: Message, receive: Receive, send: Send, at_once: int) -> None:
         more = list(_HEADERS)
 
         async def guarded(message: Message) -> None:
@@ -167,10 +166,11 @@ class Guard:
         try:
             if is_foreign(request.headers.items()):
                 raise HTTPException(421, "this page is that of 127.0.0.1, for its own pages alone")
-            if crowd:
+            if visitor and at_once > _AT_ONCE:
                 raise HTTPException(503, "too many requests at once; try again")
             if request.method in ("GET", "HEAD") and _READ.fullmatch(path):
-                if {"content-length", "transfer-encoding"} & set(request.headers):
+                stated = request.headers.get("content-length", "0")
+                if stated != "0" or "transfer-encoding" in request.headers:
                     raise HTTPException(400, "to ask for something takes no body")
                 if path == "/" and visitor is None:
                     cookie = f"{_COOKIE}={secrets.token_hex(16)}; HttpOnly; SameSite=Lax; Path=/"
@@ -284,11 +284,10 @@ class Guard:
         return msgspec.json.encode(call)
 
 
-def _check_size(request: Request, limit: int) -> int:
-    """The bytes that a request states; it must, and may not be over the limit."""
+def _check_size(request: Request, limit: int) -> None:
+    """A request must state how many bytes it sends, and may not be over the limit."""
     stated = request.headers.get("content-length", "")
     if not re.fullmatch("[0-9]{1,15}", stated):
         raise HTTPException(411, "what is sent must state its length")
     if int(stated) > limit:
         raise HTTPException(413, f"more than {limit >> 20} MB, the maximum allowed size")
-    return int(stated)

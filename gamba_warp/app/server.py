@@ -12,6 +12,7 @@ import stat
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
@@ -68,7 +69,7 @@ def app_command(
     chosen, door = pick_device(device), listener(port)
     ways = Ways(matte_model=matte_model, device=chosen).checked()
     model = load_model(checkpoint, chosen, encoder_weights)
-    with work_folder() as folder:
+    with door, work_folder() as folder:
         quiet(folder)
         from .actions import Actions
         from .interface import build
@@ -260,9 +261,13 @@ def serve(
     thread = threading.Thread(target=server.run, args=[[door]], daemon=True)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     thread.start()
-    address = f"http://{HOST}:{port}/"
-    print(f"{address} (Ctrl-C ends it)", flush=True)
     try:
+        while not server.started:
+            if not thread.is_alive():
+                raise RuntimeError("the server did not start")
+            time.sleep(0.01)
+        address = f"http://{HOST}:{port}/"
+        print(f"{address} (Ctrl-C ends it)", flush=True)
         if open_browser:
             webbrowser.open(address)
         turns.work()
