@@ -260,6 +260,8 @@ def only_process(folder: Path, what: str) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     path = folder / ".lock"
+    if path.is_symlink():  # its target would be emptied
+        raise UserError(f"cannot lock {folder}: .lock is a link")
     lock = FileLock(path, timeout=0)
     try:
         lock.acquire()
