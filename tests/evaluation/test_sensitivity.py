@@ -44,8 +44,8 @@ def test_variants_change_one_field_and_keep_the_place():
 
 def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
     """Stages that rows have in common are computed once; that must change no figure."""
-    fields = ("points", "num_points", "chamfer", "align", "occupancy", "iou_voxels")
-    changes = {name: sensitivity._CHANGES[name][-1:] for name in fields}
+    fields = ("points", "num_points", "seed", "unit", "chamfer", "align", "occupancy", "grid")
+    changes = {name: sensitivity._CHANGES[name][-1:] for name in (*fields, "iou_voxels")}
     monkeypatch.setattr(sensitivity, "_CHANGES", changes)
     given = ["--points", "500", "--set", "iou_voxels=16", "--sensitivity", "--out"]
     words = [str(folders / side) for side in ("pred", "gt")]
@@ -66,6 +66,8 @@ def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
         got = next(o for o in kept["objects"] if o["name"] == "a")["variants"][label]
         for key in ("chamfer", "iou", "noise_floor", "normal_consistency"):
             assert got[key] == want[key], (label, key)
+        least = f"{min(protocol.thresholds):g}"
+        assert got["fscore"] == want["fscore"][least], label
 
 
 def test_an_interrupted_evaluation_goes_on(folders):
