@@ -73,7 +73,9 @@ def test_an_interrupted_evaluation_goes_on(folders):
     pairs, _ = find_pairs(folders / "pred", folders / "gt")
     first = evaluate_pairs(pairs[:1], SMALL, None, journal=Journal(folders, SMALL, None))
     noted = folders / "objects.jsonl"
-    noted.write_text(noted.read_text() + '{"key": "cut of')  # a line that was cut off
+    lines = noted.read_text()
+    # what is no record: nested too deeply, of another kind, and a line that was cut off
+    noted.write_text("[" * 10**5 + '\n{"key": "a", "record": 5}\n' + lines + '{"key": "cut of')
     pairs = [pair._replace(name="bad" if pair.name == "b" else pair.name) for pair in pairs]
     again = evaluate_pairs(
         pairs, SMALL, None, murderous_pair, journal=Journal(folders, SMALL, None)
