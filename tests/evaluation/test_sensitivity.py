@@ -54,6 +54,11 @@ def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
     kept = json.loads((folders / "out" / "sensitivity.json").read_text())
     assert printed == (folders / "out" / "sensitivity.md").read_text()
     assert "</svg>" in (folders / "out" / "sensitivity.svg").read_text()
+    (folders / "gt" / "b.ply").rename(folders / "gt" / "c.ply")
+    assert run("eval-geometry", [*words, *given, str(folders / "fewer")]) == 1
+    said = capfd.readouterr()
+    assert "failed: b: no ground truth\nfailed: c: no prediction\n" in said.err
+    assert "of 1 objects" in said.out
     from gamba_warp.eval.shapes.load import load_prediction, load_truth
 
     protocols = sensitivity.variants(SMALL)
