@@ -17,6 +17,7 @@ from msgspec import Meta
 from gamba_warp.conventions import DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig, Preset
+from gamba_warp.untrusted.documents import value_of
 from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options, option
 
 _Count = Annotated[int, Meta(ge=1, le=10**12)]
@@ -289,10 +290,7 @@ class TrainConfig:
                 raise UserError(
                     f"--set {change}: expected FIELD=VALUE, FIELD of {', '.join(names)}"
                 )
-            try:
-                changes[name] = json.loads(text)
-            except (ValueError, RecursionError):
-                changes[name] = text
+            changes[name] = value_of(text)
         try:
             return replace(PRESETS[self.preset], **changes)
         except UserError as error:

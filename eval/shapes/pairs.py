@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from gamba_warp.batch import progress_bar
@@ -24,6 +25,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, sha256, visible, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
 from gamba_warp.untrusted.children import Failed, run_each
+from gamba_warp.untrusted.documents import read_lines
 from gamba_warp.versions import __version__, installed
 
 from ..report import (
@@ -146,6 +148,13 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     return report
 
 
+class _Noted(msgspec.Struct):
+    """A line of the journal."""
+
+    key: str
+    record: dict[str, Any]
+
+
 class Journal:
     """The records of an evaluation that is under way, so that an interrupted one goes on.
 
@@ -158,10 +167,8 @@ class Journal:
         self._decides = [protocol.to_json(), __version__, str(data and data.resolve())]
         self._known: dict[str, dict[str, Any]] = {}
         if self._file is not None and self._file.is_file():
-            for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines():
-                with suppress(ValueError, KeyError, TypeError):  # a line that was cut off
-                    entry = json.loads(line)
-                    self._known[entry["key"]] = entry["record"]
+            for noted in read_lines(self._file, _Noted):
+                self._known[noted.key] = noted.record
 
     def key(self, pair: Pair) -> str:
         """What decides the pair's record."""

@@ -13,7 +13,7 @@ from msgspec import Meta
 from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.errors import UserError
 from gamba_warp.surfaces.options import SurfaceOptions
-from gamba_warp.untrusted.documents import read_document
+from gamba_warp.untrusted.documents import read_document, value_of
 from gamba_warp.untrusted.ranges import Seed, check_options
 
 from .. import presets
@@ -194,10 +194,7 @@ def with_fields(protocol: GeometryProtocol, texts: Sequence[str]) -> GeometryPro
         if not sign or inner not in ("", "surface") or name not in place or field == "surface":
             known = ", ".join([*(k for k in value if k != "surface"), "surface.…"])
             raise UserError(f"--set {text}: not FIELD=JSON, FIELD one of {known}")
-        try:
-            place[name] = msgspec.json.decode(given)
-        except msgspec.DecodeError:
-            place[name] = given
+        place[name] = value_of(given)
     return _checked(value, f"--set {' '.join(texts)}")
 
 

@@ -82,7 +82,9 @@ def variants(protocol: GeometryProtocol) -> dict[str, GeometryProtocol]:
     return found | {f"protocol {', '.join(names)}": p for p, names in named.items()}
 
 
-def evaluate_variants(options: ShapesOptions, protocol: GeometryProtocol) -> str:
+def evaluate_variants(
+    options: ShapesOptions, protocol: GeometryProtocol
+) -> tuple[str, list[dict[str, Any]]]:
     """Evaluates all pairs under all variants; writes sensitivity.json, .md and .svg into OUT.
 
     Args:
@@ -90,7 +92,7 @@ def evaluate_variants(options: ShapesOptions, protocol: GeometryProtocol) -> str
         protocol: the chosen one.
 
     Returns:
-        The table, as sensitivity.md has it.
+        The table, as sensitivity.md has it, and the records of all objects.
 
     Raises:
         UserError: something cannot be opened or written, or no object could be evaluated.
@@ -128,7 +130,7 @@ def evaluate_variants(options: ShapesOptions, protocol: GeometryProtocol) -> str
         write_json(folder / "sensitivity.json", finite_or_none(report))
         write_text(folder / "sensitivity.md", page)
         write_text(folder / "sensitivity.svg", _chart(rows))
-    return page
+    return page, records
 
 
 def vary_pair(

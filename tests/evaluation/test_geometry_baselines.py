@@ -213,6 +213,7 @@ def test_differences_are_paired(tmp_path, capsys):
     text = (tmp_path / "out" / "table.md").read_text()
     printed = capsys.readouterr().out
     assert text in printed and "failed: c (near): no prediction" in printed
+    assert "\n3 evaluated, 0 failed, 1 of baselines failed;" in printed
     for row in ("predicted", "near", "far", "predicted - near", "predicted - far"):
         assert text.count(f"| {row.ljust(16)} |") == 2  # means and medians
     assert "F-score at 0.02" in text
