@@ -21,6 +21,7 @@ def data(tmp_path_factory):
         micro.write_object(root / "views" / name, micro.cloud(seed))
         (root / "pred").mkdir(exist_ok=True)
         save_ply(root / "pred" / f"{name}.ply", micro.cloud(seed))
+    for name in THERE:
         (root / "meshes" / name).mkdir(parents=True)
         trimesh.creation.box().export(root / "meshes" / name / "model.obj")
     everything = {"version": 2, "test": [*THERE, "not of the list"]}
