@@ -42,6 +42,7 @@ TO_Z_UP = {
 # Those of the frames that predictions may be in; those of the truth's file depend on the file.
 FRAME_AXES = {"unit": "z-up", "reference": "opencv"}
 DATASET = "dataset"  # axes of the meshes that a dataset was rendered from, as it says them
+_FOLLOWED = "which was rendered of these meshes with another axis up; --up is followed"
 _OTHER_FILES = (
     "other bounding boxes than the meshes that DATA was rendered from; DATA's axes are not used, "
     "those of the format are (--up)"
@@ -108,7 +109,7 @@ def load_truth(
                 matrix, scale = placement.transform, placement.scale
                 motion = Similarity(matrix[:, :3], scale * matrix[:, 3], scale)
                 return _evaluated(shape, motion.apply(shape), motion, DATASET, protocol)
-            warning = f"--up {protocol.up} is followed, though DATA was rendered another way up"
+            warning = f"--up {protocol.up} contradicts DATA, {_FOLLOWED}"
         elif placement is not None and asked is None:
             warning = _OTHER_FILES
         axes = asked or axes_of(path, shape)

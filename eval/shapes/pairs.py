@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -302,7 +302,7 @@ def find_pairs(
         rotations = {name: meshes[library[name]].rotation for name in true}
         uids = library | uids
     else:
-        true = _shapes_in(gt)
+        true = _shapes_in(gt, uids)
         if known is not None:
             parts = {splits[uids[name]] for name in wanted & uids.keys()}
             wanted |= {name for name, uid in uids.items() if splits[uid] in parts}
@@ -320,14 +320,18 @@ def find_pairs(
     return pairs, failures
 
 
-def _shapes_in(folder: Path) -> dict[str, list[Path]]:
-    """The shape files in a folder by ``object_names``. Raises UserError for none."""
+def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Path]]:
+    """The shape files in a folder by ``object_names``. Raises UserError for none.
+
+    A further file of one name is another object where it was rendered as one (``find_meshes``).
+    """
     files = (path for path in visible(folder, "*") if path.suffix.lower() in SUFFIXES)
     paths = sorted(path for path in files if path.is_file())
     names = object_names([path.relative_to(folder).with_suffix("") for path in paths])
     found: dict[str, list[Path]] = {}
     for name, path in zip(names, paths):
-        found.setdefault(name, []).append(path)
+        other = f"{name}-{path.suffix[1:].lower()}"
+        found.setdefault(other if name in found and other in rendered else name, []).append(path)
     if not found:
         raise UserError(f"{folder}: no files of {', '.join(SUFFIXES)} in it")
     return found

@@ -64,8 +64,9 @@ _READ = re.compile(
 )
 _MAX_CALL = 1 << 20  # bytes of a call of a function; a real one takes 2 kB
 _HEAD = 1 << 16  # bytes of an upload beside its files
-_CALL_SECONDS, _UPLOAD_SECONDS = READ_SECONDS, 300.0  # until all of it is there
-_AT_ONCE = 16  # requests of one visitor
+_CALL_SECONDS = READ_SECONDS  # until all of it is there
+UPLOAD_SECONDS = 300.0
+MAX_AT_ONCE = 16  # requests of one visitor
 # The rest is ignored: gradio fails with several ranges, or with other digits than ours.
 _RANGE = re.compile(b"bytes=([0-9]{1,15}-[0-9]{0,15}|-[0-9]{1,15})")
 
@@ -166,7 +167,7 @@ class Guard:
         try:
             if is_foreign(request.headers.items()):
                 raise HTTPException(421, "this page is that of 127.0.0.1, for its own pages alone")
-            if visitor and at_once > _AT_ONCE:
+            if visitor and at_once > MAX_AT_ONCE:
                 raise HTTPException(503, "too many requests at once; try again")
             if request.method in ("GET", "HEAD") and _READ.fullmatch(path):
                 stated = request.headers.get("content-length", "0")
@@ -238,7 +239,7 @@ class Guard:
         form = FormData()
         try:
             sent = Request(request.scope, counted).form(max_files=4, max_fields=0)
-            form = await asyncio.wait_for(sent, _UPLOAD_SECONDS)
+            form = await asyncio.wait_for(sent, UPLOAD_SECONDS)
             if not form:
                 raise HTTPException(400, "no upload of files")
             return [await asyncio.to_thread(self._keep, f, visitor) for f in form.values()]

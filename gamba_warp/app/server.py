@@ -146,13 +146,14 @@ def work_folder() -> Iterator[Path]:
 def _remove_unheld(folder: Path) -> None:
     """Removes a folder that an ended ``gamba app`` of this user left; touches no other."""
     try:
-        made, lock = folder.lstat(), (folder / ".lock").lstat()
-    except OSError:  # another process makes it just now, or it is not ours
-        return
-    if not (stat.S_ISDIR(made.st_mode) and stat.S_ISREG(lock.st_mode)):
+        made = folder.lstat()
+    except OSError:  # it is gone
         return
     # Anybody may put a folder of this name there, and links into it.
-    if os.name == "posix" and (made.st_uid != os.geteuid() or made.st_mode & 0o077):
+    ours = os.name != "posix" or (made.st_uid == os.geteuid() and not made.st_mode & 0o077)
+    if not (stat.S_ISDIR(made.st_mode) and ours):
+        return
+    if not (folder / ".lock").is_file():  # another process makes it just now
         return
     try:
         with only_process(folder, "serves"):

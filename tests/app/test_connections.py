@@ -73,6 +73,13 @@ def test_the_one_that_waited_longest_makes_room(address):
     assert all(closed(client, 0.2) for client in held[:17])
 
 
+def test_who_asks_nothing_more_makes_room(address):
+    idle = [asked(address) for _ in range(3)]
+    assert all(client.recv(1) for client in idle)
+    time.sleep(0.05)
+    assert read(address) == b"hello"
+
+
 def test_who_is_answered_makes_no_room(address):
     streams = [asked(address, "stream") for _ in range(3)]
     assert all(client.recv(1) for client in streams)
