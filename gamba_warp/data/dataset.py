@@ -115,12 +115,16 @@ def _read_split(root: Path) -> tuple[int, dict[str, str]]:
 
 
 def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
-    """The split of each object of a dataset, whose ``split.json`` may state it.
+    """The split of each object of a dataset, whose ``split.json`` or index of a pack may state it.
 
     Raises:
         UserError: that file is bad.
     """
-    _, stated = _read_split(Path(folder))
+    root = Path(folder)
+    if (root / INDEX).exists():
+        stated = {values["uid"]: str(values.get("split")) for values in open_pack(root).objects}
+    else:
+        _, stated = _read_split(root)
     return {uid: stated.get(uid) or split_of(uid) for uid in uids}
 
 

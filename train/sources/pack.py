@@ -86,12 +86,7 @@ def write_pack(
             settings, cannot be written, or its disk is full.
     """
     dataset = open_dataset(data, settings.split)
-    if dataset.layout == "pack":  # whose splits stand in its index
-        splits = {
-            values["uid"]: str(values.get("split")) for values in packs.read_index(data).objects
-        }
-    else:
-        splits = splits_of(data, dataset.uids)
+    splits = splits_of(data, dataset.uids)
     index = _begun(out, settings)  # before the folder is made
     out = output_folder(out)
     with only_process(out, "packs"):
