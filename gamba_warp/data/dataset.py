@@ -115,7 +115,7 @@ def _read_split(root: Path) -> tuple[int, dict[str, str]]:
 
 
 def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
-    """The split of each object of a dataset, whose ``split.json`` may state it, or of a pack.
+    """The split of each object of a dataset, whose ``split.json`` or index of a pack may state it.
 
     Raises:
         UserError: that file, or the pack's index, is bad.

@@ -361,9 +361,16 @@ def test_bad_folders(meshes, tmp_path):
     refused("catalogue.json", render_views, meshes, tmp_path / "data")
 
 
-def test_limit(meshes, tmp_path):
+def test_limit(meshes, tmp_path, capsys):
     assert render_views(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
     assert len(open_dataset(tmp_path / "data")) == 2
+    without = "training does not validate; eval-views needs --split"
+    assert f"\nthe val and test splits are empty; {without}\n" in capsys.readouterr().out
+    words = [str(tmp_path / "data"), str(tmp_path / "pack"), "--size", "16"]
+    assert run("data pack", words) == 0
+    assert f"\nthe val and test splits are empty; {without}\n" in capsys.readouterr().out
+    assert run("data pack", [*words[:1], str(tmp_path / "train"), "--split", "train"]) == 0
+    assert "empty" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
