@@ -218,8 +218,9 @@ class Guard:
                 raise HTTPException(403, _NO_COOKIE)
             if path != _DATA:
                 scope["path"] += visitor
-        session = visitor and _SESSION.fullmatch(asked)
-        scope["query_string"] = asked + visitor.encode() if session else b""
+        scope["query_string"] = b""
+        if visitor and _SESSION.fullmatch(asked):
+            scope["query_string"] = asked + visitor.encode()
 
     async def _taken(self, request: Request, visitor: str) -> list[str]:
         """Puts the files of a form on the shelf as they are; nobody looks into them yet."""

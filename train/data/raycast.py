@@ -1,5 +1,8 @@
 """A small ray caster for textured meshes: Open3D finds the hits, a Warp kernel shades them."""
 
+# Annotations of kernels are values that Warp reads, no types.
+# pyright: reportInvalidTypeForm=false
+
 import math
 from dataclasses import dataclass
 from typing import Any, no_type_check

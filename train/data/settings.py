@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from msgspec import Meta
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 SPREAD = 0.2  # largest share by which a distance exceeds the least one, unless told
 # Fields of view of 20° to 70°, one for each object, evenly drawn by their logarithm.
-VARIED_CAMERAS = {"fov": 37.4, "fov_spread": 1.87, "spread": 0.3}
+VARIED_CAMERAS: dict[str, Any] = {"fov": 37.4, "fov_spread": 1.87, "spread": 0.3}
 
 
 @dataclass(frozen=True)
