@@ -244,23 +244,44 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     used, faces = np.unique(same[corners], return_inverse=True)
     vertices = points[used, :3].astype(np.float64)
     faces = faces.reshape(-1, 3)
-    smooth = points[corners, 3:6]
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    flat = np.cross(b - a, c - a)
-    length = np.linalg.norm(flat, axis=1, keepdims=True)
-    flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])[:, None]
-    # Where a cut left slivers a vertex may have the normal of another side.
-    normals = np.where((smooth * flat).sum(2, keepdims=True) > CREASE, smooth, flat)
+    normals = _normals(points[:, 3:6], same, corners, vertices[faces])
     uvs, ids, materials = _mapped(points[corners, 6:9], number, looks)
     return TexturedMesh(
         vertices=vertices,
         faces=faces,
-        normals=normals.astype(np.float32),
+        normals=normals,
         uvs=uvs,
         colors=np.full((len(faces), 3, 4), 255, np.uint8),
         material_ids=ids,
         materials=materials,
     )
+
+
+def _normals(rough: np.ndarray, same: np.ndarray, corners: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Unit normals ``[F, 3, 3]`` of corners: means over the faces of a smooth patch, by their area.
+
+    So a flat face beside a rounded edge stays flat, and slivers that a cut left have no say.
+
+    Args:
+        rough: ``[V, 3]`` normals which are equal where a vertex's faces belong to one patch.
+        same: ``[V]`` the first of the vertices at one place.
+        corners: ``[F, 3]`` vertices of faces.
+        places: ``[F, 3, 3]`` where these are.
+    """
+    steps = np.rint(500 * rough).astype(np.int64) + 512
+    key = ((same * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
+    groups, group = np.unique(key, return_inverse=True)
+    group = group[corners]
+    across = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+    total = np.stack(
+        [np.bincount(group.ravel(), np.repeat(across[:, k], 3), len(groups)) for k in range(3)], 1
+    )
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    flat = np.where(size > 0, across / np.maximum(size, 1e-300), [0.0, 1.0, 0.0])[:, None]
+    smooth = total[group]
+    agree = (smooth * flat).sum(2, keepdims=True) > CREASE
+    return np.where(agree, smooth, flat).astype(np.float32)
 
 
 def _mapped(skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarray, list[Material]]:

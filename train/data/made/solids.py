@@ -12,10 +12,12 @@ from functools import lru_cache
 
 import numpy as np
 from manifold3d import CrossSection, Error, Manifold, Mesh, OpType
+from scipy.ndimage import map_coordinates
 from skimage.measure import marching_cubes
 
 Points = np.ndarray | Sequence[Sequence[float]]
-RESOLUTION = 46  # cells along the longest side of a blended solid
+RESOLUTION = 46  # cells along the longest side of a blended solid, at most
+CELLS = 45_000  # of its bounding box, at most
 
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
@@ -331,13 +333,13 @@ class Blend:
         lows = np.stack([item[0] for item in self._items])
         highs = np.stack([item[1] for item in self._items])
         low, high = lows.min(0), highs.max(0)
-        step = float((high - low).max()) / cells
+        step = max(float((high - low).max()) / cells, float((high - low).prod() / CELLS) ** (1 / 3))
         margin = self.soft / 2 + 2 * step
         low = low - margin + 0.37e-3 * step  # so that no surface lies right on the grid
         shape = np.ceil((high + margin - low) / step).astype(int) + 1
         far = np.float32(2 * margin)
         field = np.full(shape, far, np.float32)
-        nearest, owner = np.full(shape, far, np.float32), np.zeros(shape, np.int16)
+        nearest = [np.full(shape, far, np.float32) for _ in range(1 + max(i[2] for i in self._items))]
         axes = [low[i] + step * np.arange(shape[i], dtype=np.float32) for i in range(3)]
         k = np.float32(self.soft)
         for a, b, look, distance in self._items:
@@ -351,18 +353,49 @@ class Blend:
             )
             there = field[part]
             h = np.maximum(k - np.abs(there - d), 0)
-            closer = d < nearest[part]
-            owner[part][closer] = look
-            np.minimum(nearest[part], d, out=nearest[part])
+            np.minimum(nearest[look][part], d, out=nearest[look][part])
             field[part] = np.minimum(there, d) - h * h / (4 * k)
         np.minimum(field, far, out=field)
         for axis in range(3):  # nothing reaches the border of the grid
             edge = np.moveaxis(field, axis, 0)
             edge[0] = edge[-1] = far
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=False)
-        middle = np.rint(vertices[faces].mean(1)).astype(int)
-        looks = owner[middle[:, 0], middle[:, 1], middle[:, 2]]
+        looks = np.zeros(len(faces), int)
+        for look in range(1, len(nearest)):
+            others = np.minimum.reduce(nearest[:look] + nearest[look + 1 :])
+            border = map_coordinates(nearest[look] - others, vertices.T, order=1)
+            vertices, faces, looks = _split(vertices, faces, looks, border, look)
         return stamp(vertices * step + low, faces, looks)
+
+
+def _split(vertices: np.ndarray, faces: np.ndarray, looks: np.ndarray, border: np.ndarray, look: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A mesh cut along a line; what lies where ``border [V]`` is below 0 gets another look."""
+    border = np.where(np.abs(border) < 1e-4, 1e-4, border)
+    below = border[faces] < 0
+    count = below.sum(1)
+    whole, crossed = (count == 0) | (count == 3), (count == 1) | (count == 2)
+    kept_looks = np.where(count[whole] == 3, look, looks[whole])
+    if not crossed.any():
+        return vertices, faces, kept_looks
+    # Turned so that the corner that is alone on its side comes first.
+    alone = np.where(count[crossed] == 1, below[crossed].argmax(1), (~below[crossed]).argmax(1))
+    order = (alone[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(faces[crossed], order, 1).T
+    pairs = np.sort(np.stack([np.concatenate([a, a]), np.concatenate([b, c])], 1), 1)
+    edges, where = np.unique(pairs[:, 0] * len(vertices) + pairs[:, 1], return_inverse=True)
+    first, second = np.divmod(edges, len(vertices))
+    t = (border[first] / (border[first] - border[second]))[:, None]
+    added = vertices[first] * (1 - t) + vertices[second] * t
+    ab, ac = (len(vertices) + where).reshape(2, -1)
+    tip, rest = np.stack([a, ab, ac], 1), np.stack([ab, b, c, ab, c, ac], 1).reshape(-1, 3)
+    single = count[crossed] == 1
+    old = looks[crossed]
+    made = [np.where(single, look, old), np.repeat(np.where(single, old, look), 2)]
+    return (
+        np.concatenate([vertices, added.astype(vertices.dtype)]),
+        np.concatenate([faces[whole], tip, rest]),
+        np.concatenate([kept_looks, *made]),
+    )
 
 
 def _cone(a: np.ndarray, b: np.ndarray, ra: float, rb: float) -> Callable:
