@@ -24,6 +24,8 @@ def composition(m: Maker) -> list[Manifold]:
     """A body, and two to nine parts on it: mirrored, in rows, around an axis, or cut out of it."""
     scheme = m.pick(*SCHEMES)
     looks = [m.fur(*scheme) if m.chance(0.15) else m.surface(*scheme) for _ in range(m.n(2, 4))]
+    if m.chance(0.25):
+        looks[m.n(0, 1)] = m.printed(m.pick("front", "label"), m.color(*scheme, "white"), m.pick("fit", "round"))
     mirrored = m.chance(0.82)
     body = shape(m, mirrored)
     if m.chance(0.2):
@@ -31,7 +33,7 @@ def composition(m: Maker) -> list[Manifold]:
     parts = [m.stamp(body, looks[0])]
     if m.chance(0.3):
         parts[0] = hollowed(m, parts[0], m.surface(*scheme))
-    for _ in range(m.n(1, m.pick(3, 6, 9))):
+    for _ in range(m.n(2, m.pick(3, 5, 9)) if m.chance(0.92) else 1):
         if sum(part.num_tri() for part in parts) > ENOUGH:
             break
         # The body carries most of the parts.
@@ -42,7 +44,12 @@ def composition(m: Maker) -> list[Manifold]:
             parts.append(grown(m, host, mirrored, m.pick(*looks)))
     if m.chance(0.12):
         parts = [whole_warped(m, parts, mirrored)]
-    return parts
+    return parts if m.chance(0.1) else [largest(joined(parts))]
+
+
+def largest(solid: Manifold) -> Manifold:
+    """A solid without the pieces that hang in the air beside its largest one."""
+    return max(solid.decompose(), key=lambda piece: piece.volume(), default=solid)
 
 
 def shape(m: Maker, mirrored: bool = True, fine: int = 32) -> Manifold:

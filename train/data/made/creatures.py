@@ -9,7 +9,9 @@ from manifold3d import Manifold
 
 from .composition import turned_to
 from .looks import Maker
-from .solids import Blend, ball, both, extent, lathe, ripple, ring_of, slab, tube
+from .solids import (
+    Blend, ball, bend, both, box, extent, joined, lathe, loft, ring, ripple, ring_of, rod, slab, spline, tube,
+)
 
 Vec = np.ndarray
 
@@ -263,13 +265,16 @@ def swimmer(m: Maker) -> list[Manifold]:
     """Fish, shark, whale or dolphin."""
     skin, fin = m.pattern(("spotted", "striped", "plain", "clouded", "shaded"), "toy", "metal", "pastel", contrast=0.5), m.surface("toy", "any")
     tall, wide = m.u(0.15, 0.4), m.u(0.1, 0.28)
-    blend = Blend(0.05)
-    z = np.linspace(-0.5, 0.5, 6)
-    size = np.array([0.18, 0.5, 0.85, 1.0, m.u(0.8, 1), m.u(0.3, 0.7)])
-    bow = m.u(-0.12, 0.12)
-    for a, s in zip(z, size):
-        blend.egg((0, bow * (a * 4) ** 2 * 0.3, a), (wide * s, tall * s, 0.2), 0)
-    parts = [m.blended(blend, (skin,))]
+    bow, count, sides = m.u(-0.12, 0.12), 26, 24
+    z = np.linspace(-0.55, 0.5, count)
+    blunt, waist = m.u(0.25, 0.9), m.u(0.08, 0.3)
+    size = spline([[waist], [waist * 1.2], [m.u(0.5, 0.8)], [1.0], [m.u(0.85, 1.05)], [blunt], [blunt * 0.35]], count)[:, 0]
+    form = ring_of(m.u(1.7, 2.5), sides)
+    rings = np.empty((count, sides, 3))
+    rings[..., 0] = form[None, :, 0] * wide * size[:, None] ** 1.2
+    rings[..., 1] = form[None, :, 1] * tall * size[:, None] + (bow * (2 * z) ** 2 * 0.3)[:, None]
+    rings[..., 2] = z[:, None]
+    parts = [m.stamp(loft(rings), skin)]
     tip = np.array([0, bow * 1.2, -0.55])
     form = np.array([(0.12, 0), (-0.1, 0.34), (-0.28, 0.38), (-0.16, 0), (-0.28, -0.38), (-0.1, -0.34)]) * m.u(0.6, 1.1)
     level = m.chance(0.4)
@@ -281,15 +286,8 @@ def swimmer(m: Maker) -> list[Manifold]:
     parts.append(m.stamp(top, fin))
     side = slab(blade, 0.03, 0.01, 2).rotate([0, -90, 0]).rotate([0, 0, -m.u(70, 120)]).translate([0.8 * wide, -0.2 * tall, 0.15])
     parts.append(both(m.stamp(side, fin)))
-    parts += _eyes(m, np.array([0, 0.0, 0.45]), np.array([wide * 0.75, tall * 0.6, 0.2]), m.u(0.02, 0.045))
-    return [p.rotate([0, m.pick(90, -90, m.u(-90, 90)), 0]) for p in [joined_parts(parts)]]
-
-
-def joined_parts(parts: list[Manifold]) -> Manifold:
-    """The union of parts, to be turned as one."""
-    from .solids import joined
-
-    return joined(parts)
+    parts += _eyes(m, np.array([0, 0.0, 0.3]), np.array([wide * 0.9 * blunt**0.5, tall * 0.5, 0.16]), m.u(0.02, 0.045))
+    return [p.rotate([0, m.pick(90, -90, m.u(-90, 90)), 0]) for p in [joined(parts)]]
 
 
 def crawler(m: Maker) -> list[Manifold]:
@@ -332,7 +330,7 @@ def snake(m: Maker) -> list[Manifold]:
     r = m.u(0.05, 0.13)
     body = tube(path, [0.015, r * 0.8, r, r, r * 0.8, r * m.u(0.9, 1.4), r * 0.7], 16, 60)
     head = path[-1]
-    return [joined_parts([m.stamp(body, skin), *[e.translate([float(head[0]), 0, 0]) for e in _eyes(m, head * [0, 1, 1], np.array([r, r, r]), 0.02)]]).rotate([0, m.u(-90, 90), 0])]
+    return [joined([m.stamp(body, skin), *[e.translate([float(head[0]), 0, 0]) for e in _eyes(m, head * [0, 1, 1], np.array([r, r, r]), 0.02)]]).rotate([0, m.u(-90, 90), 0])]
 
 
 def figure(m: Maker) -> list[Manifold]:
@@ -369,9 +367,11 @@ def figure(m: Maker) -> list[Manifold]:
         blend.limb([elbow * flip, hand * flip], [bulk * 0.75, bulk * 0.65], m.pick(0, 1))
         blend.egg(hand * flip, (bulk * 0.9, bulk * 0.9, bulk * 0.9), 0)
     blend.symmetric = True
+    if m.chance(0.5):  # chest, belly or muscles
+        blend.egg((0.4 * broad, leg + torso * m.u(0.4, 0.75), 0.02), (broad * m.u(0.5, 0.9), torso * m.u(0.2, 0.4), bulk * m.u(1.2, 2.2)), 1)
     parts = [m.blended(blend, looks)]
     parts += _eyes(m, head, radii, big * m.u(0.08, 0.16))
-    top = m.n(0, 4)
+    top = m.n(0, 5)
     hair = m.surface("fur", "dark", "toy")
     if top <= 1:
         cut = ball((radii * m.u(1.06, 1.2)).tolist(), 32).translate((head + [0, 0.05 * big, -0.12 * big]).tolist())
@@ -384,16 +384,67 @@ def figure(m: Maker) -> list[Manifold]:
     elif top == 3:
         helmet = ball((radii * 1.15).tolist(), 32).trim_by_plane([0, 1, -0.4], float(head @ [0, 1, -0.4]))
         parts.append(m.stamp(helmet, m.surface("metal", "toy", "dark")))
+    elif top == 4:  # long hair
+        long = m.u(0.8, 2.2) * big
+        mane = tube([(head + [0, big * 0.7, -0.1 * big]).tolist(), (head + [0, 0.2 * big, -0.75 * big]).tolist(), (head + [0, -long, -0.7 * big]).tolist()], [0.8 * big, 0.85 * big, m.u(0.3, 0.8) * big], 18, 14, flat=(1, 0.6) if m.chance(0.5) else (1, 1))
+        parts.append(m.stamp(mane - ball((radii * 0.97).tolist(), 24).translate((head + [0, -0.12 * big, 0.25 * big]).tolist()), hair))
     if m.chance(0.2):  # a skirt or a robe
         robe = lathe([(0, 0), (m.u(0.15, 0.3), 0), (broad * 0.8, leg * m.u(0.6, 0.9)), (0, leg * 0.9)], 28).translate([0, leg - leg * m.u(0.4, 0.9), 0])
         parts.append(m.stamp(robe, m.cloth("any")))
+    if m.chance(0.3):  # something in one hand
+        look, grip = m.surface("metal", "wood", "toy"), hand * [1, 1, 1]
+        item = m.pick(
+            tube([(0, -0.1, 0), (0, 0.15, 0), (0, m.u(0.3, 0.6), 0)], [0.02, 0.018, m.u(0.008, 0.03)], 10, 10, flat=(1, m.u(0.4, 2))),
+            slab(ring_of(m.u(1.5, 4), 24) * m.u(0.08, 0.18), 0.03, 0.01, 2),
+            ball(m.u(0.05, 0.12), 20),
+            box(m.u(0.08, 0.2), m.u(0.08, 0.2), 0.05, 0.01),
+        )
+        parts.append(m.stamp(item.rotate([m.u(-20, 80), 0, 0]).translate((grip + [0, 0, bulk]).tolist()), look))
+    if m.chance(0.2):  # a cape
+        wide = broad + bulk
+        cape = box(2 * wide, leg * 0.5 + torso * 0.9, 0.02).refine_to_length(0.06)
+        cape = cape.translate([0, leg + torso * 0.95 - (leg * 0.5 + torso * 0.9) / 2, -bulk * 1.8])
+        flow = m.u(0.05, 0.35)
+        low_end = leg + torso
+        cape = cape.warp_batch(lambda p: np.stack([p[:, 0] * (0.8 + 0.6 * (low_end - p[:, 1])), p[:, 1], p[:, 2] - flow * (low_end - p[:, 1]) ** 1.5 + 0.015 * np.sin(30 * p[:, 0])], -1))
+        parts.append(m.stamp(cape, m.cloth("toy", "any")))
+    if m.chance(0.25):  # a rucksack, or wings
+        parts.append(m.stamp(box(1.5 * broad, torso * 0.7, 0.12, 0.03).translate([0, leg + torso * 0.6, -bulk - 0.07]), m.surface()))
     if m.chance(0.3):  # a stand
         base = lathe([(0, 0), (0.25, 0), (0.25, 0.03), (0, 0.03)], 32).translate([0, -0.02, 0])
         parts.append(m.stamp(base, m.surface("dark", "earth", "white")))
     return parts
 
 
+def block_figure(m: Maker) -> list[Manifold]:
+    """A figure of blocks and rods, with a printed chest."""
+    skin, second, dark = m.plain("skin", "toy"), m.surface("toy", "any"), m.plain("dark", "toy")
+    w, h, d = m.u(0.22, 0.4), m.u(0.2, 0.4), m.u(0.12, 0.22)
+    leg = m.u(0.12, 0.35)
+    shirt = m.printed(m.pick("label", "front"), m.color("toy", "dark", "white"), sides=True)
+    trunk = box(w, h, d, m.u(0, 0.03)).warp_batch(lambda p: np.stack([p[:, 0] * (1 - 0.4 * (p[:, 1] + h / 2)), p[:, 1], p[:, 2]], -1))
+    parts = [m.stamp(trunk.translate([0, leg + h / 2, 0]), shirt)]
+    r = m.u(0.09, 0.17)
+    head = m.pick(rod(r, 1.7 * r, 28, 0.3 * r), box(2 * r, 1.8 * r, 2 * r, m.u(0, 0.4) * r).translate([0, 0.9 * r, 0]), ball(r, 28).translate([0, 0.9 * r, 0]))
+    top = leg + h
+    parts += [m.stamp(head.translate([0, top + 0.01, 0]), skin), m.stamp(rod(0.5 * r, 0.05, 16).translate([0, top - 0.02, 0]), skin)]
+    parts.append(both(m.stamp(ball([0.12 * r, 0.16 * r, 0.1 * r], 12).translate([0.4 * r, top + r * 1.1, r * 0.95]), m.painted(np.full(3, 0.04)))))
+    if m.chance(0.6):
+        hair = m.pick(rod(r * 1.08, 0.6 * r, 28, 0.2 * r), ball(r * 1.1, 28).trim_by_plane([0, 1, -0.3], 0.0), lathe([(0, 0), (1.6 * r, 0), (1.5 * r, 0.1 * r), (r, 0.2 * r), (0.8 * r, r), (0, r)], 28))
+        parts.append(m.stamp(hair.translate([0, top + 1.35 * r, 0]), m.surface("dark", "toy", "fur")))
+    step = m.u(-40, 40) if m.chance(0.4) else 0.0
+    for side in (1, -1):
+        one = box(w * 0.44, leg, d * 0.9, m.u(0, 0.02)).translate([0, -leg / 2, 0]) + box(w * 0.44, 0.08, d * 1.3).translate([0, -leg + 0.04, d * 0.2])
+        parts.append(m.stamp(one.rotate([step * side, 0, 0]).translate([side * w * 0.24, leg + 0.01, 0]), dark))
+        swing = m.u(-60, 120) if m.chance(0.5) else m.u(-10, 20)
+        arm = tube([(0, 0, 0), (side * 0.04, -h * 0.4, 0), (side * 0.05, -h * 0.75, 0.06)], 0.06, m.pick(12, ring_of(6, 12)), 12)
+        hand = ring(0.04, 0.02, 16, 8).translate([side * 0.05, -h * 0.85, 0.08])
+        whole = joined([m.stamp(arm, second), m.stamp(hand + ball(0.045, 12).translate([side * 0.05, -h * 0.8, 0.07]), skin)])
+        parts.append(whole.rotate([-swing, 0, 0]).translate([side * (w * 0.45 + 0.03), top - 0.07, 0]))
+    return [joined(parts).rotate([0, m.u(-50, 50), 0])]
+
+
 CREATURES = (
     *((quadruped, 4.0), (plush, 4.0), (biped, 2.0), (bird, 1.5), (swimmer, 1.2), (crawler, 1.2)),
-    *((snake, 0.5), (figure, 4.0)),
+    *((snake, 0.5), (figure, 3.5), (block_figure, 1.5)),
 )

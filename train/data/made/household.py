@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from manifold3d import Manifold
+from manifold3d import CrossSection, FillRule, Manifold
 
 from .composition import handle, outline, shape
 from .looks import Maker
@@ -251,7 +251,7 @@ def food(m: Maker) -> list[Manifold]:
     if m.chance(0.6):
         for _ in range(m.n(2, 6)):
             parts.append(m.stamp(tube([(0, 0.75, 0), (m.u(-0.2, 0.2), 1.0, m.u(-0.2, 0.2)), (m.u(-0.4, 0.4), 1.25, m.u(-0.4, 0.4))], [0.04, 0.05, 0.02], 8, 12), m.plain("leaf")))
-    return [p.rotate([0, 0, m.pick(0, 90, m.u(60, 120))]) for p in parts]
+    return [joined(parts).rotate([0, 0, m.pick(0, 90, m.u(60, 120))])]
 
 
 def carton(m: Maker) -> list[Manifold]:
@@ -520,7 +520,134 @@ def furniture(m: Maker) -> list[Manifold]:
     return parts
 
 
+def rack(m: Maker) -> list[Manifold]:
+    """Wires and slats: a basket, a rack, a cage, a crate, a stand, a hanger."""
+    look, second = m.pick(m.metal(), m.plain("white", "dark", "toy"), m.wood()), m.surface()
+    w, h, d, r = m.u(0.5, 1.0), m.u(0.2, 0.7), m.u(0.3, 0.7), m.u(0.01, 0.022)
+    parts: list[Manifold] = []
+    kind = m.n(0, 3)
+    flare = m.u(0.6, 1.0)
+
+    def hoop(scale: float, y: float, thick: float) -> Manifold:
+        corners = rounded(w * scale, d * scale, m_corner, 3)
+        return tube([(x, y, z) for x, z in corners], thick, 8, 48, True)
+
+    m_corner = m.u(0.03, 0.15)
+    if kind <= 1:  # a basket of wires or slats
+        for y in np.linspace(0, h, m.n(2, 6)):
+            parts.append(hoop(flare + (1 - flare) * y / h, float(y), r))
+        slat = m.pick(1.0, 1.0, m.u(1.5, 3))
+        for x in np.linspace(-w / 2, w / 2, m.n(4, 9)) * 0.92:
+            for z in (-d / 2, d / 2):
+                parts.append(tube([(x * flare, 0, z * flare), (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2), (x, h, z)], r, 6, 3, flat=(1, 1), round_ends=False))
+            parts.append(tube([(x * flare, 0, -d / 2 * flare), (x * flare, 0, 0), (x * flare, 0, d / 2 * flare)], r * slat, 6, 3, round_ends=False))
+        for z in np.linspace(-d / 2, d / 2, m.n(3, 7)) * 0.92:
+            for x in (-w / 2, w / 2):
+                parts.append(tube([(x * flare, 0, z * flare), (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2), (x, h, z)], r, 6, 3, round_ends=False))
+        solids = [m.stamp(joined(parts), look)]
+        if m.chance(0.4):
+            solids.append(m.stamp(hoop(1.01, h, r * 2), second))
+        if m.chance(0.4):
+            bow = tube([(-w / 2, h, 0), (-w * 0.4, h + 0.35, 0), (0, h + 0.5, 0), (w * 0.4, h + 0.35, 0), (w / 2, h, 0)], r * 1.5, 8, 28)
+            solids.append(m.stamp(bow, m.pick(look, second)))
+        if m.chance(0.3):
+            solids.append(m.stamp(box(w * flare, r * 1.5, d * flare), second))
+    elif kind == 2:  # plates or shelves on posts
+        post = rod(r * 1.5, h * 1.5, 10)
+        posts = [post.translate([x * w * 0.46, 0, z * d * 0.46]) for x in (-1, 1) for z in (-1, 1)]
+        solids = [m.stamp(joined(posts), look)]
+        for y in np.linspace(0.05, h * 1.4, m.n(2, 4)):
+            if m.chance(0.5):
+                solids.append(m.stamp(box(w, 0.03, d, 0.01).translate([0, float(y), 0]), second))
+            else:
+                rods = [tube([(x, y, -d / 2), (x, y, 0), (x, y, d / 2)], r * 0.8, 6, 3, round_ends=False) for x in np.linspace(-w / 2, w / 2, m.n(5, 9))]
+                rods += [tube([(-w / 2, y, z), (0, y, z), (w / 2, y, z)], r, 6, 3, round_ends=False) for z in (-d / 2, d / 2)]
+                solids.append(m.stamp(joined(rods), look))
+    else:  # a crate of boards
+        t, boards = m.u(0.015, 0.03), m.n(2, 4)
+        tall = h / boards
+        for i in range(boards):
+            for z in (-d / 2, d / 2):
+                parts.append(box(w, tall * 0.8, t).translate([0, (i + 0.5) * tall, z]))
+            for x in (-w / 2, w / 2):
+                parts.append(box(t, tall * 0.8, d).translate([x, (i + 0.5) * tall, 0]))
+        for x in (-1, 1):
+            for z in (-1, 1):
+                parts.append(box(0.05, h, 0.05).translate([x * (w / 2 - 0.02), h / 2, z * (d / 2 - 0.02)]))
+        parts.append(box(w, t, d).translate([0, t, 0]))
+        solids = [m.stamp(joined(parts), m.pick(m.wood(), look))]
+        for i in range(m.n(0, 5)):
+            s = m.u(0.08, 0.14)
+            solids.append(m.stamp(_produce(m, s).translate([m.u(-0.3, 0.3) * w, h * 0.6, m.u(-0.3, 0.3) * d]), second if i % 2 else m.plain("toy", "leaf")))
+    return [joined(solids).rotate([0, m.u(-50, 50), 0])]
+
+
+def organiser(m: Maker) -> list[Manifold]:
+    """A tray, drawer or stand with places for things, and some of these."""
+    w, h, d, t = m.u(0.5, 1.0), m.u(0.1, 0.5), m.u(0.3, 0.7), m.u(0.015, 0.04)
+    look, inside = m.pick(m.surface(), m.wood()), m.surface("white", "dark", "any")
+    body = m.stamp(box(w, h, d, m.pick(0.0, 0.02, 0.06)), look)
+    columns, rows = m.n(1, 4), m.n(1, 3)
+    xs, zs = np.sort(m.rng.uniform(-0.5, 0.5, columns - 1)), np.sort(m.rng.uniform(-0.5, 0.5, rows - 1))
+    xs, zs = np.array([-0.5, *xs, 0.5]) * w, np.array([-0.5, *zs, 0.5]) * d
+    parts, cuts = [], []
+    for left, right in zip(xs, xs[1:]):
+        for back, front in zip(zs, zs[1:]):
+            wide, deep = float(right - left) - 2 * t, float(front - back) - 2 * t
+            if min(wide, deep) < 0.04:
+                continue
+            x, z = float(left + right) / 2, float(back + front) / 2
+            round_one = m.chance(0.2)
+            pit = rod(min(wide, deep) / 2, h, 24).translate([0, -h / 2, 0]) if round_one else box(wide, h, deep, m.pick(0.0, 0.02))
+            cuts.append(pit.translate([x, m.u(0.05, 0.4) * h, z]))
+            if m.chance(0.5):
+                tall = h * m.u(0.6, 2.2)
+                item = m.pick(box(wide * m.u(0.3, 0.9), tall, deep * m.u(0.3, 0.9), 0.01), rod(min(wide, deep) * m.u(0.1, 0.45), tall, 16).translate([0, -tall / 2, 0]))
+                parts.append(m.stamp(item.rotate([m.u(-6, 6), 0, m.u(-6, 6)]).translate([x, tall / 2 - h * 0.4, z]), m.surface()))
+    if cuts:
+        body = body - m.stamp(joined(cuts), inside)
+    return [joined([body, *parts]).rotate([m.pick(0, m.u(0, 60)), m.u(-50, 50), 0])]
+
+
+def cushion(m: Maker) -> list[Manifold]:
+    """A cushion, a folded towel or blanket, a roll, a rug."""
+    look, trim = m.pick(m.cloth("any"), m.printed("front", m.color("white", "any", "toy"), sides=m.chance(0.5)), m.fur()), m.cloth()
+    kind = m.n(0, 3)
+    if kind <= 1:
+        w, h, d = m.u(0.4, 0.7), m.u(0.3, 0.6), m.u(0.12, 0.25)
+        body = superquadric([w, h, d], m.u(0.5, 1), m.u(0.5, 0.9), 40)
+        p = m.u(2.5, 6)
+        form = ring_of(p, 40) * [w, h]
+        heights = np.linspace(-1, 1, 15)
+        rings = np.stack([np.column_stack([form * (1 - abs(z) ** 3 * 0.9), np.full(40, z * d * (1 - 0.0))]) for z in heights])
+        body = m.pick(body, loft(rings))
+        parts = [m.stamp(ripple(body, m.rng, m.u(0.004, 0.02), m.u(0.2, 0.6), False), look)]
+        if m.chance(0.4):
+            rim = tube([(x, y, 0) for x, y in form[::3]], 0.02, 8, 56, True)
+            parts.append(m.stamp(rim, trim))
+        return [joined(parts).rotate([m.u(-40, 0), m.u(-40, 40), m.pick(0, m.u(-45, 45))])]
+    if kind == 2:  # folded
+        parts, y = [], 0.0
+        for i in range(m.n(1, 5)):
+            w, d, t = m.u(0.7, 0.9), m.u(0.5, 0.65), m.u(0.08, 0.15)
+            one = box(w, t, d, 0.45 * t)
+            one = ripple(one.refine_to_length(0.15), m.rng, 0.006, 0.3, False)
+            parts.append(m.stamp(one.translate([0, y + t / 2, 0]), look if i % 2 else trim))
+            y += t * 0.97
+        return [joined(parts).rotate([0, m.u(-60, 60), 0])]
+    r, long = m.u(0.12, 0.3), m.u(0.6, 1.2)
+    turns = np.linspace(0.15, 1, 60)
+    a = turns * m.u(2.5, 5) * 2 * math.pi
+    spiral = np.stack([turns * r * np.cos(a), turns * r * np.sin(a)], -1)
+    sheet = r / 14
+    normal = spiral / np.linalg.norm(spiral, axis=1, keepdims=True)
+    outline_ = np.concatenate([spiral + sheet * normal, (spiral - sheet * normal)[::-1]])
+    roll = CrossSection([outline_], FillRule.NonZero).extrude(long).translate([0, 0, -long / 2])
+    return [m.stamp(roll, look).rotate([m.pick(0, -90), m.u(-60, 60), 0])]
+
+
 HOUSEHOLD = (
     *((mug, 3.0), (teapot, 1.5), (bottle, 5.0), (bowl, 3.0), (food, 2.5), (carton, 7.0)),
     *((pouch, 2.0), (plant, 2.5), (lamp, 1.2), (furniture, 5.0)),
+    *((rack, 2.5), (organiser, 1.5), (cushion, 2.0)),
 )

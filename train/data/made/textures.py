@@ -32,9 +32,10 @@ def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
         kinds = ("toy", "toy", "pastel", "dark", "dark", "white", "white", "earth", "metal", "wide")
         kind = kinds[rng.integers(len(kinds))]
     if kind == "toy":
-        hues = (0.0, 0.02, 0.07, 0.13, 0.15, 0.33, 0.4, 0.52, 0.58, 0.62, 0.78, 0.9)
-        hue = hues[rng.integers(len(hues))] + rng.normal(0, 0.012)
-        hsv = hue % 1, rng.uniform(0.7, 1), rng.uniform(0.55, 0.98)
+        hues = (0.0, 0.0, 0.02, 0.07, 0.12, 0.14, 0.15, 0.25, 0.36, 0.45, 0.55, 0.58, 0.6, 0.62, 0.78, 0.92)
+        hue = hues[rng.integers(len(hues))] + rng.normal(0, 0.015)
+        light = rng.uniform(0.45, 0.95) * (0.8 if 0.2 < hue < 0.5 else 1)  # few things are bright green
+        hsv = hue % 1, rng.uniform(0.55, 0.97), light
     elif kind == "pastel":
         hsv = rng.random(), rng.uniform(0.12, 0.45), rng.uniform(0.75, 0.97)
     elif kind == "dark":
@@ -52,7 +53,7 @@ def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
     elif kind == "earth":
         hsv = rng.uniform(0.02, 0.2), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.75)
     elif kind == "leaf":
-        hsv = rng.uniform(0.2, 0.42), rng.uniform(0.3, 0.8), rng.uniform(0.2, 0.7)
+        hsv = rng.uniform(0.2, 0.4), rng.uniform(0.3, 0.7), rng.uniform(0.2, 0.6)
     elif kind == "leather":
         hsv = rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.8), rng.uniform(0.1, 0.6)
     else:

@@ -97,8 +97,8 @@ def shoe(m: Maker) -> list[Manifold]:
         cap = loft(rings * [1.04, 1.04, 1.01]).trim_by_plane([0, 0, 1], m.u(0.25, 0.36))
         parts.append(m.stamp(cap, m.pick(lower, trim)))
     if collar > 0.5 and m.chance(0.5):  # fur or a roll at the top of a boot
-        roll = tube([(math.sin(a) * wide * 0.33, collar * 0.98, math.cos(a) * 0.22 - 0.27) for a in np.linspace(0, 2 * math.pi, 9)[:-1]], m.u(0.03, 0.06), 10, 28, True)
-        parts.append(m.stamp(roll, m.fur()))
+        band = loft(rings * [1.15, 1.02, 1.06]) ^ box(5, collar * 0.22, 5).translate([0, collar * 0.93, 0])
+        parts.append(m.stamp(band, m.fur()) - hole)
     whole = joined(parts)
     if m.chance(0.12):
         return [joined([whole.translate([-wide * 0.62, 0, 0]), whole.mirror([1, 0, 0]).translate([wide * 0.62, 0, m.u(-0.1, 0.1)])]).rotate([0, m.u(-40, 40), 0])]
@@ -471,7 +471,7 @@ def plane(m: Maker) -> list[Manifold]:
         parts = [m.stamp(hull, paint)]
         parts.append(m.stamp(ball([r * 0.7, r * 0.6, r * 1.3], 24).translate([0, r * 0.7, long * 0.22]), m.plain("dark", "pastel", "metal")))
         if kind == 0 or m.chance(0.4):
-            sweep, chord, span = m.u(-0.05, 0.4), m.u(0.15, 0.35), m.u(0.5, 0.8)
+            sweep, chord, span = m.u(-0.05, 0.45), m.u(0.25, 0.5), m.u(0.55, 0.9)
             form = np.array([(0, -chord / 2), (span, -sweep - chord * 0.3), (span, -sweep + chord * 0.2), (0, chord / 2)])
             wing = slab(form, 0.05, 0.02, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
             levels = (m.u(-0.6, 0.8) * r,) if m.chance(0.75) else (-0.7 * r, 1.8 * r)
@@ -592,11 +592,11 @@ def blocks(m: Maker) -> list[Manifold]:
     elif kind == 2:  # loose pieces on the ground
         for i in range(m.n(3, 9)):
             piece = m.pick(box, None, None)
-            solid = box(m.u(0.15, 0.3), m.u(0.12, 0.3), m.u(0.15, 0.3), 0.015) if piece else shape(m).scale([m.u(0.12, 0.25)] * 3)
+            solid = box(m.u(0.15, 0.3), m.u(0.12, 0.3), m.u(0.15, 0.3), 0.015) if piece else shape(m, True, 20).scale([m.u(0.15, 0.28)] * 3)
             low, _ = extent(solid)
-            a, d = 2.4 * i, 0.22 * math.sqrt(i)
+            a, d = 2.4 * i, 0.17 * math.sqrt(i)
             solid = solid.translate([0, -float(low[1]), 0]).rotate([0, m.u(0, 360), 0])
-            parts.append(m.stamp(solid, m.pick(*looks)).translate([d * 1.5 * math.sin(a), 0, d * 1.5 * math.cos(a)]))
+            parts.append(m.stamp(solid, m.pick(*looks)).translate([d * 1.3 * math.sin(a), 0, d * 1.3 * math.cos(a)]))
     elif kind == 3:  # studded bricks
         for i in range(m.n(1, 6)):
             nx, nz, h = m.n(1, 4), m.n(1, 2), 0.12
@@ -678,7 +678,7 @@ def pieces(m: Maker) -> list[Manifold]:
     plan = m.pick(bottle, carton, food, mug, game, shape)
     parts: list[Manifold] = []
     x = 0.0
-    for _ in range(m.n(2, 4)):
+    for _ in range(m.n(2, 3)):
         one = m.stamp(shape(m), m.surface()) if plan is shape else joined(plan(m))
         low, high = extent(one)
         scale = m.u(0.6, 1) / max(float((high - low).max()), 0.1)
@@ -686,11 +686,117 @@ def pieces(m: Maker) -> list[Manifold]:
         low, high = extent(one)
         one = one.translate([x - float(low[0]), -float(low[1]), m.u(-0.15, 0.15) - float(low[2] + high[2]) / 2])
         parts.append(one)
-        x += float(high[0] - low[0]) + m.u(0.01, 0.15)
+        x += float(high[0] - low[0]) + m.u(-0.02, 0.08)
     return [joined(parts).rotate([0, m.u(-40, 40), 0])]
+
+
+def wearable(m: Maker) -> list[Manifold]:
+    """Headphones, glasses, a watch, a mask, a crown, a ring."""
+    a, b, dark = m.surface(), m.surface("dark", "metal", "toy"), m.plain("dark")
+    kind = m.n(0, 4)
+    parts: list[Manifold] = []
+    if kind == 0:
+        r, thick = m.u(0.4, 0.5), m.u(0.02, 0.06)
+        arc = tube([(r * math.cos(t), r * 1.1 * math.sin(t), 0) for t in np.linspace(0, math.pi, 7)], thick, 12, 36, flat=(1, m.u(1, 2.5)))
+        parts = [m.stamp(arc, a)]
+        cup, deep = m.u(0.14, 0.24), m.u(0.08, 0.16)
+        shell = rod(cup, deep, 28, 0.03).rotate([0, 0, 90])
+        parts.append(both(m.stamp(shell.translate([r + deep * 0.8, -0.05, 0]), b)))
+        parts.append(both(m.stamp(ring(cup * 0.8, 0.045, 28, 10).rotate([0, 0, 90]).translate([r - 0.02 - deep * 0.2, -0.05, 0]), dark)))
+        if m.chance(0.3):
+            parts.append(m.stamp(tube([(r, -0.15, 0.05), (r * 0.8, -0.35, 0.25), (r * 0.3, -0.4, 0.4)], 0.015, 8, 16), dark))
+    elif kind == 1:
+        form = m.pick(ring_of(2, 36), ring_of(4, 36), rounded(1.9, 1.5, 0.5, 9)) * [m.u(0.2, 0.26), m.u(0.13, 0.22)]
+        frame = slab(form, 0.05, 0.015, 2) - slab(form * 0.82, 0.2)
+        parts = [both(m.stamp(frame.translate([0.27, 0, 0]), a)), both(m.stamp(slab(form * 0.86, 0.015).translate([0.27, 0, 0]), m.plain("dark", "pastel")))]
+        parts.append(m.stamp(tube([(-0.08, 0.03, 0), (0, 0.07, 0.02), (0.08, 0.03, 0)], 0.022, 8, 12), a))
+        parts.append(both(m.stamp(tube([(0.47, 0.05, 0), (0.5, 0.05, -0.3), (0.47, 0.02, -0.55), (0.45, -0.12, -0.68)], 0.02, 8, 22, flat=(1, 1.4)), b)))
+    elif kind == 2:
+        band = ring(0.4, m.u(0.02, 0.035), 44, 12, m.u(2.5, 5)).rotate([90, 0, 90])
+        parts = [m.stamp(band, a)]
+        face = m.pick(rod(m.u(0.16, 0.24), 0.1, 36, 0.02), box(0.34, 0.1, 0.4, 0.03))
+        parts.append(m.stamp(face.rotate([90, 0, 0]).translate([0, 0, 0.39]), b))
+        picture = m.add(Look([plain_material(np.zeros(3))] * 4 + [material(screen(m.rng))] * 2, "fit"))
+        parts.append(m.stamp(rod(0.14, 0.03, 30).rotate([90, 0, 0]).translate([0, 0, 0.47]), picture))
+        return [joined(parts).rotate([m.u(-40, 0), m.u(-40, 40), 0])]
+    elif kind == 3:
+        shell = superquadric([0.4, m.u(0.45, 0.6), 0.3], m.u(0.7, 1), 0.9, 36).trim_by_plane([0, 0, 1], 0.0)
+        shell = shell - superquadric([0.36, 0.45, 0.26], 0.8, 0.9)
+        holes = joined([ball([0.09, m.u(0.04, 0.07), 0.5]).rotate([0, 0, m.u(-20, 20)]).translate([0.15, 0.1, 0.2]), box(m.u(0.1, 0.25), 0.05, 1).translate([0, -0.22, 0.2])])
+        parts = [m.stamp(shell - both(holes), a)]
+        parts.append(m.stamp(tube([(0, 0.12, 0.28), (0, 0.0, 0.38), (0, -0.1, 0.3)], [0.03, 0.06, 0.04], 10, 12), m.pick(a, b)))
+        if m.chance(0.5):
+            parts.append(both(m.stamp(lathe([(0, 0), (0.1, 0), (m.u(0.01, 0.08), 0.3), (0, 0.3)], 16).rotate([0, 0, -25]).translate([0.2, 0.4, 0.1]), b)))
+    else:
+        r, count = m.u(0.35, 0.45), m.pick(5, 6, 8, 12)
+        band = lathe([(0, 0), (r, 0), (r * 1.05, 0.2), (0, 0.2)], 44) - rod(r * 0.93, 1).translate([0, -0.5, 0])
+        parts = [m.stamp(band, a)]
+        spike = m.pick(lathe([(0, 0), (0.08, 0), (0.01, m.u(0.15, 0.35)), (0, 0.35)], 12), ball(0.06, 14).translate([0, 0.05, 0]), box(0.1, 0.2, 0.04, 0.01))
+        parts += [m.stamp(spike.translate([0, 0.17, r]), m.pick(a, b)).rotate([0, 360 * i / count, 0]) for i in range(count)]
+    return [joined(parts).rotate([m.u(-25, 10), m.u(-50, 50), 0])]
+
+
+def instrument(m: Maker) -> list[Manifold]:
+    """A guitar, a trumpet, a racket, a bat, a chess piece, a cup, a statuette on its base."""
+    a, b, dark = m.pick(m.wood(), m.surface()), m.surface("wood", "dark", "metal"), m.plain("dark")
+    kind = m.n(0, 4)
+    parts: list[Manifold] = []
+    if kind == 0:
+        t = np.arange(60) * (2 * math.pi / 60)
+        r = 0.34 + m.u(0.02, 0.06) * np.cos(t - math.pi / 2) - m.u(0.06, 0.11) * np.cos(2 * t) * np.abs(np.sin(t)) + m.u(0.0, 0.05) * np.sin(3 * t)
+        form = np.stack([r * np.cos(t) * 0.9, r * np.sin(t) * 1.25], -1)
+        thick = m.u(0.05, 0.16)
+        parts = [m.stamp(slab(form, thick, 0.02) - rod(0.1, 1, 28).rotate([90, 0, 0]).translate([0, 0.05, thick / 2 - 0.03]), a)]
+        parts.append(m.stamp(box(0.08, 0.8, 0.05, 0.01).translate([0, 0.7, thick / 2]), b))
+        parts.append(m.stamp(box(0.14, 0.2, 0.04, 0.01).translate([0, 1.17, thick / 2 - 0.01]), b))
+        parts.append(m.stamp(box(0.2, 0.04, 0.04).translate([0, -0.22, thick / 2 + 0.01]), dark))
+        pegs = [rod(0.015, 0.26, 8).rotate([0, 0, 90]).translate([0.13, 1.1 + 0.06 * i, thick / 2 - 0.01]) for i in range(3)]
+        parts.append(m.stamp(joined(pegs), m.metal()))
+        return [joined(parts).rotate([m.u(-20, 0), m.u(-50, 50), m.pick(0, m.u(-80, 80))])]
+    if kind == 1:
+        flare = lathe([(0, 0), *[(0.03 + 0.25 * s**4, s * 0.9) for s in np.linspace(0, 1, 12)], *[(0.015 + 0.25 * s**4, s * 0.9 + 0.015) for s in np.linspace(1, 0.5, 6)], (0, 0.4)], 32)
+        parts = [m.stamp(flare.rotate([0, 0, -90]), m.pick(m.metal(), m.surface("toy")))]
+        parts.append(m.stamp(tube([(0.1, 0, 0), (-0.1, -0.08, 0), (0.1, -0.2, 0), (0.5, -0.2, 0), (0.6, -0.08, 0), (0.5, 0, 0)], 0.028, 10, 44), m.metal()))
+        parts.append(m.stamp(joined([rod(0.03, 0.25, 14).translate([x, -0.22, 0]) for x in (0.2, 0.3, 0.4)]), b))
+        return [joined(parts).rotate([0, m.u(-60, 60), m.u(-20, 20)])]
+    if kind == 2:
+        grip = tube([(0, -0.6, 0), (0, -0.3, 0), (0, 0.0, 0)], [0.05, 0.04, 0.035], 14, 14)
+        parts = [m.stamp(grip, b)]
+        if m.chance(0.5):  # a racket with its strings, or a paddle
+            wide, tall = m.u(0.22, 0.3), m.u(0.28, 0.4)
+            rim = tube([(wide * math.sin(t), tall * (1 - math.cos(t)), 0) for t in np.linspace(0, 2 * math.pi, 13)[:-1]], 0.028, 10, 40, True)
+            strings = [box(0.012, 2 * tall, 0.012).translate([x, tall, 0]) for x in np.linspace(-wide, wide, 9)[1:-1]]
+            strings += [box(2 * wide, 0.012, 0.012).translate([0, y, 0]) for y in np.linspace(0, 2 * tall, 11)[1:-1]]
+            net = joined(strings) ^ (ball([wide, tall, 1]).translate([0, tall, 0]))
+            parts += [m.stamp(rim, a), m.stamp(net, m.plain("white", "toy"))]
+        elif m.chance(0.5):
+            parts.append(m.stamp(slab(ring_of(2.2, 36) * [0.26, 0.3], 0.05, 0.01).translate([0, 0.26, 0]), a))
+        else:
+            parts.append(m.stamp(tube([(0, 0, 0), (0, 0.3, 0), (0, 0.8, 0)], [0.04, 0.07, 0.085], 18, 20), a))
+        return [joined(parts).rotate([m.pick(0, -70), m.u(-40, 40), m.pick(0, m.u(-80, 80))])]
+    if kind == 3:  # a turned piece: chess, a candlestick, a cup
+        count = m.n(5, 9)
+        r = np.abs(m.rng.normal(0.14, 0.09, count)) + 0.03
+        r[0] = m.u(0.2, 0.32)
+        profile = spline(np.stack([r, np.linspace(0.05, 1, count)], 1), 40)
+        body = lathe([(0, 0), (r[0] * 1.05, 0), *np.maximum(profile, [0.03, 0]).tolist(), (0, 1.02)], 32)
+        parts = [m.stamp(body, a)]
+        top = m.pick(ball(m.u(0.06, 0.14)), box(0.08, 0.2, 0.06) + box(0.18, 0.07, 0.06), lathe([(0, 0), (0.08, 0), (0.17, 0.15), (0.12, 0.16), (0.08, 0.1), (0, 0.08)], 24))
+        parts.append(m.stamp(top.translate([0, 1.04, 0]), m.pick(a, b)))
+        if m.chance(0.35):
+            parts.append(both(m.stamp(handle(m, 0.2, 0.3, 0.025).translate([float(np.interp(0.7, profile[:, 1], profile[:, 0])) - 0.03, 0.7, 0]), m.pick(a, b))))
+        return parts
+    base, h = m.pick(box(0.6, 0.2, 0.5, 0.01), rod(0.32, 0.2, 36, 0.02).translate([0, -0.1, 0])), 0.1
+    thing = shape(m, True)
+    low, high = extent(thing)
+    thing = thing.scale([0.8 / float((high - low).max())] * 3)
+    low, high = extent(thing)
+    thing = thing.translate([0, h - float(low[1]) - 0.03, 0])
+    return [m.stamp(base, b), m.stamp(thing, a)]
 
 
 THINGS = (
     *((shoe, 8.0), (bag, 3.5), (hat, 1.8), (tool, 4.0), (device, 6.0), (vehicle, 4.5), (plane, 2.0)),
-    *((train_of, 2.0), (blocks, 3.0), (game, 3.5), (pieces, 2.5)),
+    *((train_of, 2.0), (blocks, 3.0), (game, 3.5), (pieces, 1.5)),
+    *((wearable, 2.0), (instrument, 2.0)),
 )
