@@ -109,7 +109,14 @@ class Maker:
         """A look of one given display colour."""
         return self.add(Look([plain_material(value)]))
 
-    def pattern(self, patterns: Sequence[str] | str, *kinds: str, contrast: float = 0.0, mapping: str = "box", repeats: float = 0.0) -> int:
+    def pattern(
+        self,
+        patterns: Sequence[str] | str,
+        *kinds: str,
+        contrast: float = 0.0,
+        mapping: str = "box",
+        repeats: float = 0.0,
+    ) -> int:
         """A look of a pattern of two colours.
 
         Args:
@@ -127,7 +134,7 @@ class Maker:
 
     def surface(self, *kinds: str) -> int:
         """A look for anything: mostly one colour, sometimes a pattern."""
-        if self.chance(0.5):
+        if self.chance(0.42):
             return self.plain(*kinds)
         quiet = ("plain", "clouded", "speckled", "brushed", "woven", "paneled")
         loud = (*textures.PATTERNS,)
@@ -143,19 +150,41 @@ class Maker:
 
     def cloth(self, *kinds: str) -> int:
         """Cloth: woven, knitted, striped, printed."""
-        names = ("woven", "woven", "knitted", "striped", "checked", "dotted", "flowered", "plain", "spotted")
+        names = (
+            "woven",
+            "woven",
+            "knitted",
+            "striped",
+            "checked",
+            "dotted",
+            "flowered",
+            "plain",
+            "spotted",
+        )
         return self.pattern(names, *kinds, contrast=0.4, repeats=self.u(1.5, 4))
 
     def fur(self, *kinds: str) -> int:
         """Fur or plush, of one colour or in patches."""
         name = self.pick("furry", "furry", "speckled", "plain", "spotted")
-        return self.pattern(name, *(kinds or ("fur", "fur", "fur", "pastel", "toy")), contrast=0.35, repeats=self.u(1, 2.5))
+        return self.pattern(
+            name,
+            *(kinds or ("fur", "fur", "fur", "pastel", "toy")),
+            contrast=0.35,
+            repeats=self.u(1, 2.5),
+        )
 
     def inks(self, count: int = 3) -> list[np.ndarray]:
         """Colours of a print."""
         return [self.color("toy", "toy", "dark", "white", "any") for _ in range(count)]
 
-    def printed(self, kind: str, ground: np.ndarray, mapping: str = "fit", inks: list[np.ndarray] | None = None, sides: bool = False) -> int:
+    def printed(
+        self,
+        kind: str,
+        ground: np.ndarray,
+        mapping: str = "fit",
+        inks: list[np.ndarray] | None = None,
+        sides: bool = False,
+    ) -> int:
         """A look of printed matter.
 
         Args:
@@ -165,7 +194,12 @@ class Maker:
             inks: colours; None: drawn.
             sides: whether what does not look to +z or -z is of the ground's colour.
         """
-        picture = material(textures.package(self.rng, ground, inks or self.inks(), kind))
+        # What goes once around is four times as wide as high.
+        height = textures.PRINT * 3 // 8 if mapping == "round" else textures.PRINT
+        pixels = textures.package(
+            self.rng, ground, inks or self.inks(), kind, textures.PRINT, height
+        )
+        picture = material(pixels)
         if not sides:
             return self.add(Look([picture], mapping))
         bare = plain_material(ground)
@@ -177,7 +211,9 @@ class Maker:
         vertices = np.asarray(mesh.vert_properties)[:, :3]
         return self.stamped(vertices, np.asarray(mesh.tri_verts), np.zeros(1), (look,))
 
-    def stamped(self, vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray, looks: Sequence[int]) -> Manifold:
+    def stamped(
+        self, vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray, looks: Sequence[int]
+    ) -> Manifold:
         """A solid of arrays, with its skin where it is.
 
         Args:
@@ -216,7 +252,11 @@ class Maker:
             if sound.is_empty():
                 return sound
             swapped = faces[:, ::-1]
-            probe = np.einsum("fk,fk->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
+            probe = np.einsum(
+                "fk,fk->",
+                vertices[faces[:, 0]],
+                np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]),
+            )
             return self.stamped(vertices, faces if probe > 0 else swapped, of_face, looks)
 
         return blend.solid(stamp)
@@ -238,7 +278,9 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     mesh = whole.calculate_normals(0, SHARP).to_mesh()
     points = np.asarray(mesh.vert_properties)
     corners = np.asarray(mesh.tri_verts).astype(np.int64)
-    number = np.repeat(np.asarray(mesh.run_original_id), np.diff(mesh.run_index) // 3).astype(np.int64)
+    number = np.repeat(np.asarray(mesh.run_original_id), np.diff(mesh.run_index) // 3).astype(
+        np.int64
+    )
     same = np.arange(len(points))
     same[np.asarray(mesh.merge_from_vert, np.int64)] = np.asarray(mesh.merge_to_vert, np.int64)
     used, faces = np.unique(same[corners], return_inverse=True)
@@ -257,7 +299,9 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     )
 
 
-def _normals(rough: np.ndarray, same: np.ndarray, corners: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _normals(
+    rough: np.ndarray, same: np.ndarray, corners: np.ndarray, places: np.ndarray
+) -> np.ndarray:
     """Unit normals ``[F, 3, 3]`` of corners: means over the faces of a smooth patch, by their area.
 
     So a flat face beside a rounded edge stays flat, and slivers that a cut left have no say.
@@ -284,7 +328,9 @@ def _normals(rough: np.ndarray, same: np.ndarray, corners: np.ndarray, places: n
     return np.where(agree, smooth, flat).astype(np.float32)
 
 
-def _mapped(skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarray, list[Material]]:
+def _mapped(
+    skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]
+) -> tuple[np.ndarray, np.ndarray, list[Material]]:
     """UVs ``[F, 3, 2]``, materials' numbers ``[F]`` and materials of faces.
 
     Args:
@@ -312,7 +358,9 @@ def _mapped(skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]) -> tupl
             continue
         size = np.maximum(look.high - look.low, 1e-6)
         if look.mapping == "fit":
-            share = (uv[mine] - look.low[_ACROSS[axis[mine]]][:, None]) / size[_ACROSS[axis[mine]]][:, None]
+            share = (uv[mine] - look.low[_ACROSS[axis[mine]]][:, None]) / size[_ACROSS[axis[mine]]][
+                :, None
+            ]
             s = signs[mine][:, None]
             uvs[mine] = np.where(s > 0, share, 1 - share)
             continue

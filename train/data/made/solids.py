@@ -17,7 +17,7 @@ from skimage.measure import marching_cubes
 
 Points = np.ndarray | Sequence[Sequence[float]]
 RESOLUTION = 46  # cells along the longest side of a blended solid, at most
-CELLS = 45_000  # of its bounding box, at most
+CELLS = 36_000  # of its bounding box, at most
 
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
@@ -160,7 +160,9 @@ def slab(outline: np.ndarray, thickness: float, bevel: float = 0.0, steps: int =
         angle = np.linspace(0, math.pi / 2, steps + 1)
         below = [(bevel * (1 - math.sin(a)), -half + bevel * (1 - math.cos(a))) for a in angle]
         layers = [*below, *[(d, -z) for d, z in reversed(below)]]
-    rings = np.stack([np.column_stack([inset(outline, d), np.full(len(outline), z)]) for d, z in layers])
+    rings = np.stack(
+        [np.column_stack([inset(outline, d), np.full(len(outline), z)]) for d, z in layers]
+    )
     return loft(rings)
 
 
@@ -182,7 +184,9 @@ def rod(radius: float, height: float, sides: int = 24, bevel: float = 0.0) -> Ma
     b = min(bevel, 0.9 * radius, 0.45 * height)
     if b <= 0:
         return lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sides)
-    edge = [(radius - b * (1 - math.sin(a)), b * (1 - math.cos(a))) for a in (0, 0.5, 1.05, math.pi / 2)]
+    edge = [
+        (radius - b * (1 - math.sin(a)), b * (1 - math.cos(a))) for a in (0, 0.5, 1.05, math.pi / 2)
+    ]
     top = [(r, height - y) for r, y in reversed(edge)]
     return lathe([(0, 0), *edge, *top, (0, height)], sides)
 
@@ -212,7 +216,9 @@ def superquadric(radii: Sequence[float], up: float, around: float, segments: int
     return Manifold.sphere(1.0, segments).warp_batch(shape).scale(list(radii))
 
 
-def ring(radius: float, thick: float, sides: int = 32, around: int = 12, flat: float = 1.0) -> Manifold:
+def ring(
+    radius: float, thick: float, sides: int = 32, around: int = 12, flat: float = 1.0
+) -> Manifold:
     """A torus about y; ``flat`` stretches its section along y."""
     angle = np.arange(sides) * (2 * math.pi / sides)
     turn = np.arange(around) * (2 * math.pi / around)
@@ -262,7 +268,9 @@ def tube(
     line = spline(path, count, closed)
     given = np.atleast_1d(np.asarray(radii, float))
     if closed:
-        r = np.interp(np.arange(count) / count, np.linspace(0, 1, len(given) + 1), [*given, given[0]])
+        r = np.interp(
+            np.arange(count) / count, np.linspace(0, 1, len(given) + 1), [*given, given[0]]
+        )
     else:
         r = spline(given[:, None], count)[:, 0] if len(given) > 1 else np.full(count, given[0])
     r = np.maximum(r, 1e-4)
@@ -271,7 +279,10 @@ def tube(
     t, u, v = frames(line, closed)
     if not closed and round_ends:
         angles = np.radians([75, 50, 25])
-        head, tail = line[0] - np.outer(np.sin(angles) * r[0], t[0]), line[-1] + np.outer(np.sin(angles[::-1]) * r[-1], t[-1])
+        head, tail = (
+            line[0] - np.outer(np.sin(angles) * r[0], t[0]),
+            line[-1] + np.outer(np.sin(angles[::-1]) * r[-1], t[-1]),
+        )
         tips = np.stack([line[0] - r[0] * t[0], line[-1] + r[-1] * t[-1]])
         line = np.concatenate([head, line, tail])
         r = np.concatenate([np.cos(angles) * r[0], r, np.cos(angles[::-1]) * r[-1]])
@@ -314,7 +325,9 @@ class Blend:
                 np.minimum(a - ra, b - rb), np.maximum(a + ra, b + rb), look, _cone(a, b, ra, rb)
             )
 
-    def egg(self, center: Sequence[float], radii: Sequence[float], look: int = 0, tilt: float = 0.0) -> None:
+    def egg(
+        self, center: Sequence[float], radii: Sequence[float], look: int = 0, tilt: float = 0.0
+    ) -> None:
         """Adds an ellipsoid, turned about x by ``tilt`` radians."""
         c, r = np.asarray(center, np.float32), np.asarray(radii, np.float32)
         s, k = math.sin(tilt), math.cos(tilt)
@@ -323,7 +336,11 @@ class Blend:
         )
         self._add(c - reach, c + reach, look, _egg(c, r, s, k))
 
-    def solid(self, stamp: Callable[[np.ndarray, np.ndarray, np.ndarray], Manifold], cells: int = RESOLUTION) -> Manifold:
+    def solid(
+        self,
+        stamp: Callable[[np.ndarray, np.ndarray, np.ndarray], Manifold],
+        cells: int = RESOLUTION,
+    ) -> Manifold:
         """The solid.
 
         Args:
@@ -339,7 +356,9 @@ class Blend:
         shape = np.ceil((high + margin - low) / step).astype(int) + 1
         far = np.float32(2 * margin)
         field = np.full(shape, far, np.float32)
-        nearest = [np.full(shape, far, np.float32) for _ in range(1 + max(i[2] for i in self._items))]
+        nearest = [
+            np.full(shape, far, np.float32) for _ in range(1 + max(i[2] for i in self._items))
+        ]
         axes = [low[i] + step * np.arange(shape[i], dtype=np.float32) for i in range(3)]
         k = np.float32(self.soft)
         for a, b, look, distance in self._items:
@@ -368,7 +387,9 @@ class Blend:
         return stamp(vertices * step + low, faces, looks)
 
 
-def _split(vertices: np.ndarray, faces: np.ndarray, looks: np.ndarray, border: np.ndarray, look: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _split(
+    vertices: np.ndarray, faces: np.ndarray, looks: np.ndarray, border: np.ndarray, look: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A mesh cut along a line; what lies where ``border [V]`` is below 0 gets another look."""
     border = np.where(np.abs(border) < 1e-4, 1e-4, border)
     below = border[faces] < 0
@@ -466,7 +487,9 @@ def twist(solid: Manifold, angle: float) -> Manifold:
     return solid.warp_batch(move)
 
 
-def ripple(solid: Manifold, rng: np.random.Generator, height: float, length: float, mirrored: bool) -> Manifold:
+def ripple(
+    solid: Manifold, rng: np.random.Generator, height: float, length: float, mirrored: bool
+) -> Manifold:
     """A solid displaced by a smooth random field.
 
     Args:

@@ -32,9 +32,28 @@ def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
         kinds = ("toy", "toy", "pastel", "dark", "dark", "white", "white", "earth", "metal", "wide")
         kind = kinds[rng.integers(len(kinds))]
     if kind == "toy":
-        hues = (0.0, 0.0, 0.02, 0.07, 0.12, 0.14, 0.15, 0.25, 0.36, 0.45, 0.55, 0.58, 0.6, 0.62, 0.78, 0.92)
+        hues = (
+            0.0,
+            0.0,
+            0.02,
+            0.07,
+            0.12,
+            0.14,
+            0.15,
+            0.25,
+            0.36,
+            0.45,
+            0.55,
+            0.58,
+            0.6,
+            0.62,
+            0.78,
+            0.92,
+        )
         hue = hues[rng.integers(len(hues))] + rng.normal(0, 0.015)
-        light = rng.uniform(0.45, 0.95) * (0.8 if 0.2 < hue < 0.5 else 1)  # few things are bright green
+        light = rng.uniform(0.45, 0.95) * (
+            0.8 if 0.2 < hue < 0.5 else 1
+        )  # few things are bright green
         hsv = hue % 1, rng.uniform(0.55, 0.97), light
     elif kind == "pastel":
         hsv = rng.random(), rng.uniform(0.12, 0.45), rng.uniform(0.75, 0.97)
@@ -67,7 +86,9 @@ def mixed(mix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.rint(255 * np.clip(first * (1 - m) + second * m, 0, 1)).astype(np.uint8)
 
 
-def noise(rng: np.random.Generator, levels: tuple[int, int] = (2, 6), stretch: int = 1, side: int = SIDE) -> np.ndarray:
+def noise(
+    rng: np.random.Generator, levels: tuple[int, int] = (2, 6), stretch: int = 1, side: int = SIDE
+) -> np.ndarray:
     """Smooth noise ``[side, side]`` from 0 to 1 without a seam.
 
     Args:
@@ -120,7 +141,9 @@ def clouded(rng: np.random.Generator) -> np.ndarray:
 def grained(rng: np.random.Generator) -> np.ndarray:
     """The grain of wood."""
     rings = noise(rng, (1, 4), 4)
-    return 0.6 * (0.5 + 0.5 * np.sin(2 * math.pi * (rings * rng.uniform(3, 9)))) + 0.4 * noise(rng, (4, 7), 16)
+    return 0.6 * (0.5 + 0.5 * np.sin(2 * math.pi * (rings * rng.uniform(3, 9)))) + 0.4 * noise(
+        rng, (4, 7), 16
+    )
 
 
 def furry(rng: np.random.Generator) -> np.ndarray:
@@ -184,7 +207,7 @@ def speckled(rng: np.random.Generator) -> np.ndarray:
 def flowered(rng: np.random.Generator) -> np.ndarray:
     """Flowers or leaves strewn about."""
     out = np.zeros_like(_U)
-    for _ in range(rng.integers(4, 12)):
+    for _ in range(rng.integers(3, 9)):
         x = (_U - rng.random() + 0.5) % 1 - 0.5
         y = (_V - rng.random() + 0.5) % 1 - 0.5
         r, a = np.hypot(x, y), np.arctan2(y, x) + rng.uniform(0, 6)
@@ -223,7 +246,9 @@ def _ink(value: np.ndarray) -> tuple[int, ...]:
 
 
 def _word(rng: np.random.Generator, low: int = 2, high: int = 9) -> str:
-    letters = "".join(_LETTERS[i] for i in rng.integers(len(_LETTERS), size=rng.integers(low, high)))
+    letters = "".join(
+        _LETTERS[i] for i in rng.integers(len(_LETTERS), size=rng.integers(low, high))
+    )
     return letters if rng.random() < 0.6 else letters.capitalize()
 
 
@@ -237,7 +262,9 @@ class Print:
         height: pixels.
     """
 
-    def __init__(self, rng: np.random.Generator, ground: np.ndarray, width: int = PRINT, height: int = PRINT) -> None:
+    def __init__(
+        self, rng: np.random.Generator, ground: np.ndarray, width: int = PRINT, height: int = PRINT
+    ) -> None:
         self.rng, self.width, self.height = rng, width, height
         self.image = Image.new("RGB", (width, height), _ink(ground))
         self.draw = ImageDraw.Draw(self.image)
@@ -249,17 +276,28 @@ class Print:
     def _place(self, box: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
         w, h = self.width, self.height
         left, top, right, bottom = box
-        return int(left * w), int(top * h), max(int(right * w), int(left * w) + 1), max(int(bottom * h), int(top * h) + 1)
+        return (
+            int(left * w),
+            int(top * h),
+            max(int(right * w), int(left * w) + 1),
+            max(int(bottom * h), int(top * h) + 1),
+        )
 
-    def word(self, box: tuple[float, float, float, float], ink: np.ndarray, text: str | None = None) -> None:
+    def word(
+        self, box: tuple[float, float, float, float], ink: np.ndarray, text: str | None = None
+    ) -> None:
         """A word that fills a box of shares (left, top, right, bottom) of the sheet."""
         x0, y0, x1, y1 = self._place(box)
         text = text or _word(self.rng)
         size = max(6, min(int(0.95 * (y1 - y0)), int(1.6 * (x1 - x0) / len(text))))
         kwargs = {"stroke_width": size // 18} if self.rng.random() < 0.5 else {}
-        self.draw.text(((x0 + x1) / 2, (y0 + y1) / 2), text, _ink(ink), _font(size), anchor="mm", **kwargs)
+        self.draw.text(
+            ((x0 + x1) / 2, (y0 + y1) / 2), text, _ink(ink), _font(size), anchor="mm", **kwargs
+        )
 
-    def lines(self, box: tuple[float, float, float, float], ink: np.ndarray, height: float = 0.03) -> None:
+    def lines(
+        self, box: tuple[float, float, float, float], ink: np.ndarray, height: float = 0.03
+    ) -> None:
         """Lines of marks as small print has them."""
         x0, y0, x1, y1 = self._place(box)
         step = max(3, int(height * self.height))
@@ -271,7 +309,9 @@ class Print:
                 self.draw.rectangle((x, y, min(x + long, end), y + step // 2 - 1), _ink(ink))
                 x += long + step // 3 + 1
 
-    def mark(self, center: tuple[float, float], radius: float, ink: np.ndarray, second: np.ndarray) -> None:
+    def mark(
+        self, center: tuple[float, float], radius: float, ink: np.ndarray, second: np.ndarray
+    ) -> None:
         """A logo: a disc, a star, a badge or a flower."""
         rng = self.rng
         x, y = center[0] * self.width, center[1] * self.height
@@ -281,7 +321,13 @@ class Print:
             self.draw.ellipse((x - r, y - r, x + r, y + r), _ink(ink))
             self.draw.ellipse((x - r / 2, y - r / 2, x + r / 2, y + r / 2), _ink(second))
         elif kind == 1:
-            self.draw.rounded_rectangle((x - r, y - 0.6 * r, x + r, y + 0.6 * r), 0.3 * r, _ink(ink), _ink(second), max(1, int(r / 8)))
+            self.draw.rounded_rectangle(
+                (x - r, y - 0.6 * r, x + r, y + 0.6 * r),
+                0.3 * r,
+                _ink(ink),
+                _ink(second),
+                max(1, int(r / 8)),
+            )
         else:
             corners = int(rng.integers(3, 13))
             angle = np.arange(2 * corners) * math.pi / corners + rng.uniform(0, 6)
@@ -319,13 +365,24 @@ class Print:
         """A field with a curved or slanted edge, over part of the sheet."""
         rng = self.rng
         x = np.linspace(0, 1, 24)
-        y = rng.uniform(0.2, 0.8) + rng.uniform(-0.25, 0.25) * (x - 0.5) + rng.uniform(0, 0.15) * np.sin(x * rng.uniform(1, 7) + rng.uniform(0, 6))
+        y = (
+            rng.uniform(0.2, 0.8)
+            + rng.uniform(-0.25, 0.25) * (x - 0.5)
+            + rng.uniform(0, 0.15) * np.sin(x * rng.uniform(1, 7) + rng.uniform(0, 6))
+        )
         edge = list(zip((x * self.width).tolist(), (y * self.height).tolist()))
         side = self.height if rng.random() < 0.6 else 0
         self.draw.polygon([*edge, (self.width, side), (0, side)], _ink(ink))
 
 
-def package(rng: np.random.Generator, ground: np.ndarray, inks: list[np.ndarray], kind: str, width: int = PRINT, height: int = PRINT) -> np.ndarray:
+def package(
+    rng: np.random.Generator,
+    ground: np.ndarray,
+    inks: list[np.ndarray],
+    kind: str,
+    width: int = PRINT,
+    height: int = PRINT,
+) -> np.ndarray:
     """A printed side of a package.
 
     Args:
@@ -347,7 +404,9 @@ def package(rng: np.random.Generator, ground: np.ndarray, inks: list[np.ndarray]
             left, top = rng.uniform(0, 0.4), rng.uniform(0.2, 0.5)
             sheet.photo((left, top, rng.uniform(left + 0.35, 1), rng.uniform(top + 0.3, 1)))
         for _ in range(rng.integers(0, 3)):
-            sheet.mark((rng.uniform(0.1, 0.9), rng.uniform(0.1, 0.9)), rng.uniform(0.06, 0.2), ink(), ink())
+            sheet.mark(
+                (rng.uniform(0.1, 0.9), rng.uniform(0.1, 0.9)), rng.uniform(0.06, 0.2), ink(), ink()
+            )
         top = rng.choice([0.04, 0.08, 0.3, 0.62])
         if rng.random() < 0.4:
             sheet.band((0, top - 0.02, 1, top + 0.24), ink())
@@ -376,7 +435,9 @@ def package(rng: np.random.Generator, ground: np.ndarray, inks: list[np.ndarray]
             x, y = rng.uniform(0.1, 0.6), 0.78
             sheet.band((x, y, x + 0.3, 0.95), np.ones(3))
             for bar in np.flatnonzero(rng.random(20) < 0.5):
-                sheet.band((x + 0.02 + 0.013 * bar, y + 0.02, x + 0.028 + 0.013 * bar, 0.93), np.zeros(3))
+                sheet.band(
+                    (x + 0.02 + 0.013 * bar, y + 0.02, x + 0.028 + 0.013 * bar, 0.93), np.zeros(3)
+                )
         elif rng.random() < 0.5:
             sheet.photo((0.1, 0.6, 0.9, 0.95))
     return sheet.pixels()

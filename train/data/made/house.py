@@ -1,0 +1,449 @@
+"""Lamps, furniture, racks, trays, cushions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from manifold3d import CrossSection, FillRule, Manifold
+
+from .details import produce
+from .looks import Maker
+from .solids import (
+    ball,
+    both,
+    box,
+    joined,
+    lathe,
+    loft,
+    ring_of,
+    ripple,
+    rod,
+    rounded,
+    spline,
+    superquadric,
+    tube,
+)
+
+
+def lamp(m: Maker) -> list[Manifold]:
+    """A lamp, a lantern or a candlestick on a stand."""
+    height, foot = m.u(0.4, 1.4), m.u(0.12, 0.3)
+    metal, shade = (
+        m.pick(m.metal(), m.wood(), m.surface()),
+        m.pick(m.plain("white", "pastel", "any"), m.cloth()),
+    )
+    bulge = np.abs(m.rng.normal(0, 0.08, 8)) * (m.rng.random() < 0.6) + m.u(0.015, 0.05)
+    heights = np.linspace(0.05, height, 8)
+    line = spline(np.stack([bulge, heights], 1), 24)
+    stand = lathe(
+        [(0, 0), (foot, 0), (foot, 0.03), *np.maximum(line, [0.01, 0]).tolist(), (0, height)], 28
+    )
+    low, high, tall = m.u(0.15, 0.4), m.u(0.06, 0.35), m.u(0.15, 0.5)
+    sides = m.pick(36, 36, 4, 6)
+    bell = lathe(
+        [
+            (0, tall - 0.03),
+            (high - 0.02, tall - 0.03),
+            (low - 0.02, 0),
+            (low, 0),
+            (high, tall),
+            (0, tall),
+        ],
+        sides,
+    )
+    if m.chance(0.2):
+        bell = ball([low, low * m.u(0.8, 1.2), low])
+    tilt = [m.pick(0, 0, 0, m.u(20, 80)), 0, 0]
+    parts = [
+        m.stamp(stand, metal),
+        m.stamp(bell.rotate(tilt).translate([0, height - tall * 0.3, 0]), shade),
+    ]
+    if m.chance(0.2):
+        for a in range(m.n(2, 4)):
+            rail = tube([(low, height + 0.3, 0), (low, 0.1, 0), (low * 0.9, 0.0, 0)], 0.015, 8, 12)
+            parts.append(m.stamp(rail.rotate([0, 90 * a, 0]), metal))
+    return parts
+
+
+def furniture(m: Maker) -> list[Manifold]:
+    """A table, chair, sofa, shelf, cabinet or bed."""
+    main, second, third = (
+        m.pick(m.wood(), m.wood(), m.surface("white", "dark", "wood"), m.cloth("earth", "any"))
+        for _ in range(3)
+    )
+    w, d, h = m.u(0.5, 1.4), m.u(0.35, 0.9), m.u(0.2, 0.8)
+    kind = m.n(0, 5)
+    parts: list[Manifold] = []
+    soft = m.pick(0.0, m.u(0.01, 0.05))
+
+    def block(look: int, size: tuple, at: tuple, radius: float | None = None) -> None:
+        parts.append(
+            m.stamp(box(*size, soft if radius is None else radius).translate(list(at)), look)
+        )
+
+    def legs(wide: float, deep: float, high: float) -> None:
+        r = m.u(0.02, 0.05)
+        splay, square = m.u(0, 0.08), m.chance(0.5)
+        leg = (
+            box(2 * r, high + 0.01, 2 * r).translate([0, high / 2, 0])
+            if square
+            else lathe(
+                [(0, 0), (r * 0.7, 0), (r, high * 0.7), (r * 1.1, high + 0.01), (0, high + 0.01)],
+                14,
+            )
+        )
+        leg = leg.rotate([math.degrees(-splay), 0, math.degrees(splay)])
+        x, z = wide / 2 - 1.3 * r, deep / 2 - 1.3 * r
+        one = m.stamp(leg.translate([x, 0, z]), second)
+        pair = both(one)
+        parts.append(pair + pair.mirror([0, 0, 1]))
+
+    if kind == 0:
+        thick = m.u(0.02, 0.08)
+        if m.chance(0.35):
+            parts.append(m.stamp(rod(w / 2, thick, 40, 0.3 * thick).translate([0, h, 0]), main))
+            parts.append(
+                m.stamp(
+                    lathe(
+                        [
+                            (0, 0),
+                            (w * 0.3, 0),
+                            (w * 0.28, 0.03),
+                            (0.04, 0.08),
+                            (m.u(0.03, 0.08), h * 0.6),
+                            (0.05, h + 0.01),
+                            (0, h + 0.01),
+                        ]
+                    ),
+                    second,
+                )
+            )
+        else:
+            block(main, (w, thick, d), (0, h + thick / 2, 0))
+            legs(w, d, h)
+            if m.chance(0.4):
+                block(second, (w * 0.85, 0.03, d * 0.8), (0, h * 0.3, 0))
+    elif kind == 1:
+        w, d = m.u(0.4, 1.2), m.u(0.4, 0.6)
+        thick, back, deep = m.u(0.04, 0.2), m.u(0.3, 0.7), m.u(0.03, 0.16)
+        seat = h * 0.6 + thick
+        block(main, (w, thick, d), (0, seat - thick / 2, 0))
+        legs(w, d, h * 0.6)
+        if m.chance(0.6):
+            rest = box(w, back, deep, m.pick(soft, 0.4 * deep)).rotate([-m.u(0, 15), 0, 0])
+            parts.append(
+                m.stamp(rest.translate([0, seat + back / 2 - 0.02, -d / 2 + deep / 2]), main)
+            )
+        else:
+            for x in np.linspace(-w / 2 + 0.03, w / 2 - 0.03, m.n(3, 6)):
+                block(second, (0.035, back, 0.035), (float(x), seat + back / 2, -d / 2 + 0.03), 0.0)
+            block(second, (w, 0.08, 0.045), (0, seat + back, -d / 2 + 0.03))
+        if m.chance(0.4):
+            arm = m.u(0.12, 0.25)
+            for side in (-1, 1):
+                block(third, (0.07, arm, d), (side * (w / 2 - 0.02), seat + arm / 2, 0))
+    elif kind == 2:
+        h, w, d, t = m.u(0.5, 1.6), m.u(0.4, 1.1), m.u(0.2, 0.4), m.u(0.02, 0.05)
+        for side in (-1, 1):
+            block(main, (t, h, d), (side * w / 2, h / 2, 0), 0.0)
+        if m.chance(0.7):
+            block(second, (w, h, 0.02), (0, h / 2, -d / 2 + 0.01), 0.0)
+        levels = np.linspace(t / 2, h - t / 2, m.n(2, 6))
+        for low, high in zip(levels, [*levels[1:], h]):
+            block(main, (w, t, d), (0, float(low), 0), 0.0)
+            x = -w / 2 + 0.05
+            while high - low > 0.15 and x < w / 2 - 0.1 and m.chance(0.75):
+                wide, tall = m.u(0.03, 0.2), m.u(0.5, 0.9) * float(high - low)
+                block(
+                    m.plain("any"),
+                    (wide, tall, 0.7 * d),
+                    (x + wide / 2, float(low) + t / 2 + tall / 2 - 0.005, 0),
+                    0.0,
+                )
+                x += wide + m.u(0.003, 0.1)
+    elif kind == 3:
+        h, foot = m.u(0.3, 1.4), m.u(0, 0.15)
+        block(main, (w, h, d), (0, foot + h / 2, 0))
+        columns, rows = m.n(1, 3), m.n(1, 4)
+        wide, tall = w / columns, h / rows
+        for i, j in np.ndindex(columns, rows):
+            x, y = (i + 0.5) * wide - w / 2, foot + (j + 0.5) * tall
+            block(third, (0.9 * wide, 0.9 * tall, 0.03), (x, y, d / 2), 0.0)
+            knob = (
+                ball(0.02, 12).translate([x, y, d / 2 + 0.03])
+                if m.chance(0.5)
+                else box(0.25 * wide, 0.02, 0.03).translate([x, y, d / 2 + 0.025])
+            )
+            parts.append(m.stamp(knob, second))
+        if foot > 0.05:
+            legs(w, d, foot)
+    elif kind == 4:
+        w, d, h, head = m.u(0.7, 1.4), m.u(1.3, 1.8), m.u(0.15, 0.4), m.u(0.2, 0.6)
+        block(main, (w, h, d), (0, h / 2, 0))
+        block(m.cloth("white", "pastel"), (0.96 * w, 0.2, 0.96 * d), (0, h + 0.07, 0), 0.06)
+        block(main, (w, h + head, 0.06), (0, (h + head) / 2, -d / 2))
+        parts.append(
+            m.stamp(
+                superquadric([0.25 * w, 0.07, 0.15], 0.7, 0.5).translate(
+                    [0.22 * w, h + 0.2, -d / 2 + 0.25]
+                ),
+                third,
+            )
+        )
+        block(m.cloth(), (0.99 * w, 0.1, 0.6 * d), (0, h + 0.14, 0.2 * d), 0.04)
+    else:
+        w, h, d = m.u(0.8, 1.6), m.u(0.25, 0.4), m.u(0.5, 0.7)
+        puff, cloth = m.u(0.04, 0.09), m.cloth("earth", "any", "dark")
+        block(cloth, (w, h, d), (0, h / 2, 0), puff * 0.5)
+        count = m.n(1, 3)
+        for i in range(count):
+            block(
+                cloth,
+                (w / count * 0.97, 0.18, d * 0.9),
+                ((i + 0.5) * w / count - w / 2, h + 0.05, 0.03),
+                puff,
+            )
+            block(
+                cloth,
+                (w / count * 0.97, 0.4, 0.2),
+                ((i + 0.5) * w / count - w / 2, h + 0.25, -d / 2 + 0.12),
+                puff,
+            )
+        for side in (-1, 1):
+            block(
+                cloth,
+                (0.16, h + m.u(0.1, 0.25), d),
+                (side * (w / 2 + 0.05), (h + 0.15) / 2, 0),
+                puff,
+            )
+        if m.chance(0.4):
+            parts.append(
+                m.stamp(
+                    superquadric([0.16, 0.16, 0.06], 0.5, 0.8)
+                    .rotate([-20, 0, m.u(-20, 20)])
+                    .translate([m.u(-0.3, 0.3), h + 0.25, 0.05]),
+                    third,
+                )
+            )
+    if m.chance(0.3):
+        return [joined(parts).rotate([0, m.u(-60, 60), 0])]
+    return parts
+
+
+def rack(m: Maker) -> list[Manifold]:
+    """Wires and slats: a basket, a rack, a cage, a crate, a stand, a hanger."""
+    look, second = m.pick(m.metal(), m.plain("white", "dark", "toy"), m.wood()), m.surface()
+    w, h, d, r = m.u(0.5, 1.0), m.u(0.2, 0.7), m.u(0.3, 0.7), m.u(0.01, 0.022)
+    parts: list[Manifold] = []
+    kind = m.n(0, 3)
+    flare = m.u(0.6, 1.0)
+
+    def hoop(scale: float, y: float, thick: float) -> Manifold:
+        corners = rounded(w * scale, d * scale, m_corner, 3)
+        return tube([(x, y, z) for x, z in corners], thick, 6, 32, True)
+
+    m_corner = m.u(0.03, 0.15)
+    if kind <= 1:  # a basket of wires or slats
+        for y in np.linspace(0, h, m.n(2, 4)):
+            parts.append(hoop(flare + (1 - flare) * y / h, float(y), r))
+        slat = m.pick(1.0, 1.0, m.u(1.5, 3))
+        for x in np.linspace(-w / 2, w / 2, m.n(4, 7)) * 0.92:
+            for z in (-d / 2, d / 2):
+                parts.append(
+                    tube(
+                        [
+                            (x * flare, 0, z * flare),
+                            (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
+                            (x, h, z),
+                        ],
+                        r,
+                        6,
+                        3,
+                        flat=(1, 1),
+                        round_ends=False,
+                    )
+                )
+            parts.append(
+                tube(
+                    [
+                        (x * flare, 0, -d / 2 * flare),
+                        (x * flare, 0, 0),
+                        (x * flare, 0, d / 2 * flare),
+                    ],
+                    r * slat,
+                    6,
+                    3,
+                    round_ends=False,
+                )
+            )
+        for z in np.linspace(-d / 2, d / 2, m.n(3, 5)) * 0.92:
+            for x in (-w / 2, w / 2):
+                parts.append(
+                    tube(
+                        [
+                            (x * flare, 0, z * flare),
+                            (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
+                            (x, h, z),
+                        ],
+                        r,
+                        6,
+                        3,
+                        round_ends=False,
+                    )
+                )
+        solids = [m.stamp(joined(parts), look)]
+        if m.chance(0.4):
+            solids.append(m.stamp(hoop(1.01, h, r * 2), second))
+        if m.chance(0.4):
+            bow = tube(
+                [
+                    (-w / 2, h, 0),
+                    (-w * 0.4, h + 0.35, 0),
+                    (0, h + 0.5, 0),
+                    (w * 0.4, h + 0.35, 0),
+                    (w / 2, h, 0),
+                ],
+                r * 1.5,
+                8,
+                28,
+            )
+            solids.append(m.stamp(bow, m.pick(look, second)))
+        if m.chance(0.3):
+            solids.append(m.stamp(box(w * flare, r * 1.5, d * flare), second))
+    elif kind == 2:  # plates or shelves on posts
+        post = rod(r * 1.5, h * 1.5, 10)
+        posts = [post.translate([x * w * 0.46, 0, z * d * 0.46]) for x in (-1, 1) for z in (-1, 1)]
+        solids = [m.stamp(joined(posts), look)]
+        for y in np.linspace(0.05, h * 1.4, m.n(2, 4)):
+            if m.chance(0.5):
+                solids.append(m.stamp(box(w, 0.03, d, 0.01).translate([0, float(y), 0]), second))
+            else:
+                rods = [
+                    tube(
+                        [(x, y, -d / 2), (x, y, 0), (x, y, d / 2)], r * 0.8, 6, 3, round_ends=False
+                    )
+                    for x in np.linspace(-w / 2, w / 2, m.n(5, 9))
+                ]
+                rods += [
+                    tube([(-w / 2, y, z), (0, y, z), (w / 2, y, z)], r, 6, 3, round_ends=False)
+                    for z in (-d / 2, d / 2)
+                ]
+                solids.append(m.stamp(joined(rods), look))
+    else:  # a crate of boards
+        t, boards = m.u(0.015, 0.03), m.n(2, 4)
+        tall = h / boards
+        for i in range(boards):
+            for z in (-d / 2, d / 2):
+                parts.append(box(w, tall * 0.8, t).translate([0, (i + 0.5) * tall, z]))
+            for x in (-w / 2, w / 2):
+                parts.append(box(t, tall * 0.8, d).translate([x, (i + 0.5) * tall, 0]))
+        for x in (-1, 1):
+            for z in (-1, 1):
+                parts.append(
+                    box(0.05, h, 0.05).translate([x * (w / 2 - 0.02), h / 2, z * (d / 2 - 0.02)])
+                )
+        parts.append(box(w, t, d).translate([0, t, 0]))
+        solids = [m.stamp(joined(parts), m.pick(m.wood(), look))]
+        for i in range(m.n(0, 5)):
+            s = m.u(0.08, 0.14)
+            solids.append(
+                m.stamp(
+                    produce(m, s).translate([m.u(-0.3, 0.3) * w, h * 0.6, m.u(-0.3, 0.3) * d]),
+                    second if i % 2 else m.plain("toy", "leaf"),
+                )
+            )
+    return [joined(solids).rotate([0, m.u(-50, 50), 0])]
+
+
+def organiser(m: Maker) -> list[Manifold]:
+    """A tray, drawer or stand with places for things, and some of these."""
+    w, h, d, t = m.u(0.5, 1.0), m.u(0.1, 0.5), m.u(0.3, 0.7), m.u(0.015, 0.04)
+    look, inside = m.pick(m.surface(), m.wood()), m.surface("white", "dark", "any")
+    body = m.stamp(box(w, h, d, m.pick(0.0, 0.02, 0.06)), look)
+    columns, rows = m.n(1, 4), m.n(1, 3)
+    xs, zs = (
+        np.sort(m.rng.uniform(-0.5, 0.5, columns - 1)),
+        np.sort(m.rng.uniform(-0.5, 0.5, rows - 1)),
+    )
+    xs, zs = np.array([-0.5, *xs, 0.5]) * w, np.array([-0.5, *zs, 0.5]) * d
+    parts, cuts = [], []
+    for left, right in zip(xs, xs[1:]):
+        for back, front in zip(zs, zs[1:]):
+            wide, deep = float(right - left) - 2 * t, float(front - back) - 2 * t
+            if min(wide, deep) < 0.04:
+                continue
+            x, z = float(left + right) / 2, float(back + front) / 2
+            round_one = m.chance(0.2)
+            pit = (
+                rod(min(wide, deep) / 2, h, 24).translate([0, -h / 2, 0])
+                if round_one
+                else box(wide, h, deep, m.pick(0.0, 0.02))
+            )
+            cuts.append(pit.translate([x, m.u(0.05, 0.4) * h, z]))
+            if m.chance(0.5):
+                tall = h * m.u(0.6, 2.2)
+                item = m.pick(
+                    box(wide * m.u(0.3, 0.9), tall, deep * m.u(0.3, 0.9), 0.01),
+                    rod(min(wide, deep) * m.u(0.1, 0.45), tall, 16).translate([0, -tall / 2, 0]),
+                )
+                parts.append(
+                    m.stamp(
+                        item.rotate([m.u(-6, 6), 0, m.u(-6, 6)]).translate(
+                            [x, tall / 2 - h * 0.4, z]
+                        ),
+                        m.surface(),
+                    )
+                )
+    if cuts:
+        body = body - m.stamp(joined(cuts), inside)
+    return [joined([body, *parts]).rotate([m.pick(0, m.u(0, 60)), m.u(-50, 50), 0])]
+
+
+def cushion(m: Maker) -> list[Manifold]:
+    """A cushion, a folded towel or blanket, a roll, a rug."""
+    look, trim = (
+        m.pick(
+            m.cloth("any"),
+            m.printed("front", m.color("white", "any", "toy"), sides=m.chance(0.5)),
+            m.fur(),
+        ),
+        m.cloth(),
+    )
+    kind = m.n(0, 3)
+    if kind <= 1:
+        w, h, d = m.u(0.4, 0.7), m.u(0.3, 0.6), m.u(0.12, 0.25)
+        body = superquadric([w, h, d], m.u(0.5, 1), m.u(0.5, 0.9), 40)
+        p = m.u(2.5, 6)
+        form = ring_of(p, 40) * [w, h]
+        heights = np.linspace(-1, 1, 15)
+        rings = np.stack(
+            [
+                np.column_stack([form * (1 - abs(z) ** 3 * 0.9), np.full(40, z * d * (1 - 0.0))])
+                for z in heights
+            ]
+        )
+        body = m.pick(body, loft(rings))
+        parts = [m.stamp(ripple(body, m.rng, m.u(0.004, 0.02), m.u(0.2, 0.6), False), look)]
+        if m.chance(0.4):
+            rim = tube([(x, y, 0) for x, y in form[::3]], 0.02, 8, 56, True)
+            parts.append(m.stamp(rim, trim))
+        return [joined(parts).rotate([m.u(-40, 0), m.u(-40, 40), m.pick(0, m.u(-45, 45))])]
+    if kind == 2:  # folded
+        parts, y = [], 0.0
+        for i in range(m.n(1, 5)):
+            w, d, t = m.u(0.7, 0.9), m.u(0.5, 0.65), m.u(0.08, 0.15)
+            one = box(w, t, d, 0.45 * t)
+            one = ripple(one.refine_to_length(0.15), m.rng, 0.006, 0.3, False)
+            parts.append(m.stamp(one.translate([0, y + t / 2, 0]), look if i % 2 else trim))
+            y += t * 0.97
+        return [joined(parts).rotate([0, m.u(-60, 60), 0])]
+    r, long = m.u(0.12, 0.3), m.u(0.6, 1.2)
+    turns = np.linspace(0.15, 1, 60)
+    a = turns * m.u(2.5, 5) * 2 * math.pi
+    spiral = np.stack([turns * r * np.cos(a), turns * r * np.sin(a)], -1)
+    sheet = r / 14
+    normal = spiral / np.linalg.norm(spiral, axis=1, keepdims=True)
+    outline_ = np.concatenate([spiral + sheet * normal, (spiral - sheet * normal)[::-1]])
+    roll = CrossSection([outline_], FillRule.NonZero).extrude(long).translate([0, 0, -long / 2])
+    return [m.stamp(roll, look).rotate([m.pick(0, -90), m.u(-60, 60), 0])]

@@ -1,0 +1,523 @@
+"""Cars, lorries, aeroplanes, boats, trains."""
+
+from __future__ import annotations
+
+import numpy as np
+from manifold3d import Manifold
+
+from .details import wheel
+from .looks import Maker
+from .solids import ball, both, box, joined, lathe, loft, ring_of, ripple, rod, slab, tube
+
+
+def vehicle(m: Maker) -> list[Manifold]:
+    """A car, bus, lorry, tractor or digger."""
+    paint, dark, glass, accent = (
+        m.surface("toy", "toy", "any", "pastel", "metal"),
+        m.plain("dark"),
+        m.painted(np.array([0.1, 0.14, 0.18]) * m.u(0.3, 4)),
+        m.surface("toy", "metal", "white", "dark"),
+    )
+    kind = m.n(0, 4)
+    long, w = m.u(0.9, 1.4), m.u(0.4, 0.55)
+    r = m.u(0.09, 0.2)
+    h = m.u(0.15, 0.3)
+    floor = r * 0.9
+    parts: list[Manifold] = []
+    axles = [-long * m.u(0.28, 0.36), long * m.u(0.28, 0.36)]
+    if kind <= 1:  # a car: the side's outline, drawn out and rounded
+        ends, hood, boot, roof = (
+            floor + h * 0.15,
+            floor + h * m.u(0.75, 1.1),
+            floor + h * m.u(0.75, 1.3),
+            floor + h + m.u(0.15, 0.35),
+        )
+        z = np.array(
+            [
+                -0.5,
+                -0.49,
+                -0.42,
+                -0.3 + m.u(-0.1, 0.06),
+                -0.22 + m.u(-0.15, 0.05),
+                0.1 + m.u(-0.05, 0.08),
+                0.25 + m.u(-0.05, 0.05),
+                0.44,
+                0.5,
+                0.5,
+            ]
+        )
+        y = np.array(
+            [
+                ends,
+                boot * 0.8,
+                boot,
+                boot * 1.02,
+                roof,
+                roof,
+                hood * 1.05,
+                hood * 0.95,
+                hood * 0.75,
+                ends,
+            ]
+        )
+        line = np.stack([z * long, y], 1)
+        body = loft(
+            np.stack(
+                [
+                    np.column_stack(
+                        [
+                            np.full(10, x),
+                            np.where(line[:, 1] > hood, hood + (line[:, 1] - hood) * s, line[:, 1]),
+                            line[:, 0] * (0.97 + 0.03 * s),
+                        ]
+                    )
+                    for x, s in (
+                        (-w / 2, 0.75),
+                        (-w * 0.42, 0.95),
+                        (-w * 0.2, 1.0),
+                        (w * 0.2, 1.0),
+                        (w * 0.42, 0.95),
+                        (w / 2, 0.75),
+                    )
+                ]
+            )
+        )
+        # A loft in x: the cabin is narrower than what is below it.
+        pinch = lambda p: np.stack(
+            [p[:, 0] * (1 - 0.5 * np.clip(p[:, 1] - hood, 0, 1)), p[:, 1], p[:, 2]], -1
+        )  # noqa: E731
+        body = body.warp_batch(pinch)
+        arches = joined(
+            [
+                rod(r * 1.15, 3, 24).translate([0, -1.5, 0]).rotate([0, 0, 90]).translate([0, r, a])
+                for a in axles
+            ]
+        ) - box(w * 0.6, 5, 5)
+        shell = m.stamp(body, paint) - m.stamp(arches, dark)
+        low, high = hood + 0.02, roof - 0.03
+        panes = box(2, max(high - low, 0.02), long * 0.62).translate(
+            [0, (low + high) / 2, -0.04 * long]
+        )
+        window = m.stamp(body.scale([1.012, 1, 1]) ^ panes, glass)
+        shield = m.stamp(
+            body.scale([0.9, 1, 1]).translate([0, 0.0, 0.0]).scale([1, 1.004, 1.01])
+            ^ box(2, max(high - low, 0.02), 9).translate([0, (low + high) / 2, 0]),
+            glass,
+        )
+        parts = [shell, window, shield]
+        for x in (-0.33, 0.33):
+            parts.append(
+                m.stamp(
+                    ball([0.06, 0.04, 0.03], 14).translate([x * w, hood * 0.82, long * 0.49]),
+                    m.plain("white", "pastel"),
+                )
+            )
+        parts.append(
+            m.stamp(
+                box(w * 0.96, 0.05, 0.06, 0.02).translate([0, floor + h * 0.25, long * 0.5]), accent
+            )
+        )
+        if m.chance(0.25):
+            parts.append(
+                m.stamp(
+                    box(w * 0.8, 0.03, 0.1).translate([0, boot + 0.1, -long * 0.45])
+                    + both(box(0.03, 0.12, 0.05).translate([w * 0.3, boot + 0.04, -long * 0.45])),
+                    accent,
+                )
+            )
+    elif kind == 2:  # bus or van
+        tall = m.u(0.4, 0.6)
+        body = box(w, tall, long, 0.06).translate([0, floor + tall / 2, 0])
+        parts = [m.stamp(body, paint)]
+        count = m.n(2, 6)
+        for z in np.linspace(-long * 0.4, long * 0.4, count):
+            parts.append(
+                m.stamp(
+                    box(w * 1.015, tall * 0.3, long * 0.65 / count, 0).translate(
+                        [0, floor + tall * 0.65, float(z)]
+                    ),
+                    glass,
+                )
+            )
+        parts.append(
+            m.stamp(
+                box(w * 0.85, tall * 0.35, 0.05).translate(
+                    [0, floor + tall * 0.62, long / 2 - 0.015]
+                ),
+                glass,
+            )
+        )
+        parts.append(
+            m.stamp(
+                box(w * 1.01, 0.04, long * 1.005).translate([0, floor + tall * 0.35, 0]), accent
+            )
+        )
+    else:  # a lorry: chassis, cabin, load
+        cab = m.u(0.3, 0.42)
+        parts = [m.stamp(box(w * 0.8, 0.08, long, 0.02).translate([0, floor + 0.05, 0]), dark)]
+        parts.append(
+            m.stamp(
+                box(w, cab, long * 0.27, m.u(0.02, 0.08)).translate(
+                    [0, floor + cab / 2 + 0.05, long * 0.36]
+                ),
+                paint,
+            )
+        )
+        parts.append(
+            m.stamp(
+                box(w * 1.02, cab * 0.35, long * 0.16).translate(
+                    [0, floor + cab * 0.75, long * 0.37]
+                ),
+                glass,
+            )
+        )
+        parts.append(
+            m.stamp(
+                box(w * 0.8, cab * 0.35, 0.05).translate([0, floor + cab * 0.75, long * 0.49]),
+                glass,
+            )
+        )
+        load = m.n(0, 4)
+        z, deep = -long * 0.15, long * 0.66
+        if load == 0:
+            parts.append(
+                m.stamp(
+                    box(w, m.u(0.3, 0.6), deep, 0.02).translate([0, floor + 0.35, z]),
+                    m.pick(accent, m.printed("front", m.color("white", "any"))),
+                )
+            )
+        elif load == 1:
+            tub = box(w, 0.3, deep, 0.0) - box(w * 0.9, 0.3, deep * 0.93).translate([0, 0.04, 0])
+            parts.append(
+                m.stamp(
+                    tub.rotate([m.pick(0, 0, 20), 0, 0]).translate([0, floor + 0.27, z]), accent
+                )
+            )
+            if m.chance(0.5):
+                heap = ripple(ball([w * 0.42, 0.2, deep * 0.42], 32), m.rng, 0.02, 0.15, False)
+                parts.append(
+                    m.stamp(heap.translate([0, floor + 0.3, z]), m.pattern("speckled", "earth"))
+                )
+        elif load == 2:
+            tank = tube(
+                [(0, 0, -deep / 2 + 0.1), (0, 0, 0), (0, 0, deep / 2 - 0.1)],
+                m.u(0.18, 0.24),
+                24,
+                12,
+            )
+            parts.append(m.stamp(tank.translate([0, floor + 0.3, z]), m.pick(accent, m.metal())))
+        elif load == 3:  # a ladder or crane
+            arm = tube(
+                [
+                    (0, floor + 0.2, z - 0.1),
+                    (0, floor + 0.5, z),
+                    (0, floor + m.u(0.4, 0.9), long * m.u(0.2, 0.6)),
+                ],
+                [0.08, 0.06, 0.04],
+                ring_of(6, 12),
+                20,
+            )
+            parts += [
+                m.stamp(arm, accent),
+                m.stamp(rod(0.15, 0.15).translate([0, floor + 0.05, z]), paint),
+            ]
+            parts.append(
+                m.stamp(
+                    (
+                        box(0.25, 0.18, 0.2, 0.02) - box(0.2, 0.2, 0.2).translate([0, 0.06, 0.06])
+                    ).translate([0, floor + 0.4, long * 0.55]),
+                    accent,
+                )
+            )
+        else:
+            parts.append(
+                m.stamp(
+                    Manifold.compose(
+                        [
+                            rod(0.09, deep, 16)
+                            .rotate([90, 0, 0])
+                            .translate([x, floor + 0.18, z - deep / 2])
+                            for x in (-0.19, 0.0, 0.19)
+                        ]
+                    ),
+                    m.wood(),
+                )
+            )
+        axles = [long * 0.36, -long * 0.2, *([-long * 0.38] if m.chance(0.6) else [])]
+        if m.chance(0.15):
+            r *= 1.3
+    hub = m.surface("metal", "white", "toy")
+    thick = m.u(0.08, 0.16)
+    tire = wheel(r, thick)
+    for a in axles:
+        at = [w / 2 - thick * 0.3, r, float(a)]
+        parts.append(both(m.stamp(tire.translate(at), dark)))
+        parts.append(both(m.stamp(wheel(r * m.u(0.4, 0.65), thick * 1.15).translate(at), hub)))
+    return [
+        joined(parts).rotate([0, m.pick(0, 90, -90, m.u(-180, 180), m.u(20, 70), m.u(-70, -20)), 0])
+    ]
+
+
+def plane(m: Maker) -> list[Manifold]:
+    """An aeroplane, helicopter, rocket or boat."""
+    paint, second, dark = (
+        m.surface("toy", "white", "metal", "any"),
+        m.surface("toy", "any"),
+        m.plain("dark"),
+    )
+    kind = m.n(0, 3)
+    parts: list[Manifold] = []
+    if kind <= 1:
+        long, r = m.u(1.0, 1.4), m.u(0.09, 0.2)
+        hull = tube(
+            [(0, m.u(0, 0.08), -long / 2), (0, 0, 0), (0, 0, long / 2)],
+            [r * 0.3, r, r * m.u(0.6, 1)],
+            22,
+            28,
+        )
+        parts = [m.stamp(hull, paint)]
+        parts.append(
+            m.stamp(
+                ball([r * 0.7, r * 0.6, r * 1.3], 24).translate([0, r * 0.7, long * 0.22]),
+                m.plain("dark", "pastel", "metal"),
+            )
+        )
+        if kind == 0 or m.chance(0.4):
+            sweep, chord, span = m.u(-0.05, 0.45), m.u(0.25, 0.5), m.u(0.55, 0.9)
+            form = np.array(
+                [
+                    (0, -chord / 2),
+                    (span, -sweep - chord * 0.3),
+                    (span, -sweep + chord * 0.2),
+                    (0, chord / 2),
+                ]
+            )
+            wing = slab(form, 0.05, 0.02, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
+            levels = (m.u(-0.6, 0.8) * r,) if m.chance(0.75) else (-0.7 * r, 1.8 * r)
+            for y in levels:
+                parts.append(both(m.stamp(wing.translate([0, y, 0.08]), m.pick(paint, second))))
+            if len(levels) > 1:
+                parts.append(
+                    both(
+                        m.stamp(rod(0.02, 2.6 * r, 10).translate([span * 0.6, -0.7 * r, 0.0]), dark)
+                    )
+                )
+            if m.chance(0.5):
+                parts.append(
+                    both(
+                        m.stamp(
+                            tube([(0, 0, -0.12), (0, 0, 0.15)], [0.05, 0.06], 16, 10).translate(
+                                [span * 0.45, levels[0] - 0.05, 0.12]
+                            ),
+                            m.metal(),
+                        )
+                    )
+                )
+        else:
+            parts.append(
+                m.stamp(
+                    joined(
+                        [box(1.3, 0.015, 0.08).rotate([0, 90 * i + 20, 0]) for i in range(2)]
+                        + [rod(0.04, 0.15, 12).translate([0, -0.12, 0])]
+                    ).translate([0, r + 0.12, 0.1]),
+                    dark,
+                )
+            )
+            parts.append(
+                both(
+                    m.stamp(
+                        tube([(r, -r - 0.12, -0.3), (r, -r - 0.12, 0.3)], 0.025, 8, 8)
+                        + rod(0.02, 0.2, 8).translate([r, -r - 0.12, 0]),
+                        dark,
+                    )
+                )
+            )
+        fin = (
+            slab(np.array([(-0.02, 0), (0.18, 0), (0.06, 0.3), (-0.06, 0.3)]), 0.03, 0.01, 2)
+            .rotate([0, -90, 0])
+            .mirror([0, 0, 0])
+        )
+        parts.append(m.stamp(fin.translate([0, r * 0.4, -long / 2 + 0.02]), second))
+        flat = (
+            slab(np.array([(0, -0.1), (0.28, -0.14), (0.28, 0.0), (0, 0.1)]), 0.025, 0.008, 2)
+            .rotate([90, 0, 0])
+            .mirror([0, 0, 1])
+        )
+        parts.append(both(m.stamp(flat.translate([0, 0.05, -long / 2 + 0.08]), second)))
+        if m.chance(0.4):
+            parts.append(
+                m.stamp(
+                    joined(
+                        [box(0.5, 0.05, 0.015).rotate([0, 0, 60 * i]) for i in range(m.pick(2, 3))]
+                    ).translate([0, 0, long / 2 + r * 0.8]),
+                    dark,
+                )
+            )
+    elif kind == 2:  # a rocket that stands
+        r = m.u(0.12, 0.25)
+        hull = lathe(
+            [(0, 0), (r * 0.7, 0), (r, 0.3), (r, 0.7), (r * 0.7, 1.0), (r * 0.2, 1.2), (0, 1.25)],
+            32,
+        )
+        parts = [
+            m.stamp(
+                hull,
+                m.pick(paint, m.pattern("striped", "white", "toy", contrast=1, mapping="round")),
+            )
+        ]
+        fin = slab(
+            np.array([(0, 0.1), (0.25, -0.15), (0.25, 0.05), (0.0, 0.45)]), 0.04, 0.01, 2
+        ).translate([r * 0.8, 0, 0])
+        parts += [
+            m.stamp(fin, second).rotate([0, 360 * i / n, 0])
+            for n in (m.pick(3, 4),)
+            for i in range(n)
+        ]
+        parts.append(m.stamp(ball([0.1, 0.1, 0.05], 20).translate([0, 0.7, r * 0.95]), dark))
+        return parts
+    else:  # a boat
+        long, w, h = m.u(0.9, 1.4), m.u(0.35, 0.5), m.u(0.2, 0.35)
+        count, sides = 16, 24
+        t = np.linspace(0, 1, count)
+        half = (
+            w / 2 * np.clip(np.interp(t, [0, 0.3, 0.65, 1], [m.u(0.5, 0.9), 1, 0.9, 0.05]), 0.02, 1)
+        )
+        form = ring_of(3, sides)
+        rings = np.empty((count, sides, 3))
+        rings[..., 0] = form[None, :, 0] * half[:, None] * (0.75 + 0.25 * form[None, :, 1])
+        rings[..., 1] = form[None, :, 1] * h / 2 + 0.15 * t[:, None] ** 3
+        rings[..., 2] = (t[:, None] - 0.5) * long
+        hull = loft(rings)
+        well = m.stamp(hull.scale([0.85, 1, 0.85]).translate([0, h * 0.6, 0]), m.wood())
+        parts = [m.stamp(hull, paint) - well]
+        if m.chance(0.5):
+            parts.append(m.stamp(rod(0.025, 1.0, 10), m.wood()))
+            sail = slab(np.array([(0.03, 0.25), (0.5, 0.25), (0.03, 0.95)]), 0.02).rotate(
+                [0, m.u(60, 120), 0]
+            )
+            parts.append(m.stamp(sail, m.cloth("white", "toy")))
+            if m.chance(0.5):
+                parts.append(
+                    m.stamp(
+                        slab(np.array([(0.03, 0.25), (0.4, 0.25), (0.03, 0.8)]), 0.02).rotate(
+                            [0, -m.u(60, 120), 0]
+                        ),
+                        m.cloth("white", "toy"),
+                    )
+                )
+        else:
+            parts.append(
+                m.stamp(
+                    box(w * 0.55, 0.25, long * 0.3, 0.03).translate([0, h * 0.4, -0.05 * long]),
+                    second,
+                )
+            )
+            parts.append(
+                m.stamp(
+                    box(w * 0.4, 0.15, long * 0.15, 0.02).translate([0, h * 0.4 + 0.19, 0]),
+                    m.pick(paint, second),
+                )
+            )
+            for z in np.linspace(-0.2, 0.0, m.n(1, 3)):
+                parts.append(
+                    m.stamp(
+                        rod(0.05, 0.3, 16).translate([0, h * 0.4, z * long]),
+                        m.surface("toy", "dark"),
+                    )
+                )
+    return [joined(parts).rotate([0, m.pick(0, 90, -90, m.u(-180, 180)), 0])]
+
+
+def train_of(m: Maker) -> list[Manifold]:
+    """A wooden or plastic train: an engine and waggons, or one of them."""
+    looks = [m.surface("toy") for _ in range(3)]
+    dark = m.surface("dark", "wood", "toy")
+    parts: list[Manifold] = []
+    count = m.n(1, 3)
+    w, long, r = m.u(0.3, 0.4), m.u(0.5, 0.7), m.u(0.07, 0.11)
+    for i in range(count):
+        z = -i * (long + 0.1)
+        main, second = m.pick(*looks), m.pick(*looks)
+        car = [m.stamp(box(w, 0.08, long, 0.015).translate([0, r + 0.04, 0]), m.pick(dark, second))]
+        if i == 0:
+            car.append(
+                m.stamp(
+                    tube(
+                        [(0, 0, -long * 0.1), (0, 0, long * 0.38)],
+                        m.u(0.11, 0.15),
+                        24,
+                        8,
+                        round_ends=m.chance(0.5),
+                    ).translate([0, r + 0.2, 0]),
+                    main,
+                )
+            )
+            car.append(
+                m.stamp(
+                    box(w * 0.95, m.u(0.3, 0.42), long * 0.3, 0.01).translate(
+                        [0, r + 0.25, -long * 0.3]
+                    ),
+                    second,
+                )
+            )
+            car.append(
+                m.stamp(
+                    box(w * 1.1, 0.04, long * 0.36, 0.015).translate([0, r + 0.46, -long * 0.3]),
+                    main,
+                )
+            )
+            car.append(
+                m.stamp(
+                    lathe([(0, 0), (0.04, 0), (m.u(0.03, 0.08), 0.15), (0, 0.15)], 20).translate(
+                        [0, r + 0.3, long * 0.3]
+                    ),
+                    dark,
+                )
+            )
+            car.append(m.stamp(ball(0.06, 18).translate([0, r + 0.34, 0.05]), second))
+        else:
+            load = m.n(0, 3)
+            if load == 0:
+                car.append(
+                    m.stamp(
+                        box(w * 0.95, 0.22, long * 0.9, 0.02)
+                        - box(w * 0.8, 0.22, long * 0.8).translate([0, 0.05, 0]),
+                        main,
+                    ).translate([0, r + 0.18, 0])
+                )
+            elif load == 1:
+                car.append(
+                    m.stamp(
+                        tube([(0, 0, -long * 0.3), (0, 0, long * 0.3)], 0.15, 24, 8), main
+                    ).translate([0, r + 0.2, 0])
+                )
+            elif load == 2:
+                car += [
+                    m.stamp(
+                        rod(0.05, long * 0.85, 14)
+                        .rotate([90, 0, 0])
+                        .translate([x, r + 0.12, -long * 0.42]),
+                        second,
+                    )
+                    for x in (-0.1, 0.0, 0.1)
+                ]
+            else:
+                for k in range(m.n(1, 3)):
+                    car.append(
+                        m.stamp(
+                            box(0.2, 0.2, 0.2, 0.01).translate([0, r + 0.18, (k - 1) * 0.21]),
+                            m.pick(*looks),
+                        )
+                    )
+        for a in (-long * 0.3, long * 0.3):
+            car.append(
+                both(
+                    m.stamp(
+                        wheel(r, 0.05).translate([w / 2, r, a]),
+                        m.pick(dark, second) if i % 2 else dark,
+                    )
+                )
+            )
+        car.append(m.stamp(box(0.05, 0.04, long + 0.15).translate([0, r + 0.04, 0]), dark))
+        parts.append(joined(car).translate([0, 0, z]))
+    return [joined(parts).rotate([0, m.pick(90, -90, m.u(-180, 180), m.u(30, 70)), 0])]
