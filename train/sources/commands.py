@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -26,6 +27,12 @@ from .objaverse_lists import Lists
 
 Item = TypeVar("Item")
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+# What an empty part of a set's split means.
+_WITHOUT = {
+    "train": "there is nothing to train on",
+    "val": "training does not validate",
+    "test": "eval-views needs --split",
+}
 _SHOWN = 20  # objects of Objaverse that are told one by one; the record has all
 
 
@@ -66,6 +73,18 @@ def _told(failures: Mapping[str, str], what: str, warnings: Mapping[str, list[st
     for name, reason in sorted(failures.items()):
         print(f"{what}: {name}: {reason}", file=sys.stderr)
     return 1 if failures else 0
+
+
+def _tell_empty(data: Path) -> None:
+    """Says in one line which parts of the split of a set, of some objects, hold none of them."""
+    from gamba_warp.data.dataset import open_dataset, splits_of
+
+    with suppress(UserError):  # no object is there, or what is wrong is said where it is read
+        there = {*splits_of(data, open_dataset(data).uids).values()}
+        empty = [name for name in _WITHOUT if name not in there]
+        if empty:
+            parts = f"{' and '.join(empty)} {'split is' if len(empty) == 1 else 'splits are'}"
+            print(f"the {parts} empty; {'; '.join(_WITHOUT[name] for name in empty)}")
 
 
 def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None = None) -> int:
@@ -145,6 +164,8 @@ def data_render_command(
     rendered, failures = len(todo) - len(failures), failures | damaged
     code = _told(failures, "failed", warnings)
     print(f"rendered {counted(rendered, 'object')} into {out}, {len(failures)} failed")
+    if split == "all":
+        _tell_empty(out)
     return code
 
 
@@ -184,6 +205,8 @@ def data_pack_command(
         print(f"{counted(done.there, 'object')} in {out} already")
     made = f"packed {counted(done.written, 'object')} into {out}, {counted(done.shards, 'shard')}"
     print(f"{made}, {len(done.failures)} failed")
+    if split == "all":
+        _tell_empty(out)
     return _told(done.failures, "failed", {})
 
 
@@ -245,6 +268,8 @@ def data_objaverse_command(
         print(f"left out: {name}: {reason}", file=sys.stderr)
     if (rest := len(failures) - _SHOWN) > 0:
         print(f"left out: {rest:,} more, see {record}", file=sys.stderr)
+    if not meshes:
+        _tell_empty(out)
     following = "gamba data render {} --size 512 --out DATA" if meshes else "gamba train {} ..."
     print(f"next: {following.format(out)}")
     return 1 if failures else 0
