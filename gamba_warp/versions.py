@@ -76,7 +76,10 @@ HOLDS = {
     "mesh": {*_SHAPES, "manifold3d", "xatlas"},
     "eval": {*_SHAPES, "manifold3d", "xatlas"},
     "fit": {"gsplat", "kornia"},
-    "app": {"gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", "manifold3d", *_SHAPES},
+    "app": {
+        *("gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", "manifold3d"),
+        *_SHAPES,
+    },
     "all": set(EXTRA_OF),
 }
 # What a command cannot begin without; what only some of its options need is found missing then.

@@ -1,4 +1,4 @@
-"""Objects that the project makes of seeds: closed, bounded, the same again, different from each other."""
+"""Objects that the project makes of seeds: closed, bounded, the same again, all different."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from gamba_warp.data.dataset import split_of
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.train.data.made import make_object, textures
+from gamba_warp.train.data.made.composition import composition
 from gamba_warp.train.data.made.looks import MAX_FACES
 from gamba_warp.train.data.made.objects import PLANS, made_by
-from gamba_warp.train.data.made.composition import composition
 from gamba_warp.train.sources.commands import data_made_command
 
 NUMBERS = range(40)

@@ -268,7 +268,8 @@ def hollowed(m: Maker, solid: Manifold, look: int) -> Manifold:
     inner = inner.translate([0, float(size[1]) * m.u(0.1, 0.4), 0])
     level = high[1] - m.u(0.02, 0.3) * size[1]
     if m.chance(0.6):
-        above = box(*(3 * size), 0).translate(
+        wide, tall, deep = (3 * size).tolist()
+        above = box(wide, tall, deep).translate(
             [*center[[0]], float(level + 1.5 * size[1]), *center[[2]]]
         )
         inner = inner + m.stamp(above, look)

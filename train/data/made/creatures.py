@@ -241,7 +241,7 @@ def _crest(m: Maker, spine: list[Vec], stout: float) -> Manifold:
     look, count, size = m.surface("toy", "earth"), m.n(5, 11), m.u(0.3, 0.7) * stout
     line = np.array(spine)
     plates = []
-    for i, t in enumerate(np.linspace(0, 1, count)):
+    for t in np.linspace(0, 1, count):
         at = np.array([np.interp(t, np.linspace(0, 1, len(line)), line[:, k]) for k in range(3)])
         h = size * (0.5 + math.sin(math.pi * t))
         form = ring_of(1.2, 16) * [h * 0.6, h]
@@ -288,7 +288,7 @@ def plush(m: Maker) -> list[Manifold]:
         foot = np.array([w * m.u(0.7, 1.3), leg, w + m.u(0.1, 0.35)])
     else:
         foot = np.array([w * m.u(0.5, 0.8), -m.u(0.1, 0.5), 0.05])
-    blend.limb([[w * 0.55, 0.35 * h, 0.1], foot], [leg * 1.1, leg], 0)
+    blend.limb([(w * 0.55, 0.35 * h, 0.1), tuple(foot)], [leg * 1.1, leg], 0)
     blend.egg(
         foot + [0, 0.25 * leg, 0.25 * leg],
         (leg * 1.15, leg * m.u(1.1, 1.6), leg * 0.8),
@@ -375,7 +375,7 @@ def biped(m: Maker) -> list[Manifold]:
     knee = np.array([stout * 0.8, hip[1] * 0.55, m.u(0.05, 0.2)])
     ankle = np.array([stout * 0.85, hip[1] * 0.22, -0.06])
     blend.limb([hip + [stout * 0.6, 0, 0], knee, ankle], [leg, leg * 0.75, leg * 0.4], 0)
-    blend.limb([ankle, [stout * 0.9, 0.04, m.u(0.08, 0.2)]], [leg * 0.4, leg * m.u(0.4, 0.6)], 2)
+    blend.limb([tuple(ankle), (stout * 0.9, 0.04, m.u(0.08, 0.2))], [leg * 0.4, leg * m.u(0.4, 0.6)], 2)
     arm = chest + np.array([stout * 0.7, -0.02, 0.08])
     blend.limb(
         [arm, arm + [0.05, -0.13, 0.08], arm + [0.02, -m.u(0.1, 0.25), 0.2]], [0.05, 0.035, 0.03], 0
@@ -758,7 +758,10 @@ def figure(m: Maker) -> list[Manifold]:
         )
         parts.append(
             m.stamp(
-                item.rotate([m.u(-20, 80), 0, 0]).translate((grip + [0, 0, bulk]).tolist()), look
+                item.rotate([m.u(-20, 80), 0, 0]).translate(
+                    (np.array(grip) + [0, 0, bulk]).tolist()
+                ),
+                look,
             )
         )
     if m.chance(0.2):  # a cape

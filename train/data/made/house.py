@@ -78,9 +78,9 @@ def furniture(m: Maker) -> list[Manifold]:
     soft = m.pick(0.0, m.u(0.01, 0.05))
 
     def block(look: int, size: tuple, at: tuple, radius: float | None = None) -> None:
-        parts.append(
-            m.stamp(box(*size, soft if radius is None else radius).translate(list(at)), look)
-        )
+        w, h, d = size
+        solid = box(w, h, d, soft if radius is None else radius)
+        parts.append(m.stamp(solid.translate(list(at)), look))
 
     def legs(wide: float, deep: float, high: float) -> None:
         r = m.u(0.02, 0.05)

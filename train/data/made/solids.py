@@ -12,10 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 from manifold3d import CrossSection, Error, Manifold, Mesh, OpType
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 from skimage.measure import marching_cubes
 
-Points = np.ndarray | Sequence[Sequence[float]]
 RESOLUTION = 46  # cells along the longest side of a blended solid, at most
 CELLS = 36_000  # of its bounding box, at most
 
@@ -50,7 +50,7 @@ def extent(solid: Manifold) -> np.ndarray:
     return np.array(solid.bounding_box()).reshape(2, 3)
 
 
-def spline(points: Points, count: int, closed: bool = False) -> np.ndarray:
+def spline(points: ArrayLike, count: int, closed: bool = False) -> np.ndarray:
     """A Catmull-Rom curve ``[count, D]`` through points ``[K, D]``."""
     p = np.asarray(points, float)
     k = len(p)
@@ -99,7 +99,7 @@ def loft(rings: np.ndarray, tips: np.ndarray | None = None, closed: bool = False
     return solid_of(points, _loft_faces(count, sides, closed))
 
 
-def lathe(profile: Points, sides: int = 32) -> Manifold:
+def lathe(profile: ArrayLike, sides: int = 32) -> Manifold:
     """A solid of revolution about y.
 
     Args:
@@ -191,13 +191,12 @@ def rod(radius: float, height: float, sides: int = 24, bevel: float = 0.0) -> Ma
     return lathe([(0, 0), *edge, *top, (0, height)], sides)
 
 
-def ball(radii: float | Sequence[float], segments: int = 32) -> Manifold:
+def ball(radii: ArrayLike, segments: int = 32) -> Manifold:
     """An ellipsoid about the origin."""
-    size = [radii] * 3 if isinstance(radii, (int, float)) else list(radii)
-    return Manifold.sphere(1.0, segments).scale(size)
+    return Manifold.sphere(1.0, segments).scale(np.broadcast_to(radii, 3).tolist())
 
 
-def superquadric(radii: Sequence[float], up: float, around: float, segments: int = 32) -> Manifold:
+def superquadric(radii: ArrayLike, up: float, around: float, segments: int = 32) -> Manifold:
     """A superquadric about the origin.
 
     Args:
@@ -213,7 +212,7 @@ def superquadric(radii: Sequence[float], up: float, around: float, segments: int
         r = (flat ** (around / up) + a[:, 1] ** (2 / up)) ** (-up / 2)
         return p * r[:, None]
 
-    return Manifold.sphere(1.0, segments).warp_batch(shape).scale(list(radii))
+    return Manifold.sphere(1.0, segments).warp_batch(shape).scale(np.asarray(radii, float).tolist())
 
 
 def ring(
@@ -246,8 +245,8 @@ def frames(path: np.ndarray, closed: bool = False) -> tuple[np.ndarray, np.ndarr
 
 
 def tube(
-    path: Points,
-    radii: float | Sequence[float] | np.ndarray,
+    path: ArrayLike,
+    radii: ArrayLike,
     sides: int | np.ndarray = 14,
     count: int = 24,
     closed: bool = False,
@@ -316,7 +315,7 @@ class Blend:
             if mirrored[0][0] > low[0] + 1e-6 or mirrored[1][0] < high[0] - 1e-6:
                 self._items.append((*mirrored, look, lambda x, y, z: distance(-x, y, z)))
 
-    def limb(self, path: Points, radii: Sequence[float] | float, look: int = 0) -> None:
+    def limb(self, path: ArrayLike, radii: ArrayLike, look: int = 0) -> None:
         """Adds round cones through points ``[K, 3]`` with a radius at each."""
         p = np.asarray(path, np.float32)
         r = np.broadcast_to(np.asarray(radii, np.float32), len(p))
@@ -325,9 +324,7 @@ class Blend:
                 np.minimum(a - ra, b - rb), np.maximum(a + ra, b + rb), look, _cone(a, b, ra, rb)
             )
 
-    def egg(
-        self, center: Sequence[float], radii: Sequence[float], look: int = 0, tilt: float = 0.0
-    ) -> None:
+    def egg(self, center: ArrayLike, radii: ArrayLike, look: int = 0, tilt: float = 0.0) -> None:
         """Adds an ellipsoid, turned about x by ``tilt`` radians."""
         c, r = np.asarray(center, np.float32), np.asarray(radii, np.float32)
         s, k = math.sin(tilt), math.cos(tilt)
@@ -434,11 +431,11 @@ def _cone(a: np.ndarray, b: np.ndarray, ra: float, rb: float) -> Callable:
 
 def _egg(c: np.ndarray, r: np.ndarray, s: float, k: float) -> Callable:
     least = np.float32(r.min())
-    s, k = np.float32(s), np.float32(k)
 
     def distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         px, py, pz = x - c[0], y - c[1], z - c[2]
-        qy, qz = k * py + s * pz, k * pz - s * py
+        sine, cosine = np.float32(s), np.float32(k)
+        qy, qz = cosine * py + sine * pz, cosine * pz - sine * py
         inner = np.sqrt((px / r[0]) ** 2 + (qy / r[1]) ** 2 + (qz / r[2]) ** 2)
         slope = np.sqrt((px / r[0] ** 2) ** 2 + (qy / r[1] ** 2) ** 2 + (qz / r[2] ** 2) ** 2)
         return np.maximum(inner * (inner - 1) / np.maximum(slope, np.float32(1e-6)), -least)

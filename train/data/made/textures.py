@@ -290,9 +290,14 @@ class Print:
         x0, y0, x1, y1 = self._place(box)
         text = text or _word(self.rng)
         size = max(6, min(int(0.95 * (y1 - y0)), int(1.6 * (x1 - x0) / len(text))))
-        kwargs = {"stroke_width": size // 18} if self.rng.random() < 0.5 else {}
+        bold = size // 18 if self.rng.random() < 0.5 else 0
         self.draw.text(
-            ((x0 + x1) / 2, (y0 + y1) / 2), text, _ink(ink), _font(size), anchor="mm", **kwargs
+            ((x0 + x1) / 2, (y0 + y1) / 2),
+            text,
+            _ink(ink),
+            _font(size),
+            anchor="mm",
+            stroke_width=bold,
         )
 
     def lines(

@@ -83,10 +83,14 @@ def vehicle(m: Maker) -> list[Manifold]:
             )
         )
         # A loft in x: the cabin is narrower than what is below it.
-        pinch = lambda p: np.stack(
-            [p[:, 0] * (1 - 0.5 * np.clip(p[:, 1] - hood, 0, 1)), p[:, 1], p[:, 2]], -1
-        )  # noqa: E731
-        body = body.warp_batch(pinch)
+        body = body.warp_batch(
+            lambda p: (
+                p
+                * np.stack(
+                    [1 - 0.5 * np.clip(p[:, 1] - hood, 0, 1), p[:, 1] ** 0, p[:, 2] ** 0], -1
+                )
+            )
+        )
         arches = joined(
             [
                 rod(r * 1.15, 3, 24).translate([0, -1.5, 0]).rotate([0, 0, 90]).translate([0, r, a])

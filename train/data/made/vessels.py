@@ -430,7 +430,7 @@ def plant(m: Maker) -> list[Manifold]:
             parts.append(m.stamp(arm, leaf))
     else:  # flowers on stalks
         petal, heart = m.plain("toy", "pastel", "white"), m.plain("toy", "earth")
-        for i in range(m.n(2, 6)):
+        for _ in range(m.n(2, 6)):
             x, z, y = m.u(-0.3, 0.3), m.u(-0.3, 0.3), h + m.u(0.3, 0.7)
             parts.append(
                 m.stamp(
@@ -540,7 +540,7 @@ def food(m: Maker) -> list[Manifold]:
         ice = ring(0.35, r * 1.06, 40, 18, 0.85).translate([0, 0.02, 0])
         ice = ripple(ice, m.rng, 0.02, 0.25, False).trim_by_plane([0, 1, 0], 0.02)
         parts = [m.stamp(dough, m.plain("wood")), m.stamp(ice, m.plain("pastel", "earth", "toy"))]
-        flip = [90, 0, 0] if m.chance(0.3) else [0, 0, 0]
+        flip = [90.0 if m.chance(0.3) else 0.0, 0.0, 0.0]
         return [p.rotate(flip) for p in parts]
     if kind == 5:  # an ice cream
         cone = lathe([(0, 0), (0.03, 0), (m.u(0.18, 0.28), 0.7), (0, 0.7)], 24)

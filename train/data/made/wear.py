@@ -41,6 +41,16 @@ def _sole(width: float, long: float, count: int = 40) -> np.ndarray:
     return np.stack([x, y], -1)
 
 
+def _lifted(solid: Manifold, heel: float) -> Manifold:
+    """A part of a shoe whose heel stands higher than its toes."""
+
+    def move(p: np.ndarray) -> np.ndarray:
+        up = heel * np.clip((0.2 - p[:, 2]) / 0.6, 0, 1) ** 1.3
+        return np.stack([p[:, 0], p[:, 1] + up, p[:, 2]], -1)
+
+    return solid.refine_to_length(0.12).warp_batch(move)
+
+
 def shoe(m: Maker) -> list[Manifold]:
     """A trainer, a boot, a slipper, a clog or a shoe with a heel; one or a pair."""
     upper, lower, trim = (
@@ -80,8 +90,8 @@ def shoe(m: Maker) -> list[Manifold]:
         / 2
     )
     shift = 0.05 * wide * (t - 0.3)
-    smooth = lambda v: np.convolve(np.pad(v, 2, mode="edge"), [0.1, 0.2, 0.4, 0.2, 0.1], "valid")  # noqa: E731
-    instep, half = smooth(instep), smooth(half)
+    blur = [0.1, 0.2, 0.4, 0.2, 0.1]
+    instep, half = (np.convolve(np.pad(v, 2, mode="edge"), blur, "valid") for v in (instep, half))
     angle = np.arange(sides) * (2 * math.pi / sides)
     narrow = m.u(0.5, 0.85)  # how much of its width is left at the top of a high place
     rings = np.empty((count, sides, 3))
@@ -134,10 +144,7 @@ def shoe(m: Maker) -> list[Manifold]:
         body = body + m.stamp(loft(shaft), m.pick(upper, upper, trim))
     body = body - hole
     if heel > 0.12:  # the foot stands on its toes
-        lift = lambda p: np.stack(
-            [p[:, 0], p[:, 1] + heel * np.clip((0.2 - p[:, 2]) / 0.6, 0, 1) ** 1.3, p[:, 2]], -1
-        )  # noqa: E731
-        body = body.refine_to_length(0.12).warp_batch(lift)
+        body = _lifted(body, heel)
     spread = m.u(1.02, 1.1)
     base = (
         slab(_sole(wide * spread, long * 1.02), thick, 0.25 * thick, 2)
@@ -147,7 +154,7 @@ def shoe(m: Maker) -> list[Manifold]:
     base = base.translate([0, 0.015 - thick / 2, 0])
     parts = [body]
     if heel > 0.12:
-        base = base.refine_to_length(0.1).warp_batch(lift)
+        base = _lifted(base, heel)
         post = lathe(
             [(0, 0), (m.u(0.03, 0.1), 0), (0.11, heel + 0.02), (0, heel + 0.02)], 16
         ).translate([0, -thick, -0.38])
