@@ -58,17 +58,15 @@ def produce(m: Maker, r: float) -> Manifold:
         return tube([(0, -r, 0), (0.3 * r, 0, 0), (0, r, 0)], [0.25 * r, 0.45 * r, 0.2 * r], 12, 16)
     if kind == 3:
         return superquadric([r, r * 0.8, r], m.u(0.5, 1), m.u(0.4, 1), 24)
-    return lathe(
-        [
-            (0, -r),
-            (r * 0.3, -r * 0.95),
-            (r * 0.9, -0.1 * r),
-            (r * 0.6, 0.6 * r),
-            (0.1 * r, r),
-            (0, r),
-        ],
-        20,
-    )
+    side_line = [
+        (0, -r),
+        (r * 0.3, -r * 0.95),
+        (r * 0.9, -0.1 * r),
+        (r * 0.6, 0.6 * r),
+        (0.1 * r, r),
+        (0, r),
+    ]
+    return lathe(side_line, 20)
 
 
 def outline(m: Maker, sides: int = 48) -> np.ndarray:
@@ -92,19 +90,17 @@ def outline(m: Maker, sides: int = 48) -> np.ndarray:
 
 def letter(m: Maker) -> CrossSection:
     """A figure of bars and bows, as letters are."""
-    w, points = (
-        m.u(0.08, 0.2),
-        [
-            (-0.4, -0.5),
-            (0.4, -0.5),
-            (-0.4, 0.0),
-            (0.4, 0.0),
-            (-0.4, 0.5),
-            (0.4, 0.5),
-            (0, -0.5),
-            (0, 0.5),
-        ],
-    )
+    w = m.u(0.08, 0.2)
+    points = [
+        (-0.4, -0.5),
+        (0.4, -0.5),
+        (-0.4, 0.0),
+        (0.4, 0.0),
+        (-0.4, 0.5),
+        (0.4, 0.5),
+        (0, -0.5),
+        (0, 0.5),
+    ]
     dot = (
         CrossSection.circle(w, 12)
         if m.chance(0.5)

@@ -9,12 +9,11 @@ from manifold3d import Manifold
 
 from .composition import shape
 from .details import handle, outline
-from .looks import Look, Maker, material, plain_material
+from .looks import Look, Maker, Parts, material, plain_material
 from .solids import (
     Blend,
     ball,
     bend,
-    both,
     box,
     extent,
     joined,
@@ -46,56 +45,40 @@ def tool(m: Maker) -> list[Manifold]:
         26,
         flat=(1, m.u(0.6, 1)),
     )
-    parts = [m.stamp(shaft, grip)]
+    parts = Parts(m)
+    parts.add(shaft, look=grip)
     if m.chance(0.4):
         for y in np.linspace(-long * 0.4, -long * 0.1, m.n(2, 6)):
-            parts.append(m.stamp(ring(r * 1.05, 0.012, 24, 8).translate([0, float(y), 0]), head))
+            parts.add(ring(r * 1.05, 0.012, 24, 8), at=(0, y, 0), look=head)
     top = long / 2
     kind = m.n(0, 9)
     if kind == 0:  # hammer
         w = m.u(0.12, 0.22)
         poll = rod(m.u(0.06, 0.12), w, 20, 0.02).rotate([0, 0, 90])
-        claw = tube(
-            [(0, 0, 0), (w, 0.02, 0), (w * 1.8, -m.u(0, 0.15), 0)],
-            [0.07, 0.06, 0.015],
-            12,
-            16,
-            flat=(1, 1.2),
-        )
-        parts.append(
-            m.stamp(joined([poll, box(0.14, 0.12, 0.12, 0.02), claw]).translate([0, top, 0]), head)
-        )
+        line = [(0, 0, 0), (w, 0.02, 0), (w * 1.8, -m.u(0, 0.15), 0)]
+        claw = tube(line, [0.07, 0.06, 0.015], 12, 16, flat=(1, 1.2))
+        parts.add(joined([poll, box(0.14, 0.12, 0.12, 0.02), claw]), at=(0, top, 0), look=head)
     elif kind == 1:  # screwdriver
         blade = lathe([(0, 0), (0.025, 0), (0.025, m.u(0.3, 0.7)), (0.0, 0.75)], 12)
-        parts.append(m.stamp(blade.translate([0, top - 0.02, 0]), head))
+        parts.add(blade, at=(0, top - 0.02, 0), look=head)
     elif kind == 2:  # spanner
         jaw = slab(ring_of(2.5, 28) * m.u(0.1, 0.16), 0.06, 0.01, 2) - box(
             m.u(0.06, 0.1), 0.2, 0.5
         ).translate([0, 0.1, 0]).rotate([0, 0, m.u(-20, 20)])
-        parts = [
-            m.stamp(box(2 * r, long, 0.05, 0.015), head),
-            m.stamp(jaw.translate([0, top, 0]), head),
-        ]
+        parts.clear()
+        parts.add(box(2 * r, long, 0.05, 0.015), look=head)
+        parts.add(jaw, at=(0, top, 0), look=head)
         if m.chance(0.6):
-            parts.append(
-                m.stamp(
-                    (
-                        slab(ring_of(2, 28) * 0.1, 0.06, 0.01, 2)
-                        - rod(0.06, 0.3, 6).rotate([90, 0, 0]).translate([0, 0, -0.15])
-                    ).translate([0, -top, 0]),
-                    head,
-                )
-            )
+            part = slab(ring_of(2, 28) * 0.1, 0.06, 0.01, 2) - rod(0.06, 0.3, 6).rotate(
+                [90, 0, 0]
+            ).translate([0, 0, -0.15])
+            parts.add(part, at=(0, -top, 0), look=head)
     elif kind == 3:  # spoon or ladle
         size = m.u(0.1, 0.22)
         scoop = ball([size, size * 1.3, size * m.u(0.3, 0.9)]) - ball(
             [size * 0.9, size * 1.2, size * 0.8]
         ).translate([0, 0, size * 0.35])
-        parts.append(
-            m.stamp(
-                scoop.rotate([m.u(-10, 30), 0, 0]).translate([0, top + size, 0]), m.pick(grip, head)
-            )
-        )
+        parts.add(scoop, turn=(m.u(-10, 30), 0, 0), at=(0, top + size, 0), look=m.pick(grip, head))
     elif kind == 4:  # spatula, oar, paddle
         w, h = m.u(0.12, 0.25), m.u(0.2, 0.4)
         blade = box(w * 2, h, m.u(0.015, 0.05), 0.01)
@@ -106,63 +89,41 @@ def tool(m: Maker) -> list[Manifold]:
                     for x in np.linspace(-w * 0.6, w * 0.6, 4)
                 ]
             )
-        parts.append(
-            m.stamp(
-                blade.rotate([m.u(-15, 15), 0, 0]).translate([0, top + h * 0.45, 0]),
-                m.pick(grip, head),
-            )
+        parts.add(
+            blade, turn=(m.u(-15, 15), 0, 0), at=(0, top + h * 0.45, 0), look=m.pick(grip, head)
         )
     elif kind == 5:  # brush
         w = m.u(0.1, 0.3)
-        parts.append(m.stamp(box(w, 0.1, 0.08, 0.02).translate([0, top, 0]), head))
+        parts.add(box(w, 0.1, 0.08, 0.02), at=(0, top, 0), look=head)
         tuft = m.pattern(("furry", "brushed"), "earth", "dark", "white", repeats=4)
-        parts.append(
-            m.stamp(
-                taper(box(w * 0.95, m.u(0.12, 0.3), 0.07, 0.01), m.u(0.7, 1.3)).translate(
-                    [0, top + 0.13, 0]
-                ),
-                tuft,
-            )
-        )
+        part = taper(box(w * 0.95, m.u(0.12, 0.3), 0.07, 0.01), m.u(0.7, 1.3))
+        parts.add(part, at=(0, top + 0.13, 0), look=tuft)
     elif kind == 6:  # axe, cleaver, knife
-        form = np.array(
-            [(-0.02, -0.1), (0.2, -0.16), (m.u(0.25, 0.4), 0.0), (0.2, 0.18), (-0.02, 0.1)]
-        )
+        corners = [(-0.02, -0.1), (0.2, -0.16), (m.u(0.25, 0.4), 0.0), (0.2, 0.18), (-0.02, 0.1)]
+        form = np.array(corners)
         blade = slab(form, m.u(0.02, 0.07), 0.01, 2)
         if m.chance(0.5):
-            blade = slab(
-                np.array([(-0.05, 0), (0.06, 0), (0.06, 0.5), (0.0, 0.7), (-0.05, 0.5)]),
-                0.02,
-                0.006,
-                2,
-            )
-        parts.append(m.stamp(blade.translate([0, top - 0.03, 0]), head))
+            corners = [(-0.05, 0), (0.06, 0), (0.06, 0.5), (0.0, 0.7), (-0.05, 0.5)]
+            blade = slab(np.array(corners), 0.02, 0.006, 2)
+        parts.add(blade, at=(0, top - 0.03, 0), look=head)
     elif kind == 7:  # torch
-        cone = lathe(
-            [
-                (0, 0),
-                (r, 0),
-                (r * 1.9, 0.12),
-                (r * 1.9, 0.25),
-                (r * 1.7, 0.25),
-                (r * 1.5, 0.2),
-                (0, 0.2),
-            ]
-        )
-        parts.append(m.stamp(cone.translate([0, top - 0.02, 0]), m.pick(grip, head)))
-        parts.append(
-            m.stamp(rod(r * 1.5, 0.02).translate([0, top + 0.18, 0]), m.plain("white", "pastel"))
-        )
+        profile = [
+            (0, 0),
+            (r, 0),
+            (r * 1.9, 0.12),
+            (r * 1.9, 0.25),
+            (r * 1.7, 0.25),
+            (r * 1.5, 0.2),
+            (0, 0.2),
+        ]
+        cone = lathe(profile)
+        parts.add(cone, at=(0, top - 0.02, 0), look=m.pick(grip, head))
+        parts.add(rod(r * 1.5, 0.02), at=(0, top + 0.18, 0), look=m.plain("white", "pastel"))
     elif kind == 8:  # pliers, scissors
-        parts = []
+        parts.clear()
         a = m.u(8, 25)
-        arm = tube(
-            [(0.14, -0.6, 0), (0.16, -0.35, 0), (0.0, 0.0, 0), (-0.06, 0.3, 0)],
-            [0.04, 0.04, 0.04, 0.015],
-            10,
-            22,
-            flat=(1, 1),
-        )
+        line = [(0.14, -0.6, 0), (0.16, -0.35, 0), (0.0, 0.0, 0), (-0.06, 0.3, 0)]
+        arm = tube(line, [0.04, 0.04, 0.04, 0.015], 10, 22, flat=(1, 1))
         bow = (
             ring(m.u(0.08, 0.13), 0.028, 28, 10)
             .rotate([90, 0, 0])
@@ -178,22 +139,13 @@ def tool(m: Maker) -> list[Manifold]:
             one += [m.stamp(bow, grip)] if loop else []
             whole = joined(one).rotate([0, 0, a])
             parts.append((whole if side > 0 else whole.mirror([1, 0, 0])).translate([0, 0, z]))
-        parts.append(m.stamp(rod(0.05, 0.12, 20).rotate([90, 0, 0]).translate([0, 0, -0.06]), head))
+        parts.add(rod(0.05, 0.12, 20), turn=(90, 0, 0), at=(0, 0, -0.06), look=head)
     else:  # a rake, a fork
         count, w = m.n(3, 6), m.u(0.15, 0.35)
-        parts.append(m.stamp(box(w, 0.05, 0.04, 0.01).translate([0, top, 0]), head))
+        parts.add(box(w, 0.05, 0.04, 0.01), at=(0, top, 0), look=head)
         for x in np.linspace(-w / 2 + 0.02, w / 2 - 0.02, count):
-            parts.append(
-                m.stamp(
-                    tube(
-                        [(x, top, 0), (x, top + 0.15, 0.02), (x, top + m.u(0.22, 0.3), 0.06)],
-                        [0.02, 0.018, 0.008],
-                        8,
-                        10,
-                    ),
-                    head,
-                )
-            )
+            line = [(x, top, 0), (x, top + 0.15, 0.02), (x, top + m.u(0.22, 0.3), 0.06)]
+            parts.add(tube(line, [0.02, 0.018, 0.008], 8, 10), look=head)
     pose = m.n(0, 3)
     whole = joined(parts)
     if pose == 0:
@@ -207,30 +159,23 @@ def tool(m: Maker) -> list[Manifold]:
 
 def device(m: Maker) -> list[Manifold]:
     """A telephone, mouse, camera, loudspeaker, console, remote, clock, toaster, hair dryer."""
-    case, dark, accent = (
-        m.surface("dark", "white", "metal", "any"),
-        m.plain("dark"),
-        m.plain("toy", "metal", "white"),
-    )
+    case, dark = m.surface("dark", "white", "metal", "any"), m.plain("dark")
+    accent = m.plain("toy", "metal", "white")
     kind = m.n(0, 10)
-    parts: list[Manifold] = []
+    parts = Parts(m)
     if kind == 0:  # a telephone, tablet or frame
         w, h, t = m.u(0.4, 0.9), m.u(0.6, 1.1), m.u(0.03, 0.1)
         edge = m.u(0.02, 0.08)
-        parts = [m.stamp(box(w, h, t, m.u(0.1, 0.45) * t), case)]
+        parts.add(box(w, h, t, m.u(0.1, 0.45) * t), look=case)
         pane = box(w - 2 * edge, h - 2 * edge - m.u(0, 0.1), 0.02).translate([0, 0, t / 2])
         picture = m.add(
             Look([plain_material(np.zeros(3))] * 4 + [material(screen(m.rng))] * 2, "fit")
         )
-        parts.append(m.stamp(pane, picture))
+        parts.add(pane, look=picture)
         if m.chance(0.4):
-            parts.append(
-                m.stamp(
-                    rod(0.05, 0.03, 20)
-                    .rotate([90, 0, 0])
-                    .translate([0, -h / 2 + edge / 2 + 0.03, t / 2 - 0.01]),
-                    accent,
-                )
+            part = rod(0.05, 0.03, 20)
+            parts.add(
+                part, turn=(90, 0, 0), at=(0, -h / 2 + edge / 2 + 0.03, t / 2 - 0.01), look=accent
             )
         whole = joined(parts).rotate([m.pick(0, -m.u(10, 35), -80), 0, 0])
         if m.chance(0.4):
@@ -248,10 +193,8 @@ def device(m: Maker) -> list[Manifold]:
             )
         )
         seam = m.stamp(box(0.015, 1, 0.6).translate([0, 0, 0.4]), dark)
-        parts = [
-            m.stamp(body, case) - seam,
-            m.stamp(rod(0.07, 0.06, 20).rotate([0, 0, 90]).translate([0.03, 0.14, 0.27]), accent),
-        ]
+        parts.append(m.stamp(body, case) - seam)
+        parts.add(rod(0.07, 0.06, 20), turn=(0, 0, 90), at=(0.03, 0.14, 0.27), look=accent)
         if m.chance(0.6):
             line = [
                 (0, 0, 0.5),
@@ -259,117 +202,74 @@ def device(m: Maker) -> list[Manifold]:
                 (m.u(-0.4, 0.4), 0, 1.0),
                 (m.u(-0.6, 0.6), 0, 0.7),
             ]
-            parts.append(m.stamp(tube(line, 0.018, 8, 40), dark))
-        return [joined(parts).rotate([0, m.u(90, 270) if m.chance(0.5) else m.u(-90, 90), 0])]
+            parts.add(tube(line, 0.018, 8, 40), look=dark)
+        return parts.turned(0, m.u(90, 270) if m.chance(0.5) else m.u(-90, 90), 0)
     if kind == 2:  # a camera
         w, h, t = m.u(0.6, 0.9), m.u(0.4, 0.6), m.u(0.2, 0.35)
-        parts = [m.stamp(box(w, h, t, 0.05), case)]
+        parts.add(box(w, h, t, 0.05), look=case)
         r, long = m.u(0.14, 0.22), m.u(0.1, 0.5)
-        lens = lathe(
-            [
-                (0, 0),
-                (r, 0),
-                (r, long * 0.6),
-                (r * 1.08, long * 0.65),
-                (r * 1.08, long),
-                (r * 0.9, long),
-                (r * 0.75, long * 0.85),
-                (0, long * 0.85),
-            ],
-            36,
-        )
-        parts.append(
-            m.stamp(lens.rotate([90, 0, 0]).translate([m.u(-0.1, 0.1), -0.02, t / 2 - 0.01]), dark)
-        )
-        parts.append(
-            m.stamp(
-                ball([r * 0.7, r * 0.7, 0.05]).translate([0, -0.02, t / 2 + long * 0.83]), accent
-            )
-        )
-        parts.append(
-            m.stamp(box(w * 0.3, 0.12, t * 0.9, 0.04).translate([0, h / 2 + 0.03, 0]), case)
-        )
+        profile = [
+            (0, 0),
+            (r, 0),
+            (r, long * 0.6),
+            (r * 1.08, long * 0.65),
+            (r * 1.08, long),
+            (r * 0.9, long),
+            (r * 0.75, long * 0.85),
+            (0, long * 0.85),
+        ]
+        lens = lathe(profile, 36)
+        parts.add(lens, turn=(90, 0, 0), at=(m.u(-0.1, 0.1), -0.02, t / 2 - 0.01), look=dark)
+        parts.add(ball([r * 0.7, r * 0.7, 0.05]), at=(0, -0.02, t / 2 + long * 0.83), look=accent)
+        parts.add(box(w * 0.3, 0.12, t * 0.9, 0.04), at=(0, h / 2 + 0.03, 0), look=case)
         for x in (-0.3, 0.3):
-            parts.append(
-                m.stamp(
-                    rod(m.u(0.04, 0.07), 0.06, 20, 0.01).translate([x * w, h / 2 - 0.01, 0]),
-                    m.pick(accent, dark),
-                )
-            )
+            part = rod(m.u(0.04, 0.07), 0.06, 20, 0.01)
+            parts.add(part, at=(x * w, h / 2 - 0.01, 0), look=m.pick(accent, dark))
         if m.chance(0.3):
-            parts.append(
-                m.stamp(
-                    tube(
-                        [
-                            (-w / 2, h * 0.3, 0),
-                            (-w * 0.6, h, -0.1),
-                            (0, h * 1.4, -0.2),
-                            (w * 0.6, h, -0.1),
-                            (w / 2, h * 0.3, 0),
-                        ],
-                        0.02,
-                        8,
-                        32,
-                        flat=(1, 2),
-                    ),
-                    dark,
-                )
-            )
+            path = [
+                (-w / 2, h * 0.3, 0),
+                (-w * 0.6, h, -0.1),
+                (0, h * 1.4, -0.2),
+                (w * 0.6, h, -0.1),
+                (w / 2, h * 0.3, 0),
+            ]
+            parts.add(tube(path, 0.02, 8, 32, flat=(1, 2)), look=dark)
     elif kind == 3:  # a loudspeaker or radio
         w, h, t = m.u(0.4, 1.2), m.u(0.4, 1.1), m.u(0.25, 0.5)
-        parts = [m.stamp(box(w, h, t, m.u(0.01, 0.12)), m.pick(case, m.wood()))]
+        parts.add(box(w, h, t, m.u(0.01, 0.12)), look=m.pick(case, m.wood()))
         rows = (
             [(0.0, -0.2 * h, 0.38 * min(w, h)), (0.0, 0.28 * h, 0.18 * min(w, h))]
             if h > w
             else [(-0.27 * w, 0, 0.2 * min(w, h) + 0.06), (0.27 * w, 0, 0.2 * min(w, h) + 0.06)]
         )
         for x, y, r in rows:
-            cone = lathe(
-                [
-                    (0, 0),
-                    (r, 0),
-                    (r, 0.05),
-                    (r * 0.85, 0.05),
-                    (r * 0.4, 0.015),
-                    (r * 0.3, 0.035),
-                    (0, 0.045),
-                ],
-                32,
-            )
-            parts.append(
-                m.stamp(
-                    cone.rotate([90, 0, 0]).translate([x, y, t / 2 - 0.01]), m.pick(dark, accent)
-                )
-            )
+            profile = [
+                (0, 0),
+                (r, 0),
+                (r, 0.05),
+                (r * 0.85, 0.05),
+                (r * 0.4, 0.015),
+                (r * 0.3, 0.035),
+                (0, 0.045),
+            ]
+            cone = lathe(profile, 32)
+            parts.add(cone, turn=(90, 0, 0), at=(x, y, t / 2 - 0.01), look=m.pick(dark, accent))
         if m.chance(0.4):
-            parts.append(
-                m.stamp(
-                    tube(
-                        [
-                            (w * 0.4, h / 2, 0),
-                            (w * 0.45, h / 2 + 0.4, 0),
-                            (w * 0.6, h / 2 + 0.9, -0.1),
-                        ],
-                        0.015,
-                        8,
-                        14,
-                    ),
-                    accent,
-                )
-            )
+            path = [(w * 0.4, h / 2, 0), (w * 0.45, h / 2 + 0.4, 0), (w * 0.6, h / 2 + 0.9, -0.1)]
+            parts.add(tube(path, 0.015, 8, 14), look=accent)
     elif kind == 4:  # a remote, a handset
         w, h, t = m.u(0.2, 0.4), m.u(0.7, 1.1), m.u(0.07, 0.15)
-        parts = [m.stamp(bend(box(w, h, t, 0.4 * t).refine_to_length(0.1), m.u(-0.3, 0.3)), case)]
+        parts.add(bend(box(w, h, t, 0.4 * t).refine_to_length(0.1), m.u(-0.3, 0.3)), look=case)
         columns, rows = m.n(2, 3), m.n(4, 8)
         for i, j in np.ndindex(columns, rows):
             x, y = (i - (columns - 1) / 2) * w * 0.7 / columns, (j / rows - 0.45) * h * 0.7
             key = ball([w * 0.09, w * 0.09, 0.04], 12) if rows % 2 else box(w * 0.2, w * 0.12, 0.05)
-            parts.append(m.stamp(key.translate([x, y, t / 2]), accent if j == rows - 1 else dark))
+            parts.add(key, at=(x, y, t / 2), look=accent if j == rows - 1 else dark)
         whole = joined(parts)
         return [whole.rotate([m.pick(0, -60, -85), 0, 0]).rotate([0, m.u(-60, 60), 0])]
     elif kind == 5:  # a keyboard or a piano
         w, d, t = m.u(0.8, 1.4), m.u(0.3, 0.5), m.u(0.05, 0.12)
-        parts = [m.stamp(box(w, t, d, 0.3 * t), case)]
+        parts.add(box(w, t, d, 0.3 * t), look=case)
         rows, columns = m.pick(1, 3, 4), m.n(8, 14)
         keys = [
             box(w * 0.85 / columns, 0.06, d * 0.8 / rows * 0.85).translate(
@@ -381,84 +281,60 @@ def device(m: Maker) -> list[Manifold]:
             )
             for i, j in np.ndindex(columns, rows)
         ]
-        parts.append(m.stamp(Manifold.compose(keys), m.pick(dark, accent, m.plain("white"))))
-        return [joined(parts).rotate([m.u(0, 25), m.u(-40, 40), 0])]
+        parts.add(Manifold.compose(keys), look=m.pick(dark, accent, m.plain("white")))
+        return parts.turned(m.u(0, 25), m.u(-40, 40), 0)
     elif kind == 6:  # a game controller
         blend = Blend(0.12)
         blend.limb([(0, 0, 0), (0.3, 0.02, 0)], [0.16, 0.17], 0)
         blend.limb([(0.3, 0.02, 0), (0.45, -0.1, m.u(0.2, 0.45))], [0.16, 0.11], 0)
         body = m.blended(blend, (case,)).scale([1, 0.7, 1])
-        parts = [body]
+        parts.append(body)
         stick = joined([rod(0.03, 0.16, 12), ball([0.07, 0.03, 0.07], 20).translate([0, 0.17, 0])])
-        parts.append(both(m.stamp(stick.translate([0.16, 0.05, 0.05]), dark)))
+        parts.pair(stick, at=(0.16, 0.05, 0.05), look=dark)
         for a in range(4):
-            parts.append(
-                m.stamp(
-                    ball([0.03, 0.03, 0.03], 12).translate(
-                        [0.34 + 0.06 * math.sin(a * 1.57), 0.12, -0.02 + 0.06 * math.cos(a * 1.57)]
-                    ),
-                    m.plain("toy"),
-                )
+            parts.add(
+                ball([0.03, 0.03, 0.03], 12),
+                at=(0.34 + 0.06 * math.sin(a * 1.57), 0.12, -0.02 + 0.06 * math.cos(a * 1.57)),
+                look=m.plain("toy"),
             )
-        parts.append(
-            m.stamp(
-                box(0.15, 0.03, 0.05).translate([-0.34, 0.12, 0])
-                + box(0.05, 0.03, 0.15).translate([-0.34, 0.12, 0]),
-                dark,
-            )
+        part = box(0.15, 0.03, 0.05).translate([-0.34, 0.12, 0]) + box(0.05, 0.03, 0.15).translate(
+            [-0.34, 0.12, 0]
         )
-        return [joined(parts).rotate([m.u(20, 80), m.u(-30, 30), 0])]
+        parts.add(part, look=dark)
+        return parts.turned(m.u(20, 80), m.u(-30, 30), 0)
     elif kind == 7:  # a toaster, iron or coffee machine
         w, h, t = m.u(0.5, 0.9), m.u(0.4, 1.0), m.u(0.35, 0.6)
         body = superquadric([w / 2, h / 2, t / 2], m.u(0.15, 0.5), m.u(0.15, 0.5), 40)
         if h > 0.7:  # a niche for the jug
             niche = m.stamp(box(w * 0.7, h * 0.5, t).translate([0, -h * 0.05, t * 0.3]), dark)
-            parts = [
-                m.stamp(body, m.pick(case, m.metal())) - niche,
-                m.stamp(
-                    _jug(m, 0.2 * w, 0.4 * h).translate([0, -h * 0.29, t * 0.25]),
-                    m.plain("dark", "metal", "pastel"),
-                ),
-            ]
+            parts.append(m.stamp(body, m.pick(case, m.metal())) - niche)
+            part = _jug(m, 0.2 * w, 0.4 * h)
+            parts.add(part, at=(0, -h * 0.29, t * 0.25), look=m.plain("dark", "metal", "pastel"))
         else:
             slots = joined([box(w * 0.7, 0.3, 0.06).translate([0, h / 2, z]) for z in (-0.1, 0.1)])
-            parts = [m.stamp(body, m.pick(case, m.metal())) - m.stamp(slots, dark)]
-        parts.append(m.stamp(box(0.08, 0.04, 0.06, 0.01).translate([w / 2, 0.1, 0]), dark))
+            parts.append(m.stamp(body, m.pick(case, m.metal())) - m.stamp(slots, dark))
+        parts.add(box(0.08, 0.04, 0.06, 0.01), at=(w / 2, 0.1, 0), look=dark)
         for x in np.linspace(-0.2, 0.2, m.n(1, 4)):
-            parts.append(
-                m.stamp(
-                    rod(0.04, 0.05, 18, 0.01)
-                    .rotate([90, 0, 0])
-                    .translate([x * w, -h * 0.38, t / 2 - 0.02]),
-                    accent,
-                )
-            )
+            part = rod(0.04, 0.05, 18, 0.01)
+            parts.add(part, turn=(90, 0, 0), at=(x * w, -h * 0.38, t / 2 - 0.02), look=accent)
     elif kind == 8:  # a hair dryer, drill, water pistol
         long, r = m.u(0.5, 0.9), m.u(0.12, 0.2)
-        barrel = tube(
-            [(0, 0, -long / 2), (0, 0.01, 0), (0, 0, long / 2)],
-            [r, r * m.u(0.9, 1.2), r * m.u(0.4, 0.9)],
-            20,
-            24,
-        )
-        grip = tube(
-            [(0, 0, -0.05), (0, -0.3, -0.08), (0, -m.u(0.45, 0.65), -m.u(0.05, 0.2))],
-            [0.08, 0.075, 0.09],
-            14,
-            18,
-            flat=(1, 1.2),
-        )
-        parts = [m.stamp(barrel, case), m.stamp(grip, m.pick(case, dark))]
-        parts.append(m.stamp(box(0.05, 0.1, 0.06, 0.015).translate([0, -0.17, 0.04]), accent))
+        path = [(0, 0, -long / 2), (0, 0.01, 0), (0, 0, long / 2)]
+        barrel = tube(path, [r, r * m.u(0.9, 1.2), r * m.u(0.4, 0.9)], 20, 24)
+        path = [(0, 0, -0.05), (0, -0.3, -0.08), (0, -m.u(0.45, 0.65), -m.u(0.05, 0.2))]
+        grip = tube(path, [0.08, 0.075, 0.09], 14, 18, flat=(1, 1.2))
+        parts.add(barrel, look=case)
+        parts.add(grip, look=m.pick(case, dark))
+        parts.add(box(0.05, 0.1, 0.06, 0.015), at=(0, -0.17, 0.04), look=accent)
         nozzle = (
             rod(r * m.u(0.2, 0.7), m.u(0.05, 0.35), 20)
             .rotate([90, 0, 0])
             .translate([0, 0, long / 2])
         )
-        parts.append(m.stamp(nozzle, m.pick(dark, accent)))
+        parts.add(nozzle, look=m.pick(dark, accent))
         if m.chance(0.5):
-            parts.append(m.stamp(box(0.22, 0.14, 0.25, 0.03).translate([0, -0.6, -0.1]), dark))
-        return [joined(parts).rotate([0, m.pick(90, -90, m.u(-180, 180)), 0])]
+            parts.add(box(0.22, 0.14, 0.25, 0.03), at=(0, -0.6, -0.1), look=dark)
+        return parts.turned(0, m.pick(90, -90, m.u(-180, 180)), 0)
     elif kind == 9:  # a clock, or a scale
         r, t = m.u(0.4, 0.55), m.u(0.08, 0.25)
         face = m.add(
@@ -476,79 +352,42 @@ def device(m: Maker) -> list[Manifold]:
             )
         )
         form = ring_of(m.pick(2, 2, 5), 48)
-        parts = [
-            m.stamp(
-                slab(form * r, t, 0.03) - slab(form * r * 0.88, t).translate([0, 0, t * 0.8]), case
-            )
-        ]
-        parts.append(m.stamp(slab(form * r * 0.87, 0.02).translate([0, 0, t * 0.3]), face))
+        part = slab(form * r, t, 0.03) - slab(form * r * 0.88, t).translate([0, 0, t * 0.8])
+        parts.add(part, look=case)
+        parts.add(slab(form * r * 0.87, 0.02), at=(0, 0, t * 0.3), look=face)
         for a, long in ((m.u(0, 360), 0.6), (m.u(0, 360), 0.4)):
-            parts.append(
-                m.stamp(
-                    box(0.02, long * r, 0.02)
-                    .translate([0, long * r / 2, t * 0.33])
-                    .rotate([0, 0, a]),
-                    dark,
-                )
-            )
+            part = box(0.02, long * r, 0.02).translate([0, long * r / 2, t * 0.33])
+            parts.add(part, turn=(0, 0, a), look=dark)
         if m.chance(0.4):
-            parts.append(
-                both(m.stamp(ball([0.12, 0.1, 0.08]).translate([0.25, r + 0.02, 0]), accent))
-            )
-            parts.append(
-                both(
-                    m.stamp(
-                        rod(0.03, 0.2, 12).rotate([0, 0, 20]).translate([0.25, -r - 0.1, 0]), accent
-                    )
-                )
-            )
-        return [joined(parts).rotate([m.pick(0, -20, -85), m.u(-30, 30), 0])]
+            parts.pair(ball([0.12, 0.1, 0.08]), at=(0.25, r + 0.02, 0), look=accent)
+            parts.pair(rod(0.03, 0.2, 12), turn=(0, 0, 20), at=(0.25, -r - 0.1, 0), look=accent)
+        return parts.turned(m.pick(0, -20, -85), m.u(-30, 30), 0)
     else:  # a router, hub, plug: a slab with aerials and cables
         w, t, d = m.u(0.5, 0.9), m.u(0.08, 0.2), m.u(0.3, 0.6)
-        parts = [
-            m.stamp(
-                slab(outline(m) * [w / 1.2, d / 1.2], t, 0.3 * t).rotate([90, 0, 0])
-                if m.chance(0.3)
-                else box(w, t, d, 0.3 * t),
-                case,
-            )
-        ]
+        parts.add(
+            slab(outline(m) * [w / 1.2, d / 1.2], t, 0.3 * t).rotate([90, 0, 0])
+            if m.chance(0.3)
+            else box(w, t, d, 0.3 * t),
+            look=case,
+        )
         for x in np.linspace(-0.4, 0.4, m.n(1, 4)):
-            parts.append(
-                m.stamp(
-                    tube(
-                        [
-                            (x * w, 0, -d * 0.4),
-                            (x * w, 0.3, -d * 0.45),
-                            (x * w * m.u(0.8, 1.4), m.u(0.4, 0.7), -d * 0.5),
-                        ],
-                        [0.03, 0.025, 0.02],
-                        10,
-                        14,
-                    ),
-                    dark,
-                )
-            )
+            path = [
+                (x * w, 0, -d * 0.4),
+                (x * w, 0.3, -d * 0.45),
+                (x * w * m.u(0.8, 1.4), m.u(0.4, 0.7), -d * 0.5),
+            ]
+            parts.add(tube(path, [0.03, 0.025, 0.02], 10, 14), look=dark)
         if m.chance(0.5):
-            parts.append(
-                m.stamp(
-                    tube(
-                        [
-                            (0, 0, -d * 0.45),
-                            (0.2, 0, -d),
-                            (m.u(-0.8, 0.8), 0, -d * 0.9),
-                            (m.u(-0.6, 0.9), 0, 0.2),
-                        ],
-                        0.02,
-                        8,
-                        44,
-                    ),
-                    dark,
-                )
-            )
+            path = [
+                (0, 0, -d * 0.45),
+                (0.2, 0, -d),
+                (m.u(-0.8, 0.8), 0, -d * 0.9),
+                (m.u(-0.6, 0.9), 0, 0.2),
+            ]
+            parts.add(tube(path, 0.02, 8, 44), look=dark)
         for x in np.linspace(-0.3, 0.3, m.n(2, 5)):
-            parts.append(m.stamp(ball(0.02, 10).translate([x * w, t * 0.1, d / 2]), accent))
-    return [joined(parts).rotate([0, m.pick(0, m.u(-45, 45)), 0])]
+            parts.add(ball(0.02, 10), at=(x * w, t * 0.1, d / 2), look=accent)
+    return parts.turned(0, m.pick(0, m.u(-45, 45)), 0)
 
 
 def _jug(m: Maker, r: float, h: float) -> Manifold:
@@ -560,7 +399,7 @@ def instrument(m: Maker) -> list[Manifold]:
     """A guitar, a trumpet, a racket, a bat, a chess piece, a cup, a statuette on its base."""
     a, b, dark = m.pick(m.wood(), m.surface()), m.surface("wood", "dark", "metal"), m.plain("dark")
     kind = m.n(0, 4)
-    parts: list[Manifold] = []
+    parts = Parts(m)
     if kind == 0:
         t = np.arange(60) * (2 * math.pi / 60)
         r = (
@@ -571,74 +410,52 @@ def instrument(m: Maker) -> list[Manifold]:
         )
         form = np.stack([r * np.cos(t) * 0.9, r * np.sin(t) * 1.25], -1)
         thick = m.u(0.05, 0.16)
-        parts = [
-            m.stamp(
-                slab(form, thick, 0.02)
-                - rod(0.1, 1, 28).rotate([90, 0, 0]).translate([0, 0.05, thick / 2 - 0.03]),
-                a,
-            )
-        ]
-        parts.append(m.stamp(box(0.08, 0.8, 0.05, 0.01).translate([0, 0.7, thick / 2]), b))
-        parts.append(m.stamp(box(0.14, 0.2, 0.04, 0.01).translate([0, 1.17, thick / 2 - 0.01]), b))
-        parts.append(m.stamp(box(0.2, 0.04, 0.04).translate([0, -0.22, thick / 2 + 0.01]), dark))
+        part = slab(form, thick, 0.02) - rod(0.1, 1, 28).rotate([90, 0, 0]).translate(
+            [0, 0.05, thick / 2 - 0.03]
+        )
+        parts.add(part, look=a)
+        parts.add(box(0.08, 0.8, 0.05, 0.01), at=(0, 0.7, thick / 2), look=b)
+        parts.add(box(0.14, 0.2, 0.04, 0.01), at=(0, 1.17, thick / 2 - 0.01), look=b)
+        parts.add(box(0.2, 0.04, 0.04), at=(0, -0.22, thick / 2 + 0.01), look=dark)
         pegs = [
             rod(0.015, 0.26, 8)
             .rotate([0, 0, 90])
             .translate([0.13, 1.1 + 0.06 * i, thick / 2 - 0.01])
             for i in range(3)
         ]
-        parts.append(m.stamp(joined(pegs), m.metal()))
-        return [joined(parts).rotate([m.u(-20, 0), m.u(-50, 50), m.pick(0, m.u(-80, 80))])]
+        parts.add(joined(pegs), look=m.metal())
+        return parts.turned(m.u(-20, 0), m.u(-50, 50), m.pick(0, m.u(-80, 80)))
     if kind == 1:
-        flare = lathe(
-            [
-                (0, 0),
-                *[(0.03 + 0.25 * s**4, s * 0.9) for s in np.linspace(0, 1, 12)],
-                *[(0.015 + 0.25 * s**4, s * 0.9 + 0.015) for s in np.linspace(1, 0.5, 6)],
-                (0, 0.4),
-            ],
-            32,
-        )
-        parts = [m.stamp(flare.rotate([0, 0, -90]), m.pick(m.metal(), m.surface("toy")))]
-        parts.append(
-            m.stamp(
-                tube(
-                    [
-                        (0.1, 0, 0),
-                        (-0.1, -0.08, 0),
-                        (0.1, -0.2, 0),
-                        (0.5, -0.2, 0),
-                        (0.6, -0.08, 0),
-                        (0.5, 0, 0),
-                    ],
-                    0.028,
-                    10,
-                    44,
-                ),
-                m.metal(),
-            )
-        )
-        parts.append(
-            m.stamp(
-                joined([rod(0.03, 0.25, 14).translate([x, -0.22, 0]) for x in (0.2, 0.3, 0.4)]), b
-            )
-        )
-        return [joined(parts).rotate([0, m.u(-60, 60), m.u(-20, 20)])]
+        side_line = [
+            (0, 0),
+            *[(0.03 + 0.25 * s**4, s * 0.9) for s in np.linspace(0, 1, 12)],
+            *[(0.015 + 0.25 * s**4, s * 0.9 + 0.015) for s in np.linspace(1, 0.5, 6)],
+            (0, 0.4),
+        ]
+        flare = lathe(side_line, 32)
+        parts.add(flare, turn=(0, 0, -90), look=m.pick(m.metal(), m.surface("toy")))
+        line = [
+            (0.1, 0, 0),
+            (-0.1, -0.08, 0),
+            (0.1, -0.2, 0),
+            (0.5, -0.2, 0),
+            (0.6, -0.08, 0),
+            (0.5, 0, 0),
+        ]
+        parts.add(tube(line, 0.028, 10, 44), look=m.metal())
+        part = joined([rod(0.03, 0.25, 14).translate([x, -0.22, 0]) for x in (0.2, 0.3, 0.4)])
+        parts.add(part, look=b)
+        return parts.turned(0, m.u(-60, 60), m.u(-20, 20))
     if kind == 2:
         grip = tube([(0, -0.6, 0), (0, -0.3, 0), (0, 0.0, 0)], [0.05, 0.04, 0.035], 14, 14)
-        parts = [m.stamp(grip, b)]
+        parts.add(grip, look=b)
         if m.chance(0.5):  # a racket with its strings, or a paddle
             wide, tall = m.u(0.22, 0.3), m.u(0.28, 0.4)
-            rim = tube(
-                [
-                    (wide * math.sin(t), tall * (1 - math.cos(t)), 0)
-                    for t in np.linspace(0, 2 * math.pi, 13)[:-1]
-                ],
-                0.028,
-                10,
-                40,
-                True,
-            )
+            line = [
+                (wide * math.sin(t), tall * (1 - math.cos(t)), 0)
+                for t in np.linspace(0, 2 * math.pi, 13)[:-1]
+            ]
+            rim = tube(line, 0.028, 10, 40, True)
             strings = [
                 box(0.012, 2 * tall, 0.012).translate([x, tall, 0])
                 for x in np.linspace(-wide, wide, 9)[1:-1]
@@ -648,47 +465,37 @@ def instrument(m: Maker) -> list[Manifold]:
                 for y in np.linspace(0, 2 * tall, 11)[1:-1]
             ]
             net = joined(strings) ^ (ball([wide, tall, 1]).translate([0, tall, 0]))
-            parts += [m.stamp(rim, a), m.stamp(net, m.plain("white", "toy"))]
+            parts.add(rim, look=a)
+            parts.add(net, look=m.plain("white", "toy"))
         elif m.chance(0.5):
-            parts.append(
-                m.stamp(slab(ring_of(2.2, 36) * [0.26, 0.3], 0.05, 0.01).translate([0, 0.26, 0]), a)
-            )
+            parts.add(slab(ring_of(2.2, 36) * [0.26, 0.3], 0.05, 0.01), at=(0, 0.26, 0), look=a)
         else:
-            parts.append(
-                m.stamp(tube([(0, 0, 0), (0, 0.3, 0), (0, 0.8, 0)], [0.04, 0.07, 0.085], 18, 20), a)
-            )
-        return [joined(parts).rotate([m.pick(0, -70), m.u(-40, 40), m.pick(0, m.u(-80, 80))])]
+            part = tube([(0, 0, 0), (0, 0.3, 0), (0, 0.8, 0)], [0.04, 0.07, 0.085], 18, 20)
+            parts.add(part, look=a)
+        return parts.turned(m.pick(0, -70), m.u(-40, 40), m.pick(0, m.u(-80, 80)))
     if kind == 3:  # a turned piece: chess, a candlestick, a cup
         count = m.n(5, 9)
         r = np.abs(m.rng.normal(0.14, 0.09, count)) + 0.03
         r[0] = m.u(0.2, 0.32)
         profile = spline(np.stack([r, np.linspace(0.05, 1, count)], 1), 40)
-        body = lathe(
-            [(0, 0), (r[0] * 1.05, 0), *np.maximum(profile, [0.03, 0]).tolist(), (0, 1.02)], 32
-        )
-        parts = [m.stamp(body, a)]
+        side_line = [(0, 0), (r[0] * 1.05, 0), *np.maximum(profile, [0.03, 0]).tolist(), (0, 1.02)]
+        body = lathe(side_line, 32)
+        parts.add(body, look=a)
         top = m.pick(
             ball(m.u(0.06, 0.14)),
             box(0.08, 0.2, 0.06) + box(0.18, 0.07, 0.06),
             lathe([(0, 0), (0.08, 0), (0.17, 0.15), (0.12, 0.16), (0.08, 0.1), (0, 0.08)], 24),
         )
-        parts.append(m.stamp(top.translate([0, 1.04, 0]), m.pick(a, b)))
+        parts.add(top, at=(0, 1.04, 0), look=m.pick(a, b))
         if m.chance(0.35):
-            parts.append(
-                both(
-                    m.stamp(
-                        handle(m, 0.2, 0.3, 0.025).translate(
-                            [float(np.interp(0.7, profile[:, 1], profile[:, 0])) - 0.03, 0.7, 0]
-                        ),
-                        m.pick(a, b),
-                    )
-                )
+            parts.pair(
+                handle(m, 0.2, 0.3, 0.025),
+                at=(float(np.interp(0.7, profile[:, 1], profile[:, 0])) - 0.03, 0.7, 0),
+                look=m.pick(a, b),
             )
         return parts
-    base, h = (
-        m.pick(box(0.6, 0.2, 0.5, 0.01), rod(0.32, 0.2, 36, 0.02).translate([0, -0.1, 0])),
-        0.1,
-    )
+    base = m.pick(box(0.6, 0.2, 0.5, 0.01), rod(0.32, 0.2, 36, 0.02).translate([0, -0.1, 0]))
+    h = 0.1
     thing = shape(m, True)
     low, high = extent(thing)
     thing = thing.scale([0.8 / float((high - low).max())] * 3)

@@ -8,7 +8,7 @@ import numpy as np
 from manifold3d import CrossSection, FillRule, Manifold
 
 from .details import produce
-from .looks import Maker
+from .looks import Maker, Parts
 from .solids import (
     ball,
     both,
@@ -29,40 +29,34 @@ from .solids import (
 def lamp(m: Maker) -> list[Manifold]:
     """A lamp, a lantern or a candlestick on a stand."""
     height, foot = m.u(0.4, 1.4), m.u(0.12, 0.3)
-    metal, shade = (
-        m.pick(m.metal(), m.wood(), m.surface()),
-        m.pick(m.plain("white", "pastel", "any"), m.cloth()),
-    )
+    metal = m.pick(m.metal(), m.wood(), m.surface())
+    shade = m.pick(m.plain("white", "pastel", "any"), m.cloth())
     bulge = np.abs(m.rng.normal(0, 0.08, 8)) * (m.rng.random() < 0.6) + m.u(0.015, 0.05)
     heights = np.linspace(0.05, height, 8)
     line = spline(np.stack([bulge, heights], 1), 24)
-    stand = lathe(
-        [(0, 0), (foot, 0), (foot, 0.03), *np.maximum(line, [0.01, 0]).tolist(), (0, height)], 28
-    )
+    profile = [(0, 0), (foot, 0), (foot, 0.03), *np.maximum(line, [0.01, 0]).tolist(), (0, height)]
+    stand = lathe(profile, 28)
     low, high, tall = m.u(0.15, 0.4), m.u(0.06, 0.35), m.u(0.15, 0.5)
     sides = m.pick(36, 36, 4, 6)
-    bell = lathe(
-        [
-            (0, tall - 0.03),
-            (high - 0.02, tall - 0.03),
-            (low - 0.02, 0),
-            (low, 0),
-            (high, tall),
-            (0, tall),
-        ],
-        sides,
-    )
+    profile = [
+        (0, tall - 0.03),
+        (high - 0.02, tall - 0.03),
+        (low - 0.02, 0),
+        (low, 0),
+        (high, tall),
+        (0, tall),
+    ]
+    bell = lathe(profile, sides)
     if m.chance(0.2):
         bell = ball([low, low * m.u(0.8, 1.2), low])
     tilt = [m.pick(0, 0, 0, m.u(20, 80)), 0, 0]
-    parts = [
-        m.stamp(stand, metal),
-        m.stamp(bell.rotate(tilt).translate([0, height - tall * 0.3, 0]), shade),
-    ]
+    parts = Parts(m)
+    parts.add(stand, look=metal)
+    parts.add(bell.rotate(tilt), at=(0, height - tall * 0.3, 0), look=shade)
     if m.chance(0.2):
         for a in range(m.n(2, 4)):
             rail = tube([(low, height + 0.3, 0), (low, 0.1, 0), (low * 0.9, 0.0, 0)], 0.015, 8, 12)
-            parts.append(m.stamp(rail.rotate([0, 90 * a, 0]), metal))
+            parts.add(rail, turn=(0, 90 * a, 0), look=metal)
     return parts
 
 
@@ -74,13 +68,13 @@ def furniture(m: Maker) -> list[Manifold]:
     )
     w, d, h = m.u(0.5, 1.4), m.u(0.35, 0.9), m.u(0.2, 0.8)
     kind = m.n(0, 5)
-    parts: list[Manifold] = []
+    parts = Parts(m)
     soft = m.pick(0.0, m.u(0.01, 0.05))
 
     def block(look: int, size: tuple, at: tuple, radius: float | None = None) -> None:
         w, h, d = size
         solid = box(w, h, d, soft if radius is None else radius)
-        parts.append(m.stamp(solid.translate(list(at)), look))
+        parts.add(solid, at=list(at), look=look)
 
     def legs(wide: float, deep: float, high: float) -> None:
         r = m.u(0.02, 0.05)
@@ -102,23 +96,17 @@ def furniture(m: Maker) -> list[Manifold]:
     if kind == 0:
         thick = m.u(0.02, 0.08)
         if m.chance(0.35):
-            parts.append(m.stamp(rod(w / 2, thick, 40, 0.3 * thick).translate([0, h, 0]), main))
-            parts.append(
-                m.stamp(
-                    lathe(
-                        [
-                            (0, 0),
-                            (w * 0.3, 0),
-                            (w * 0.28, 0.03),
-                            (0.04, 0.08),
-                            (m.u(0.03, 0.08), h * 0.6),
-                            (0.05, h + 0.01),
-                            (0, h + 0.01),
-                        ]
-                    ),
-                    second,
-                )
-            )
+            parts.add(rod(w / 2, thick, 40, 0.3 * thick), at=(0, h, 0), look=main)
+            profile = [
+                (0, 0),
+                (w * 0.3, 0),
+                (w * 0.28, 0.03),
+                (0.04, 0.08),
+                (m.u(0.03, 0.08), h * 0.6),
+                (0.05, h + 0.01),
+                (0, h + 0.01),
+            ]
+            parts.add(lathe(profile), look=second)
         else:
             block(main, (w, thick, d), (0, h + thick / 2, 0))
             legs(w, d, h)
@@ -132,9 +120,7 @@ def furniture(m: Maker) -> list[Manifold]:
         legs(w, d, h * 0.6)
         if m.chance(0.6):
             rest = box(w, back, deep, m.pick(soft, 0.4 * deep)).rotate([-m.u(0, 15), 0, 0])
-            parts.append(
-                m.stamp(rest.translate([0, seat + back / 2 - 0.02, -d / 2 + deep / 2]), main)
-            )
+            parts.add(rest, at=(0, seat + back / 2 - 0.02, -d / 2 + deep / 2), look=main)
         else:
             for x in np.linspace(-w / 2 + 0.03, w / 2 - 0.03, m.n(3, 6)):
                 block(second, (0.035, back, 0.035), (float(x), seat + back / 2, -d / 2 + 0.03), 0.0)
@@ -175,7 +161,7 @@ def furniture(m: Maker) -> list[Manifold]:
                 if m.chance(0.5)
                 else box(0.25 * wide, 0.02, 0.03).translate([x, y, d / 2 + 0.025])
             )
-            parts.append(m.stamp(knob, second))
+            parts.add(knob, look=second)
         if foot > 0.05:
             legs(w, d, foot)
     elif kind == 4:
@@ -183,14 +169,8 @@ def furniture(m: Maker) -> list[Manifold]:
         block(main, (w, h, d), (0, h / 2, 0))
         block(m.cloth("white", "pastel"), (0.96 * w, 0.2, 0.96 * d), (0, h + 0.07, 0), 0.06)
         block(main, (w, h + head, 0.06), (0, (h + head) / 2, -d / 2))
-        parts.append(
-            m.stamp(
-                superquadric([0.25 * w, 0.07, 0.15], 0.7, 0.5).translate(
-                    [0.22 * w, h + 0.2, -d / 2 + 0.25]
-                ),
-                third,
-            )
-        )
+        part = superquadric([0.25 * w, 0.07, 0.15], 0.7, 0.5)
+        parts.add(part, at=(0.22 * w, h + 0.2, -d / 2 + 0.25), look=third)
         block(m.cloth(), (0.99 * w, 0.1, 0.6 * d), (0, h + 0.14, 0.2 * d), 0.04)
     else:
         w, h, d = m.u(0.8, 1.6), m.u(0.25, 0.4), m.u(0.5, 0.7)
@@ -218,16 +198,12 @@ def furniture(m: Maker) -> list[Manifold]:
                 puff,
             )
         if m.chance(0.4):
-            parts.append(
-                m.stamp(
-                    superquadric([0.16, 0.16, 0.06], 0.5, 0.8)
-                    .rotate([-20, 0, m.u(-20, 20)])
-                    .translate([m.u(-0.3, 0.3), h + 0.25, 0.05]),
-                    third,
-                )
+            part = superquadric([0.16, 0.16, 0.06], 0.5, 0.8)
+            parts.add(
+                part, turn=(-20, 0, m.u(-20, 20)), at=(m.u(-0.3, 0.3), h + 0.25, 0.05), look=third
             )
     if m.chance(0.3):
-        return [joined(parts).rotate([0, m.u(-60, 60), 0])]
+        return parts.turned(0, m.u(-60, 60), 0)
     return parts
 
 
@@ -235,7 +211,7 @@ def rack(m: Maker) -> list[Manifold]:
     """Wires and slats: a basket, a rack, a cage, a crate, a stand, a hanger."""
     look, second = m.pick(m.metal(), m.plain("white", "dark", "toy"), m.wood()), m.surface()
     w, h, d, r = m.u(0.5, 1.0), m.u(0.2, 0.7), m.u(0.3, 0.7), m.u(0.01, 0.022)
-    parts: list[Manifold] = []
+    solids, parts = Parts(m), []
     kind = m.n(0, 3)
     flare = m.u(0.6, 1.0)
 
@@ -250,74 +226,48 @@ def rack(m: Maker) -> list[Manifold]:
         slat = m.pick(1.0, 1.0, m.u(1.5, 3))
         for x in np.linspace(-w / 2, w / 2, m.n(4, 7)) * 0.92:
             for z in (-d / 2, d / 2):
-                parts.append(
-                    tube(
-                        [
-                            (x * flare, 0, z * flare),
-                            (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
-                            (x, h, z),
-                        ],
-                        r,
-                        6,
-                        3,
-                        flat=(1, 1),
-                        round_ends=False,
-                    )
-                )
-            parts.append(
-                tube(
-                    [
-                        (x * flare, 0, -d / 2 * flare),
-                        (x * flare, 0, 0),
-                        (x * flare, 0, d / 2 * flare),
-                    ],
-                    r * slat,
-                    6,
-                    3,
-                    round_ends=False,
-                )
-            )
+                line = [
+                    (x * flare, 0, z * flare),
+                    (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
+                    (x, h, z),
+                ]
+                parts.append(tube(line, r, 6, 3, flat=(1, 1), round_ends=False))
+            line = [
+                (x * flare, 0, -d / 2 * flare),
+                (x * flare, 0, 0),
+                (x * flare, 0, d / 2 * flare),
+            ]
+            parts.append(tube(line, r * slat, 6, 3, round_ends=False))
         for z in np.linspace(-d / 2, d / 2, m.n(3, 5)) * 0.92:
             for x in (-w / 2, w / 2):
-                parts.append(
-                    tube(
-                        [
-                            (x * flare, 0, z * flare),
-                            (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
-                            (x, h, z),
-                        ],
-                        r,
-                        6,
-                        3,
-                        round_ends=False,
-                    )
-                )
-        solids = [m.stamp(joined(parts), look)]
+                line = [
+                    (x * flare, 0, z * flare),
+                    (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
+                    (x, h, z),
+                ]
+                parts.append(tube(line, r, 6, 3, round_ends=False))
+        solids.add(joined(parts), look=look)
         if m.chance(0.4):
-            solids.append(m.stamp(hoop(1.01, h, r * 2), second))
+            solids.add(hoop(1.01, h, r * 2), look=second)
         if m.chance(0.4):
-            bow = tube(
-                [
-                    (-w / 2, h, 0),
-                    (-w * 0.4, h + 0.35, 0),
-                    (0, h + 0.5, 0),
-                    (w * 0.4, h + 0.35, 0),
-                    (w / 2, h, 0),
-                ],
-                r * 1.5,
-                8,
-                28,
-            )
-            solids.append(m.stamp(bow, m.pick(look, second)))
+            line = [
+                (-w / 2, h, 0),
+                (-w * 0.4, h + 0.35, 0),
+                (0, h + 0.5, 0),
+                (w * 0.4, h + 0.35, 0),
+                (w / 2, h, 0),
+            ]
+            bow = tube(line, r * 1.5, 8, 28)
+            solids.add(bow, look=m.pick(look, second))
         if m.chance(0.3):
-            solids.append(m.stamp(box(w * flare, r * 1.5, d * flare), second))
+            solids.add(box(w * flare, r * 1.5, d * flare), look=second)
     elif kind == 2:  # plates or shelves on posts
         post = rod(r * 1.5, h * 1.5, 10)
         posts = [post.translate([x * w * 0.46, 0, z * d * 0.46]) for x in (-1, 1) for z in (-1, 1)]
-        solids = [m.stamp(joined(posts), look)]
+        solids.add(joined(posts), look=look)
         for y in np.linspace(0.05, h * 1.4, m.n(2, 4)):
             if m.chance(0.5):
-                solids.append(m.stamp(box(w, 0.03, d, 0.01).translate([0, float(y), 0]), second))
+                solids.add(box(w, 0.03, d, 0.01), at=(0, y, 0), look=second)
             else:
                 rods = [
                     tube(
@@ -329,7 +279,7 @@ def rack(m: Maker) -> list[Manifold]:
                     tube([(-w / 2, y, z), (0, y, z), (w / 2, y, z)], r, 6, 3, round_ends=False)
                     for z in (-d / 2, d / 2)
                 ]
-                solids.append(m.stamp(joined(rods), look))
+                solids.add(joined(rods), look=look)
     else:  # a crate of boards
         t, boards = m.u(0.015, 0.03), m.n(2, 4)
         tall = h / boards
@@ -340,18 +290,16 @@ def rack(m: Maker) -> list[Manifold]:
                 parts.append(box(t, tall * 0.8, d).translate([x, (i + 0.5) * tall, 0]))
         for x in (-1, 1):
             for z in (-1, 1):
-                parts.append(
-                    box(0.05, h, 0.05).translate([x * (w / 2 - 0.02), h / 2, z * (d / 2 - 0.02)])
-                )
+                part = box(0.05, h, 0.05).translate([x * (w / 2 - 0.02), h / 2, z * (d / 2 - 0.02)])
+                parts.append(part)
         parts.append(box(w, t, d).translate([0, t, 0]))
-        solids = [m.stamp(joined(parts), m.pick(m.wood(), look))]
+        solids.add(joined(parts), look=m.pick(m.wood(), look))
         for i in range(m.n(0, 5)):
             s = m.u(0.08, 0.14)
-            solids.append(
-                m.stamp(
-                    produce(m, s).translate([m.u(-0.3, 0.3) * w, h * 0.6, m.u(-0.3, 0.3) * d]),
-                    second if i % 2 else m.plain("toy", "leaf"),
-                )
+            solids.add(
+                produce(m, s),
+                at=(m.u(-0.3, 0.3) * w, h * 0.6, m.u(-0.3, 0.3) * d),
+                look=second if i % 2 else m.plain("toy", "leaf"),
             )
     return [joined(solids).rotate([0, m.u(-50, 50), 0])]
 
@@ -362,12 +310,10 @@ def organiser(m: Maker) -> list[Manifold]:
     look, inside = m.pick(m.surface(), m.wood()), m.surface("white", "dark", "any")
     body = m.stamp(box(w, h, d, m.pick(0.0, 0.02, 0.06)), look)
     columns, rows = m.n(1, 4), m.n(1, 3)
-    xs, zs = (
-        np.sort(m.rng.uniform(-0.5, 0.5, columns - 1)),
-        np.sort(m.rng.uniform(-0.5, 0.5, rows - 1)),
-    )
+    xs = np.sort(m.rng.uniform(-0.5, 0.5, columns - 1))
+    zs = np.sort(m.rng.uniform(-0.5, 0.5, rows - 1))
     xs, zs = np.array([-0.5, *xs, 0.5]) * w, np.array([-0.5, *zs, 0.5]) * d
-    parts, cuts = [], []
+    parts, cuts = Parts(m), []
     for left, right in zip(xs, xs[1:]):
         for back, front in zip(zs, zs[1:]):
             wide, deep = float(right - left) - 2 * t, float(front - back) - 2 * t
@@ -387,13 +333,11 @@ def organiser(m: Maker) -> list[Manifold]:
                     box(wide * m.u(0.3, 0.9), tall, deep * m.u(0.3, 0.9), 0.01),
                     rod(min(wide, deep) * m.u(0.1, 0.45), tall, 16).translate([0, -tall / 2, 0]),
                 )
-                parts.append(
-                    m.stamp(
-                        item.rotate([m.u(-6, 6), 0, m.u(-6, 6)]).translate(
-                            [x, tall / 2 - h * 0.4, z]
-                        ),
-                        m.surface(),
-                    )
+                parts.add(
+                    item,
+                    turn=(m.u(-6, 6), 0, m.u(-6, 6)),
+                    at=(x, tall / 2 - h * 0.4, z),
+                    look=m.surface(),
                 )
     if cuts:
         body = body - m.stamp(joined(cuts), inside)
@@ -402,14 +346,13 @@ def organiser(m: Maker) -> list[Manifold]:
 
 def cushion(m: Maker) -> list[Manifold]:
     """A cushion, a folded towel or blanket, a roll, a rug."""
-    look, trim = (
-        m.pick(
-            m.cloth("any"),
-            m.printed("front", m.color("white", "any", "toy"), sides=m.chance(0.5)),
-            m.fur(),
-        ),
-        m.cloth(),
+    parts = Parts(m)
+    look = m.pick(
+        m.cloth("any"),
+        m.printed("front", m.color("white", "any", "toy"), sides=m.chance(0.5)),
+        m.fur(),
     )
+    trim = m.cloth()
     kind = m.n(0, 3)
     if kind <= 1:
         w, h, d = m.u(0.4, 0.7), m.u(0.3, 0.6), m.u(0.12, 0.25)
@@ -424,20 +367,20 @@ def cushion(m: Maker) -> list[Manifold]:
             ]
         )
         body = m.pick(body, loft(rings))
-        parts = [m.stamp(ripple(body, m.rng, m.u(0.004, 0.02), m.u(0.2, 0.6), False), look)]
+        parts.add(ripple(body, m.rng, m.u(0.004, 0.02), m.u(0.2, 0.6), False), look=look)
         if m.chance(0.4):
             rim = tube([(x, y, 0) for x, y in form[::3]], 0.02, 8, 56, True)
-            parts.append(m.stamp(rim, trim))
-        return [joined(parts).rotate([m.u(-40, 0), m.u(-40, 40), m.pick(0, m.u(-45, 45))])]
+            parts.add(rim, look=trim)
+        return parts.turned(m.u(-40, 0), m.u(-40, 40), m.pick(0, m.u(-45, 45)))
     if kind == 2:  # folded
-        parts, y = [], 0.0
+        y = 0.0
         for i in range(m.n(1, 5)):
             w, d, t = m.u(0.7, 0.9), m.u(0.5, 0.65), m.u(0.08, 0.15)
             one = box(w, t, d, 0.45 * t)
             one = ripple(one.refine_to_length(0.15), m.rng, 0.006, 0.3, False)
-            parts.append(m.stamp(one.translate([0, y + t / 2, 0]), look if i % 2 else trim))
+            parts.add(one, at=(0, y + t / 2, 0), look=look if i % 2 else trim)
             y += t * 0.97
-        return [joined(parts).rotate([0, m.u(-60, 60), 0])]
+        return parts.turned(0, m.u(-60, 60), 0)
     r, long = m.u(0.12, 0.3), m.u(0.6, 1.2)
     turns = np.linspace(0.15, 1, 60)
     a = turns * m.u(2.5, 5) * 2 * math.pi

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from manifold3d import Manifold, Mesh
+from numpy.typing import ArrayLike
 
 from gamba_warp.formats.materials import Material, to_linear
 from gamba_warp.formats.meshes import CREASE, TexturedMesh
 
 from . import textures
-from .solids import extent, joined, solid_of
+from .solids import both, extent, joined, solid_of
 
 SHARP = 40.0  # degrees; a sharper edge is not shaded smoothly
 MAX_FACES = 60_000
@@ -260,6 +261,45 @@ class Maker:
             return self.stamped(vertices, faces if probe > 0 else swapped, of_face, looks)
 
         return blend.solid(stamp)
+
+
+class Parts(list[Manifold]):
+    """Stamped parts of an object.
+
+    Args:
+        m: source of their looks.
+    """
+
+    def __init__(self, m: Maker) -> None:
+        super().__init__()
+        self.m = m
+
+    def add(
+        self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
+    ) -> None:
+        """Adds a solid of one look.
+
+        Args:
+            solid: about the origin.
+            look: its number.
+            turn: degrees about x, then y, then z.
+            at: place of its origin.
+        """
+        self.append(self._stamped(solid, look, turn, at))
+
+    def pair(
+        self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
+    ) -> None:
+        """Adds a solid and its mirror image on the other side of x = 0, see ``add``."""
+        self.append(both(self._stamped(solid, look, turn, at)))
+
+    def _stamped(self, solid: Manifold, look: int, turn: ArrayLike, at: ArrayLike) -> Manifold:
+        turned = solid.rotate(np.asarray(turn, float).tolist())
+        return self.m.stamp(turned.translate(np.asarray(at, float).tolist()), look)
+
+    def turned(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> list[Manifold]:
+        """All of them as one, turned about x, then y, then z by degrees."""
+        return [joined(self).rotate([x, y, z])]
 
 
 def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh | None:

@@ -9,8 +9,8 @@ from manifold3d import Manifold
 
 from .composition import shape
 from .details import laid
-from .looks import Look, Maker, material, plain_material
-from .solids import both, box, extent, loft, ring_of, ripple, rod, slab, tube
+from .looks import Look, Maker, Parts, material, plain_material
+from .solids import box, extent, loft, ring_of, ripple, rod, slab, tube
 from .textures import package
 
 
@@ -24,13 +24,14 @@ def carton(m: Maker) -> list[Manifold]:
     look = _carton_look(m, w, h, d, ground, inks)
     if m.chance(0.12):
         body = ripple(body.refine_to_length(0.1), m.rng, 0.006, 0.4, False)
-    parts = [m.stamp(body, look)]
+    parts = Parts(m)
+    parts.add(body, look=look)
     kind = m.n(0, 9)
     if kind == 0:  # open, with flaps
         inner = m.stamp(
             box(w - 0.03, h, d - 0.03).translate([0, 0.03, 0]), m.plain("wood", "white")
         )
-        parts = [parts[0] - inner]
+        parts[0] -= inner
         flap = m.painted(ground * 0.95)
         tilt = m.u(10, 130)
         for side in (1, -1):
@@ -40,15 +41,14 @@ def carton(m: Maker) -> list[Manifold]:
                 .rotate([0, 0, -tilt * side])
                 .translate([side * (w / 2 - 0.006), h / 2 - 0.005, 0])
             )
-            parts.append(m.stamp(sheet, flap))
+            parts.add(sheet, look=flap)
     elif kind == 1:  # ribbon
         ribbon = m.plain("toy")
-        parts.append(m.stamp(box(w * 0.14, h * 1.01, d * 1.02), ribbon))
-        parts.append(m.stamp(box(w * 1.01, h * 1.011, d * 0.14), ribbon))
-        bow = tube(
-            [(0, 0, 0), (0.18, 0.14, 0), (0.25, 0.02, 0), (0, 0, 0)], 0.03, 10, 24, flat=(1, 2)
-        )
-        parts.append(both(m.stamp(bow.translate([0, h / 2, 0]), ribbon)))
+        parts.add(box(w * 0.14, h * 1.01, d * 1.02), look=ribbon)
+        parts.add(box(w * 1.01, h * 1.011, d * 0.14), look=ribbon)
+        line = [(0, 0, 0), (0.18, 0.14, 0), (0.25, 0.02, 0), (0, 0, 0)]
+        bow = tube(line, 0.03, 10, 24, flat=(1, 2))
+        parts.pair(bow, at=(0, h / 2, 0), look=ribbon)
     elif kind == 2:  # a window with the thing behind it
         pane = m.stamp(
             box(w * m.u(0.5, 0.8), h * m.u(0.4, 0.7), 0.1).translate([0, -0.05 * h, d / 2]),
@@ -60,34 +60,20 @@ def carton(m: Maker) -> list[Manifold]:
             [0.4 * min(w, h) / float((high - low).max())] * 3
         )
         thing = thing.scale([1, 1, min(1, 0.15 / max(float(np.ptp(extent(thing)[:, 2])), 0.01))])
-        parts = [
-            parts[0] - pane,
-            m.stamp(thing.translate([0, -0.05 * h, d / 2 - 0.04]), m.surface("toy", "any")),
-        ]
+        parts[0] -= pane
+        parts.add(thing, at=(0, -0.05 * h, d / 2 - 0.04), look=m.surface("toy", "any"))
     elif kind == 3:  # a carry handle
-        parts.append(
-            m.stamp(
-                tube(
-                    [
-                        (-0.15 * w, h / 2 - 0.02, 0),
-                        (-0.15 * w, h / 2 + 0.12, 0),
-                        (0.15 * w, h / 2 + 0.12, 0),
-                        (0.15 * w, h / 2 - 0.02, 0),
-                    ],
-                    0.02,
-                    10,
-                    24,
-                    flat=(1, 1.5),
-                ),
-                m.plain(),
-            )
-        )
+        line = [
+            (-0.15 * w, h / 2 - 0.02, 0),
+            (-0.15 * w, h / 2 + 0.12, 0),
+            (0.15 * w, h / 2 + 0.12, 0),
+            (0.15 * w, h / 2 - 0.02, 0),
+        ]
+        parts.add(tube(line, 0.02, 10, 24, flat=(1, 1.5)), look=m.plain())
     elif kind == 4:  # a gable top, as milk has
         roof = slab(np.array([(-w / 2, 0), (w / 2, 0), (0.0, 0.5 * w)]), d).translate([0, h / 2, 0])
-        parts += [
-            m.stamp(roof, m.painted(inks[0])),
-            m.stamp(box(0.03, 0.12, d).translate([0, h / 2 + 0.5 * w, 0]), m.painted(ground)),
-        ]
+        parts.add(roof, look=m.painted(inks[0]))
+        parts.add(box(0.03, 0.12, d), at=(0, h / 2 + 0.5 * w, 0), look=m.painted(ground))
     elif kind == 5:  # a stack of them
         for i in range(1, m.n(2, 4)):
             parts.append(
@@ -97,12 +83,8 @@ def carton(m: Maker) -> list[Manifold]:
                 .translate([0, i * h * 0.999, 0])
             )
     elif kind == 6:  # a sleeve or lid of another colour
-        parts.append(
-            m.stamp(
-                box(w * 1.02, h * m.u(0.15, 0.5), d * 1.02).translate([0, h * m.u(-0.2, 0.35), 0]),
-                m.surface(),
-            )
-        )
+        part = box(w * 1.02, h * m.u(0.15, 0.5), d * 1.02)
+        parts.add(part, at=(0, h * m.u(-0.2, 0.35), 0), look=m.surface())
     return laid(m, parts, 0.25)
 
 
@@ -125,10 +107,8 @@ def _carton_look(
     if min(d / w, d / h) < 0.12 or m.chance(0.15):
         edge = top = plain_material(m.pick(ground, inks[0]))
     else:
-        edge, top = (
-            side(m.pick("back", "front"), d, h),
-            side("front", w, d) if m.chance(0.5) else plain_material(m.pick(ground, inks[1])),
-        )
+        edge = side(m.pick("back", "front"), d, h)
+        top = side("front", w, d) if m.chance(0.5) else plain_material(m.pick(ground, inks[1]))
     return m.add(Look([edge, edge, top, top, front, back], "fit"))
 
 
@@ -155,10 +135,11 @@ def pouch(m: Maker) -> list[Manifold]:
     look = (
         m.cloth() if cloth else m.printed("front", m.color("toy", "white", "dark", "any", "metal"))
     )
-    parts = [m.stamp(body, look)]
+    parts = Parts(m)
+    parts.add(body, look=look)
     if m.chance(0.5):  # seams
         for y in (0.0, h):
-            parts.append(m.stamp(box(w, 0.06, 0.015).translate([0, y, 0]), m.plain("metal", "any")))
+            parts.add(box(w, 0.06, 0.015), at=(0, y, 0), look=m.plain("metal", "any"))
     elif m.chance(0.4):
-        parts.append(m.stamp(rod(0.08, 0.12).translate([m.u(-0.2, 0.2), h - 0.03, 0]), m.plain()))
+        parts.add(rod(0.08, 0.12), at=(m.u(-0.2, 0.2), h - 0.03, 0), look=m.plain())
     return laid(m, parts, 0.3)

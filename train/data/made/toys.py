@@ -9,11 +9,10 @@ from manifold3d import Manifold
 
 from .composition import shape
 from .details import letter
-from .looks import Maker
+from .looks import Maker, Parts
 from .packages import carton
 from .solids import (
     ball,
-    both,
     box,
     extent,
     joined,
@@ -36,10 +35,10 @@ def blocks(m: Maker) -> list[Manifold]:
         m.pick(m.plain("toy"), m.plain("toy"), m.plain("pastel"), m.wood())
         for _ in range(m.n(2, 5))
     ]
-    parts: list[Manifold] = []
+    parts = Parts(m)
     if kind == 0:  # stacked rings on a rod
         y, r, count = 0.06, m.u(0.35, 0.5), m.n(3, 7)
-        parts = [m.stamp(lathe([(0, 0), (r, 0), (r * 0.9, 0.07), (0, 0.07)]), looks[0])]
+        parts.add(lathe([(0, 0), (r, 0), (r * 0.9, 0.07), (0, 0.07)]), look=looks[0])
         for i in range(count):
             t = m.u(0.06, 0.09)
             one = (
@@ -47,12 +46,11 @@ def blocks(m: Maker) -> list[Manifold]:
                 if r * 0.6 > t * 1.5
                 else ball([t * 1.5, t, t * 1.5])
             )
-            parts.append(m.stamp(one.translate([0, y + t, 0]), looks[i % len(looks)]))
+            parts.add(one, at=(0, y + t, 0), look=looks[i % len(looks)])
             y += 1.9 * t
             r *= m.u(0.8, 0.95)
-        parts.append(
-            m.stamp(joined([rod(0.05, y, 16), ball(0.09).translate([0, y + 0.05, 0])]), looks[-1])
-        )
+        part = joined([rod(0.05, y, 16), ball(0.09).translate([0, y + 0.05, 0])])
+        parts.add(part, look=looks[-1])
     elif kind == 1:  # a tower or a castle
         y = 0.0
         for _ in range(m.n(2, 5)):
@@ -62,22 +60,16 @@ def blocks(m: Maker) -> list[Manifold]:
                     box(m.u(0.25, 0.4), h, m.u(0.2, 0.4), 0.015),
                     rod(m.u(0.1, 0.19), h, 28, 0.01).translate([0, -h / 2, 0]),
                 )
-                parts.append(m.stamp(solid.translate([float(x), y + h / 2, 0]), m.pick(*looks)))
+                parts.add(solid, at=(x, y + h / 2, 0), look=m.pick(*looks))
             if m.chance(0.3):
-                parts.append(
-                    m.stamp(
-                        box(0.42 * count, 0.06, 0.4, 0.01).translate([0, y + h + 0.03, 0]),
-                        m.pick(*looks),
-                    )
-                )
+                part = box(0.42 * count, 0.06, 0.4, 0.01)
+                parts.add(part, at=(0, y + h + 0.03, 0), look=m.pick(*looks))
                 h += 0.06
             y += h
         if m.chance(0.6):
-            top = m.pick(
-                slab(np.array([(-0.25, 0), (0.25, 0), (0, 0.3)]), 0.3),
-                lathe([(0, 0), (0.22, 0), (0.01, 0.35), (0, 0.36)]),
-            )
-            parts.append(m.stamp(top.translate([0, y - 0.001, 0]), m.pick(*looks)))
+            profile = [(0, 0), (0.22, 0), (0.01, 0.35), (0, 0.36)]
+            top = m.pick(slab(np.array([(-0.25, 0), (0.25, 0), (0, 0.3)]), 0.3), lathe(profile))
+            parts.add(top, at=(0, y - 0.001, 0), look=m.pick(*looks))
     elif kind == 2:  # loose pieces on the ground
         for i in range(m.n(3, 9)):
             piece = m.pick(box, None, None)
@@ -89,11 +81,10 @@ def blocks(m: Maker) -> list[Manifold]:
             low, _ = extent(solid)
             a, d = 2.4 * i, 0.17 * math.sqrt(i)
             solid = solid.translate([0, -float(low[1]), 0]).rotate([0, m.u(0, 360), 0])
-            parts.append(
-                m.stamp(solid, m.pick(*looks)).translate(
-                    [d * 1.3 * math.sin(a), 0, d * 1.3 * math.cos(a)]
-                )
+            part = m.stamp(solid, m.pick(*looks)).translate(
+                [d * 1.3 * math.sin(a), 0, d * 1.3 * math.cos(a)]
             )
+            parts.append(part)
     elif kind == 3:  # studded bricks
         for i in range(m.n(1, 6)):
             nx, nz, h = m.n(1, 4), m.n(1, 2), 0.12
@@ -104,32 +95,25 @@ def blocks(m: Maker) -> list[Manifold]:
                 )
                 for a, b in np.ndindex(nx, nz)
             ]
-            parts.append(
-                m.stamp(joined([brick, *studs]), m.pick(*looks)).translate(
-                    [m.n(-1, 1) * 0.16, i * h, m.n(0, 1) * 0.08]
-                )
+            part = m.stamp(joined([brick, *studs]), m.pick(*looks)).translate(
+                [m.n(-1, 1) * 0.16, i * h, m.n(0, 1) * 0.08]
             )
+            parts.append(part)
     else:  # letters or figures, standing or lying
         for i in range(m.n(1, 4)):
-            parts.append(
-                m.stamp(plate(letter(m), m.u(0.12, 0.4)), looks[i % len(looks)]).translate(
-                    [i * 1.1, 0, 0]
-                )
+            part = m.stamp(plate(letter(m), m.u(0.12, 0.4)), looks[i % len(looks)]).translate(
+                [i * 1.1, 0, 0]
             )
+            parts.append(part)
         if m.chance(0.4):
-            parts.append(
-                m.stamp(
-                    box(1.1 * len(parts) + 0.2, 0.12, 0.5, 0.02).translate(
-                        [(len(parts) - 1) * 0.55, -0.6, 0]
-                    ),
-                    m.wood(),
-                )
-            )
-    return [joined(parts).rotate([0, m.u(-50, 50), 0])]
+            part = box(1.1 * len(parts) + 0.2, 0.12, 0.5, 0.02)
+            parts.add(part, at=((len(parts) - 1) * 0.55, -0.6, 0), look=m.wood())
+    return parts.turned(0, m.u(-50, 50), 0)
 
 
 def game(m: Maker) -> list[Manifold]:
     """A ball, top, skittles, dumb-bell, xylophone, rattle, drum, house, robot."""
+    parts = Parts(m)
     a, b, c = m.surface("toy"), m.surface("toy", "white"), m.surface("any", "dark")
     kind = m.n(0, 7)
     if kind == 0:
@@ -145,10 +129,8 @@ def game(m: Maker) -> list[Manifold]:
             )
         ]
     if kind == 1:
-        profile = np.maximum(
-            spline([(0.03, 0), (0.1, 0.1), (m.u(0.3, 0.5), 0.35), (0.12, 0.55), (0.05, 0.8)], 24),
-            [0.02, 0],
-        )
+        points = [(0.03, 0), (0.1, 0.1), (m.u(0.3, 0.5), 0.35), (0.12, 0.55), (0.05, 0.8)]
+        profile = np.maximum(spline(points, 24), [0.02, 0])
         return [
             m.stamp(
                 lathe([(0, 0), *profile.tolist(), (0, 0.8)], 36),
@@ -158,9 +140,8 @@ def game(m: Maker) -> list[Manifold]:
             ).rotate([m.u(0, 25), 0, 0])
         ]
     if kind == 2:
-        profile = np.maximum(
-            spline([(0.1, 0), (0.19, 0.3), (0.07, 0.62), (0.11, 0.76), (0.04, 0.88)], 22), [0.02, 0]
-        )
+        points = [(0.1, 0), (0.19, 0.3), (0.07, 0.62), (0.11, 0.76), (0.04, 0.88)]
+        profile = np.maximum(spline(points, 22), [0.02, 0])
         pin = m.stamp(
             lathe([(0, 0), *profile.tolist(), (0, 0.88)], 24),
             m.pattern("striped", "white", "toy", contrast=1, mapping="round", repeats=1),
@@ -186,23 +167,11 @@ def game(m: Maker) -> list[Manifold]:
         ]
     if kind == 4:  # a xylophone or abacus
         count = m.n(5, 9)
-        parts = [
-            both(
-                m.stamp(
-                    box(0.06, 0.08, 0.12 * count, 0.01).rotate([0, 8, 0]).translate([0.22, 0, 0]),
-                    m.wood(),
-                )
-            )
-        ]
+        part = box(0.06, 0.08, 0.12 * count, 0.01)
+        parts.pair(part, turn=(0, 8, 0), at=(0.22, 0, 0), look=m.wood())
         for i in range(count):
-            parts.append(
-                m.stamp(
-                    box(0.75 - 0.06 * i, 0.04, 0.09, 0.01).translate(
-                        [0, 0.06, (i - (count - 1) / 2) * 0.12]
-                    ),
-                    m.plain("toy"),
-                )
-            )
+            part = box(0.75 - 0.06 * i, 0.04, 0.09, 0.01)
+            parts.add(part, at=(0, 0.06, (i - (count - 1) / 2) * 0.12), look=m.plain("toy"))
         stick = (
             joined([rod(0.015, 0.6, 8), ball(0.05, 14)])
             .rotate([70, 40, 0])
@@ -211,105 +180,62 @@ def game(m: Maker) -> list[Manifold]:
         return [joined([*parts, m.stamp(stick, m.wood())]).rotate([m.u(0, 20), m.u(-60, 60), 0])]
     if kind == 5:  # a drum or a tin with a lid
         r, h = m.u(0.3, 0.5), m.u(0.25, 0.7)
-        parts = [
-            m.stamp(rod(r, h, 40), m.pick(a, m.printed("label", m.color("toy"), "round"))),
-            m.stamp(ring(r, 0.03, 40, 8, 1.3), b),
-            m.stamp(ring(r, 0.03, 40, 8, 1.3).translate([0, h, 0]), b),
-            m.stamp(rod(r * 0.97, 0.02, 40).translate([0, h - 0.01, 0]), m.plain("white")),
-        ]
+        parts.add(rod(r, h, 40), look=m.pick(a, m.printed("label", m.color("toy"), "round")))
+        parts.add(ring(r, 0.03, 40, 8, 1.3), look=b)
+        parts.add(ring(r, 0.03, 40, 8, 1.3), at=(0, h, 0), look=b)
+        parts.add(rod(r * 0.97, 0.02, 40), at=(0, h - 0.01, 0), look=m.plain("white"))
         return parts
     if kind == 6:  # a house
         w, h, d = m.u(0.5, 1), m.u(0.4, 0.9), m.u(0.4, 0.8)
-        wall, roof, trim = (
-            m.pick(a, m.pattern(("bricked", "grained", "plain"), "any")),
-            m.pattern(("bricked", "striped", "plain"), "toy", "earth"),
-            m.plain("white", "dark"),
-        )
+        wall = m.pick(a, m.pattern(("bricked", "grained", "plain"), "any"))
+        roof = m.pattern(("bricked", "striped", "plain"), "toy", "earth")
+        trim = m.plain("white", "dark")
         gable = m.u(0.2, 0.5)
-        parts = [
-            m.stamp(
-                slab(
-                    np.array([(-w / 2, 0), (w / 2, 0), (w / 2, h), (0, h + gable), (-w / 2, h)]), d
-                ),
-                wall,
-            )
-        ]
+        part = slab(np.array([(-w / 2, 0), (w / 2, 0), (w / 2, h), (0, h + gable), (-w / 2, h)]), d)
+        parts.add(part, look=wall)
         lean = math.degrees(math.atan2(gable, w / 2))
         side = (
             box(math.hypot(gable, w / 2) * 1.25, 0.05, d * 1.15)
             .rotate([0, 0, -lean])
             .translate([w * 0.27, h + gable * 0.48, 0])
         )
-        parts.append(both(m.stamp(side, roof)))
-        parts.append(
-            m.stamp(
-                box(w * 0.2, h * 0.5, 0.06).translate([m.u(-0.2, 0.2) * w, h * 0.25, d / 2]), trim
-            )
-        )
-        parts.append(
-            both(
-                m.stamp(
-                    box(w * 0.18, w * 0.18, 0.05).translate([w * 0.3, h * 0.65, d / 2]),
-                    m.plain("dark", "pastel"),
-                )
-            )
-        )
+        parts.pair(side, look=roof)
+        parts.add(box(w * 0.2, h * 0.5, 0.06), at=(m.u(-0.2, 0.2) * w, h * 0.25, d / 2), look=trim)
+        part = box(w * 0.18, w * 0.18, 0.05)
+        parts.pair(part, at=(w * 0.3, h * 0.65, d / 2), look=m.plain("dark", "pastel"))
         if m.chance(0.5):
-            parts.append(
-                m.stamp(box(0.1, 0.3, 0.1).translate([w * 0.25, h + gable * 0.7, -d * 0.2]), roof)
-            )
-        return [joined(parts).rotate([0, m.u(-50, 50), 0])]
+            parts.add(box(0.1, 0.3, 0.1), at=(w * 0.25, h + gable * 0.7, -d * 0.2), look=roof)
+        return parts.turned(0, m.u(-50, 50), 0)
     # A robot: boxes and rods.
     metal, second, dark = m.pick(m.metal(), a), b, c
     w, h = m.u(0.3, 0.5), m.u(0.35, 0.55)
-    parts = [m.stamp(box(w, h, w * 0.7, m.u(0.0, 0.08)).translate([0, h / 2 + 0.3, 0]), metal)]
+    parts.add(box(w, h, w * 0.7, m.u(0.0, 0.08)), at=(0, h / 2 + 0.3, 0), look=metal)
     hw = w * m.u(0.5, 0.9)
-    parts.append(
-        m.stamp(
-            box(hw, hw * 0.8, hw * 0.8, m.u(0, 0.1)).translate([0, h + 0.35 + hw * 0.4, 0]),
-            m.pick(metal, second),
-        )
-    )
-    parts.append(m.stamp(rod(0.06, 0.1, 14).translate([0, h + 0.27, 0]), dark))
-    parts.append(
-        both(
-            m.stamp(
-                ball(hw * 0.14, 16).translate([hw * 0.25, h + 0.38 + hw * 0.4, hw * 0.4]),
-                m.plain("toy", "white"),
-            )
-        )
-    )
-    arm = tube(
-        [
-            (w / 2, h + 0.2, 0),
-            (w / 2 + 0.15, h + m.u(-0.1, 0.2), 0),
-            (w / 2 + m.u(0.1, 0.2), h - 0.1 + m.u(-0.2, 0.4), m.u(0, 0.25)),
-        ],
-        0.055,
-        m.pick(12, ring_of(8, 12)),
-        18,
-    )
-    parts.append(both(m.stamp(arm, second)))
-    parts.append(
-        both(
-            m.stamp(
-                box(w * 0.3, 0.34, w * 0.35, 0.02).translate([w * 0.27, 0.15, 0])
-                + box(w * 0.36, 0.1, w * 0.6, 0.02).translate([w * 0.27, 0.02, 0.04]),
-                dark,
-            )
-        )
-    )
+    part = box(hw, hw * 0.8, hw * 0.8, m.u(0, 0.1))
+    parts.add(part, at=(0, h + 0.35 + hw * 0.4, 0), look=m.pick(metal, second))
+    parts.add(rod(0.06, 0.1, 14), at=(0, h + 0.27, 0), look=dark)
+    part = ball(hw * 0.14, 16)
+    parts.pair(part, at=(hw * 0.25, h + 0.38 + hw * 0.4, hw * 0.4), look=m.plain("toy", "white"))
+    line = [
+        (w / 2, h + 0.2, 0),
+        (w / 2 + 0.15, h + m.u(-0.1, 0.2), 0),
+        (w / 2 + m.u(0.1, 0.2), h - 0.1 + m.u(-0.2, 0.4), m.u(0, 0.25)),
+    ]
+    arm = tube(line, 0.055, m.pick(12, ring_of(8, 12)), 18)
+    parts.pair(arm, look=second)
+    part = box(w * 0.3, 0.34, w * 0.35, 0.02).translate([w * 0.27, 0.15, 0]) + box(
+        w * 0.36, 0.1, w * 0.6, 0.02
+    ).translate([w * 0.27, 0.02, 0.04])
+    parts.pair(part, look=dark)
     panel = m.printed("label", m.color("dark", "white"), sides=True)
-    parts.append(
-        m.stamp(box(w * 0.7, h * 0.5, 0.05).translate([0, h * 0.55 + 0.3, w * 0.35]), panel)
-    )
-    return [joined(parts).rotate([0, m.u(-40, 40), 0])]
+    parts.add(box(w * 0.7, h * 0.5, 0.05), at=(0, h * 0.55 + 0.3, w * 0.35), look=panel)
+    return parts.turned(0, m.u(-40, 40), 0)
 
 
 def pieces(m: Maker) -> list[Manifold]:
     """Several things of one kind, or a set of different ones, side by side on the ground."""
     plan = m.pick(bottle, carton, food, mug, game, shape)
-    parts: list[Manifold] = []
+    parts = Parts(m)
     x = 0.0
     for _ in range(m.n(2, 3)):
         one = m.stamp(shape(m), m.surface()) if plan is shape else joined(plan(m))
@@ -322,4 +248,4 @@ def pieces(m: Maker) -> list[Manifold]:
         )
         parts.append(one)
         x += float(high[0] - low[0]) + m.u(-0.02, 0.08)
-    return [joined(parts).rotate([0, m.u(-40, 40), 0])]
+    return parts.turned(0, m.u(-40, 40), 0)

@@ -6,60 +6,51 @@ import numpy as np
 from manifold3d import Manifold
 
 from .details import wheel
-from .looks import Maker
+from .looks import Maker, Parts
 from .solids import ball, both, box, joined, lathe, loft, ring_of, ripple, rod, slab, tube
 
 
 def vehicle(m: Maker) -> list[Manifold]:
     """A car, bus, lorry, tractor or digger."""
-    paint, dark, glass, accent = (
-        m.surface("toy", "toy", "any", "pastel", "metal"),
-        m.plain("dark"),
-        m.painted(np.array([0.1, 0.14, 0.18]) * m.u(0.3, 4)),
-        m.surface("toy", "metal", "white", "dark"),
-    )
+    paint, dark = m.surface("toy", "toy", "any", "pastel", "metal"), m.plain("dark")
+    glass = m.painted(np.array([0.1, 0.14, 0.18]) * m.u(0.3, 4))
+    accent = m.surface("toy", "metal", "white", "dark")
     kind = m.n(0, 4)
     long, w = m.u(0.9, 1.4), m.u(0.4, 0.55)
     r = m.u(0.09, 0.2)
     h = m.u(0.15, 0.3)
     floor = r * 0.9
-    parts: list[Manifold] = []
+    parts = Parts(m)
     axles = [-long * m.u(0.28, 0.36), long * m.u(0.28, 0.36)]
     if kind <= 1:  # a car: the side's outline, drawn out and rounded
-        ends, hood, boot, roof = (
-            floor + h * 0.15,
-            floor + h * m.u(0.75, 1.1),
-            floor + h * m.u(0.75, 1.3),
-            floor + h + m.u(0.15, 0.35),
-        )
-        z = np.array(
-            [
-                -0.5,
-                -0.49,
-                -0.42,
-                -0.3 + m.u(-0.1, 0.06),
-                -0.22 + m.u(-0.15, 0.05),
-                0.1 + m.u(-0.05, 0.08),
-                0.25 + m.u(-0.05, 0.05),
-                0.44,
-                0.5,
-                0.5,
-            ]
-        )
-        y = np.array(
-            [
-                ends,
-                boot * 0.8,
-                boot,
-                boot * 1.02,
-                roof,
-                roof,
-                hood * 1.05,
-                hood * 0.95,
-                hood * 0.75,
-                ends,
-            ]
-        )
+        ends, hood, boot = floor + h * 0.15, floor + h * m.u(0.75, 1.1), floor + h * m.u(0.75, 1.3)
+        roof = floor + h + m.u(0.15, 0.35)
+        corners = [
+            -0.5,
+            -0.49,
+            -0.42,
+            -0.3 + m.u(-0.1, 0.06),
+            -0.22 + m.u(-0.15, 0.05),
+            0.1 + m.u(-0.05, 0.08),
+            0.25 + m.u(-0.05, 0.05),
+            0.44,
+            0.5,
+            0.5,
+        ]
+        z = np.array(corners)
+        corners = [
+            ends,
+            boot * 0.8,
+            boot,
+            boot * 1.02,
+            roof,
+            roof,
+            hood * 1.05,
+            hood * 0.95,
+            hood * 0.75,
+            ends,
+        ]
+        y = np.array(corners)
         line = np.stack([z * long, y], 1)
         body = loft(
             np.stack(
@@ -108,145 +99,78 @@ def vehicle(m: Maker) -> list[Manifold]:
             ^ box(2, max(high - low, 0.02), 9).translate([0, (low + high) / 2, 0]),
             glass,
         )
-        parts = [shell, window, shield]
+        parts.append(shell)
+        parts.append(window)
+        parts.append(shield)
         for x in (-0.33, 0.33):
-            parts.append(
-                m.stamp(
-                    ball([0.06, 0.04, 0.03], 14).translate([x * w, hood * 0.82, long * 0.49]),
-                    m.plain("white", "pastel"),
-                )
-            )
-        parts.append(
-            m.stamp(
-                box(w * 0.96, 0.05, 0.06, 0.02).translate([0, floor + h * 0.25, long * 0.5]), accent
-            )
-        )
+            part = ball([0.06, 0.04, 0.03], 14)
+            parts.add(part, at=(x * w, hood * 0.82, long * 0.49), look=m.plain("white", "pastel"))
+        part = box(w * 0.96, 0.05, 0.06, 0.02)
+        parts.add(part, at=(0, floor + h * 0.25, long * 0.5), look=accent)
         if m.chance(0.25):
-            parts.append(
-                m.stamp(
-                    box(w * 0.8, 0.03, 0.1).translate([0, boot + 0.1, -long * 0.45])
-                    + both(box(0.03, 0.12, 0.05).translate([w * 0.3, boot + 0.04, -long * 0.45])),
-                    accent,
-                )
+            part = box(w * 0.8, 0.03, 0.1).translate([0, boot + 0.1, -long * 0.45]) + both(
+                box(0.03, 0.12, 0.05).translate([w * 0.3, boot + 0.04, -long * 0.45])
             )
+            parts.add(part, look=accent)
     elif kind == 2:  # bus or van
         tall = m.u(0.4, 0.6)
         body = box(w, tall, long, 0.06).translate([0, floor + tall / 2, 0])
-        parts = [m.stamp(body, paint)]
+        parts.add(body, look=paint)
         count = m.n(2, 6)
         for z in np.linspace(-long * 0.4, long * 0.4, count):
-            parts.append(
-                m.stamp(
-                    box(w * 1.015, tall * 0.3, long * 0.65 / count, 0).translate(
-                        [0, floor + tall * 0.65, float(z)]
-                    ),
-                    glass,
-                )
-            )
-        parts.append(
-            m.stamp(
-                box(w * 0.85, tall * 0.35, 0.05).translate(
-                    [0, floor + tall * 0.62, long / 2 - 0.015]
-                ),
-                glass,
-            )
-        )
-        parts.append(
-            m.stamp(
-                box(w * 1.01, 0.04, long * 1.005).translate([0, floor + tall * 0.35, 0]), accent
-            )
-        )
+            part = box(w * 1.015, tall * 0.3, long * 0.65 / count, 0)
+            parts.add(part, at=(0, floor + tall * 0.65, z), look=glass)
+        part = box(w * 0.85, tall * 0.35, 0.05)
+        parts.add(part, at=(0, floor + tall * 0.62, long / 2 - 0.015), look=glass)
+        parts.add(box(w * 1.01, 0.04, long * 1.005), at=(0, floor + tall * 0.35, 0), look=accent)
     else:  # a lorry: chassis, cabin, load
         cab = m.u(0.3, 0.42)
-        parts = [m.stamp(box(w * 0.8, 0.08, long, 0.02).translate([0, floor + 0.05, 0]), dark)]
-        parts.append(
-            m.stamp(
-                box(w, cab, long * 0.27, m.u(0.02, 0.08)).translate(
-                    [0, floor + cab / 2 + 0.05, long * 0.36]
-                ),
-                paint,
-            )
-        )
-        parts.append(
-            m.stamp(
-                box(w * 1.02, cab * 0.35, long * 0.16).translate(
-                    [0, floor + cab * 0.75, long * 0.37]
-                ),
-                glass,
-            )
-        )
-        parts.append(
-            m.stamp(
-                box(w * 0.8, cab * 0.35, 0.05).translate([0, floor + cab * 0.75, long * 0.49]),
-                glass,
-            )
-        )
+        parts.add(box(w * 0.8, 0.08, long, 0.02), at=(0, floor + 0.05, 0), look=dark)
+        part = box(w, cab, long * 0.27, m.u(0.02, 0.08))
+        parts.add(part, at=(0, floor + cab / 2 + 0.05, long * 0.36), look=paint)
+        part = box(w * 1.02, cab * 0.35, long * 0.16)
+        parts.add(part, at=(0, floor + cab * 0.75, long * 0.37), look=glass)
+        part = box(w * 0.8, cab * 0.35, 0.05)
+        parts.add(part, at=(0, floor + cab * 0.75, long * 0.49), look=glass)
         load = m.n(0, 4)
         z, deep = -long * 0.15, long * 0.66
         if load == 0:
-            parts.append(
-                m.stamp(
-                    box(w, m.u(0.3, 0.6), deep, 0.02).translate([0, floor + 0.35, z]),
-                    m.pick(accent, m.printed("front", m.color("white", "any"))),
-                )
+            parts.add(
+                box(w, m.u(0.3, 0.6), deep, 0.02),
+                at=(0, floor + 0.35, z),
+                look=m.pick(accent, m.printed("front", m.color("white", "any"))),
             )
         elif load == 1:
             tub = box(w, 0.3, deep, 0.0) - box(w * 0.9, 0.3, deep * 0.93).translate([0, 0.04, 0])
-            parts.append(
-                m.stamp(
-                    tub.rotate([m.pick(0, 0, 20), 0, 0]).translate([0, floor + 0.27, z]), accent
-                )
-            )
+            parts.add(tub, turn=(m.pick(0, 0, 20), 0, 0), at=(0, floor + 0.27, z), look=accent)
             if m.chance(0.5):
                 heap = ripple(ball([w * 0.42, 0.2, deep * 0.42], 32), m.rng, 0.02, 0.15, False)
-                parts.append(
-                    m.stamp(heap.translate([0, floor + 0.3, z]), m.pattern("speckled", "earth"))
-                )
+                parts.add(heap, at=(0, floor + 0.3, z), look=m.pattern("speckled", "earth"))
         elif load == 2:
-            tank = tube(
-                [(0, 0, -deep / 2 + 0.1), (0, 0, 0), (0, 0, deep / 2 - 0.1)],
-                m.u(0.18, 0.24),
-                24,
-                12,
-            )
-            parts.append(m.stamp(tank.translate([0, floor + 0.3, z]), m.pick(accent, m.metal())))
+            path = [(0, 0, -deep / 2 + 0.1), (0, 0, 0), (0, 0, deep / 2 - 0.1)]
+            tank = tube(path, m.u(0.18, 0.24), 24, 12)
+            parts.add(tank, at=(0, floor + 0.3, z), look=m.pick(accent, m.metal()))
         elif load == 3:  # a ladder or crane
-            arm = tube(
-                [
-                    (0, floor + 0.2, z - 0.1),
-                    (0, floor + 0.5, z),
-                    (0, floor + m.u(0.4, 0.9), long * m.u(0.2, 0.6)),
-                ],
-                [0.08, 0.06, 0.04],
-                ring_of(6, 12),
-                20,
-            )
-            parts += [
-                m.stamp(arm, accent),
-                m.stamp(rod(0.15, 0.15).translate([0, floor + 0.05, z]), paint),
+            path = [
+                (0, floor + 0.2, z - 0.1),
+                (0, floor + 0.5, z),
+                (0, floor + m.u(0.4, 0.9), long * m.u(0.2, 0.6)),
             ]
-            parts.append(
-                m.stamp(
-                    (
-                        box(0.25, 0.18, 0.2, 0.02) - box(0.2, 0.2, 0.2).translate([0, 0.06, 0.06])
-                    ).translate([0, floor + 0.4, long * 0.55]),
-                    accent,
-                )
-            )
+            arm = tube(path, [0.08, 0.06, 0.04], ring_of(6, 12), 20)
+            parts.add(arm, look=accent)
+            parts.add(rod(0.15, 0.15), at=(0, floor + 0.05, z), look=paint)
+            part = box(0.25, 0.18, 0.2, 0.02) - box(0.2, 0.2, 0.2).translate([0, 0.06, 0.06])
+            parts.add(part, at=(0, floor + 0.4, long * 0.55), look=accent)
         else:
-            parts.append(
-                m.stamp(
-                    Manifold.compose(
-                        [
-                            rod(0.09, deep, 16)
-                            .rotate([90, 0, 0])
-                            .translate([x, floor + 0.18, z - deep / 2])
-                            for x in (-0.19, 0.0, 0.19)
-                        ]
-                    ),
-                    m.wood(),
-                )
+            part = Manifold.compose(
+                [
+                    rod(0.09, deep, 16)
+                    .rotate([90, 0, 0])
+                    .translate([x, floor + 0.18, z - deep / 2])
+                    for x in (-0.19, 0.0, 0.19)
+                ]
             )
+            parts.add(part, look=m.wood())
         axles = [long * 0.36, -long * 0.2, *([-long * 0.38] if m.chance(0.6) else [])]
         if m.chance(0.15):
             r *= 1.3
@@ -255,129 +179,80 @@ def vehicle(m: Maker) -> list[Manifold]:
     tire = wheel(r, thick)
     for a in axles:
         at = [w / 2 - thick * 0.3, r, float(a)]
-        parts.append(both(m.stamp(tire.translate(at), dark)))
-        parts.append(both(m.stamp(wheel(r * m.u(0.4, 0.65), thick * 1.15).translate(at), hub)))
-    return [
-        joined(parts).rotate([0, m.pick(0, 90, -90, m.u(-180, 180), m.u(20, 70), m.u(-70, -20)), 0])
-    ]
+        parts.pair(tire, at=at, look=dark)
+        parts.pair(wheel(r * m.u(0.4, 0.65), thick * 1.15), at=at, look=hub)
+    return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180), m.u(20, 70), m.u(-70, -20)), 0)
 
 
 def plane(m: Maker) -> list[Manifold]:
     """An aeroplane, helicopter, rocket or boat."""
-    paint, second, dark = (
-        m.surface("toy", "white", "metal", "any"),
-        m.surface("toy", "any"),
-        m.plain("dark"),
-    )
+    paint, second = m.surface("toy", "white", "metal", "any"), m.surface("toy", "any")
+    dark = m.plain("dark")
     kind = m.n(0, 3)
-    parts: list[Manifold] = []
+    parts = Parts(m)
     if kind <= 1:
         long, r = m.u(1.0, 1.4), m.u(0.09, 0.2)
-        hull = tube(
-            [(0, m.u(0, 0.08), -long / 2), (0, 0, 0), (0, 0, long / 2)],
-            [r * 0.3, r, r * m.u(0.6, 1)],
-            22,
-            28,
-        )
-        parts = [m.stamp(hull, paint)]
-        parts.append(
-            m.stamp(
-                ball([r * 0.7, r * 0.6, r * 1.3], 24).translate([0, r * 0.7, long * 0.22]),
-                m.plain("dark", "pastel", "metal"),
-            )
-        )
+        line = [(0, m.u(0, 0.08), -long / 2), (0, 0, 0), (0, 0, long / 2)]
+        hull = tube(line, [r * 0.3, r, r * m.u(0.6, 1)], 22, 28)
+        parts.add(hull, look=paint)
+        part = ball([r * 0.7, r * 0.6, r * 1.3], 24)
+        parts.add(part, at=(0, r * 0.7, long * 0.22), look=m.plain("dark", "pastel", "metal"))
         if kind == 0 or m.chance(0.4):
             sweep, chord, span = m.u(-0.05, 0.45), m.u(0.25, 0.5), m.u(0.55, 0.9)
-            form = np.array(
-                [
-                    (0, -chord / 2),
-                    (span, -sweep - chord * 0.3),
-                    (span, -sweep + chord * 0.2),
-                    (0, chord / 2),
-                ]
-            )
+            corners = [
+                (0, -chord / 2),
+                (span, -sweep - chord * 0.3),
+                (span, -sweep + chord * 0.2),
+                (0, chord / 2),
+            ]
+            form = np.array(corners)
             wing = slab(form, 0.05, 0.02, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
             levels = (m.u(-0.6, 0.8) * r,) if m.chance(0.75) else (-0.7 * r, 1.8 * r)
             for y in levels:
-                parts.append(both(m.stamp(wing.translate([0, y, 0.08]), m.pick(paint, second))))
+                parts.pair(wing, at=(0, y, 0.08), look=m.pick(paint, second))
             if len(levels) > 1:
-                parts.append(
-                    both(
-                        m.stamp(rod(0.02, 2.6 * r, 10).translate([span * 0.6, -0.7 * r, 0.0]), dark)
-                    )
-                )
+                parts.pair(rod(0.02, 2.6 * r, 10), at=(span * 0.6, -0.7 * r, 0.0), look=dark)
             if m.chance(0.5):
-                parts.append(
-                    both(
-                        m.stamp(
-                            tube([(0, 0, -0.12), (0, 0, 0.15)], [0.05, 0.06], 16, 10).translate(
-                                [span * 0.45, levels[0] - 0.05, 0.12]
-                            ),
-                            m.metal(),
-                        )
-                    )
-                )
+                part = tube([(0, 0, -0.12), (0, 0, 0.15)], [0.05, 0.06], 16, 10)
+                parts.pair(part, at=(span * 0.45, levels[0] - 0.05, 0.12), look=m.metal())
         else:
-            parts.append(
-                m.stamp(
-                    joined(
-                        [box(1.3, 0.015, 0.08).rotate([0, 90 * i + 20, 0]) for i in range(2)]
-                        + [rod(0.04, 0.15, 12).translate([0, -0.12, 0])]
-                    ).translate([0, r + 0.12, 0.1]),
-                    dark,
-                )
+            part = joined(
+                [box(1.3, 0.015, 0.08).rotate([0, 90 * i + 20, 0]) for i in range(2)]
+                + [rod(0.04, 0.15, 12).translate([0, -0.12, 0])]
             )
-            parts.append(
-                both(
-                    m.stamp(
-                        tube([(r, -r - 0.12, -0.3), (r, -r - 0.12, 0.3)], 0.025, 8, 8)
-                        + rod(0.02, 0.2, 8).translate([r, -r - 0.12, 0]),
-                        dark,
-                    )
-                )
-            )
-        fin = (
-            slab(np.array([(-0.02, 0), (0.18, 0), (0.06, 0.3), (-0.06, 0.3)]), 0.03, 0.01, 2)
-            .rotate([0, -90, 0])
-            .mirror([0, 0, 0])
-        )
-        parts.append(m.stamp(fin.translate([0, r * 0.4, -long / 2 + 0.02]), second))
-        flat = (
-            slab(np.array([(0, -0.1), (0.28, -0.14), (0.28, 0.0), (0, 0.1)]), 0.025, 0.008, 2)
-            .rotate([90, 0, 0])
-            .mirror([0, 0, 1])
-        )
-        parts.append(both(m.stamp(flat.translate([0, 0.05, -long / 2 + 0.08]), second)))
+            parts.add(part, at=(0, r + 0.12, 0.1), look=dark)
+            line = [(r, -r - 0.12, -0.3), (r, -r - 0.12, 0.3)]
+            part = tube(line, 0.025, 8, 8) + rod(0.02, 0.2, 8).translate([r, -r - 0.12, 0])
+            parts.pair(part, look=dark)
+        corners = [(-0.02, 0), (0.18, 0), (0.06, 0.3), (-0.06, 0.3)]
+        fin = slab(np.array(corners), 0.03, 0.01, 2).rotate([0, -90, 0]).mirror([0, 0, 0])
+        parts.add(fin, at=(0, r * 0.4, -long / 2 + 0.02), look=second)
+        corners = [(0, -0.1), (0.28, -0.14), (0.28, 0.0), (0, 0.1)]
+        flat = slab(np.array(corners), 0.025, 0.008, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
+        parts.pair(flat, at=(0, 0.05, -long / 2 + 0.08), look=second)
         if m.chance(0.4):
-            parts.append(
-                m.stamp(
-                    joined(
-                        [box(0.5, 0.05, 0.015).rotate([0, 0, 60 * i]) for i in range(m.pick(2, 3))]
-                    ).translate([0, 0, long / 2 + r * 0.8]),
-                    dark,
-                )
+            part = joined(
+                [box(0.5, 0.05, 0.015).rotate([0, 0, 60 * i]) for i in range(m.pick(2, 3))]
             )
+            parts.add(part, at=(0, 0, long / 2 + r * 0.8), look=dark)
     elif kind == 2:  # a rocket that stands
         r = m.u(0.12, 0.25)
         hull = lathe(
             [(0, 0), (r * 0.7, 0), (r, 0.3), (r, 0.7), (r * 0.7, 1.0), (r * 0.2, 1.2), (0, 1.25)],
             32,
         )
-        parts = [
-            m.stamp(
-                hull,
-                m.pick(paint, m.pattern("striped", "white", "toy", contrast=1, mapping="round")),
-            )
-        ]
-        fin = slab(
-            np.array([(0, 0.1), (0.25, -0.15), (0.25, 0.05), (0.0, 0.45)]), 0.04, 0.01, 2
-        ).translate([r * 0.8, 0, 0])
+        parts.add(
+            hull,
+            look=m.pick(paint, m.pattern("striped", "white", "toy", contrast=1, mapping="round")),
+        )
+        corners = [(0, 0.1), (0.25, -0.15), (0.25, 0.05), (0.0, 0.45)]
+        fin = slab(np.array(corners), 0.04, 0.01, 2).translate([r * 0.8, 0, 0])
         parts += [
             m.stamp(fin, second).rotate([0, 360 * i / n, 0])
             for n in (m.pick(3, 4),)
             for i in range(n)
         ]
-        parts.append(m.stamp(ball([0.1, 0.1, 0.05], 20).translate([0, 0.7, r * 0.95]), dark))
+        parts.add(ball([0.1, 0.1, 0.05], 20), at=(0, 0.7, r * 0.95), look=dark)
         return parts
     else:  # a boat
         long, w, h = m.u(0.9, 1.4), m.u(0.35, 0.5), m.u(0.2, 0.35)
@@ -393,108 +268,61 @@ def plane(m: Maker) -> list[Manifold]:
         rings[..., 2] = (t[:, None] - 0.5) * long
         hull = loft(rings)
         well = m.stamp(hull.scale([0.85, 1, 0.85]).translate([0, h * 0.6, 0]), m.wood())
-        parts = [m.stamp(hull, paint) - well]
+        parts.append(m.stamp(hull, paint) - well)
         if m.chance(0.5):
-            parts.append(m.stamp(rod(0.025, 1.0, 10), m.wood()))
-            sail = slab(np.array([(0.03, 0.25), (0.5, 0.25), (0.03, 0.95)]), 0.02).rotate(
-                [0, m.u(60, 120), 0]
-            )
-            parts.append(m.stamp(sail, m.cloth("white", "toy")))
+            parts.add(rod(0.025, 1.0, 10), look=m.wood())
+            corners = [(0.03, 0.25), (0.5, 0.25), (0.03, 0.95)]
+            sail = slab(np.array(corners), 0.02).rotate([0, m.u(60, 120), 0])
+            parts.add(sail, look=m.cloth("white", "toy"))
             if m.chance(0.5):
-                parts.append(
-                    m.stamp(
-                        slab(np.array([(0.03, 0.25), (0.4, 0.25), (0.03, 0.8)]), 0.02).rotate(
-                            [0, -m.u(60, 120), 0]
-                        ),
-                        m.cloth("white", "toy"),
-                    )
-                )
+                part = slab(np.array([(0.03, 0.25), (0.4, 0.25), (0.03, 0.8)]), 0.02)
+                parts.add(part, turn=(0, -m.u(60, 120), 0), look=m.cloth("white", "toy"))
         else:
-            parts.append(
-                m.stamp(
-                    box(w * 0.55, 0.25, long * 0.3, 0.03).translate([0, h * 0.4, -0.05 * long]),
-                    second,
-                )
-            )
-            parts.append(
-                m.stamp(
-                    box(w * 0.4, 0.15, long * 0.15, 0.02).translate([0, h * 0.4 + 0.19, 0]),
-                    m.pick(paint, second),
-                )
-            )
+            part = box(w * 0.55, 0.25, long * 0.3, 0.03)
+            parts.add(part, at=(0, h * 0.4, -0.05 * long), look=second)
+            part = box(w * 0.4, 0.15, long * 0.15, 0.02)
+            parts.add(part, at=(0, h * 0.4 + 0.19, 0), look=m.pick(paint, second))
             for z in np.linspace(-0.2, 0.0, m.n(1, 3)):
-                parts.append(
-                    m.stamp(
-                        rod(0.05, 0.3, 16).translate([0, h * 0.4, z * long]),
-                        m.surface("toy", "dark"),
-                    )
-                )
-    return [joined(parts).rotate([0, m.pick(0, 90, -90, m.u(-180, 180)), 0])]
+                part = rod(0.05, 0.3, 16)
+                parts.add(part, at=(0, h * 0.4, z * long), look=m.surface("toy", "dark"))
+    return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180)), 0)
 
 
 def train_of(m: Maker) -> list[Manifold]:
     """A wooden or plastic train: an engine and waggons, or one of them."""
     looks = [m.surface("toy") for _ in range(3)]
     dark = m.surface("dark", "wood", "toy")
-    parts: list[Manifold] = []
+    parts = Parts(m)
     count = m.n(1, 3)
     w, long, r = m.u(0.3, 0.4), m.u(0.5, 0.7), m.u(0.07, 0.11)
     for i in range(count):
         z = -i * (long + 0.1)
         main, second = m.pick(*looks), m.pick(*looks)
-        car = [m.stamp(box(w, 0.08, long, 0.015).translate([0, r + 0.04, 0]), m.pick(dark, second))]
+        car = Parts(m)
+        car.add(box(w, 0.08, long, 0.015), at=(0, r + 0.04, 0), look=m.pick(dark, second))
         if i == 0:
-            car.append(
-                m.stamp(
-                    tube(
-                        [(0, 0, -long * 0.1), (0, 0, long * 0.38)],
-                        m.u(0.11, 0.15),
-                        24,
-                        8,
-                        round_ends=m.chance(0.5),
-                    ).translate([0, r + 0.2, 0]),
-                    main,
-                )
-            )
-            car.append(
-                m.stamp(
-                    box(w * 0.95, m.u(0.3, 0.42), long * 0.3, 0.01).translate(
-                        [0, r + 0.25, -long * 0.3]
-                    ),
-                    second,
-                )
-            )
-            car.append(
-                m.stamp(
-                    box(w * 1.1, 0.04, long * 0.36, 0.015).translate([0, r + 0.46, -long * 0.3]),
-                    main,
-                )
-            )
-            car.append(
-                m.stamp(
-                    lathe([(0, 0), (0.04, 0), (m.u(0.03, 0.08), 0.15), (0, 0.15)], 20).translate(
-                        [0, r + 0.3, long * 0.3]
-                    ),
-                    dark,
-                )
-            )
-            car.append(m.stamp(ball(0.06, 18).translate([0, r + 0.34, 0.05]), second))
+            line = [(0, 0, -long * 0.1), (0, 0, long * 0.38)]
+            part = tube(line, m.u(0.11, 0.15), 24, 8, round_ends=m.chance(0.5))
+            car.add(part, at=(0, r + 0.2, 0), look=main)
+            part = box(w * 0.95, m.u(0.3, 0.42), long * 0.3, 0.01)
+            car.add(part, at=(0, r + 0.25, -long * 0.3), look=second)
+            part = box(w * 1.1, 0.04, long * 0.36, 0.015)
+            car.add(part, at=(0, r + 0.46, -long * 0.3), look=main)
+            part = lathe([(0, 0), (0.04, 0), (m.u(0.03, 0.08), 0.15), (0, 0.15)], 20)
+            car.add(part, at=(0, r + 0.3, long * 0.3), look=dark)
+            car.add(ball(0.06, 18), at=(0, r + 0.34, 0.05), look=second)
         else:
             load = m.n(0, 3)
             if load == 0:
-                car.append(
-                    m.stamp(
-                        box(w * 0.95, 0.22, long * 0.9, 0.02)
-                        - box(w * 0.8, 0.22, long * 0.8).translate([0, 0.05, 0]),
-                        main,
-                    ).translate([0, r + 0.18, 0])
-                )
+                part = m.stamp(
+                    box(w * 0.95, 0.22, long * 0.9, 0.02)
+                    - box(w * 0.8, 0.22, long * 0.8).translate([0, 0.05, 0]),
+                    main,
+                ).translate([0, r + 0.18, 0])
+                car.append(part)
             elif load == 1:
-                car.append(
-                    m.stamp(
-                        tube([(0, 0, -long * 0.3), (0, 0, long * 0.3)], 0.15, 24, 8), main
-                    ).translate([0, r + 0.2, 0])
-                )
+                line = [(0, 0, -long * 0.3), (0, 0, long * 0.3)]
+                car.append(m.stamp(tube(line, 0.15, 24, 8), main).translate([0, r + 0.2, 0]))
             elif load == 2:
                 car += [
                     m.stamp(
@@ -507,21 +335,10 @@ def train_of(m: Maker) -> list[Manifold]:
                 ]
             else:
                 for k in range(m.n(1, 3)):
-                    car.append(
-                        m.stamp(
-                            box(0.2, 0.2, 0.2, 0.01).translate([0, r + 0.18, (k - 1) * 0.21]),
-                            m.pick(*looks),
-                        )
-                    )
+                    part = box(0.2, 0.2, 0.2, 0.01)
+                    car.add(part, at=(0, r + 0.18, (k - 1) * 0.21), look=m.pick(*looks))
         for a in (-long * 0.3, long * 0.3):
-            car.append(
-                both(
-                    m.stamp(
-                        wheel(r, 0.05).translate([w / 2, r, a]),
-                        m.pick(dark, second) if i % 2 else dark,
-                    )
-                )
-            )
-        car.append(m.stamp(box(0.05, 0.04, long + 0.15).translate([0, r + 0.04, 0]), dark))
+            car.pair(wheel(r, 0.05), at=(w / 2, r, a), look=m.pick(dark, second) if i % 2 else dark)
+        car.add(box(0.05, 0.04, long + 0.15), at=(0, r + 0.04, 0), look=dark)
         parts.append(joined(car).translate([0, 0, z]))
-    return [joined(parts).rotate([0, m.pick(90, -90, m.u(-180, 180), m.u(30, 70)), 0])]
+    return parts.turned(0, m.pick(90, -90, m.u(-180, 180), m.u(30, 70)), 0)

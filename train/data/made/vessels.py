@@ -8,10 +8,9 @@ import numpy as np
 from manifold3d import Manifold
 
 from .details import handle, laid, produce
-from .looks import Maker
+from .looks import Maker, Parts
 from .solids import (
     ball,
-    both,
     box,
     joined,
     lathe,
@@ -72,7 +71,8 @@ def mug(m: Maker) -> list[Manifold]:
         ),
     )
     cup = m.stamp(_vessel(m, profile, m.u(0.02, 0.05)), outer)
-    parts = [cup]
+    parts = Parts(m)
+    parts.append(cup)
     if m.chance(0.75):
         middle = h * m.u(0.45, 0.6)
         bow = handle(m, m.u(0.2, 0.35), h * m.u(0.4, 0.7), m.u(0.025, 0.05))
@@ -85,24 +85,13 @@ def mug(m: Maker) -> list[Manifold]:
         parts += handles
     if m.chance(0.4):
         level = h * m.u(0.6, 0.9)
-        parts.append(
-            m.stamp(
-                rod(float(np.interp(level, profile[:, 1], profile[:, 0])) - 0.01, 0.02).translate(
-                    [0, level, 0]
-                )
-                ^ rod(5, 9),
-                m.plain("earth", "dark", "leaf"),
-            )
-        )
+        part = rod(float(np.interp(level, profile[:, 1], profile[:, 0])) - 0.01, 0.02).translate(
+            [0, level, 0]
+        ) ^ rod(5, 9)
+        parts.add(part, look=m.plain("earth", "dark", "leaf"))
     elif m.chance(0.2):  # a lid
-        parts.append(
-            m.stamp(
-                lathe(
-                    [(0, 0), (r * 1.05, 0), (r * 1.03, 0.08), (r * 0.5, 0.14), (0, 0.14)]
-                ).translate([0, h - 0.01, 0]),
-                m.plain(),
-            )
-        )
+        part = lathe([(0, 0), (r * 1.05, 0), (r * 1.03, 0.08), (r * 0.5, 0.14), (0, 0.14)])
+        parts.add(part, at=(0, h - 0.01, 0), look=m.plain())
     angle = m.u(-180, 180) if m.chance(0.3) else m.u(-50, 50)
     return [p.rotate([0, angle, 0]) for p in parts]
 
@@ -111,63 +100,48 @@ def teapot(m: Maker) -> list[Manifold]:
     """A teapot, kettle, jug or watering can."""
     r, h = m.u(0.3, 0.5), m.u(0.35, 0.9)
     profile = _profile(m, r * m.u(0.5, 1), r * m.u(0.35, 0.9), h, 0.5)
-    look, second = (
-        m.pick(
-            m.surface(),
-            m.metal(),
-            m.pattern(("flowered", "spotted"), "white", "pastel", contrast=0.8, mapping="round"),
-        ),
-        m.surface("dark", "metal", "any"),
+    look = m.pick(
+        m.surface(),
+        m.metal(),
+        m.pattern(("flowered", "spotted"), "white", "pastel", contrast=0.8, mapping="round"),
     )
+    second = m.surface("dark", "metal", "any")
     body = lathe([(0, 0), *profile.tolist(), (0, h)])
-    parts = [m.stamp(body, look)]
+    parts = Parts(m)
+    parts.add(body, look=look)
     wide = float(profile[:, 0].max())
     long = m.u(0.25, 0.6)
-    spout = tube(
-        [
-            (wide * 0.7, h * 0.3, 0),
-            (wide + long * 0.5, h * m.u(0.35, 0.6), 0),
-            (wide + long, h * m.u(0.8, 1.15), 0),
-        ],
-        [0.12, 0.08, m.u(0.04, 0.07)],
-        14,
-        20,
-        round_ends=False,
-    )
-    parts.append(m.stamp(spout, look))
+    line = [
+        (wide * 0.7, h * 0.3, 0),
+        (wide + long * 0.5, h * m.u(0.35, 0.6), 0),
+        (wide + long, h * m.u(0.8, 1.15), 0),
+    ]
+    spout = tube(line, [0.12, 0.08, m.u(0.04, 0.07)], 14, 20, round_ends=False)
+    parts.add(spout, look=look)
     bow = handle(m, m.u(0.2, 0.4), h * m.u(0.5, 0.9), m.u(0.025, 0.05))
     if m.chance(0.7):
-        parts.append(
-            m.stamp(
-                bow.rotate([0, 180, 0]).translate([-wide * 0.8, h * 0.55, 0]), m.pick(look, second)
-            )
-        )
+        parts.add(bow, turn=(0, 180, 0), at=(-wide * 0.8, h * 0.55, 0), look=m.pick(look, second))
     else:
-        over = tube(
-            [
-                (wide * 0.8, h * 0.8, 0),
-                (wide * 0.8, h * 1.4, 0),
-                (-wide * 0.8, h * 1.4, 0),
-                (-wide * 0.8, h * 0.8, 0),
-            ],
-            0.035,
-            10,
-            28,
-        )
-        parts.append(m.stamp(over, second))
-    top = float(profile[-1, 0])
-    lid = lathe(
-        [
-            (0, -0.02),
-            (top * 0.98, -0.02),
-            (top * 0.9, 0.06),
-            (0.08, m.u(0.08, 0.2)),
-            (0.05, 0.2),
-            (0.07, 0.25),
-            (0, 0.3),
+        line = [
+            (wide * 0.8, h * 0.8, 0),
+            (wide * 0.8, h * 1.4, 0),
+            (-wide * 0.8, h * 1.4, 0),
+            (-wide * 0.8, h * 0.8, 0),
         ]
-    )
-    parts.append(m.stamp(lid.translate([0, h, 0]), m.pick(look, second)))
+        over = tube(line, 0.035, 10, 28)
+        parts.add(over, look=second)
+    top = float(profile[-1, 0])
+    side_line = [
+        (0, -0.02),
+        (top * 0.98, -0.02),
+        (top * 0.9, 0.06),
+        (0.08, m.u(0.08, 0.2)),
+        (0.05, 0.2),
+        (0.07, 0.25),
+        (0, 0.3),
+    ]
+    lid = lathe(side_line)
+    parts.add(lid, at=(0, h, 0), look=m.pick(look, second))
     angle = m.pick(0, 180, m.u(-70, 70))
     return [p.rotate([0, angle, 0]) for p in parts]
 
@@ -213,18 +187,17 @@ def bottle(m: Maker) -> list[Manifold]:
 
         body = body.warp_batch(squared)
     ground = m.color("white", "toy", "any", "earth")
-    parts = [m.stamp(body, m.pick(m.plain(), m.plain("earth", "white", "toy"), m.surface()))]
+    parts = Parts(m)
+    parts.add(body, look=m.pick(m.plain(), m.plain("earth", "white", "toy"), m.surface()))
     low, high = m.u(0.06, 0.3) * shoulder, m.u(0.7, 0.97) * shoulder
     if m.chance(0.85):
         strip = box(9, high - low, 9).translate([0, (low + high) / 2, 0])
         label = body.scale([1.015, 1, 1.015]) ^ strip
-        parts.append(
-            m.stamp(
-                label,
-                m.printed(
-                    m.pick("label", "label", "front"), ground, "round" if flat == 1 else "fit"
-                ),
-            )
+        parts.add(
+            label,
+            look=m.printed(
+                m.pick("label", "label", "front"), ground, "round" if flat == 1 else "fit"
+            ),
         )
     cap_r, cap_h = neck * m.u(1.05, 1.3), m.u(0.08, 0.25)
     top = m.n(0, 4)
@@ -239,21 +212,12 @@ def bottle(m: Maker) -> list[Manifold]:
                 for a in np.linspace(0, 2 * math.pi, 24)[:-1]
             ]
             lid = joined([lid, *ribs])
-        parts.append(m.stamp(lid.translate([0, h - 0.02, 0]), cap))
+        parts.add(lid, at=(0, h - 0.02, 0), look=cap)
     elif top == 3:  # a pump or a spray
-        parts.append(m.stamp(rod(neck * 1.1, 0.1).translate([0, h - 0.02, 0]), cap))
-        parts.append(m.stamp(rod(neck * 0.3, 0.25, 14).translate([0, h, 0]), cap))
-        parts.append(
-            m.stamp(
-                tube(
-                    [(0, h + 0.25, -0.08), (0, h + 0.27, 0.1), (0, h + 0.2, m.u(0.2, 0.4))],
-                    [0.06, 0.06, 0.03],
-                    10,
-                    14,
-                ),
-                cap,
-            )
-        )
+        parts.add(rod(neck * 1.1, 0.1), at=(0, h - 0.02, 0), look=cap)
+        parts.add(rod(neck * 0.3, 0.25, 14), at=(0, h, 0), look=cap)
+        line = [(0, h + 0.25, -0.08), (0, h + 0.27, 0.1), (0, h + 0.2, m.u(0.2, 0.4))]
+        parts.add(tube(line, [0.06, 0.06, 0.03], 10, 14), look=cap)
     if flat != 1:
         parts = [p.scale([1, 1, flat]) for p in parts]
     return laid(m, parts, 0.12)
@@ -278,53 +242,24 @@ def bowl(m: Maker) -> list[Manifold]:
     vessel = _vessel(m, profile, m.u(0.02, 0.05), sides)
     if m.chance(0.25):
         vessel = vessel.scale([1, 1, m.u(0.55, 0.85)])
-    parts = [m.stamp(vessel, look)]
+    parts = Parts(m)
+    parts.add(vessel, look=look)
     kind = m.n(0, 5)
     if kind == 0:  # a pan's handle
-        parts.append(
-            m.stamp(
-                tube(
-                    [
-                        (r * 0.95, h * 0.8, 0),
-                        (r + 0.3, h + 0.05, 0),
-                        (r + m.u(0.5, 0.9), h + 0.08, 0),
-                    ],
-                    [0.04, 0.035, 0.05],
-                    10,
-                    14,
-                ),
-                m.surface("dark", "wood"),
-            )
-        )
+        line = [(r * 0.95, h * 0.8, 0), (r + 0.3, h + 0.05, 0), (r + m.u(0.5, 0.9), h + 0.08, 0)]
+        parts.add(tube(line, [0.04, 0.035, 0.05], 10, 14), look=m.surface("dark", "wood"))
     elif kind == 1:  # a bucket's
-        parts.append(
-            m.stamp(
-                tube(
-                    [
-                        (r * 0.97, h * 0.9, 0),
-                        (r * 0.8, h + 0.6 * r, 0),
-                        (0, h + r, 0),
-                        (-r * 0.8, h + 0.6 * r, 0),
-                        (-r * 0.97, h * 0.9, 0),
-                    ],
-                    m.u(0.015, 0.05),
-                    10,
-                    32,
-                ),
-                m.surface("metal", "wood", "any"),
-            )
-        )
+        line = [
+            (r * 0.97, h * 0.9, 0),
+            (r * 0.8, h + 0.6 * r, 0),
+            (0, h + r, 0),
+            (-r * 0.8, h + 0.6 * r, 0),
+            (-r * 0.97, h * 0.9, 0),
+        ]
+        parts.add(tube(line, m.u(0.015, 0.05), 10, 32), look=m.surface("metal", "wood", "any"))
     elif kind == 2:
-        parts.append(
-            both(
-                m.stamp(
-                    handle(m, 0.15, 0.25, 0.025)
-                    .rotate([90, 0, 0])
-                    .translate([r * 0.93, h * 0.85, 0]),
-                    look,
-                )
-            )
-        )
+        part = handle(m, 0.15, 0.25, 0.025)
+        parts.pair(part, turn=(90, 0, 0), at=(r * 0.93, h * 0.85, 0), look=look)
     if m.chance(0.5):
         things = [m.surface("toy", "leaf", "earth") for _ in range(3)]
         inside = r * 0.6
@@ -332,13 +267,10 @@ def bowl(m: Maker) -> list[Manifold]:
         for _ in range(m.n(1, 9)):
             a, d = m.u(0, 6.3), m.u(0, 1) ** 0.5 * max(inside - size, 0.02)
             item = produce(m, size * m.u(0.8, 1.2)).rotate([m.u(0, 360), m.u(0, 360), 0])
-            parts.append(
-                m.stamp(
-                    item.translate(
-                        [d * math.sin(a), max(h * 0.7, size) + m.u(-0.05, 0.1), d * math.cos(a)]
-                    ),
-                    m.pick(*things),
-                )
+            parts.add(
+                item,
+                at=(d * math.sin(a), max(h * 0.7, size) + m.u(-0.05, 0.1), d * math.cos(a)),
+                look=m.pick(*things),
             )
     return parts
 
@@ -359,18 +291,15 @@ def plant(m: Maker) -> list[Manifold]:
             mapping="round",
         ),
     )
-    parts = [m.stamp(_vessel(m, profile, 0.03, sides), look)]
+    parts = Parts(m)
+    parts.add(_vessel(m, profile, 0.03, sides), look=look)
     if m.chance(0.3):
-        parts.append(m.stamp(ring(float(profile[-1, 0]), 0.035, 36, 8).translate([0, h, 0]), look))
+        parts.add(ring(float(profile[-1, 0]), 0.035, 36, 8), at=(0, h, 0), look=look)
     if m.chance(0.3):
         return parts
     rim = float(profile[-3, 0]) - 0.02
-    parts.append(
-        m.stamp(
-            rod(max(rim, 0.03), 0.05).translate([0, h - 0.1, 0]),
-            m.pattern("speckled", "earth", "dark"),
-        )
-    )
+    part = rod(max(rim, 0.03), 0.05)
+    parts.add(part, at=(0, h - 0.1, 0), look=m.pattern("speckled", "earth", "dark"))
     leaf = m.pattern(("plain", "clouded", "shaded"), "leaf")
     kind = m.n(0, 3)
     if kind == 0:  # a ball of leaves or a bonsai
@@ -378,74 +307,42 @@ def plant(m: Maker) -> list[Manifold]:
             s = m.u(0.15, 0.4)
             x, y, z = m.u(-0.2, 0.2), h + m.u(0.1, 0.6), m.u(-0.2, 0.2)
             clump = ripple(ball([s, s * m.u(0.6, 1.1), s], 24), m.rng, 0.12 * s, 0.5 * s, False)
-            parts.append(m.stamp(clump.translate([x, y, z]), leaf))
-            parts.append(
-                m.stamp(
-                    tube(
-                        [(0, h - 0.1, 0), (x * 0.4, (h + y) / 2, z * 0.4), (x, y, z)], 0.03, 8, 12
-                    ),
-                    m.wood(),
-                )
-            )
+            parts.add(clump, at=(x, y, z), look=leaf)
+            part = tube([(0, h - 0.1, 0), (x * 0.4, (h + y) / 2, z * 0.4), (x, y, z)], 0.03, 8, 12)
+            parts.add(part, look=m.wood())
     elif kind == 1:  # long leaves
         for i in range(m.n(4, 11)):
             a, long, lean = 2.4 * i, m.u(0.4, 1.0), m.u(0.1, 0.7)
-            blade = tube(
-                [(0, 0, 0), (0, long * 0.6, lean * long * 0.3), (0, long, lean * long)],
-                [0.03, m.u(0.04, 0.1), 0.01],
-                6,
-                10,
-                flat=(0.2, 1),
-            )
-            parts.append(
-                m.stamp(blade.rotate([0, math.degrees(a), 0]).translate([0, h - 0.08, 0]), leaf)
-            )
+            line = [(0, 0, 0), (0, long * 0.6, lean * long * 0.3), (0, long, lean * long)]
+            blade = tube(line, [0.03, m.u(0.04, 0.1), 0.01], 6, 10, flat=(0.2, 1))
+            parts.add(blade, turn=(0, math.degrees(a), 0), at=(0, h - 0.08, 0), look=leaf)
     elif kind == 2:  # a cactus
         ribs = m.n(6, 12)
         c, tall = m.u(0.1, 0.22), m.u(0.3, 0.9)
         angle = np.linspace(0, 2 * math.pi, 49)[:-1]
         form = ring_of(2, 48) * (1 + 0.1 * np.cos(ribs * angle))[:, None]
-        parts.append(
-            m.stamp(
-                tube(
-                    [(0, h - 0.1, 0), (0, h + tall / 2, 0), (0, h + tall, 0)],
-                    [c * 0.9, c, c * 0.8],
-                    form,
-                    14,
-                ),
-                leaf,
-            )
-        )
+        line = [(0, h - 0.1, 0), (0, h + tall / 2, 0), (0, h + tall, 0)]
+        parts.add(tube(line, [c * 0.9, c, c * 0.8], form, 14), look=leaf)
         if m.chance(0.5):
-            arm = tube(
-                [
-                    (0, h + tall * 0.4, 0),
-                    (c + 0.15, h + tall * 0.45, 0),
-                    (c + 0.18, h + tall * 0.8, 0),
-                ],
-                [0.07, 0.08, 0.06],
-                12,
-                18,
-            )
-            parts.append(m.stamp(arm, leaf))
+            line = [
+                (0, h + tall * 0.4, 0),
+                (c + 0.15, h + tall * 0.45, 0),
+                (c + 0.18, h + tall * 0.8, 0),
+            ]
+            arm = tube(line, [0.07, 0.08, 0.06], 12, 18)
+            parts.add(arm, look=leaf)
     else:  # flowers on stalks
         petal, heart = m.plain("toy", "pastel", "white"), m.plain("toy", "earth")
         for _ in range(m.n(2, 6)):
             x, z, y = m.u(-0.3, 0.3), m.u(-0.3, 0.3), h + m.u(0.3, 0.7)
-            parts.append(
-                m.stamp(
-                    tube(
-                        [(0, h - 0.1, 0), (x * 0.3, (h + y) / 2, z * 0.3), (x, y, z)], 0.018, 8, 12
-                    ),
-                    leaf,
-                )
-            )
+            part = tube([(0, h - 0.1, 0), (x * 0.3, (h + y) / 2, z * 0.3), (x, y, z)], 0.018, 8, 12)
+            parts.add(part, look=leaf)
             s = m.u(0.1, 0.18)
             bloom = slab(outline_of_flower(m.n(5, 8)) * s, 0.04, 0.015).rotate(
                 [m.u(-80, -10), m.u(-60, 60), 0]
             )
-            parts.append(m.stamp(bloom.translate([x, y, z]), petal))
-            parts.append(m.stamp(ball(0.35 * s, 16).translate([x, y + 0.02, z + 0.02]), heart))
+            parts.add(bloom, at=(x, y, z), look=petal)
+            parts.add(ball(0.35 * s, 16), at=(x, y + 0.02, z + 0.02), look=heart)
     return parts
 
 
@@ -458,6 +355,7 @@ def outline_of_flower(petals: int) -> np.ndarray:
 
 def food(m: Maker) -> list[Manifold]:
     """A fruit, a loaf, a cake, a burger, a doughnut, an ice cream."""
+    parts = Parts(m)
     kind = m.n(0, 6)
     if kind == 0:
         look = m.pattern(
@@ -467,22 +365,20 @@ def food(m: Maker) -> list[Manifold]:
             "earth",
             contrast=0.3,
         )
-        parts = [m.stamp(produce(m, 0.5), look)]
+        parts.add(produce(m, 0.5), look=look)
         stem = tube([(0, 0.3, 0), (0.03, 0.55, 0), (0.08, 0.65, 0.02)], [0.03, 0.025, 0.035], 8, 10)
-        parts.append(m.stamp(stem, m.plain("wood", "leaf")))
+        parts.add(stem, look=m.plain("wood", "leaf"))
         if m.chance(0.5):
             leaf = (
                 slab(ring_of(1.3, 16) * [0.22, 0.1], 0.02)
                 .rotate([70, 20, 0])
                 .translate([0.22, 0.55, 0])
             )
-            parts.append(m.stamp(leaf, m.plain("leaf")))
+            parts.add(leaf, look=m.plain("leaf"))
         return parts
     if kind == 1:  # a loaf, with cuts
-        crust, crumb = (
-            m.pattern(("clouded", "speckled"), "wood"),
-            m.pattern("speckled", "white", "wood"),
-        )
+        crust = m.pattern(("clouded", "speckled"), "wood")
+        crumb = m.pattern("speckled", "white", "wood")
         loaf = superquadric(
             [m.u(0.5, 0.9), m.u(0.25, 0.4), m.u(0.25, 0.45)], m.u(0.5, 0.9), m.u(0.4, 1), 40
         )
@@ -493,93 +389,71 @@ def food(m: Maker) -> list[Manifold]:
         ]
         return [loaf - joined(cuts)]
     if kind == 2:  # a cake in layers, sometimes a slice
-        r, y, parts = m.u(0.4, 0.6), 0.0, []
+        r, y = m.u(0.4, 0.6), 0.0
         looks = [m.pattern("speckled", "wood", "pastel"), m.plain("white", "pastel", "toy")]
         for i in range(m.n(2, 5)):
             t = m.u(0.06, 0.2)
-            parts.append(
-                m.stamp(
-                    rod(r - 0.01 * (i % 2), t + 0.004, 40, 0.02).translate([0, y, 0]), looks[i % 2]
-                )
-            )
+            parts.add(rod(r - 0.01 * (i % 2), t + 0.004, 40, 0.02), at=(0, y, 0), look=looks[i % 2])
             y += t
         for a in np.linspace(0, 2 * math.pi, m.n(1, 10))[:-1]:
-            parts.append(
-                m.stamp(
-                    produce(m, 0.08).translate(
-                        [0.75 * r * math.sin(a), y + 0.05, 0.75 * r * math.cos(a)]
-                    ),
-                    m.pick(*looks) if m.chance(0.3) else m.plain("toy"),
-                )
+            parts.add(
+                produce(m, 0.08),
+                at=(0.75 * r * math.sin(a), y + 0.05, 0.75 * r * math.cos(a)),
+                look=m.pick(*looks) if m.chance(0.3) else m.plain("toy"),
             )
         whole = joined(parts)
         if m.chance(0.4):
+            corners = [(0, 0), (1.5, 0), (1.5, m.u(0.8, 2.5))]
             wedge = m.stamp(
-                slab(np.array([(0, 0), (1.5, 0), (1.5, m.u(0.8, 2.5))]), 4)
-                .rotate([90, 0, 0])
-                .rotate([0, m.u(0, 360), 0]),
-                looks[0],
+                slab(np.array(corners), 4).rotate([90, 0, 0]).rotate([0, m.u(0, 360), 0]), looks[0]
             )
             whole = whole ^ wedge if m.chance(0.5) else whole - wedge
         return [whole]
     if kind == 3:  # a burger or a sandwich: layers between halves
-        y, parts, square = 0.0, [], m.pick(1.0, m.u(0.2, 0.5))
+        y, square = 0.0, m.pick(1.0, m.u(0.2, 0.5))
         bun = m.pattern(("speckled", "plain"), "wood")
-        parts.append(m.stamp(superquadric([0.5, 0.1, 0.5], 0.6, square), bun))
+        parts.add(superquadric([0.5, 0.1, 0.5], 0.6, square), look=bun)
         for _ in range(m.n(2, 5)):
             y += m.u(0.07, 0.12)
             layer = superquadric([m.u(0.46, 0.58), m.u(0.03, 0.08), m.u(0.46, 0.58)], 0.5, square)
             layer = ripple(layer, m.rng, 0.012, 0.2, False) if m.chance(0.5) else layer
-            parts.append(m.stamp(layer.translate([0, y, 0]), m.surface("leaf", "toy", "earth")))
+            parts.add(layer, at=(0, y, 0), look=m.surface("leaf", "toy", "earth"))
         top = superquadric([0.5, m.u(0.15, 0.3), 0.5], 0.9, square).trim_by_plane([0, 1, 0], -0.03)
-        parts.append(m.stamp(top.translate([0, y + 0.08, 0]), bun))
+        parts.add(top, at=(0, y + 0.08, 0), look=bun)
         return parts
     if kind == 4:  # a doughnut
         r = m.u(0.12, 0.2)
         dough = ring(0.35, r, 40, 18, m.u(0.7, 1))
         ice = ring(0.35, r * 1.06, 40, 18, 0.85).translate([0, 0.02, 0])
         ice = ripple(ice, m.rng, 0.02, 0.25, False).trim_by_plane([0, 1, 0], 0.02)
-        parts = [m.stamp(dough, m.plain("wood")), m.stamp(ice, m.plain("pastel", "earth", "toy"))]
+        parts.add(dough, look=m.plain("wood"))
+        parts.add(ice, look=m.plain("pastel", "earth", "toy"))
         flip = [90.0 if m.chance(0.3) else 0.0, 0.0, 0.0]
         return [p.rotate(flip) for p in parts]
     if kind == 5:  # an ice cream
         cone = lathe([(0, 0), (0.03, 0), (m.u(0.18, 0.28), 0.7), (0, 0.7)], 24)
-        parts = [m.stamp(cone, m.pattern("checked", "wood", repeats=4))]
+        parts.add(cone, look=m.pattern("checked", "wood", repeats=4))
         y, r = 0.78, 0.26
         for _ in range(m.n(1, 3)):
             scoop = ripple(ball(r, 28), m.rng, 0.012, 0.15, False)
-            parts.append(
-                m.stamp(
-                    scoop.translate([0, y, 0]),
-                    m.pattern(("speckled", "plain"), "pastel", "earth", "white"),
-                )
+            parts.add(
+                scoop,
+                at=(0, y, 0),
+                look=m.pattern(("speckled", "plain"), "pastel", "earth", "white"),
             )
             y += r * 1.2
             r *= m.u(0.8, 1)
         return parts
     look = m.pattern(("plain", "clouded"), "toy", "leaf", "earth")  # a root or a banana
-    body = tube(
-        [(0, -0.7, 0), (m.u(-0.2, 0.2), -0.2, 0), (m.u(-0.3, 0.3), 0.4, 0), (0, 0.8, 0)],
-        [0.04, m.u(0.1, 0.2), m.u(0.12, 0.28), m.u(0.05, 0.15)],
-        m.pick(16, 6),
-        32,
-    )
-    parts = [m.stamp(body, look)]
+    line = [(0, -0.7, 0), (m.u(-0.2, 0.2), -0.2, 0), (m.u(-0.3, 0.3), 0.4, 0), (0, 0.8, 0)]
+    body = tube(line, [0.04, m.u(0.1, 0.2), m.u(0.12, 0.28), m.u(0.05, 0.15)], m.pick(16, 6), 32)
+    parts.add(body, look=look)
     if m.chance(0.6):
         for _ in range(m.n(2, 6)):
-            parts.append(
-                m.stamp(
-                    tube(
-                        [
-                            (0, 0.75, 0),
-                            (m.u(-0.2, 0.2), 1.0, m.u(-0.2, 0.2)),
-                            (m.u(-0.4, 0.4), 1.25, m.u(-0.4, 0.4)),
-                        ],
-                        [0.04, 0.05, 0.02],
-                        8,
-                        12,
-                    ),
-                    m.plain("leaf"),
-                )
-            )
-    return [joined(parts).rotate([0, 0, m.pick(0, 90, m.u(60, 120))])]
+            line = [
+                (0, 0.75, 0),
+                (m.u(-0.2, 0.2), 1.0, m.u(-0.2, 0.2)),
+                (m.u(-0.4, 0.4), 1.25, m.u(-0.4, 0.4)),
+            ]
+            parts.add(tube(line, [0.04, 0.05, 0.02], 8, 12), look=m.plain("leaf"))
+    return parts.turned(0, 0, m.pick(0, 90, m.u(60, 120)))
