@@ -34,18 +34,18 @@ from .solids import (
 
 ENOUGH = 8_000  # faces of the parts after which no more are added
 SCHEMES = (
-    *(("toy",), ("toy",), ("pastel",), ("dark", "metal"), ("white", "metal"), ("wood", "earth")),
-    *(("fur",), ("any",), ("any",), ("wide",), ("leather", "earth"), ("white", "dark")),
+    *("toy", "toy", "pastel", "dark metal", "white metal", "wood earth"),
+    *("fur", "any", "any", "wide", "leather earth", "white dark"),
 )
 
 
 def composition(m: Maker) -> list[Manifold]:
     """A body, and two to nine parts on it: mirrored, in rows, around an axis, or cut out of it."""
     scheme = m.pick(*SCHEMES)
-    looks = [m.fur(*scheme) if m.chance(0.15) else m.surface(*scheme) for _ in range(m.n(2, 4))]
+    looks = [m.fur(scheme) if m.chance(0.15) else m.surface(scheme) for _ in range(m.n(2, 4))]
     if m.chance(0.33):
         looks[m.n(0, 1)] = m.printed(
-            m.pick("front", "label"), m.color(*scheme, "white"), m.pick("fit", "round")
+            m.pick("front", "label"), m.color(f"{scheme} white"), m.pick("fit", "round")
         )
     mirrored = m.chance(0.82)
     body = shape(m, mirrored)
@@ -53,7 +53,7 @@ def composition(m: Maker) -> list[Manifold]:
         body = warped(m, body, mirrored)
     parts = [m.stamp(body, looks[0])]
     if m.chance(0.3):
-        parts[0] = hollowed(m, parts[0], m.surface(*scheme))
+        parts[0] = hollowed(m, parts[0], m.surface(scheme))
     for _ in range(m.n(2, m.pick(3, 5, 9)) if m.chance(0.92) else 1):
         if sum(part.num_tri() for part in parts) > ENOUGH:
             break

@@ -40,11 +40,11 @@ def _eyes(m: Maker, center: Vec, radii: Vec, size: float) -> list[Manifold]:
     eyes = Parts(m)
     if m.chance(0.4):  # the white of the eye, and its pupil before it
         white = m.painted(np.full(3, m.u(0.85, 0.97)))
-        eyes.pair(ball(size * 1.5, 20), at=place, look=white)
+        eyes.pair(ball(size * 1.5, 20), white, at=place)
         ahead_of = place + np.array([0.15, 0.1, 1.0]) * size * 0.85
-        eyes.pair(ball(size * 0.8, 16), at=ahead_of, look=dark)
+        eyes.pair(ball(size * 0.8, 16), dark, at=ahead_of)
     else:
-        eyes.pair(ball([size, size * m.u(1, 1.5), size], 20), at=place, look=dark)
+        eyes.pair(ball([size, size * m.u(1, 1.5), size], 20), dark, at=place)
     if m.chance(0.35):  # a mouth
         mouth = center + radii * np.array([0, -0.42, 0.88])
         line = [
@@ -53,7 +53,7 @@ def _eyes(m: Maker, center: Vec, radii: Vec, size: float) -> list[Manifold]:
             mouth + [2.2 * size, 0.5 * size, -0.3 * size],
         ]
         bow = tube(line, 0.45 * size, 8, 12)
-        eyes.add(bow, look=m.painted(np.array([m.u(0.1, 0.7), 0.05, 0.08])))
+        eyes.add(bow, m.painted(np.array([m.u(0.1, 0.7), 0.05, 0.08])))
     return eyes
 
 
@@ -68,18 +68,12 @@ def _ears(m: Maker, blend: Blend, center: Vec, radii: Vec, look: int) -> None:
         blend.limb([base, base + np.array([0.2, 0.7, 0]) * r], [0.28 * r, 0.04 * r], look)
     elif kind == 2:
         tall = m.u(0.8, 2.0)
-        line = [
-            base,
-            base + np.array([0.15, 0.5 * tall, -0.05]) * r,
-            base + np.array([m.u(0.1, 0.6), tall, -0.1]) * r,
-        ]
+        corners = [m.u(0.1, 0.6), tall, -0.1]
+        line = [base, base + np.array([0.15, 0.5 * tall, -0.05]) * r, base + np.array(corners) * r]
         blend.limb(line, [0.18 * r, 0.26 * r, 0.12 * r], look)
     elif kind == 3:
-        line = [
-            base,
-            base + np.array([0.4, 0.05, 0]) * r,
-            base + np.array([0.6, -m.u(0.5, 1.1), 0.1]) * r,
-        ]
+        corners = [0.4, 0.05, 0]
+        line = [base, base + np.array(corners) * r, base + np.array([0.6, -m.u(0.5, 1.1), 0.1]) * r]
         blend.limb(line, [0.15 * r, 0.2 * r, 0.25 * r], look)
     elif kind == 4:
         blend.egg(
@@ -105,7 +99,7 @@ def _knobbly(m: Maker, part: Manifold) -> Manifold:
 
 def quadruped(m: Maker) -> list[Manifold]:
     """Dog, cat, horse, cow, elephant, bear, long-necked dinosaur: a body on four legs."""
-    coat, second, third = m.fur(), m.fur(), m.surface("dark", "fur", "earth")
+    coat, second, third = m.fur(), m.fur(), m.surface("dark fur earth")
     stout, high = m.u(0.13, 0.32), m.u(0.12, 0.55)
     long = m.u(0.4, 0.65)
     blend = Blend(m.u(0.04, 0.12))
@@ -165,7 +159,7 @@ def quadruped(m: Maker) -> list[Manifold]:
     nose = m.painted(np.full(3, m.u(0.02, 0.2)))
     if m.chance(0.6):
         part = ball([0.2 * r, 0.15 * r, 0.15 * r], 16)
-        parts.add(part, at=tip + [0, 0.1 * r, 0.35 * r], look=nose)
+        parts.add(part, nose, at=tip + [0, 0.1 * r, 0.35 * r])
     if m.chance(0.25):
         parts.append(_horns(m, head, r))
     if m.chance(0.2):
@@ -177,7 +171,7 @@ def quadruped(m: Maker) -> list[Manifold]:
             for a in np.linspace(0, 2 * math.pi, 9)[:-1]
         ]
         collar = tube(line, 0.02, 8, 28, True, flat=(1, 2))
-        parts.add(turned_to(collar, head - chest, at), look=m.plain("toy"))
+        parts.add(turned_to(collar, head - chest, at), m.plain("toy"))
     return _turned(m, parts)
 
 
@@ -187,15 +181,13 @@ def _horns(m: Maker, head: Vec, r: float) -> Manifold:
     edge_line = [m.u(0, 0.9), m.u(0.6, 1.5), m.u(-0.5, 0.6)]
     curve = [base, base + np.array(corners) * r, base + np.array(edge_line) * r]
     return both(
-        m.stamp(
-            tube(curve, [0.16 * r, 0.12 * r, 0.02 * r], 10, 16), m.plain("white", "earth", "dark")
-        )
+        m.stamp(tube(curve, [0.16 * r, 0.12 * r, 0.02 * r], 10, 16), m.plain("white earth dark"))
     )
 
 
 def _crest(m: Maker, spine: list[Vec], stout: float) -> Manifold:
     """Plates along the back."""
-    look, count, size = m.surface("toy", "earth"), m.n(5, 11), m.u(0.3, 0.7) * stout
+    look, count, size = m.surface("toy earth"), m.n(5, 11), m.u(0.3, 0.7) * stout
     line = np.array(spine)
     plates = []
     for t in np.linspace(0, 1, count):
@@ -259,7 +251,7 @@ def plush(m: Maker) -> list[Manifold]:
     parts.append(m.blended(blend, (coat, second, third)))
     parts += _eyes(m, head, radii, r * m.u(0.07, 0.13))
     nose = head + [0, -0.15 * r, radii[2] + 0.15 * r]
-    parts.add(ball([0.16 * r, 0.12 * r, 0.12 * r], 16), at=nose, look=m.plain("dark", "toy"))
+    parts.add(ball([0.16 * r, 0.12 * r, 0.12 * r], 16), m.plain("dark toy"), at=nose)
     if m.chance(0.3):  # a bow tie or a scarf
         y = 2 * h - 0.02
         line = [
@@ -267,7 +259,7 @@ def plush(m: Maker) -> list[Manifold]:
             for t in np.linspace(0, 2 * math.pi, 9)[:-1]
         ]
         loop = tube(line, m.u(0.03, 0.06), 10, 28, True)
-        parts.add(loop, look=m.cloth("toy", "any"))
+        parts.add(loop, m.cloth("toy any"))
     if m.chance(0.6):
         return parts
     return _turned(m, parts)
@@ -275,10 +267,8 @@ def plush(m: Maker) -> list[Manifold]:
 
 def biped(m: Maker) -> list[Manifold]:
     """A dinosaur, kangaroo or dragon on two legs, with a long tail."""
-    skin = m.pattern(
-        ("spotted", "clouded", "striped", "speckled", "plain"), "toy", "earth", "leaf", contrast=0.4
-    )
-    second, third = m.surface("earth", "toy"), m.surface("dark", "white")
+    skin = m.pattern("spotted clouded striped speckled plain", "toy earth leaf", contrast=0.4)
+    second, third = m.surface("earth toy"), m.surface("dark white")
     blend = Blend(m.u(0.04, 0.1))
     hip = np.array([0, m.u(0.35, 0.6), 0.0])
     stout, lean = m.u(0.14, 0.24), m.u(0.2, 1.1)
@@ -327,15 +317,15 @@ def _wings(m: Maker, at: Vec, size: float) -> Manifold:
     return both(
         m.stamp(
             wing.translate((at + [0.3 * size, 0.3 * size, -0.3 * size]).tolist()),
-            m.surface("toy", "any"),
+            m.surface("toy any"),
         )
     )
 
 
 def bird(m: Maker) -> list[Manifold]:
     """Duck, penguin, parrot, chick or owl."""
-    coat, second = m.fur("toy", "fur", "pastel", "dark"), m.fur("white", "any")
-    third = m.surface("toy", "earth")
+    coat, second = m.fur("toy fur pastel dark"), m.fur("white any")
+    third = m.surface("toy earth")
     upright = m.u(0, 1.3)
     blend = Blend(m.u(0.03, 0.1))
     r = m.u(0.22, 0.35)
@@ -362,7 +352,7 @@ def bird(m: Maker) -> list[Manifold]:
         (0, h * 1.2),
     ]
     beak = lathe(profile, 16).scale([1, 1, m.u(0.4, 1)])
-    parts.add(beak, turn=(90 + m.u(-5, 25), 0, 0), at=head + [0, -0.1 * h, 0.85 * h], look=third)
+    parts.add(beak, third, turn=(90 + m.u(-5, 25), 0, 0), at=head + [0, -0.1 * h, 0.85 * h])
     if m.chance(0.7):
         line = [
             (0.3 * r, 0.1, 0),
@@ -371,16 +361,14 @@ def bird(m: Maker) -> list[Manifold]:
             (0.4 * r, -0.06, 0.5 * r),
         ]
         foot = tube(line, [0.03, 0.03, 0.05, 0.06], 8, 14, flat=(1, 1))
-        parts.pair(foot, look=third)
+        parts.pair(foot, third)
     return _turned(m, parts)
 
 
 def swimmer(m: Maker) -> list[Manifold]:
     """Fish, shark, whale or dolphin."""
-    skin = m.pattern(
-        ("spotted", "striped", "plain", "clouded", "shaded"), "toy", "metal", "pastel", contrast=0.5
-    )
-    fin = m.surface("toy", "any")
+    skin = m.pattern("spotted striped plain clouded shaded", "toy metal pastel", contrast=0.5)
+    fin = m.surface("toy any")
     tall, wide = m.u(0.15, 0.4), m.u(0.1, 0.28)
     bow, count, sides = m.u(-0.12, 0.12), 26, 24
     z = np.linspace(-0.55, 0.5, count)
@@ -401,26 +389,26 @@ def swimmer(m: Maker) -> list[Manifold]:
     rings[..., 1] = form[None, :, 1] * tall * size[:, None] + (bow * (2 * z) ** 2 * 0.3)[:, None]
     rings[..., 2] = z[:, None]
     parts = Parts(m)
-    parts.add(loft(rings), look=skin)
+    parts.add(loft(rings), skin)
     tip = np.array([0, bow * 1.2, -0.55])
     corners = [(0.12, 0), (-0.1, 0.34), (-0.28, 0.38), (-0.16, 0), (-0.28, -0.38), (-0.1, -0.34)]
     form = np.array(corners) * m.u(0.6, 1.1)
     level = m.chance(0.4)
     tail = slab(form[::1], 0.04, 0.015, 2).rotate([0, -90, 0])
     tail = tail.rotate([0, 0, 90]) if level else tail
-    parts.add(tail, at=tip, look=fin)
+    parts.add(tail, fin, at=tip)
     blade = np.array([(-0.15, 0), (0.2, 0), (0.02, 0.2), (-0.12, 0.26)]) * m.u(0.6, 1.3)
     top = (
         slab(blade, 0.03, 0.01, 2).rotate([0, -90, 0]).translate([0, 0.85 * tall, m.u(-0.1, 0.15)])
     )
-    parts.add(top, look=fin)
+    parts.add(top, fin)
     side = (
         slab(blade, 0.03, 0.01, 2)
         .rotate([0, -90, 0])
         .rotate([0, 0, -m.u(70, 120)])
         .translate([0.8 * wide, -0.2 * tall, 0.15])
     )
-    parts.pair(side, look=fin)
+    parts.pair(side, fin)
     corners = [wide * 0.9 * blunt**0.5, tall * 0.5, 0.16]
     parts += _eyes(m, np.array([0, 0.0, 0.3]), np.array(corners), m.u(0.02, 0.045))
     return [p.rotate([0, m.pick(90, -90, m.u(-90, 90)), 0]) for p in [joined(parts)]]
@@ -429,25 +417,20 @@ def swimmer(m: Maker) -> list[Manifold]:
 def crawler(m: Maker) -> list[Manifold]:
     """Turtle, ladybird, beetle, crab or spider: a shell on many legs."""
     shell = m.pattern(
-        ("spotted", "checked", "dotted", "plain", "striped", "bricked"),
-        "toy",
-        "leaf",
-        "earth",
-        "dark",
-        contrast=0.6,
+        "spotted checked dotted plain striped bricked", "toy leaf earth dark", contrast=0.6
     )
-    skin = m.surface("leaf", "earth", "dark", "toy")
+    skin = m.surface("leaf earth dark toy")
     wide, tall, long = m.u(0.25, 0.45), m.u(0.12, 0.35), m.u(0.3, 0.55)
     dome = ball([wide, tall, long], 40).trim_by_plane([0, 1, 0], -0.25 * tall)
     parts = Parts(m)
-    parts.add(dome, look=shell)
+    parts.add(dome, shell)
     if m.chance(0.5):
         line = [
             (math.sin(t) * wide, 0, math.cos(t) * long)
             for t in np.linspace(0, 2 * math.pi, 13)[:-1]
         ]
         rim = tube(line, 0.04, 10, 36, True)
-        parts.add(rim, look=skin)
+        parts.add(rim, skin)
     r = m.u(0.1, 0.2)
     head = np.array([0, m.u(-0.02, 0.15), long + 0.6 * r])
     blend = Blend(0.04)
@@ -473,15 +456,13 @@ def crawler(m: Maker) -> list[Manifold]:
             head + [0.2, 1.8 * r, 1.5 * r],
         ]
         feeler = tube(line, [0.015, 0.012, 0.025], 8, 12)
-        parts.pair(feeler, look=skin)
+        parts.pair(feeler, skin)
     return _turned(m, parts)
 
 
 def snake(m: Maker) -> list[Manifold]:
     """A snake, worm or caterpillar."""
-    skin = m.pattern(
-        ("striped", "spotted", "checked", "furry", "dotted"), "toy", "leaf", "earth", contrast=0.6
-    )
+    skin = m.pattern("striped spotted checked furry dotted", "toy leaf earth", contrast=0.6)
     turns, count = m.u(0.5, 2), 7
     t = np.linspace(0, 1, count)
     path = np.stack(
@@ -510,9 +491,9 @@ def snake(m: Maker) -> list[Manifold]:
 
 def figure(m: Maker) -> list[Manifold]:
     """A doll, a hero, a soldier or a person, posed."""
-    skin = m.painted(m.color("skin", "skin", "skin", "toy", "metal"))
-    shirt, trousers = m.cloth("any"), m.cloth("dark", "any", "toy")
-    boots = m.surface("dark", "leather", "toy")
+    skin = m.painted(m.color("skin skin skin toy metal"))
+    shirt, trousers = m.cloth("any"), m.cloth("dark any toy")
+    boots = m.surface("dark leather toy")
     looks = (skin, shirt, trousers, boots)
     big = m.pick(m.u(0.09, 0.13), m.u(0.13, 0.22))
     broad, slim = m.u(0.1, 0.2), m.u(0.6, 1.2)
@@ -562,7 +543,7 @@ def figure(m: Maker) -> list[Manifold]:
     parts.append(m.blended(blend, looks))
     parts += _eyes(m, head, radii, big * m.u(0.08, 0.16))
     top = m.n(0, 5)
-    hair = m.surface("fur", "dark", "toy")
+    hair = m.surface("fur dark toy")
     if top <= 1:
         cut = ball((radii * m.u(1.06, 1.2)).tolist(), 32).translate(
             (head + [0, 0.05 * big, -0.12 * big]).tolist()
@@ -570,7 +551,7 @@ def figure(m: Maker) -> list[Manifold]:
         cut = cut.trim_by_plane(
             [0, 0.75, -0.65], float((head + [0, 0.15 * big, 0.2 * big]) @ [0, 0.75, -0.65])
         )
-        parts.add(cut, look=hair)
+        parts.add(cut, hair)
     elif top == 2:
         brim = m.u(1.1, 1.9)
         profile = [
@@ -582,12 +563,12 @@ def figure(m: Maker) -> list[Manifold]:
             (0, big * 1.1),
         ]
         hat = lathe(profile, 28)
-        parts.add(hat, at=head + [0, 0.55 * big, 0], look=hair)
+        parts.add(hat, hair, at=head + [0, 0.55 * big, 0])
     elif top == 3:
         helmet = ball((radii * 1.15).tolist(), 32).trim_by_plane(
             [0, 1, -0.4], float(head @ [0, 1, -0.4])
         )
-        parts.add(helmet, look=m.surface("metal", "toy", "dark"))
+        parts.add(helmet, m.surface("metal toy dark"))
     elif top == 4:  # long hair
         long = m.u(0.8, 2.2) * big
         mane = tube(
@@ -604,13 +585,13 @@ def figure(m: Maker) -> list[Manifold]:
         part = mane - ball((radii * 0.97).tolist(), 24).translate(
             (head + [0, -0.12 * big, 0.25 * big]).tolist()
         )
-        parts.add(part, look=hair)
+        parts.add(part, hair)
     if m.chance(0.2):  # a skirt or a robe
         profile = [(0, 0), (m.u(0.15, 0.3), 0), (broad * 0.8, leg * m.u(0.6, 0.9)), (0, leg * 0.9)]
         robe = lathe(profile, 28).translate([0, leg - leg * m.u(0.4, 0.9), 0])
-        parts.add(robe, look=m.cloth("any"))
+        parts.add(robe, m.cloth("any"))
     if m.chance(0.3):  # something in one hand
-        look, grip = m.surface("metal", "wood", "toy"), hand * [1, 1, 1]
+        look, grip = m.surface("metal wood toy"), hand * [1, 1, 1]
         line = [(0, -0.1, 0), (0, 0.15, 0), (0, m.u(0.3, 0.6), 0)]
         item = m.pick(
             tube(line, [0.02, 0.018, m.u(0.008, 0.03)], 10, 10, flat=(1, m.u(0.4, 2))),
@@ -618,7 +599,7 @@ def figure(m: Maker) -> list[Manifold]:
             ball(m.u(0.05, 0.12), 20),
             box(m.u(0.08, 0.2), m.u(0.08, 0.2), 0.05, 0.01),
         )
-        parts.add(item, turn=(m.u(-20, 80), 0, 0), at=np.array(grip) + [0, 0, bulk], look=look)
+        parts.add(item, look, turn=(m.u(-20, 80), 0, 0), at=np.array(grip) + [0, 0, bulk])
     if m.chance(0.2):  # a cape
         wide = broad + bulk
         cape = box(2 * wide, leg * 0.5 + torso * 0.9, 0.02).refine_to_length(0.06)
@@ -635,27 +616,27 @@ def figure(m: Maker) -> list[Manifold]:
                 -1,
             )
         )
-        parts.add(cape, look=m.cloth("toy", "any"))
+        parts.add(cape, m.cloth("toy any"))
     if m.chance(0.25):  # a rucksack, or wings
         part = box(1.5 * broad, torso * 0.7, 0.12, 0.03)
-        parts.add(part, at=(0, leg + torso * 0.6, -bulk - 0.07), look=m.surface())
+        parts.add(part, m.surface(), at=(0, leg + torso * 0.6, -bulk - 0.07))
     if m.chance(0.3):  # a stand
         base = lathe([(0, 0), (0.25, 0), (0.25, 0.03), (0, 0.03)], 32).translate([0, -0.02, 0])
-        parts.add(base, look=m.surface("dark", "earth", "white"))
+        parts.add(base, m.surface("dark earth white"))
     return parts
 
 
 def block_figure(m: Maker) -> list[Manifold]:
     """A figure of blocks and rods, with a printed chest."""
-    skin, second, dark = m.plain("skin", "toy"), m.surface("toy", "any"), m.plain("dark", "toy")
+    skin, second, dark = m.plain("skin toy"), m.surface("toy any"), m.plain("dark toy")
     w, h, d = m.u(0.22, 0.4), m.u(0.2, 0.4), m.u(0.12, 0.22)
     leg = m.u(0.12, 0.35)
-    shirt = m.printed(m.pick("label", "front"), m.color("toy", "dark", "white"), sides=True)
+    shirt = m.printed(m.pick("label", "front"), m.color("toy dark white"), sides=True)
     trunk = box(w, h, d, m.u(0, 0.03)).warp_batch(
         lambda p: np.stack([p[:, 0] * (1 - 0.4 * (p[:, 1] + h / 2)), p[:, 1], p[:, 2]], -1)
     )
     parts = Parts(m)
-    parts.add(trunk, at=(0, leg + h / 2, 0), look=shirt)
+    parts.add(trunk, shirt, at=(0, leg + h / 2, 0))
     r = m.u(0.09, 0.17)
     head = m.pick(
         rod(r, 1.7 * r, 28, 0.3 * r),
@@ -663,10 +644,10 @@ def block_figure(m: Maker) -> list[Manifold]:
         ball(r, 28).translate([0, 0.9 * r, 0]),
     )
     top = leg + h
-    parts.add(head, at=(0, top + 0.01, 0), look=skin)
-    parts.add(rod(0.5 * r, 0.05, 16), at=(0, top - 0.02, 0), look=skin)
+    parts.add(head, skin, at=(0, top + 0.01, 0))
+    parts.add(rod(0.5 * r, 0.05, 16), skin, at=(0, top - 0.02, 0))
     part = ball([0.12 * r, 0.16 * r, 0.1 * r], 12)
-    parts.pair(part, at=(0.4 * r, top + r * 1.1, r * 0.95), look=m.painted(np.full(3, 0.04)))
+    parts.pair(part, m.painted(np.full(3, 0.04)), at=(0.4 * r, top + r * 1.1, r * 0.95))
     if m.chance(0.6):
         profile = [(0, 0), (1.6 * r, 0), (1.5 * r, 0.1 * r), (r, 0.2 * r), (0.8 * r, r), (0, r)]
         hair = m.pick(
@@ -674,13 +655,13 @@ def block_figure(m: Maker) -> list[Manifold]:
             ball(r * 1.1, 28).trim_by_plane([0, 1, -0.3], 0.0),
             lathe(profile, 28),
         )
-        parts.add(hair, at=(0, top + 1.35 * r, 0), look=m.surface("dark", "toy", "fur"))
+        parts.add(hair, m.surface("dark toy fur"), at=(0, top + 1.35 * r, 0))
     step = m.u(-40, 40) if m.chance(0.4) else 0.0
     for side in (1, -1):
         one = box(w * 0.44, leg, d * 0.9, m.u(0, 0.02)).translate([0, -leg / 2, 0]) + box(
             w * 0.44, 0.08, d * 1.3
         ).translate([0, -leg + 0.04, d * 0.2])
-        parts.add(one, turn=(step * side, 0, 0), at=(side * w * 0.24, leg + 0.01, 0), look=dark)
+        parts.add(one, dark, turn=(step * side, 0, 0), at=(side * w * 0.24, leg + 0.01, 0))
         swing = m.u(-60, 120) if m.chance(0.5) else m.u(-10, 20)
         line = [(0, 0, 0), (side * 0.04, -h * 0.4, 0), (side * 0.05, -h * 0.75, 0.06)]
         arm = tube(line, 0.06, m.pick(12, ring_of(6, 12)), 12)

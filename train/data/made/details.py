@@ -51,9 +51,8 @@ def produce(m: Maker, r: float) -> Manifold:
             [r * np.sin(t) * dent, -r * 0.9 * np.cos(t) * (1 - 0.25 * np.exp(-8 * np.sin(t) ** 2))],
             1,
         )
-        return lathe(
-            [(0, profile[0, 1] + 0.05 * r), *profile.tolist(), (0, profile[-1, 1] - 0.1 * r)], 24
-        )
+        contour = [(0, profile[0, 1] + 0.05 * r), *profile.tolist(), (0, profile[-1, 1] - 0.1 * r)]
+        return lathe(contour, 24)
     if kind == 2:
         return tube([(0, -r, 0), (0.3 * r, 0, 0), (0, r, 0)], [0.25 * r, 0.45 * r, 0.2 * r], 12, 16)
     if kind == 3:

@@ -32,7 +32,7 @@ from .textures import package, screen
 
 def tool(m: Maker) -> list[Manifold]:
     """Something with a handle: hammer, screwdriver, brush, spoon, spanner, axe, torch, saw."""
-    grip, head = m.pick(m.wood(), m.surface("toy", "dark")), m.pick(m.metal(), m.surface())
+    grip, head = m.pick(m.wood(), m.surface("toy dark")), m.pick(m.metal(), m.surface())
     long, r = m.u(0.6, 1.0), m.u(0.035, 0.09)
     swell = m.rng.uniform(0.7, 1.25, 5) * r
     shaft = tube(
@@ -46,10 +46,10 @@ def tool(m: Maker) -> list[Manifold]:
         flat=(1, m.u(0.6, 1)),
     )
     parts = Parts(m)
-    parts.add(shaft, look=grip)
+    parts.add(shaft, grip)
     if m.chance(0.4):
         for y in np.linspace(-long * 0.4, -long * 0.1, m.n(2, 6)):
-            parts.add(ring(r * 1.05, 0.012, 24, 8), at=(0, y, 0), look=head)
+            parts.add(ring(r * 1.05, 0.012, 24, 8), head, at=(0, y, 0))
     top = long / 2
     kind = m.n(0, 9)
     if kind == 0:  # hammer
@@ -57,28 +57,28 @@ def tool(m: Maker) -> list[Manifold]:
         poll = rod(m.u(0.06, 0.12), w, 20, 0.02).rotate([0, 0, 90])
         line = [(0, 0, 0), (w, 0.02, 0), (w * 1.8, -m.u(0, 0.15), 0)]
         claw = tube(line, [0.07, 0.06, 0.015], 12, 16, flat=(1, 1.2))
-        parts.add(joined([poll, box(0.14, 0.12, 0.12, 0.02), claw]), at=(0, top, 0), look=head)
+        parts.add(joined([poll, box(0.14, 0.12, 0.12, 0.02), claw]), head, at=(0, top, 0))
     elif kind == 1:  # screwdriver
         blade = lathe([(0, 0), (0.025, 0), (0.025, m.u(0.3, 0.7)), (0.0, 0.75)], 12)
-        parts.add(blade, at=(0, top - 0.02, 0), look=head)
+        parts.add(blade, head, at=(0, top - 0.02, 0))
     elif kind == 2:  # spanner
         jaw = slab(ring_of(2.5, 28) * m.u(0.1, 0.16), 0.06, 0.01, 2) - box(
             m.u(0.06, 0.1), 0.2, 0.5
         ).translate([0, 0.1, 0]).rotate([0, 0, m.u(-20, 20)])
         parts.clear()
-        parts.add(box(2 * r, long, 0.05, 0.015), look=head)
-        parts.add(jaw, at=(0, top, 0), look=head)
+        parts.add(box(2 * r, long, 0.05, 0.015), head)
+        parts.add(jaw, head, at=(0, top, 0))
         if m.chance(0.6):
             part = slab(ring_of(2, 28) * 0.1, 0.06, 0.01, 2) - rod(0.06, 0.3, 6).rotate(
                 [90, 0, 0]
             ).translate([0, 0, -0.15])
-            parts.add(part, at=(0, -top, 0), look=head)
+            parts.add(part, head, at=(0, -top, 0))
     elif kind == 3:  # spoon or ladle
         size = m.u(0.1, 0.22)
         scoop = ball([size, size * 1.3, size * m.u(0.3, 0.9)]) - ball(
             [size * 0.9, size * 1.2, size * 0.8]
         ).translate([0, 0, size * 0.35])
-        parts.add(scoop, turn=(m.u(-10, 30), 0, 0), at=(0, top + size, 0), look=m.pick(grip, head))
+        parts.add(scoop, m.pick(grip, head), turn=(m.u(-10, 30), 0, 0), at=(0, top + size, 0))
     elif kind == 4:  # spatula, oar, paddle
         w, h = m.u(0.12, 0.25), m.u(0.2, 0.4)
         blade = box(w * 2, h, m.u(0.015, 0.05), 0.01)
@@ -89,15 +89,13 @@ def tool(m: Maker) -> list[Manifold]:
                     for x in np.linspace(-w * 0.6, w * 0.6, 4)
                 ]
             )
-        parts.add(
-            blade, turn=(m.u(-15, 15), 0, 0), at=(0, top + h * 0.45, 0), look=m.pick(grip, head)
-        )
+        parts.add(blade, m.pick(grip, head), turn=(m.u(-15, 15), 0, 0), at=(0, top + h * 0.45, 0))
     elif kind == 5:  # brush
         w = m.u(0.1, 0.3)
-        parts.add(box(w, 0.1, 0.08, 0.02), at=(0, top, 0), look=head)
-        tuft = m.pattern(("furry", "brushed"), "earth", "dark", "white", repeats=4)
+        parts.add(box(w, 0.1, 0.08, 0.02), head, at=(0, top, 0))
+        tuft = m.pattern("furry brushed", "earth dark white", repeats=4)
         part = taper(box(w * 0.95, m.u(0.12, 0.3), 0.07, 0.01), m.u(0.7, 1.3))
-        parts.add(part, at=(0, top + 0.13, 0), look=tuft)
+        parts.add(part, tuft, at=(0, top + 0.13, 0))
     elif kind == 6:  # axe, cleaver, knife
         corners = [(-0.02, -0.1), (0.2, -0.16), (m.u(0.25, 0.4), 0.0), (0.2, 0.18), (-0.02, 0.1)]
         form = np.array(corners)
@@ -105,7 +103,7 @@ def tool(m: Maker) -> list[Manifold]:
         if m.chance(0.5):
             corners = [(-0.05, 0), (0.06, 0), (0.06, 0.5), (0.0, 0.7), (-0.05, 0.5)]
             blade = slab(np.array(corners), 0.02, 0.006, 2)
-        parts.add(blade, at=(0, top - 0.03, 0), look=head)
+        parts.add(blade, head, at=(0, top - 0.03, 0))
     elif kind == 7:  # torch
         profile = [
             (0, 0),
@@ -117,8 +115,8 @@ def tool(m: Maker) -> list[Manifold]:
             (0, 0.2),
         ]
         cone = lathe(profile)
-        parts.add(cone, at=(0, top - 0.02, 0), look=m.pick(grip, head))
-        parts.add(rod(r * 1.5, 0.02), at=(0, top + 0.18, 0), look=m.plain("white", "pastel"))
+        parts.add(cone, m.pick(grip, head), at=(0, top - 0.02, 0))
+        parts.add(rod(r * 1.5, 0.02), m.plain("white pastel"), at=(0, top + 0.18, 0))
     elif kind == 8:  # pliers, scissors
         parts.clear()
         a = m.u(8, 25)
@@ -139,13 +137,13 @@ def tool(m: Maker) -> list[Manifold]:
             one += [m.stamp(bow, grip)] if loop else []
             whole = joined(one).rotate([0, 0, a])
             parts.append((whole if side > 0 else whole.mirror([1, 0, 0])).translate([0, 0, z]))
-        parts.add(rod(0.05, 0.12, 20), turn=(90, 0, 0), at=(0, 0, -0.06), look=head)
+        parts.add(rod(0.05, 0.12, 20), head, turn=(90, 0, 0), at=(0, 0, -0.06))
     else:  # a rake, a fork
         count, w = m.n(3, 6), m.u(0.15, 0.35)
-        parts.add(box(w, 0.05, 0.04, 0.01), at=(0, top, 0), look=head)
+        parts.add(box(w, 0.05, 0.04, 0.01), head, at=(0, top, 0))
         for x in np.linspace(-w / 2 + 0.02, w / 2 - 0.02, count):
             line = [(x, top, 0), (x, top + 0.15, 0.02), (x, top + m.u(0.22, 0.3), 0.06)]
-            parts.add(tube(line, [0.02, 0.018, 0.008], 8, 10), look=head)
+            parts.add(tube(line, [0.02, 0.018, 0.008], 8, 10), head)
     pose = m.n(0, 3)
     whole = joined(parts)
     if pose == 0:
@@ -159,24 +157,22 @@ def tool(m: Maker) -> list[Manifold]:
 
 def device(m: Maker) -> list[Manifold]:
     """A telephone, mouse, camera, loudspeaker, console, remote, clock, toaster, hair dryer."""
-    case, dark = m.surface("dark", "white", "metal", "any"), m.plain("dark")
-    accent = m.plain("toy", "metal", "white")
+    case, dark = m.surface("dark white metal any"), m.plain("dark")
+    accent = m.plain("toy metal white")
     kind = m.n(0, 10)
     parts = Parts(m)
     if kind == 0:  # a telephone, tablet or frame
         w, h, t = m.u(0.4, 0.9), m.u(0.6, 1.1), m.u(0.03, 0.1)
         edge = m.u(0.02, 0.08)
-        parts.add(box(w, h, t, m.u(0.1, 0.45) * t), look=case)
+        parts.add(box(w, h, t, m.u(0.1, 0.45) * t), case)
         pane = box(w - 2 * edge, h - 2 * edge - m.u(0, 0.1), 0.02).translate([0, 0, t / 2])
         picture = m.add(
             Look([plain_material(np.zeros(3))] * 4 + [material(screen(m.rng))] * 2, "fit")
         )
-        parts.add(pane, look=picture)
+        parts.add(pane, picture)
         if m.chance(0.4):
             part = rod(0.05, 0.03, 20)
-            parts.add(
-                part, turn=(90, 0, 0), at=(0, -h / 2 + edge / 2 + 0.03, t / 2 - 0.01), look=accent
-            )
+            parts.add(part, accent, turn=(90, 0, 0), at=(0, -h / 2 + edge / 2 + 0.03, t / 2 - 0.01))
         whole = joined(parts).rotate([m.pick(0, -m.u(10, 35), -80), 0, 0])
         if m.chance(0.4):
             whole = joined(
@@ -194,7 +190,7 @@ def device(m: Maker) -> list[Manifold]:
         )
         seam = m.stamp(box(0.015, 1, 0.6).translate([0, 0, 0.4]), dark)
         parts.append(m.stamp(body, case) - seam)
-        parts.add(rod(0.07, 0.06, 20), turn=(0, 0, 90), at=(0.03, 0.14, 0.27), look=accent)
+        parts.add(rod(0.07, 0.06, 20), accent, turn=(0, 0, 90), at=(0.03, 0.14, 0.27))
         if m.chance(0.6):
             line = [
                 (0, 0, 0.5),
@@ -202,11 +198,11 @@ def device(m: Maker) -> list[Manifold]:
                 (m.u(-0.4, 0.4), 0, 1.0),
                 (m.u(-0.6, 0.6), 0, 0.7),
             ]
-            parts.add(tube(line, 0.018, 8, 40), look=dark)
+            parts.add(tube(line, 0.018, 8, 40), dark)
         return parts.turned(0, m.u(90, 270) if m.chance(0.5) else m.u(-90, 90), 0)
     if kind == 2:  # a camera
         w, h, t = m.u(0.6, 0.9), m.u(0.4, 0.6), m.u(0.2, 0.35)
-        parts.add(box(w, h, t, 0.05), look=case)
+        parts.add(box(w, h, t, 0.05), case)
         r, long = m.u(0.14, 0.22), m.u(0.1, 0.5)
         profile = [
             (0, 0),
@@ -219,12 +215,12 @@ def device(m: Maker) -> list[Manifold]:
             (0, long * 0.85),
         ]
         lens = lathe(profile, 36)
-        parts.add(lens, turn=(90, 0, 0), at=(m.u(-0.1, 0.1), -0.02, t / 2 - 0.01), look=dark)
-        parts.add(ball([r * 0.7, r * 0.7, 0.05]), at=(0, -0.02, t / 2 + long * 0.83), look=accent)
-        parts.add(box(w * 0.3, 0.12, t * 0.9, 0.04), at=(0, h / 2 + 0.03, 0), look=case)
+        parts.add(lens, dark, turn=(90, 0, 0), at=(m.u(-0.1, 0.1), -0.02, t / 2 - 0.01))
+        parts.add(ball([r * 0.7, r * 0.7, 0.05]), accent, at=(0, -0.02, t / 2 + long * 0.83))
+        parts.add(box(w * 0.3, 0.12, t * 0.9, 0.04), case, at=(0, h / 2 + 0.03, 0))
         for x in (-0.3, 0.3):
             part = rod(m.u(0.04, 0.07), 0.06, 20, 0.01)
-            parts.add(part, at=(x * w, h / 2 - 0.01, 0), look=m.pick(accent, dark))
+            parts.add(part, m.pick(accent, dark), at=(x * w, h / 2 - 0.01, 0))
         if m.chance(0.3):
             path = [
                 (-w / 2, h * 0.3, 0),
@@ -233,10 +229,10 @@ def device(m: Maker) -> list[Manifold]:
                 (w * 0.6, h, -0.1),
                 (w / 2, h * 0.3, 0),
             ]
-            parts.add(tube(path, 0.02, 8, 32, flat=(1, 2)), look=dark)
+            parts.add(tube(path, 0.02, 8, 32, flat=(1, 2)), dark)
     elif kind == 3:  # a loudspeaker or radio
         w, h, t = m.u(0.4, 1.2), m.u(0.4, 1.1), m.u(0.25, 0.5)
-        parts.add(box(w, h, t, m.u(0.01, 0.12)), look=m.pick(case, m.wood()))
+        parts.add(box(w, h, t, m.u(0.01, 0.12)), m.pick(case, m.wood()))
         rows = (
             [(0.0, -0.2 * h, 0.38 * min(w, h)), (0.0, 0.28 * h, 0.18 * min(w, h))]
             if h > w
@@ -253,23 +249,23 @@ def device(m: Maker) -> list[Manifold]:
                 (0, 0.045),
             ]
             cone = lathe(profile, 32)
-            parts.add(cone, turn=(90, 0, 0), at=(x, y, t / 2 - 0.01), look=m.pick(dark, accent))
+            parts.add(cone, m.pick(dark, accent), turn=(90, 0, 0), at=(x, y, t / 2 - 0.01))
         if m.chance(0.4):
             path = [(w * 0.4, h / 2, 0), (w * 0.45, h / 2 + 0.4, 0), (w * 0.6, h / 2 + 0.9, -0.1)]
-            parts.add(tube(path, 0.015, 8, 14), look=accent)
+            parts.add(tube(path, 0.015, 8, 14), accent)
     elif kind == 4:  # a remote, a handset
         w, h, t = m.u(0.2, 0.4), m.u(0.7, 1.1), m.u(0.07, 0.15)
-        parts.add(bend(box(w, h, t, 0.4 * t).refine_to_length(0.1), m.u(-0.3, 0.3)), look=case)
+        parts.add(bend(box(w, h, t, 0.4 * t).refine_to_length(0.1), m.u(-0.3, 0.3)), case)
         columns, rows = m.n(2, 3), m.n(4, 8)
         for i, j in np.ndindex(columns, rows):
             x, y = (i - (columns - 1) / 2) * w * 0.7 / columns, (j / rows - 0.45) * h * 0.7
             key = ball([w * 0.09, w * 0.09, 0.04], 12) if rows % 2 else box(w * 0.2, w * 0.12, 0.05)
-            parts.add(key, at=(x, y, t / 2), look=accent if j == rows - 1 else dark)
+            parts.add(key, accent if j == rows - 1 else dark, at=(x, y, t / 2))
         whole = joined(parts)
         return [whole.rotate([m.pick(0, -60, -85), 0, 0]).rotate([0, m.u(-60, 60), 0])]
     elif kind == 5:  # a keyboard or a piano
         w, d, t = m.u(0.8, 1.4), m.u(0.3, 0.5), m.u(0.05, 0.12)
-        parts.add(box(w, t, d, 0.3 * t), look=case)
+        parts.add(box(w, t, d, 0.3 * t), case)
         rows, columns = m.pick(1, 3, 4), m.n(8, 14)
         keys = [
             box(w * 0.85 / columns, 0.06, d * 0.8 / rows * 0.85).translate(
@@ -281,7 +277,7 @@ def device(m: Maker) -> list[Manifold]:
             )
             for i, j in np.ndindex(columns, rows)
         ]
-        parts.add(Manifold.compose(keys), look=m.pick(dark, accent, m.plain("white")))
+        parts.add(Manifold.compose(keys), m.pick(dark, accent, m.plain("white")))
         return parts.turned(m.u(0, 25), m.u(-40, 40), 0)
     elif kind == 6:  # a game controller
         blend = Blend(0.12)
@@ -290,17 +286,17 @@ def device(m: Maker) -> list[Manifold]:
         body = m.blended(blend, (case,)).scale([1, 0.7, 1])
         parts.append(body)
         stick = joined([rod(0.03, 0.16, 12), ball([0.07, 0.03, 0.07], 20).translate([0, 0.17, 0])])
-        parts.pair(stick, at=(0.16, 0.05, 0.05), look=dark)
+        parts.pair(stick, dark, at=(0.16, 0.05, 0.05))
         for a in range(4):
             parts.add(
                 ball([0.03, 0.03, 0.03], 12),
+                m.plain("toy"),
                 at=(0.34 + 0.06 * math.sin(a * 1.57), 0.12, -0.02 + 0.06 * math.cos(a * 1.57)),
-                look=m.plain("toy"),
             )
         part = box(0.15, 0.03, 0.05).translate([-0.34, 0.12, 0]) + box(0.05, 0.03, 0.15).translate(
             [-0.34, 0.12, 0]
         )
-        parts.add(part, look=dark)
+        parts.add(part, dark)
         return parts.turned(m.u(20, 80), m.u(-30, 30), 0)
     elif kind == 7:  # a toaster, iron or coffee machine
         w, h, t = m.u(0.5, 0.9), m.u(0.4, 1.0), m.u(0.35, 0.6)
@@ -309,37 +305,37 @@ def device(m: Maker) -> list[Manifold]:
             niche = m.stamp(box(w * 0.7, h * 0.5, t).translate([0, -h * 0.05, t * 0.3]), dark)
             parts.append(m.stamp(body, m.pick(case, m.metal())) - niche)
             part = _jug(m, 0.2 * w, 0.4 * h)
-            parts.add(part, at=(0, -h * 0.29, t * 0.25), look=m.plain("dark", "metal", "pastel"))
+            parts.add(part, m.plain("dark metal pastel"), at=(0, -h * 0.29, t * 0.25))
         else:
             slots = joined([box(w * 0.7, 0.3, 0.06).translate([0, h / 2, z]) for z in (-0.1, 0.1)])
             parts.append(m.stamp(body, m.pick(case, m.metal())) - m.stamp(slots, dark))
-        parts.add(box(0.08, 0.04, 0.06, 0.01), at=(w / 2, 0.1, 0), look=dark)
+        parts.add(box(0.08, 0.04, 0.06, 0.01), dark, at=(w / 2, 0.1, 0))
         for x in np.linspace(-0.2, 0.2, m.n(1, 4)):
             part = rod(0.04, 0.05, 18, 0.01)
-            parts.add(part, turn=(90, 0, 0), at=(x * w, -h * 0.38, t / 2 - 0.02), look=accent)
+            parts.add(part, accent, turn=(90, 0, 0), at=(x * w, -h * 0.38, t / 2 - 0.02))
     elif kind == 8:  # a hair dryer, drill, water pistol
         long, r = m.u(0.5, 0.9), m.u(0.12, 0.2)
         path = [(0, 0, -long / 2), (0, 0.01, 0), (0, 0, long / 2)]
         barrel = tube(path, [r, r * m.u(0.9, 1.2), r * m.u(0.4, 0.9)], 20, 24)
         path = [(0, 0, -0.05), (0, -0.3, -0.08), (0, -m.u(0.45, 0.65), -m.u(0.05, 0.2))]
         grip = tube(path, [0.08, 0.075, 0.09], 14, 18, flat=(1, 1.2))
-        parts.add(barrel, look=case)
-        parts.add(grip, look=m.pick(case, dark))
-        parts.add(box(0.05, 0.1, 0.06, 0.015), at=(0, -0.17, 0.04), look=accent)
+        parts.add(barrel, case)
+        parts.add(grip, m.pick(case, dark))
+        parts.add(box(0.05, 0.1, 0.06, 0.015), accent, at=(0, -0.17, 0.04))
         nozzle = (
             rod(r * m.u(0.2, 0.7), m.u(0.05, 0.35), 20)
             .rotate([90, 0, 0])
             .translate([0, 0, long / 2])
         )
-        parts.add(nozzle, look=m.pick(dark, accent))
+        parts.add(nozzle, m.pick(dark, accent))
         if m.chance(0.5):
-            parts.add(box(0.22, 0.14, 0.25, 0.03), at=(0, -0.6, -0.1), look=dark)
+            parts.add(box(0.22, 0.14, 0.25, 0.03), dark, at=(0, -0.6, -0.1))
         return parts.turned(0, m.pick(90, -90, m.u(-180, 180)), 0)
     elif kind == 9:  # a clock, or a scale
         r, t = m.u(0.4, 0.55), m.u(0.08, 0.25)
         face = m.add(
             Look(
-                [plain_material(m.color("white", "any"))] * 4
+                [plain_material(m.color("white any"))] * 4
                 + [
                     material(
                         screen(m.rng)
@@ -353,14 +349,14 @@ def device(m: Maker) -> list[Manifold]:
         )
         form = ring_of(m.pick(2, 2, 5), 48)
         part = slab(form * r, t, 0.03) - slab(form * r * 0.88, t).translate([0, 0, t * 0.8])
-        parts.add(part, look=case)
-        parts.add(slab(form * r * 0.87, 0.02), at=(0, 0, t * 0.3), look=face)
+        parts.add(part, case)
+        parts.add(slab(form * r * 0.87, 0.02), face, at=(0, 0, t * 0.3))
         for a, long in ((m.u(0, 360), 0.6), (m.u(0, 360), 0.4)):
             part = box(0.02, long * r, 0.02).translate([0, long * r / 2, t * 0.33])
-            parts.add(part, turn=(0, 0, a), look=dark)
+            parts.add(part, dark, turn=(0, 0, a))
         if m.chance(0.4):
-            parts.pair(ball([0.12, 0.1, 0.08]), at=(0.25, r + 0.02, 0), look=accent)
-            parts.pair(rod(0.03, 0.2, 12), turn=(0, 0, 20), at=(0.25, -r - 0.1, 0), look=accent)
+            parts.pair(ball([0.12, 0.1, 0.08]), accent, at=(0.25, r + 0.02, 0))
+            parts.pair(rod(0.03, 0.2, 12), accent, turn=(0, 0, 20), at=(0.25, -r - 0.1, 0))
         return parts.turned(m.pick(0, -20, -85), m.u(-30, 30), 0)
     else:  # a router, hub, plug: a slab with aerials and cables
         w, t, d = m.u(0.5, 0.9), m.u(0.08, 0.2), m.u(0.3, 0.6)
@@ -368,7 +364,7 @@ def device(m: Maker) -> list[Manifold]:
             slab(outline(m) * [w / 1.2, d / 1.2], t, 0.3 * t).rotate([90, 0, 0])
             if m.chance(0.3)
             else box(w, t, d, 0.3 * t),
-            look=case,
+            case,
         )
         for x in np.linspace(-0.4, 0.4, m.n(1, 4)):
             path = [
@@ -376,7 +372,7 @@ def device(m: Maker) -> list[Manifold]:
                 (x * w, 0.3, -d * 0.45),
                 (x * w * m.u(0.8, 1.4), m.u(0.4, 0.7), -d * 0.5),
             ]
-            parts.add(tube(path, [0.03, 0.025, 0.02], 10, 14), look=dark)
+            parts.add(tube(path, [0.03, 0.025, 0.02], 10, 14), dark)
         if m.chance(0.5):
             path = [
                 (0, 0, -d * 0.45),
@@ -384,9 +380,9 @@ def device(m: Maker) -> list[Manifold]:
                 (m.u(-0.8, 0.8), 0, -d * 0.9),
                 (m.u(-0.6, 0.9), 0, 0.2),
             ]
-            parts.add(tube(path, 0.02, 8, 44), look=dark)
+            parts.add(tube(path, 0.02, 8, 44), dark)
         for x in np.linspace(-0.3, 0.3, m.n(2, 5)):
-            parts.add(ball(0.02, 10), at=(x * w, t * 0.1, d / 2), look=accent)
+            parts.add(ball(0.02, 10), accent, at=(x * w, t * 0.1, d / 2))
     return parts.turned(0, m.pick(0, m.u(-45, 45)), 0)
 
 
@@ -397,7 +393,7 @@ def _jug(m: Maker, r: float, h: float) -> Manifold:
 
 def instrument(m: Maker) -> list[Manifold]:
     """A guitar, a trumpet, a racket, a bat, a chess piece, a cup, a statuette on its base."""
-    a, b, dark = m.pick(m.wood(), m.surface()), m.surface("wood", "dark", "metal"), m.plain("dark")
+    a, b, dark = m.pick(m.wood(), m.surface()), m.surface("wood dark metal"), m.plain("dark")
     kind = m.n(0, 4)
     parts = Parts(m)
     if kind == 0:
@@ -413,17 +409,17 @@ def instrument(m: Maker) -> list[Manifold]:
         part = slab(form, thick, 0.02) - rod(0.1, 1, 28).rotate([90, 0, 0]).translate(
             [0, 0.05, thick / 2 - 0.03]
         )
-        parts.add(part, look=a)
-        parts.add(box(0.08, 0.8, 0.05, 0.01), at=(0, 0.7, thick / 2), look=b)
-        parts.add(box(0.14, 0.2, 0.04, 0.01), at=(0, 1.17, thick / 2 - 0.01), look=b)
-        parts.add(box(0.2, 0.04, 0.04), at=(0, -0.22, thick / 2 + 0.01), look=dark)
+        parts.add(part, a)
+        parts.add(box(0.08, 0.8, 0.05, 0.01), b, at=(0, 0.7, thick / 2))
+        parts.add(box(0.14, 0.2, 0.04, 0.01), b, at=(0, 1.17, thick / 2 - 0.01))
+        parts.add(box(0.2, 0.04, 0.04), dark, at=(0, -0.22, thick / 2 + 0.01))
         pegs = [
             rod(0.015, 0.26, 8)
             .rotate([0, 0, 90])
             .translate([0.13, 1.1 + 0.06 * i, thick / 2 - 0.01])
             for i in range(3)
         ]
-        parts.add(joined(pegs), look=m.metal())
+        parts.add(joined(pegs), m.metal())
         return parts.turned(m.u(-20, 0), m.u(-50, 50), m.pick(0, m.u(-80, 80)))
     if kind == 1:
         side_line = [
@@ -433,7 +429,7 @@ def instrument(m: Maker) -> list[Manifold]:
             (0, 0.4),
         ]
         flare = lathe(side_line, 32)
-        parts.add(flare, turn=(0, 0, -90), look=m.pick(m.metal(), m.surface("toy")))
+        parts.add(flare, m.pick(m.metal(), m.surface("toy")), turn=(0, 0, -90))
         line = [
             (0.1, 0, 0),
             (-0.1, -0.08, 0),
@@ -442,13 +438,13 @@ def instrument(m: Maker) -> list[Manifold]:
             (0.6, -0.08, 0),
             (0.5, 0, 0),
         ]
-        parts.add(tube(line, 0.028, 10, 44), look=m.metal())
+        parts.add(tube(line, 0.028, 10, 44), m.metal())
         part = joined([rod(0.03, 0.25, 14).translate([x, -0.22, 0]) for x in (0.2, 0.3, 0.4)])
-        parts.add(part, look=b)
+        parts.add(part, b)
         return parts.turned(0, m.u(-60, 60), m.u(-20, 20))
     if kind == 2:
         grip = tube([(0, -0.6, 0), (0, -0.3, 0), (0, 0.0, 0)], [0.05, 0.04, 0.035], 14, 14)
-        parts.add(grip, look=b)
+        parts.add(grip, b)
         if m.chance(0.5):  # a racket with its strings, or a paddle
             wide, tall = m.u(0.22, 0.3), m.u(0.28, 0.4)
             line = [
@@ -465,13 +461,13 @@ def instrument(m: Maker) -> list[Manifold]:
                 for y in np.linspace(0, 2 * tall, 11)[1:-1]
             ]
             net = joined(strings) ^ (ball([wide, tall, 1]).translate([0, tall, 0]))
-            parts.add(rim, look=a)
-            parts.add(net, look=m.plain("white", "toy"))
+            parts.add(rim, a)
+            parts.add(net, m.plain("white toy"))
         elif m.chance(0.5):
-            parts.add(slab(ring_of(2.2, 36) * [0.26, 0.3], 0.05, 0.01), at=(0, 0.26, 0), look=a)
+            parts.add(slab(ring_of(2.2, 36) * [0.26, 0.3], 0.05, 0.01), a, at=(0, 0.26, 0))
         else:
             part = tube([(0, 0, 0), (0, 0.3, 0), (0, 0.8, 0)], [0.04, 0.07, 0.085], 18, 20)
-            parts.add(part, look=a)
+            parts.add(part, a)
         return parts.turned(m.pick(0, -70), m.u(-40, 40), m.pick(0, m.u(-80, 80)))
     if kind == 3:  # a turned piece: chess, a candlestick, a cup
         count = m.n(5, 9)
@@ -480,18 +476,17 @@ def instrument(m: Maker) -> list[Manifold]:
         profile = spline(np.stack([r, np.linspace(0.05, 1, count)], 1), 40)
         side_line = [(0, 0), (r[0] * 1.05, 0), *np.maximum(profile, [0.03, 0]).tolist(), (0, 1.02)]
         body = lathe(side_line, 32)
-        parts.add(body, look=a)
+        parts.add(body, a)
+        contour = [(0, 0), (0.08, 0), (0.17, 0.15), (0.12, 0.16), (0.08, 0.1), (0, 0.08)]
         top = m.pick(
-            ball(m.u(0.06, 0.14)),
-            box(0.08, 0.2, 0.06) + box(0.18, 0.07, 0.06),
-            lathe([(0, 0), (0.08, 0), (0.17, 0.15), (0.12, 0.16), (0.08, 0.1), (0, 0.08)], 24),
+            ball(m.u(0.06, 0.14)), box(0.08, 0.2, 0.06) + box(0.18, 0.07, 0.06), lathe(contour, 24)
         )
-        parts.add(top, at=(0, 1.04, 0), look=m.pick(a, b))
+        parts.add(top, m.pick(a, b), at=(0, 1.04, 0))
         if m.chance(0.35):
             parts.pair(
                 handle(m, 0.2, 0.3, 0.025),
+                m.pick(a, b),
                 at=(float(np.interp(0.7, profile[:, 1], profile[:, 0])) - 0.03, 0.7, 0),
-                look=m.pick(a, b),
             )
         return parts
     base = m.pick(box(0.6, 0.2, 0.5, 0.01), rod(0.32, 0.2, 36, 0.02).translate([0, -0.1, 0]))

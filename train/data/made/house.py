@@ -30,7 +30,7 @@ def lamp(m: Maker) -> list[Manifold]:
     """A lamp, a lantern or a candlestick on a stand."""
     height, foot = m.u(0.4, 1.4), m.u(0.12, 0.3)
     metal = m.pick(m.metal(), m.wood(), m.surface())
-    shade = m.pick(m.plain("white", "pastel", "any"), m.cloth())
+    shade = m.pick(m.plain("white pastel any"), m.cloth())
     bulge = np.abs(m.rng.normal(0, 0.08, 8)) * (m.rng.random() < 0.6) + m.u(0.015, 0.05)
     heights = np.linspace(0.05, height, 8)
     line = spline(np.stack([bulge, heights], 1), 24)
@@ -51,19 +51,19 @@ def lamp(m: Maker) -> list[Manifold]:
         bell = ball([low, low * m.u(0.8, 1.2), low])
     tilt = [m.pick(0, 0, 0, m.u(20, 80)), 0, 0]
     parts = Parts(m)
-    parts.add(stand, look=metal)
-    parts.add(bell.rotate(tilt), at=(0, height - tall * 0.3, 0), look=shade)
+    parts.add(stand, metal)
+    parts.add(bell.rotate(tilt), shade, at=(0, height - tall * 0.3, 0))
     if m.chance(0.2):
         for a in range(m.n(2, 4)):
             rail = tube([(low, height + 0.3, 0), (low, 0.1, 0), (low * 0.9, 0.0, 0)], 0.015, 8, 12)
-            parts.add(rail, turn=(0, 90 * a, 0), look=metal)
+            parts.add(rail, metal, turn=(0, 90 * a, 0))
     return parts
 
 
 def furniture(m: Maker) -> list[Manifold]:
     """A table, chair, sofa, shelf, cabinet or bed."""
     main, second, third = (
-        m.pick(m.wood(), m.wood(), m.surface("white", "dark", "wood"), m.cloth("earth", "any"))
+        m.pick(m.wood(), m.wood(), m.surface("white dark wood"), m.cloth("earth any"))
         for _ in range(3)
     )
     w, d, h = m.u(0.5, 1.4), m.u(0.35, 0.9), m.u(0.2, 0.8)
@@ -74,7 +74,7 @@ def furniture(m: Maker) -> list[Manifold]:
     def block(look: int, size: tuple, at: tuple, radius: float | None = None) -> None:
         w, h, d = size
         solid = box(w, h, d, soft if radius is None else radius)
-        parts.add(solid, at=list(at), look=look)
+        parts.add(solid, look, at=list(at))
 
     def legs(wide: float, deep: float, high: float) -> None:
         r = m.u(0.02, 0.05)
@@ -96,7 +96,7 @@ def furniture(m: Maker) -> list[Manifold]:
     if kind == 0:
         thick = m.u(0.02, 0.08)
         if m.chance(0.35):
-            parts.add(rod(w / 2, thick, 40, 0.3 * thick), at=(0, h, 0), look=main)
+            parts.add(rod(w / 2, thick, 40, 0.3 * thick), main, at=(0, h, 0))
             profile = [
                 (0, 0),
                 (w * 0.3, 0),
@@ -106,7 +106,7 @@ def furniture(m: Maker) -> list[Manifold]:
                 (0.05, h + 0.01),
                 (0, h + 0.01),
             ]
-            parts.add(lathe(profile), look=second)
+            parts.add(lathe(profile), second)
         else:
             block(main, (w, thick, d), (0, h + thick / 2, 0))
             legs(w, d, h)
@@ -120,7 +120,7 @@ def furniture(m: Maker) -> list[Manifold]:
         legs(w, d, h * 0.6)
         if m.chance(0.6):
             rest = box(w, back, deep, m.pick(soft, 0.4 * deep)).rotate([-m.u(0, 15), 0, 0])
-            parts.add(rest, at=(0, seat + back / 2 - 0.02, -d / 2 + deep / 2), look=main)
+            parts.add(rest, main, at=(0, seat + back / 2 - 0.02, -d / 2 + deep / 2))
         else:
             for x in np.linspace(-w / 2 + 0.03, w / 2 - 0.03, m.n(3, 6)):
                 block(second, (0.035, back, 0.035), (float(x), seat + back / 2, -d / 2 + 0.03), 0.0)
@@ -161,20 +161,20 @@ def furniture(m: Maker) -> list[Manifold]:
                 if m.chance(0.5)
                 else box(0.25 * wide, 0.02, 0.03).translate([x, y, d / 2 + 0.025])
             )
-            parts.add(knob, look=second)
+            parts.add(knob, second)
         if foot > 0.05:
             legs(w, d, foot)
     elif kind == 4:
         w, d, h, head = m.u(0.7, 1.4), m.u(1.3, 1.8), m.u(0.15, 0.4), m.u(0.2, 0.6)
         block(main, (w, h, d), (0, h / 2, 0))
-        block(m.cloth("white", "pastel"), (0.96 * w, 0.2, 0.96 * d), (0, h + 0.07, 0), 0.06)
+        block(m.cloth("white pastel"), (0.96 * w, 0.2, 0.96 * d), (0, h + 0.07, 0), 0.06)
         block(main, (w, h + head, 0.06), (0, (h + head) / 2, -d / 2))
         part = superquadric([0.25 * w, 0.07, 0.15], 0.7, 0.5)
-        parts.add(part, at=(0.22 * w, h + 0.2, -d / 2 + 0.25), look=third)
+        parts.add(part, third, at=(0.22 * w, h + 0.2, -d / 2 + 0.25))
         block(m.cloth(), (0.99 * w, 0.1, 0.6 * d), (0, h + 0.14, 0.2 * d), 0.04)
     else:
         w, h, d = m.u(0.8, 1.6), m.u(0.25, 0.4), m.u(0.5, 0.7)
-        puff, cloth = m.u(0.04, 0.09), m.cloth("earth", "any", "dark")
+        puff, cloth = m.u(0.04, 0.09), m.cloth("earth any dark")
         block(cloth, (w, h, d), (0, h / 2, 0), puff * 0.5)
         count = m.n(1, 3)
         for i in range(count):
@@ -199,9 +199,7 @@ def furniture(m: Maker) -> list[Manifold]:
             )
         if m.chance(0.4):
             part = superquadric([0.16, 0.16, 0.06], 0.5, 0.8)
-            parts.add(
-                part, turn=(-20, 0, m.u(-20, 20)), at=(m.u(-0.3, 0.3), h + 0.25, 0.05), look=third
-            )
+            parts.add(part, third, turn=(-20, 0, m.u(-20, 20)), at=(m.u(-0.3, 0.3), h + 0.25, 0.05))
     if m.chance(0.3):
         return parts.turned(0, m.u(-60, 60), 0)
     return parts
@@ -209,7 +207,7 @@ def furniture(m: Maker) -> list[Manifold]:
 
 def rack(m: Maker) -> list[Manifold]:
     """Wires and slats: a basket, a rack, a cage, a crate, a stand, a hanger."""
-    look, second = m.pick(m.metal(), m.plain("white", "dark", "toy"), m.wood()), m.surface()
+    look, second = m.pick(m.metal(), m.plain("white dark toy"), m.wood()), m.surface()
     w, h, d, r = m.u(0.5, 1.0), m.u(0.2, 0.7), m.u(0.3, 0.7), m.u(0.01, 0.022)
     solids, parts = Parts(m), []
     kind = m.n(0, 3)
@@ -246,9 +244,9 @@ def rack(m: Maker) -> list[Manifold]:
                     (x, h, z),
                 ]
                 parts.append(tube(line, r, 6, 3, round_ends=False))
-        solids.add(joined(parts), look=look)
+        solids.add(joined(parts), look)
         if m.chance(0.4):
-            solids.add(hoop(1.01, h, r * 2), look=second)
+            solids.add(hoop(1.01, h, r * 2), second)
         if m.chance(0.4):
             line = [
                 (-w / 2, h, 0),
@@ -258,16 +256,16 @@ def rack(m: Maker) -> list[Manifold]:
                 (w / 2, h, 0),
             ]
             bow = tube(line, r * 1.5, 8, 28)
-            solids.add(bow, look=m.pick(look, second))
+            solids.add(bow, m.pick(look, second))
         if m.chance(0.3):
-            solids.add(box(w * flare, r * 1.5, d * flare), look=second)
+            solids.add(box(w * flare, r * 1.5, d * flare), second)
     elif kind == 2:  # plates or shelves on posts
         post = rod(r * 1.5, h * 1.5, 10)
         posts = [post.translate([x * w * 0.46, 0, z * d * 0.46]) for x in (-1, 1) for z in (-1, 1)]
-        solids.add(joined(posts), look=look)
+        solids.add(joined(posts), look)
         for y in np.linspace(0.05, h * 1.4, m.n(2, 4)):
             if m.chance(0.5):
-                solids.add(box(w, 0.03, d, 0.01), at=(0, y, 0), look=second)
+                solids.add(box(w, 0.03, d, 0.01), second, at=(0, y, 0))
             else:
                 rods = [
                     tube(
@@ -279,7 +277,7 @@ def rack(m: Maker) -> list[Manifold]:
                     tube([(-w / 2, y, z), (0, y, z), (w / 2, y, z)], r, 6, 3, round_ends=False)
                     for z in (-d / 2, d / 2)
                 ]
-                solids.add(joined(rods), look=look)
+                solids.add(joined(rods), look)
     else:  # a crate of boards
         t, boards = m.u(0.015, 0.03), m.n(2, 4)
         tall = h / boards
@@ -293,13 +291,13 @@ def rack(m: Maker) -> list[Manifold]:
                 part = box(0.05, h, 0.05).translate([x * (w / 2 - 0.02), h / 2, z * (d / 2 - 0.02)])
                 parts.append(part)
         parts.append(box(w, t, d).translate([0, t, 0]))
-        solids.add(joined(parts), look=m.pick(m.wood(), look))
+        solids.add(joined(parts), m.pick(m.wood(), look))
         for i in range(m.n(0, 5)):
             s = m.u(0.08, 0.14)
             solids.add(
                 produce(m, s),
+                second if i % 2 else m.plain("toy leaf"),
                 at=(m.u(-0.3, 0.3) * w, h * 0.6, m.u(-0.3, 0.3) * d),
-                look=second if i % 2 else m.plain("toy", "leaf"),
             )
     return [joined(solids).rotate([0, m.u(-50, 50), 0])]
 
@@ -307,7 +305,7 @@ def rack(m: Maker) -> list[Manifold]:
 def organiser(m: Maker) -> list[Manifold]:
     """A tray, drawer or stand with places for things, and some of these."""
     w, h, d, t = m.u(0.5, 1.0), m.u(0.1, 0.5), m.u(0.3, 0.7), m.u(0.015, 0.04)
-    look, inside = m.pick(m.surface(), m.wood()), m.surface("white", "dark", "any")
+    look, inside = m.pick(m.surface(), m.wood()), m.surface("white dark any")
     body = m.stamp(box(w, h, d, m.pick(0.0, 0.02, 0.06)), look)
     columns, rows = m.n(1, 4), m.n(1, 3)
     xs = np.sort(m.rng.uniform(-0.5, 0.5, columns - 1))
@@ -335,9 +333,9 @@ def organiser(m: Maker) -> list[Manifold]:
                 )
                 parts.add(
                     item,
+                    m.surface(),
                     turn=(m.u(-6, 6), 0, m.u(-6, 6)),
                     at=(x, tall / 2 - h * 0.4, z),
-                    look=m.surface(),
                 )
     if cuts:
         body = body - m.stamp(joined(cuts), inside)
@@ -348,9 +346,7 @@ def cushion(m: Maker) -> list[Manifold]:
     """A cushion, a folded towel or blanket, a roll, a rug."""
     parts = Parts(m)
     look = m.pick(
-        m.cloth("any"),
-        m.printed("front", m.color("white", "any", "toy"), sides=m.chance(0.5)),
-        m.fur(),
+        m.cloth("any"), m.printed("front", m.color("white any toy"), sides=m.chance(0.5)), m.fur()
     )
     trim = m.cloth()
     kind = m.n(0, 3)
@@ -367,10 +363,10 @@ def cushion(m: Maker) -> list[Manifold]:
             ]
         )
         body = m.pick(body, loft(rings))
-        parts.add(ripple(body, m.rng, m.u(0.004, 0.02), m.u(0.2, 0.6), False), look=look)
+        parts.add(ripple(body, m.rng, m.u(0.004, 0.02), m.u(0.2, 0.6), False), look)
         if m.chance(0.4):
             rim = tube([(x, y, 0) for x, y in form[::3]], 0.02, 8, 56, True)
-            parts.add(rim, look=trim)
+            parts.add(rim, trim)
         return parts.turned(m.u(-40, 0), m.u(-40, 40), m.pick(0, m.u(-45, 45)))
     if kind == 2:  # folded
         y = 0.0
@@ -378,7 +374,7 @@ def cushion(m: Maker) -> list[Manifold]:
             w, d, t = m.u(0.7, 0.9), m.u(0.5, 0.65), m.u(0.08, 0.15)
             one = box(w, t, d, 0.45 * t)
             one = ripple(one.refine_to_length(0.15), m.rng, 0.006, 0.3, False)
-            parts.add(one, at=(0, y + t / 2, 0), look=look if i % 2 else trim)
+            parts.add(one, look if i % 2 else trim, at=(0, y + t / 2, 0))
             y += t * 0.97
         return parts.turned(0, m.u(-60, 60), 0)
     r, long = m.u(0.12, 0.3), m.u(0.6, 1.2)

@@ -93,18 +93,18 @@ class Maker:
         """One of some things."""
         return options[self.rng.integers(len(options))]
 
-    def color(self, *kinds: str) -> np.ndarray:
-        """A colour of one of some kinds, see ``textures.color``."""
-        return textures.color(self.rng, self.pick(*kinds) if kinds else "any")
+    def color(self, kinds: str = "any") -> np.ndarray:
+        """A colour of one of some kinds, see ``textures.color``, separated by spaces."""
+        return textures.color(self.rng, self.pick(*kinds.split()))
 
     def add(self, look: Look) -> int:
         """The number of a new look."""
         self.looks.append(look)
         return len(self.looks) - 1
 
-    def plain(self, *kinds: str) -> int:
+    def plain(self, kinds: str = "any") -> int:
         """A look of one colour, of one of some kinds."""
-        return self.add(Look([plain_material(self.color(*kinds))]))
+        return self.painted(self.color(kinds))
 
     def painted(self, value: np.ndarray) -> int:
         """A look of one given display colour."""
@@ -112,8 +112,9 @@ class Maker:
 
     def pattern(
         self,
-        patterns: Sequence[str] | str,
-        *kinds: str,
+        patterns: str,
+        kinds: str = "any",
+        *,
         contrast: float = 0.0,
         mapping: str = "box",
         repeats: float = 0.0,
@@ -121,25 +122,25 @@ class Maker:
         """A look of a pattern of two colours.
 
         Args:
-            patterns: names in ``textures.PATTERNS`` to choose from.
+            patterns: names in ``textures.PATTERNS`` to choose from, separated by spaces.
             kinds: of the first colour.
             contrast: share of cases in which the second is another colour, not a shade.
             mapping: see ``Look``.
             repeats: the same; 0: drawn.
         """
-        name = patterns if isinstance(patterns, str) else self.pick(*patterns)
-        first = self.color(*kinds)
+        name = self.pick(*patterns.split())
+        first = self.color(kinds)
         second = self.color() if self.chance(contrast) else first * self.u(0.45, 0.85)
         picture = textures.mixed(textures.PATTERNS[name](self.rng), first, second)
         return self.add(Look([material(picture)], mapping, repeats or self.u(0.8, 2.5)))
 
-    def surface(self, *kinds: str) -> int:
+    def surface(self, kinds: str = "any") -> int:
         """A look for anything: mostly one colour, sometimes a pattern."""
         if self.chance(0.42):
-            return self.plain(*kinds)
-        quiet = ("plain", "clouded", "speckled", "brushed", "woven", "paneled")
-        loud = (*textures.PATTERNS,)
-        return self.pattern(quiet if self.chance(0.6) else loud, *kinds, contrast=0.3)
+            return self.plain(kinds)
+        quiet = "plain clouded speckled brushed woven paneled"
+        names = quiet if self.chance(0.6) else " ".join(textures.PATTERNS)
+        return self.pattern(names, kinds, contrast=0.3)
 
     def wood(self) -> int:
         """Wood, bare or stained."""
@@ -147,36 +148,21 @@ class Maker:
 
     def metal(self) -> int:
         """Metal, brushed or smooth."""
-        return self.pattern("brushed", "metal") if self.chance(0.5) else self.plain("metal", "dark")
+        return self.pattern("brushed", "metal") if self.chance(0.5) else self.plain("metal dark")
 
-    def cloth(self, *kinds: str) -> int:
+    def cloth(self, kinds: str = "any") -> int:
         """Cloth: woven, knitted, striped, printed."""
-        names = (
-            "woven",
-            "woven",
-            "knitted",
-            "striped",
-            "checked",
-            "dotted",
-            "flowered",
-            "plain",
-            "spotted",
-        )
-        return self.pattern(names, *kinds, contrast=0.4, repeats=self.u(1.5, 4))
+        names = "woven woven knitted striped checked dotted flowered plain spotted"
+        return self.pattern(names, kinds, contrast=0.4, repeats=self.u(1.5, 4))
 
-    def fur(self, *kinds: str) -> int:
+    def fur(self, kinds: str = "fur fur fur pastel toy") -> int:
         """Fur or plush, of one colour or in patches."""
-        name = self.pick("furry", "furry", "speckled", "plain", "spotted")
-        return self.pattern(
-            name,
-            *(kinds or ("fur", "fur", "fur", "pastel", "toy")),
-            contrast=0.35,
-            repeats=self.u(1, 2.5),
-        )
+        names = "furry furry speckled plain spotted"
+        return self.pattern(names, kinds, contrast=0.35, repeats=self.u(1, 2.5))
 
     def inks(self, count: int = 3) -> list[np.ndarray]:
         """Colours of a print."""
-        return [self.color("toy", "toy", "dark", "white", "any") for _ in range(count)]
+        return [self.color("toy toy dark white any") for _ in range(count)]
 
     def printed(
         self,

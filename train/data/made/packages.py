@@ -19,18 +19,16 @@ def carton(m: Maker) -> list[Manifold]:
     w, h = m.u(0.3, 1.0), m.u(0.3, 1.0)
     d = m.pick(m.u(0.06, 0.2), m.u(0.15, 0.45), m.u(0.3, 1.0))
     body = box(w, h, d, m.pick(0.0, 0.0, m.u(0.004, 0.03)))
-    ground = m.color("white", "toy", "dark", "any", "wood")
+    ground = m.color("white toy dark any wood")
     inks = m.inks(4)
     look = _carton_look(m, w, h, d, ground, inks)
     if m.chance(0.12):
         body = ripple(body.refine_to_length(0.1), m.rng, 0.006, 0.4, False)
     parts = Parts(m)
-    parts.add(body, look=look)
+    parts.add(body, look)
     kind = m.n(0, 9)
     if kind == 0:  # open, with flaps
-        inner = m.stamp(
-            box(w - 0.03, h, d - 0.03).translate([0, 0.03, 0]), m.plain("wood", "white")
-        )
+        inner = m.stamp(box(w - 0.03, h, d - 0.03).translate([0, 0.03, 0]), m.plain("wood white"))
         parts[0] -= inner
         flap = m.painted(ground * 0.95)
         tilt = m.u(10, 130)
@@ -41,18 +39,18 @@ def carton(m: Maker) -> list[Manifold]:
                 .rotate([0, 0, -tilt * side])
                 .translate([side * (w / 2 - 0.006), h / 2 - 0.005, 0])
             )
-            parts.add(sheet, look=flap)
+            parts.add(sheet, flap)
     elif kind == 1:  # ribbon
         ribbon = m.plain("toy")
-        parts.add(box(w * 0.14, h * 1.01, d * 1.02), look=ribbon)
-        parts.add(box(w * 1.01, h * 1.011, d * 0.14), look=ribbon)
+        parts.add(box(w * 0.14, h * 1.01, d * 1.02), ribbon)
+        parts.add(box(w * 1.01, h * 1.011, d * 0.14), ribbon)
         line = [(0, 0, 0), (0.18, 0.14, 0), (0.25, 0.02, 0), (0, 0, 0)]
         bow = tube(line, 0.03, 10, 24, flat=(1, 2))
-        parts.pair(bow, at=(0, h / 2, 0), look=ribbon)
+        parts.pair(bow, ribbon, at=(0, h / 2, 0))
     elif kind == 2:  # a window with the thing behind it
         pane = m.stamp(
             box(w * m.u(0.5, 0.8), h * m.u(0.4, 0.7), 0.1).translate([0, -0.05 * h, d / 2]),
-            m.plain("dark", "white"),
+            m.plain("dark white"),
         )
         thing = shape(m)
         low, high = extent(thing)
@@ -61,7 +59,7 @@ def carton(m: Maker) -> list[Manifold]:
         )
         thing = thing.scale([1, 1, min(1, 0.15 / max(float(np.ptp(extent(thing)[:, 2])), 0.01))])
         parts[0] -= pane
-        parts.add(thing, at=(0, -0.05 * h, d / 2 - 0.04), look=m.surface("toy", "any"))
+        parts.add(thing, m.surface("toy any"), at=(0, -0.05 * h, d / 2 - 0.04))
     elif kind == 3:  # a carry handle
         line = [
             (-0.15 * w, h / 2 - 0.02, 0),
@@ -69,11 +67,11 @@ def carton(m: Maker) -> list[Manifold]:
             (0.15 * w, h / 2 + 0.12, 0),
             (0.15 * w, h / 2 - 0.02, 0),
         ]
-        parts.add(tube(line, 0.02, 10, 24, flat=(1, 1.5)), look=m.plain())
+        parts.add(tube(line, 0.02, 10, 24, flat=(1, 1.5)), m.plain())
     elif kind == 4:  # a gable top, as milk has
         roof = slab(np.array([(-w / 2, 0), (w / 2, 0), (0.0, 0.5 * w)]), d).translate([0, h / 2, 0])
-        parts.add(roof, look=m.painted(inks[0]))
-        parts.add(box(0.03, 0.12, d), at=(0, h / 2 + 0.5 * w, 0), look=m.painted(ground))
+        parts.add(roof, m.painted(inks[0]))
+        parts.add(box(0.03, 0.12, d), m.painted(ground), at=(0, h / 2 + 0.5 * w, 0))
     elif kind == 5:  # a stack of them
         for i in range(1, m.n(2, 4)):
             parts.append(
@@ -84,7 +82,7 @@ def carton(m: Maker) -> list[Manifold]:
             )
     elif kind == 6:  # a sleeve or lid of another colour
         part = box(w * 1.02, h * m.u(0.15, 0.5), d * 1.02)
-        parts.add(part, at=(0, h * m.u(-0.2, 0.35), 0), look=m.surface())
+        parts.add(part, m.surface(), at=(0, h * m.u(-0.2, 0.35), 0))
     return laid(m, parts, 0.25)
 
 
@@ -92,7 +90,7 @@ def _carton_look(
     m: Maker, w: float, h: float, d: float, ground: np.ndarray, inks: list[np.ndarray]
 ) -> int:
     if m.chance(0.1):
-        return m.pattern(("plain", "striped", "dotted", "flowered", "checked"), contrast=0.7)
+        return m.pattern("plain striped dotted flowered checked", contrast=0.7)
 
     def side(kind: str, wide: float, tall: float):
         scale = 256 / max(wide, tall)
@@ -132,14 +130,12 @@ def pouch(m: Maker) -> list[Manifold]:
     rings[..., 2] = form[None, :, 1] * depth[:, None]
     body = ripple(loft(rings), m.rng, m.u(0.003, 0.015), m.u(0.15, 0.5), False)
     cloth = m.chance(0.25)
-    look = (
-        m.cloth() if cloth else m.printed("front", m.color("toy", "white", "dark", "any", "metal"))
-    )
+    look = m.cloth() if cloth else m.printed("front", m.color("toy white dark any metal"))
     parts = Parts(m)
-    parts.add(body, look=look)
+    parts.add(body, look)
     if m.chance(0.5):  # seams
         for y in (0.0, h):
-            parts.add(box(w, 0.06, 0.015), at=(0, y, 0), look=m.plain("metal", "any"))
+            parts.add(box(w, 0.06, 0.015), m.plain("metal any"), at=(0, y, 0))
     elif m.chance(0.4):
-        parts.add(rod(0.08, 0.12), at=(m.u(-0.2, 0.2), h - 0.03, 0), look=m.plain())
+        parts.add(rod(0.08, 0.12), m.plain(), at=(m.u(-0.2, 0.2), h - 0.03, 0))
     return laid(m, parts, 0.3)

@@ -38,7 +38,7 @@ def blocks(m: Maker) -> list[Manifold]:
     parts = Parts(m)
     if kind == 0:  # stacked rings on a rod
         y, r, count = 0.06, m.u(0.35, 0.5), m.n(3, 7)
-        parts.add(lathe([(0, 0), (r, 0), (r * 0.9, 0.07), (0, 0.07)]), look=looks[0])
+        parts.add(lathe([(0, 0), (r, 0), (r * 0.9, 0.07), (0, 0.07)]), looks[0])
         for i in range(count):
             t = m.u(0.06, 0.09)
             one = (
@@ -46,11 +46,11 @@ def blocks(m: Maker) -> list[Manifold]:
                 if r * 0.6 > t * 1.5
                 else ball([t * 1.5, t, t * 1.5])
             )
-            parts.add(one, at=(0, y + t, 0), look=looks[i % len(looks)])
+            parts.add(one, looks[i % len(looks)], at=(0, y + t, 0))
             y += 1.9 * t
             r *= m.u(0.8, 0.95)
         part = joined([rod(0.05, y, 16), ball(0.09).translate([0, y + 0.05, 0])])
-        parts.add(part, look=looks[-1])
+        parts.add(part, looks[-1])
     elif kind == 1:  # a tower or a castle
         y = 0.0
         for _ in range(m.n(2, 5)):
@@ -60,16 +60,16 @@ def blocks(m: Maker) -> list[Manifold]:
                     box(m.u(0.25, 0.4), h, m.u(0.2, 0.4), 0.015),
                     rod(m.u(0.1, 0.19), h, 28, 0.01).translate([0, -h / 2, 0]),
                 )
-                parts.add(solid, at=(x, y + h / 2, 0), look=m.pick(*looks))
+                parts.add(solid, m.pick(*looks), at=(x, y + h / 2, 0))
             if m.chance(0.3):
                 part = box(0.42 * count, 0.06, 0.4, 0.01)
-                parts.add(part, at=(0, y + h + 0.03, 0), look=m.pick(*looks))
+                parts.add(part, m.pick(*looks), at=(0, y + h + 0.03, 0))
                 h += 0.06
             y += h
         if m.chance(0.6):
             profile = [(0, 0), (0.22, 0), (0.01, 0.35), (0, 0.36)]
             top = m.pick(slab(np.array([(-0.25, 0), (0.25, 0), (0, 0.3)]), 0.3), lathe(profile))
-            parts.add(top, at=(0, y - 0.001, 0), look=m.pick(*looks))
+            parts.add(top, m.pick(*looks), at=(0, y - 0.001, 0))
     elif kind == 2:  # loose pieces on the ground
         for i in range(m.n(3, 9)):
             piece = m.pick(box, None, None)
@@ -107,21 +107,21 @@ def blocks(m: Maker) -> list[Manifold]:
             parts.append(part)
         if m.chance(0.4):
             part = box(1.1 * len(parts) + 0.2, 0.12, 0.5, 0.02)
-            parts.add(part, at=((len(parts) - 1) * 0.55, -0.6, 0), look=m.wood())
+            parts.add(part, m.wood(), at=((len(parts) - 1) * 0.55, -0.6, 0))
     return parts.turned(0, m.u(-50, 50), 0)
 
 
 def game(m: Maker) -> list[Manifold]:
     """A ball, top, skittles, dumb-bell, xylophone, rattle, drum, house, robot."""
     parts = Parts(m)
-    a, b, c = m.surface("toy"), m.surface("toy", "white"), m.surface("any", "dark")
+    a, b, c = m.surface("toy"), m.surface("toy white"), m.surface("any dark")
     kind = m.n(0, 7)
     if kind == 0:
         return [
             m.stamp(
                 ball(0.5, 48),
                 m.pattern(
-                    ("striped", "checked", "spotted", "dotted", "flowered", "bricked"),
+                    "striped checked spotted dotted flowered bricked",
                     "toy",
                     contrast=1.0,
                     mapping=m.pick("box", "round"),
@@ -134,9 +134,7 @@ def game(m: Maker) -> list[Manifold]:
         return [
             m.stamp(
                 lathe([(0, 0), *profile.tolist(), (0, 0.8)], 36),
-                m.pattern(
-                    ("striped", "grained", "shaded"), "toy", "wood", contrast=0.8, mapping="round"
-                ),
+                m.pattern("striped grained shaded", "toy wood", contrast=0.8, mapping="round"),
             ).rotate([m.u(0, 25), 0, 0])
         ]
     if kind == 2:
@@ -144,7 +142,7 @@ def game(m: Maker) -> list[Manifold]:
         profile = np.maximum(spline(points, 22), [0.02, 0])
         pin = m.stamp(
             lathe([(0, 0), *profile.tolist(), (0, 0.88)], 24),
-            m.pattern("striped", "white", "toy", contrast=1, mapping="round", repeats=1),
+            m.pattern("striped", "white toy", contrast=1, mapping="round", repeats=1),
         )
         rows = m.n(1, 3)
         pins = [
@@ -168,10 +166,10 @@ def game(m: Maker) -> list[Manifold]:
     if kind == 4:  # a xylophone or abacus
         count = m.n(5, 9)
         part = box(0.06, 0.08, 0.12 * count, 0.01)
-        parts.pair(part, turn=(0, 8, 0), at=(0.22, 0, 0), look=m.wood())
+        parts.pair(part, m.wood(), turn=(0, 8, 0), at=(0.22, 0, 0))
         for i in range(count):
             part = box(0.75 - 0.06 * i, 0.04, 0.09, 0.01)
-            parts.add(part, at=(0, 0.06, (i - (count - 1) / 2) * 0.12), look=m.plain("toy"))
+            parts.add(part, m.plain("toy"), at=(0, 0.06, (i - (count - 1) / 2) * 0.12))
         stick = (
             joined([rod(0.015, 0.6, 8), ball(0.05, 14)])
             .rotate([70, 40, 0])
@@ -180,55 +178,55 @@ def game(m: Maker) -> list[Manifold]:
         return [joined([*parts, m.stamp(stick, m.wood())]).rotate([m.u(0, 20), m.u(-60, 60), 0])]
     if kind == 5:  # a drum or a tin with a lid
         r, h = m.u(0.3, 0.5), m.u(0.25, 0.7)
-        parts.add(rod(r, h, 40), look=m.pick(a, m.printed("label", m.color("toy"), "round")))
-        parts.add(ring(r, 0.03, 40, 8, 1.3), look=b)
-        parts.add(ring(r, 0.03, 40, 8, 1.3), at=(0, h, 0), look=b)
-        parts.add(rod(r * 0.97, 0.02, 40), at=(0, h - 0.01, 0), look=m.plain("white"))
+        parts.add(rod(r, h, 40), m.pick(a, m.printed("label", m.color("toy"), "round")))
+        parts.add(ring(r, 0.03, 40, 8, 1.3), b)
+        parts.add(ring(r, 0.03, 40, 8, 1.3), b, at=(0, h, 0))
+        parts.add(rod(r * 0.97, 0.02, 40), m.plain("white"), at=(0, h - 0.01, 0))
         return parts
     if kind == 6:  # a house
         w, h, d = m.u(0.5, 1), m.u(0.4, 0.9), m.u(0.4, 0.8)
-        wall = m.pick(a, m.pattern(("bricked", "grained", "plain"), "any"))
-        roof = m.pattern(("bricked", "striped", "plain"), "toy", "earth")
-        trim = m.plain("white", "dark")
+        wall = m.pick(a, m.pattern("bricked grained plain", "any"))
+        roof = m.pattern("bricked striped plain", "toy earth")
+        trim = m.plain("white dark")
         gable = m.u(0.2, 0.5)
         part = slab(np.array([(-w / 2, 0), (w / 2, 0), (w / 2, h), (0, h + gable), (-w / 2, h)]), d)
-        parts.add(part, look=wall)
+        parts.add(part, wall)
         lean = math.degrees(math.atan2(gable, w / 2))
         side = (
             box(math.hypot(gable, w / 2) * 1.25, 0.05, d * 1.15)
             .rotate([0, 0, -lean])
             .translate([w * 0.27, h + gable * 0.48, 0])
         )
-        parts.pair(side, look=roof)
-        parts.add(box(w * 0.2, h * 0.5, 0.06), at=(m.u(-0.2, 0.2) * w, h * 0.25, d / 2), look=trim)
+        parts.pair(side, roof)
+        parts.add(box(w * 0.2, h * 0.5, 0.06), trim, at=(m.u(-0.2, 0.2) * w, h * 0.25, d / 2))
         part = box(w * 0.18, w * 0.18, 0.05)
-        parts.pair(part, at=(w * 0.3, h * 0.65, d / 2), look=m.plain("dark", "pastel"))
+        parts.pair(part, m.plain("dark pastel"), at=(w * 0.3, h * 0.65, d / 2))
         if m.chance(0.5):
-            parts.add(box(0.1, 0.3, 0.1), at=(w * 0.25, h + gable * 0.7, -d * 0.2), look=roof)
+            parts.add(box(0.1, 0.3, 0.1), roof, at=(w * 0.25, h + gable * 0.7, -d * 0.2))
         return parts.turned(0, m.u(-50, 50), 0)
     # A robot: boxes and rods.
     metal, second, dark = m.pick(m.metal(), a), b, c
     w, h = m.u(0.3, 0.5), m.u(0.35, 0.55)
-    parts.add(box(w, h, w * 0.7, m.u(0.0, 0.08)), at=(0, h / 2 + 0.3, 0), look=metal)
+    parts.add(box(w, h, w * 0.7, m.u(0.0, 0.08)), metal, at=(0, h / 2 + 0.3, 0))
     hw = w * m.u(0.5, 0.9)
     part = box(hw, hw * 0.8, hw * 0.8, m.u(0, 0.1))
-    parts.add(part, at=(0, h + 0.35 + hw * 0.4, 0), look=m.pick(metal, second))
-    parts.add(rod(0.06, 0.1, 14), at=(0, h + 0.27, 0), look=dark)
+    parts.add(part, m.pick(metal, second), at=(0, h + 0.35 + hw * 0.4, 0))
+    parts.add(rod(0.06, 0.1, 14), dark, at=(0, h + 0.27, 0))
     part = ball(hw * 0.14, 16)
-    parts.pair(part, at=(hw * 0.25, h + 0.38 + hw * 0.4, hw * 0.4), look=m.plain("toy", "white"))
+    parts.pair(part, m.plain("toy white"), at=(hw * 0.25, h + 0.38 + hw * 0.4, hw * 0.4))
     line = [
         (w / 2, h + 0.2, 0),
         (w / 2 + 0.15, h + m.u(-0.1, 0.2), 0),
         (w / 2 + m.u(0.1, 0.2), h - 0.1 + m.u(-0.2, 0.4), m.u(0, 0.25)),
     ]
     arm = tube(line, 0.055, m.pick(12, ring_of(8, 12)), 18)
-    parts.pair(arm, look=second)
+    parts.pair(arm, second)
     part = box(w * 0.3, 0.34, w * 0.35, 0.02).translate([w * 0.27, 0.15, 0]) + box(
         w * 0.36, 0.1, w * 0.6, 0.02
     ).translate([w * 0.27, 0.02, 0.04])
-    parts.pair(part, look=dark)
-    panel = m.printed("label", m.color("dark", "white"), sides=True)
-    parts.add(box(w * 0.7, h * 0.5, 0.05), at=(0, h * 0.55 + 0.3, w * 0.35), look=panel)
+    parts.pair(part, dark)
+    panel = m.printed("label", m.color("dark white"), sides=True)
+    parts.add(box(w * 0.7, h * 0.5, 0.05), panel, at=(0, h * 0.55 + 0.3, w * 0.35))
     return parts.turned(0, m.u(-40, 40), 0)
 
 

@@ -12,9 +12,9 @@ from .solids import ball, both, box, joined, lathe, loft, ring_of, ripple, rod, 
 
 def vehicle(m: Maker) -> list[Manifold]:
     """A car, bus, lorry, tractor or digger."""
-    paint, dark = m.surface("toy", "toy", "any", "pastel", "metal"), m.plain("dark")
+    paint, dark = m.surface("toy toy any pastel metal"), m.plain("dark")
     glass = m.painted(np.array([0.1, 0.14, 0.18]) * m.u(0.3, 4))
-    accent = m.surface("toy", "metal", "white", "dark")
+    accent = m.surface("toy metal white dark")
     kind = m.n(0, 4)
     long, w = m.u(0.9, 1.4), m.u(0.4, 0.55)
     r = m.u(0.09, 0.2)
@@ -104,52 +104,52 @@ def vehicle(m: Maker) -> list[Manifold]:
         parts.append(shield)
         for x in (-0.33, 0.33):
             part = ball([0.06, 0.04, 0.03], 14)
-            parts.add(part, at=(x * w, hood * 0.82, long * 0.49), look=m.plain("white", "pastel"))
+            parts.add(part, m.plain("white pastel"), at=(x * w, hood * 0.82, long * 0.49))
         part = box(w * 0.96, 0.05, 0.06, 0.02)
-        parts.add(part, at=(0, floor + h * 0.25, long * 0.5), look=accent)
+        parts.add(part, accent, at=(0, floor + h * 0.25, long * 0.5))
         if m.chance(0.25):
             part = box(w * 0.8, 0.03, 0.1).translate([0, boot + 0.1, -long * 0.45]) + both(
                 box(0.03, 0.12, 0.05).translate([w * 0.3, boot + 0.04, -long * 0.45])
             )
-            parts.add(part, look=accent)
+            parts.add(part, accent)
     elif kind == 2:  # bus or van
         tall = m.u(0.4, 0.6)
         body = box(w, tall, long, 0.06).translate([0, floor + tall / 2, 0])
-        parts.add(body, look=paint)
+        parts.add(body, paint)
         count = m.n(2, 6)
         for z in np.linspace(-long * 0.4, long * 0.4, count):
             part = box(w * 1.015, tall * 0.3, long * 0.65 / count, 0)
-            parts.add(part, at=(0, floor + tall * 0.65, z), look=glass)
+            parts.add(part, glass, at=(0, floor + tall * 0.65, z))
         part = box(w * 0.85, tall * 0.35, 0.05)
-        parts.add(part, at=(0, floor + tall * 0.62, long / 2 - 0.015), look=glass)
-        parts.add(box(w * 1.01, 0.04, long * 1.005), at=(0, floor + tall * 0.35, 0), look=accent)
+        parts.add(part, glass, at=(0, floor + tall * 0.62, long / 2 - 0.015))
+        parts.add(box(w * 1.01, 0.04, long * 1.005), accent, at=(0, floor + tall * 0.35, 0))
     else:  # a lorry: chassis, cabin, load
         cab = m.u(0.3, 0.42)
-        parts.add(box(w * 0.8, 0.08, long, 0.02), at=(0, floor + 0.05, 0), look=dark)
+        parts.add(box(w * 0.8, 0.08, long, 0.02), dark, at=(0, floor + 0.05, 0))
         part = box(w, cab, long * 0.27, m.u(0.02, 0.08))
-        parts.add(part, at=(0, floor + cab / 2 + 0.05, long * 0.36), look=paint)
+        parts.add(part, paint, at=(0, floor + cab / 2 + 0.05, long * 0.36))
         part = box(w * 1.02, cab * 0.35, long * 0.16)
-        parts.add(part, at=(0, floor + cab * 0.75, long * 0.37), look=glass)
+        parts.add(part, glass, at=(0, floor + cab * 0.75, long * 0.37))
         part = box(w * 0.8, cab * 0.35, 0.05)
-        parts.add(part, at=(0, floor + cab * 0.75, long * 0.49), look=glass)
+        parts.add(part, glass, at=(0, floor + cab * 0.75, long * 0.49))
         load = m.n(0, 4)
         z, deep = -long * 0.15, long * 0.66
         if load == 0:
             parts.add(
                 box(w, m.u(0.3, 0.6), deep, 0.02),
+                m.pick(accent, m.printed("front", m.color("white any"))),
                 at=(0, floor + 0.35, z),
-                look=m.pick(accent, m.printed("front", m.color("white", "any"))),
             )
         elif load == 1:
             tub = box(w, 0.3, deep, 0.0) - box(w * 0.9, 0.3, deep * 0.93).translate([0, 0.04, 0])
-            parts.add(tub, turn=(m.pick(0, 0, 20), 0, 0), at=(0, floor + 0.27, z), look=accent)
+            parts.add(tub, accent, turn=(m.pick(0, 0, 20), 0, 0), at=(0, floor + 0.27, z))
             if m.chance(0.5):
                 heap = ripple(ball([w * 0.42, 0.2, deep * 0.42], 32), m.rng, 0.02, 0.15, False)
-                parts.add(heap, at=(0, floor + 0.3, z), look=m.pattern("speckled", "earth"))
+                parts.add(heap, m.pattern("speckled", "earth"), at=(0, floor + 0.3, z))
         elif load == 2:
             path = [(0, 0, -deep / 2 + 0.1), (0, 0, 0), (0, 0, deep / 2 - 0.1)]
             tank = tube(path, m.u(0.18, 0.24), 24, 12)
-            parts.add(tank, at=(0, floor + 0.3, z), look=m.pick(accent, m.metal()))
+            parts.add(tank, m.pick(accent, m.metal()), at=(0, floor + 0.3, z))
         elif load == 3:  # a ladder or crane
             path = [
                 (0, floor + 0.2, z - 0.1),
@@ -157,10 +157,10 @@ def vehicle(m: Maker) -> list[Manifold]:
                 (0, floor + m.u(0.4, 0.9), long * m.u(0.2, 0.6)),
             ]
             arm = tube(path, [0.08, 0.06, 0.04], ring_of(6, 12), 20)
-            parts.add(arm, look=accent)
-            parts.add(rod(0.15, 0.15), at=(0, floor + 0.05, z), look=paint)
+            parts.add(arm, accent)
+            parts.add(rod(0.15, 0.15), paint, at=(0, floor + 0.05, z))
             part = box(0.25, 0.18, 0.2, 0.02) - box(0.2, 0.2, 0.2).translate([0, 0.06, 0.06])
-            parts.add(part, at=(0, floor + 0.4, long * 0.55), look=accent)
+            parts.add(part, accent, at=(0, floor + 0.4, long * 0.55))
         else:
             part = Manifold.compose(
                 [
@@ -170,23 +170,23 @@ def vehicle(m: Maker) -> list[Manifold]:
                     for x in (-0.19, 0.0, 0.19)
                 ]
             )
-            parts.add(part, look=m.wood())
+            parts.add(part, m.wood())
         axles = [long * 0.36, -long * 0.2, *([-long * 0.38] if m.chance(0.6) else [])]
         if m.chance(0.15):
             r *= 1.3
-    hub = m.surface("metal", "white", "toy")
+    hub = m.surface("metal white toy")
     thick = m.u(0.08, 0.16)
     tire = wheel(r, thick)
     for a in axles:
         at = [w / 2 - thick * 0.3, r, float(a)]
-        parts.pair(tire, at=at, look=dark)
-        parts.pair(wheel(r * m.u(0.4, 0.65), thick * 1.15), at=at, look=hub)
+        parts.pair(tire, dark, at=at)
+        parts.pair(wheel(r * m.u(0.4, 0.65), thick * 1.15), hub, at=at)
     return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180), m.u(20, 70), m.u(-70, -20)), 0)
 
 
 def plane(m: Maker) -> list[Manifold]:
     """An aeroplane, helicopter, rocket or boat."""
-    paint, second = m.surface("toy", "white", "metal", "any"), m.surface("toy", "any")
+    paint, second = m.surface("toy white metal any"), m.surface("toy any")
     dark = m.plain("dark")
     kind = m.n(0, 3)
     parts = Parts(m)
@@ -194,9 +194,9 @@ def plane(m: Maker) -> list[Manifold]:
         long, r = m.u(1.0, 1.4), m.u(0.09, 0.2)
         line = [(0, m.u(0, 0.08), -long / 2), (0, 0, 0), (0, 0, long / 2)]
         hull = tube(line, [r * 0.3, r, r * m.u(0.6, 1)], 22, 28)
-        parts.add(hull, look=paint)
+        parts.add(hull, paint)
         part = ball([r * 0.7, r * 0.6, r * 1.3], 24)
-        parts.add(part, at=(0, r * 0.7, long * 0.22), look=m.plain("dark", "pastel", "metal"))
+        parts.add(part, m.plain("dark pastel metal"), at=(0, r * 0.7, long * 0.22))
         if kind == 0 or m.chance(0.4):
             sweep, chord, span = m.u(-0.05, 0.45), m.u(0.25, 0.5), m.u(0.55, 0.9)
             corners = [
@@ -209,32 +209,32 @@ def plane(m: Maker) -> list[Manifold]:
             wing = slab(form, 0.05, 0.02, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
             levels = (m.u(-0.6, 0.8) * r,) if m.chance(0.75) else (-0.7 * r, 1.8 * r)
             for y in levels:
-                parts.pair(wing, at=(0, y, 0.08), look=m.pick(paint, second))
+                parts.pair(wing, m.pick(paint, second), at=(0, y, 0.08))
             if len(levels) > 1:
-                parts.pair(rod(0.02, 2.6 * r, 10), at=(span * 0.6, -0.7 * r, 0.0), look=dark)
+                parts.pair(rod(0.02, 2.6 * r, 10), dark, at=(span * 0.6, -0.7 * r, 0.0))
             if m.chance(0.5):
                 part = tube([(0, 0, -0.12), (0, 0, 0.15)], [0.05, 0.06], 16, 10)
-                parts.pair(part, at=(span * 0.45, levels[0] - 0.05, 0.12), look=m.metal())
+                parts.pair(part, m.metal(), at=(span * 0.45, levels[0] - 0.05, 0.12))
         else:
             part = joined(
                 [box(1.3, 0.015, 0.08).rotate([0, 90 * i + 20, 0]) for i in range(2)]
                 + [rod(0.04, 0.15, 12).translate([0, -0.12, 0])]
             )
-            parts.add(part, at=(0, r + 0.12, 0.1), look=dark)
+            parts.add(part, dark, at=(0, r + 0.12, 0.1))
             line = [(r, -r - 0.12, -0.3), (r, -r - 0.12, 0.3)]
             part = tube(line, 0.025, 8, 8) + rod(0.02, 0.2, 8).translate([r, -r - 0.12, 0])
-            parts.pair(part, look=dark)
+            parts.pair(part, dark)
         corners = [(-0.02, 0), (0.18, 0), (0.06, 0.3), (-0.06, 0.3)]
         fin = slab(np.array(corners), 0.03, 0.01, 2).rotate([0, -90, 0]).mirror([0, 0, 0])
-        parts.add(fin, at=(0, r * 0.4, -long / 2 + 0.02), look=second)
+        parts.add(fin, second, at=(0, r * 0.4, -long / 2 + 0.02))
         corners = [(0, -0.1), (0.28, -0.14), (0.28, 0.0), (0, 0.1)]
         flat = slab(np.array(corners), 0.025, 0.008, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
-        parts.pair(flat, at=(0, 0.05, -long / 2 + 0.08), look=second)
+        parts.pair(flat, second, at=(0, 0.05, -long / 2 + 0.08))
         if m.chance(0.4):
             part = joined(
                 [box(0.5, 0.05, 0.015).rotate([0, 0, 60 * i]) for i in range(m.pick(2, 3))]
             )
-            parts.add(part, at=(0, 0, long / 2 + r * 0.8), look=dark)
+            parts.add(part, dark, at=(0, 0, long / 2 + r * 0.8))
     elif kind == 2:  # a rocket that stands
         r = m.u(0.12, 0.25)
         hull = lathe(
@@ -242,8 +242,7 @@ def plane(m: Maker) -> list[Manifold]:
             32,
         )
         parts.add(
-            hull,
-            look=m.pick(paint, m.pattern("striped", "white", "toy", contrast=1, mapping="round")),
+            hull, m.pick(paint, m.pattern("striped", "white toy", contrast=1, mapping="round"))
         )
         corners = [(0, 0.1), (0.25, -0.15), (0.25, 0.05), (0.0, 0.45)]
         fin = slab(np.array(corners), 0.04, 0.01, 2).translate([r * 0.8, 0, 0])
@@ -252,7 +251,7 @@ def plane(m: Maker) -> list[Manifold]:
             for n in (m.pick(3, 4),)
             for i in range(n)
         ]
-        parts.add(ball([0.1, 0.1, 0.05], 20), at=(0, 0.7, r * 0.95), look=dark)
+        parts.add(ball([0.1, 0.1, 0.05], 20), dark, at=(0, 0.7, r * 0.95))
         return parts
     else:  # a boat
         long, w, h = m.u(0.9, 1.4), m.u(0.35, 0.5), m.u(0.2, 0.35)
@@ -270,28 +269,28 @@ def plane(m: Maker) -> list[Manifold]:
         well = m.stamp(hull.scale([0.85, 1, 0.85]).translate([0, h * 0.6, 0]), m.wood())
         parts.append(m.stamp(hull, paint) - well)
         if m.chance(0.5):
-            parts.add(rod(0.025, 1.0, 10), look=m.wood())
+            parts.add(rod(0.025, 1.0, 10), m.wood())
             corners = [(0.03, 0.25), (0.5, 0.25), (0.03, 0.95)]
             sail = slab(np.array(corners), 0.02).rotate([0, m.u(60, 120), 0])
-            parts.add(sail, look=m.cloth("white", "toy"))
+            parts.add(sail, m.cloth("white toy"))
             if m.chance(0.5):
                 part = slab(np.array([(0.03, 0.25), (0.4, 0.25), (0.03, 0.8)]), 0.02)
-                parts.add(part, turn=(0, -m.u(60, 120), 0), look=m.cloth("white", "toy"))
+                parts.add(part, m.cloth("white toy"), turn=(0, -m.u(60, 120), 0))
         else:
             part = box(w * 0.55, 0.25, long * 0.3, 0.03)
-            parts.add(part, at=(0, h * 0.4, -0.05 * long), look=second)
+            parts.add(part, second, at=(0, h * 0.4, -0.05 * long))
             part = box(w * 0.4, 0.15, long * 0.15, 0.02)
-            parts.add(part, at=(0, h * 0.4 + 0.19, 0), look=m.pick(paint, second))
+            parts.add(part, m.pick(paint, second), at=(0, h * 0.4 + 0.19, 0))
             for z in np.linspace(-0.2, 0.0, m.n(1, 3)):
                 part = rod(0.05, 0.3, 16)
-                parts.add(part, at=(0, h * 0.4, z * long), look=m.surface("toy", "dark"))
+                parts.add(part, m.surface("toy dark"), at=(0, h * 0.4, z * long))
     return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180)), 0)
 
 
 def train_of(m: Maker) -> list[Manifold]:
     """A wooden or plastic train: an engine and waggons, or one of them."""
     looks = [m.surface("toy") for _ in range(3)]
-    dark = m.surface("dark", "wood", "toy")
+    dark = m.surface("dark wood toy")
     parts = Parts(m)
     count = m.n(1, 3)
     w, long, r = m.u(0.3, 0.4), m.u(0.5, 0.7), m.u(0.07, 0.11)
@@ -299,18 +298,18 @@ def train_of(m: Maker) -> list[Manifold]:
         z = -i * (long + 0.1)
         main, second = m.pick(*looks), m.pick(*looks)
         car = Parts(m)
-        car.add(box(w, 0.08, long, 0.015), at=(0, r + 0.04, 0), look=m.pick(dark, second))
+        car.add(box(w, 0.08, long, 0.015), m.pick(dark, second), at=(0, r + 0.04, 0))
         if i == 0:
             line = [(0, 0, -long * 0.1), (0, 0, long * 0.38)]
             part = tube(line, m.u(0.11, 0.15), 24, 8, round_ends=m.chance(0.5))
-            car.add(part, at=(0, r + 0.2, 0), look=main)
+            car.add(part, main, at=(0, r + 0.2, 0))
             part = box(w * 0.95, m.u(0.3, 0.42), long * 0.3, 0.01)
-            car.add(part, at=(0, r + 0.25, -long * 0.3), look=second)
+            car.add(part, second, at=(0, r + 0.25, -long * 0.3))
             part = box(w * 1.1, 0.04, long * 0.36, 0.015)
-            car.add(part, at=(0, r + 0.46, -long * 0.3), look=main)
+            car.add(part, main, at=(0, r + 0.46, -long * 0.3))
             part = lathe([(0, 0), (0.04, 0), (m.u(0.03, 0.08), 0.15), (0, 0.15)], 20)
-            car.add(part, at=(0, r + 0.3, long * 0.3), look=dark)
-            car.add(ball(0.06, 18), at=(0, r + 0.34, 0.05), look=second)
+            car.add(part, dark, at=(0, r + 0.3, long * 0.3))
+            car.add(ball(0.06, 18), second, at=(0, r + 0.34, 0.05))
         else:
             load = m.n(0, 3)
             if load == 0:
@@ -336,9 +335,9 @@ def train_of(m: Maker) -> list[Manifold]:
             else:
                 for k in range(m.n(1, 3)):
                     part = box(0.2, 0.2, 0.2, 0.01)
-                    car.add(part, at=(0, r + 0.18, (k - 1) * 0.21), look=m.pick(*looks))
+                    car.add(part, m.pick(*looks), at=(0, r + 0.18, (k - 1) * 0.21))
         for a in (-long * 0.3, long * 0.3):
-            car.pair(wheel(r, 0.05), at=(w / 2, r, a), look=m.pick(dark, second) if i % 2 else dark)
-        car.add(box(0.05, 0.04, long + 0.15), at=(0, r + 0.04, 0), look=dark)
+            car.pair(wheel(r, 0.05), m.pick(dark, second) if i % 2 else dark, at=(w / 2, r, a))
+        car.add(box(0.05, 0.04, long + 0.15), dark, at=(0, r + 0.04, 0))
         parts.append(joined(car).translate([0, 0, z]))
     return parts.turned(0, m.pick(90, -90, m.u(-180, 180), m.u(30, 70)), 0)

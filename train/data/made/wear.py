@@ -53,8 +53,8 @@ def _lifted(solid: Manifold, heel: float) -> Manifold:
 
 def shoe(m: Maker) -> list[Manifold]:
     """A trainer, a boot, a slipper, a clog or a shoe with a heel; one or a pair."""
-    upper = m.pick(m.surface(), m.cloth("any"), m.pattern(("plain", "clouded"), "leather", "dark"))
-    lower, trim = m.surface("white", "dark", "earth", "any"), m.surface("any")
+    upper = m.pick(m.surface(), m.cloth("any"), m.pattern("plain clouded", "leather dark"))
+    lower, trim = m.surface("white dark earth any"), m.surface("any")
     long, wide = 1.0, m.u(0.3, 0.4)
     collar = m.pick(m.u(0.25, 0.36), m.u(0.3, 0.42))
     tall = m.u(0.4, 1.0) if m.chance(0.22) else 0.0  # of a boot's shaft
@@ -114,7 +114,7 @@ def shoe(m: Maker) -> list[Manifold]:
     inner[:, :, 0] = (inner[:, :, 0] - shift[:, None]) * 0.86 + shift[:, None]
     inner[:, :, 1] = inner[:, :, 1] * 1.3 + 0.05
     inner[:, :, 2] = inner[:, :, 2] * 0.95
-    inside = m.surface("dark", "white", "any")
+    inside = m.surface("dark white any")
     hole = m.stamp(loft(inner[keep][1:]), inside)
     if tall:
         wide_top, lean = m.u(0.3, 0.42), m.u(-0.08, 0.08)
@@ -155,7 +155,7 @@ def shoe(m: Maker) -> list[Manifold]:
         base = _lifted(base, heel)
         profile = [(0, 0), (m.u(0.03, 0.1), 0), (0.11, heel + 0.02), (0, heel + 0.02)]
         post = lathe(profile, 16).translate([0, -thick, -0.38])
-        parts.add(post, look=lower)
+        parts.add(post, lower)
     elif heel > 0:
         block = (
             slab(_sole(wide, long)[:], heel, 0)
@@ -163,7 +163,7 @@ def shoe(m: Maker) -> list[Manifold]:
             .mirror([0, 0, 1])
             .trim_by_plane([0, 0, -1], m.u(0.15, 0.25))
         )
-        parts.add(block, at=(0, -thick - heel / 2 + 0.02, 0), look=lower)
+        parts.add(block, lower, at=(0, -thick - heel / 2 + 0.02, 0))
     elif m.chance(0.4):  # a profile below
         teeth = joined(
             [
@@ -172,7 +172,7 @@ def shoe(m: Maker) -> list[Manifold]:
             ]
         )
         base = base - teeth
-    parts.add(base, look=lower)
+    parts.add(base, lower)
     if m.chance(0.65) and not tall:  # laces, or a strap
         rows = m.n(1, 6)
         for z in np.linspace(0.02, 0.24, rows):
@@ -180,7 +180,7 @@ def shoe(m: Maker) -> list[Manifold]:
             w = float(np.interp(z + 0.5, t, half)) * 0.75
             line = [(-w, y - 0.03, z), (0, y + 0.012, z - 0.01), (w, y - 0.03, z)]
             lace = tube(line, 0.013 if rows > 1 else 0.03, 8, 12, flat=(1, 1.5))
-            parts.add(lace, look=trim)
+            parts.add(lace, trim)
     if m.chance(0.45):  # a mark on the sides, a cap on the toe
         mark = (
             slab(outline(m) * [0.25, 0.12], 0.5)
@@ -191,7 +191,7 @@ def shoe(m: Maker) -> list[Manifold]:
         parts.append(m.stamp(shell, trim) - hole)
     if m.chance(0.35):
         cap = loft(rings * [1.04, 1.04, 1.01]).trim_by_plane([0, 0, 1], m.u(0.25, 0.36))
-        parts.add(cap, look=m.pick(lower, trim))
+        parts.add(cap, m.pick(lower, trim))
     if tall and not heel > 0.12 and m.chance(0.5):  # fur or a roll at the top of a boot
         roll = tube(shaft[-1][::2] * [1.03, 1, 1], m.u(0.03, 0.06), 10, 30, True)
         parts.append(m.stamp(roll, m.fur()) - hole)
@@ -211,13 +211,13 @@ def shoe(m: Maker) -> list[Manifold]:
 def bag(m: Maker) -> list[Manifold]:
     """A backpack, handbag, purse, tote or case with straps and pockets."""
     w, h, d = m.u(0.4, 0.9), m.u(0.4, 1.0), m.u(0.15, 0.4)
-    cloth = m.pick(m.cloth("any"), m.pattern(("plain", "clouded"), "leather"), m.surface())
-    trim = m.surface("dark", "leather", "any")
+    cloth = m.pick(m.cloth("any"), m.pattern("plain clouded", "leather"), m.surface())
+    trim = m.surface("dark leather any")
     body = superquadric([w / 2, h / 2, d / 2], m.u(0.2, 0.6), m.u(0.25, 0.7), 36)
     body = taper(body, m.u(0.65, 1.1))
     body = ripple(body, m.rng, m.u(0.0, 0.012), 0.5, True)
     parts = Parts(m)
-    parts.add(body, look=cloth)
+    parts.add(body, cloth)
     kind = m.n(0, 2)
     if kind == 0:  # a backpack
         for _ in range(m.n(1, 2)):
@@ -225,8 +225,8 @@ def bag(m: Maker) -> list[Manifold]:
             pocket = superquadric([pw / 2, ph / 2, d * 0.3], 0.4, 0.5)
             parts.add(
                 pocket,
+                m.pick(cloth, trim),
                 at=(0, -h / 2 + ph / 2 + m.u(0.02, 0.12) * h, d / 2 - 0.02),
-                look=m.pick(cloth, trim),
             )
         line = [
             (w * 0.2, h * 0.45, -d * 0.35),
@@ -235,11 +235,11 @@ def bag(m: Maker) -> list[Manifold]:
             (w * 0.35, -h * 0.4, -d * 0.35),
         ]
         strap = tube(line, 0.025, 10, 24, flat=(1, 2))
-        parts.pair(strap, look=trim)
+        parts.pair(strap, trim)
         part = handle(m, 0.12, w * 0.3, 0.018)
-        parts.add(part, turn=(0, 0, 90), at=(0, h * 0.47, -d * 0.2), look=trim)
+        parts.add(part, trim, turn=(0, 0, 90), at=(0, h * 0.47, -d * 0.2))
         side = box(0.05, h * 0.3, d * 0.5, 0.02).translate([w * 0.47, -h * 0.25, 0])
-        parts.pair(side, look=trim)
+        parts.pair(side, trim)
     elif kind == 1:  # a handbag with one or two bows
         tall = m.u(0.2, 0.6)
         for z in (0.25 * d, -0.25 * d) if m.chance(0.6) else (0.0,):
@@ -251,21 +251,21 @@ def bag(m: Maker) -> list[Manifold]:
                 (w * 0.25, h * 0.42, z),
             ]
             bow = tube(line, m.u(0.012, 0.03), 10, 32)
-            parts.add(bow, look=trim)
+            parts.add(bow, trim)
         flap = superquadric([w * 0.48, h * m.u(0.2, 0.35), d * 0.5], 0.4, 0.5).translate(
             [0, h * 0.25, 0.04]
         )
         if m.chance(0.6):
-            parts.add(flap, look=m.pick(trim, cloth))
-            parts.add(ball(0.03, 14), at=(0, h * 0.1, d * 0.52), look=m.metal())
+            parts.add(flap, m.pick(trim, cloth))
+            parts.add(ball(0.03, 14), m.metal(), at=(0, h * 0.1, d * 0.52))
     else:  # a tote: open at its top
         inner = m.stamp(
-            body.scale([0.93, 0.95, 0.88]).translate([0, 0.2, 0]), m.plain("dark", "white")
+            body.scale([0.93, 0.95, 0.88]).translate([0, 0.2, 0]), m.plain("dark white")
         )
         cutter = m.stamp(box(5, h, 5).translate([0, h * 0.88, 0]), trim)
         parts[0] = parts[0] - inner - cutter
         if m.chance(0.6):
-            front = m.printed("front", m.color("white", "any"), sides=True)
+            front = m.printed("front", m.color("white any"), sides=True)
             parts[0] = m.stamp(body, front) - inner - cutter
         for z in (0.4 * d, -0.4 * d):
             line = [
@@ -276,7 +276,7 @@ def bag(m: Maker) -> list[Manifold]:
                 (w * 0.2, h * 0.2, z),
             ]
             bow = tube(line, 0.02, 10, 32, flat=(1, 1.6))
-            parts.add(bow, look=trim)
+            parts.add(bow, trim)
     return parts.turned(0, m.pick(0, m.u(-50, 50), m.u(-180, 180)), 0)
 
 
@@ -287,7 +287,7 @@ def hat(m: Maker) -> list[Manifold]:
     dome = superquadric([r, h, r * m.u(1, 1.2)], m.u(0.5, 1), m.u(0.8, 1)).trim_by_plane(
         [0, 1, 0], 0
     )
-    hollow = m.stamp(superquadric([r * 0.93, h * 0.93, r * 0.95], 0.8, 0.9), m.plain("dark", "any"))
+    hollow = m.stamp(superquadric([r * 0.93, h * 0.93, r * 0.95], 0.8, 0.9), m.plain("dark any"))
     parts = Parts(m)
     parts.append(m.stamp(dome, cloth) - hollow)
     kind = m.n(0, 3)
@@ -298,8 +298,8 @@ def hat(m: Maker) -> list[Manifold]:
             .translate([0, 0.01, r * 0.75])
         )
         cutter = superquadric([r * 0.93, h * 0.93, r * 0.95], 0.8, 0.9)
-        parts.add(peak - cutter, look=m.pick(cloth, trim))
-        parts.add(ball(0.03, 12), at=(0, h, 0), look=trim)
+        parts.add(peak - cutter, m.pick(cloth, trim))
+        parts.add(ball(0.03, 12), trim, at=(0, h, 0))
     elif kind == 1:  # a brim
         reach = r * m.u(1.3, 1.9)
         up = m.u(-0.05, 0.12)
@@ -307,16 +307,16 @@ def hat(m: Maker) -> list[Manifold]:
             [(0, -0.01), (r, -0.01), (reach, up), (reach, up + 0.025), (r * 0.95, 0.03), (0, 0.03)],
             40,
         ) - rod(r * 0.9, 1).translate([0, -0.5, 0])
-        parts.add(brim, look=cloth)
+        parts.add(brim, cloth)
         part = (
             superquadric([r * 1.03, h, r * 1.03], 0.7, 0.9)
             ^ box(5, 0.08, 5).translate([0, 0.06, 0])
         ) - rod(r * 0.85, 1).translate([0, -0.5, 0])
-        parts.add(part, look=trim)
+        parts.add(part, trim)
     elif kind == 2:  # a roll and a bobble
-        parts.add(ring(r * 0.97, 0.06, 40, 12, 1.6), at=(0, 0.05, 0), look=trim)
+        parts.add(ring(r * 0.97, 0.06, 40, 12, 1.6), trim, at=(0, 0.05, 0))
         part = ripple(ball(m.u(0.08, 0.15), 28), m.rng, 0.01, 0.06, False)
-        parts.add(part, at=(0, h + 0.05, 0), look=m.fur())
+        parts.add(part, m.fur(), at=(0, h + 0.05, 0))
     else:  # a helmet with ridges
         for x in np.linspace(0, r * 0.7, m.n(1, 4)):
             line = [
@@ -326,48 +326,48 @@ def hat(m: Maker) -> list[Manifold]:
                 (x, 0.1, -r * 0.95),
             ]
             ridge = tube(line, 0.035, 10, 24)
-            parts.pair(ridge, look=trim)
+            parts.pair(ridge, trim)
     return parts.turned(m.u(-15, 10), m.u(-60, 60), 0)
 
 
 def wearable(m: Maker) -> list[Manifold]:
     """Headphones, glasses, a watch, a mask, a crown, a ring."""
-    a, b, dark = m.surface(), m.surface("dark", "metal", "toy"), m.plain("dark")
+    a, b, dark = m.surface(), m.surface("dark metal toy"), m.plain("dark")
     kind = m.n(0, 4)
     parts = Parts(m)
     if kind == 0:
         r, thick = m.u(0.4, 0.5), m.u(0.02, 0.06)
         line = [(r * math.cos(t), r * 1.1 * math.sin(t), 0) for t in np.linspace(0, math.pi, 7)]
         arc = tube(line, thick, 12, 36, flat=(1, m.u(1, 2.5)))
-        parts.add(arc, look=a)
+        parts.add(arc, a)
         cup, deep = m.u(0.14, 0.24), m.u(0.08, 0.16)
         shell = rod(cup, deep, 28, 0.03).rotate([0, 0, 90])
-        parts.pair(shell, at=(r + deep * 0.8, -0.05, 0), look=b)
+        parts.pair(shell, b, at=(r + deep * 0.8, -0.05, 0))
         part = ring(cup * 0.8, 0.045, 28, 10)
-        parts.pair(part, turn=(0, 0, 90), at=(r - 0.02 - deep * 0.2, -0.05, 0), look=dark)
+        parts.pair(part, dark, turn=(0, 0, 90), at=(r - 0.02 - deep * 0.2, -0.05, 0))
         if m.chance(0.3):
             line = [(r, -0.15, 0.05), (r * 0.8, -0.35, 0.25), (r * 0.3, -0.4, 0.4)]
-            parts.add(tube(line, 0.015, 8, 16), look=dark)
+            parts.add(tube(line, 0.015, 8, 16), dark)
     elif kind == 1:
         form = m.pick(ring_of(2, 36), ring_of(4, 36), rounded(1.9, 1.5, 0.5, 9)) * [
             m.u(0.2, 0.26),
             m.u(0.13, 0.22),
         ]
         frame = slab(form, 0.05, 0.015, 2) - slab(form * 0.82, 0.2)
-        parts.pair(frame, at=(0.27, 0, 0), look=a)
-        parts.pair(slab(form * 0.86, 0.015), at=(0.27, 0, 0), look=m.plain("dark", "pastel"))
-        parts.add(tube([(-0.08, 0.03, 0), (0, 0.07, 0.02), (0.08, 0.03, 0)], 0.022, 8, 12), look=a)
+        parts.pair(frame, a, at=(0.27, 0, 0))
+        parts.pair(slab(form * 0.86, 0.015), m.plain("dark pastel"), at=(0.27, 0, 0))
+        parts.add(tube([(-0.08, 0.03, 0), (0, 0.07, 0.02), (0.08, 0.03, 0)], 0.022, 8, 12), a)
         line = [(0.47, 0.05, 0), (0.5, 0.05, -0.3), (0.47, 0.02, -0.55), (0.45, -0.12, -0.68)]
-        parts.pair(tube(line, 0.02, 8, 22, flat=(1, 1.4)), look=b)
+        parts.pair(tube(line, 0.02, 8, 22, flat=(1, 1.4)), b)
     elif kind == 2:
         band = ring(0.4, m.u(0.02, 0.035), 44, 12, m.u(2.5, 5)).rotate([90, 0, 90])
-        parts.add(band, look=a)
+        parts.add(band, a)
         face = m.pick(rod(m.u(0.16, 0.24), 0.1, 36, 0.02), box(0.34, 0.1, 0.4, 0.03))
-        parts.add(face, turn=(90, 0, 0), at=(0, 0, 0.39), look=b)
+        parts.add(face, b, turn=(90, 0, 0), at=(0, 0, 0.39))
         picture = m.add(
             Look([plain_material(np.zeros(3))] * 4 + [material(screen(m.rng))] * 2, "fit")
         )
-        parts.add(rod(0.14, 0.03, 30), turn=(90, 0, 0), at=(0, 0, 0.47), look=picture)
+        parts.add(rod(0.14, 0.03, 30), picture, turn=(90, 0, 0), at=(0, 0, 0.47))
         return parts.turned(m.u(-40, 0), m.u(-40, 40), 0)
     elif kind == 3:
         shell = superquadric([0.4, m.u(0.45, 0.6), 0.3], m.u(0.7, 1), 0.9, 36).trim_by_plane(
@@ -382,17 +382,17 @@ def wearable(m: Maker) -> list[Manifold]:
                 box(m.u(0.1, 0.25), 0.05, 1).translate([0, -0.22, 0.2]),
             ]
         )
-        parts.add(shell - both(holes), look=a)
+        parts.add(shell - both(holes), a)
         part = tube([(0, 0.12, 0.28), (0, 0.0, 0.38), (0, -0.1, 0.3)], [0.03, 0.06, 0.04], 10, 12)
-        parts.add(part, look=m.pick(a, b))
+        parts.add(part, m.pick(a, b))
         if m.chance(0.5):
             part = lathe([(0, 0), (0.1, 0), (m.u(0.01, 0.08), 0.3), (0, 0.3)], 16)
-            parts.pair(part, turn=(0, 0, -25), at=(0.2, 0.4, 0.1), look=b)
+            parts.pair(part, b, turn=(0, 0, -25), at=(0.2, 0.4, 0.1))
     else:
         r, count = m.u(0.35, 0.45), m.pick(5, 6, 8, 12)
         profile = [(0, 0), (r, 0), (r * 1.05, 0.2), (0, 0.2)]
         band = lathe(profile, 44) - rod(r * 0.93, 1).translate([0, -0.5, 0])
-        parts.add(band, look=a)
+        parts.add(band, a)
         profile = [(0, 0), (0.08, 0), (0.01, m.u(0.15, 0.35)), (0, 0.35)]
         spike = m.pick(
             lathe(profile, 12), ball(0.06, 14).translate([0, 0.05, 0]), box(0.1, 0.2, 0.04, 0.01)
