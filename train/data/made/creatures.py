@@ -30,6 +30,11 @@ from .solids import (
 Vec = np.ndarray
 
 
+def xyz(x: float, y: float, z: float) -> Vec:
+    """A point or direction ``[3]``."""
+    return np.array([x, y, z])
+
+
 def _eyes(m: Maker, center: Vec, radii: Vec, size: float) -> list[Manifold]:
     """Two eyes on an egg that looks along z, and sometimes a nose."""
     side, up = m.u(0.35, 0.9), m.u(0.05, 0.5)
@@ -41,19 +46,19 @@ def _eyes(m: Maker, center: Vec, radii: Vec, size: float) -> list[Manifold]:
     if m.chance(0.4):  # the white of the eye, and its pupil before it
         white = m.painted(np.full(3, m.u(0.85, 0.97)))
         eyes.pair(ball(size * 1.5, 20), white, at=place)
-        ahead_of = place + np.array([0.15, 0.1, 1.0]) * size * 0.85
+        ahead_of = place + xyz(0.15, 0.1, 1.0) * size * 0.85
         eyes.pair(ball(size * 0.8, 16), dark, at=ahead_of)
     else:
         eyes.pair(ball([size, size * m.u(1, 1.5), size], 20), dark, at=place)
     if m.chance(0.35):  # a mouth
-        mouth = center + radii * np.array([0, -0.42, 0.88])
+        mouth = center + radii * xyz(0, -0.42, 0.88)
         line = [
             mouth + [-2.2 * size, 0.5 * size, -0.3 * size],
             mouth,
             mouth + [2.2 * size, 0.5 * size, -0.3 * size],
         ]
         bow = tube(line, 0.45 * size, 8, 12)
-        eyes.add(bow, m.painted(np.array([m.u(0.1, 0.7), 0.05, 0.08])))
+        eyes.add(bow, m.painted(xyz(m.u(0.1, 0.7), 0.05, 0.08)))
     return eyes
 
 
@@ -61,19 +66,18 @@ def _ears(m: Maker, blend: Blend, center: Vec, radii: Vec, look: int) -> None:
     """Ears of a kind into a blend: round, pointed, long or hanging; or none."""
     kind = m.n(0, 5)
     r = float(radii.mean())
-    base = center + radii * np.array([m.u(0.5, 0.8), m.u(0.6, 0.8), 0])
+    base = center + radii * xyz(m.u(0.5, 0.8), m.u(0.6, 0.8), 0)
     if kind == 0:
         blend.egg(base + [0.15 * r, 0.2 * r, 0], (0.42 * r, 0.42 * r, 0.16 * r), look)
     elif kind == 1:
-        blend.limb([base, base + np.array([0.2, 0.7, 0]) * r], [0.28 * r, 0.04 * r], look)
+        blend.limb([base, base + xyz(0.2, 0.7, 0) * r], [0.28 * r, 0.04 * r], look)
     elif kind == 2:
         tall = m.u(0.8, 2.0)
         corners = [m.u(0.1, 0.6), tall, -0.1]
-        line = [base, base + np.array([0.15, 0.5 * tall, -0.05]) * r, base + np.array(corners) * r]
+        line = [base, base + xyz(0.15, 0.5 * tall, -0.05) * r, base + np.array(corners) * r]
         blend.limb(line, [0.18 * r, 0.26 * r, 0.12 * r], look)
     elif kind == 3:
-        corners = [0.4, 0.05, 0]
-        line = [base, base + np.array(corners) * r, base + np.array([0.6, -m.u(0.5, 1.1), 0.1]) * r]
+        line = [base, base + np.array([0.4, 0.05, 0]) * r, base + xyz(0.6, -m.u(0.5, 1.1), 0.1) * r]
         blend.limb(line, [0.15 * r, 0.2 * r, 0.25 * r], look)
     elif kind == 4:
         blend.egg(
@@ -103,8 +107,8 @@ def quadruped(m: Maker) -> list[Manifold]:
     stout, high = m.u(0.13, 0.32), m.u(0.12, 0.55)
     long = m.u(0.4, 0.65)
     blend = Blend(m.u(0.04, 0.12))
-    hip = np.array([0, high + stout, -long / 2])
-    chest = np.array([0, high + stout + m.u(-0.05, 0.08), long / 2])
+    hip = xyz(0, high + stout, -long / 2)
+    chest = xyz(0, high + stout + m.u(-0.05, 0.08), long / 2)
     arch = (hip + chest) / 2 + [0, m.u(-0.06, 0.08), 0]
     line = [hip, arch, chest]
     blend.limb(line, [stout * m.u(0.8, 1.1), stout * m.u(0.85, 1.15), stout * m.u(0.9, 1.2)], 0)
@@ -117,11 +121,11 @@ def quadruped(m: Maker) -> list[Manifold]:
     thick = min(r * m.u(0.6, 0.95), stout)
     line = [chest, (chest + head) / 2 + [0, m.u(-0.02, 0.05), m.u(-0.04, 0.04)], head]
     blend.limb(line, [stout * 0.7, thick, thick], 0)
-    radii = np.array([r, r * m.u(0.8, 1.05), r * m.u(0.9, 1.2)])
+    radii = xyz(r, r * m.u(0.8, 1.05), r * m.u(0.9, 1.2))
     blend.egg(head, radii, 0)
     kind = m.n(0, 3)
     snout = m.u(0.4, 1.4) * r
-    tip = head + np.array([0, -0.35 * r, 0.6 * r + snout])
+    tip = head + xyz(0, -0.35 * r, 0.6 * r + snout)
     blend.limb([head + [0, -0.25 * r, 0.4 * r], tip], [0.6 * r, r * m.u(0.25, 0.5)], m.pick(0, 1))
     if kind == 0 and m.chance(0.4):  # a trunk
         line = [tip, tip + [0, -2 * r, 0.5 * r], tip + [0, -2.6 * r, 1.2 * r]]
@@ -149,7 +153,7 @@ def quadruped(m: Maker) -> list[Manifold]:
     blend.symmetric = True
     tail = m.u(0.08, 0.8)
     up = m.u(-0.7, 1.2)
-    end = hip + np.array([0, tail * math.sin(up), -stout * 0.7 - tail * math.cos(up)])
+    end = hip + xyz(0, tail * math.sin(up), -stout * 0.7 - tail * math.cos(up))
     fat = m.u(0.02, 0.09)
     line = [hip + [0, 0.2 * stout, -0.6 * stout], (hip + end) / 2 + [0, m.u(-0.05, 0.1), -0.1], end]
     blend.limb(line, [fat * 1.5, fat, fat * m.u(0.3, 1.8)], m.pick(0, 0, 1))
@@ -158,8 +162,7 @@ def quadruped(m: Maker) -> list[Manifold]:
     parts += _eyes(m, head, radii, r * m.u(0.09, 0.16))
     nose = m.painted(np.full(3, m.u(0.02, 0.2)))
     if m.chance(0.6):
-        part = ball([0.2 * r, 0.15 * r, 0.15 * r], 16)
-        parts.add(part, nose, at=tip + [0, 0.1 * r, 0.35 * r])
+        parts.add(ball([0.2 * r, 0.15 * r, 0.15 * r], 16), nose, at=tip + [0, 0.1 * r, 0.35 * r])
     if m.chance(0.25):
         parts.append(_horns(m, head, r))
     if m.chance(0.2):
@@ -176,7 +179,7 @@ def quadruped(m: Maker) -> list[Manifold]:
 
 
 def _horns(m: Maker, head: Vec, r: float) -> Manifold:
-    base = head + np.array([0.45, 0.75, 0]) * r
+    base = head + xyz(0.45, 0.75, 0) * r
     corners = [m.u(0.1, 0.7), m.u(0.3, 0.7), 0]
     edge_line = [m.u(0, 0.9), m.u(0.6, 1.5), m.u(-0.5, 0.6)]
     curve = [base, base + np.array(corners) * r, base + np.array(edge_line) * r]
@@ -215,7 +218,7 @@ def plush(m: Maker) -> list[Manifold]:
     if m.chance(0.6):  # a belly of another colour
         blend.egg((0, h * 0.9, w * 0.25), (w * 0.75, h * 0.75, w * 0.78), 1)
     r = m.u(0.2, 0.38)
-    radii = np.array([r * m.u(0.95, 1.25), r * m.u(0.8, 1), r * m.u(0.8, 1)])
+    radii = xyz(r * m.u(0.95, 1.25), r * m.u(0.8, 1), r * m.u(0.8, 1))
     head = np.array([0, 2 * h + radii[1] * 0.65, m.u(0, 0.08)])
     blend.egg(head, radii, 0)
     blend.egg(
@@ -226,7 +229,7 @@ def plush(m: Maker) -> list[Manifold]:
     _ears(m, blend, head, radii, m.pick(0, 1))
     a = m.u(0.07, 0.14)
     down, out, ahead = m.u(-0.3, 0.15), m.u(0.1, 0.4), m.u(-0.02, 0.3)
-    shoulder = np.array([w * 0.75, 1.55 * h, 0])
+    shoulder = xyz(w * 0.75, 1.55 * h, 0)
     blend.limb(
         [shoulder, shoulder + [out * 0.6, down * 0.4, ahead * 0.4], shoulder + [out, down, ahead]],
         [a, a * 0.95, a * m.u(0.8, 1.3)],
@@ -234,9 +237,9 @@ def plush(m: Maker) -> list[Manifold]:
     )
     leg = m.u(0.09, 0.16)
     if m.chance(0.6):
-        foot = np.array([w * m.u(0.7, 1.3), leg, w + m.u(0.1, 0.35)])
+        foot = xyz(w * m.u(0.7, 1.3), leg, w + m.u(0.1, 0.35))
     else:
-        foot = np.array([w * m.u(0.5, 0.8), -m.u(0.1, 0.5), 0.05])
+        foot = xyz(w * m.u(0.5, 0.8), -m.u(0.1, 0.5), 0.05)
     blend.limb([(w * 0.55, 0.35 * h, 0.1), tuple(foot)], [leg * 1.1, leg], 0)
     blend.egg(
         foot + [0, 0.25 * leg, 0.25 * leg],
@@ -244,7 +247,7 @@ def plush(m: Maker) -> list[Manifold]:
         m.pick(0, 1, 2),
     )
     if m.chance(0.5):
-        tail = np.array([0, 0.3 * h, -w])
+        tail = xyz(0, 0.3 * h, -w)
         line = [tail, tail + [0, m.u(-0.1, 0.4), -m.u(0.05, 0.3)]]
         blend.limb(line, [m.u(0.04, 0.1), m.u(0.03, 0.12)], m.pick(0, 1))
     parts = Parts(m)
@@ -270,17 +273,17 @@ def biped(m: Maker) -> list[Manifold]:
     skin = m.pattern("spotted clouded striped speckled plain", "toy earth leaf", contrast=0.4)
     second, third = m.surface("earth toy"), m.surface("dark white")
     blend = Blend(m.u(0.04, 0.1))
-    hip = np.array([0, m.u(0.35, 0.6), 0.0])
+    hip = xyz(0, m.u(0.35, 0.6), 0.0)
     stout, lean = m.u(0.14, 0.24), m.u(0.2, 1.1)
-    chest = hip + np.array([0, 0.4 * math.cos(lean), 0.4 * math.sin(lean)])
+    chest = hip + xyz(0, 0.4 * math.cos(lean), 0.4 * math.sin(lean))
     blend.limb([hip, chest], [stout, stout * m.u(0.7, 1)], 0)
     blend.egg((hip + chest) / 2 + [0, -0.03, 0.06], (stout * 0.8, stout, stout * 0.9), 1)
-    neck = chest + np.array([0, m.u(0.1, 0.35), m.u(0.05, 0.2)])
+    neck = chest + xyz(0, m.u(0.1, 0.35), m.u(0.05, 0.2))
     blend.limb([chest, neck], [stout * 0.7, stout * 0.5], 0)
     r = m.u(0.1, 0.18)
-    radii = np.array([r * 0.85, r * 0.9, r])
+    radii = xyz(r * 0.85, r * 0.9, r)
     blend.egg(neck + [0, 0.3 * r, 0.3 * r], radii, 0)
-    head = neck + np.array([0, 0.3 * r, 0.3 * r])
+    head = neck + xyz(0, 0.3 * r, 0.3 * r)
     jaw = m.u(1.0, 2.4) * r
     line = [head + [0, -0.1 * r, 0.4 * r], head + [0, -0.25 * r, jaw]]
     blend.limb(line, [0.6 * r, m.u(0.25, 0.45) * r], 0)
@@ -296,7 +299,7 @@ def biped(m: Maker) -> list[Manifold]:
     blend.limb([hip + [stout * 0.6, 0, 0], knee, ankle], [leg, leg * 0.75, leg * 0.4], 0)
     line = [tuple(ankle), (stout * 0.9, 0.04, m.u(0.08, 0.2))]
     blend.limb(line, [leg * 0.4, leg * m.u(0.4, 0.6)], 2)
-    arm = chest + np.array([stout * 0.7, -0.02, 0.08])
+    arm = chest + xyz(stout * 0.7, -0.02, 0.08)
     line = [arm, arm + [0.05, -0.13, 0.08], arm + [0.02, -m.u(0.1, 0.25), 0.2]]
     blend.limb(line, [0.05, 0.035, 0.03], 0)
     parts = Parts(m)
@@ -329,35 +332,30 @@ def bird(m: Maker) -> list[Manifold]:
     upright = m.u(0, 1.3)
     blend = Blend(m.u(0.03, 0.1))
     r = m.u(0.22, 0.35)
-    body = np.array([0, r + 0.05, 0])
+    body = xyz(0, r + 0.05, 0)
     blend.egg(body, (r * m.u(0.7, 1), r * m.u(0.75, 1), r * m.u(1.0, 1.5)), 0, -upright)
     blend.egg(body + [0, -0.03, 0.12 * r], (r * 0.75, r * 0.8, r * 1.05), 1, -upright)
     h = r * m.u(0.45, 0.8)
-    head = body + np.array([0, r * m.u(0.9, 1.5), r * m.u(0.2, 0.8)])
+    head = body + xyz(0, r * m.u(0.9, 1.5), r * m.u(0.2, 0.8))
     blend.limb([body + [0, 0.3 * r, 0.3 * r], head], [0.6 * r, h * 0.75], 0)
-    radii = np.array([h, h, h])
+    radii = xyz(h, h, h)
     blend.egg(head, radii, m.pick(0, 0, 1))
-    wing = body + np.array([r * 0.8, 0.15 * r, -0.1 * r])
+    wing = body + xyz(r * 0.8, 0.15 * r, -0.1 * r)
     blend.egg(wing, (0.12 * r, 0.5 * r, m.u(0.7, 1.1) * r), m.pick(0, 2), m.u(-1, 0.2))
-    tail = body + np.array([0, m.u(-0.5, 0.5) * r, -r * m.u(1.3, 2)])
+    tail = body + xyz(0, m.u(-0.5, 0.5) * r, -r * m.u(1.3, 2))
     blend.limb([body + [0, 0, -0.6 * r], tail], [0.4 * r, 0.08 * r], 0)
     parts = Parts(m)
     parts.append(m.blended(blend, (coat, second, third)))
     parts += _eyes(m, head, radii, h * m.u(0.1, 0.2))
     profile = [
-        (0, 0),
-        (h * m.u(0.25, 0.5), 0),
-        (h * 0.25, h * 0.3),
-        (0.02 * h, h * m.u(0.5, 1.2)),
+        *((h * m.u(0.25, 0.5), 0), (h * 0.25, h * 0.3), (0.02 * h, h * m.u(0.5, 1.2))),
         (0, h * 1.2),
     ]
     beak = lathe(profile, 16).scale([1, 1, m.u(0.4, 1)])
     parts.add(beak, third, turn=(90 + m.u(-5, 25), 0, 0), at=head + [0, -0.1 * h, 0.85 * h])
     if m.chance(0.7):
         line = [
-            (0.3 * r, 0.1, 0),
-            (0.32 * r, 0.0, 0.0),
-            (0.36 * r, -0.06, 0.15 * r),
+            *((0.3 * r, 0.1, 0), (0.32 * r, 0.0, 0.0), (0.36 * r, -0.06, 0.15 * r)),
             (0.4 * r, -0.06, 0.5 * r),
         ]
         foot = tube(line, [0.03, 0.03, 0.05, 0.06], 8, 14, flat=(1, 1))
@@ -374,12 +372,7 @@ def swimmer(m: Maker) -> list[Manifold]:
     z = np.linspace(-0.55, 0.5, count)
     blunt, waist = m.u(0.25, 0.9), m.u(0.08, 0.3)
     points = [
-        [waist],
-        [waist * 1.2],
-        [m.u(0.5, 0.8)],
-        [1.0],
-        [m.u(0.85, 1.05)],
-        [blunt],
+        *([waist], [waist * 1.2], [m.u(0.5, 0.8)], [1.0], [m.u(0.85, 1.05)], [blunt]),
         [blunt * 0.35],
     ]
     size = spline(points, count)[:, 0]
@@ -390,7 +383,7 @@ def swimmer(m: Maker) -> list[Manifold]:
     rings[..., 2] = z[:, None]
     parts = Parts(m)
     parts.add(loft(rings), skin)
-    tip = np.array([0, bow * 1.2, -0.55])
+    tip = xyz(0, bow * 1.2, -0.55)
     corners = [(0.12, 0), (-0.1, 0.34), (-0.28, 0.38), (-0.16, 0), (-0.28, -0.38), (-0.1, -0.34)]
     form = np.array(corners) * m.u(0.6, 1.1)
     level = m.chance(0.4)
@@ -410,7 +403,7 @@ def swimmer(m: Maker) -> list[Manifold]:
     )
     parts.pair(side, fin)
     corners = [wide * 0.9 * blunt**0.5, tall * 0.5, 0.16]
-    parts += _eyes(m, np.array([0, 0.0, 0.3]), np.array(corners), m.u(0.02, 0.045))
+    parts += _eyes(m, xyz(0, 0.0, 0.3), np.array(corners), m.u(0.02, 0.045))
     return [p.rotate([0, m.pick(90, -90, m.u(-90, 90)), 0]) for p in [joined(parts)]]
 
 
@@ -432,15 +425,15 @@ def crawler(m: Maker) -> list[Manifold]:
         rim = tube(line, 0.04, 10, 36, True)
         parts.add(rim, skin)
     r = m.u(0.1, 0.2)
-    head = np.array([0, m.u(-0.02, 0.15), long + 0.6 * r])
+    head = xyz(0, m.u(-0.02, 0.15), long + 0.6 * r)
     blend = Blend(0.04)
-    radii = np.array([r, r * 0.9, r])
+    radii = xyz(r, r * 0.9, r)
     blend.egg(head, radii, 0)
     blend.limb([[0, 0, long * 0.6], head], [r * 0.7, r * 0.6], 0)
     pairs = m.pick(2, 3, 3, 4)
     leg = m.u(0.025, 0.09)
     for z in np.linspace(-0.6, 0.65, pairs) * long:
-        a = np.array([wide * 0.7, 0, z])
+        a = xyz(wide * 0.7, 0, z)
         out, bow = m.u(0.1, 0.3), m.u(0, 0.2)
         line = [a, a + [0.6 * out, bow, 0.3 * z], a + [out, -0.18, 0.5 * z]]
         blend.limb(line, [leg, leg, leg * 0.8], 0)
@@ -482,7 +475,7 @@ def snake(m: Maker) -> list[Manifold]:
                 m.stamp(body, skin),
                 *[
                     e.translate([float(head[0]), 0, 0])
-                    for e in _eyes(m, head * [0, 1, 1], np.array([r, r, r]), 0.02)
+                    for e in _eyes(m, head * [0, 1, 1], xyz(r, r, r), 0.02)
                 ],
             ]
         ).rotate([0, m.u(-90, 90), 0])
@@ -500,29 +493,29 @@ def figure(m: Maker) -> list[Manifold]:
     leg, torso = m.u(0.3, 0.55), m.u(0.25, 0.38)
     bulk = m.u(0.045, 0.085)
     blend = Blend(m.u(0.015, 0.04))
-    hip, neck = np.array([0, leg, 0]), np.array([0, leg + torso, 0.0])
+    hip, neck = xyz(0, leg, 0), xyz(0, leg + torso, 0.0)
     line = [
         [0.25 * broad, leg + 0.03, 0],
         [0.5 * broad, leg + torso * 0.5, 0],
         [0.55 * broad, leg + torso * 0.8, 0],
     ]
     blend.limb(line, [bulk * 1.4, bulk * 1.2 * slim, bulk * 1.4], 1)
-    head = neck + np.array([0, big * 0.95 + 0.02, 0.01])
-    radii = np.array([big * m.u(0.8, 1), big * m.u(0.95, 1.2), big * m.u(0.85, 1)])
+    head = neck + xyz(0, big * 0.95 + 0.02, 0.01)
+    radii = xyz(big * m.u(0.8, 1), big * m.u(0.95, 1.2), big * m.u(0.85, 1))
     blend.limb([neck - [0, 0.03, 0], head], [bulk * 0.8, bulk * 0.8], 0)
     blend.egg(head, radii, 0)
     blend.egg(head + [0, -0.05 * big, radii[2]], (0.13 * big, 0.15 * big, 0.15 * big), 0)
     blend.symmetric = m.chance(0.4)
     for side in (1,) if blend.symmetric else (1, -1):
-        flip = np.array([side, 1, 1])
+        flip = xyz(side, 1, 1)
         spread, swing = m.u(0.02, 0.16), m.u(-0.22, 0.22)
-        knee = hip + np.array([0.5 * broad + spread * 0.5, -leg * 0.5, max(swing, 0) * 0.8 + 0.02])
-        foot = np.array([0.5 * broad + spread, 0.05, swing * (1 if swing > 0 else 1.2)])
+        knee = hip + xyz(0.5 * broad + spread * 0.5, -leg * 0.5, max(swing, 0) * 0.8 + 0.02)
+        foot = xyz(0.5 * broad + spread, 0.05, swing * (1 if swing > 0 else 1.2))
         line = [(hip + [0.45 * broad, 0, 0]) * flip, knee * flip, foot * flip]
         blend.limb(line, [bulk * 1.3, bulk * 1.05, bulk * 0.8], 2)
         line = [foot * flip, (foot + [0.02, -0.02, m.u(0.07, 0.12)]) * flip]
         blend.limb(line, [bulk * 0.9, bulk * 0.8], 3)
-        shoulder = neck + np.array([broad * 0.75 + bulk * 0.5, -0.06, 0])
+        shoulder = neck + xyz(broad * 0.75 + bulk * 0.5, -0.06, 0)
         reach = m.u(0.15, 0.24)
         lift, ahead = m.u(-1.3, 1.1), m.u(-0.6, 1.2)
         corners = [math.cos(lift) * 0.9, math.sin(lift), 0.3 * math.sin(ahead)]
@@ -555,12 +548,8 @@ def figure(m: Maker) -> list[Manifold]:
     elif top == 2:
         brim = m.u(1.1, 1.9)
         profile = [
-            (0, 0),
-            (big * brim, 0),
-            (big * brim, 0.08 * big),
-            (big * 0.95, 0.1 * big),
-            (big * m.u(0.5, 1), big * m.u(0.5, 1.4)),
-            (0, big * 1.1),
+            *((big * brim, 0), (big * brim, 0.08 * big), (big * 0.95, 0.1 * big)),
+            *((big * m.u(0.5, 1), big * m.u(0.5, 1.4)), (0, big * 1.1)),
         ]
         hat = lathe(profile, 28)
         parts.add(hat, hair, at=head + [0, 0.55 * big, 0])
@@ -587,7 +576,7 @@ def figure(m: Maker) -> list[Manifold]:
         )
         parts.add(part, hair)
     if m.chance(0.2):  # a skirt or a robe
-        profile = [(0, 0), (m.u(0.15, 0.3), 0), (broad * 0.8, leg * m.u(0.6, 0.9)), (0, leg * 0.9)]
+        profile = [(m.u(0.15, 0.3), 0), (broad * 0.8, leg * m.u(0.6, 0.9)), (0, leg * 0.9)]
         robe = lathe(profile, 28).translate([0, leg - leg * m.u(0.4, 0.9), 0])
         parts.add(robe, m.cloth("any"))
     if m.chance(0.3):  # something in one hand
@@ -621,7 +610,7 @@ def figure(m: Maker) -> list[Manifold]:
         part = box(1.5 * broad, torso * 0.7, 0.12, 0.03)
         parts.add(part, m.surface(), at=(0, leg + torso * 0.6, -bulk - 0.07))
     if m.chance(0.3):  # a stand
-        base = lathe([(0, 0), (0.25, 0), (0.25, 0.03), (0, 0.03)], 32).translate([0, -0.02, 0])
+        base = lathe([(0.25, 0), (0.25, 0.03)], 32).translate([0, -0.02, 0])
         parts.add(base, m.surface("dark earth white"))
     return parts
 
@@ -649,7 +638,7 @@ def block_figure(m: Maker) -> list[Manifold]:
     part = ball([0.12 * r, 0.16 * r, 0.1 * r], 12)
     parts.pair(part, m.painted(np.full(3, 0.04)), at=(0.4 * r, top + r * 1.1, r * 0.95))
     if m.chance(0.6):
-        profile = [(0, 0), (1.6 * r, 0), (1.5 * r, 0.1 * r), (r, 0.2 * r), (0.8 * r, r), (0, r)]
+        profile = [(1.6 * r, 0), (1.5 * r, 0.1 * r), (r, 0.2 * r), (0.8 * r, r)]
         hair = m.pick(
             rod(r * 1.08, 0.6 * r, 28, 0.2 * r),
             ball(r * 1.1, 28).trim_by_plane([0, 1, -0.3], 0.0),

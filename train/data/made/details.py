@@ -15,11 +15,8 @@ def handle(m: Maker, width: float, height: float, thick: float) -> Manifold:
     """A bow in the plane of x and y whose ends lie on x = 0, about y = 0."""
     square = m.chance(0.3)
     path = [
-        (0, height / 2, 0),
-        (width * (1 if square else 0.8), height / 2, 0),
-        (width, 0, 0),
-        (width * (1 if square else 0.75), -height / 2, 0),
-        (0, -height / 2, 0),
+        *((0, height / 2, 0), (width * (1 if square else 0.8), height / 2, 0), (width, 0, 0)),
+        *((width * (1 if square else 0.75), -height / 2, 0), (0, -height / 2, 0)),
     ]
     return tube(path, thick, 12, 26, flat=(1, m.u(1, 1.8)), round_ends=False)
 
@@ -58,12 +55,7 @@ def produce(m: Maker, r: float) -> Manifold:
     if kind == 3:
         return superquadric([r, r * 0.8, r], m.u(0.5, 1), m.u(0.4, 1), 24)
     side_line = [
-        (0, -r),
-        (r * 0.3, -r * 0.95),
-        (r * 0.9, -0.1 * r),
-        (r * 0.6, 0.6 * r),
-        (0.1 * r, r),
-        (0, r),
+        *((0, -r), (r * 0.3, -r * 0.95), (r * 0.9, -0.1 * r), (r * 0.6, 0.6 * r), (0.1 * r, r)),
     ]
     return lathe(side_line, 20)
 
@@ -91,13 +83,7 @@ def letter(m: Maker) -> CrossSection:
     """A figure of bars and bows, as letters are."""
     w = m.u(0.08, 0.2)
     points = [
-        (-0.4, -0.5),
-        (0.4, -0.5),
-        (-0.4, 0.0),
-        (0.4, 0.0),
-        (-0.4, 0.5),
-        (0.4, 0.5),
-        (0, -0.5),
+        *((-0.4, -0.5), (0.4, -0.5), (-0.4, 0.0), (0.4, 0.0), (-0.4, 0.5), (0.4, 0.5), (0, -0.5)),
         (0, 0.5),
     ]
     dot = (

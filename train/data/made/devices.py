@@ -59,7 +59,7 @@ def tool(m: Maker) -> list[Manifold]:
         claw = tube(line, [0.07, 0.06, 0.015], 12, 16, flat=(1, 1.2))
         parts.add(joined([poll, box(0.14, 0.12, 0.12, 0.02), claw]), head, at=(0, top, 0))
     elif kind == 1:  # screwdriver
-        blade = lathe([(0, 0), (0.025, 0), (0.025, m.u(0.3, 0.7)), (0.0, 0.75)], 12)
+        blade = lathe([(0.025, 0), (0.025, m.u(0.3, 0.7)), (0.0, 0.75)], 12)
         parts.add(blade, head, at=(0, top - 0.02, 0))
     elif kind == 2:  # spanner
         jaw = slab(ring_of(2.5, 28) * m.u(0.1, 0.16), 0.06, 0.01, 2) - box(
@@ -105,15 +105,7 @@ def tool(m: Maker) -> list[Manifold]:
             blade = slab(np.array(corners), 0.02, 0.006, 2)
         parts.add(blade, head, at=(0, top - 0.03, 0))
     elif kind == 7:  # torch
-        profile = [
-            (0, 0),
-            (r, 0),
-            (r * 1.9, 0.12),
-            (r * 1.9, 0.25),
-            (r * 1.7, 0.25),
-            (r * 1.5, 0.2),
-            (0, 0.2),
-        ]
+        profile = [*((r, 0), (r * 1.9, 0.12), (r * 1.9, 0.25), (r * 1.7, 0.25), (r * 1.5, 0.2))]
         cone = lathe(profile)
         parts.add(cone, m.pick(grip, head), at=(0, top - 0.02, 0))
         parts.add(rod(r * 1.5, 0.02), m.plain("white pastel"), at=(0, top + 0.18, 0))
@@ -193,9 +185,7 @@ def device(m: Maker) -> list[Manifold]:
         parts.add(rod(0.07, 0.06, 20), accent, turn=(0, 0, 90), at=(0.03, 0.14, 0.27))
         if m.chance(0.6):
             line = [
-                (0, 0, 0.5),
-                (m.u(-0.1, 0.1), 0, 0.8),
-                (m.u(-0.4, 0.4), 0, 1.0),
+                *((0, 0, 0.5), (m.u(-0.1, 0.1), 0, 0.8), (m.u(-0.4, 0.4), 0, 1.0)),
                 (m.u(-0.6, 0.6), 0, 0.7),
             ]
             parts.add(tube(line, 0.018, 8, 40), dark)
@@ -205,14 +195,8 @@ def device(m: Maker) -> list[Manifold]:
         parts.add(box(w, h, t, 0.05), case)
         r, long = m.u(0.14, 0.22), m.u(0.1, 0.5)
         profile = [
-            (0, 0),
-            (r, 0),
-            (r, long * 0.6),
-            (r * 1.08, long * 0.65),
-            (r * 1.08, long),
-            (r * 0.9, long),
-            (r * 0.75, long * 0.85),
-            (0, long * 0.85),
+            *((r, 0), (r, long * 0.6), (r * 1.08, long * 0.65), (r * 1.08, long)),
+            *((r * 0.9, long), (r * 0.75, long * 0.85)),
         ]
         lens = lathe(profile, 36)
         parts.add(lens, dark, turn=(90, 0, 0), at=(m.u(-0.1, 0.1), -0.02, t / 2 - 0.01))
@@ -223,11 +207,8 @@ def device(m: Maker) -> list[Manifold]:
             parts.add(part, m.pick(accent, dark), at=(x * w, h / 2 - 0.01, 0))
         if m.chance(0.3):
             path = [
-                (-w / 2, h * 0.3, 0),
-                (-w * 0.6, h, -0.1),
-                (0, h * 1.4, -0.2),
-                (w * 0.6, h, -0.1),
-                (w / 2, h * 0.3, 0),
+                *((-w / 2, h * 0.3, 0), (-w * 0.6, h, -0.1), (0, h * 1.4, -0.2)),
+                *((w * 0.6, h, -0.1), (w / 2, h * 0.3, 0)),
             ]
             parts.add(tube(path, 0.02, 8, 32, flat=(1, 2)), dark)
     elif kind == 3:  # a loudspeaker or radio
@@ -240,12 +221,7 @@ def device(m: Maker) -> list[Manifold]:
         )
         for x, y, r in rows:
             profile = [
-                (0, 0),
-                (r, 0),
-                (r, 0.05),
-                (r * 0.85, 0.05),
-                (r * 0.4, 0.015),
-                (r * 0.3, 0.035),
+                *((r, 0), (r, 0.05), (r * 0.85, 0.05), (r * 0.4, 0.015), (r * 0.3, 0.035)),
                 (0, 0.045),
             ]
             cone = lathe(profile, 32)
@@ -375,9 +351,7 @@ def device(m: Maker) -> list[Manifold]:
             parts.add(tube(path, [0.03, 0.025, 0.02], 10, 14), dark)
         if m.chance(0.5):
             path = [
-                (0, 0, -d * 0.45),
-                (0.2, 0, -d),
-                (m.u(-0.8, 0.8), 0, -d * 0.9),
+                *((0, 0, -d * 0.45), (0.2, 0, -d), (m.u(-0.8, 0.8), 0, -d * 0.9)),
                 (m.u(-0.6, 0.9), 0, 0.2),
             ]
             parts.add(tube(path, 0.02, 8, 44), dark)
@@ -387,7 +361,7 @@ def device(m: Maker) -> list[Manifold]:
 
 
 def _jug(m: Maker, r: float, h: float) -> Manifold:
-    body = lathe([(0, 0), (r, 0), (r * 1.1, h * 0.4), (r * 0.8, h), (0, h)], 28)
+    body = lathe([(r, 0), (r * 1.1, h * 0.4), (r * 0.8, h)], 28)
     return body + handle(m, r * 0.9, h * 0.6, 0.03 * r / 0.2).translate([r * 0.9, h * 0.5, 0])
 
 
@@ -431,11 +405,7 @@ def instrument(m: Maker) -> list[Manifold]:
         flare = lathe(side_line, 32)
         parts.add(flare, m.pick(m.metal(), m.surface("toy")), turn=(0, 0, -90))
         line = [
-            (0.1, 0, 0),
-            (-0.1, -0.08, 0),
-            (0.1, -0.2, 0),
-            (0.5, -0.2, 0),
-            (0.6, -0.08, 0),
+            *((0.1, 0, 0), (-0.1, -0.08, 0), (0.1, -0.2, 0), (0.5, -0.2, 0), (0.6, -0.08, 0)),
             (0.5, 0, 0),
         ]
         parts.add(tube(line, 0.028, 10, 44), m.metal())
@@ -466,18 +436,16 @@ def instrument(m: Maker) -> list[Manifold]:
         elif m.chance(0.5):
             parts.add(slab(ring_of(2.2, 36) * [0.26, 0.3], 0.05, 0.01), a, at=(0, 0.26, 0))
         else:
-            part = tube([(0, 0, 0), (0, 0.3, 0), (0, 0.8, 0)], [0.04, 0.07, 0.085], 18, 20)
-            parts.add(part, a)
+            parts.add(tube([(0, 0, 0), (0, 0.3, 0), (0, 0.8, 0)], [0.04, 0.07, 0.085], 18, 20), a)
         return parts.turned(m.pick(0, -70), m.u(-40, 40), m.pick(0, m.u(-80, 80)))
     if kind == 3:  # a turned piece: chess, a candlestick, a cup
         count = m.n(5, 9)
         r = np.abs(m.rng.normal(0.14, 0.09, count)) + 0.03
         r[0] = m.u(0.2, 0.32)
         profile = spline(np.stack([r, np.linspace(0.05, 1, count)], 1), 40)
-        side_line = [(0, 0), (r[0] * 1.05, 0), *np.maximum(profile, [0.03, 0]).tolist(), (0, 1.02)]
-        body = lathe(side_line, 32)
+        body = lathe([(r[0] * 1.05, 0), *np.maximum(profile, [0.03, 0]).tolist(), (0, 1.02)], 32)
         parts.add(body, a)
-        contour = [(0, 0), (0.08, 0), (0.17, 0.15), (0.12, 0.16), (0.08, 0.1), (0, 0.08)]
+        contour = [(0.08, 0), (0.17, 0.15), (0.12, 0.16), (0.08, 0.1), (0, 0.08)]
         top = m.pick(
             ball(m.u(0.06, 0.14)), box(0.08, 0.2, 0.06) + box(0.18, 0.07, 0.06), lathe(contour, 24)
         )

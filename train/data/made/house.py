@@ -34,18 +34,10 @@ def lamp(m: Maker) -> list[Manifold]:
     bulge = np.abs(m.rng.normal(0, 0.08, 8)) * (m.rng.random() < 0.6) + m.u(0.015, 0.05)
     heights = np.linspace(0.05, height, 8)
     line = spline(np.stack([bulge, heights], 1), 24)
-    profile = [(0, 0), (foot, 0), (foot, 0.03), *np.maximum(line, [0.01, 0]).tolist(), (0, height)]
-    stand = lathe(profile, 28)
+    stand = lathe([(foot, 0), (foot, 0.03), *np.maximum(line, [0.01, 0]).tolist(), (0, height)], 28)
     low, high, tall = m.u(0.15, 0.4), m.u(0.06, 0.35), m.u(0.15, 0.5)
     sides = m.pick(36, 36, 4, 6)
-    profile = [
-        (0, tall - 0.03),
-        (high - 0.02, tall - 0.03),
-        (low - 0.02, 0),
-        (low, 0),
-        (high, tall),
-        (0, tall),
-    ]
+    profile = [*((high - 0.02, tall - 0.03), (low - 0.02, 0), (low, 0), (high, tall))]
     bell = lathe(profile, sides)
     if m.chance(0.2):
         bell = ball([low, low * m.u(0.8, 1.2), low])
@@ -82,10 +74,7 @@ def furniture(m: Maker) -> list[Manifold]:
         leg = (
             box(2 * r, high + 0.01, 2 * r).translate([0, high / 2, 0])
             if square
-            else lathe(
-                [(0, 0), (r * 0.7, 0), (r, high * 0.7), (r * 1.1, high + 0.01), (0, high + 0.01)],
-                14,
-            )
+            else lathe([(r * 0.7, 0), (r, high * 0.7), (r * 1.1, high + 0.01)], 14)
         )
         leg = leg.rotate([math.degrees(-splay), 0, math.degrees(splay)])
         x, z = wide / 2 - 1.3 * r, deep / 2 - 1.3 * r
@@ -98,13 +87,8 @@ def furniture(m: Maker) -> list[Manifold]:
         if m.chance(0.35):
             parts.add(rod(w / 2, thick, 40, 0.3 * thick), main, at=(0, h, 0))
             profile = [
-                (0, 0),
-                (w * 0.3, 0),
-                (w * 0.28, 0.03),
-                (0.04, 0.08),
-                (m.u(0.03, 0.08), h * 0.6),
-                (0.05, h + 0.01),
-                (0, h + 0.01),
+                *((w * 0.3, 0), (w * 0.28, 0.03), (0.04, 0.08), (m.u(0.03, 0.08), h * 0.6)),
+                *((0.05, h + 0.01),),
             ]
             parts.add(lathe(profile), second)
         else:
@@ -249,10 +233,7 @@ def rack(m: Maker) -> list[Manifold]:
             solids.add(hoop(1.01, h, r * 2), second)
         if m.chance(0.4):
             line = [
-                (-w / 2, h, 0),
-                (-w * 0.4, h + 0.35, 0),
-                (0, h + 0.5, 0),
-                (w * 0.4, h + 0.35, 0),
+                *((-w / 2, h, 0), (-w * 0.4, h + 0.35, 0), (0, h + 0.5, 0), (w * 0.4, h + 0.35, 0)),
                 (w / 2, h, 0),
             ]
             bow = tube(line, r * 1.5, 8, 28)

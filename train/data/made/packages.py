@@ -62,10 +62,8 @@ def carton(m: Maker) -> list[Manifold]:
         parts.add(thing, m.surface("toy any"), at=(0, -0.05 * h, d / 2 - 0.04))
     elif kind == 3:  # a carry handle
         line = [
-            (-0.15 * w, h / 2 - 0.02, 0),
-            (-0.15 * w, h / 2 + 0.12, 0),
-            (0.15 * w, h / 2 + 0.12, 0),
-            (0.15 * w, h / 2 - 0.02, 0),
+            *((-0.15 * w, h / 2 - 0.02, 0), (-0.15 * w, h / 2 + 0.12, 0)),
+            *((0.15 * w, h / 2 + 0.12, 0), (0.15 * w, h / 2 - 0.02, 0)),
         ]
         parts.add(tube(line, 0.02, 10, 24, flat=(1, 1.5)), m.plain())
     elif kind == 4:  # a gable top, as milk has

@@ -103,14 +103,15 @@ def lathe(profile: ArrayLike, sides: int = 32) -> Manifold:
     """A solid of revolution about y.
 
     Args:
-        profile: ``[K, 2]`` radius and height; the first and last point count as on the axis.
+        profile: ``[K, 2]`` radius and height; an end that is not on the axis is closed flat.
         sides: number of points around.
     """
     p = np.asarray(profile, float)
-    angle = np.arange(sides) * (2 * math.pi / sides)
-    r, y = p[1:-1, :1], p[1:-1, 1:]
-    rings = np.stack([r * np.sin(angle), np.repeat(y, sides, 1), r * np.cos(angle)], -1)
     tips = np.array([[0, p[0, 1], 0], [0, p[-1, 1], 0]])
+    p = p[int(p[0, 0] <= 0) : len(p) - int(p[-1, 0] <= 0)]
+    angle = np.arange(sides) * (2 * math.pi / sides)
+    r, y = p[:, :1], p[:, 1:]
+    rings = np.stack([r * np.sin(angle), np.repeat(y, sides, 1), r * np.cos(angle)], -1)
     return loft(rings, tips)
 
 
@@ -183,7 +184,7 @@ def rod(radius: float, height: float, sides: int = 24, bevel: float = 0.0) -> Ma
     """A cylinder along y that stands on y = 0."""
     b = min(bevel, 0.9 * radius, 0.45 * height)
     if b <= 0:
-        return lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sides)
+        return lathe([(radius, 0), (radius, height)], sides)
     edge = [
         (radius - b * (1 - math.sin(a)), b * (1 - math.cos(a))) for a in (0, 0.5, 1.05, math.pi / 2)
     ]

@@ -38,7 +38,7 @@ def blocks(m: Maker) -> list[Manifold]:
     parts = Parts(m)
     if kind == 0:  # stacked rings on a rod
         y, r, count = 0.06, m.u(0.35, 0.5), m.n(3, 7)
-        parts.add(lathe([(0, 0), (r, 0), (r * 0.9, 0.07), (0, 0.07)]), looks[0])
+        parts.add(lathe([(r, 0), (r * 0.9, 0.07)]), looks[0])
         for i in range(count):
             t = m.u(0.06, 0.09)
             one = (
@@ -49,8 +49,7 @@ def blocks(m: Maker) -> list[Manifold]:
             parts.add(one, looks[i % len(looks)], at=(0, y + t, 0))
             y += 1.9 * t
             r *= m.u(0.8, 0.95)
-        part = joined([rod(0.05, y, 16), ball(0.09).translate([0, y + 0.05, 0])])
-        parts.add(part, looks[-1])
+        parts.add(joined([rod(0.05, y, 16), ball(0.09).translate([0, y + 0.05, 0])]), looks[-1])
     elif kind == 1:  # a tower or a castle
         y = 0.0
         for _ in range(m.n(2, 5)):
@@ -67,7 +66,7 @@ def blocks(m: Maker) -> list[Manifold]:
                 h += 0.06
             y += h
         if m.chance(0.6):
-            profile = [(0, 0), (0.22, 0), (0.01, 0.35), (0, 0.36)]
+            profile = [(0.22, 0), (0.01, 0.35), (0, 0.36)]
             top = m.pick(slab(np.array([(-0.25, 0), (0.25, 0), (0, 0.3)]), 0.3), lathe(profile))
             parts.add(top, m.pick(*looks), at=(0, y - 0.001, 0))
     elif kind == 2:  # loose pieces on the ground
@@ -165,8 +164,7 @@ def game(m: Maker) -> list[Manifold]:
         ]
     if kind == 4:  # a xylophone or abacus
         count = m.n(5, 9)
-        part = box(0.06, 0.08, 0.12 * count, 0.01)
-        parts.pair(part, m.wood(), turn=(0, 8, 0), at=(0.22, 0, 0))
+        parts.pair(box(0.06, 0.08, 0.12 * count, 0.01), m.wood(), turn=(0, 8, 0), at=(0.22, 0, 0))
         for i in range(count):
             part = box(0.75 - 0.06 * i, 0.04, 0.09, 0.01)
             parts.add(part, m.plain("toy"), at=(0, 0.06, (i - (count - 1) / 2) * 0.12))

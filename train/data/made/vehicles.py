@@ -26,29 +26,13 @@ def vehicle(m: Maker) -> list[Manifold]:
         ends, hood, boot = floor + h * 0.15, floor + h * m.u(0.75, 1.1), floor + h * m.u(0.75, 1.3)
         roof = floor + h + m.u(0.15, 0.35)
         corners = [
-            -0.5,
-            -0.49,
-            -0.42,
-            -0.3 + m.u(-0.1, 0.06),
-            -0.22 + m.u(-0.15, 0.05),
-            0.1 + m.u(-0.05, 0.08),
-            0.25 + m.u(-0.05, 0.05),
-            0.44,
-            0.5,
-            0.5,
+            *(-0.5, -0.49, -0.42, -0.3 + m.u(-0.1, 0.06), -0.22 + m.u(-0.15, 0.05)),
+            *(0.1 + m.u(-0.05, 0.08), 0.25 + m.u(-0.05, 0.05), 0.44, 0.5, 0.5),
         ]
         z = np.array(corners)
         corners = [
-            ends,
-            boot * 0.8,
-            boot,
-            boot * 1.02,
-            roof,
-            roof,
-            hood * 1.05,
-            hood * 0.95,
-            hood * 0.75,
-            ends,
+            *(ends, boot * 0.8, boot, boot * 1.02, roof, roof, hood * 1.05, hood * 0.95),
+            *(hood * 0.75, ends),
         ]
         y = np.array(corners)
         line = np.stack([z * long, y], 1)
@@ -63,12 +47,8 @@ def vehicle(m: Maker) -> list[Manifold]:
                         ]
                     )
                     for x, s in (
-                        (-w / 2, 0.75),
-                        (-w * 0.42, 0.95),
-                        (-w * 0.2, 1.0),
-                        (w * 0.2, 1.0),
-                        (w * 0.42, 0.95),
-                        (w / 2, 0.75),
+                        *((-w / 2, 0.75), (-w * 0.42, 0.95), (-w * 0.2, 1.0), (w * 0.2, 1.0)),
+                        *((w * 0.42, 0.95), (w / 2, 0.75)),
                     )
                 ]
             )
@@ -105,8 +85,7 @@ def vehicle(m: Maker) -> list[Manifold]:
         for x in (-0.33, 0.33):
             part = ball([0.06, 0.04, 0.03], 14)
             parts.add(part, m.plain("white pastel"), at=(x * w, hood * 0.82, long * 0.49))
-        part = box(w * 0.96, 0.05, 0.06, 0.02)
-        parts.add(part, accent, at=(0, floor + h * 0.25, long * 0.5))
+        parts.add(box(w * 0.96, 0.05, 0.06, 0.02), accent, at=(0, floor + h * 0.25, long * 0.5))
         if m.chance(0.25):
             part = box(w * 0.8, 0.03, 0.1).translate([0, boot + 0.1, -long * 0.45]) + both(
                 box(0.03, 0.12, 0.05).translate([w * 0.3, boot + 0.04, -long * 0.45])
@@ -130,8 +109,7 @@ def vehicle(m: Maker) -> list[Manifold]:
         parts.add(part, paint, at=(0, floor + cab / 2 + 0.05, long * 0.36))
         part = box(w * 1.02, cab * 0.35, long * 0.16)
         parts.add(part, glass, at=(0, floor + cab * 0.75, long * 0.37))
-        part = box(w * 0.8, cab * 0.35, 0.05)
-        parts.add(part, glass, at=(0, floor + cab * 0.75, long * 0.49))
+        parts.add(box(w * 0.8, cab * 0.35, 0.05), glass, at=(0, floor + cab * 0.75, long * 0.49))
         load = m.n(0, 4)
         z, deep = -long * 0.15, long * 0.66
         if load == 0:
@@ -200,9 +178,7 @@ def plane(m: Maker) -> list[Manifold]:
         if kind == 0 or m.chance(0.4):
             sweep, chord, span = m.u(-0.05, 0.45), m.u(0.25, 0.5), m.u(0.55, 0.9)
             corners = [
-                (0, -chord / 2),
-                (span, -sweep - chord * 0.3),
-                (span, -sweep + chord * 0.2),
+                *((0, -chord / 2), (span, -sweep - chord * 0.3), (span, -sweep + chord * 0.2)),
                 (0, chord / 2),
             ]
             form = np.array(corners)
@@ -237,10 +213,8 @@ def plane(m: Maker) -> list[Manifold]:
             parts.add(part, dark, at=(0, 0, long / 2 + r * 0.8))
     elif kind == 2:  # a rocket that stands
         r = m.u(0.12, 0.25)
-        hull = lathe(
-            [(0, 0), (r * 0.7, 0), (r, 0.3), (r, 0.7), (r * 0.7, 1.0), (r * 0.2, 1.2), (0, 1.25)],
-            32,
-        )
+        profile = [(r * 0.7, 0), (r, 0.3), (r, 0.7), (r * 0.7, 1.0), (r * 0.2, 1.2), (0, 1.25)]
+        hull = lathe(profile, 32)
         parts.add(
             hull, m.pick(paint, m.pattern("striped", "white toy", contrast=1, mapping="round"))
         )
@@ -277,13 +251,11 @@ def plane(m: Maker) -> list[Manifold]:
                 part = slab(np.array([(0.03, 0.25), (0.4, 0.25), (0.03, 0.8)]), 0.02)
                 parts.add(part, m.cloth("white toy"), turn=(0, -m.u(60, 120), 0))
         else:
-            part = box(w * 0.55, 0.25, long * 0.3, 0.03)
-            parts.add(part, second, at=(0, h * 0.4, -0.05 * long))
+            parts.add(box(w * 0.55, 0.25, long * 0.3, 0.03), second, at=(0, h * 0.4, -0.05 * long))
             part = box(w * 0.4, 0.15, long * 0.15, 0.02)
             parts.add(part, m.pick(paint, second), at=(0, h * 0.4 + 0.19, 0))
             for z in np.linspace(-0.2, 0.0, m.n(1, 3)):
-                part = rod(0.05, 0.3, 16)
-                parts.add(part, m.surface("toy dark"), at=(0, h * 0.4, z * long))
+                parts.add(rod(0.05, 0.3, 16), m.surface("toy dark"), at=(0, h * 0.4, z * long))
     return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180)), 0)
 
 
@@ -305,9 +277,8 @@ def train_of(m: Maker) -> list[Manifold]:
             car.add(part, main, at=(0, r + 0.2, 0))
             part = box(w * 0.95, m.u(0.3, 0.42), long * 0.3, 0.01)
             car.add(part, second, at=(0, r + 0.25, -long * 0.3))
-            part = box(w * 1.1, 0.04, long * 0.36, 0.015)
-            car.add(part, main, at=(0, r + 0.46, -long * 0.3))
-            part = lathe([(0, 0), (0.04, 0), (m.u(0.03, 0.08), 0.15), (0, 0.15)], 20)
+            car.add(box(w * 1.1, 0.04, long * 0.36, 0.015), main, at=(0, r + 0.46, -long * 0.3))
+            part = lathe([(0.04, 0), (m.u(0.03, 0.08), 0.15)], 20)
             car.add(part, dark, at=(0, r + 0.3, long * 0.3))
             car.add(ball(0.06, 18), second, at=(0, r + 0.34, 0.05))
         else:

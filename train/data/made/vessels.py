@@ -40,7 +40,6 @@ def _vessel(m: Maker, profile: np.ndarray, wall: float, sides: int = 36) -> Mani
         *rim,
         *inner.tolist(),
         (max(float(inner[-1, 0]) - 0.2 * wall, 0.01), floor),
-        (0, floor),
     ]
     return lathe(line, sides)
 
@@ -85,7 +84,7 @@ def mug(m: Maker) -> list[Manifold]:
         ) ^ rod(5, 9)
         parts.add(part, m.plain("earth dark leaf"))
     elif m.chance(0.2):  # a lid
-        part = lathe([(0, 0), (r * 1.05, 0), (r * 1.03, 0.08), (r * 0.5, 0.14), (0, 0.14)])
+        part = lathe([(r * 1.05, 0), (r * 1.03, 0.08), (r * 0.5, 0.14)])
         parts.add(part, m.plain(), at=(0, h - 0.01, 0))
     angle = m.u(-180, 180) if m.chance(0.3) else m.u(-50, 50)
     return [p.rotate([0, angle, 0]) for p in parts]
@@ -118,22 +117,15 @@ def teapot(m: Maker) -> list[Manifold]:
         parts.add(bow, m.pick(look, second), turn=(0, 180, 0), at=(-wide * 0.8, h * 0.55, 0))
     else:
         line = [
-            (wide * 0.8, h * 0.8, 0),
-            (wide * 0.8, h * 1.4, 0),
-            (-wide * 0.8, h * 1.4, 0),
+            *((wide * 0.8, h * 0.8, 0), (wide * 0.8, h * 1.4, 0), (-wide * 0.8, h * 1.4, 0)),
             (-wide * 0.8, h * 0.8, 0),
         ]
         over = tube(line, 0.035, 10, 28)
         parts.add(over, second)
     top = float(profile[-1, 0])
     side_line = [
-        (0, -0.02),
-        (top * 0.98, -0.02),
-        (top * 0.9, 0.06),
-        (0.08, m.u(0.08, 0.2)),
-        (0.05, 0.2),
-        (0.07, 0.25),
-        (0, 0.3),
+        *((top * 0.98, -0.02), (top * 0.9, 0.06), (0.08, m.u(0.08, 0.2)), (0.05, 0.2)),
+        *((0.07, 0.25), (0, 0.3)),
     ]
     lid = lathe(side_line)
     parts.add(lid, m.pick(look, second), at=(0, h, 0))
@@ -150,17 +142,11 @@ def bottle(m: Maker) -> list[Manifold]:
     e = 0.06 * r
     soft = m.u(0.2, 1) * (h - shoulder)
     profile = [
-        (0, 0),
-        (r - e, 0),
-        (r, e),
-        (r, shoulder - soft * 0.2),
-        (0.5 * (r + neck) + 0.1 * r, shoulder + soft * 0.35),
-        (neck, shoulder + soft),
-        (neck, h),
-        (0, h),
+        *((r - e, 0), (r, e), (r, shoulder - soft * 0.2)),
+        *((0.5 * (r + neck) + 0.1 * r, shoulder + soft * 0.35), (neck, shoulder + soft), (neck, h)),
     ]
     if m.chance(0.25):  # a waist, as a sports bottle has
-        profile[3:3] = [
+        profile[2:2] = [
             (r, 0.3 * shoulder),
             (r * m.u(0.75, 0.95), 0.5 * shoulder),
             (r, 0.75 * shoulder),
@@ -243,16 +229,12 @@ def bowl(m: Maker) -> list[Manifold]:
         parts.add(tube(line, [0.04, 0.035, 0.05], 10, 14), m.surface("dark wood"))
     elif kind == 1:  # a bucket's
         line = [
-            (r * 0.97, h * 0.9, 0),
-            (r * 0.8, h + 0.6 * r, 0),
-            (0, h + r, 0),
-            (-r * 0.8, h + 0.6 * r, 0),
-            (-r * 0.97, h * 0.9, 0),
+            *((r * 0.97, h * 0.9, 0), (r * 0.8, h + 0.6 * r, 0), (0, h + r, 0)),
+            *((-r * 0.8, h + 0.6 * r, 0), (-r * 0.97, h * 0.9, 0)),
         ]
         parts.add(tube(line, m.u(0.015, 0.05), 10, 32), m.surface("metal wood any"))
     elif kind == 2:
-        part = handle(m, 0.15, 0.25, 0.025)
-        parts.pair(part, look, turn=(90, 0, 0), at=(r * 0.93, h * 0.85, 0))
+        parts.pair(handle(m, 0.15, 0.25, 0.025), look, turn=(90, 0, 0), at=(r * 0.93, h * 0.85, 0))
     if m.chance(0.5):
         things = [m.surface("toy leaf earth") for _ in range(3)]
         inside = r * 0.6
@@ -286,8 +268,7 @@ def plant(m: Maker) -> list[Manifold]:
     if m.chance(0.3):
         return parts
     rim = float(profile[-3, 0]) - 0.02
-    part = rod(max(rim, 0.03), 0.05)
-    parts.add(part, m.pattern("speckled", "earth dark"), at=(0, h - 0.1, 0))
+    parts.add(rod(max(rim, 0.03), 0.05), m.pattern("speckled", "earth dark"), at=(0, h - 0.1, 0))
     leaf = m.pattern("plain clouded shaded", "leaf")
     kind = m.n(0, 3)
     if kind == 0:  # a ball of leaves or a bonsai
@@ -413,7 +394,7 @@ def food(m: Maker) -> list[Manifold]:
         flip = [90.0 if m.chance(0.3) else 0.0, 0.0, 0.0]
         return [p.rotate(flip) for p in parts]
     if kind == 5:  # an ice cream
-        cone = lathe([(0, 0), (0.03, 0), (m.u(0.18, 0.28), 0.7), (0, 0.7)], 24)
+        cone = lathe([(0.03, 0), (m.u(0.18, 0.28), 0.7)], 24)
         parts.add(cone, m.pattern("checked", "wood", repeats=4))
         y, r = 0.78, 0.26
         for _ in range(m.n(1, 3)):

@@ -67,13 +67,8 @@ def shoe(m: Maker) -> list[Manifold]:
         t,
         [0, 0.08, 0.35, 0.55, 0.8, 0.93, 1],
         [
-            0.75 * collar,
-            collar,
-            collar * 0.98,
-            0.55 * collar + 0.5 * toe,
-            toe * 1.1,
-            toe * 0.85,
-            toe * 0.3,
+            *(0.75 * collar, collar, collar * 0.98, 0.55 * collar + 0.5 * toe, toe * 1.1),
+            *(toe * 0.85, toe * 0.3),
         ],
     )
     point = m.u(0.25, 0.75)
@@ -153,8 +148,7 @@ def shoe(m: Maker) -> list[Manifold]:
     parts.append(body)
     if heel > 0.12:
         base = _lifted(base, heel)
-        profile = [(0, 0), (m.u(0.03, 0.1), 0), (0.11, heel + 0.02), (0, heel + 0.02)]
-        post = lathe(profile, 16).translate([0, -thick, -0.38])
+        post = lathe([(m.u(0.03, 0.1), 0), (0.11, heel + 0.02)], 16).translate([0, -thick, -0.38])
         parts.add(post, lower)
     elif heel > 0:
         block = (
@@ -229,10 +223,8 @@ def bag(m: Maker) -> list[Manifold]:
                 at=(0, -h / 2 + ph / 2 + m.u(0.02, 0.12) * h, d / 2 - 0.02),
             )
         line = [
-            (w * 0.2, h * 0.45, -d * 0.35),
-            (w * 0.25, h * 0.3, -d * 0.5 - 0.15),
-            (w * 0.3, -h * 0.1, -d * 0.5 - 0.15),
-            (w * 0.35, -h * 0.4, -d * 0.35),
+            *((w * 0.2, h * 0.45, -d * 0.35), (w * 0.25, h * 0.3, -d * 0.5 - 0.15)),
+            *((w * 0.3, -h * 0.1, -d * 0.5 - 0.15), (w * 0.35, -h * 0.4, -d * 0.35)),
         ]
         strap = tube(line, 0.025, 10, 24, flat=(1, 2))
         parts.pair(strap, trim)
@@ -244,10 +236,8 @@ def bag(m: Maker) -> list[Manifold]:
         tall = m.u(0.2, 0.6)
         for z in (0.25 * d, -0.25 * d) if m.chance(0.6) else (0.0,):
             line = [
-                (-w * 0.25, h * 0.42, z),
-                (-w * 0.22, h * 0.5 + tall * 0.7, z),
-                (0, h * 0.5 + tall, z),
-                (w * 0.22, h * 0.5 + tall * 0.7, z),
+                *((-w * 0.25, h * 0.42, z), (-w * 0.22, h * 0.5 + tall * 0.7, z)),
+                *((0, h * 0.5 + tall, z), (w * 0.22, h * 0.5 + tall * 0.7, z)),
                 (w * 0.25, h * 0.42, z),
             ]
             bow = tube(line, m.u(0.012, 0.03), 10, 32)
@@ -269,11 +259,8 @@ def bag(m: Maker) -> list[Manifold]:
             parts[0] = m.stamp(body, front) - inner - cutter
         for z in (0.4 * d, -0.4 * d):
             line = [
-                (-w * 0.2, h * 0.2, z),
-                (-w * 0.2, h * 0.6, z * 0.8),
-                (0, h * 0.75, z * 0.6),
-                (w * 0.2, h * 0.6, z * 0.8),
-                (w * 0.2, h * 0.2, z),
+                *((-w * 0.2, h * 0.2, z), (-w * 0.2, h * 0.6, z * 0.8), (0, h * 0.75, z * 0.6)),
+                *((w * 0.2, h * 0.6, z * 0.8), (w * 0.2, h * 0.2, z)),
             ]
             bow = tube(line, 0.02, 10, 32, flat=(1, 1.6))
             parts.add(bow, trim)
@@ -303,10 +290,8 @@ def hat(m: Maker) -> list[Manifold]:
     elif kind == 1:  # a brim
         reach = r * m.u(1.3, 1.9)
         up = m.u(-0.05, 0.12)
-        brim = lathe(
-            [(0, -0.01), (r, -0.01), (reach, up), (reach, up + 0.025), (r * 0.95, 0.03), (0, 0.03)],
-            40,
-        ) - rod(r * 0.9, 1).translate([0, -0.5, 0])
+        profile = [(r, -0.01), (reach, up), (reach, up + 0.025), (r * 0.95, 0.03)]
+        brim = lathe(profile, 40) - rod(r * 0.9, 1).translate([0, -0.5, 0])
         parts.add(brim, cloth)
         part = (
             superquadric([r * 1.03, h, r * 1.03], 0.7, 0.9)
@@ -320,9 +305,7 @@ def hat(m: Maker) -> list[Manifold]:
     else:  # a helmet with ridges
         for x in np.linspace(0, r * 0.7, m.n(1, 4)):
             line = [
-                (x, 0.1, r * 0.95),
-                (x * 0.9, h * 0.95, r * 0.4),
-                (x * 0.9, h * 1.0, -r * 0.3),
+                *((x, 0.1, r * 0.95), (x * 0.9, h * 0.95, r * 0.4), (x * 0.9, h * 1.0, -r * 0.3)),
                 (x, 0.1, -r * 0.95),
             ]
             ridge = tube(line, 0.035, 10, 24)
@@ -386,14 +369,13 @@ def wearable(m: Maker) -> list[Manifold]:
         part = tube([(0, 0.12, 0.28), (0, 0.0, 0.38), (0, -0.1, 0.3)], [0.03, 0.06, 0.04], 10, 12)
         parts.add(part, m.pick(a, b))
         if m.chance(0.5):
-            part = lathe([(0, 0), (0.1, 0), (m.u(0.01, 0.08), 0.3), (0, 0.3)], 16)
+            part = lathe([(0.1, 0), (m.u(0.01, 0.08), 0.3)], 16)
             parts.pair(part, b, turn=(0, 0, -25), at=(0.2, 0.4, 0.1))
     else:
         r, count = m.u(0.35, 0.45), m.pick(5, 6, 8, 12)
-        profile = [(0, 0), (r, 0), (r * 1.05, 0.2), (0, 0.2)]
-        band = lathe(profile, 44) - rod(r * 0.93, 1).translate([0, -0.5, 0])
+        band = lathe([(r, 0), (r * 1.05, 0.2)], 44) - rod(r * 0.93, 1).translate([0, -0.5, 0])
         parts.add(band, a)
-        profile = [(0, 0), (0.08, 0), (0.01, m.u(0.15, 0.35)), (0, 0.35)]
+        profile = [(0.08, 0), (0.01, m.u(0.15, 0.35)), (0, 0.35)]
         spike = m.pick(
             lathe(profile, 12), ball(0.06, 14).translate([0, 0.05, 0]), box(0.1, 0.2, 0.04, 0.01)
         )
