@@ -88,7 +88,7 @@ def furniture(m: Maker) -> list[Manifold]:
             parts.add(rod(w / 2, thick, 40, 0.3 * thick), main, at=(0, h, 0))
             profile = [
                 *((w * 0.3, 0), (w * 0.28, 0.03), (0.04, 0.08), (m.u(0.03, 0.08), h * 0.6)),
-                *((0.05, h + 0.01),),
+                (0.05, h + 0.01),
             ]
             parts.add(lathe(profile), second)
         else:
