@@ -120,8 +120,8 @@ def turned(m: Maker, radius: float, height: float, fine: int) -> Manifold:
         end = profile[-1]
         cap = np.stack([end[0] * np.cos(angle), end[1] + end[0] * m.u(0.2, 1) * np.sin(angle)], 1)
         profile = np.concatenate([profile, np.maximum(cap, [0.005, -1])])
-    side_line = [(0, profile[0, 1]), *profile.tolist(), (0, profile[-1, 1])]
-    made = lathe(side_line, m.pick(6, 8, fine, fine, fine))
+    contour = [(0, profile[0, 1]), *profile.tolist(), (0, profile[-1, 1])]
+    made = lathe(contour, m.pick(6, 8, fine, fine, fine))
     return made.translate([0, -height / 2, 0])
 
 

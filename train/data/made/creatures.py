@@ -12,7 +12,6 @@ from .looks import Maker, Parts
 from .solids import (
     Blend,
     ball,
-    both,
     box,
     extent,
     joined,
@@ -39,8 +38,8 @@ def _eyes(m: Maker, center: Vec, radii: Vec, size: float) -> list[Manifold]:
     """Two eyes on an egg that looks along z, and sometimes a nose."""
     side, up = m.u(0.35, 0.9), m.u(0.05, 0.5)
     ahead = math.sqrt(max(1 - side**2 - 0.8 * up**2, 0.05))
-    corners = [side, up, ahead]
-    place = center + radii * np.array(corners) / math.sqrt(side**2 + up**2 + ahead**2) * 0.98
+    toward = xyz(side, up, ahead)
+    place = center + 0.98 * radii * toward / math.sqrt(toward @ toward)
     dark = m.painted(np.full(3, m.u(0.02, 0.15)) if m.chance(0.8) else m.color("toy"))
     eyes = Parts(m)
     if m.chance(0.4):  # the white of the eye, and its pupil before it
@@ -73,8 +72,8 @@ def _ears(m: Maker, blend: Blend, center: Vec, radii: Vec, look: int) -> None:
         blend.limb([base, base + xyz(0.2, 0.7, 0) * r], [0.28 * r, 0.04 * r], look)
     elif kind == 2:
         tall = m.u(0.8, 2.0)
-        corners = [m.u(0.1, 0.6), tall, -0.1]
-        line = [base, base + xyz(0.15, 0.5 * tall, -0.05) * r, base + np.array(corners) * r]
+        tip = base + xyz(m.u(0.1, 0.6), tall, -0.1) * r
+        line = [base, base + xyz(0.15, 0.5 * tall, -0.05) * r, tip]
         blend.limb(line, [0.18 * r, 0.26 * r, 0.12 * r], look)
     elif kind == 3:
         line = [base, base + np.array([0.4, 0.05, 0]) * r, base + xyz(0.6, -m.u(0.5, 1.1), 0.1) * r]
@@ -141,8 +140,8 @@ def quadruped(m: Maker) -> list[Manifold]:
         for side in sides:
             swing = stride * reach * (side if walking else 1)
             top = base + [side * wide, -0.3 * stout, 0]
-            corners = [side * wide * 1.05, high * 0.5, base[2] + swing * 0.6 + m.u(-0.04, 0.04)]
-            knee = np.array(corners)
+            bent = base[2] + swing * 0.6 + m.u(-0.04, 0.04)
+            knee = xyz(side * wide * 1.05, high * 0.5, bent)
             foot = np.array([side * wide * 1.05, leg * paw * 0.8, base[2] + swing])
             blend.limb([top, knee, foot], [leg * 1.4, leg, leg * m.u(0.8, 1.0)], 0)
             blend.egg(
@@ -164,49 +163,32 @@ def quadruped(m: Maker) -> list[Manifold]:
     if m.chance(0.6):
         parts.add(ball([0.2 * r, 0.15 * r, 0.15 * r], 16), nose, at=tip + [0, 0.1 * r, 0.35 * r])
     if m.chance(0.25):
-        parts.append(_horns(m, head, r))
+        _horns(m, parts, head, r)
     if m.chance(0.2):
-        parts.append(_crest(m, [hip, arch, chest], stout))
+        _crest(m, parts, [hip, arch, chest], stout)
     if m.chance(0.15):  # a collar
         at = chest * 0.5 + head * 0.5
-        line = [
-            (math.sin(a) * thick * 1.15, 0, math.cos(a) * thick * 1.15)
-            for a in np.linspace(0, 2 * math.pi, 9)[:-1]
-        ]
-        collar = tube(line, 0.02, 8, 28, True, flat=(1, 2))
+        collar = ring(thick * 1.15, 0.02, 28, 8, 2)
         parts.add(turned_to(collar, head - chest, at), m.plain("toy"))
     return _turned(m, parts)
 
 
-def _horns(m: Maker, head: Vec, r: float) -> Manifold:
+def _horns(m: Maker, parts: Parts, head: Vec, r: float) -> None:
     base = head + xyz(0.45, 0.75, 0) * r
-    corners = [m.u(0.1, 0.7), m.u(0.3, 0.7), 0]
-    edge_line = [m.u(0, 0.9), m.u(0.6, 1.5), m.u(-0.5, 0.6)]
-    curve = [base, base + np.array(corners) * r, base + np.array(edge_line) * r]
-    return both(
-        m.stamp(tube(curve, [0.16 * r, 0.12 * r, 0.02 * r], 10, 16), m.plain("white earth dark"))
-    )
+    middle = base + xyz(m.u(0.1, 0.7), m.u(0.3, 0.7), 0) * r
+    tip = base + xyz(m.u(0, 0.9), m.u(0.6, 1.5), m.u(-0.5, 0.6)) * r
+    horn = tube([base, middle, tip], [0.16 * r, 0.12 * r, 0.02 * r], 10, 16)
+    parts.pair(horn, m.plain("white earth dark"))
 
 
-def _crest(m: Maker, spine: list[Vec], stout: float) -> Manifold:
+def _crest(m: Maker, parts: Parts, spine: list[Vec], stout: float) -> None:
     """Plates along the back."""
-    look, count, size = m.surface("toy earth"), m.n(5, 11), m.u(0.3, 0.7) * stout
-    line = np.array(spine)
-    plates = []
-    for t in np.linspace(0, 1, count):
-        at = np.array([np.interp(t, np.linspace(0, 1, len(line)), line[:, k]) for k in range(3)])
+    look, size = m.surface("toy earth"), m.u(0.3, 0.7) * stout
+    for t in np.linspace(0, 1, m.n(5, 11)):
         h = size * (0.5 + math.sin(math.pi * t))
-        form = ring_of(1.2, 16) * [h * 0.6, h]
-        plate = (
-            slab(form, 0.25 * size, 0.1 * size, 2)
-            .rotate([0, 90, 0])
-            .translate((at + [0, stout + 0.3 * h, 0]).tolist())
-        )
-        plates.append(plate)
-    made = plates[0]
-    for plate in plates[1:]:
-        made = made + plate
-    return m.stamp(made, look)
+        plate = slab(ring_of(1.2, 16) * [h * 0.6, h], 0.25 * size, 0.1 * size, 2)
+        at = [np.interp(t, np.linspace(0, 1, len(spine)), axis) for axis in np.transpose(spine)]
+        parts.add(plate, look, turn=(0, 90, 0), at=xyz(*at) + [0, stout + 0.3 * h, 0])
 
 
 def plush(m: Maker) -> list[Manifold]:
@@ -256,13 +238,8 @@ def plush(m: Maker) -> list[Manifold]:
     nose = head + [0, -0.15 * r, radii[2] + 0.15 * r]
     parts.add(ball([0.16 * r, 0.12 * r, 0.12 * r], 16), m.plain("dark toy"), at=nose)
     if m.chance(0.3):  # a bow tie or a scarf
-        y = 2 * h - 0.02
-        line = [
-            (math.sin(t) * w * 0.75, y, math.cos(t) * w * 0.75)
-            for t in np.linspace(0, 2 * math.pi, 9)[:-1]
-        ]
-        loop = tube(line, m.u(0.03, 0.06), 10, 28, True)
-        parts.add(loop, m.cloth("toy any"))
+        scarf = ring(w * 0.75, m.u(0.03, 0.06), 28, 10)
+        parts.add(scarf, m.cloth("toy any"), at=(0, 2 * h - 0.02, 0))
     if m.chance(0.6):
         return parts
     return _turned(m, parts)
@@ -306,23 +283,18 @@ def biped(m: Maker) -> list[Manifold]:
     parts.append(_knobbly(m, m.blended(blend, (skin, second, third))))
     parts += _eyes(m, head, radii, r * m.u(0.1, 0.18))
     if m.chance(0.4):
-        parts.append(_crest(m, [hip + [0, -0.05, -0.45 * tail], hip, chest], stout * 0.9))
+        _crest(m, parts, [hip + [0, -0.05, -0.45 * tail], hip, chest], stout * 0.9)
     if m.chance(0.2):
-        parts.append(_wings(m, chest, stout))
+        _wings(m, parts, chest, stout)
     return _turned(m, parts)
 
 
-def _wings(m: Maker, at: Vec, size: float) -> Manifold:
+def _wings(m: Maker, parts: Parts, at: Vec, size: float) -> None:
     long, deep = m.u(2.0, 4.0) * size, m.u(1, 2) * size
-    corners = [(0, -0.3), (0.5, -0.5), (1, -0.35), (1.05, 0.0), (0.6, 0.5), (0, 0.45)]
-    form = np.array(corners) * [long, deep]
-    wing = slab(form, 0.15 * size, 0.03 * size, 2).rotate([90, 0, 0]).rotate([0, 0, m.u(-20, 50)])
-    return both(
-        m.stamp(
-            wing.translate((at + [0.3 * size, 0.3 * size, -0.3 * size]).tolist()),
-            m.surface("toy any"),
-        )
-    )
+    form = [(0, -0.3), (0.5, -0.5), (1, -0.35), (1.05, 0.0), (0.6, 0.5), (0, 0.45)]
+    wing = slab(np.array(form) * [long, deep], 0.15 * size, 0.03 * size, 2).rotate([90, 0, 0])
+    place = at + [0.3 * size, 0.3 * size, -0.3 * size]
+    parts.pair(wing, m.surface("toy any"), turn=(0, 0, m.u(-20, 50)), at=place)
 
 
 def bird(m: Maker) -> list[Manifold]:
@@ -384,8 +356,8 @@ def swimmer(m: Maker) -> list[Manifold]:
     parts = Parts(m)
     parts.add(loft(rings), skin)
     tip = xyz(0, bow * 1.2, -0.55)
-    corners = [(0.12, 0), (-0.1, 0.34), (-0.28, 0.38), (-0.16, 0), (-0.28, -0.38), (-0.1, -0.34)]
-    form = np.array(corners) * m.u(0.6, 1.1)
+    form = [(0.12, 0), (-0.1, 0.34), (-0.28, 0.38), (-0.16, 0), (-0.28, -0.38), (-0.1, -0.34)]
+    form = np.array(form) * m.u(0.6, 1.1)
     level = m.chance(0.4)
     tail = slab(form[::1], 0.04, 0.015, 2).rotate([0, -90, 0])
     tail = tail.rotate([0, 0, 90]) if level else tail
@@ -402,8 +374,8 @@ def swimmer(m: Maker) -> list[Manifold]:
         .translate([0.8 * wide, -0.2 * tall, 0.15])
     )
     parts.pair(side, fin)
-    corners = [wide * 0.9 * blunt**0.5, tall * 0.5, 0.16]
-    parts += _eyes(m, xyz(0, 0.0, 0.3), np.array(corners), m.u(0.02, 0.045))
+    radii = xyz(wide * 0.9 * blunt**0.5, tall * 0.5, 0.16)
+    parts += _eyes(m, xyz(0, 0, 0.3), radii, m.u(0.02, 0.045))
     return [p.rotate([0, m.pick(90, -90, m.u(-90, 90)), 0]) for p in [joined(parts)]]
 
 
@@ -469,17 +441,11 @@ def snake(m: Maker) -> list[Manifold]:
     r = m.u(0.05, 0.13)
     body = tube(path, [0.015, r * 0.8, r, r, r * 0.8, r * m.u(0.9, 1.4), r * 0.7], 16, 60)
     head = path[-1]
-    return [
-        joined(
-            [
-                m.stamp(body, skin),
-                *[
-                    e.translate([float(head[0]), 0, 0])
-                    for e in _eyes(m, head * [0, 1, 1], xyz(r, r, r), 0.02)
-                ],
-            ]
-        ).rotate([0, m.u(-90, 90), 0])
-    ]
+    parts = Parts(m)
+    parts.add(body, skin)
+    for eye in _eyes(m, head * [0, 1, 1], xyz(r, r, r), 0.02):
+        parts.append(eye.translate([float(head[0]), 0, 0]))
+    return parts.turned(0, m.u(-90, 90), 0)
 
 
 def figure(m: Maker) -> list[Manifold]:
@@ -518,10 +484,9 @@ def figure(m: Maker) -> list[Manifold]:
         shoulder = neck + xyz(broad * 0.75 + bulk * 0.5, -0.06, 0)
         reach = m.u(0.15, 0.24)
         lift, ahead = m.u(-1.3, 1.1), m.u(-0.6, 1.2)
-        corners = [math.cos(lift) * 0.9, math.sin(lift), 0.3 * math.sin(ahead)]
-        elbow = shoulder + reach * np.array(corners)
-        corners = [0.4 * math.cos(lift), math.sin(lift + m.u(-0.5, 1.2)) * 0.8, math.sin(ahead)]
-        hand = elbow + reach * np.array(corners)
+        elbow = shoulder + reach * xyz(math.cos(lift) * 0.9, math.sin(lift), 0.3 * math.sin(ahead))
+        up = math.sin(lift + m.u(-0.5, 1.2)) * 0.8
+        hand = elbow + reach * xyz(0.4 * math.cos(lift), up, math.sin(ahead))
         blend.limb([shoulder * flip, elbow * flip], [bulk, bulk * 0.8], 1)
         blend.limb([elbow * flip, hand * flip], [bulk * 0.75, bulk * 0.65], m.pick(0, 1))
         blend.egg(hand * flip, (bulk * 0.9, bulk * 0.9, bulk * 0.9), 0)

@@ -54,10 +54,10 @@ def produce(m: Maker, r: float) -> Manifold:
         return tube([(0, -r, 0), (0.3 * r, 0, 0), (0, r, 0)], [0.25 * r, 0.45 * r, 0.2 * r], 12, 16)
     if kind == 3:
         return superquadric([r, r * 0.8, r], m.u(0.5, 1), m.u(0.4, 1), 24)
-    side_line = [
+    contour = [
         *((0, -r), (r * 0.3, -r * 0.95), (r * 0.9, -0.1 * r), (r * 0.6, 0.6 * r), (0.1 * r, r)),
     ]
-    return lathe(side_line, 20)
+    return lathe(contour, 20)
 
 
 def outline(m: Maker, sides: int = 48) -> np.ndarray:

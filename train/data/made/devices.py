@@ -9,7 +9,7 @@ from manifold3d import Manifold
 
 from .composition import shape
 from .details import handle, outline
-from .looks import Look, Maker, Parts, material, plain_material
+from .looks import Maker, Parts
 from .solids import (
     Blend,
     ball,
@@ -97,16 +97,14 @@ def tool(m: Maker) -> list[Manifold]:
         part = taper(box(w * 0.95, m.u(0.12, 0.3), 0.07, 0.01), m.u(0.7, 1.3))
         parts.add(part, tuft, at=(0, top + 0.13, 0))
     elif kind == 6:  # axe, cleaver, knife
-        corners = [(-0.02, -0.1), (0.2, -0.16), (m.u(0.25, 0.4), 0.0), (0.2, 0.18), (-0.02, 0.1)]
-        form = np.array(corners)
+        form = [(-0.02, -0.1), (0.2, -0.16), (m.u(0.25, 0.4), 0.0), (0.2, 0.18), (-0.02, 0.1)]
         blade = slab(form, m.u(0.02, 0.07), 0.01, 2)
         if m.chance(0.5):
-            corners = [(-0.05, 0), (0.06, 0), (0.06, 0.5), (0.0, 0.7), (-0.05, 0.5)]
-            blade = slab(np.array(corners), 0.02, 0.006, 2)
+            form = [(-0.05, 0), (0.06, 0), (0.06, 0.5), (0.0, 0.7), (-0.05, 0.5)]
+            blade = slab(form, 0.02, 0.006, 2)
         parts.add(blade, head, at=(0, top - 0.03, 0))
     elif kind == 7:  # torch
-        profile = [*((r, 0), (r * 1.9, 0.12), (r * 1.9, 0.25), (r * 1.7, 0.25), (r * 1.5, 0.2))]
-        cone = lathe(profile)
+        cone = lathe([*((r, 0), (r * 1.9, 0.12), (r * 1.9, 0.25), (r * 1.7, 0.25), (r * 1.5, 0.2))])
         parts.add(cone, m.pick(grip, head), at=(0, top - 0.02, 0))
         parts.add(rod(r * 1.5, 0.02), m.plain("white pastel"), at=(0, top + 0.18, 0))
     elif kind == 8:  # pliers, scissors
@@ -158,9 +156,7 @@ def device(m: Maker) -> list[Manifold]:
         edge = m.u(0.02, 0.08)
         parts.add(box(w, h, t, m.u(0.1, 0.45) * t), case)
         pane = box(w - 2 * edge, h - 2 * edge - m.u(0, 0.1), 0.02).translate([0, 0, t / 2])
-        picture = m.add(
-            Look([plain_material(np.zeros(3))] * 4 + [material(screen(m.rng))] * 2, "fit")
-        )
+        picture = m.faced(screen(m.rng), np.zeros(3))
         parts.add(pane, picture)
         if m.chance(0.4):
             part = rod(0.05, 0.03, 20)
@@ -309,24 +305,14 @@ def device(m: Maker) -> list[Manifold]:
         return parts.turned(0, m.pick(90, -90, m.u(-180, 180)), 0)
     elif kind == 9:  # a clock, or a scale
         r, t = m.u(0.4, 0.55), m.u(0.08, 0.25)
-        face = m.add(
-            Look(
-                [plain_material(m.color("white any"))] * 4
-                + [
-                    material(
-                        screen(m.rng)
-                        if m.chance(0.3)
-                        else package(m.rng, m.color("white"), m.inks(), "label")
-                    )
-                ]
-                * 2,
-                "fit",
-            )
+        face = (
+            screen(m.rng) if m.chance(0.3) else package(m.rng, m.color("white"), m.inks(), "label")
         )
+        dial = m.faced(face, m.color("white any"))
         form = ring_of(m.pick(2, 2, 5), 48)
         part = slab(form * r, t, 0.03) - slab(form * r * 0.88, t).translate([0, 0, t * 0.8])
         parts.add(part, case)
-        parts.add(slab(form * r * 0.87, 0.02), face, at=(0, 0, t * 0.3))
+        parts.add(slab(form * r * 0.87, 0.02), dial, at=(0, 0, t * 0.3))
         for a, long in ((m.u(0, 360), 0.6), (m.u(0, 360), 0.4)):
             part = box(0.02, long * r, 0.02).translate([0, long * r / 2, t * 0.33])
             parts.add(part, dark, turn=(0, 0, a))
@@ -396,13 +382,13 @@ def instrument(m: Maker) -> list[Manifold]:
         parts.add(joined(pegs), m.metal())
         return parts.turned(m.u(-20, 0), m.u(-50, 50), m.pick(0, m.u(-80, 80)))
     if kind == 1:
-        side_line = [
+        contour = [
             (0, 0),
             *[(0.03 + 0.25 * s**4, s * 0.9) for s in np.linspace(0, 1, 12)],
             *[(0.015 + 0.25 * s**4, s * 0.9 + 0.015) for s in np.linspace(1, 0.5, 6)],
             (0, 0.4),
         ]
-        flare = lathe(side_line, 32)
+        flare = lathe(contour, 32)
         parts.add(flare, m.pick(m.metal(), m.surface("toy")), turn=(0, 0, -90))
         line = [
             *((0.1, 0, 0), (-0.1, -0.08, 0), (0.1, -0.2, 0), (0.5, -0.2, 0), (0.6, -0.08, 0)),

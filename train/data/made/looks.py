@@ -179,18 +179,19 @@ class Maker:
             ground: colour of the paper.
             mapping: see ``Look``.
             inks: colours; None: drawn.
-            sides: whether what does not look to +z or -z is of the ground's colour.
+            sides: whether what does not look to +z is of the ground's colour.
         """
         # What goes once around is four times as wide as high.
         height = textures.PRINT * 3 // 8 if mapping == "round" else textures.PRINT
         pixels = textures.package(
             self.rng, ground, inks or self.inks(), kind, textures.PRINT, height
         )
-        picture = material(pixels)
-        if not sides:
-            return self.add(Look([picture], mapping))
+        return self.faced(pixels, ground) if sides else self.add(Look([material(pixels)], mapping))
+
+    def faced(self, pixels: np.ndarray, ground: np.ndarray) -> int:
+        """A look with a picture on what looks to +z, once over it, and one colour elsewhere."""
         bare = plain_material(ground)
-        return self.add(Look([bare, bare, bare, bare, picture, bare], mapping))
+        return self.add(Look([bare, bare, bare, bare, material(pixels), bare], "fit"))
 
     def stamp(self, solid: Manifold, look: int) -> Manifold:
         """The solid with its skin where it is now, all of it of one look."""

@@ -67,7 +67,7 @@ def carton(m: Maker) -> list[Manifold]:
         ]
         parts.add(tube(line, 0.02, 10, 24, flat=(1, 1.5)), m.plain())
     elif kind == 4:  # a gable top, as milk has
-        roof = slab(np.array([(-w / 2, 0), (w / 2, 0), (0.0, 0.5 * w)]), d).translate([0, h / 2, 0])
+        roof = slab([(-w / 2, 0), (w / 2, 0), (0.0, 0.5 * w)], d).translate([0, h / 2, 0])
         parts.add(roof, m.painted(inks[0]))
         parts.add(box(0.03, 0.12, d), m.painted(ground), at=(0, h / 2 + 0.5 * w, 0))
     elif kind == 5:  # a stack of them

@@ -144,7 +144,7 @@ def inset(outline: np.ndarray, distance: float) -> np.ndarray:
     )
 
 
-def slab(outline: np.ndarray, thickness: float, bevel: float = 0.0, steps: int = 3) -> Manifold:
+def slab(outline: ArrayLike, thickness: float, bevel: float = 0.0, steps: int = 3) -> Manifold:
     """An outline in x and y, thick along z, with rounded edges.
 
     Args:
@@ -153,6 +153,7 @@ def slab(outline: np.ndarray, thickness: float, bevel: float = 0.0, steps: int =
         bevel: radius of the edges.
         steps: rings of a rounded edge.
     """
+    points = np.asarray(outline, float)
     half = thickness / 2
     bevel = min(bevel, 0.99 * half)
     if bevel <= 0:
@@ -162,7 +163,7 @@ def slab(outline: np.ndarray, thickness: float, bevel: float = 0.0, steps: int =
         below = [(bevel * (1 - math.sin(a)), -half + bevel * (1 - math.cos(a))) for a in angle]
         layers = [*below, *[(d, -z) for d, z in reversed(below)]]
     rings = np.stack(
-        [np.column_stack([inset(outline, d), np.full(len(outline), z)]) for d, z in layers]
+        [np.column_stack([inset(points, d), np.full(len(points), z)]) for d, z in layers]
     )
     return loft(rings)
 

@@ -21,62 +21,40 @@ _U, _V = np.meshgrid(*[((np.arange(SIDE) + 0.5) / SIDE).astype(np.float32)] * 2)
 _LETTERS = "AAABCDEEEEFGHIIJKLMNNOOPQRSSTTUVWXYZ"
 
 
-def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
-    """Draws a colour ``[3]`` of a kind.
+# Hues of toys; few things are bright green.
+_HUES = (
+    *(0.0, 0.0, 0.02, 0.07, 0.12, 0.14, 0.15, 0.25),
+    *(0.36, 0.45, 0.55, 0.58, 0.6, 0.62, 0.78, 0.92),
+)
+# Ranges of hue, saturation and value.
+_COLORS = {
+    "pastel": ((0.0, 1.0), (0.12, 0.45), (0.75, 0.97)),
+    "white": ((0.05, 0.2), (0.0, 0.1), (0.82, 0.98)),
+    "wood": ((0.05, 0.11), (0.3, 0.7), (0.3, 0.88)),
+    "metal": ((0.5, 0.65), (0.0, 0.08), (0.35, 0.85)),
+    "skin": ((0.04, 0.09), (0.25, 0.55), (0.35, 0.96)),
+    "fur": ((0.04, 0.12), (0.0, 0.65), (0.12, 0.95)),
+    "earth": ((0.02, 0.2), (0.2, 0.7), (0.2, 0.75)),
+    "leaf": ((0.2, 0.4), (0.3, 0.7), (0.2, 0.6)),
+    "leather": ((0.02, 0.1), (0.3, 0.8), (0.1, 0.6)),
+}
 
-    Args:
-        rng: source of chance.
-        kind: any, toy, pastel, dark, white, wood, metal, skin, fur, earth, leaf or leather.
-    """
+
+def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
+    """Draws a colour ``[3]`` of a kind: one of ``_COLORS``, any, toy, dark or wide."""
     if kind == "any":
         kinds = ("toy", "toy", "pastel", "dark", "dark", "white", "white", "earth", "metal", "wide")
         kind = kinds[rng.integers(len(kinds))]
-    if kind == "toy":
-        hues = (
-            0.0,
-            0.0,
-            0.02,
-            0.07,
-            0.12,
-            0.14,
-            0.15,
-            0.25,
-            0.36,
-            0.45,
-            0.55,
-            0.58,
-            0.6,
-            0.62,
-            0.78,
-            0.92,
-        )
-        hue = hues[rng.integers(len(hues))] + rng.normal(0, 0.015)
-        light = rng.uniform(0.45, 0.95) * (
-            0.8 if 0.2 < hue < 0.5 else 1
-        )  # few things are bright green
-        hsv = hue % 1, rng.uniform(0.55, 0.97), light
-    elif kind == "pastel":
-        hsv = rng.random(), rng.uniform(0.12, 0.45), rng.uniform(0.75, 0.97)
-    elif kind == "dark":
-        hsv = rng.random(), rng.uniform(0, 0.5) * (rng.random() < 0.6), rng.uniform(0.05, 0.3)
-    elif kind == "white":
-        hsv = rng.uniform(0.05, 0.2), rng.uniform(0, 0.1), rng.uniform(0.82, 0.98)
-    elif kind == "wood":
-        hsv = rng.uniform(0.05, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.88)
-    elif kind == "metal":
-        hsv = rng.uniform(0.5, 0.65), rng.uniform(0, 0.08), rng.uniform(0.35, 0.85)
-    elif kind == "skin":
-        hsv = rng.uniform(0.04, 0.09), rng.uniform(0.25, 0.55), rng.uniform(0.35, 0.96)
-    elif kind == "fur":
-        hsv = rng.uniform(0.04, 0.12), rng.uniform(0.0, 0.65), rng.uniform(0.12, 0.95)
-    elif kind == "earth":
-        hsv = rng.uniform(0.02, 0.2), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.75)
-    elif kind == "leaf":
-        hsv = rng.uniform(0.2, 0.4), rng.uniform(0.3, 0.7), rng.uniform(0.2, 0.6)
-    elif kind == "leather":
-        hsv = rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.8), rng.uniform(0.1, 0.6)
-    else:
+    if kind == "wide":
         return rng.uniform(0.05, 0.95, 3)
+    if kind == "toy":
+        hue = _HUES[rng.integers(len(_HUES))] + rng.normal(0, 0.015)
+        light = rng.uniform(0.45, 0.95) * (0.8 if 0.2 < hue < 0.5 else 1)
+        hsv = (hue % 1, rng.uniform(0.55, 0.97), light)
+    elif kind == "dark":
+        hsv = (rng.random(), rng.uniform(0, 0.5) * (rng.random() < 0.6), rng.uniform(0.05, 0.3))
+    else:
+        hsv = tuple(rng.uniform(low, high) for low, high in _COLORS[kind])
     return np.array(colorsys.hsv_to_rgb(*map(float, hsv)))
 
 

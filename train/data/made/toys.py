@@ -67,7 +67,7 @@ def blocks(m: Maker) -> list[Manifold]:
             y += h
         if m.chance(0.6):
             profile = [(0.22, 0), (0.01, 0.35), (0, 0.36)]
-            top = m.pick(slab(np.array([(-0.25, 0), (0.25, 0), (0, 0.3)]), 0.3), lathe(profile))
+            top = m.pick(slab([(-0.25, 0), (0.25, 0), (0, 0.3)], 0.3), lathe(profile))
             parts.add(top, m.pick(*looks), at=(0, y - 0.001, 0))
     elif kind == 2:  # loose pieces on the ground
         for i in range(m.n(3, 9)):
@@ -187,8 +187,7 @@ def game(m: Maker) -> list[Manifold]:
         roof = m.pattern("bricked striped plain", "toy earth")
         trim = m.plain("white dark")
         gable = m.u(0.2, 0.5)
-        part = slab(np.array([(-w / 2, 0), (w / 2, 0), (w / 2, h), (0, h + gable), (-w / 2, h)]), d)
-        parts.add(part, wall)
+        parts.add(slab([(-w / 2, 0), (w / 2, 0), (w / 2, h), (0, h + gable), (-w / 2, h)], d), wall)
         lean = math.degrees(math.atan2(gable, w / 2))
         side = (
             box(math.hypot(gable, w / 2) * 1.25, 0.05, d * 1.15)

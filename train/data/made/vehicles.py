@@ -25,16 +25,18 @@ def vehicle(m: Maker) -> list[Manifold]:
     if kind <= 1:  # a car: the side's outline, drawn out and rounded
         ends, hood, boot = floor + h * 0.15, floor + h * m.u(0.75, 1.1), floor + h * m.u(0.75, 1.3)
         roof = floor + h + m.u(0.15, 0.35)
-        corners = [
-            *(-0.5, -0.49, -0.42, -0.3 + m.u(-0.1, 0.06), -0.22 + m.u(-0.15, 0.05)),
-            *(0.1 + m.u(-0.05, 0.08), 0.25 + m.u(-0.05, 0.05), 0.44, 0.5, 0.5),
-        ]
-        z = np.array(corners)
-        corners = [
-            *(ends, boot * 0.8, boot, boot * 1.02, roof, roof, hood * 1.05, hood * 0.95),
-            *(hood * 0.75, ends),
-        ]
-        y = np.array(corners)
+        z = np.array(
+            [
+                *(-0.5, -0.49, -0.42, -0.3 + m.u(-0.1, 0.06), -0.22 + m.u(-0.15, 0.05)),
+                *(0.1 + m.u(-0.05, 0.08), 0.25 + m.u(-0.05, 0.05), 0.44, 0.5, 0.5),
+            ]
+        )
+        y = np.array(
+            [
+                *(ends, boot * 0.8, boot, boot * 1.02, roof, roof, hood * 1.05, hood * 0.95),
+                *(hood * 0.75, ends),
+            ]
+        )
         line = np.stack([z * long, y], 1)
         body = loft(
             np.stack(
@@ -177,11 +179,10 @@ def plane(m: Maker) -> list[Manifold]:
         parts.add(part, m.plain("dark pastel metal"), at=(0, r * 0.7, long * 0.22))
         if kind == 0 or m.chance(0.4):
             sweep, chord, span = m.u(-0.05, 0.45), m.u(0.25, 0.5), m.u(0.55, 0.9)
-            corners = [
+            form = [
                 *((0, -chord / 2), (span, -sweep - chord * 0.3), (span, -sweep + chord * 0.2)),
                 (0, chord / 2),
             ]
-            form = np.array(corners)
             wing = slab(form, 0.05, 0.02, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
             levels = (m.u(-0.6, 0.8) * r,) if m.chance(0.75) else (-0.7 * r, 1.8 * r)
             for y in levels:
@@ -200,11 +201,11 @@ def plane(m: Maker) -> list[Manifold]:
             line = [(r, -r - 0.12, -0.3), (r, -r - 0.12, 0.3)]
             part = tube(line, 0.025, 8, 8) + rod(0.02, 0.2, 8).translate([r, -r - 0.12, 0])
             parts.pair(part, dark)
-        corners = [(-0.02, 0), (0.18, 0), (0.06, 0.3), (-0.06, 0.3)]
-        fin = slab(np.array(corners), 0.03, 0.01, 2).rotate([0, -90, 0]).mirror([0, 0, 0])
+        form = [(-0.02, 0), (0.18, 0), (0.06, 0.3), (-0.06, 0.3)]
+        fin = slab(form, 0.03, 0.01, 2).rotate([0, -90, 0]).mirror([0, 0, 0])
         parts.add(fin, second, at=(0, r * 0.4, -long / 2 + 0.02))
-        corners = [(0, -0.1), (0.28, -0.14), (0.28, 0.0), (0, 0.1)]
-        flat = slab(np.array(corners), 0.025, 0.008, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
+        form = [(0, -0.1), (0.28, -0.14), (0.28, 0.0), (0, 0.1)]
+        flat = slab(form, 0.025, 0.008, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
         parts.pair(flat, second, at=(0, 0.05, -long / 2 + 0.08))
         if m.chance(0.4):
             part = joined(
@@ -218,8 +219,8 @@ def plane(m: Maker) -> list[Manifold]:
         parts.add(
             hull, m.pick(paint, m.pattern("striped", "white toy", contrast=1, mapping="round"))
         )
-        corners = [(0, 0.1), (0.25, -0.15), (0.25, 0.05), (0.0, 0.45)]
-        fin = slab(np.array(corners), 0.04, 0.01, 2).translate([r * 0.8, 0, 0])
+        form = [(0, 0.1), (0.25, -0.15), (0.25, 0.05), (0.0, 0.45)]
+        fin = slab(form, 0.04, 0.01, 2).translate([r * 0.8, 0, 0])
         parts += [
             m.stamp(fin, second).rotate([0, 360 * i / n, 0])
             for n in (m.pick(3, 4),)
@@ -244,11 +245,11 @@ def plane(m: Maker) -> list[Manifold]:
         parts.append(m.stamp(hull, paint) - well)
         if m.chance(0.5):
             parts.add(rod(0.025, 1.0, 10), m.wood())
-            corners = [(0.03, 0.25), (0.5, 0.25), (0.03, 0.95)]
-            sail = slab(np.array(corners), 0.02).rotate([0, m.u(60, 120), 0])
+            form = [(0.03, 0.25), (0.5, 0.25), (0.03, 0.95)]
+            sail = slab(form, 0.02).rotate([0, m.u(60, 120), 0])
             parts.add(sail, m.cloth("white toy"))
             if m.chance(0.5):
-                part = slab(np.array([(0.03, 0.25), (0.4, 0.25), (0.03, 0.8)]), 0.02)
+                part = slab([(0.03, 0.25), (0.4, 0.25), (0.03, 0.8)], 0.02)
                 parts.add(part, m.cloth("white toy"), turn=(0, -m.u(60, 120), 0))
         else:
             parts.add(box(w * 0.55, 0.25, long * 0.3, 0.03), second, at=(0, h * 0.4, -0.05 * long))

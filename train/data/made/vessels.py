@@ -123,11 +123,11 @@ def teapot(m: Maker) -> list[Manifold]:
         over = tube(line, 0.035, 10, 28)
         parts.add(over, second)
     top = float(profile[-1, 0])
-    side_line = [
+    contour = [
         *((top * 0.98, -0.02), (top * 0.9, 0.06), (0.08, m.u(0.08, 0.2)), (0.05, 0.2)),
         *((0.07, 0.25), (0, 0.3)),
     ]
-    lid = lathe(side_line)
+    lid = lathe(contour)
     parts.add(lid, m.pick(look, second), at=(0, h, 0))
     angle = m.pick(0, 180, m.u(-70, 70))
     return [p.rotate([0, angle, 0]) for p in parts]
@@ -366,10 +366,8 @@ def food(m: Maker) -> list[Manifold]:
             )
         whole = joined(parts)
         if m.chance(0.4):
-            corners = [(0, 0), (1.5, 0), (1.5, m.u(0.8, 2.5))]
-            wedge = m.stamp(
-                slab(np.array(corners), 4).rotate([90, 0, 0]).rotate([0, m.u(0, 360), 0]), looks[0]
-            )
+            form = [(0, 0), (1.5, 0), (1.5, m.u(0.8, 2.5))]
+            wedge = m.stamp(slab(form, 4).rotate([90, 0, 0]).rotate([0, m.u(0, 360), 0]), looks[0])
             whole = whole ^ wedge if m.chance(0.5) else whole - wedge
         return [whole]
     if kind == 3:  # a burger or a sandwich: layers between halves

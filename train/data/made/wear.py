@@ -8,7 +8,7 @@ import numpy as np
 from manifold3d import Manifold
 
 from .details import handle, outline
-from .looks import Look, Maker, Parts, material, plain_material
+from .looks import Maker, Parts
 from .solids import (
     ball,
     both,
@@ -347,9 +347,7 @@ def wearable(m: Maker) -> list[Manifold]:
         parts.add(band, a)
         face = m.pick(rod(m.u(0.16, 0.24), 0.1, 36, 0.02), box(0.34, 0.1, 0.4, 0.03))
         parts.add(face, b, turn=(90, 0, 0), at=(0, 0, 0.39))
-        picture = m.add(
-            Look([plain_material(np.zeros(3))] * 4 + [material(screen(m.rng))] * 2, "fit")
-        )
+        picture = m.faced(screen(m.rng), np.zeros(3))
         parts.add(rod(0.14, 0.03, 30), picture, turn=(90, 0, 0), at=(0, 0, 0.47))
         return parts.turned(m.u(-40, 0), m.u(-40, 40), 0)
     elif kind == 3:
