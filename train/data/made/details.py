@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
+from numpy.typing import ArrayLike
 
 from .looks import Maker
 from .solids import ball, joined, lathe, ring_of, rod, rounded, superquadric, tube
@@ -19,6 +20,17 @@ def handle(m: Maker, width: float, height: float, thick: float) -> Manifold:
         *((width * (1 if square else 0.75), -height / 2, 0), (0, -height / 2, 0)),
     ]
     return tube(path, thick, 12, 26, flat=(1, m.u(1, 1.8)), round_ends=False)
+
+
+def bow(half: list, thick: float, count: int = 32, flat: float = 1.0) -> Manifold:
+    """A tube through points, the last of which lies on x = 0, and their mirror images."""
+    mirrored = [(-x, y, z) for x, y, z in half[-2::-1]]
+    return tube([*half, *mirrored], thick, 10, count, flat=(1, flat))
+
+
+def bar(start: ArrayLike, end: ArrayLike, radius: float) -> Manifold:
+    """A straight wire between two points."""
+    return tube(np.linspace(start, end, 3), radius, 6, 3, round_ends=False)
 
 
 def wheel(radius: float, thick: float) -> Manifold:

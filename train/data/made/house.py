@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 from manifold3d import CrossSection, FillRule, Manifold
 
-from .details import produce
+from .details import bar, bow, produce
 from .looks import Maker, Parts
 from .solids import (
     ball,
-    both,
     box,
     joined,
     lathe,
@@ -54,9 +54,9 @@ def lamp(m: Maker) -> list[Manifold]:
 
 def furniture(m: Maker) -> list[Manifold]:
     """A table, chair, sofa, shelf, cabinet or bed."""
+    wood, cloth = m.wood(), m.cloth("earth any")
     main, second, third = (
-        m.pick(m.wood(), m.wood(), m.surface("white dark wood"), m.cloth("earth any"))
-        for _ in range(3)
+        m.pick(wood, m.wood(), m.surface("white dark wood"), cloth) for _ in "abc"
     )
     w, d, h = m.u(0.5, 1.4), m.u(0.35, 0.9), m.u(0.2, 0.8)
     kind = m.n(0, 5)
@@ -71,16 +71,12 @@ def furniture(m: Maker) -> list[Manifold]:
     def legs(wide: float, deep: float, high: float) -> None:
         r = m.u(0.02, 0.05)
         splay, square = m.u(0, 0.08), m.chance(0.5)
-        leg = (
-            box(2 * r, high + 0.01, 2 * r).translate([0, high / 2, 0])
-            if square
-            else lathe([(r * 0.7, 0), (r, high * 0.7), (r * 1.1, high + 0.01)], 14)
-        )
-        leg = leg.rotate([math.degrees(-splay), 0, math.degrees(splay)])
-        x, z = wide / 2 - 1.3 * r, deep / 2 - 1.3 * r
-        one = m.stamp(leg.translate([x, 0, z]), second)
-        pair = both(one)
-        parts.append(pair + pair.mirror([0, 0, 1]))
+        leg = lathe([(r * 0.7, 0), (r, high * 0.7), (r * 1.1, high + 0.01)], 14)
+        if square:
+            leg = box(2 * r, high + 0.01, 2 * r).translate([0, high / 2, 0])
+        turn = (math.degrees(-splay), 0, math.degrees(splay))
+        parts.pair(leg, second, turn=turn, at=(wide / 2 - 1.3 * r, 0, deep / 2 - 1.3 * r))
+        parts[-1] += parts[-1].mirror([0, 0, 1])
 
     if kind == 0:
         thick = m.u(0.02, 0.08)
@@ -111,12 +107,10 @@ def furniture(m: Maker) -> list[Manifold]:
             block(second, (w, 0.08, 0.045), (0, seat + back, -d / 2 + 0.03))
         if m.chance(0.4):
             arm = m.u(0.12, 0.25)
-            for side in (-1, 1):
-                block(third, (0.07, arm, d), (side * (w / 2 - 0.02), seat + arm / 2, 0))
+            parts.pair(box(0.07, arm, d, soft), third, at=(w / 2 - 0.02, seat + arm / 2, 0))
     elif kind == 2:
         h, w, d, t = m.u(0.5, 1.6), m.u(0.4, 1.1), m.u(0.2, 0.4), m.u(0.02, 0.05)
-        for side in (-1, 1):
-            block(main, (t, h, d), (side * w / 2, h / 2, 0), 0.0)
+        parts.pair(box(t, h, d), main, at=(w / 2, h / 2, 0))
         if m.chance(0.7):
             block(second, (w, h, 0.02), (0, h / 2, -d / 2 + 0.01), 0.0)
         levels = np.linspace(t / 2, h - t / 2, m.n(2, 6))
@@ -125,12 +119,8 @@ def furniture(m: Maker) -> list[Manifold]:
             x = -w / 2 + 0.05
             while high - low > 0.15 and x < w / 2 - 0.1 and m.chance(0.75):
                 wide, tall = m.u(0.03, 0.2), m.u(0.5, 0.9) * float(high - low)
-                block(
-                    m.plain("any"),
-                    (wide, tall, 0.7 * d),
-                    (x + wide / 2, float(low) + t / 2 + tall / 2 - 0.005, 0),
-                    0.0,
-                )
+                at = (x + wide / 2, float(low) + t / 2 + tall / 2 - 0.005, 0)
+                block(m.plain(), (wide, tall, 0.7 * d), at, 0.0)
                 x += wide + m.u(0.003, 0.1)
     elif kind == 3:
         h, foot = m.u(0.3, 1.4), m.u(0, 0.15)
@@ -140,12 +130,8 @@ def furniture(m: Maker) -> list[Manifold]:
         for i, j in np.ndindex(columns, rows):
             x, y = (i + 0.5) * wide - w / 2, foot + (j + 0.5) * tall
             block(third, (0.9 * wide, 0.9 * tall, 0.03), (x, y, d / 2), 0.0)
-            knob = (
-                ball(0.02, 12).translate([x, y, d / 2 + 0.03])
-                if m.chance(0.5)
-                else box(0.25 * wide, 0.02, 0.03).translate([x, y, d / 2 + 0.025])
-            )
-            parts.add(knob, second)
+            knob = ball(0.02, 12) if m.chance(0.5) else box(0.25 * wide, 0.02, 0.03)
+            parts.add(knob, second, at=(x, y, d / 2 + 0.027))
         if foot > 0.05:
             legs(w, d, foot)
     elif kind == 4:
@@ -162,25 +148,11 @@ def furniture(m: Maker) -> list[Manifold]:
         block(cloth, (w, h, d), (0, h / 2, 0), puff * 0.5)
         count = m.n(1, 3)
         for i in range(count):
-            block(
-                cloth,
-                (w / count * 0.97, 0.18, d * 0.9),
-                ((i + 0.5) * w / count - w / 2, h + 0.05, 0.03),
-                puff,
-            )
-            block(
-                cloth,
-                (w / count * 0.97, 0.4, 0.2),
-                ((i + 0.5) * w / count - w / 2, h + 0.25, -d / 2 + 0.12),
-                puff,
-            )
-        for side in (-1, 1):
-            block(
-                cloth,
-                (0.16, h + m.u(0.1, 0.25), d),
-                (side * (w / 2 + 0.05), (h + 0.15) / 2, 0),
-                puff,
-            )
+            x, wide = (i + 0.5) * w / count - w / 2, w / count * 0.97
+            block(cloth, (wide, 0.18, d * 0.9), (x, h + 0.05, 0.03), puff)
+            block(cloth, (wide, 0.4, 0.2), (x, h + 0.25, -d / 2 + 0.12), puff)
+        arm = box(0.16, h + m.u(0.1, 0.25), d, puff)
+        parts.pair(arm, cloth, at=(w / 2 + 0.05, (h + 0.15) / 2, 0))
         if m.chance(0.4):
             part = superquadric([0.16, 0.16, 0.06], 0.5, 0.8)
             parts.add(part, third, turn=(-20, 0, m.u(-20, 20)), at=(m.u(-0.3, 0.3), h + 0.25, 0.05))
@@ -206,81 +178,50 @@ def rack(m: Maker) -> list[Manifold]:
         for y in np.linspace(0, h, m.n(2, 4)):
             parts.append(hoop(flare + (1 - flare) * y / h, float(y), r))
         slat = m.pick(1.0, 1.0, m.u(1.5, 3))
-        for x in np.linspace(-w / 2, w / 2, m.n(4, 7)) * 0.92:
-            for z in (-d / 2, d / 2):
-                line = [
-                    (x * flare, 0, z * flare),
-                    (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
-                    (x, h, z),
-                ]
-                parts.append(tube(line, r, 6, 3, flat=(1, 1), round_ends=False))
-            line = [
-                (x * flare, 0, -d / 2 * flare),
-                (x * flare, 0, 0),
-                (x * flare, 0, d / 2 * flare),
-            ]
-            parts.append(tube(line, r * slat, 6, 3, round_ends=False))
-        for z in np.linspace(-d / 2, d / 2, m.n(3, 5)) * 0.92:
-            for x in (-w / 2, w / 2):
-                line = [
-                    (x * flare, 0, z * flare),
-                    (x * (1 + flare) / 2, h / 2, z * (1 + flare) / 2),
-                    (x, h, z),
-                ]
-                parts.append(tube(line, r, 6, 3, round_ends=False))
+        xs = np.linspace(-w / 2, w / 2, m.n(4, 7)) * 0.92
+        zs = np.linspace(-d / 2, d / 2, m.n(3, 5)) * 0.92
+        feet = [(x, z) for x in xs for z in (-d / 2, d / 2)]
+        feet += [(x, z) for z in zs for x in (-w / 2, w / 2)]
+        parts += [bar((x * flare, 0, z * flare), (x, h, z), r) for x, z in feet]
+        for x in xs * flare:
+            parts.append(bar((x, 0, -d / 2 * flare), (x, 0, d / 2 * flare), r * slat))
         solids.add(joined(parts), look)
         if m.chance(0.4):
             solids.add(hoop(1.01, h, r * 2), second)
         if m.chance(0.4):
-            line = [
-                *((-w / 2, h, 0), (-w * 0.4, h + 0.35, 0), (0, h + 0.5, 0), (w * 0.4, h + 0.35, 0)),
-                (w / 2, h, 0),
-            ]
-            bow = tube(line, r * 1.5, 8, 28)
-            solids.add(bow, m.pick(look, second))
+            half = [(-w / 2, h, 0), (-w * 0.4, h + 0.35, 0), (0, h + 0.5, 0)]
+            solids.add(bow(half, r * 1.5, 28), m.pick(look, second))
         if m.chance(0.3):
             solids.add(box(w * flare, r * 1.5, d * flare), second)
     elif kind == 2:  # plates or shelves on posts
         post = rod(r * 1.5, h * 1.5, 10)
-        posts = [post.translate([x * w * 0.46, 0, z * d * 0.46]) for x in (-1, 1) for z in (-1, 1)]
+        places = product((-w * 0.46, w * 0.46), (-d * 0.46, d * 0.46))
+        posts = [post.translate([x, 0, z]) for x, z in places]
         solids.add(joined(posts), look)
         for y in np.linspace(0.05, h * 1.4, m.n(2, 4)):
             if m.chance(0.5):
                 solids.add(box(w, 0.03, d, 0.01), second, at=(0, y, 0))
             else:
-                rods = [
-                    tube(
-                        [(x, y, -d / 2), (x, y, 0), (x, y, d / 2)], r * 0.8, 6, 3, round_ends=False
-                    )
-                    for x in np.linspace(-w / 2, w / 2, m.n(5, 9))
-                ]
-                rods += [
-                    tube([(-w / 2, y, z), (0, y, z), (w / 2, y, z)], r, 6, 3, round_ends=False)
-                    for z in (-d / 2, d / 2)
-                ]
+                xs = np.linspace(-w / 2, w / 2, m.n(5, 9))
+                rods = [bar((x, y, -d / 2), (x, y, d / 2), r * 0.8) for x in xs]
+                rods += [bar((-w / 2, y, z), (w / 2, y, z), r) for z in (-d / 2, d / 2)]
                 solids.add(joined(rods), look)
     else:  # a crate of boards
         t, boards = m.u(0.015, 0.03), m.n(2, 4)
         tall = h / boards
         for i in range(boards):
-            for z in (-d / 2, d / 2):
-                parts.append(box(w, tall * 0.8, t).translate([0, (i + 0.5) * tall, z]))
-            for x in (-w / 2, w / 2):
-                parts.append(box(t, tall * 0.8, d).translate([x, (i + 0.5) * tall, 0]))
-        for x in (-1, 1):
-            for z in (-1, 1):
-                part = box(0.05, h, 0.05).translate([x * (w / 2 - 0.02), h / 2, z * (d / 2 - 0.02)])
-                parts.append(part)
+            y = (i + 0.5) * tall
+            parts += [box(w, tall * 0.8, t).translate([0, y, z]) for z in (-d / 2, d / 2)]
+            parts += [box(t, tall * 0.8, d).translate([x, y, 0]) for x in (-w / 2, w / 2)]
+        for x, z in product((w / 2 - 0.02, 0.02 - w / 2), (d / 2 - 0.02, 0.02 - d / 2)):
+            parts.append(box(0.05, h, 0.05).translate([x, h / 2, z]))
         parts.append(box(w, t, d).translate([0, t, 0]))
         solids.add(joined(parts), m.pick(m.wood(), look))
         for i in range(m.n(0, 5)):
             s = m.u(0.08, 0.14)
-            solids.add(
-                produce(m, s),
-                second if i % 2 else m.plain("toy leaf"),
-                at=(m.u(-0.3, 0.3) * w, h * 0.6, m.u(-0.3, 0.3) * d),
-            )
-    return [joined(solids).rotate([0, m.u(-50, 50), 0])]
+            at = (m.u(-0.3, 0.3) * w, h * 0.6, m.u(-0.3, 0.3) * d)
+            solids.add(produce(m, s), second if i % 2 else m.plain("toy leaf"), at=at)
+    return solids.turned(0, m.u(-50, 50), 0)
 
 
 def organiser(m: Maker) -> list[Manifold]:
@@ -300,11 +241,9 @@ def organiser(m: Maker) -> list[Manifold]:
                 continue
             x, z = float(left + right) / 2, float(back + front) / 2
             round_one = m.chance(0.2)
-            pit = (
-                rod(min(wide, deep) / 2, h, 24).translate([0, -h / 2, 0])
-                if round_one
-                else box(wide, h, deep, m.pick(0.0, 0.02))
-            )
+            pit = box(wide, h, deep, m.pick(0.0, 0.02))
+            if round_one:
+                pit = rod(min(wide, deep) / 2, h, 24).translate([0, -h / 2, 0])
             cuts.append(pit.translate([x, m.u(0.05, 0.4) * h, z]))
             if m.chance(0.5):
                 tall = h * m.u(0.6, 2.2)
@@ -312,12 +251,8 @@ def organiser(m: Maker) -> list[Manifold]:
                     box(wide * m.u(0.3, 0.9), tall, deep * m.u(0.3, 0.9), 0.01),
                     rod(min(wide, deep) * m.u(0.1, 0.45), tall, 16).translate([0, -tall / 2, 0]),
                 )
-                parts.add(
-                    item,
-                    m.surface(),
-                    turn=(m.u(-6, 6), 0, m.u(-6, 6)),
-                    at=(x, tall / 2 - h * 0.4, z),
-                )
+                lean = (m.u(-6, 6), 0, m.u(-6, 6))
+                parts.add(item, m.surface(), turn=lean, at=(x, tall / 2 - h * 0.4, z))
     if cuts:
         body = body - m.stamp(joined(cuts), inside)
     return [joined([body, *parts]).rotate([m.pick(0, m.u(0, 60)), m.u(-50, 50), 0])]
@@ -337,13 +272,8 @@ def cushion(m: Maker) -> list[Manifold]:
         p = m.u(2.5, 6)
         form = ring_of(p, 40) * [w, h]
         heights = np.linspace(-1, 1, 15)
-        rings = np.stack(
-            [
-                np.column_stack([form * (1 - abs(z) ** 3 * 0.9), np.full(40, z * d * (1 - 0.0))])
-                for z in heights
-            ]
-        )
-        body = m.pick(body, loft(rings))
+        rings = [np.column_stack([form * (1 - abs(z) ** 3 * 0.9), [z * d] * 40]) for z in heights]
+        body = m.pick(body, loft(np.stack(rings)))
         parts.add(ripple(body, m.rng, m.u(0.004, 0.02), m.u(0.2, 0.6), False), look)
         if m.chance(0.4):
             rim = tube([(x, y, 0) for x, y in form[::3]], 0.02, 8, 56, True)

@@ -9,6 +9,8 @@ from .details import wheel
 from .looks import Maker, Parts
 from .solids import ball, both, box, joined, lathe, loft, ring_of, ripple, rod, slab, tube
 
+SLOPE = np.array([1.05, 0.95, 0.75])  # heights of a car's bonnet, to its front
+
 
 def vehicle(m: Maker) -> list[Manifold]:
     """A car, bus, lorry, tractor or digger."""
@@ -25,45 +27,18 @@ def vehicle(m: Maker) -> list[Manifold]:
     if kind <= 1:  # a car: the side's outline, drawn out and rounded
         ends, hood, boot = floor + h * 0.15, floor + h * m.u(0.75, 1.1), floor + h * m.u(0.75, 1.3)
         roof = floor + h + m.u(0.15, 0.35)
-        z = np.array(
-            [
-                *(-0.5, -0.49, -0.42, -0.3 + m.u(-0.1, 0.06), -0.22 + m.u(-0.15, 0.05)),
-                *(0.1 + m.u(-0.05, 0.08), 0.25 + m.u(-0.05, 0.05), 0.44, 0.5, 0.5),
-            ]
+        z = (
+            *(-0.5, -0.49, -0.42, -0.3 + m.u(-0.1, 0.06), -0.22 + m.u(-0.15, 0.05)),
+            *(0.1 + m.u(-0.05, 0.08), 0.25 + m.u(-0.05, 0.05), 0.44, 0.5, 0.5),
         )
-        y = np.array(
-            [
-                *(ends, boot * 0.8, boot, boot * 1.02, roof, roof, hood * 1.05, hood * 0.95),
-                *(hood * 0.75, ends),
-            ]
-        )
-        line = np.stack([z * long, y], 1)
-        body = loft(
-            np.stack(
-                [
-                    np.column_stack(
-                        [
-                            np.full(10, x),
-                            np.where(line[:, 1] > hood, hood + (line[:, 1] - hood) * s, line[:, 1]),
-                            line[:, 0] * (0.97 + 0.03 * s),
-                        ]
-                    )
-                    for x, s in (
-                        *((-w / 2, 0.75), (-w * 0.42, 0.95), (-w * 0.2, 1.0), (w * 0.2, 1.0)),
-                        *((w * 0.42, 0.95), (w / 2, 0.75)),
-                    )
-                ]
-            )
-        )
-        # A loft in x: the cabin is narrower than what is below it.
-        body = body.warp_batch(
-            lambda p: (
-                p
-                * np.stack(
-                    [1 - 0.5 * np.clip(p[:, 1] - hood, 0, 1), p[:, 1] ** 0, p[:, 2] ** 0], -1
-                )
-            )
-        )
+        low = np.array([ends, boot * 0.8, boot, boot * 1.02, roof, roof, *(hood * SLOPE), ends])
+        rings = []
+        for x, s in ((-0.5, 0.75), (-0.42, 0.95), (-0.2, 1), (0.2, 1), (0.42, 0.95), (0.5, 0.75)):
+            y = np.where(low > hood, hood + (low - hood) * s, low)
+            # The cabin is narrower than what is below it.
+            wide = x * w * (1 - 0.5 * np.clip(y - hood, 0, 1))
+            rings.append(np.stack([wide, y, np.array(z) * long * (0.97 + 0.03 * s)], -1))
+        body = loft(np.stack(rings))
         arches = joined(
             [
                 rod(r * 1.15, 3, 24).translate([0, -1.5, 0]).rotate([0, 0, 90]).translate([0, r, a])
@@ -76,11 +51,8 @@ def vehicle(m: Maker) -> list[Manifold]:
             [0, (low + high) / 2, -0.04 * long]
         )
         window = m.stamp(body.scale([1.012, 1, 1]) ^ panes, glass)
-        shield = m.stamp(
-            body.scale([0.9, 1, 1]).translate([0, 0.0, 0.0]).scale([1, 1.004, 1.01])
-            ^ box(2, max(high - low, 0.02), 9).translate([0, (low + high) / 2, 0]),
-            glass,
-        )
+        level = box(2, max(high - low, 0.02), 9).translate([0, (low + high) / 2, 0])
+        shield = m.stamp(body.scale([0.9, 1.004, 1.01]) ^ level, glass)
         parts.append(shell)
         parts.append(window)
         parts.append(shield)
@@ -142,14 +114,8 @@ def vehicle(m: Maker) -> list[Manifold]:
             part = box(0.25, 0.18, 0.2, 0.02) - box(0.2, 0.2, 0.2).translate([0, 0.06, 0.06])
             parts.add(part, accent, at=(0, floor + 0.4, long * 0.55))
         else:
-            part = Manifold.compose(
-                [
-                    rod(0.09, deep, 16)
-                    .rotate([90, 0, 0])
-                    .translate([x, floor + 0.18, z - deep / 2])
-                    for x in (-0.19, 0.0, 0.19)
-                ]
-            )
+            log = rod(0.09, deep, 16).rotate([90, 0, 0]).translate([0, floor + 0.18, z - deep / 2])
+            part = joined([log.translate([x, 0, 0]) for x in (-0.19, 0, 0.19)])
             parts.add(part, m.wood())
         axles = [long * 0.36, -long * 0.2, *([-long * 0.38] if m.chance(0.6) else [])]
         if m.chance(0.15):
@@ -202,7 +168,7 @@ def plane(m: Maker) -> list[Manifold]:
             part = tube(line, 0.025, 8, 8) + rod(0.02, 0.2, 8).translate([r, -r - 0.12, 0])
             parts.pair(part, dark)
         form = [(-0.02, 0), (0.18, 0), (0.06, 0.3), (-0.06, 0.3)]
-        fin = slab(form, 0.03, 0.01, 2).rotate([0, -90, 0]).mirror([0, 0, 0])
+        fin = slab(form, 0.03, 0.01, 2).rotate([0, -90, 0])
         parts.add(fin, second, at=(0, r * 0.4, -long / 2 + 0.02))
         form = [(0, -0.1), (0.28, -0.14), (0.28, 0.0), (0, 0.1)]
         flat = slab(form, 0.025, 0.008, 2).rotate([90, 0, 0]).mirror([0, 0, 1])
@@ -221,11 +187,8 @@ def plane(m: Maker) -> list[Manifold]:
         )
         form = [(0, 0.1), (0.25, -0.15), (0.25, 0.05), (0.0, 0.45)]
         fin = slab(form, 0.04, 0.01, 2).translate([r * 0.8, 0, 0])
-        parts += [
-            m.stamp(fin, second).rotate([0, 360 * i / n, 0])
-            for n in (m.pick(3, 4),)
-            for i in range(n)
-        ]
+        fin, count = m.stamp(fin, second), m.pick(3, 4)
+        parts += [fin.rotate([0, 360 * i / count, 0]) for i in range(count)]
         parts.add(ball([0.1, 0.1, 0.05], 20), dark, at=(0, 0.7, r * 0.95))
         return parts
     else:  # a boat
@@ -285,25 +248,17 @@ def train_of(m: Maker) -> list[Manifold]:
         else:
             load = m.n(0, 3)
             if load == 0:
-                part = m.stamp(
-                    box(w * 0.95, 0.22, long * 0.9, 0.02)
-                    - box(w * 0.8, 0.22, long * 0.8).translate([0, 0.05, 0]),
-                    main,
-                ).translate([0, r + 0.18, 0])
+                hole = box(w * 0.8, 0.22, long * 0.8).translate([0, 0.05, 0])
+                part = box(w * 0.95, 0.22, long * 0.9, 0.02) - hole
+                part = m.stamp(part, main).translate([0, r + 0.18, 0])
                 car.append(part)
             elif load == 1:
                 line = [(0, 0, -long * 0.3), (0, 0, long * 0.3)]
                 car.append(m.stamp(tube(line, 0.15, 24, 8), main).translate([0, r + 0.2, 0]))
             elif load == 2:
-                car += [
-                    m.stamp(
-                        rod(0.05, long * 0.85, 14)
-                        .rotate([90, 0, 0])
-                        .translate([x, r + 0.12, -long * 0.42]),
-                        second,
-                    )
-                    for x in (-0.1, 0.0, 0.1)
-                ]
+                log = rod(0.05, long * 0.85, 14).rotate([90, 0, 0])
+                for x in (-0.1, 0.0, 0.1):
+                    car.add(log, second, at=(x, r + 0.12, -long * 0.42))
             else:
                 for k in range(m.n(1, 3)):
                     part = box(0.2, 0.2, 0.2, 0.01)
