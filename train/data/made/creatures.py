@@ -51,11 +51,7 @@ def _eyes(m: Maker, center: Vec, radii: Vec, size: float) -> list[Manifold]:
         eyes.pair(ball([size, size * m.u(1, 1.5), size], 20), dark, at=place)
     if m.chance(0.35):  # a mouth
         mouth = center + radii * xyz(0, -0.42, 0.88)
-        line = [
-            mouth + [-2.2 * size, 0.5 * size, -0.3 * size],
-            mouth,
-            mouth + [2.2 * size, 0.5 * size, -0.3 * size],
-        ]
+        line = mouth + size * np.array([(-2.2, 0.5, -0.3), (0, 0, 0), (2.2, 0.5, -0.3)])
         bow = tube(line, 0.45 * size, 8, 12)
         eyes.add(bow, m.painted(xyz(m.u(0.1, 0.7), 0.05, 0.08)))
     return eyes
@@ -367,13 +363,8 @@ def swimmer(m: Maker) -> list[Manifold]:
         slab(blade, 0.03, 0.01, 2).rotate([0, -90, 0]).translate([0, 0.85 * tall, m.u(-0.1, 0.15)])
     )
     parts.add(top, fin)
-    side = (
-        slab(blade, 0.03, 0.01, 2)
-        .rotate([0, -90, 0])
-        .rotate([0, 0, -m.u(70, 120)])
-        .translate([0.8 * wide, -0.2 * tall, 0.15])
-    )
-    parts.pair(side, fin)
+    side = slab(blade, 0.03, 0.01, 2).rotate([0, -90, 0])
+    parts.pair(side, fin, turn=(0, 0, -m.u(70, 120)), at=(0.8 * wide, -0.2 * tall, 0.15))
     radii = xyz(wide * 0.9 * blunt**0.5, tall * 0.5, 0.16)
     parts += _eyes(m, xyz(0, 0, 0.3), radii, m.u(0.02, 0.045))
     return [p.rotate([0, m.pick(90, -90, m.u(-90, 90)), 0]) for p in [joined(parts)]]
@@ -390,11 +381,8 @@ def crawler(m: Maker) -> list[Manifold]:
     parts = Parts(m)
     parts.add(dome, shell)
     if m.chance(0.5):
-        line = [
-            (math.sin(t) * wide, 0, math.cos(t) * long)
-            for t in np.linspace(0, 2 * math.pi, 13)[:-1]
-        ]
-        rim = tube(line, 0.04, 10, 36, True)
+        circle = ring_of(2, 12) * [wide, long]
+        rim = tube(np.insert(circle, 1, 0, axis=1), 0.04, 10, 36, True)
         parts.add(rim, skin)
     r = m.u(0.1, 0.2)
     head = xyz(0, m.u(-0.02, 0.15), long + 0.6 * r)
@@ -415,11 +403,7 @@ def crawler(m: Maker) -> list[Manifold]:
     parts.append(m.blended(blend, (skin,)))
     parts += _eyes(m, head, radii, r * m.u(0.12, 0.25))
     if m.chance(0.3):
-        line = [
-            head + [0.05, 0.7 * r, 0.3 * r],
-            head + [0.1, 1.5 * r, 0.8 * r],
-            head + [0.2, 1.8 * r, 1.5 * r],
-        ]
+        line = head + [(0.05, 0.7 * r, 0.3 * r), (0.1, 1.5 * r, 0.8 * r), (0.2, 1.8 * r, 1.5 * r)]
         feeler = tube(line, [0.015, 0.012, 0.025], 8, 12)
         parts.pair(feeler, skin)
     return _turned(m, parts)
@@ -430,14 +414,8 @@ def snake(m: Maker) -> list[Manifold]:
     skin = m.pattern("striped spotted checked furry dotted", "toy leaf earth", contrast=0.6)
     turns, count = m.u(0.5, 2), 7
     t = np.linspace(0, 1, count)
-    path = np.stack(
-        [
-            m.u(0.15, 0.35) * np.sin(2 * math.pi * turns * t + m.u(0, 6)),
-            0.12 * t**6,
-            t * m.u(0.6, 1.4),
-        ],
-        -1,
-    )
+    side = m.u(0.15, 0.35) * np.sin(2 * math.pi * turns * t + m.u(0, 6))
+    path = np.stack([side, 0.12 * t**6, t * m.u(0.6, 1.4)], -1)
     r = m.u(0.05, 0.13)
     body = tube(path, [0.015, r * 0.8, r, r, r * 0.8, r * m.u(0.9, 1.4), r * 0.7], 16, 60)
     head = path[-1]
@@ -445,7 +423,7 @@ def snake(m: Maker) -> list[Manifold]:
     parts.add(body, skin)
     for eye in _eyes(m, head * [0, 1, 1], xyz(r, r, r), 0.02):
         parts.append(eye.translate([float(head[0]), 0, 0]))
-    return parts.turned(0, m.u(-90, 90), 0)
+    return parts.turned(0, m.u(-90, 90))
 
 
 def figure(m: Maker) -> list[Manifold]:
@@ -503,13 +481,10 @@ def figure(m: Maker) -> list[Manifold]:
     top = m.n(0, 5)
     hair = m.surface("fur dark toy")
     if top <= 1:
-        cut = ball((radii * m.u(1.06, 1.2)).tolist(), 32).translate(
-            (head + [0, 0.05 * big, -0.12 * big]).tolist()
-        )
-        cut = cut.trim_by_plane(
-            [0, 0.75, -0.65], float((head + [0, 0.15 * big, 0.2 * big]) @ [0, 0.75, -0.65])
-        )
-        parts.add(cut, hair)
+        cut = ball(radii * m.u(1.06, 1.2)).translate((head + [0, 0.05 * big, -0.12 * big]).tolist())
+        plane = np.array([0, 0.75, -0.65])
+        level = float((head + [0, 0.15 * big, 0.2 * big]) @ plane)
+        parts.add(cut.trim_by_plane(plane.tolist(), level), hair)
     elif top == 2:
         brim = m.u(1.1, 1.9)
         profile = [
@@ -519,27 +494,15 @@ def figure(m: Maker) -> list[Manifold]:
         hat = lathe(profile, 28)
         parts.add(hat, hair, at=head + [0, 0.55 * big, 0])
     elif top == 3:
-        helmet = ball((radii * 1.15).tolist(), 32).trim_by_plane(
-            [0, 1, -0.4], float(head @ [0, 1, -0.4])
-        )
+        helmet = ball(radii * 1.15).trim_by_plane([0, 1, -0.4], float(head @ [0, 1, -0.4]))
         parts.add(helmet, m.surface("metal toy dark"))
     elif top == 4:  # long hair
         long = m.u(0.8, 2.2) * big
-        mane = tube(
-            [
-                (head + [0, big * 0.7, -0.1 * big]).tolist(),
-                (head + [0, 0.2 * big, -0.75 * big]).tolist(),
-                (head + [0, -long, -0.7 * big]).tolist(),
-            ],
-            [0.8 * big, 0.85 * big, m.u(0.3, 0.8) * big],
-            18,
-            14,
-            flat=(1, 0.6) if m.chance(0.5) else (1, 1),
-        )
-        part = mane - ball((radii * 0.97).tolist(), 24).translate(
-            (head + [0, -0.12 * big, 0.25 * big]).tolist()
-        )
-        parts.add(part, hair)
+        line = head + big * np.array([(0, 0.7, -0.1), (0, 0.2, -0.75), (0, -long / big, -0.7)])
+        thick = [0.8 * big, 0.85 * big, m.u(0.3, 0.8) * big]
+        mane = tube(line, thick, 18, 14, flat=(1, 0.6 if m.chance(0.5) else 1))
+        face = ball(radii * 0.97, 24).translate((head + [0, -0.12 * big, 0.25 * big]).tolist())
+        parts.add(mane - face, hair)
     if m.chance(0.2):  # a skirt or a robe
         profile = [(m.u(0.15, 0.3), 0), (broad * 0.8, leg * m.u(0.6, 0.9)), (0, leg * 0.9)]
         robe = lathe(profile, 28).translate([0, leg - leg * m.u(0.4, 0.9), 0])
@@ -560,17 +523,13 @@ def figure(m: Maker) -> list[Manifold]:
         cape = cape.translate([0, leg + torso * 0.95 - (leg * 0.5 + torso * 0.9) / 2, -bulk * 1.8])
         flow = m.u(0.05, 0.35)
         low_end = leg + torso
-        cape = cape.warp_batch(
-            lambda p: np.stack(
-                [
-                    p[:, 0] * (0.8 + 0.6 * (low_end - p[:, 1])),
-                    p[:, 1],
-                    p[:, 2] - flow * (low_end - p[:, 1]) ** 1.5 + 0.015 * np.sin(30 * p[:, 0]),
-                ],
-                -1,
-            )
-        )
-        parts.add(cape, m.cloth("toy any"))
+
+        def hang(p: np.ndarray) -> np.ndarray:
+            x, y, z = p.T
+            fold = 0.015 * np.sin(30 * x) - flow * (low_end - y) ** 1.5
+            return np.stack([x * (0.8 + 0.6 * (low_end - y)), y, z + fold], -1)
+
+        parts.add(cape.warp_batch(hang), m.cloth("toy any"))
     if m.chance(0.25):  # a rucksack, or wings
         part = box(1.5 * broad, torso * 0.7, 0.12, 0.03)
         parts.add(part, m.surface(), at=(0, leg + torso * 0.6, -bulk - 0.07))
@@ -620,12 +579,8 @@ def block_figure(m: Maker) -> list[Manifold]:
         line = [(0, 0, 0), (side * 0.04, -h * 0.4, 0), (side * 0.05, -h * 0.75, 0.06)]
         arm = tube(line, 0.06, m.pick(12, ring_of(6, 12)), 12)
         hand = ring(0.04, 0.02, 16, 8).translate([side * 0.05, -h * 0.85, 0.08])
-        whole = joined(
-            [
-                m.stamp(arm, second),
-                m.stamp(hand + ball(0.045, 12).translate([side * 0.05, -h * 0.8, 0.07]), skin),
-            ]
-        )
+        hand += ball(0.045, 12).translate([side * 0.05, -h * 0.8, 0.07])
+        whole = m.stamp(arm, second) + m.stamp(hand, skin)
         part = whole.rotate([-swing, 0, 0]).translate([side * (w * 0.45 + 0.03), top - 0.07, 0])
         parts.append(part)
-    return parts.turned(0, m.u(-50, 50), 0)
+    return parts.turned(0, m.u(-50, 50))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
-from numpy.typing import ArrayLike
 
 from .looks import Maker
 from .solids import ball, joined, lathe, ring_of, rod, rounded, superquadric, tube
@@ -28,7 +28,7 @@ def bow(half: list, thick: float, count: int = 32, flat: float = 1.0) -> Manifol
     return tube([*half, *mirrored], thick, 10, count, flat=(1, flat))
 
 
-def bar(start: ArrayLike, end: ArrayLike, radius: float) -> Manifold:
+def bar(start: Sequence[float], end: Sequence[float], radius: float) -> Manifold:
     """A straight wire between two points."""
     return tube(np.linspace(start, end, 3), radius, 6, 3, round_ends=False)
 

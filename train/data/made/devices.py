@@ -8,7 +8,7 @@ import numpy as np
 from manifold3d import Manifold
 
 from .composition import shape
-from .details import handle, outline
+from .details import bow, handle, outline
 from .looks import Maker, Parts
 from .solids import (
     Blend,
@@ -35,16 +35,9 @@ def tool(m: Maker) -> list[Manifold]:
     grip, head = m.pick(m.wood(), m.surface("toy dark")), m.pick(m.metal(), m.surface())
     long, r = m.u(0.6, 1.0), m.u(0.035, 0.09)
     swell = m.rng.uniform(0.7, 1.25, 5) * r
-    shaft = tube(
-        np.stack(
-            [np.zeros(5), np.linspace(-long / 2, long / 2, 5), np.cumsum(m.rng.normal(0, 0.01, 5))],
-            1,
-        ),
-        swell,
-        m.pick(16, 16, ring_of(4, 16), 6),
-        26,
-        flat=(1, m.u(0.6, 1)),
-    )
+    bent = np.cumsum(m.rng.normal(0, 0.01, 5))
+    line = np.stack([np.zeros(5), np.linspace(-long / 2, long / 2, 5), bent], 1)
+    shaft = tube(line, swell, m.pick(16, 16, ring_of(4, 16), 6), 26, flat=(1, m.u(0.6, 1)))
     parts = Parts(m)
     parts.add(shaft, grip)
     if m.chance(0.4):
@@ -83,12 +76,8 @@ def tool(m: Maker) -> list[Manifold]:
         w, h = m.u(0.12, 0.25), m.u(0.2, 0.4)
         blade = box(w * 2, h, m.u(0.015, 0.05), 0.01)
         if m.chance(0.4):
-            blade = blade - joined(
-                [
-                    box(0.03, h * 0.6, 1).translate([x, 0, 0])
-                    for x in np.linspace(-w * 0.6, w * 0.6, 4)
-                ]
-            )
+            slot = box(0.03, h * 0.6, 1)
+            blade -= joined([slot.translate([x, 0, 0]) for x in np.linspace(-w * 0.6, w * 0.6, 4)])
         parts.add(blade, m.pick(grip, head), turn=(m.u(-15, 15), 0, 0), at=(0, top + h * 0.45, 0))
     elif kind == 5:  # brush
         w = m.u(0.1, 0.3)
@@ -112,20 +101,12 @@ def tool(m: Maker) -> list[Manifold]:
         a = m.u(8, 25)
         line = [(0.14, -0.6, 0), (0.16, -0.35, 0), (0.0, 0.0, 0), (-0.06, 0.3, 0)]
         arm = tube(line, [0.04, 0.04, 0.04, 0.015], 10, 22, flat=(1, 1))
-        bow = (
-            ring(m.u(0.08, 0.13), 0.028, 28, 10)
-            .rotate([90, 0, 0])
-            .scale([1, 1.4, 1])
-            .translate([0.16, -0.62, 0])
-        )
-        loop = m.chance(0.5)
+        loop = ring(m.u(0.08, 0.13), 0.028, 28, 10).rotate([90, 0, 0]).scale([1, 1.4, 1])
+        loops = [m.stamp(loop.translate([0.16, -0.62, 0]), grip)] if m.chance(0.5) else []
         for side, z in ((1, 0.02), (-1, -0.02)):
-            one = [
-                m.stamp(arm.trim_by_plane([0, 1, 0], -0.1), head),
-                m.stamp(arm.trim_by_plane([0, -1, 0], 0.09), grip),
-            ]
-            one += [m.stamp(bow, grip)] if loop else []
-            whole = joined(one).rotate([0, 0, a])
+            blade = m.stamp(arm.trim_by_plane([0, 1, 0], -0.1), head)
+            lower = m.stamp(arm.trim_by_plane([0, -1, 0], 0.09), grip)
+            whole = joined([blade, lower, *loops]).rotate([0, 0, a])
             parts.append((whole if side > 0 else whole.mirror([1, 0, 0])).translate([0, 0, z]))
         parts.add(rod(0.05, 0.12, 20), head, turn=(90, 0, 0), at=(0, 0, -0.06))
     else:  # a rake, a fork
@@ -171,11 +152,7 @@ def device(m: Maker) -> list[Manifold]:
         body = superquadric(
             [m.u(0.28, 0.38), m.u(0.16, 0.28), 0.55], m.u(0.7, 1), m.u(0.6, 0.95), 40
         ).trim_by_plane([0, 1, 0], -0.04)
-        body = body.warp_batch(
-            lambda p: np.stack(
-                [p[:, 0] * (1 + 0.15 * p[:, 2]), p[:, 1] * (1 - 0.35 * p[:, 2]), p[:, 2]], -1
-            )
-        )
+        body = body.warp_batch(lambda p: p * (1 + p[:, 2:] * [0.15, -0.35, 0]))
         seam = m.stamp(box(0.015, 1, 0.6).translate([0, 0, 0.4]), dark)
         parts.append(m.stamp(body, case) - seam)
         parts.add(rod(0.07, 0.06, 20), accent, turn=(0, 0, 90), at=(0.03, 0.14, 0.27))
@@ -185,7 +162,7 @@ def device(m: Maker) -> list[Manifold]:
                 (m.u(-0.6, 0.6), 0, 0.7),
             ]
             parts.add(tube(line, 0.018, 8, 40), dark)
-        return parts.turned(0, m.u(90, 270) if m.chance(0.5) else m.u(-90, 90), 0)
+        return parts.turned(0, m.u(90, 270) if m.chance(0.5) else m.u(-90, 90))
     if kind == 2:  # a camera
         w, h, t = m.u(0.6, 0.9), m.u(0.4, 0.6), m.u(0.2, 0.35)
         parts.add(box(w, h, t, 0.05), case)
@@ -202,19 +179,15 @@ def device(m: Maker) -> list[Manifold]:
             part = rod(m.u(0.04, 0.07), 0.06, 20, 0.01)
             parts.add(part, m.pick(accent, dark), at=(x * w, h / 2 - 0.01, 0))
         if m.chance(0.3):
-            path = [
-                *((-w / 2, h * 0.3, 0), (-w * 0.6, h, -0.1), (0, h * 1.4, -0.2)),
-                *((w * 0.6, h, -0.1), (w / 2, h * 0.3, 0)),
-            ]
-            parts.add(tube(path, 0.02, 8, 32, flat=(1, 2)), dark)
+            half = [(-w / 2, h * 0.3, 0), (-w * 0.6, h, -0.1), (0, h * 1.4, -0.2)]
+            parts.add(bow(half, 0.02, flat=2), dark)
     elif kind == 3:  # a loudspeaker or radio
         w, h, t = m.u(0.4, 1.2), m.u(0.4, 1.1), m.u(0.25, 0.5)
         parts.add(box(w, h, t, m.u(0.01, 0.12)), m.pick(case, m.wood()))
-        rows = (
-            [(0.0, -0.2 * h, 0.38 * min(w, h)), (0.0, 0.28 * h, 0.18 * min(w, h))]
-            if h > w
-            else [(-0.27 * w, 0, 0.2 * min(w, h) + 0.06), (0.27 * w, 0, 0.2 * min(w, h) + 0.06)]
-        )
+        small = min(w, h)
+        rows = [(-0.27 * w, 0, 0.2 * small + 0.06), (0.27 * w, 0, 0.2 * small + 0.06)]
+        if h > w:
+            rows = [(0, -0.2 * h, 0.38 * small), (0, 0.28 * h, 0.18 * small)]
         for x, y, r in rows:
             profile = [
                 *((r, 0), (r, 0.05), (r * 0.85, 0.05), (r * 0.4, 0.015), (r * 0.3, 0.035)),
@@ -239,18 +212,12 @@ def device(m: Maker) -> list[Manifold]:
         w, d, t = m.u(0.8, 1.4), m.u(0.3, 0.5), m.u(0.05, 0.12)
         parts.add(box(w, t, d, 0.3 * t), case)
         rows, columns = m.pick(1, 3, 4), m.n(8, 14)
-        keys = [
-            box(w * 0.85 / columns, 0.06, d * 0.8 / rows * 0.85).translate(
-                [
-                    (i - (columns - 1) / 2) * w * 0.93 / columns,
-                    t / 2,
-                    (j - (rows - 1) / 2) * d * 0.85 / rows,
-                ]
-            )
-            for i, j in np.ndindex(columns, rows)
-        ]
+        wide, deep = w * 0.93 / columns, d * 0.85 / rows
+        key = box(w * 0.85 / columns, 0.06, d * 0.68 / rows)
+        key = key.translate([(1 - columns) / 2 * wide, t / 2, (1 - rows) / 2 * deep])
+        keys = [key.translate([i * wide, 0, j * deep]) for i, j in np.ndindex(columns, rows)]
         parts.add(Manifold.compose(keys), m.pick(dark, accent, m.plain("white")))
-        return parts.turned(m.u(0, 25), m.u(-40, 40), 0)
+        return parts.turned(m.u(0, 25), m.u(-40, 40))
     elif kind == 6:  # a game controller
         blend = Blend(0.12)
         blend.limb([(0, 0, 0), (0.3, 0.02, 0)], [0.16, 0.17], 0)
@@ -260,16 +227,13 @@ def device(m: Maker) -> list[Manifold]:
         stick = joined([rod(0.03, 0.16, 12), ball([0.07, 0.03, 0.07], 20).translate([0, 0.17, 0])])
         parts.pair(stick, dark, at=(0.16, 0.05, 0.05))
         for a in range(4):
-            parts.add(
-                ball([0.03, 0.03, 0.03], 12),
-                m.plain("toy"),
-                at=(0.34 + 0.06 * math.sin(a * 1.57), 0.12, -0.02 + 0.06 * math.cos(a * 1.57)),
-            )
+            x, z = 0.06 * math.sin(a * 1.57), 0.06 * math.cos(a * 1.57)
+            parts.add(ball(0.03, 12), m.plain("toy"), at=(0.34 + x, 0.12, z - 0.02))
         part = box(0.15, 0.03, 0.05).translate([-0.34, 0.12, 0]) + box(0.05, 0.03, 0.15).translate(
             [-0.34, 0.12, 0]
         )
         parts.add(part, dark)
-        return parts.turned(m.u(20, 80), m.u(-30, 30), 0)
+        return parts.turned(m.u(20, 80), m.u(-30, 30))
     elif kind == 7:  # a toaster, iron or coffee machine
         w, h, t = m.u(0.5, 0.9), m.u(0.4, 1.0), m.u(0.35, 0.6)
         body = superquadric([w / 2, h / 2, t / 2], m.u(0.15, 0.5), m.u(0.15, 0.5), 40)
@@ -294,15 +258,12 @@ def device(m: Maker) -> list[Manifold]:
         parts.add(barrel, case)
         parts.add(grip, m.pick(case, dark))
         parts.add(box(0.05, 0.1, 0.06, 0.015), accent, at=(0, -0.17, 0.04))
-        nozzle = (
-            rod(r * m.u(0.2, 0.7), m.u(0.05, 0.35), 20)
-            .rotate([90, 0, 0])
-            .translate([0, 0, long / 2])
-        )
+        nozzle = rod(r * m.u(0.2, 0.7), m.u(0.05, 0.35), 20).rotate([90, 0, 0])
+        nozzle = nozzle.translate([0, 0, long / 2])
         parts.add(nozzle, m.pick(dark, accent))
         if m.chance(0.5):
             parts.add(box(0.22, 0.14, 0.25, 0.03), dark, at=(0, -0.6, -0.1))
-        return parts.turned(0, m.pick(90, -90, m.u(-180, 180)), 0)
+        return parts.turned(0, m.pick(90, -90, m.u(-180, 180)))
     elif kind == 9:  # a clock, or a scale
         r, t = m.u(0.4, 0.55), m.u(0.08, 0.25)
         face = (
@@ -319,15 +280,13 @@ def device(m: Maker) -> list[Manifold]:
         if m.chance(0.4):
             parts.pair(ball([0.12, 0.1, 0.08]), accent, at=(0.25, r + 0.02, 0))
             parts.pair(rod(0.03, 0.2, 12), accent, turn=(0, 0, 20), at=(0.25, -r - 0.1, 0))
-        return parts.turned(m.pick(0, -20, -85), m.u(-30, 30), 0)
+        return parts.turned(m.pick(0, -20, -85), m.u(-30, 30))
     else:  # a router, hub, plug: a slab with aerials and cables
         w, t, d = m.u(0.5, 0.9), m.u(0.08, 0.2), m.u(0.3, 0.6)
-        parts.add(
-            slab(outline(m) * [w / 1.2, d / 1.2], t, 0.3 * t).rotate([90, 0, 0])
-            if m.chance(0.3)
-            else box(w, t, d, 0.3 * t),
-            case,
-        )
+        body = box(w, t, d, 0.3 * t)
+        if m.chance(0.3):
+            body = slab(outline(m) * [w / 1.2, d / 1.2], t, 0.3 * t).rotate([90, 0, 0])
+        parts.add(body, case)
         for x in np.linspace(-0.4, 0.4, m.n(1, 4)):
             path = [
                 (x * w, 0, -d * 0.4),
@@ -343,7 +302,7 @@ def device(m: Maker) -> list[Manifold]:
             parts.add(tube(path, 0.02, 8, 44), dark)
         for x in np.linspace(-0.3, 0.3, m.n(2, 5)):
             parts.add(ball(0.02, 10), accent, at=(x * w, t * 0.1, d / 2))
-    return parts.turned(0, m.pick(0, m.u(-45, 45)), 0)
+    return parts.turned(0, m.pick(0, m.u(-45, 45)))
 
 
 def _jug(m: Maker, r: float, h: float) -> Manifold:
@@ -373,12 +332,8 @@ def instrument(m: Maker) -> list[Manifold]:
         parts.add(box(0.08, 0.8, 0.05, 0.01), b, at=(0, 0.7, thick / 2))
         parts.add(box(0.14, 0.2, 0.04, 0.01), b, at=(0, 1.17, thick / 2 - 0.01))
         parts.add(box(0.2, 0.04, 0.04), dark, at=(0, -0.22, thick / 2 + 0.01))
-        pegs = [
-            rod(0.015, 0.26, 8)
-            .rotate([0, 0, 90])
-            .translate([0.13, 1.1 + 0.06 * i, thick / 2 - 0.01])
-            for i in range(3)
-        ]
+        peg = rod(0.015, 0.26, 8).rotate([0, 0, 90]).translate([0.13, 1.1, thick / 2 - 0.01])
+        pegs = [peg.translate([0, 0.06 * i, 0]) for i in range(3)]
         parts.add(joined(pegs), m.metal())
         return parts.turned(m.u(-20, 0), m.u(-50, 50), m.pick(0, m.u(-80, 80)))
     if kind == 1:
@@ -403,19 +358,12 @@ def instrument(m: Maker) -> list[Manifold]:
         parts.add(grip, b)
         if m.chance(0.5):  # a racket with its strings, or a paddle
             wide, tall = m.u(0.22, 0.3), m.u(0.28, 0.4)
-            line = [
-                (wide * math.sin(t), tall * (1 - math.cos(t)), 0)
-                for t in np.linspace(0, 2 * math.pi, 13)[:-1]
-            ]
-            rim = tube(line, 0.028, 10, 40, True)
-            strings = [
-                box(0.012, 2 * tall, 0.012).translate([x, tall, 0])
-                for x in np.linspace(-wide, wide, 9)[1:-1]
-            ]
-            strings += [
-                box(2 * wide, 0.012, 0.012).translate([0, y, 0])
-                for y in np.linspace(0, 2 * tall, 11)[1:-1]
-            ]
+            circle = np.column_stack([ring_of(2, 12) * [wide, tall], np.zeros(12)])
+            rim = tube(circle + [0, tall, 0], 0.028, 10, 40, True)
+            down, across = box(0.012, 2 * tall, 0.012), box(2 * wide, 0.012, 0.012)
+            xs, ys = np.linspace(-wide, wide, 9)[1:-1], np.linspace(0, 2 * tall, 11)[1:-1]
+            strings = [down.translate([x, tall, 0]) for x in xs]
+            strings += [across.translate([0, y, 0]) for y in ys]
             net = joined(strings) ^ (ball([wide, tall, 1]).translate([0, tall, 0]))
             parts.add(rim, a)
             parts.add(net, m.plain("white toy"))
@@ -437,11 +385,8 @@ def instrument(m: Maker) -> list[Manifold]:
         )
         parts.add(top, m.pick(a, b), at=(0, 1.04, 0))
         if m.chance(0.35):
-            parts.pair(
-                handle(m, 0.2, 0.3, 0.025),
-                m.pick(a, b),
-                at=(float(np.interp(0.7, profile[:, 1], profile[:, 0])) - 0.03, 0.7, 0),
-            )
+            reach = np.interp(0.7, profile[:, 1], profile[:, 0]) - 0.03
+            parts.pair(handle(m, 0.2, 0.3, 0.025), m.pick(a, b), at=(reach, 0.7, 0))
         return parts
     base = m.pick(box(0.6, 0.2, 0.5, 0.01), rod(0.32, 0.2, 36, 0.02).translate([0, -0.1, 0]))
     h = 0.1

@@ -157,7 +157,7 @@ def furniture(m: Maker) -> list[Manifold]:
             part = superquadric([0.16, 0.16, 0.06], 0.5, 0.8)
             parts.add(part, third, turn=(-20, 0, m.u(-20, 20)), at=(m.u(-0.3, 0.3), h + 0.25, 0.05))
     if m.chance(0.3):
-        return parts.turned(0, m.u(-60, 60), 0)
+        return parts.turned(0, m.u(-60, 60))
     return parts
 
 
@@ -287,7 +287,7 @@ def cushion(m: Maker) -> list[Manifold]:
             one = ripple(one.refine_to_length(0.15), m.rng, 0.006, 0.3, False)
             parts.add(one, look if i % 2 else trim, at=(0, y + t / 2, 0))
             y += t * 0.97
-        return parts.turned(0, m.u(-60, 60), 0)
+        return parts.turned(0, m.u(-60, 60))
     r, long = m.u(0.12, 0.3), m.u(0.6, 1.2)
     turns = np.linspace(0.15, 1, 60)
     a = turns * m.u(2.5, 5) * 2 * math.pi

@@ -31,15 +31,8 @@ def carton(m: Maker) -> list[Manifold]:
         inner = m.stamp(box(w - 0.03, h, d - 0.03).translate([0, 0.03, 0]), m.plain("wood white"))
         parts[0] -= inner
         flap = m.painted(ground * 0.95)
-        tilt = m.u(10, 130)
-        for side in (1, -1):
-            sheet = (
-                box(0.012, w * 0.45, d * 0.96)
-                .translate([0, w * 0.22, 0])
-                .rotate([0, 0, -tilt * side])
-                .translate([side * (w / 2 - 0.006), h / 2 - 0.005, 0])
-            )
-            parts.add(sheet, flap)
+        sheet = box(0.012, w * 0.45, d * 0.96).translate([0, w * 0.22, 0])
+        parts.pair(sheet, flap, turn=(0, 0, -m.u(10, 130)), at=(w / 2 - 0.006, h / 2 - 0.005, 0))
     elif kind == 1:  # ribbon
         ribbon = m.plain("toy")
         parts.add(box(w * 0.14, h * 1.01, d * 1.02), ribbon)
@@ -48,10 +41,8 @@ def carton(m: Maker) -> list[Manifold]:
         bow = tube(line, 0.03, 10, 24, flat=(1, 2))
         parts.pair(bow, ribbon, at=(0, h / 2, 0))
     elif kind == 2:  # a window with the thing behind it
-        pane = m.stamp(
-            box(w * m.u(0.5, 0.8), h * m.u(0.4, 0.7), 0.1).translate([0, -0.05 * h, d / 2]),
-            m.plain("dark white"),
-        )
+        pane = box(w * m.u(0.5, 0.8), h * m.u(0.4, 0.7), 0.1).translate([0, -0.05 * h, d / 2])
+        pane = m.stamp(pane, m.plain("dark white"))
         thing = shape(m)
         low, high = extent(thing)
         thing = thing.translate((-(low + high) / 2).tolist()).scale(
@@ -61,10 +52,8 @@ def carton(m: Maker) -> list[Manifold]:
         parts[0] -= pane
         parts.add(thing, m.surface("toy any"), at=(0, -0.05 * h, d / 2 - 0.04))
     elif kind == 3:  # a carry handle
-        line = [
-            *((-0.15 * w, h / 2 - 0.02, 0), (-0.15 * w, h / 2 + 0.12, 0)),
-            *((0.15 * w, h / 2 + 0.12, 0), (0.15 * w, h / 2 - 0.02, 0)),
-        ]
+        x, low, high = 0.15 * w, h / 2 - 0.02, h / 2 + 0.12
+        line = [(-x, low, 0), (-x, high, 0), (x, high, 0), (x, low, 0)]
         parts.add(tube(line, 0.02, 10, 24, flat=(1, 1.5)), m.plain())
     elif kind == 4:  # a gable top, as milk has
         roof = slab([(-w / 2, 0), (w / 2, 0), (0.0, 0.5 * w)], d).translate([0, h / 2, 0])
@@ -72,12 +61,8 @@ def carton(m: Maker) -> list[Manifold]:
         parts.add(box(0.03, 0.12, d), m.painted(ground), at=(0, h / 2 + 0.5 * w, 0))
     elif kind == 5:  # a stack of them
         for i in range(1, m.n(2, 4)):
-            parts.append(
-                parts[0]
-                .translate([m.u(-0.08, 0.08), 0, 0])
-                .rotate([0, m.u(-15, 15), 0])
-                .translate([0, i * h * 0.999, 0])
-            )
+            moved = parts[0].translate([m.u(-0.08, 0.08), i * h * 0.999, 0])
+            parts.append(moved.rotate([0, m.u(-15, 15), 0]))
     elif kind == 6:  # a sleeve or lid of another colour
         part = box(w * 1.02, h * m.u(0.15, 0.5), d * 1.02)
         parts.add(part, m.surface(), at=(0, h * m.u(-0.2, 0.35), 0))
@@ -92,11 +77,8 @@ def _carton_look(
 
     def side(kind: str, wide: float, tall: float):
         scale = 256 / max(wide, tall)
-        return material(
-            package(
-                m.rng, ground, inks, kind, max(48, int(wide * scale)), max(48, int(tall * scale))
-            )
-        )
+        pixels = (max(48, int(length * scale)) for length in (wide, tall))
+        return material(package(m.rng, ground, inks, kind, *pixels))
 
     front = side("front", w, h)
     back = front if m.chance(0.3) else side("back", w, h)
@@ -114,12 +96,8 @@ def pouch(m: Maker) -> list[Manifold]:
     count, sides = 26, 36
     t = np.linspace(0, 1, count)
     flat_foot = m.chance(0.4)
-    depth = (
-        d
-        / 2
-        * np.clip(np.sin(math.pi * (t * 0.85 + 0.15 if flat_foot else t)), 0.0, 1) ** m.u(0.5, 0.9)
-        + 0.008
-    )
+    swell = np.sin(math.pi * (t * 0.85 + 0.15 if flat_foot else t)).clip(0, 1)
+    depth = d / 2 * swell ** m.u(0.5, 0.9) + 0.008
     pinch = 1 - m.u(0.0, 0.18) * np.sin(math.pi * t)
     form = ring_of(m.u(2, 3.5), sides)
     rings = np.empty((count, sides, 3))

@@ -41,11 +41,8 @@ def blocks(m: Maker) -> list[Manifold]:
         parts.add(lathe([(r, 0), (r * 0.9, 0.07)]), looks[0])
         for i in range(count):
             t = m.u(0.06, 0.09)
-            one = (
-                ring(r * 0.6, t * 1.4, 36, 14, 0.75)
-                if r * 0.6 > t * 1.5
-                else ball([t * 1.5, t, t * 1.5])
-            )
+            wide = r * 0.6 > t * 1.5
+            one = ring(r * 0.6, t * 1.4, 36, 14, 0.75) if wide else ball([t * 1.5, t, t * 1.5])
             parts.add(one, looks[i % len(looks)], at=(0, y + t, 0))
             y += 1.9 * t
             r *= m.u(0.8, 0.95)
@@ -88,12 +85,8 @@ def blocks(m: Maker) -> list[Manifold]:
         for i in range(m.n(1, 6)):
             nx, nz, h = m.n(1, 4), m.n(1, 2), 0.12
             brick = box(nx * 0.16 - 0.004, h, nz * 0.16 - 0.004)
-            studs = [
-                rod(0.048, 0.04, 14).translate(
-                    [(a - (nx - 1) / 2) * 0.16, h / 2 - 0.005, (b - (nz - 1) / 2) * 0.16]
-                )
-                for a, b in np.ndindex(nx, nz)
-            ]
+            stud = rod(0.048, 0.04, 14).translate([(1 - nx) * 0.08, h / 2 - 0.005, (1 - nz) * 0.08])
+            studs = [stud.translate([a * 0.16, 0, b * 0.16]) for a, b in np.ndindex(nx, nz)]
             part = m.stamp(joined([brick, *studs]), m.pick(*looks)).translate(
                 [m.n(-1, 1) * 0.16, i * h, m.n(0, 1) * 0.08]
             )
@@ -107,7 +100,7 @@ def blocks(m: Maker) -> list[Manifold]:
         if m.chance(0.4):
             part = box(1.1 * len(parts) + 0.2, 0.12, 0.5, 0.02)
             parts.add(part, m.wood(), at=((len(parts) - 1) * 0.55, -0.6, 0))
-    return parts.turned(0, m.u(-50, 50), 0)
+    return parts.turned(0, m.u(-50, 50))
 
 
 def game(m: Maker) -> list[Manifold]:
@@ -116,33 +109,20 @@ def game(m: Maker) -> list[Manifold]:
     a, b, c = m.surface("toy"), m.surface("toy white"), m.surface("any dark")
     kind = m.n(0, 7)
     if kind == 0:
-        return [
-            m.stamp(
-                ball(0.5, 48),
-                m.pattern(
-                    "striped checked spotted dotted flowered bricked",
-                    "toy",
-                    contrast=1.0,
-                    mapping=m.pick("box", "round"),
-                ),
-            )
-        ]
+        names, mapping = "striped checked spotted dotted flowered bricked", m.pick("box", "round")
+        parts.add(ball(0.5, 48), m.pattern(names, "toy", contrast=1, mapping=mapping))
+        return parts
     if kind == 1:
         points = [(0.03, 0), (0.1, 0.1), (m.u(0.3, 0.5), 0.35), (0.12, 0.55), (0.05, 0.8)]
         profile = np.maximum(spline(points, 24), [0.02, 0])
-        return [
-            m.stamp(
-                lathe([(0, 0), *profile.tolist(), (0, 0.8)], 36),
-                m.pattern("striped grained shaded", "toy wood", contrast=0.8, mapping="round"),
-            ).rotate([m.u(0, 25), 0, 0])
-        ]
+        look = m.pattern("striped grained shaded", "toy wood", contrast=0.8, mapping="round")
+        parts.add(lathe(profile, 36), look)
+        return parts.turned(m.u(0, 25))
     if kind == 2:
         points = [(0.1, 0), (0.19, 0.3), (0.07, 0.62), (0.11, 0.76), (0.04, 0.88)]
         profile = np.maximum(spline(points, 22), [0.02, 0])
-        pin = m.stamp(
-            lathe([(0, 0), *profile.tolist(), (0, 0.88)], 24),
-            m.pattern("striped", "white toy", contrast=1, mapping="round", repeats=1),
-        )
+        look = m.pattern("striped", "white toy", contrast=1, mapping="round", repeats=1)
+        pin = m.stamp(lathe(profile, 24), look)
         rows = m.n(1, 3)
         pins = [
             pin.translate([(j - i / 2) * 0.5, 0, -i * 0.4])
@@ -153,27 +133,20 @@ def game(m: Maker) -> list[Manifold]:
     if kind == 3:
         sides = m.pick(6, 8, 32)
         bar = rod(0.06, 1.0, 20).rotate([0, 0, 90]).translate([0.5, 0, 0])
-        plates = [
-            rod(m.u(0.18, 0.35), 0.12, sides, 0.03).rotate([0, 0, 90]).translate([x, 0, 0])
-            for x in (-0.36, -0.25, 0.36 + 0.12, 0.25 + 0.12)
-        ]
-        return [
-            joined([m.stamp(bar, m.metal()), *[m.stamp(p, m.pick(a, c)) for p in plates]]).rotate(
-                [0, m.u(-60, 60), 0]
-            )
-        ]
+        parts.add(bar, m.metal())
+        for x in (-0.36, -0.25, 0.48, 0.37):
+            plate = rod(m.u(0.18, 0.35), 0.12, sides, 0.03)
+            parts.add(plate, m.pick(a, c), turn=(0, 0, 90), at=(x, 0, 0))
+        return parts.turned(0, m.u(-60, 60))
     if kind == 4:  # a xylophone or abacus
         count = m.n(5, 9)
         parts.pair(box(0.06, 0.08, 0.12 * count, 0.01), m.wood(), turn=(0, 8, 0), at=(0.22, 0, 0))
         for i in range(count):
             part = box(0.75 - 0.06 * i, 0.04, 0.09, 0.01)
             parts.add(part, m.plain("toy"), at=(0, 0.06, (i - (count - 1) / 2) * 0.12))
-        stick = (
-            joined([rod(0.015, 0.6, 8), ball(0.05, 14)])
-            .rotate([70, 40, 0])
-            .translate([-0.2, 0.14, 0.1])
-        )
-        return [joined([*parts, m.stamp(stick, m.wood())]).rotate([m.u(0, 20), m.u(-60, 60), 0])]
+        stick = joined([rod(0.015, 0.6, 8), ball(0.05, 14)])
+        parts.add(stick, m.wood(), turn=(70, 40, 0), at=(-0.2, 0.14, 0.1))
+        return parts.turned(m.u(0, 20), m.u(-60, 60))
     if kind == 5:  # a drum or a tin with a lid
         r, h = m.u(0.3, 0.5), m.u(0.25, 0.7)
         parts.add(rod(r, h, 40), m.pick(a, m.printed("label", m.color("toy"), "round")))
@@ -189,18 +162,14 @@ def game(m: Maker) -> list[Manifold]:
         gable = m.u(0.2, 0.5)
         parts.add(slab([(-w / 2, 0), (w / 2, 0), (w / 2, h), (0, h + gable), (-w / 2, h)], d), wall)
         lean = math.degrees(math.atan2(gable, w / 2))
-        side = (
-            box(math.hypot(gable, w / 2) * 1.25, 0.05, d * 1.15)
-            .rotate([0, 0, -lean])
-            .translate([w * 0.27, h + gable * 0.48, 0])
-        )
-        parts.pair(side, roof)
+        side = box(math.hypot(gable, w / 2) * 1.25, 0.05, d * 1.15)
+        parts.pair(side, roof, turn=(0, 0, -lean), at=(w * 0.27, h + gable * 0.48, 0))
         parts.add(box(w * 0.2, h * 0.5, 0.06), trim, at=(m.u(-0.2, 0.2) * w, h * 0.25, d / 2))
         part = box(w * 0.18, w * 0.18, 0.05)
         parts.pair(part, m.plain("dark pastel"), at=(w * 0.3, h * 0.65, d / 2))
         if m.chance(0.5):
             parts.add(box(0.1, 0.3, 0.1), roof, at=(w * 0.25, h + gable * 0.7, -d * 0.2))
-        return parts.turned(0, m.u(-50, 50), 0)
+        return parts.turned(0, m.u(-50, 50))
     # A robot: boxes and rods.
     metal, second, dark = m.pick(m.metal(), a), b, c
     w, h = m.u(0.3, 0.5), m.u(0.35, 0.55)
@@ -224,7 +193,7 @@ def game(m: Maker) -> list[Manifold]:
     parts.pair(part, dark)
     panel = m.printed("label", m.color("dark white"), sides=True)
     parts.add(box(w * 0.7, h * 0.5, 0.05), panel, at=(0, h * 0.55 + 0.3, w * 0.35))
-    return parts.turned(0, m.u(-40, 40), 0)
+    return parts.turned(0, m.u(-40, 40))
 
 
 def pieces(m: Maker) -> list[Manifold]:
@@ -243,4 +212,4 @@ def pieces(m: Maker) -> list[Manifold]:
         )
         parts.append(one)
         x += float(high[0] - low[0]) + m.u(-0.02, 0.08)
-    return parts.turned(0, m.u(-40, 40), 0)
+    return parts.turned(0, m.u(-40, 40))

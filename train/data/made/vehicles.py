@@ -31,20 +31,16 @@ def vehicle(m: Maker) -> list[Manifold]:
             *(-0.5, -0.49, -0.42, -0.3 + m.u(-0.1, 0.06), -0.22 + m.u(-0.15, 0.05)),
             *(0.1 + m.u(-0.05, 0.08), 0.25 + m.u(-0.05, 0.05), 0.44, 0.5, 0.5),
         )
-        low = np.array([ends, boot * 0.8, boot, boot * 1.02, roof, roof, *(hood * SLOPE), ends])
+        side = np.array([ends, boot * 0.8, boot, boot * 1.02, roof, roof, *(hood * SLOPE), ends])
         rings = []
         for x, s in ((-0.5, 0.75), (-0.42, 0.95), (-0.2, 1), (0.2, 1), (0.42, 0.95), (0.5, 0.75)):
-            y = np.where(low > hood, hood + (low - hood) * s, low)
+            y = np.where(side > hood, hood + (side - hood) * s, side)
             # The cabin is narrower than what is below it.
             wide = x * w * (1 - 0.5 * np.clip(y - hood, 0, 1))
             rings.append(np.stack([wide, y, np.array(z) * long * (0.97 + 0.03 * s)], -1))
         body = loft(np.stack(rings))
-        arches = joined(
-            [
-                rod(r * 1.15, 3, 24).translate([0, -1.5, 0]).rotate([0, 0, 90]).translate([0, r, a])
-                for a in axles
-            ]
-        ) - box(w * 0.6, 5, 5)
+        arch = rod(r * 1.15, 3, 24).rotate([0, 0, 90]).translate([1.5, r, 0])
+        arches = joined([arch.translate([0, 0, a]) for a in axles]) - box(w * 0.6, 5, 5)
         shell = m.stamp(body, paint) - m.stamp(arches, dark)
         low, high = hood + 0.02, roof - 0.03
         panes = box(2, max(high - low, 0.02), long * 0.62).translate(
@@ -53,9 +49,7 @@ def vehicle(m: Maker) -> list[Manifold]:
         window = m.stamp(body.scale([1.012, 1, 1]) ^ panes, glass)
         level = box(2, max(high - low, 0.02), 9).translate([0, (low + high) / 2, 0])
         shield = m.stamp(body.scale([0.9, 1.004, 1.01]) ^ level, glass)
-        parts.append(shell)
-        parts.append(window)
-        parts.append(shield)
+        parts += [shell, window, shield]
         for x in (-0.33, 0.33):
             part = ball([0.06, 0.04, 0.03], 14)
             parts.add(part, m.plain("white pastel"), at=(x * w, hood * 0.82, long * 0.49))
@@ -87,11 +81,8 @@ def vehicle(m: Maker) -> list[Manifold]:
         load = m.n(0, 4)
         z, deep = -long * 0.15, long * 0.66
         if load == 0:
-            parts.add(
-                box(w, m.u(0.3, 0.6), deep, 0.02),
-                m.pick(accent, m.printed("front", m.color("white any"))),
-                at=(0, floor + 0.35, z),
-            )
+            side = m.pick(accent, m.printed("front", m.color("white any")))
+            parts.add(box(w, m.u(0.3, 0.6), deep, 0.02), side, at=(0, floor + 0.35, z))
         elif load == 1:
             tub = box(w, 0.3, deep, 0.0) - box(w * 0.9, 0.3, deep * 0.93).translate([0, 0.04, 0])
             parts.add(tub, accent, turn=(m.pick(0, 0, 20), 0, 0), at=(0, floor + 0.27, z))
@@ -127,7 +118,7 @@ def vehicle(m: Maker) -> list[Manifold]:
         at = [w / 2 - thick * 0.3, r, float(a)]
         parts.pair(tire, dark, at=at)
         parts.pair(wheel(r * m.u(0.4, 0.65), thick * 1.15), hub, at=at)
-    return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180), m.u(20, 70), m.u(-70, -20)), 0)
+    return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180), m.u(20, 70), m.u(-70, -20)))
 
 
 def plane(m: Maker) -> list[Manifold]:
@@ -159,10 +150,8 @@ def plane(m: Maker) -> list[Manifold]:
                 part = tube([(0, 0, -0.12), (0, 0, 0.15)], [0.05, 0.06], 16, 10)
                 parts.pair(part, m.metal(), at=(span * 0.45, levels[0] - 0.05, 0.12))
         else:
-            part = joined(
-                [box(1.3, 0.015, 0.08).rotate([0, 90 * i + 20, 0]) for i in range(2)]
-                + [rod(0.04, 0.15, 12).translate([0, -0.12, 0])]
-            )
+            blades = [box(1.3, 0.015, 0.08).rotate([0, 90 * i + 20, 0]) for i in range(2)]
+            part = joined([*blades, rod(0.04, 0.15, 12).translate([0, -0.12, 0])])
             parts.add(part, dark, at=(0, r + 0.12, 0.1))
             line = [(r, -r - 0.12, -0.3), (r, -r - 0.12, 0.3)]
             part = tube(line, 0.025, 8, 8) + rod(0.02, 0.2, 8).translate([r, -r - 0.12, 0])
@@ -220,7 +209,7 @@ def plane(m: Maker) -> list[Manifold]:
             parts.add(part, m.pick(paint, second), at=(0, h * 0.4 + 0.19, 0))
             for z in np.linspace(-0.2, 0.0, m.n(1, 3)):
                 parts.add(rod(0.05, 0.3, 16), m.surface("toy dark"), at=(0, h * 0.4, z * long))
-    return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180)), 0)
+    return parts.turned(0, m.pick(0, 90, -90, m.u(-180, 180)))
 
 
 def train_of(m: Maker) -> list[Manifold]:
@@ -267,4 +256,4 @@ def train_of(m: Maker) -> list[Manifold]:
             car.pair(wheel(r, 0.05), m.pick(dark, second) if i % 2 else dark, at=(w / 2, r, a))
         car.add(box(0.05, 0.04, long + 0.15), dark, at=(0, r + 0.04, 0))
         parts.append(joined(car).translate([0, 0, z]))
-    return parts.turned(0, m.pick(90, -90, m.u(-180, 180), m.u(30, 70)), 0)
+    return parts.turned(0, m.pick(90, -90, m.u(-180, 180), m.u(30, 70)))

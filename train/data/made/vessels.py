@@ -7,7 +7,7 @@ import math
 import numpy as np
 from manifold3d import Manifold
 
-from .details import handle, laid, produce
+from .details import bow, handle, laid, produce
 from .looks import Maker, Parts
 from .solids import (
     ball,
@@ -59,21 +59,19 @@ def mug(m: Maker) -> list[Manifold]:
     """A mug, cup, glass or beaker, with or without a handle."""
     r, h = m.u(0.25, 0.5), m.u(0.5, 1.1)
     profile = _profile(m, r * m.u(0.6, 1), r, h, m.pick(0.0, 0.05, 0.25))
-    outer = m.pick(
-        m.surface(),
-        m.printed("label", m.color("white any"), "round"),
-        m.pattern("striped flowered spotted checked shaded", "any", contrast=0.7, mapping="round"),
-    )
+    names = "striped flowered spotted checked shaded"
+    painted = m.pattern(names, contrast=0.7, mapping="round")
+    outer = m.pick(m.surface(), m.printed("label", m.color("white any"), "round"), painted)
     cup = m.stamp(_vessel(m, profile, m.u(0.02, 0.05)), outer)
     parts = Parts(m)
     parts.append(cup)
     if m.chance(0.75):
         middle = h * m.u(0.45, 0.6)
-        bow = handle(m, m.u(0.2, 0.35), h * m.u(0.4, 0.7), m.u(0.025, 0.05))
+        grip = handle(m, m.u(0.2, 0.35), h * m.u(0.4, 0.7), m.u(0.025, 0.05))
         reach = float(np.interp(middle, profile[:, 1], profile[:, 0]))
-        bow = bow.translate([reach - 0.03, middle, 0])
+        grip = grip.translate([reach - 0.03, middle, 0])
         axle = rod(reach - 0.01, h * 1.2, 24)
-        handles = [m.stamp(bow - axle, m.pick(outer, m.plain()))]
+        handles = [m.stamp(grip - axle, m.pick(outer, m.plain()))]
         if m.chance(0.1):
             handles.append(handles[0].mirror([1, 0, 0]))
         parts += handles
@@ -94,11 +92,8 @@ def teapot(m: Maker) -> list[Manifold]:
     """A teapot, kettle, jug or watering can."""
     r, h = m.u(0.3, 0.5), m.u(0.35, 0.9)
     profile = _profile(m, r * m.u(0.5, 1), r * m.u(0.35, 0.9), h, 0.5)
-    look = m.pick(
-        m.surface(),
-        m.metal(),
-        m.pattern("flowered spotted", "white pastel", contrast=0.8, mapping="round"),
-    )
+    painted = m.pattern("flowered spotted", "white pastel", contrast=0.8, mapping="round")
+    look = m.pick(m.surface(), m.metal(), painted)
     second = m.surface("dark metal any")
     body = lathe([(0, 0), *profile.tolist(), (0, h)])
     parts = Parts(m)
@@ -112,14 +107,12 @@ def teapot(m: Maker) -> list[Manifold]:
     ]
     spout = tube(line, [0.12, 0.08, m.u(0.04, 0.07)], 14, 20, round_ends=False)
     parts.add(spout, look)
-    bow = handle(m, m.u(0.2, 0.4), h * m.u(0.5, 0.9), m.u(0.025, 0.05))
+    grip = handle(m, m.u(0.2, 0.4), h * m.u(0.5, 0.9), m.u(0.025, 0.05))
     if m.chance(0.7):
-        parts.add(bow, m.pick(look, second), turn=(0, 180, 0), at=(-wide * 0.8, h * 0.55, 0))
+        parts.add(grip, m.pick(look, second), turn=(0, 180, 0), at=(-wide * 0.8, h * 0.55, 0))
     else:
-        line = [
-            *((wide * 0.8, h * 0.8, 0), (wide * 0.8, h * 1.4, 0), (-wide * 0.8, h * 1.4, 0)),
-            (-wide * 0.8, h * 0.8, 0),
-        ]
+        x = wide * 0.8
+        line = [(x, h * 0.8, 0), (x, h * 1.4, 0), (-x, h * 1.4, 0), (-x, h * 0.8, 0)]
         over = tube(line, 0.035, 10, 28)
         parts.add(over, second)
     top = float(profile[-1, 0])
@@ -146,11 +139,8 @@ def bottle(m: Maker) -> list[Manifold]:
         *((0.5 * (r + neck) + 0.1 * r, shoulder + soft * 0.35), (neck, shoulder + soft), (neck, h)),
     ]
     if m.chance(0.25):  # a waist, as a sports bottle has
-        profile[2:2] = [
-            (r, 0.3 * shoulder),
-            (r * m.u(0.75, 0.95), 0.5 * shoulder),
-            (r, 0.75 * shoulder),
-        ]
+        waist = (r * m.u(0.75, 0.95), 0.5 * shoulder)
+        profile[2:2] = [(r, 0.3 * shoulder), waist, (r, 0.75 * shoulder)]
     flat = m.pick(1, 1, 1, m.u(0.45, 0.85))
     square = m.pick(2, 2, 2, m.u(3, 8))
     body = lathe(profile, 40)
@@ -159,11 +149,7 @@ def bottle(m: Maker) -> list[Manifold]:
         def squared(p: np.ndarray) -> np.ndarray:
             a, b = np.abs(p[:, 0]) + 1e-9, np.abs(p[:, 2]) + 1e-9
             k = np.hypot(a, b) / (a**square + b**square) ** (1 / square)
-            k = np.where(
-                p[:, 1] > shoulder,
-                1 + (k - 1) * np.clip(1 - (p[:, 1] - shoulder) / max(soft, 0.01), 0, 1),
-                k,
-            )
+            k = 1 + (k - 1) * np.clip(1 - (p[:, 1] - shoulder) / max(soft, 0.01), 0, 1)
             return np.stack([p[:, 0] * k, p[:, 1], p[:, 2] * k], -1)
 
         body = body.warp_batch(squared)
@@ -184,12 +170,8 @@ def bottle(m: Maker) -> list[Manifold]:
     if top <= 2:
         lid = rod(cap_r, cap_h, 36, 0.02)
         if m.chance(0.4):
-            ribs = [
-                rod(0.012, cap_h * 0.8, 6).translate(
-                    [cap_r * math.sin(a), 0.02, cap_r * math.cos(a)]
-                )
-                for a in np.linspace(0, 2 * math.pi, 24)[:-1]
-            ]
+            rib = rod(0.012, cap_h * 0.8, 6).translate([cap_r, 0.02, 0])
+            ribs = [rib.rotate([0, 360 * i / 23, 0]) for i in range(23)]
             lid = joined([lid, *ribs])
         parts.add(lid, cap, at=(0, h - 0.02, 0))
     elif top == 3:  # a pump or a spray
@@ -206,17 +188,9 @@ def bowl(m: Maker) -> list[Manifold]:
     """A bowl, plate, basket, pan or bucket, often with things in it."""
     r, h = m.u(0.4, 0.7), m.u(0.08, 0.7)
     profile = _profile(m, r * m.u(0.4, 0.95), r, h, 0.15)
-    look = m.pick(
-        m.surface(),
-        m.wood(),
-        m.metal(),
-        m.pattern(
-            "striped flowered woven checked dotted speckled",
-            "any",
-            contrast=0.6,
-            mapping=m.pick("box", "round"),
-        ),
-    )
+    names, mapping = "striped flowered woven checked dotted speckled", m.pick("box", "round")
+    painted = m.pattern(names, contrast=0.6, mapping=mapping)
+    look = m.pick(m.surface(), m.wood(), m.metal(), painted)
     sides = m.pick(36, 36, 36, 6, 8)
     vessel = _vessel(m, profile, m.u(0.02, 0.05), sides)
     if m.chance(0.25):
@@ -228,11 +202,8 @@ def bowl(m: Maker) -> list[Manifold]:
         line = [(r * 0.95, h * 0.8, 0), (r + 0.3, h + 0.05, 0), (r + m.u(0.5, 0.9), h + 0.08, 0)]
         parts.add(tube(line, [0.04, 0.035, 0.05], 10, 14), m.surface("dark wood"))
     elif kind == 1:  # a bucket's
-        line = [
-            *((r * 0.97, h * 0.9, 0), (r * 0.8, h + 0.6 * r, 0), (0, h + r, 0)),
-            *((-r * 0.8, h + 0.6 * r, 0), (-r * 0.97, h * 0.9, 0)),
-        ]
-        parts.add(tube(line, m.u(0.015, 0.05), 10, 32), m.surface("metal wood any"))
+        half = [(r * 0.97, h * 0.9, 0), (r * 0.8, h + 0.6 * r, 0), (0, h + r, 0)]
+        parts.add(bow(half, m.u(0.015, 0.05)), m.surface("metal wood any"))
     elif kind == 2:
         parts.pair(handle(m, 0.15, 0.25, 0.025), look, turn=(90, 0, 0), at=(r * 0.93, h * 0.85, 0))
     if m.chance(0.5):
@@ -242,11 +213,8 @@ def bowl(m: Maker) -> list[Manifold]:
         for _ in range(m.n(1, 9)):
             a, d = m.u(0, 6.3), m.u(0, 1) ** 0.5 * max(inside - size, 0.02)
             item = produce(m, size * m.u(0.8, 1.2)).rotate([m.u(0, 360), m.u(0, 360), 0])
-            parts.add(
-                item,
-                m.pick(*things),
-                at=(d * math.sin(a), max(h * 0.7, size) + m.u(-0.05, 0.1), d * math.cos(a)),
-            )
+            y = max(h * 0.7, size) + m.u(-0.05, 0.1)
+            parts.add(item, m.pick(*things), at=(d * math.sin(a), y, d * math.cos(a)))
     return parts
 
 
@@ -255,12 +223,9 @@ def plant(m: Maker) -> list[Manifold]:
     r, h = m.u(0.2, 0.4), m.u(0.25, 0.9)
     profile = _profile(m, r * m.u(0.6, 1), r, h, m.pick(0.1, 0.5))
     sides = m.pick(36, 36, 4, 6, 8)
-    look = m.pick(
-        m.surface("earth white any"),
-        m.pattern(
-            "speckled clouded woven striped", "earth white any", contrast=0.4, mapping="round"
-        ),
-    )
+    names, kinds = "speckled clouded woven striped", "earth white any"
+    painted = m.pattern(names, kinds, contrast=0.4, mapping="round")
+    look = m.pick(m.surface(kinds), painted)
     parts = Parts(m)
     parts.add(_vessel(m, profile, 0.03, sides), look)
     if m.chance(0.3):
@@ -359,11 +324,9 @@ def food(m: Maker) -> list[Manifold]:
             parts.add(rod(r - 0.01 * (i % 2), t + 0.004, 40, 0.02), looks[i % 2], at=(0, y, 0))
             y += t
         for a in np.linspace(0, 2 * math.pi, m.n(1, 10))[:-1]:
-            parts.add(
-                produce(m, 0.08),
-                m.pick(*looks) if m.chance(0.3) else m.plain("toy"),
-                at=(0.75 * r * math.sin(a), y + 0.05, 0.75 * r * math.cos(a)),
-            )
+            look = m.pick(*looks) if m.chance(0.3) else m.plain("toy")
+            at = (0.75 * r * math.sin(a), y + 0.05, 0.75 * r * math.cos(a))
+            parts.add(produce(m, 0.08), look, at=at)
         whole = joined(parts)
         if m.chance(0.4):
             form = [(0, 0), (1.5, 0), (1.5, m.u(0.8, 2.5))]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from manifold3d import Manifold
 
-from .details import handle, outline
+from .details import bow, handle, outline
 from .looks import Maker, Parts
 from .solids import (
     ball,
@@ -63,24 +63,13 @@ def shoe(m: Maker) -> list[Manifold]:
     count, sides = 30, 28
     t = np.linspace(0, 1, count)  # from the heel to the toe
     toe = m.u(0.11, 0.2)
-    instep = np.interp(
-        t,
-        [0, 0.08, 0.35, 0.55, 0.8, 0.93, 1],
-        [
-            *(0.75 * collar, collar, collar * 0.98, 0.55 * collar + 0.5 * toe, toe * 1.1),
-            *(toe * 0.85, toe * 0.3),
-        ],
-    )
+    tongue = 0.55 * collar + 0.5 * toe
+    levels = [0.75 * collar, collar, collar * 0.98, tongue, toe * 1.1, toe * 0.85, toe * 0.3]
+    instep = np.interp(t, [0, 0.08, 0.35, 0.55, 0.8, 0.93, 1], levels)
     point = m.u(0.25, 0.75)
-    half = (
-        np.interp(
-            t,
-            [0, 0.04, 0.15, 0.4, 0.7, 0.9, 0.97, 1],
-            [0.35, 0.6, 0.8, 0.72, 1.0, 0.85 - 0.3 * (point < 0.4), point, 0.5 * point],
-        )
-        * wide
-        / 2
-    )
+    places = [0, 0.04, 0.15, 0.4, 0.7, 0.9, 0.97, 1]
+    widths = [0.35, 0.6, 0.8, 0.72, 1.0, 0.85 - 0.3 * (point < 0.4), point, 0.5 * point]
+    half = np.interp(t, places, widths) * wide / 2
     shift = 0.05 * wide * (t - 0.3)
     blur = [0.1, 0.2, 0.4, 0.2, 0.1]
     instep, half = (np.convolve(np.pad(v, 2, mode="edge"), blur, "valid") for v in (instep, half))
@@ -92,13 +81,8 @@ def shoe(m: Maker) -> list[Manifold]:
         k = 3.0
         r = (np.abs(s) ** k + np.abs(c) ** k) ** (-1 / k)
         up = (r * s + 1) / 2
-        tight = (
-            1
-            - (1 - narrow)
-            * np.clip(up - 0.25, 0, 1)
-            * np.clip(instep[i] / max(collar, 0.01), 0, 1)
-            * 1.3
-        )
+        tall_here = np.clip(instep[i] / collar, 0, 1)
+        tight = 1 - 1.3 * (1 - narrow) * np.clip(up - 0.25, 0, 1) * tall_here
         rings[i, :, 0] = r * c * half[i] * tight + shift[i]
         rings[i, :, 1] = up * instep[i]
         rings[i, :, 2] = (t[i] - 0.5) * long
@@ -115,21 +99,12 @@ def shoe(m: Maker) -> list[Manifold]:
         wide_top, lean = m.u(0.3, 0.42), m.u(-0.08, 0.08)
         heights = np.linspace(0.1, tall, 9)
         form = ring_of(2.3, 26)
-        widths = (
-            np.interp(heights, [0.1, 0.3, 0.5 * tall + 0.2, tall], [0.36, 0.32, 0.36, wide_top])[
-                :, None
-            ]
-            * wide
-            * m.u(0.95, 1.1)
-        )
-        shaft = np.stack(
-            [
-                form[:, 0] * widths,
-                np.repeat(heights[:, None], 26, 1),
-                form[:, 1] * widths * m.u(1.2, 1.5) - 0.27 + lean * (heights[:, None] - 0.1),
-            ],
-            -1,
-        )
+        places = [0.1, 0.3, 0.5 * tall + 0.2, tall]
+        widths = np.interp(heights, places, [0.36, 0.32, 0.36, wide_top])[:, None]
+        widths = widths * wide * m.u(0.95, 1.1)
+        x, y = form[:, 0] * widths, np.repeat(heights[:, None], 26, 1)
+        z = form[:, 1] * widths * m.u(1.2, 1.5) - 0.27 + lean * (y - 0.1)
+        shaft = np.stack([x, y, z], -1)
         core = (shaft - [0, 0, -0.27]) * [0.86, 1, 0.86] + [0, 0.04, -0.27]
         core[..., 1] = (core[..., 1] - 0.1) * 1.1 + 0.06
         hole = m.stamp(loft(core), inside)
@@ -138,11 +113,8 @@ def shoe(m: Maker) -> list[Manifold]:
     if heel > 0.12:  # the foot stands on its toes
         body = _lifted(body, heel)
     spread = m.u(1.02, 1.1)
-    base = (
-        slab(_sole(wide * spread, long * 1.02), thick, 0.25 * thick, 2)
-        .rotate([90, 0, 0])
-        .mirror([0, 0, 1])
-    )
+    base = slab(_sole(wide * spread, long * 1.02), thick, 0.25 * thick, 2)
+    base = base.rotate([90, 0, 0]).mirror([0, 0, 1])
     base = base.translate([0, 0.015 - thick / 2, 0])
     parts = Parts(m)
     parts.append(body)
@@ -151,21 +123,13 @@ def shoe(m: Maker) -> list[Manifold]:
         post = lathe([(m.u(0.03, 0.1), 0), (0.11, heel + 0.02)], 16).translate([0, -thick, -0.38])
         parts.add(post, lower)
     elif heel > 0:
-        block = (
-            slab(_sole(wide, long)[:], heel, 0)
-            .rotate([90, 0, 0])
-            .mirror([0, 0, 1])
-            .trim_by_plane([0, 0, -1], m.u(0.15, 0.25))
-        )
+        block = slab(_sole(wide, long), heel).rotate([90, 0, 0]).mirror([0, 0, 1])
+        block = block.trim_by_plane([0, 0, -1], m.u(0.15, 0.25))
         parts.add(block, lower, at=(0, -thick - heel / 2 + 0.02, 0))
     elif m.chance(0.4):  # a profile below
-        teeth = joined(
-            [
-                box(wide * 1.4, 0.03, 0.03).translate([0, -thick, z])
-                for z in np.linspace(-0.45, 0.45, m.n(7, 13))
-            ]
-        )
-        base = base - teeth
+        groove = box(wide * 1.4, 0.03, 0.03)
+        for z in np.linspace(-0.45, 0.45, m.n(7, 13)):
+            base -= groove.translate([0, -thick, z])
     parts.add(base, lower)
     if m.chance(0.65) and not tall:  # laces, or a strap
         rows = m.n(1, 6)
@@ -176,12 +140,8 @@ def shoe(m: Maker) -> list[Manifold]:
             lace = tube(line, 0.013 if rows > 1 else 0.03, 8, 12, flat=(1, 1.5))
             parts.add(lace, trim)
     if m.chance(0.45):  # a mark on the sides, a cap on the toe
-        mark = (
-            slab(outline(m) * [0.25, 0.12], 0.5)
-            .rotate([0, 90, 0])
-            .translate([0.25, collar * 0.45, 0.0])
-        )
-        shell = loft(rings * [1.03, 1.0, 1.0]) ^ joined([mark, mark.mirror([1, 0, 0])])
+        mark = slab(outline(m) * [0.25, 0.12], 0.5).rotate([0, 90, 0])
+        shell = loft(rings * [1.03, 1.0, 1.0]) ^ both(mark.translate([0.25, collar * 0.45, 0]))
         parts.append(m.stamp(shell, trim) - hole)
     if m.chance(0.35):
         cap = loft(rings * [1.04, 1.04, 1.01]).trim_by_plane([0, 0, 1], m.u(0.25, 0.36))
@@ -191,14 +151,8 @@ def shoe(m: Maker) -> list[Manifold]:
         parts.append(m.stamp(roll, m.fur()) - hole)
     whole = joined(parts)
     if m.chance(0.12):
-        return [
-            joined(
-                [
-                    whole.translate([-wide * 0.62, 0, 0]),
-                    whole.mirror([1, 0, 0]).translate([wide * 0.62, 0, m.u(-0.1, 0.1)]),
-                ]
-            ).rotate([0, m.u(-40, 40), 0])
-        ]
+        other = whole.mirror([1, 0, 0]).translate([wide * 1.24, 0, m.u(-0.1, 0.1)])
+        return [(whole + other).rotate([0, m.u(-40, 40), 0])]
     return [whole.rotate([0, m.pick(90, -90, m.u(-90, 90), m.u(-180, 180)), 0])]
 
 
@@ -217,11 +171,8 @@ def bag(m: Maker) -> list[Manifold]:
         for _ in range(m.n(1, 2)):
             ph, pw = h * m.u(0.25, 0.5), w * m.u(0.5, 0.85)
             pocket = superquadric([pw / 2, ph / 2, d * 0.3], 0.4, 0.5)
-            parts.add(
-                pocket,
-                m.pick(cloth, trim),
-                at=(0, -h / 2 + ph / 2 + m.u(0.02, 0.12) * h, d / 2 - 0.02),
-            )
+            y = -h / 2 + ph / 2 + m.u(0.02, 0.12) * h
+            parts.add(pocket, m.pick(cloth, trim), at=(0, y, d / 2 - 0.02))
         line = [
             *((w * 0.2, h * 0.45, -d * 0.35), (w * 0.25, h * 0.3, -d * 0.5 - 0.15)),
             *((w * 0.3, -h * 0.1, -d * 0.5 - 0.15), (w * 0.35, -h * 0.4, -d * 0.35)),
@@ -235,13 +186,9 @@ def bag(m: Maker) -> list[Manifold]:
     elif kind == 1:  # a handbag with one or two bows
         tall = m.u(0.2, 0.6)
         for z in (0.25 * d, -0.25 * d) if m.chance(0.6) else (0.0,):
-            line = [
-                *((-w * 0.25, h * 0.42, z), (-w * 0.22, h * 0.5 + tall * 0.7, z)),
-                *((0, h * 0.5 + tall, z), (w * 0.22, h * 0.5 + tall * 0.7, z)),
-                (w * 0.25, h * 0.42, z),
-            ]
-            bow = tube(line, m.u(0.012, 0.03), 10, 32)
-            parts.add(bow, trim)
+            top = h * 0.5 + tall
+            half = [(-w * 0.25, h * 0.42, z), (-w * 0.22, top - tall * 0.3, z), (0, top, z)]
+            parts.add(bow(half, m.u(0.012, 0.03)), trim)
         flap = superquadric([w * 0.48, h * m.u(0.2, 0.35), d * 0.5], 0.4, 0.5).translate(
             [0, h * 0.25, 0.04]
         )
@@ -258,13 +205,9 @@ def bag(m: Maker) -> list[Manifold]:
             front = m.printed("front", m.color("white any"), sides=True)
             parts[0] = m.stamp(body, front) - inner - cutter
         for z in (0.4 * d, -0.4 * d):
-            line = [
-                *((-w * 0.2, h * 0.2, z), (-w * 0.2, h * 0.6, z * 0.8), (0, h * 0.75, z * 0.6)),
-                *((w * 0.2, h * 0.6, z * 0.8), (w * 0.2, h * 0.2, z)),
-            ]
-            bow = tube(line, 0.02, 10, 32, flat=(1, 1.6))
-            parts.add(bow, trim)
-    return parts.turned(0, m.pick(0, m.u(-50, 50), m.u(-180, 180)), 0)
+            half = [(-w * 0.2, h * 0.2, z), (-w * 0.2, h * 0.6, z * 0.8), (0, h * 0.75, z * 0.6)]
+            parts.add(bow(half, 0.02, flat=1.6), trim)
+    return parts.turned(0, m.pick(0, m.u(-50, 50), m.u(-180, 180)))
 
 
 def hat(m: Maker) -> list[Manifold]:
@@ -279,11 +222,8 @@ def hat(m: Maker) -> list[Manifold]:
     parts.append(m.stamp(dome, cloth) - hollow)
     kind = m.n(0, 3)
     if kind == 0:  # a peak
-        peak = (
-            slab(ring_of(2.5, 36) * [r * 0.85, r * m.u(0.8, 1.1)], 0.03, 0.01, 2)
-            .rotate([90 + m.u(0, 15), 0, 0])
-            .translate([0, 0.01, r * 0.75])
-        )
+        peak = slab(ring_of(2.5, 36) * [r * 0.85, r * m.u(0.8, 1.1)], 0.03, 0.01, 2)
+        peak = peak.rotate([90 + m.u(0, 15), 0, 0]).translate([0, 0.01, r * 0.75])
         cutter = superquadric([r * 0.93, h * 0.93, r * 0.95], 0.8, 0.9)
         parts.add(peak - cutter, m.pick(cloth, trim))
         parts.add(ball(0.03, 12), trim, at=(0, h, 0))
@@ -293,10 +233,8 @@ def hat(m: Maker) -> list[Manifold]:
         profile = [(r, -0.01), (reach, up), (reach, up + 0.025), (r * 0.95, 0.03)]
         brim = lathe(profile, 40) - rod(r * 0.9, 1).translate([0, -0.5, 0])
         parts.add(brim, cloth)
-        part = (
-            superquadric([r * 1.03, h, r * 1.03], 0.7, 0.9)
-            ^ box(5, 0.08, 5).translate([0, 0.06, 0])
-        ) - rod(r * 0.85, 1).translate([0, -0.5, 0])
+        band = box(5, 0.08, 5).translate([0, 0.06, 0]) - rod(r * 0.85, 1).translate([0, -0.5, 0])
+        part = superquadric([r * 1.03, h, r * 1.03], 0.7, 0.9) ^ band
         parts.add(part, trim)
     elif kind == 2:  # a roll and a bobble
         parts.add(ring(r * 0.97, 0.06, 40, 12, 1.6), trim, at=(0, 0.05, 0))
@@ -310,7 +248,7 @@ def hat(m: Maker) -> list[Manifold]:
             ]
             ridge = tube(line, 0.035, 10, 24)
             parts.pair(ridge, trim)
-    return parts.turned(m.u(-15, 10), m.u(-60, 60), 0)
+    return parts.turned(m.u(-15, 10), m.u(-60, 60))
 
 
 def wearable(m: Maker) -> list[Manifold]:
@@ -332,10 +270,8 @@ def wearable(m: Maker) -> list[Manifold]:
             line = [(r, -0.15, 0.05), (r * 0.8, -0.35, 0.25), (r * 0.3, -0.4, 0.4)]
             parts.add(tube(line, 0.015, 8, 16), dark)
     elif kind == 1:
-        form = m.pick(ring_of(2, 36), ring_of(4, 36), rounded(1.9, 1.5, 0.5, 9)) * [
-            m.u(0.2, 0.26),
-            m.u(0.13, 0.22),
-        ]
+        form = m.pick(ring_of(2, 36), ring_of(4, 36), rounded(1.9, 1.5, 0.5, 9))
+        form = form * [m.u(0.2, 0.26), m.u(0.13, 0.22)]
         frame = slab(form, 0.05, 0.015, 2) - slab(form * 0.82, 0.2)
         parts.pair(frame, a, at=(0.27, 0, 0))
         parts.pair(slab(form * 0.86, 0.015), m.plain("dark pastel"), at=(0.27, 0, 0))
@@ -349,20 +285,15 @@ def wearable(m: Maker) -> list[Manifold]:
         parts.add(face, b, turn=(90, 0, 0), at=(0, 0, 0.39))
         picture = m.faced(screen(m.rng), np.zeros(3))
         parts.add(rod(0.14, 0.03, 30), picture, turn=(90, 0, 0), at=(0, 0, 0.47))
-        return parts.turned(m.u(-40, 0), m.u(-40, 40), 0)
+        return parts.turned(m.u(-40, 0), m.u(-40, 40))
     elif kind == 3:
         shell = superquadric([0.4, m.u(0.45, 0.6), 0.3], m.u(0.7, 1), 0.9, 36).trim_by_plane(
             [0, 0, 1], 0.0
         )
         shell = shell - superquadric([0.36, 0.45, 0.26], 0.8, 0.9)
-        holes = joined(
-            [
-                ball([0.09, m.u(0.04, 0.07), 0.5])
-                .rotate([0, 0, m.u(-20, 20)])
-                .translate([0.15, 0.1, 0.2]),
-                box(m.u(0.1, 0.25), 0.05, 1).translate([0, -0.22, 0.2]),
-            ]
-        )
+        eye = ball([0.09, m.u(0.04, 0.07), 0.5]).rotate([0, 0, m.u(-20, 20)])
+        mouth = box(m.u(0.1, 0.25), 0.05, 1).translate([0, -0.22, 0.2])
+        holes = eye.translate([0.15, 0.1, 0.2]) + mouth
         parts.add(shell - both(holes), a)
         part = tube([(0, 0.12, 0.28), (0, 0.0, 0.38), (0, -0.1, 0.3)], [0.03, 0.06, 0.04], 10, 12)
         parts.add(part, m.pick(a, b))
@@ -381,4 +312,4 @@ def wearable(m: Maker) -> list[Manifold]:
             m.stamp(spike.translate([0, 0.17, r]), m.pick(a, b)).rotate([0, 360 * i / count, 0])
             for i in range(count)
         ]
-    return parts.turned(m.u(-25, 10), m.u(-50, 50), 0)
+    return parts.turned(m.u(-25, 10), m.u(-50, 50))
