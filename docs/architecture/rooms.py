@@ -44,8 +44,8 @@ _RESULTS = (
     "pages",
 )
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
-_DATA = ("train.data", "train.data.made", "train.sources")
-_TRAIN = ("train.config", "train.objective", "train", *_DATA)
+_TRAIN_DATA = ("train.data", "train.data.made", "train.sources")
+_TRAIN = ("train.config", "train.objective", "train", *_TRAIN_DATA)
 _EVAL = ("eval", "eval.views", "eval.shapes")
 
 ROOMS = {
@@ -109,7 +109,7 @@ ROOMS = {
     "train.objective": Room("the losses", (*_LIBRARY, "train.config")),
     "train": Room(
         "batches, loop, checkpoints",
-        (*_LIBRARY, "train.config", "train.objective", *_DATA),
+        (*_LIBRARY, "train.config", "train.objective", *_TRAIN_DATA),
         ("pages",),
     ),
     "eval": Room("the report that both evaluations share", _RESULTS),

@@ -37,16 +37,11 @@ def front_view(mesh: TexturedMesh, rng: np.random.Generator) -> np.ndarray:
     return to_uint8(over_background(picture, GREY))
 
 
-def main(path: Path = PICTURE, seed: int = SEED) -> None:
-    """Writes the picture.
-
-    Args:
-        path: its file.
-        seed: of the objects.
-    """
+def main(path: Path) -> None:
+    """Writes the picture."""
     cells = []
     for number in range(COLUMNS * ROWS):
-        rng = np.random.default_rng([seed, number])
+        rng = np.random.default_rng([SEED, number])
         cells.append(front_view(make_object(rng), rng))
     rows = [np.concatenate(cells[i : i + COLUMNS], 1) for i in range(0, len(cells), COLUMNS)]
     with atomic_path(path) as temporary:
@@ -55,4 +50,4 @@ def main(path: Path = PICTURE, seed: int = SEED) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:2]), *map(int, sys.argv[2:3]))
+    main(Path(sys.argv[1]) if sys.argv[1:] else PICTURE)

@@ -2,17 +2,21 @@
 
 import collections
 import dataclasses
-import os
+import signal
 
+import numpy as np
 import pytest
 from helpers import micro
 from helpers.micro import run, same_weights
 from helpers.refusals import refused
 
+from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.train.batches import Batches, open_data
 from gamba_warp.train.data import pool as pools
+from gamba_warp.train.data.made import make_object
 from gamba_warp.train.data.pool import Pool, PoolOptions
+from gamba_warp.train.data.render import draw_views
 from gamba_warp.train.data.settings import Settings
 
 VIEWS = Settings(views=3, size=16, seed=3, depth=True, fronts=1, up="y")
@@ -22,6 +26,18 @@ OPTIONS = PoolOptions(seed=3, rank=0, world=1, uses=3, workers=1, views=VIEWS)
 @pytest.fixture
 def slots(monkeypatch):
     monkeypatch.setattr(pools, "SLOTS", 5)
+    monkeypatch.setattr(pools, "AHEAD", 2)
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Objects that this process makes: another takes seconds to start."""
+    monkeypatch.setattr(pools, "run_each", lambda made, items, workers: enumerate(map(made, items)))
+    monkeypatch.setattr(pools, "_made", views_of)
+
+
+def views_of(number, seed, settings):
+    return draw_views(make_object(np.random.default_rng([seed, number])), str(number), settings)
 
 
 @pytest.fixture
@@ -53,33 +69,50 @@ def test_every_object_is_used_as_often_as_told_in_rounds_that_differ(slots):
     assert not {other._object(n) for n in range(60)} & {number * 2 for number in uses}
 
 
-def test_a_pool_that_begins_later_goes_on_with_the_same_pictures(slots, opened):
-    whole, late = opened(), opened(first=12, workers=2)
-    for sample in range(18):
+def test_a_pool_that_begins_later_goes_on_with_the_same_pictures(slots, opened, in_process):
+    whole, late = opened(), opened(first=6)
+    for sample in range(12):
         before = whole.take(sample)
-        if sample >= 12:
+        if sample >= 6:
             after = late.take(sample)
             assert before.uids == after.uids
-            one, two = before.load(0), after.load(0)
-            assert one.images.equal(two.images) and one.depths.equal(two.depths)
-            assert one.backs.equal(two.backs)
-            assert one.cameras.viewmats.equal(two.cameras.viewmats)
-            assert one.images[..., 3].max() == 1 and one.depths.max() > 0
+            assert_same(before.load(0), after.load(0))
     assert len(whole._ready) <= 5 + 2 * 2 + pools.AHEAD  # those of older rounds are forgotten
 
 
+def test_other_processes_make_the_same_pictures(slots, opened):
+    made = opened().take(0)
+    number = int(made.uids[0].removeprefix("made-3-"))
+    expected = pools._files(made.uids[0], views_of(number, 3, VIEWS))
+    ours = ViewDataset({made.uids[0]: lambda: expected}, "made", cache=False)
+    assert_same(made.load(0), ours.load(0))
+
+
+def assert_same(one, two):
+    assert one.images.equal(two.images) and one.depths.equal(two.depths)
+    assert one.backs.equal(two.backs)
+    assert one.cameras.viewmats.equal(two.cameras.viewmats)
+    assert one.images[..., 3].max() == 1 and one.depths.max() > 0
+
+
+class Deadly:
+    """Kills the process that unpickles it, which has imported nothing by then."""
+
+    def __reduce__(self):
+        return signal.raise_signal, (signal.SIGKILL,)
+
+    def __call__(self):
+        raise NotImplementedError
+
+
 def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeypatch):
-    monkeypatch.setattr(pools, "_made", _dies)
+    monkeypatch.setattr(pools, "_made", Deadly())
     with pytest.raises(UserError, match=r"made object \d+: its process died of signal 9"):
-        opened().take(0)
-
-
-def _dies(number, seed, settings):
-    os.kill(os.getpid(), 9)
+        opened(views=None).take(0)
 
 
 @pytest.mark.parametrize("share, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])
-def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, share, expected):
+def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, share, expected):
     def batches(made):
         views = {"made": made, "made_views": 3, "batch_size": 8}
         options = micro.options(data, data, views=views)
@@ -98,7 +131,7 @@ def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, share, expected
         assert same == (not is_made)
 
 
-def test_a_resumed_run_has_the_same_bits_and_another_share_is_refused(data, tmp_path, capsys):
+def test_a_resumed_run_has_the_same_bits_and_another_share_is_refused(data, tmp_path, in_process):
     views = {"made": 0.5, "made_views": 3, "made_uses": 2}
     assert run(data, tmp_path / "whole", length={"steps": 4}, views=views) == 0
     half = tmp_path / "half"

@@ -5,33 +5,56 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from manifold3d import CrossSection, Manifold
+from manifold3d import Manifold
 
+from .details import letter, outline
 from .looks import Maker
 from .solids import (
-    Blend, ball, bend, both, box, extent, joined, lathe, loft, plate, ring, ring_of, ripple, rod,
-    rounded, slab, solid_of, spline, superquadric, taper, tube, twist,
+    Blend,
+    ball,
+    bend,
+    both,
+    box,
+    extent,
+    joined,
+    lathe,
+    loft,
+    plate,
+    ring_of,
+    ripple,
+    rod,
+    slab,
+    solid_of,
+    spline,
+    superquadric,
+    taper,
+    tube,
+    twist,
 )
 
 ENOUGH = 8_000  # faces of the parts after which no more are added
 SCHEMES = (
-    *(("toy",), ("toy",), ("pastel",), ("dark", "metal"), ("white", "metal"), ("wood", "earth")),
-    *(("fur",), ("any",), ("any",), ("wide",), ("leather", "earth"), ("white", "dark")),
+    *("toy", "toy", "pastel", "dark metal", "white metal", "wood earth"),
+    *("fur", "any", "any", "wide", "leather earth", "white dark"),
 )
 
 
 def composition(m: Maker) -> list[Manifold]:
     """A body, and two to nine parts on it: mirrored, in rows, around an axis, or cut out of it."""
     scheme = m.pick(*SCHEMES)
-    looks = [m.fur(*scheme) if m.chance(0.15) else m.surface(*scheme) for _ in range(m.n(2, 4))]
+    looks = [m.fur(scheme) if m.chance(0.15) else m.surface(scheme) for _ in range(m.n(2, 4))]
+    if m.chance(0.33):
+        looks[m.n(0, 1)] = m.printed(
+            m.pick("front", "label"), m.color(f"{scheme} white"), m.pick("fit", "round")
+        )
     mirrored = m.chance(0.82)
     body = shape(m, mirrored)
     if m.chance(0.2):
         body = warped(m, body, mirrored)
     parts = [m.stamp(body, looks[0])]
     if m.chance(0.3):
-        parts[0] = hollowed(m, parts[0], m.surface(*scheme))
-    for _ in range(m.n(1, m.pick(3, 6, 9))):
+        parts[0] = hollowed(m, parts[0], m.surface(scheme))
+    for _ in range(m.n(2, m.pick(3, 5, 9)) if m.chance(0.92) else 1):
         if sum(part.num_tri() for part in parts) > ENOUGH:
             break
         # The body carries most of the parts.
@@ -42,7 +65,12 @@ def composition(m: Maker) -> list[Manifold]:
             parts.append(grown(m, host, mirrored, m.pick(*looks)))
     if m.chance(0.12):
         parts = [whole_warped(m, parts, mirrored)]
-    return parts
+    return parts if m.chance(0.1) else [largest(joined(parts))]
+
+
+def largest(solid: Manifold) -> Manifold:
+    """A solid without the pieces that hang in the air beside its largest one."""
+    return max(solid.decompose(), key=lambda piece: piece.volume(), default=solid)
 
 
 def shape(m: Maker, mirrored: bool = True, fine: int = 32) -> Manifold:
@@ -62,23 +90,29 @@ def shape(m: Maker, mirrored: bool = True, fine: int = 32) -> Manifold:
     if kind <= 5:
         return turned(m, a, 2 * b, fine)
     if kind == 6:
-        return slab(outline(m, fine * 3 // 2), m.u(0.05, 0.6), m.u(0, 0.1), 3).scale([a / 0.6, b / 0.6, 1])
+        return slab(outline(m, fine * 3 // 2), m.u(0.05, 0.6), m.u(0, 0.1), 3).scale(
+            [a / 0.6, b / 0.6, 1]
+        )
     if kind <= 8:
         return loafed(m, a, b, c, fine)
     if kind == 9:
         return lumps(m, mirrored, fine * 5 // 4)
     if kind == 10:
-        path = m.rng.normal(0, 0.4, (m.n(3, 5), 3)) + np.linspace([0, -0.6, 0], [0, 0.6, 0], 5)[: 1]
+        path = m.rng.normal(0, 0.4, (m.n(3, 5), 3)) + np.linspace([0, -0.6, 0], [0, 0.6, 0], 5)[:1]
         if mirrored:
             path[:, 0] *= 0.0 if m.chance(0.7) else 1.0
-        return tube(path, m.rng.uniform(0.05, 0.3, 3), fine // 2, fine * 3 // 4, flat=(1, m.u(0.5, 1)))
+        return tube(
+            path, m.rng.uniform(0.05, 0.3, 3), fine // 2, fine * 3 // 4, flat=(1, m.u(0.5, 1))
+        )
     return plate(letter(m), m.u(0.1, 0.5))
 
 
 def turned(m: Maker, radius: float, height: float, fine: int) -> Manifold:
     """A random solid of revolution, sometimes with a profile that is not round."""
     count = m.n(3, 6)
-    profile = np.stack([m.rng.uniform(0.25, 1, count) * radius, np.linspace(0, 1, count) * height], 1)
+    profile = np.stack(
+        [m.rng.uniform(0.25, 1, count) * radius, np.linspace(0, 1, count) * height], 1
+    )
     if m.chance(0.7):
         profile = np.maximum(spline(profile, fine // 2), [0.02, -1])
     if m.chance(0.3):  # a rounded top
@@ -86,7 +120,8 @@ def turned(m: Maker, radius: float, height: float, fine: int) -> Manifold:
         end = profile[-1]
         cap = np.stack([end[0] * np.cos(angle), end[1] + end[0] * m.u(0.2, 1) * np.sin(angle)], 1)
         profile = np.concatenate([profile, np.maximum(cap, [0.005, -1])])
-    made = lathe([(0, profile[0, 1]), *profile.tolist(), (0, profile[-1, 1])], m.pick(6, 8, fine, fine, fine))
+    contour = [(0, profile[0, 1]), *profile.tolist(), (0, profile[-1, 1])]
+    made = lathe(contour, m.pick(6, 8, fine, fine, fine))
     return made.translate([0, -height / 2, 0])
 
 
@@ -95,7 +130,7 @@ def loafed(m: Maker, a: float, b: float, c: float, fine: int) -> Manifold:
     count, sides = fine // 2, fine * 7 // 8
     t = np.linspace(-1, 1, count)
     ends = m.u(0.3, 0.95)
-    swell = (1 - (np.abs(t) ** m.u(2, 6)) * ends)
+    swell = 1 - (np.abs(t) ** m.u(2, 6)) * ends
     wide = a * swell * spline(m.rng.uniform(0.6, 1.1, (4, 1)), count)[:, 0]
     tall = b * swell * spline(m.rng.uniform(0.6, 1.1, (4, 1)), count)[:, 0]
     lift = b * spline(m.rng.uniform(-0.4, 0.4, (3, 1)), count)[:, 0]
@@ -122,43 +157,6 @@ def lumps(m: Maker, mirrored: bool, cells: int) -> Manifold:
         blend.limb([start, end], [r, r * m.u(0.4, 1.5)])
         points.append(end)
     return blend.solid(lambda v, f, _: solid_of(v, f), cells)
-
-
-def outline(m: Maker, sides: int = 48) -> np.ndarray:
-    """A smooth, starred or toothed outline ``[sides, 2]`` of radius .6 or so."""
-    angle = np.arange(sides) * (2 * math.pi / sides)
-    kind = m.n(0, 4)
-    if kind == 0:
-        r = 1 + sum(m.u(-0.25, 0.25) / k * np.cos(k * (angle - math.pi / 2)) for k in range(2, 6))
-    elif kind == 1:
-        r = 1 + m.u(0.1, 0.35) * np.cos(m.n(3, 8) * (angle - math.pi / 2))
-    elif kind == 2:
-        teeth = m.n(6, 16)
-        r = 1 + m.u(0.05, 0.15) * np.tanh(4 * np.sin(teeth * angle))
-    elif kind == 3:
-        return 0.6 * ring_of(m.u(1.2, 8), sides)
-    else:
-        width = m.u(0.5, 1.3)
-        return rounded(width, m.u(0.5, 1.3), m.u(0.05, 0.6) * width, sides // 4)
-    return 0.6 * np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
-
-
-def letter(m: Maker) -> CrossSection:
-    """A figure of bars and bows, as letters are."""
-    w, points = m.u(0.08, 0.2), [(-0.4, -0.5), (0.4, -0.5), (-0.4, 0.0), (0.4, 0.0), (-0.4, 0.5), (0.4, 0.5), (0, -0.5), (0, 0.5)]
-    dot = CrossSection.circle(w, 12) if m.chance(0.5) else CrossSection.square([1.7 * w, 1.7 * w], True)
-    bars, here = [], points[m.n(0, 7)]
-    for _ in range(m.n(2, 5)):
-        there = points[m.n(0, 7)]
-        bars.append(CrossSection.batch_hull([dot.translate(here), dot.translate(there)]))
-        here = there
-    made = bars[0]
-    for bar in bars[1:]:
-        made = made + bar
-    if m.chance(0.4):
-        bow = CrossSection.circle(0.35, 32) - CrossSection.circle(0.35 - w, 32)
-        made = made + bow.translate([m.u(-0.2, 0.2), m.pick(-0.2, 0.2)])
-    return made
 
 
 def warped(m: Maker, solid: Manifold, mirrored: bool) -> Manifold:
@@ -241,12 +239,16 @@ def grown(m: Maker, host: Manifold, mirrored: bool, look: int) -> Manifold:
         count = m.n(2, 5)
         axis = m.pick(1, 2) if mirrored else m.n(0, 2)
         step = np.eye(3)[axis] * size * m.u(0.12, 0.3)
-        return joined([one.translate((step * (i - (count - 1) / 2)).tolist()) for i in range(count)])
+        return joined(
+            [one.translate((step * (i - (count - 1) / 2)).tolist()) for i in range(count)]
+        )
     if arrangement == "around":
         count = m.pick(3, 4, 6, 8)
         center = (extent(host)[0] + extent(host)[1]) / 2
         centered = one.translate((-center).tolist())
-        return joined([centered.rotate([0, 360 * i / count, 0]) for i in range(count)]).translate(center.tolist())
+        return joined([centered.rotate([0, 360 * i / count, 0]) for i in range(count)]).translate(
+            center.tolist()
+        )
     return one
 
 
@@ -259,11 +261,16 @@ def hollowed(m: Maker, solid: Manifold, look: int) -> Manifold:
     if (share < 0.2).any():
         return solid
     center = (low + high) / 2
-    inner = m.stamp(solid.translate((-center).tolist()).scale(share.tolist()).translate(center.tolist()), look)
+    inner = m.stamp(
+        solid.translate((-center).tolist()).scale(share.tolist()).translate(center.tolist()), look
+    )
     inner = inner.translate([0, float(size[1]) * m.u(0.1, 0.4), 0])
     level = high[1] - m.u(0.02, 0.3) * size[1]
     if m.chance(0.6):
-        above = box(*(3 * size), 0).translate([*center[[0]], float(level + 1.5 * size[1]), *center[[2]]])
+        wide, tall, deep = (3 * size).tolist()
+        above = box(wide, tall, deep).translate(
+            [*center[[0]], float(level + 1.5 * size[1]), *center[[2]]]
+        )
         inner = inner + m.stamp(above, look)
     made = solid - inner
     return made if made.volume() > 0.05 * solid.volume() else solid
@@ -278,24 +285,9 @@ def cut(m: Maker, solid: Manifold, mirrored: bool, look: int) -> Manifold:
         if not normal.any():
             normal[2] = 1.0
     r = size * m.u(0.04, 0.2)
-    tool = m.pick(rod(r, size * m.u(0.05, 1.5)), box(r * m.u(0.5, 3), size * m.u(0.1, 0.5), r, 0.0), ball(r))
+    tool = m.pick(
+        rod(r, size * m.u(0.05, 1.5)), box(r * m.u(0.5, 3), size * m.u(0.1, 0.5), r, 0.0), ball(r)
+    )
     tool = m.stamp(turned_to(tool, -normal, point + 0.02 * size * normal), look)
     made = solid - (both(tool) if mirrored else tool)
     return made if made.volume() > 0.3 * solid.volume() else solid
-
-
-def handle(m: Maker, width: float, height: float, thick: float) -> Manifold:
-    """A bow in the plane of x and y whose ends lie on x = 0, about y = 0."""
-    square = m.chance(0.3)
-    path = [(0, height / 2, 0), (width * (1 if square else 0.8), height / 2, 0), (width, 0, 0), (width * (1 if square else 0.75), -height / 2, 0), (0, -height / 2, 0)]
-    return tube(path, thick, 12, 26, flat=(1, m.u(1, 1.8)), round_ends=False)
-
-
-def wheel(radius: float, thick: float) -> Manifold:
-    """A wheel about the x axis."""
-    return rod(radius, thick, 28, 0.25 * thick).translate([0, -thick / 2, 0]).rotate([0, 0, 90])
-
-
-def ringed(m: Maker, radius: float, thick: float) -> Manifold:
-    """A torus about y."""
-    return ring(radius, thick, flat=m.u(0.8, 1.5))

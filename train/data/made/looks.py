@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from manifold3d import Manifold, Mesh
+from numpy.typing import ArrayLike
 
 from gamba_warp.formats.materials import Material, to_linear
 from gamba_warp.formats.meshes import CREASE, TexturedMesh
 
 from . import textures
-from .solids import extent, joined, solid_of
+from .solids import both, extent, joined, solid_of
 
 SHARP = 40.0  # degrees; a sharper edge is not shaded smoothly
 MAX_FACES = 60_000
@@ -92,46 +93,54 @@ class Maker:
         """One of some things."""
         return options[self.rng.integers(len(options))]
 
-    def color(self, *kinds: str) -> np.ndarray:
-        """A colour of one of some kinds, see ``textures.color``."""
-        return textures.color(self.rng, self.pick(*kinds) if kinds else "any")
+    def color(self, kinds: str = "any") -> np.ndarray:
+        """A colour of one of some kinds, see ``textures.color``, separated by spaces."""
+        return textures.color(self.rng, self.pick(*kinds.split()))
 
     def add(self, look: Look) -> int:
         """The number of a new look."""
         self.looks.append(look)
         return len(self.looks) - 1
 
-    def plain(self, *kinds: str) -> int:
+    def plain(self, kinds: str = "any") -> int:
         """A look of one colour, of one of some kinds."""
-        return self.add(Look([plain_material(self.color(*kinds))]))
+        return self.painted(self.color(kinds))
 
     def painted(self, value: np.ndarray) -> int:
         """A look of one given display colour."""
         return self.add(Look([plain_material(value)]))
 
-    def pattern(self, patterns: Sequence[str] | str, *kinds: str, contrast: float = 0.0, mapping: str = "box", repeats: float = 0.0) -> int:
+    def pattern(
+        self,
+        patterns: str,
+        kinds: str = "any",
+        *,
+        contrast: float = 0.0,
+        mapping: str = "box",
+        repeats: float = 0.0,
+    ) -> int:
         """A look of a pattern of two colours.
 
         Args:
-            patterns: names in ``textures.PATTERNS`` to choose from.
+            patterns: names in ``textures.PATTERNS`` to choose from, separated by spaces.
             kinds: of the first colour.
             contrast: share of cases in which the second is another colour, not a shade.
             mapping: see ``Look``.
             repeats: the same; 0: drawn.
         """
-        name = patterns if isinstance(patterns, str) else self.pick(*patterns)
-        first = self.color(*kinds)
+        name = self.pick(*patterns.split())
+        first = self.color(kinds)
         second = self.color() if self.chance(contrast) else first * self.u(0.45, 0.85)
         picture = textures.mixed(textures.PATTERNS[name](self.rng), first, second)
         return self.add(Look([material(picture)], mapping, repeats or self.u(0.8, 2.5)))
 
-    def surface(self, *kinds: str) -> int:
+    def surface(self, kinds: str = "any") -> int:
         """A look for anything: mostly one colour, sometimes a pattern."""
-        if self.chance(0.5):
-            return self.plain(*kinds)
-        quiet = ("plain", "clouded", "speckled", "brushed", "woven", "paneled")
-        loud = (*textures.PATTERNS,)
-        return self.pattern(quiet if self.chance(0.6) else loud, *kinds, contrast=0.3)
+        if self.chance(0.42):
+            return self.plain(kinds)
+        quiet = "plain clouded speckled brushed woven paneled"
+        names = quiet if self.chance(0.6) else " ".join(textures.PATTERNS)
+        return self.pattern(names, kinds, contrast=0.3)
 
     def wood(self) -> int:
         """Wood, bare or stained."""
@@ -139,23 +148,30 @@ class Maker:
 
     def metal(self) -> int:
         """Metal, brushed or smooth."""
-        return self.pattern("brushed", "metal") if self.chance(0.5) else self.plain("metal", "dark")
+        return self.pattern("brushed", "metal") if self.chance(0.5) else self.plain("metal dark")
 
-    def cloth(self, *kinds: str) -> int:
+    def cloth(self, kinds: str = "any") -> int:
         """Cloth: woven, knitted, striped, printed."""
-        names = ("woven", "woven", "knitted", "striped", "checked", "dotted", "flowered", "plain", "spotted")
-        return self.pattern(names, *kinds, contrast=0.4, repeats=self.u(1.5, 4))
+        names = "woven woven knitted striped checked dotted flowered plain spotted"
+        return self.pattern(names, kinds, contrast=0.4, repeats=self.u(1.5, 4))
 
-    def fur(self, *kinds: str) -> int:
+    def fur(self, kinds: str = "fur fur fur pastel toy") -> int:
         """Fur or plush, of one colour or in patches."""
-        name = self.pick("furry", "furry", "speckled", "plain", "spotted")
-        return self.pattern(name, *(kinds or ("fur", "fur", "fur", "pastel", "toy")), contrast=0.35, repeats=self.u(1, 2.5))
+        names = "furry furry speckled plain spotted"
+        return self.pattern(names, kinds, contrast=0.35, repeats=self.u(1, 2.5))
 
     def inks(self, count: int = 3) -> list[np.ndarray]:
         """Colours of a print."""
-        return [self.color("toy", "toy", "dark", "white", "any") for _ in range(count)]
+        return [self.color("toy toy dark white any") for _ in range(count)]
 
-    def printed(self, kind: str, ground: np.ndarray, mapping: str = "fit", inks: list[np.ndarray] | None = None, sides: bool = False) -> int:
+    def printed(
+        self,
+        kind: str,
+        ground: np.ndarray,
+        mapping: str = "fit",
+        inks: list[np.ndarray] | None = None,
+        sides: bool = False,
+    ) -> int:
         """A look of printed matter.
 
         Args:
@@ -163,13 +179,19 @@ class Maker:
             ground: colour of the paper.
             mapping: see ``Look``.
             inks: colours; None: drawn.
-            sides: whether what does not look to +z or -z is of the ground's colour.
+            sides: whether what does not look to +z is of the ground's colour.
         """
-        picture = material(textures.package(self.rng, ground, inks or self.inks(), kind))
-        if not sides:
-            return self.add(Look([picture], mapping))
+        # What goes once around is four times as wide as high.
+        height = textures.PRINT * 3 // 8 if mapping == "round" else textures.PRINT
+        pixels = textures.package(
+            self.rng, ground, inks or self.inks(), kind, textures.PRINT, height
+        )
+        return self.faced(pixels, ground) if sides else self.add(Look([material(pixels)], mapping))
+
+    def faced(self, pixels: np.ndarray, ground: np.ndarray) -> int:
+        """A look with a picture on what looks to +z, once over it, and one colour elsewhere."""
         bare = plain_material(ground)
-        return self.add(Look([bare, bare, bare, bare, picture, bare], mapping))
+        return self.add(Look([bare, bare, bare, bare, material(pixels), bare], "fit"))
 
     def stamp(self, solid: Manifold, look: int) -> Manifold:
         """The solid with its skin where it is now, all of it of one look."""
@@ -177,7 +199,9 @@ class Maker:
         vertices = np.asarray(mesh.vert_properties)[:, :3]
         return self.stamped(vertices, np.asarray(mesh.tri_verts), np.zeros(1), (look,))
 
-    def stamped(self, vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray, looks: Sequence[int]) -> Manifold:
+    def stamped(
+        self, vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray, looks: Sequence[int]
+    ) -> Manifold:
         """A solid of arrays, with its skin where it is.
 
         Args:
@@ -216,10 +240,53 @@ class Maker:
             if sound.is_empty():
                 return sound
             swapped = faces[:, ::-1]
-            probe = np.einsum("fk,fk->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
+            probe = np.einsum(
+                "fk,fk->",
+                vertices[faces[:, 0]],
+                np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]),
+            )
             return self.stamped(vertices, faces if probe > 0 else swapped, of_face, looks)
 
         return blend.solid(stamp)
+
+
+class Parts(list[Manifold]):
+    """Stamped parts of an object.
+
+    Args:
+        m: source of their looks.
+    """
+
+    def __init__(self, m: Maker) -> None:
+        super().__init__()
+        self.m = m
+
+    def add(
+        self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
+    ) -> None:
+        """Adds a solid of one look.
+
+        Args:
+            solid: about the origin.
+            look: its number.
+            turn: degrees about x, then y, then z.
+            at: place of its origin.
+        """
+        self.append(self._stamped(solid, look, turn, at))
+
+    def pair(
+        self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
+    ) -> None:
+        """Adds a solid and its mirror image on the other side of x = 0, see ``add``."""
+        self.append(both(self._stamped(solid, look, turn, at)))
+
+    def _stamped(self, solid: Manifold, look: int, turn: ArrayLike, at: ArrayLike) -> Manifold:
+        turned = solid.rotate(np.asarray(turn, float).tolist())
+        return self.m.stamp(turned.translate(np.asarray(at, float).tolist()), look)
+
+    def turned(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> list[Manifold]:
+        """All of them as one, turned about x, then y, then z by degrees."""
+        return [joined(self).rotate([x, y, z])]
 
 
 def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh | None:
@@ -238,24 +305,20 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     mesh = whole.calculate_normals(0, SHARP).to_mesh()
     points = np.asarray(mesh.vert_properties)
     corners = np.asarray(mesh.tri_verts).astype(np.int64)
-    number = np.repeat(np.asarray(mesh.run_original_id), np.diff(mesh.run_index) // 3).astype(np.int64)
+    number = np.repeat(np.asarray(mesh.run_original_id), np.diff(mesh.run_index) // 3).astype(
+        np.int64
+    )
     same = np.arange(len(points))
     same[np.asarray(mesh.merge_from_vert, np.int64)] = np.asarray(mesh.merge_to_vert, np.int64)
     used, faces = np.unique(same[corners], return_inverse=True)
     vertices = points[used, :3].astype(np.float64)
     faces = faces.reshape(-1, 3)
-    smooth = points[corners, 3:6]
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    flat = np.cross(b - a, c - a)
-    length = np.linalg.norm(flat, axis=1, keepdims=True)
-    flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])[:, None]
-    # Where a cut left slivers a vertex may have the normal of another side.
-    normals = np.where((smooth * flat).sum(2, keepdims=True) > CREASE, smooth, flat)
+    normals = _normals(points[:, 3:6], same, corners, vertices[faces])
     uvs, ids, materials = _mapped(points[corners, 6:9], number, looks)
     return TexturedMesh(
         vertices=vertices,
         faces=faces,
-        normals=normals.astype(np.float32),
+        normals=normals,
         uvs=uvs,
         colors=np.full((len(faces), 3, 4), 255, np.uint8),
         material_ids=ids,
@@ -263,7 +326,38 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     )
 
 
-def _mapped(skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarray, list[Material]]:
+def _normals(
+    rough: np.ndarray, same: np.ndarray, corners: np.ndarray, places: np.ndarray
+) -> np.ndarray:
+    """Unit normals ``[F, 3, 3]`` of corners: means over the faces of a smooth patch, by their area.
+
+    So a flat face beside a rounded edge stays flat, and slivers that a cut left have no say.
+
+    Args:
+        rough: ``[V, 3]`` normals which are equal where a vertex's faces belong to one patch.
+        same: ``[V]`` the first of the vertices at one place.
+        corners: ``[F, 3]`` vertices of faces.
+        places: ``[F, 3, 3]`` where these are.
+    """
+    steps = np.rint(500 * rough).astype(np.int64) + 512
+    key = ((same * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
+    groups, group = np.unique(key, return_inverse=True)
+    group = group[corners]
+    across = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+    total = np.stack(
+        [np.bincount(group.ravel(), np.repeat(across[:, k], 3), len(groups)) for k in range(3)], 1
+    )
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    flat = np.where(size > 0, across / np.maximum(size, 1e-300), [0.0, 1.0, 0.0])[:, None]
+    smooth = total[group]
+    agree = (smooth * flat).sum(2, keepdims=True) > CREASE
+    return np.where(agree, smooth, flat).astype(np.float32)
+
+
+def _mapped(
+    skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]
+) -> tuple[np.ndarray, np.ndarray, list[Material]]:
     """UVs ``[F, 3, 2]``, materials' numbers ``[F]`` and materials of faces.
 
     Args:
@@ -291,7 +385,9 @@ def _mapped(skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]) -> tupl
             continue
         size = np.maximum(look.high - look.low, 1e-6)
         if look.mapping == "fit":
-            share = (uv[mine] - look.low[_ACROSS[axis[mine]]][:, None]) / size[_ACROSS[axis[mine]]][:, None]
+            share = (uv[mine] - look.low[_ACROSS[axis[mine]]][:, None]) / size[_ACROSS[axis[mine]]][
+                :, None
+            ]
             s = signs[mine][:, None]
             uvs[mine] = np.where(s > 0, share, 1 - share)
             continue

@@ -12,10 +12,12 @@ from functools import lru_cache
 
 import numpy as np
 from manifold3d import CrossSection, Error, Manifold, Mesh, OpType
+from numpy.typing import ArrayLike
+from scipy.ndimage import map_coordinates
 from skimage.measure import marching_cubes
 
-Points = np.ndarray | Sequence[Sequence[float]]
-RESOLUTION = 46  # cells along the longest side of a blended solid
+RESOLUTION = 46  # cells along the longest side of a blended solid, at most
+CELLS = 36_000  # of its bounding box, at most
 
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
@@ -48,7 +50,7 @@ def extent(solid: Manifold) -> np.ndarray:
     return np.array(solid.bounding_box()).reshape(2, 3)
 
 
-def spline(points: Points, count: int, closed: bool = False) -> np.ndarray:
+def spline(points: ArrayLike, count: int, closed: bool = False) -> np.ndarray:
     """A Catmull-Rom curve ``[count, D]`` through points ``[K, D]``."""
     p = np.asarray(points, float)
     k = len(p)
@@ -97,18 +99,19 @@ def loft(rings: np.ndarray, tips: np.ndarray | None = None, closed: bool = False
     return solid_of(points, _loft_faces(count, sides, closed))
 
 
-def lathe(profile: Points, sides: int = 32) -> Manifold:
+def lathe(profile: ArrayLike, sides: int = 32) -> Manifold:
     """A solid of revolution about y.
 
     Args:
-        profile: ``[K, 2]`` radius and height; the first and last point count as on the axis.
+        profile: ``[K, 2]`` radius and height; an end that is not on the axis is closed flat.
         sides: number of points around.
     """
     p = np.asarray(profile, float)
-    angle = np.arange(sides) * (2 * math.pi / sides)
-    r, y = p[1:-1, :1], p[1:-1, 1:]
-    rings = np.stack([r * np.sin(angle), np.repeat(y, sides, 1), r * np.cos(angle)], -1)
     tips = np.array([[0, p[0, 1], 0], [0, p[-1, 1], 0]])
+    p = p[int(p[0, 0] <= 0) : len(p) - int(p[-1, 0] <= 0)]
+    angle = np.arange(sides) * (2 * math.pi / sides)
+    r, y = p[:, :1], p[:, 1:]
+    rings = np.stack([r * np.sin(angle), np.repeat(y, sides, 1), r * np.cos(angle)], -1)
     return loft(rings, tips)
 
 
@@ -141,7 +144,7 @@ def inset(outline: np.ndarray, distance: float) -> np.ndarray:
     )
 
 
-def slab(outline: np.ndarray, thickness: float, bevel: float = 0.0, steps: int = 3) -> Manifold:
+def slab(outline: ArrayLike, thickness: float, bevel: float = 0.0, steps: int = 3) -> Manifold:
     """An outline in x and y, thick along z, with rounded edges.
 
     Args:
@@ -150,6 +153,7 @@ def slab(outline: np.ndarray, thickness: float, bevel: float = 0.0, steps: int =
         bevel: radius of the edges.
         steps: rings of a rounded edge.
     """
+    points = np.asarray(outline, float)
     half = thickness / 2
     bevel = min(bevel, 0.99 * half)
     if bevel <= 0:
@@ -158,7 +162,9 @@ def slab(outline: np.ndarray, thickness: float, bevel: float = 0.0, steps: int =
         angle = np.linspace(0, math.pi / 2, steps + 1)
         below = [(bevel * (1 - math.sin(a)), -half + bevel * (1 - math.cos(a))) for a in angle]
         layers = [*below, *[(d, -z) for d, z in reversed(below)]]
-    rings = np.stack([np.column_stack([inset(outline, d), np.full(len(outline), z)]) for d, z in layers])
+    rings = np.stack(
+        [np.column_stack([inset(points, d), np.full(len(points), z)]) for d, z in layers]
+    )
     return loft(rings)
 
 
@@ -179,19 +185,20 @@ def rod(radius: float, height: float, sides: int = 24, bevel: float = 0.0) -> Ma
     """A cylinder along y that stands on y = 0."""
     b = min(bevel, 0.9 * radius, 0.45 * height)
     if b <= 0:
-        return lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sides)
-    edge = [(radius - b * (1 - math.sin(a)), b * (1 - math.cos(a))) for a in (0, 0.5, 1.05, math.pi / 2)]
+        return lathe([(radius, 0), (radius, height)], sides)
+    edge = [
+        (radius - b * (1 - math.sin(a)), b * (1 - math.cos(a))) for a in (0, 0.5, 1.05, math.pi / 2)
+    ]
     top = [(r, height - y) for r, y in reversed(edge)]
     return lathe([(0, 0), *edge, *top, (0, height)], sides)
 
 
-def ball(radii: float | Sequence[float], segments: int = 32) -> Manifold:
+def ball(radii: ArrayLike, segments: int = 32) -> Manifold:
     """An ellipsoid about the origin."""
-    size = [radii] * 3 if isinstance(radii, (int, float)) else list(radii)
-    return Manifold.sphere(1.0, segments).scale(size)
+    return Manifold.sphere(1.0, segments).scale(np.broadcast_to(radii, 3).tolist())
 
 
-def superquadric(radii: Sequence[float], up: float, around: float, segments: int = 32) -> Manifold:
+def superquadric(radii: ArrayLike, up: float, around: float, segments: int = 32) -> Manifold:
     """A superquadric about the origin.
 
     Args:
@@ -207,10 +214,12 @@ def superquadric(radii: Sequence[float], up: float, around: float, segments: int
         r = (flat ** (around / up) + a[:, 1] ** (2 / up)) ** (-up / 2)
         return p * r[:, None]
 
-    return Manifold.sphere(1.0, segments).warp_batch(shape).scale(list(radii))
+    return Manifold.sphere(1.0, segments).warp_batch(shape).scale(np.asarray(radii, float).tolist())
 
 
-def ring(radius: float, thick: float, sides: int = 32, around: int = 12, flat: float = 1.0) -> Manifold:
+def ring(
+    radius: float, thick: float, sides: int = 32, around: int = 12, flat: float = 1.0
+) -> Manifold:
     """A torus about y; ``flat`` stretches its section along y."""
     angle = np.arange(sides) * (2 * math.pi / sides)
     turn = np.arange(around) * (2 * math.pi / around)
@@ -238,8 +247,8 @@ def frames(path: np.ndarray, closed: bool = False) -> tuple[np.ndarray, np.ndarr
 
 
 def tube(
-    path: Points,
-    radii: float | Sequence[float] | np.ndarray,
+    path: ArrayLike,
+    radii: ArrayLike,
     sides: int | np.ndarray = 14,
     count: int = 24,
     closed: bool = False,
@@ -260,7 +269,9 @@ def tube(
     line = spline(path, count, closed)
     given = np.atleast_1d(np.asarray(radii, float))
     if closed:
-        r = np.interp(np.arange(count) / count, np.linspace(0, 1, len(given) + 1), [*given, given[0]])
+        r = np.interp(
+            np.arange(count) / count, np.linspace(0, 1, len(given) + 1), [*given, given[0]]
+        )
     else:
         r = spline(given[:, None], count)[:, 0] if len(given) > 1 else np.full(count, given[0])
     r = np.maximum(r, 1e-4)
@@ -269,7 +280,10 @@ def tube(
     t, u, v = frames(line, closed)
     if not closed and round_ends:
         angles = np.radians([75, 50, 25])
-        head, tail = line[0] - np.outer(np.sin(angles) * r[0], t[0]), line[-1] + np.outer(np.sin(angles[::-1]) * r[-1], t[-1])
+        head, tail = (
+            line[0] - np.outer(np.sin(angles) * r[0], t[0]),
+            line[-1] + np.outer(np.sin(angles[::-1]) * r[-1], t[-1]),
+        )
         tips = np.stack([line[0] - r[0] * t[0], line[-1] + r[-1] * t[-1]])
         line = np.concatenate([head, line, tail])
         r = np.concatenate([np.cos(angles) * r[0], r, np.cos(angles[::-1]) * r[-1]])
@@ -303,7 +317,7 @@ class Blend:
             if mirrored[0][0] > low[0] + 1e-6 or mirrored[1][0] < high[0] - 1e-6:
                 self._items.append((*mirrored, look, lambda x, y, z: distance(-x, y, z)))
 
-    def limb(self, path: Points, radii: Sequence[float] | float, look: int = 0) -> None:
+    def limb(self, path: ArrayLike, radii: ArrayLike, look: int = 0) -> None:
         """Adds round cones through points ``[K, 3]`` with a radius at each."""
         p = np.asarray(path, np.float32)
         r = np.broadcast_to(np.asarray(radii, np.float32), len(p))
@@ -312,7 +326,7 @@ class Blend:
                 np.minimum(a - ra, b - rb), np.maximum(a + ra, b + rb), look, _cone(a, b, ra, rb)
             )
 
-    def egg(self, center: Sequence[float], radii: Sequence[float], look: int = 0, tilt: float = 0.0) -> None:
+    def egg(self, center: ArrayLike, radii: ArrayLike, look: int = 0, tilt: float = 0.0) -> None:
         """Adds an ellipsoid, turned about x by ``tilt`` radians."""
         c, r = np.asarray(center, np.float32), np.asarray(radii, np.float32)
         s, k = math.sin(tilt), math.cos(tilt)
@@ -321,7 +335,11 @@ class Blend:
         )
         self._add(c - reach, c + reach, look, _egg(c, r, s, k))
 
-    def solid(self, stamp: Callable[[np.ndarray, np.ndarray, np.ndarray], Manifold], cells: int = RESOLUTION) -> Manifold:
+    def solid(
+        self,
+        stamp: Callable[[np.ndarray, np.ndarray, np.ndarray], Manifold],
+        cells: int = RESOLUTION,
+    ) -> Manifold:
         """The solid.
 
         Args:
@@ -331,13 +349,15 @@ class Blend:
         lows = np.stack([item[0] for item in self._items])
         highs = np.stack([item[1] for item in self._items])
         low, high = lows.min(0), highs.max(0)
-        step = float((high - low).max()) / cells
+        step = max(float((high - low).max()) / cells, float((high - low).prod() / CELLS) ** (1 / 3))
         margin = self.soft / 2 + 2 * step
         low = low - margin + 0.37e-3 * step  # so that no surface lies right on the grid
         shape = np.ceil((high + margin - low) / step).astype(int) + 1
         far = np.float32(2 * margin)
         field = np.full(shape, far, np.float32)
-        nearest, owner = np.full(shape, far, np.float32), np.zeros(shape, np.int16)
+        nearest = [
+            np.full(shape, far, np.float32) for _ in range(1 + max(i[2] for i in self._items))
+        ]
         axes = [low[i] + step * np.arange(shape[i], dtype=np.float32) for i in range(3)]
         k = np.float32(self.soft)
         for a, b, look, distance in self._items:
@@ -351,18 +371,51 @@ class Blend:
             )
             there = field[part]
             h = np.maximum(k - np.abs(there - d), 0)
-            closer = d < nearest[part]
-            owner[part][closer] = look
-            np.minimum(nearest[part], d, out=nearest[part])
+            np.minimum(nearest[look][part], d, out=nearest[look][part])
             field[part] = np.minimum(there, d) - h * h / (4 * k)
         np.minimum(field, far, out=field)
         for axis in range(3):  # nothing reaches the border of the grid
             edge = np.moveaxis(field, axis, 0)
             edge[0] = edge[-1] = far
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=False)
-        middle = np.rint(vertices[faces].mean(1)).astype(int)
-        looks = owner[middle[:, 0], middle[:, 1], middle[:, 2]]
+        looks = np.zeros(len(faces), int)
+        for look in range(1, len(nearest)):
+            others = np.minimum.reduce(nearest[:look] + nearest[look + 1 :])
+            border = map_coordinates(nearest[look] - others, vertices.T, order=1)
+            vertices, faces, looks = _split(vertices, faces, looks, border, look)
         return stamp(vertices * step + low, faces, looks)
+
+
+def _split(
+    vertices: np.ndarray, faces: np.ndarray, looks: np.ndarray, border: np.ndarray, look: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A mesh cut along a line; what lies where ``border [V]`` is below 0 gets another look."""
+    border = np.where(np.abs(border) < 1e-4, 1e-4, border)
+    below = border[faces] < 0
+    count = below.sum(1)
+    whole, crossed = (count == 0) | (count == 3), (count == 1) | (count == 2)
+    kept_looks = np.where(count[whole] == 3, look, looks[whole])
+    if not crossed.any():
+        return vertices, faces, kept_looks
+    # Turned so that the corner that is alone on its side comes first.
+    alone = np.where(count[crossed] == 1, below[crossed].argmax(1), (~below[crossed]).argmax(1))
+    order = (alone[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(faces[crossed], order, 1).T
+    pairs = np.sort(np.stack([np.concatenate([a, a]), np.concatenate([b, c])], 1), 1)
+    edges, where = np.unique(pairs[:, 0] * len(vertices) + pairs[:, 1], return_inverse=True)
+    first, second = np.divmod(edges, len(vertices))
+    t = (border[first] / (border[first] - border[second]))[:, None]
+    added = vertices[first] * (1 - t) + vertices[second] * t
+    ab, ac = (len(vertices) + where).reshape(2, -1)
+    tip, rest = np.stack([a, ab, ac], 1), np.stack([ab, b, c, ab, c, ac], 1).reshape(-1, 3)
+    single = count[crossed] == 1
+    old = looks[crossed]
+    made = [np.where(single, look, old), np.repeat(np.where(single, old, look), 2)]
+    return (
+        np.concatenate([vertices, added.astype(vertices.dtype)]),
+        np.concatenate([faces[whole], tip, rest]),
+        np.concatenate([kept_looks, *made]),
+    )
 
 
 def _cone(a: np.ndarray, b: np.ndarray, ra: float, rb: float) -> Callable:
@@ -380,11 +433,11 @@ def _cone(a: np.ndarray, b: np.ndarray, ra: float, rb: float) -> Callable:
 
 def _egg(c: np.ndarray, r: np.ndarray, s: float, k: float) -> Callable:
     least = np.float32(r.min())
-    s, k = np.float32(s), np.float32(k)
 
     def distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         px, py, pz = x - c[0], y - c[1], z - c[2]
-        qy, qz = k * py + s * pz, k * pz - s * py
+        sine, cosine = np.float32(s), np.float32(k)
+        qy, qz = cosine * py + sine * pz, cosine * pz - sine * py
         inner = np.sqrt((px / r[0]) ** 2 + (qy / r[1]) ** 2 + (qz / r[2]) ** 2)
         slope = np.sqrt((px / r[0] ** 2) ** 2 + (qy / r[1] ** 2) ** 2 + (qz / r[2] ** 2) ** 2)
         return np.maximum(inner * (inner - 1) / np.maximum(slope, np.float32(1e-6)), -least)
@@ -433,7 +486,9 @@ def twist(solid: Manifold, angle: float) -> Manifold:
     return solid.warp_batch(move)
 
 
-def ripple(solid: Manifold, rng: np.random.Generator, height: float, length: float, mirrored: bool) -> Manifold:
+def ripple(
+    solid: Manifold, rng: np.random.Generator, height: float, length: float, mirrored: bool
+) -> Manifold:
     """A solid displaced by a smooth random field.
 
     Args:

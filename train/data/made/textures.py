@@ -21,42 +21,40 @@ _U, _V = np.meshgrid(*[((np.arange(SIDE) + 0.5) / SIDE).astype(np.float32)] * 2)
 _LETTERS = "AAABCDEEEEFGHIIJKLMNNOOPQRSSTTUVWXYZ"
 
 
-def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
-    """Draws a colour ``[3]`` of a kind.
+# Hues of toys; few things are bright green.
+_HUES = (
+    *(0.0, 0.0, 0.02, 0.07, 0.12, 0.14, 0.15, 0.25),
+    *(0.36, 0.45, 0.55, 0.58, 0.6, 0.62, 0.78, 0.92),
+)
+# Ranges of hue, saturation and value.
+_COLORS = {
+    "pastel": ((0.0, 1.0), (0.12, 0.45), (0.75, 0.97)),
+    "white": ((0.05, 0.2), (0.0, 0.1), (0.82, 0.98)),
+    "wood": ((0.05, 0.11), (0.3, 0.7), (0.3, 0.88)),
+    "metal": ((0.5, 0.65), (0.0, 0.08), (0.35, 0.85)),
+    "skin": ((0.04, 0.09), (0.25, 0.55), (0.35, 0.96)),
+    "fur": ((0.04, 0.12), (0.0, 0.65), (0.12, 0.95)),
+    "earth": ((0.02, 0.2), (0.2, 0.7), (0.2, 0.75)),
+    "leaf": ((0.2, 0.4), (0.3, 0.7), (0.2, 0.6)),
+    "leather": ((0.02, 0.1), (0.3, 0.8), (0.1, 0.6)),
+}
 
-    Args:
-        rng: source of chance.
-        kind: any, toy, pastel, dark, white, wood, metal, skin, fur, earth, leaf or leather.
-    """
+
+def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
+    """Draws a colour ``[3]`` of a kind: one of ``_COLORS``, any, toy, dark or wide."""
     if kind == "any":
         kinds = ("toy", "toy", "pastel", "dark", "dark", "white", "white", "earth", "metal", "wide")
         kind = kinds[rng.integers(len(kinds))]
-    if kind == "toy":
-        hues = (0.0, 0.02, 0.07, 0.13, 0.15, 0.33, 0.4, 0.52, 0.58, 0.62, 0.78, 0.9)
-        hue = hues[rng.integers(len(hues))] + rng.normal(0, 0.012)
-        hsv = hue % 1, rng.uniform(0.7, 1), rng.uniform(0.55, 0.98)
-    elif kind == "pastel":
-        hsv = rng.random(), rng.uniform(0.12, 0.45), rng.uniform(0.75, 0.97)
-    elif kind == "dark":
-        hsv = rng.random(), rng.uniform(0, 0.5) * (rng.random() < 0.6), rng.uniform(0.05, 0.3)
-    elif kind == "white":
-        hsv = rng.uniform(0.05, 0.2), rng.uniform(0, 0.1), rng.uniform(0.82, 0.98)
-    elif kind == "wood":
-        hsv = rng.uniform(0.05, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.88)
-    elif kind == "metal":
-        hsv = rng.uniform(0.5, 0.65), rng.uniform(0, 0.08), rng.uniform(0.35, 0.85)
-    elif kind == "skin":
-        hsv = rng.uniform(0.04, 0.09), rng.uniform(0.25, 0.55), rng.uniform(0.35, 0.96)
-    elif kind == "fur":
-        hsv = rng.uniform(0.04, 0.12), rng.uniform(0.0, 0.65), rng.uniform(0.12, 0.95)
-    elif kind == "earth":
-        hsv = rng.uniform(0.02, 0.2), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.75)
-    elif kind == "leaf":
-        hsv = rng.uniform(0.2, 0.42), rng.uniform(0.3, 0.8), rng.uniform(0.2, 0.7)
-    elif kind == "leather":
-        hsv = rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.8), rng.uniform(0.1, 0.6)
-    else:
+    if kind == "wide":
         return rng.uniform(0.05, 0.95, 3)
+    if kind == "toy":
+        hue = _HUES[rng.integers(len(_HUES))] + rng.normal(0, 0.015)
+        light = rng.uniform(0.45, 0.95) * (0.8 if 0.2 < hue < 0.5 else 1)
+        hsv = (hue % 1, rng.uniform(0.55, 0.97), light)
+    elif kind == "dark":
+        hsv = (rng.random(), rng.uniform(0, 0.5) * (rng.random() < 0.6), rng.uniform(0.05, 0.3))
+    else:
+        hsv = tuple(rng.uniform(low, high) for low, high in _COLORS[kind])
     return np.array(colorsys.hsv_to_rgb(*map(float, hsv)))
 
 
@@ -66,7 +64,9 @@ def mixed(mix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.rint(255 * np.clip(first * (1 - m) + second * m, 0, 1)).astype(np.uint8)
 
 
-def noise(rng: np.random.Generator, levels: tuple[int, int] = (2, 6), stretch: int = 1, side: int = SIDE) -> np.ndarray:
+def noise(
+    rng: np.random.Generator, levels: tuple[int, int] = (2, 6), stretch: int = 1, side: int = SIDE
+) -> np.ndarray:
     """Smooth noise ``[side, side]`` from 0 to 1 without a seam.
 
     Args:
@@ -119,7 +119,9 @@ def clouded(rng: np.random.Generator) -> np.ndarray:
 def grained(rng: np.random.Generator) -> np.ndarray:
     """The grain of wood."""
     rings = noise(rng, (1, 4), 4)
-    return 0.6 * (0.5 + 0.5 * np.sin(2 * math.pi * (rings * rng.uniform(3, 9)))) + 0.4 * noise(rng, (4, 7), 16)
+    return 0.6 * (0.5 + 0.5 * np.sin(2 * math.pi * (rings * rng.uniform(3, 9)))) + 0.4 * noise(
+        rng, (4, 7), 16
+    )
 
 
 def furry(rng: np.random.Generator) -> np.ndarray:
@@ -183,7 +185,7 @@ def speckled(rng: np.random.Generator) -> np.ndarray:
 def flowered(rng: np.random.Generator) -> np.ndarray:
     """Flowers or leaves strewn about."""
     out = np.zeros_like(_U)
-    for _ in range(rng.integers(4, 12)):
+    for _ in range(rng.integers(3, 9)):
         x = (_U - rng.random() + 0.5) % 1 - 0.5
         y = (_V - rng.random() + 0.5) % 1 - 0.5
         r, a = np.hypot(x, y), np.arctan2(y, x) + rng.uniform(0, 6)
@@ -222,7 +224,9 @@ def _ink(value: np.ndarray) -> tuple[int, ...]:
 
 
 def _word(rng: np.random.Generator, low: int = 2, high: int = 9) -> str:
-    letters = "".join(_LETTERS[i] for i in rng.integers(len(_LETTERS), size=rng.integers(low, high)))
+    letters = "".join(
+        _LETTERS[i] for i in rng.integers(len(_LETTERS), size=rng.integers(low, high))
+    )
     return letters if rng.random() < 0.6 else letters.capitalize()
 
 
@@ -236,7 +240,9 @@ class Print:
         height: pixels.
     """
 
-    def __init__(self, rng: np.random.Generator, ground: np.ndarray, width: int = PRINT, height: int = PRINT) -> None:
+    def __init__(
+        self, rng: np.random.Generator, ground: np.ndarray, width: int = PRINT, height: int = PRINT
+    ) -> None:
         self.rng, self.width, self.height = rng, width, height
         self.image = Image.new("RGB", (width, height), _ink(ground))
         self.draw = ImageDraw.Draw(self.image)
@@ -248,17 +254,33 @@ class Print:
     def _place(self, box: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
         w, h = self.width, self.height
         left, top, right, bottom = box
-        return int(left * w), int(top * h), max(int(right * w), int(left * w) + 1), max(int(bottom * h), int(top * h) + 1)
+        return (
+            int(left * w),
+            int(top * h),
+            max(int(right * w), int(left * w) + 1),
+            max(int(bottom * h), int(top * h) + 1),
+        )
 
-    def word(self, box: tuple[float, float, float, float], ink: np.ndarray, text: str | None = None) -> None:
+    def word(
+        self, box: tuple[float, float, float, float], ink: np.ndarray, text: str | None = None
+    ) -> None:
         """A word that fills a box of shares (left, top, right, bottom) of the sheet."""
         x0, y0, x1, y1 = self._place(box)
         text = text or _word(self.rng)
         size = max(6, min(int(0.95 * (y1 - y0)), int(1.6 * (x1 - x0) / len(text))))
-        kwargs = {"stroke_width": size // 18} if self.rng.random() < 0.5 else {}
-        self.draw.text(((x0 + x1) / 2, (y0 + y1) / 2), text, _ink(ink), _font(size), anchor="mm", **kwargs)
+        bold = size // 18 if self.rng.random() < 0.5 else 0
+        self.draw.text(
+            ((x0 + x1) / 2, (y0 + y1) / 2),
+            text,
+            _ink(ink),
+            _font(size),
+            anchor="mm",
+            stroke_width=bold,
+        )
 
-    def lines(self, box: tuple[float, float, float, float], ink: np.ndarray, height: float = 0.03) -> None:
+    def lines(
+        self, box: tuple[float, float, float, float], ink: np.ndarray, height: float = 0.03
+    ) -> None:
         """Lines of marks as small print has them."""
         x0, y0, x1, y1 = self._place(box)
         step = max(3, int(height * self.height))
@@ -270,7 +292,9 @@ class Print:
                 self.draw.rectangle((x, y, min(x + long, end), y + step // 2 - 1), _ink(ink))
                 x += long + step // 3 + 1
 
-    def mark(self, center: tuple[float, float], radius: float, ink: np.ndarray, second: np.ndarray) -> None:
+    def mark(
+        self, center: tuple[float, float], radius: float, ink: np.ndarray, second: np.ndarray
+    ) -> None:
         """A logo: a disc, a star, a badge or a flower."""
         rng = self.rng
         x, y = center[0] * self.width, center[1] * self.height
@@ -280,7 +304,13 @@ class Print:
             self.draw.ellipse((x - r, y - r, x + r, y + r), _ink(ink))
             self.draw.ellipse((x - r / 2, y - r / 2, x + r / 2, y + r / 2), _ink(second))
         elif kind == 1:
-            self.draw.rounded_rectangle((x - r, y - 0.6 * r, x + r, y + 0.6 * r), 0.3 * r, _ink(ink), _ink(second), max(1, int(r / 8)))
+            self.draw.rounded_rectangle(
+                (x - r, y - 0.6 * r, x + r, y + 0.6 * r),
+                0.3 * r,
+                _ink(ink),
+                _ink(second),
+                max(1, int(r / 8)),
+            )
         else:
             corners = int(rng.integers(3, 13))
             angle = np.arange(2 * corners) * math.pi / corners + rng.uniform(0, 6)
@@ -318,13 +348,24 @@ class Print:
         """A field with a curved or slanted edge, over part of the sheet."""
         rng = self.rng
         x = np.linspace(0, 1, 24)
-        y = rng.uniform(0.2, 0.8) + rng.uniform(-0.25, 0.25) * (x - 0.5) + rng.uniform(0, 0.15) * np.sin(x * rng.uniform(1, 7) + rng.uniform(0, 6))
+        y = (
+            rng.uniform(0.2, 0.8)
+            + rng.uniform(-0.25, 0.25) * (x - 0.5)
+            + rng.uniform(0, 0.15) * np.sin(x * rng.uniform(1, 7) + rng.uniform(0, 6))
+        )
         edge = list(zip((x * self.width).tolist(), (y * self.height).tolist()))
         side = self.height if rng.random() < 0.6 else 0
         self.draw.polygon([*edge, (self.width, side), (0, side)], _ink(ink))
 
 
-def package(rng: np.random.Generator, ground: np.ndarray, inks: list[np.ndarray], kind: str, width: int = PRINT, height: int = PRINT) -> np.ndarray:
+def package(
+    rng: np.random.Generator,
+    ground: np.ndarray,
+    inks: list[np.ndarray],
+    kind: str,
+    width: int = PRINT,
+    height: int = PRINT,
+) -> np.ndarray:
     """A printed side of a package.
 
     Args:
@@ -346,7 +387,9 @@ def package(rng: np.random.Generator, ground: np.ndarray, inks: list[np.ndarray]
             left, top = rng.uniform(0, 0.4), rng.uniform(0.2, 0.5)
             sheet.photo((left, top, rng.uniform(left + 0.35, 1), rng.uniform(top + 0.3, 1)))
         for _ in range(rng.integers(0, 3)):
-            sheet.mark((rng.uniform(0.1, 0.9), rng.uniform(0.1, 0.9)), rng.uniform(0.06, 0.2), ink(), ink())
+            sheet.mark(
+                (rng.uniform(0.1, 0.9), rng.uniform(0.1, 0.9)), rng.uniform(0.06, 0.2), ink(), ink()
+            )
         top = rng.choice([0.04, 0.08, 0.3, 0.62])
         if rng.random() < 0.4:
             sheet.band((0, top - 0.02, 1, top + 0.24), ink())
@@ -375,7 +418,9 @@ def package(rng: np.random.Generator, ground: np.ndarray, inks: list[np.ndarray]
             x, y = rng.uniform(0.1, 0.6), 0.78
             sheet.band((x, y, x + 0.3, 0.95), np.ones(3))
             for bar in np.flatnonzero(rng.random(20) < 0.5):
-                sheet.band((x + 0.02 + 0.013 * bar, y + 0.02, x + 0.028 + 0.013 * bar, 0.93), np.zeros(3))
+                sheet.band(
+                    (x + 0.02 + 0.013 * bar, y + 0.02, x + 0.028 + 0.013 * bar, 0.93), np.zeros(3)
+                )
         elif rng.random() < 0.5:
             sheet.photo((0.1, 0.6, 0.9, 0.95))
     return sheet.pixels()
