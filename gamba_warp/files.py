@@ -346,11 +346,11 @@ def sha256(path: str | Path) -> str:
 
 
 def check_sha256(path: str | Path, want: str) -> None:
-    """Compares a file's SHA-256, or as many of its leading digits as ``want`` has.
+    """Compares a file's SHA-256 with ``want``, 64 hexadecimal digits.
 
     Raises:
         UserError: the file cannot be read or has another content.
     """
     got = sha256(path)
-    if not got.startswith(want):
-        raise UserError(f"{path}: SHA-256 is {got[: len(want)]}, expected {want}")
+    if got != want:
+        raise UserError(f"{path}: SHA-256 is {got}, expected {want}")

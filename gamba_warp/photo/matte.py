@@ -106,6 +106,8 @@ def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Pa
     """
     if address is None and (path := models.kept()) is not None:
         return path
+    if address is not None and not address.startswith("https://"):
+        raise UserError(f"--matte-model {address}: only addresses of https are fetched")
     model = models.PUBLISHED[0] if address is None else models.published(address)
     if model is None:
         names = ", ".join(f"{known.name}.onnx" for known in models.PUBLISHED)

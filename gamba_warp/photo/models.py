@@ -13,7 +13,7 @@ import os
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 from PIL import Image
@@ -34,13 +34,13 @@ class Published(NamedTuple):
 
     Attributes:
         name: of the model; its file is ``NAME.onnx``.
-        md5: of the file, as rembg states it.
+        sha256: of the file whose MD5 sum rembg states.
         megabytes: size of the file.
         licence: of the weights.
     """
 
     name: str
-    md5: str
+    sha256: str
     megabytes: int
     licence: str
 
@@ -52,10 +52,30 @@ class Published(NamedTuple):
 
 # The first is the one that is fetched; of those that are there, the first is used.
 PUBLISHED = (
-    Published("isnet-general-use", "fc16ebd8b0c10d971d3513d564d01e29", 179, "Apache 2.0"),
-    Published("u2net", "60024c5c889badc19c04ad937298a77b", 176, "Apache 2.0"),
-    Published("silueta", "55e59e0d8062d2f5d013f4725ee84782", 44, "Apache 2.0"),
-    Published("u2netp", "8e83ca70e441ab06c318d82300c84806", 5, "Apache 2.0"),
+    Published(
+        "isnet-general-use",
+        "60920e99c45464f2ba57bee2ad08c919a52bbf852739e96947fbb4358c0d964a",
+        179,
+        "Apache 2.0",
+    ),
+    Published(
+        "u2net",
+        "8d10d2f3bb75ae3b6d527c77944fc5e7dcd94b29809d47a739a7a728a912b491",
+        176,
+        "Apache 2.0",
+    ),
+    Published(
+        "silueta",
+        "75da6c8d2f8096ec743d071951be73b4a8bc7b3e51d9a6625d63644f90ffeedb",
+        44,
+        "Apache 2.0",
+    ),
+    Published(
+        "u2netp",
+        "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8",
+        5,
+        "Apache 2.0",
+    ),
 )
 
 
@@ -106,7 +126,7 @@ def fetch(model: Published, address: str) -> Path:
 
     Args:
         model: which one.
-        address: of the file; any copy will do, for its digest is compared.
+        address: of the file, https; any copy will do, for its digest is compared.
 
     Raises:
         ModuleNotFoundError: pooch is not installed.
@@ -117,11 +137,13 @@ def fetch(model: Published, address: str) -> Path:
     pooch.get_logger().setLevel("ERROR")
     bar: Any = progress_bar(total=model.megabytes * 10**6, unit="B", unit_scale=True)
     # Any: pooch's own types know no such bar, and no arguments by name.
-    downloader: Any = pooch.HTTPDownloader(progressbar=bar, timeout=_SECONDS)
+    downloader: Any = pooch.HTTPDownloader(
+        progressbar=bar, timeout=_SECONDS, hooks={"response": _stays_secure}
+    )
     try:
         found = pooch.retrieve(
             address,
-            known_hash=f"md5:{model.md5}",
+            known_hash=f"sha256:{model.sha256}",
             fname=f"{model.name}.onnx",
             path=_homes()[0] / "models" / model.name,
             downloader=downloader,
@@ -134,6 +156,14 @@ def fetch(model: Published, address: str) -> Path:
             reason = f"{urlsplit(address).hostname} cannot be reached"
         raise NotFetched(reason) from error
     return Path(found)
+
+
+def _stays_secure(response: Any, **options: Any) -> None:
+    """Refuses a redirection out of https; requests calls it before it follows one."""
+    if response.is_redirect:
+        goal = urljoin(response.url, response.headers["location"])
+        if urlsplit(goal).scheme != "https":
+            raise ValueError(f"it is redirected to {goal[:100]}, which is not https")
 
 
 def alpha_of(task: tuple[str, tuple[int, int], np.ndarray | None, int]) -> np.ndarray | None:

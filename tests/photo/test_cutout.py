@@ -1,7 +1,9 @@
 """The ways to an object, in their order; each says what it did, and its result can be mended."""
 
 import functools
-import hashlib
+import shutil
+import ssl
+import subprocess
 import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
@@ -14,6 +16,7 @@ from PIL import Image
 from gamba_warp import versions
 from gamba_warp.data.preprocess import recenter
 from gamba_warp.errors import UserError
+from gamba_warp.files import sha256
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.photo import cutout, matte, models
 from gamba_warp.photo.cutout import Ways, cut_out, fault_of
@@ -223,9 +226,25 @@ def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypat
         found = cut_out(path, ways)
         assert found.method == "grabcut" and found.how.endswith(" (no matting model).")
     ((address, digest, before),) = asked
-    assert address == models.PUBLISHED[0].address and digest.startswith("md5:")
+    assert (
+        address == models.PUBLISHED[0].address and digest == f"sha256:{models.PUBLISHED[0].sha256}"
+    )
     assert len(before) == 1 and address in before[0] and "179 MB" in before[0]
     assert len(said) == 2 and "github.com cannot be reached" in said[1]  # once, of two pictures
+
+
+class _Host(SimpleHTTPRequestHandler):
+    """Copies of files; what is asked below /plain/ is sent on to an address of http."""
+
+    def do_GET(self):
+        if not self.path.startswith("/plain/"):
+            return super().do_GET()
+        self.send_response(302)
+        self.send_header("Location", "http://127.0.0.1:9/u2netp.onnx")
+        self.end_headers()
+
+    def log_message(self, *words):
+        pass
 
 
 @pytest.fixture
@@ -233,19 +252,30 @@ def mirror(tmp_path, monkeypatch):
     """A host of one's own with copies, of which one is right; and rembg's folder, empty."""
     pytest.importorskip("onnxruntime")
     pytest.importorskip("pooch")
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl, which makes the host's certificate")
     folder = tmp_path / "mirror"
     folder.mkdir()
     (folder / "u2netp.onnx").write_bytes(matting_network(size=352))
     (folder / "silueta.onnx").write_bytes(b"another file")
-    right = hashlib.md5((folder / "u2netp.onnx").read_bytes()).hexdigest()
-    known = [m._replace(md5=right) if m.name == "u2netp" else m for m in models.PUBLISHED]
+    right = sha256(folder / "u2netp.onnx")
+    known = [m._replace(sha256=right) if m.name == "u2netp" else m for m in models.PUBLISHED]
     monkeypatch.setattr(models, "PUBLISHED", tuple(known))
     monkeypatch.setenv("U2NET_HOME", str(tmp_path / "rembg"))
     monkeypatch.setenv("GAMBA_OFFLINE", "0")
-    handler = functools.partial(SimpleHTTPRequestHandler, directory=folder)
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    names = ["-subj", "/CN=127.0.0.1", "-addext", "subjectAltName=IP:127.0.0.1", "-days", "2"]
+    kind = ["-x509", "-nodes", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
+    files = ["-keyout", str(key), "-out", str(certificate)]
+    subprocess.run(["openssl", "req", *kind, *names, *files], check=True, capture_output=True)
+    monkeypatch.setenv("REQUESTS_CA_BUNDLE", str(certificate))
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    handler = functools.partial(_Host, directory=folder)
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        server.socket = context.wrap_socket(server.socket, server_side=True)
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
+        yield f"https://127.0.0.1:{server.server_port}"
         server.shutdown()
 
 
@@ -254,17 +284,19 @@ def test_a_model_comes_from_the_address_of_a_copy(tmp_path, monkeypatch, busy, m
     ways = Ways(matte_model=f"{mirror}/u2netp.onnx?download=true", say=said.append).checked()
     assert cut_out(busy[0], ways).how == "The matting model u2netp.onnx cut the object out."
     assert len(said) == 1 and f"from {mirror}" in said[0] and models.kept() is not None
-    for name, reason in (
-        ("silueta.onnx", "hash"),  # another content
-        ("isnet-general-use.onnx", "404"),
-        ("own.onnx", "must end in one of isnet-general-use.onnx, u2net.onnx"),
+    (tmp_path / "rembg" / "models" / "u2netp" / "u2netp.onnx").unlink()
+    http = mirror.replace("https", "http")
+    for address, reason in (
+        (f"{mirror}/silueta.onnx", "hash"),  # another content
+        (f"{mirror}/isnet-general-use.onnx", "404"),
+        (f"{mirror}/own.onnx", "must end in one of isnet-general-use.onnx, u2net.onnx"),
+        (f"{http}/u2netp.onnx", "only addresses of https are fetched"),
+        (f"{mirror}/plain/u2netp.onnx", "redirected to http://127.0.0.1:9/u2netp.onnx, which is"),
     ):
         with pytest.raises(UserError, match=reason) as caught:
-            Ways(matte_model=f"{mirror}/{name}", say=said.append).checked()
-        assert "\n" not in str(caught.value) and f"--matte-model {mirror}/{name}: " in str(
-            caught.value
-        )
-    assert [path.name for path in (tmp_path / "rembg").rglob("*.*")] == ["u2netp.onnx"]
+            Ways(matte_model=address, say=said.append).checked()
+        assert "\n" not in str(caught.value) and f"--matte-model {address}: " in str(caught.value)
+    assert not list((tmp_path / "rembg").rglob("*.*"))
     monkeypatch.setenv("GAMBA_OFFLINE", "1")
     with pytest.raises(UserError, match="GAMBA_OFFLINE"):
         Ways(matte_model=f"{mirror}/u2netp.onnx").checked()

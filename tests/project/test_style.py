@@ -1,6 +1,7 @@
 """The house rules that a machine can check."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -45,3 +46,13 @@ def test_every_progress_bar_is_the_one_that_logs_do_without():
                 "trange",
             ):
                 assert path == ROOT / "gamba_warp" / "batch.py", f"{path}, line {node.lineno}"
+
+
+def test_the_continuous_integration_trusts_no_tag_and_may_only_read():
+    for path in sorted((ROOT / ".github" / "workflows").glob("*.yml")):
+        text = path.read_text()
+        actions = re.findall(r"uses: *(.*)", text)
+        assert actions and "\npermissions:\n  contents: read\n" in text, path
+        assert text.count("permissions:") == 1 and "persist-credentials: false" in text, path
+        for action in actions:
+            assert re.fullmatch(r"\S+@[0-9a-f]{40} # v\d+\.\d+\.\d+", action), action

@@ -195,9 +195,20 @@ def test_torchvision_file(tmp_path, monkeypatch, state):
     torch.save({**trunk, "classifier.0.bias": torch.zeros(3)}, path)
     with pytest.raises(UserError, match="SHA-256"):
         vgg16_features(path)
-    monkeypatch.setattr(ours, "_TORCHVISION_SHA256", sha256(path)[:8])
+    # the first digits, those in the name of torchvision's file, are not enough
+    for part in (8, 63):
+        monkeypatch.setattr(ours, "_TORCHVISION_SHA256", sha256(path)[:part])
+        with pytest.raises(UserError, match="SHA-256"):
+            vgg16_features(path)
+    monkeypatch.setattr(ours, "_TORCHVISION_SHA256", sha256(path))
     images = torch.rand(1, 32, 32, 3)
     assert torch.equal(vgg16_features(path)(images), VGG16Features(state)(images))
+
+
+def test_whole_digests_are_pinned():
+    for digest in (ours.JAX_SHA256, ours._JAX_MEMBER_SHA256, ours._TORCHVISION_SHA256):
+        assert len(bytes.fromhex(digest)) == 32
+    assert ours._TORCHVISION_SHA256.startswith("397923af"), "as torchvision names its file"
 
 
 def test_fetching_is_pinned(tmp_path, monkeypatch, state):
