@@ -6,13 +6,17 @@ from dataclasses import replace
 import pytest
 import trimesh
 from helpers.children import murderous_pair
+from helpers.gaussians import some
 
 from gamba_warp.cli import run
 from gamba_warp.eval.shapes import sensitivity
+from gamba_warp.eval.shapes.load import load_prediction, load_truth
 from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.pairs import Journal, Pair, evaluate_pairs, find_pairs
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.tables import latex
+from gamba_warp.formats.ply import save_ply
+from gamba_warp.surfaces.options import SurfaceOptions
 
 SMALL = replace(PRESETS["default"], num_points=500, iou_voxels=16)
 
@@ -42,6 +46,17 @@ def test_variants_change_one_field_and_keep_the_place():
     assert names == PRESETS.keys()
 
 
+def assert_as_alone(pair, protocols, found):
+    """Each row is what a direct evaluation by its protocol gives."""
+    truth = load_truth(pair.gt, SMALL)
+    for label, protocol in protocols.items():
+        shape = load_prediction(pair.pred, truth.motion, truth.axes, protocol).shape
+        want, got = compare(shape, truth.shape, protocol)[1], found[label]
+        for key in ("chamfer", "iou", "noise_floor", "normal_consistency"):
+            assert got[key] == want[key], (label, key)
+        assert got["fscore"] == want["fscore"][f"{min(protocol.thresholds):g}"], label
+
+
 def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
     """Stages that rows have in common are computed once; that must change no figure."""
     fields = ("points", "num_points", "seed", "unit", "chamfer", "align", "occupancy", "grid")
@@ -59,20 +74,24 @@ def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
     said = capfd.readouterr()
     assert "failed: b: no ground truth\nfailed: c: no prediction\n" in said.err
     assert "of 1 objects" in said.out
-    from gamba_warp.eval.shapes.load import load_prediction, load_truth
-
     protocols = sensitivity.variants(SMALL)
     assert kept["rows"].keys() == protocols.keys() and len(protocols) > 8
     pair = find_pairs(folders / "pred", folders / "gt")[0][0]
-    truth = load_truth(pair.gt, SMALL)
-    for label, protocol in protocols.items():
-        shape = load_prediction(pair.pred, truth.motion, truth.axes, protocol).shape
-        want = compare(shape, truth.shape, protocol)[1]
-        got = next(o for o in kept["objects"] if o["name"] == "a")["variants"][label]
-        for key in ("chamfer", "iou", "noise_floor", "normal_consistency"):
-            assert got[key] == want[key], (label, key)
-        least = f"{min(protocol.thresholds):g}"
-        assert got["fscore"] == want["fscore"][least], label
+    found = next(o for o in kept["objects"] if o["name"] == "a")["variants"]
+    assert_as_alone(pair, protocols, found)
+
+
+def test_rows_that_differ_by_the_surface_or_the_thresholds_alone(folders):
+    save_ply(folders / "pred" / "a.ply", some(40))
+    pair = find_pairs(folders / "pred", folders / "gt")[0][0]
+    centers, density = (
+        replace(SMALL, surface=SurfaceOptions(method=method, voxels=16))
+        for method in ("centers", "density")
+    )
+    protocols = {"a": centers, "b": density, "c": replace(centers, thresholds=(0.2, 0.1))}
+    found = sensitivity.vary_pair(pair, SMALL, None, protocols)["variants"]
+    assert_as_alone(pair, protocols, found)
+    assert len({row["chamfer"] for row in found.values()}) == 2
 
 
 def test_an_interrupted_evaluation_goes_on(folders):

@@ -251,6 +251,17 @@ def test_alpha_that_is_soft_everywhere(detail):
     assert input_view(found, model.config, small) > before
 
 
+def test_children_of_what_is_not_finite_are_not_left_out():
+    """So that what writes them can refuse them."""
+    model, rgba = fresh(), board(96, 4)
+    image = model_input(rgba, model.config)[0]
+    made = reconstruct(model, rgba, detail=1)
+    with torch.inference_mode():
+        made.opacities[3 * 200] = math.nan  # of the first layer
+        found = split_front(made, image, rgba, model.config, 4)
+    assert found.opacities.isnan().sum() >= 16
+
+
 def test_three_pixels_and_none():
     model = fresh()
     empty = np.zeros((96, 96, 4), np.float32)

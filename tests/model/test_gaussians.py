@@ -43,6 +43,13 @@ def test_containers_index_select_and_convert_alike():
         assert_close(doubled.opacities, 2 * gaussians.opacities)
 
 
+def test_what_is_faint_is_not_drawn_and_what_is_not_finite_stays():
+    gaussians = batch(n=4)
+    gaussians.opacities = torch.tensor([0.5, 0.001, math.nan, 0.01])
+    for least, kept in ((None, [0, 2, 3]), (0.1, [0, 2])):
+        assert_close(gaussians.drawn(least).opacities, gaussians.opacities[kept], equal_nan=True)
+
+
 def test_detach_cuts_the_graph():
     gaussians = batch().map(lambda value: value.requires_grad_())
     assert gaussians.means.requires_grad and not gaussians.detach().means.requires_grad
