@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from ..runtime.forward_mode import reverse_only
 from ..runtime.lanes import streams
 from ..runtime.launch import launch
 from ..runtime.memory import empty
@@ -150,3 +151,4 @@ conv.register_autograd(_gradient, setup_context=_setup_context)
 
 
 _conv_backward.register_autograd(_no_second_gradient)
+conv = reverse_only("causal_conv1d", conv)

@@ -11,6 +11,7 @@ from typing import List
 import torch
 from torch import Tensor
 
+from ..runtime.forward_mode import reverse_only
 from ..runtime.stand_in import kind_of
 from ..runtime.start import without_compiler
 from .constants import BLOCKS
@@ -112,6 +113,7 @@ def _project_backward(ctx, *cotangents):
 
 
 project.register_autograd(_project_backward, setup_context=_project_setup)
+project = reverse_only("rasterization", project)
 
 
 def _bin_views(device: torch.device, exact: bool) -> Callable[..., Bins]:
@@ -296,3 +298,4 @@ def _composite_backward(ctx, *cotangents):
 
 
 composite.register_autograd(_composite_backward, setup_context=_composite_setup)
+composite = reverse_only("rasterization", composite)

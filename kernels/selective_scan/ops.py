@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..runtime.forward_mode import reverse_only
 from ..runtime.stand_in import kind_of
 from ..runtime.start import without_compiler
 from .cpu import launch as cpu
@@ -98,3 +99,4 @@ def _no_second_gradient(ctx, *grads):
 
 scan.register_autograd(_gradient, setup_context=_setup_context)
 _scan_backward.register_autograd(_no_second_gradient)
+scan = reverse_only("selective_scan", scan)

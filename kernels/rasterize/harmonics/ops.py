@@ -5,6 +5,7 @@ from typing import List
 import torch
 from torch import Tensor
 
+from ...runtime.forward_mode import reverse_only
 from ...runtime.launch import launch
 from ...runtime.stand_in import kind_of
 from ...runtime.start import without_compiler
@@ -92,6 +93,7 @@ def _backward(ctx, v_colors):
 
 
 harmonics.register_autograd(_backward, setup_context=_setup)
+harmonics = reverse_only("spherical harmonics", harmonics)
 
 
 def colors_from_harmonics(

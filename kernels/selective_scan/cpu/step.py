@@ -13,6 +13,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ...runtime.forward_mode import has_tangent
 from ...runtime.lanes import PRELUDE, W
 from ...runtime.launch import parallel_launch
 from ...runtime.native import native, native_kernel
@@ -129,6 +130,8 @@ def _step(kernel, state: Tensor, last: int, sizes: list, rows, whole, vectors) -
     given = [*whole, *((v, shape) for v, shape in vectors if v is not None)]
     given.append((state, (batch, channels, last)))
     if torch.compiler.is_compiling() or channels % W:
+        return None
+    if has_tangent(*(v for v, _ in rows + given)):  # formulas in torch carry it on
         return None
     for v, shape in rows + given:
         if type(v) not in _PLAIN or v.dtype != torch.float32 or v.shape != shape or not v.is_cpu:

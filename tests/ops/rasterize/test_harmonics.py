@@ -300,7 +300,7 @@ def test_once_differentiable():
 def test_the_compiler_and_meta_tensors():
     inputs = make(1, 2)
     torch.library.opcheck(
-        ops.harmonics,
+        torch.ops.gamba_warp.rasterize_harmonics.default,
         (3, True, *(x.requires_grad_() for x in inputs.values())),
         test_utils=("test_schema", "test_faketensor", "test_autograd_registration"),
     )

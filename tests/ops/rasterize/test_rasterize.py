@@ -186,7 +186,9 @@ def test_fake_results_have_the_real_shapes():
     limits = Limits(alpha_min=1 / 255, alpha_max=0.99, t_min=1e-4)
     lists = list(meta.bins), list(size), list(limits)
     arguments = (means2d, conics, opacities, torch.rand(num, 3), *lists, None)
-    torch.library.opcheck(ops.composite, arguments, test_utils=checks)
+    torch.library.opcheck(
+        torch.ops.gamba_warp.rasterize_composite.default, arguments, test_utils=checks
+    )
 
 
 def test_a_compiled_call_has_the_same_bits():
