@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,20 @@ _TRIES = 100  # objects tried one after the other until one can be read
 _OVERFIT_VIEWS = 9
 
 
+class HeldOut(NamedTuple):
+    """Objects of one dataset that a run validates on.
+
+    Attributes:
+        name: the folder's name of a further dataset; empty for that of DATA.
+        dataset: what they belong to.
+        objects: indices into it.
+    """
+
+    name: str
+    dataset: ViewDataset
+    objects: list[int]
+
+
 @dataclass(frozen=True)
 class TrainingData:
     """What a run trains and validates on.
@@ -45,8 +60,7 @@ class TrainingData:
         reference: the input view, or None for any.
         batch_size: objects per batch and process.
         novel: novel views per object at every step; None means as many as the schedule says.
-        validation: dataset with the objects to validate on; None: that of the training.
-        held_out: indices into ``validation``; may be empty.
+        held_out: what is validated on, by dataset; those that hold no object are not there.
         val_views: novel views per object in a validation; None means all.
         notes: lines for the user.
     """
@@ -56,8 +70,7 @@ class TrainingData:
     reference: int | None = None
     batch_size: int = 8
     novel: int | None = None
-    validation: ViewDataset | None = None
-    held_out: list[int] = field(default_factory=list)
+    held_out: list[HeldOut] = field(default_factory=list)
     val_views: int | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -104,25 +117,37 @@ def _open_all(config: TrainConfig) -> TrainingData:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
-    validation, held_out = None, []
+    held_out = []
     try:
-        validation = open_dataset(config.data, "val")
-        bad = validation.check()
-        good = [i for i, uid in enumerate(validation.uids) if uid not in bad]
-        held_out = evenly(good, config.run.val_objects)
+        held_out.append(_held_out("", config.data, config.run.val_objects))
     except UserError as error:
         notes.append(f"no validation: {error}")
+    for folder in config.run.val_extra:
+        name = folder.resolve().name
+        if name in [part.name for part in held_out]:
+            raise UserError(f"--val-extra: two folders are called '{name}'; rename one of them")
+        try:
+            held_out.append(_held_out(name, folder, config.run.val_objects))
+        except UserError as error:
+            raise UserError(f"--val-extra: {error}") from error
     return TrainingData(
         train,
         objects,
         reference=0 if views.reference == "first" else None,
         batch_size=views.batch_size or 8,
         novel=views.views_per_object,
-        validation=validation,
-        held_out=held_out,
+        held_out=[part for part in held_out if part.objects],
         val_views=config.run.val_views,
         notes=notes,
     )
+
+
+def _held_out(name: str, folder: Path, count: int) -> HeldOut:
+    """Chooses ``count`` of the objects of the val split that can be read, evenly spaced."""
+    dataset = open_dataset(folder, "val")
+    bad = dataset.check()
+    good = [i for i, uid in enumerate(dataset.uids) if uid not in bad]
+    return HeldOut(name, dataset, evenly(good, count))
 
 
 def _open_one(config: TrainConfig, name: str) -> TrainingData:
@@ -141,7 +166,7 @@ def _open_one(config: TrainConfig, name: str) -> TrainingData:
         reference=None if views.reference == "random" else 0,
         batch_size=views.batch_size or 1,
         novel=_OVERFIT_VIEWS if views.views_per_object is None else views.views_per_object,
-        held_out=[index],
+        held_out=[HeldOut("", dataset, [index])],
     )
 
 
@@ -350,20 +375,21 @@ class Batches:
 
 
 def fixed_batches(
-    data: TrainingData, config: GambaConfig, size: int, failures: dict[str, str]
+    part: HeldOut, views: int | None, config: GambaConfig, size: int, failures: dict[str, str]
 ) -> Iterator[Batch]:
     """Yields the batches of a validation, one object each, always the same views, on white.
 
-    View 0 is the input; ``data.val_views`` others follow, evenly spaced in the list. An object that
+    View 0 is the input; ``views`` others follow, evenly spaced in the list, or all. An object that
     cannot be read is passed over, with its reason in ``failures``.
     """
-    dataset = data.train if data.validation is None else data.validation
-    for index in data.held_out:
+    dataset = part.dataset
+    for index in part.objects:
         try:
             others = range(1, dataset.num_views(index))
-            novel = evenly(others, len(others) if data.val_views is None else data.val_views)
+            novel = evenly(others, len(others) if views is None else views)
             batch = load_sample(dataset, index, [0, *novel], size, config, torch.ones(3))
         except EXPECTED as error:
-            failures[dataset.uids[index]] = first_line(error)
+            uid = f"{part.name}/{dataset.uids[index]}" if part.name else dataset.uids[index]
+            failures[uid] = first_line(error)
             continue
         yield batch

@@ -7,6 +7,7 @@ load, ``state.pt``, the tensors and plain values that a bit-identical continuati
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Callable
@@ -52,6 +53,7 @@ class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     rng: Any
     rng_cuda: list[Any]
     new_length: NewLength = NewLength()  # older versions have none
+    best: float = -math.inf
 
 
 def step_of(checkpoint: Path) -> int:

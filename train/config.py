@@ -203,8 +203,11 @@ class RunConfig:
         encoder_weights: File of the image encoder's weights, or "random" to train one from scratch.
         log_every: Steps between two lines of the log.
         val_every: Steps between two validations (and sample pictures); 0 for none.
-        val_objects: Held-out objects to validate on.
+        val_objects: Held-out objects to validate on, of each dataset.
         val_views: Novel views of each of these, evenly spaced in the list; --overfit takes all.
+        val_extra: More datasets, whose held-out objects are validated on by themselves, under their
+            folder's name. OUT/best.safetensors is of the validation with the best PSNR of novel
+            views: the mean over DATA and these, each of which counts the same.
         save_every: Steps between two checkpoints; one is always saved at the end.
         keep: Checkpoints kept; the oldest go first.
         tensorboard: Write TensorBoard files, if it is installed.
@@ -227,6 +230,7 @@ class RunConfig:
     val_every: _Every = 500
     val_objects: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
     val_views: Annotated[int, Meta(ge=0, le=100_000)] = 4
+    val_extra: tuple[Path, ...] = ()
     save_every: _Count = 500
     keep: _Count = 2
     tensorboard: bool = True
@@ -272,6 +276,8 @@ class TrainConfig:
             )
         if self.views.made and self.views.overfit is not None:
             raise UserError("--made: --overfit trains on one object alone; leave one of them out")
+        if self.run.val_extra and self.views.overfit is not None:
+            raise UserError("--val-extra: --overfit validates on its object; leave one of them out")
         if self.loss.depth_weight and self.model_config().decoder != "rays":
             raise UserError('--depth-weight: only layers of the decoder "rays" have a depth')
         self.model_config()
@@ -313,7 +319,7 @@ _TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
 _OF_A_MACHINE = {
     *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
     *("run.init", "run.encoder_weights", "run.device", "run.threads", "run.keep", "run.log"),
-    *("run.tensorboard", "views.cache_device", "views.made_workers"),
+    *("run.tensorboard", "run.val_extra", "views.cache_device", "views.made_workers"),
 }
 # The groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {

@@ -76,7 +76,10 @@ class RunLog:
             os.ftruncate(self._file.fileno(), size)
 
     def write(self, event: str, step: int, **values: object) -> None:
-        """Writes a line; numbers that are not finite become null."""
+        """Writes a line; numbers that are not finite become null.
+
+        The events are start, train, val (of a further dataset val/NAME), best, warning and end.
+        """
         line = {"event": event, "step": step, "time": round(time.time(), 3), **_plain(values)}
         data = (json.dumps(line) + "\n").encode()
         with self._guarded("log.jsonl"):

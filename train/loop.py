@@ -18,7 +18,7 @@ from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.processes import stop_requests
 
-from .batches import Batches, TrainingData, fixed_batches
+from .batches import Batches, HeldOut, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
 from .ddp import World
@@ -54,6 +54,7 @@ class Trainer:
         self.step = self.skipped = self.skipped_in_row = 0
         self.elapsed = 0.0  # seconds of training, resumed parts included
         self._collapsed = False
+        self._best = -math.inf  # PSNR of the best validation
         self._unread: dict[str, str] = {}  # reasons by uid, of objects to validate on
         self._named: set[str] = set()  # uids whose failure was said
         self._saved = self._validated = -1  # the step of the last checkpoint and validation
@@ -230,22 +231,61 @@ class Trainer:
         def alone() -> None:
             if self.log is None or not self.data.held_out:
                 return
-            run, best = self.config.run, [*self.models.values()][-1]
-            size, weights = self.config.views.size, self._weights(validates=True)
-            held_out = fixed_batches(self.data, self.model.config, size, self._unread)
-            objective = Objective(weights, self.lpips)
-            figures, rows = validate(best, held_out, objective, self.world.device)
-            self._name_failures()
-            if not rows:
-                self.log.warn(self.step, "no validation: none of its objects can be read")
-                return
-            self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
-            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
-            say(f"step {self.step}: validation {text}")
-            self.log.sample(self.step, run.out / "samples" / f"step_{self.step:06d}.png", rows)
-            self.log.page()
+            objective = Objective(self._weights(validates=True), self.lpips)
+            psnr, rows = [], []
+            for part in self.data.held_out:
+                figures, pictures = self._validate_on(part, objective)
+                if not pictures:
+                    about = f" on {part.name}" if part.name else ""
+                    reason = "none of its objects can be read"
+                    self.log.warn(self.step, f"no validation{about}: {reason}")
+                    continue
+                psnr.append(figures.get("psnr_novel", figures["psnr_input"]))
+                rows += pictures
+            if len(psnr) == len(self.data.held_out):  # others could not be compared with these
+                self._keep_best(sum(psnr) / len(psnr))
+            if rows:
+                path = self.config.run.out / "samples" / f"step_{self.step:06d}.png"
+                self.log.sample(self.step, path, rows)
+                self.log.page()
 
         self.world.on_main(alone)
+
+    def _validate_on(
+        self, part: HeldOut, objective: Objective
+    ) -> tuple[dict[str, float], list[Tensor]]:
+        """Validates on the objects of one dataset, and logs the figures; returns ``validate``'s."""
+        assert self.log is not None
+        best, size = [*self.models.values()][-1], self.config.views.size
+        about = (self.data.val_views, best.config, size, self._unread)
+        figures, rows = validate(best, fixed_batches(part, *about), objective, self.world.device)
+        self._name_failures()
+        if rows:
+            event, name = (f"val/{part.name}", f" on {part.name}") if part.name else ("val", "")
+            self.log.write(event, self.step, minutes=self.elapsed / 60, **figures)
+            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+            say(f"step {self.step}: validation{name} {text}")
+        return figures, rows
+
+    def _keep_best(self, psnr: float) -> None:
+        """Writes ``best.safetensors`` where a validation is better than all that came before.
+
+        Args:
+            psnr: dB, of novel views (or of inputs, where there are none), the mean over datasets.
+        """
+        assert self.log is not None
+        if not psnr > self._best:  # nor is one that is not a number
+            return
+        path = self.config.run.out / "best.safetensors"
+        try:
+            save_model(path, [*self.models.values()][-1])
+        except UserError as error:  # a checkpoint may have more luck, and the run goes on
+            self.log.warn(self.step, str(error))
+            return
+        self._best = psnr
+        self.log.write("best", self.step, minutes=self.elapsed / 60, psnr=psnr)
+        if len(self.data.held_out) > 1:
+            say(f"step {self.step}: best so far, mean PSNR of the datasets {psnr:.4g} -> {path}")
 
     def save(self) -> None:
         """Writes a checkpoint on the main process, once per step; the others wait."""
@@ -270,6 +310,7 @@ class Trainer:
             "elapsed": self.elapsed,
             "world_size": self.world.size,
             "ema_updates": self.ema.updates if self.ema else 0,
+            "best": self._best,
             "new_length": asdict(self.schedule.since),
             "optimizer": self.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
@@ -306,6 +347,7 @@ class Trainer:
         self.optimizer.load_state_dict(moments)
         self.step, self.skipped = state.step, state.skipped
         self.skipped_in_row, self.elapsed = state.skipped_in_row, state.elapsed
+        self._best = state.best
         self.schedule, note = self.schedule.after(old, self.step, self.elapsed)
         self._saved = self.step if checkpoint.parent.parent == self.config.run.out else -1
         torch.set_rng_state(state.rng)

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from msgspec import Meta
 
-from gamba_warp.conventions import DEFAULT_DISTANCE, DeviceChoice, Precision
+from gamba_warp.conventions import DEFAULT_DISTANCE, Detail, DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.fitting.config import FitConfig, Steps
 from gamba_warp.untrusted.ranges import check_options, option, ranged
@@ -48,7 +48,8 @@ class ViewsOptions:
         ceiling: Also score Gaussians fitted to all views: of so many objects (18 s each on two
             cores, written into OUT/ceiling), or those in a folder that gamba fit wrote.
         ceiling_steps: Steps of each fit.
-        lpips: LPIPS where its weights are there (gamba weights lpips).
+        lpips: LPIPS where its weights are there (gamba weights lpips). Where it takes more than a
+            minute, a line says first how long.
         strips: Comparison pictures for the first so many objects.
         sheet: So many best, median and worst objects in the contact sheet; 0 for none.
         save_gaussians: Also write OUT/gaussians/NAME.ply, in the input camera's
@@ -65,6 +66,9 @@ class ViewsOptions:
         background_margin: Of a model: drop the 3DGS tokens of plain background, but for those
             within so many patches of the object. It was not trained for that, unless its decoder is
             "rays", which does it always.
+        detail: Of a model: into how many Gaussians a side each of the front may split, as for gamba
+            reconstruct; if not given, the most for which the input has the pixels, at the size that
+            is compared.
         encoder_weights: The image encoder's file, for a checkpoint that does not hold it.
         precision: Precision of a model's products; "auto" is bfloat16 where that is faster.
         device: Device that everything runs on.
@@ -91,6 +95,7 @@ class ViewsOptions:
     resize_pictures: bool = False
     distance: Annotated[float, Meta(ge=0.01, le=1000)] = DEFAULT_DISTANCE
     background_margin: Annotated[int, Meta(ge=0, le=4096)] | None = None
+    detail: Detail | None = None
     encoder_weights: Path | None = None
     precision: Precision = "float32"
     device: DeviceChoice = "auto"

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+import torch
+from tqdm import tqdm
 
 from gamba_warp.batch import check_not_read, progress_bar
 from gamba_warp.conventions import GREY, WHITE
@@ -46,6 +51,7 @@ from .compare import (
     choose_views,
     compare,
     load_truth,
+    lpips_pictures,
     render_views,
     summary,
 )
@@ -55,6 +61,7 @@ from .pictures import PicturePredictions, Pictures, save_pictures
 from .predictions import Predictions, open_predictions
 from .table import page, tables_of, without_nearly_empty
 
+LONG = 60.0  # seconds of LPIPS, from which on they are said before
 SHEET_VIEWS = 4  # novel views of an object in the contact sheet
 # errors that are the failure of one object and stop no other
 ERRORS = (UserError, OSError, MemoryError, ValueError, RuntimeError, ArithmeticError)
@@ -77,6 +84,7 @@ class Job:
         failures: ``{name, reason}`` of what failed of the baselines.
         retrieval: the baseline of this name, if it is one of them.
         meshes: of the training objects, to be placed as the retrieval's shapes; or None.
+        told: whether it was said how long LPIPS takes.
     """
 
     predictions: Predictions
@@ -91,6 +99,7 @@ class Job:
     failures: list[dict[str, str]] = field(default_factory=list)
     retrieval: Retrieval | None = None
     meshes: TrainingMeshes | None = None
+    told: bool = False
 
     def predict(self, truth: Truth) -> Gaussians | Pictures:
         """Returns the Gaussians or pictures under test. Raises UserError where there are none."""
@@ -131,6 +140,7 @@ def open_job(options: ViewsOptions) -> Job:
         if not uids:
             raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
     _check_outputs(options, uids)
+    size = gso.SIZE if evaluation else options.size
     predictions = open_predictions(
         options.checkpoint,
         options.distance,
@@ -139,6 +149,8 @@ def open_job(options: ViewsOptions) -> Job:
         resize=options.resize_pictures,
         margin=options.background_margin,
         precision=options.precision,
+        detail=options.detail,
+        size=size,
     )
     rendered: dict[str, Any] = {}
     if isinstance(predictions, PicturePredictions):
@@ -159,7 +171,7 @@ def open_job(options: ViewsOptions) -> Job:
         split_version=dataset.split_version,
         reference=options.reference or 0,
         views=options.views,
-        size=gso.SIZE if evaluation else options.size,
+        size=size,
         lpips="VGG16, version 0.1" if network else None,
         lpips_reason=reason,
         distance=predictions.distance,
@@ -301,6 +313,8 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         by_view = compare(candidates, truth)
     with stages("lpips"):
         if job.network:
+            if not job.told:
+                tell_lpips(job, candidates, truth, job.network)
             add_lpips(by_view, candidates, truth, job.network)
     if not pictures.has_input:
         by_view[""][0] = dict.fromkeys(by_view[""][0])
@@ -339,6 +353,33 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         "truth_sha256": truth.digest,
         "seconds": stages.seconds,
     }
+
+
+def tell_lpips(job: Job, candidates: Mapping[str, Shown], truth: Truth, lpips: LPIPS) -> None:
+    """Says how long LPIPS will take, by the time of one picture, where that is over a minute."""
+    job.told = True
+    began = time.perf_counter()
+    with torch.no_grad():
+        lpips.features(truth.rgb[:1])[0].sum().item()  # which a GPU has to wait for
+    each, pictures = time.perf_counter() - began, lpips_pictures(candidates, truth)
+    one, whole = each * pictures, each * pictures * len(job.uids)
+    if whole < LONG:
+        return
+    height, width = truth.rgb.shape[1:3]
+    tqdm.write(
+        f"LPIPS: {each:.2g} s a picture of {width} x {height}, {pictures} pictures an object: "
+        f"about {_span(one)} an object and {_span(whole)} for all {len(job.uids)}; "
+        "--no-lpips leaves it out",
+        file=sys.stderr,
+    )
+
+
+def _span(seconds: float) -> str:
+    """A time in words."""
+    for unit, size in (("hours", 3600), ("minutes", 60)):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.0f} seconds"
 
 
 def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:

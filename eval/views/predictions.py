@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import torch
 
-from gamba_warp.conventions import Precision
+from gamba_warp.conventions import Detail, Precision
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.devices import network_products, pick_precision
 from gamba_warp.errors import UserError
@@ -15,6 +15,7 @@ from gamba_warp.files import sha256, sha256_of_all, visible
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.checkpoint import FILE_NAME, load_model
+from gamba_warp.model.detail import checked_detail, split_front
 from gamba_warp.model.posing import posed_input
 
 from .pictures import PicturePredictions, holds_pictures
@@ -49,7 +50,10 @@ class PlyPredictions:
 
 
 class ModelPredictions:
-    """A checkpoint, shown the reference view alone; attributes as those of ``PlyPredictions``."""
+    """A checkpoint, shown the reference view alone; attributes as those of ``PlyPredictions``.
+
+    Its Gaussians are those that ``gamba reconstruct`` writes of that view: see ``model.predict``.
+    """
 
     def __init__(
         self,
@@ -58,14 +62,20 @@ class ModelPredictions:
         encoder_weights: Path | None,
         margin: int | None = None,
         precision: Precision = "float32",
+        detail: Detail | None = None,
+        size: int | None = None,
     ) -> None:
         self.model, self.device = load_model(path, device, encoder_weights), device
-        self.margin = margin
+        self.margin, self.size = margin, size
+        self.detail: Detail | None = detail
+        checked_detail(detail, self.model.config, 0)
         kind = torch.device(device)
         self.precision = pick_precision(precision, kind, self.model.config.width)
         self.distance = self.model.config.distance
         file = path / FILE_NAME if path.is_dir() else path
         self.source = {"kind": "checkpoint", "path": path.name, "sha256": sha256(file)}
+        if self.model.config.decoder == "rays":
+            self.source["detail"] = "as the picture has pixels" if detail is None else str(detail)
         if margin is not None:
             self.source["background_margin"] = str(margin)
         if self.precision != torch.float32:
@@ -75,14 +85,18 @@ class ModelPredictions:
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
         """Runs the model on the reference view, on the model's own background.
 
-        Arguments and result are those of ``PlyPredictions.gaussians``.
+        Arguments and result are those of ``PlyPredictions.gaussians``. The front splits by the
+        picture at the size that is compared.
         """
         config = self.model.config
         views = dataset.load(uid, views=[reference], size=config.image_size)
         images, cameras = posed_input(views, config)
         images, cameras = images.to(self.device), cameras.to(self.device)
         with network_products(images.device, self.precision):
-            return self.model(images, cameras, background_margin=self.margin)[0]
+            gaussians = self.model(images, cameras, background_margin=self.margin)[0]
+        rgba = dataset.load(uid, views=[reference], size=self.size).images[0]
+        detail = checked_detail(self.detail, config, len(rgba))
+        return split_front(gaussians, images[0], rgba.cpu().numpy(), config, detail, cameras)
 
 
 Predictions: TypeAlias = PlyPredictions | ModelPredictions | PicturePredictions
@@ -96,6 +110,8 @@ def open_predictions(
     resize: bool = False,
     margin: int | None = None,
     precision: Precision = "float32",
+    detail: Detail | None = None,
+    size: int | None = None,
 ) -> Predictions:
     """Opens a folder with ``.ply`` files or with pictures, else a checkpoint.
 
@@ -107,10 +123,12 @@ def open_predictions(
         resize: whether pictures of another size are resized.
         margin: ``background_margin`` of a model, see ``Gamba.forward``.
         precision: of a model's products, see ``devices.pick_precision``.
+        detail: of a model's front, see ``model.predict.reconstruct``.
+        size: height of the pictures that are compared; None: that of the files.
 
     Raises:
-        UserError: there is nothing, the checkpoint cannot be read, or there is a margin or a
-            precision and no model.
+        UserError: there is nothing, the checkpoint cannot be read, or there is a margin, a
+            precision or a detail and no model that can have it.
     """
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint, folder of .ply files or of pictures")
@@ -123,10 +141,11 @@ def open_predictions(
             )
         found = PicturePredictions(path, distance, device, resize)
     else:
-        return ModelPredictions(path, device, encoder_weights, margin, precision)
+        return ModelPredictions(path, device, encoder_weights, margin, precision, detail, size)
     for name, given in (
         ("--background-margin", margin is not None),
         ("--precision", precision != "float32"),
+        ("--detail", detail is not None),
     ):
         if given:
             raise UserError(f"{name}: {path} holds no model")

@@ -29,10 +29,8 @@ _GROUNDS = {key: metric.head for key, metric in image_metrics.on_grounds().items
 _DIGITS = {key: metric.digits for key, metric in image_metrics.all_figures().items()}
 _DIGITS |= {"chamfer": 4, "iou": 3}
 _MOST_ROWS = 24  # of one picture
-_CURVES = {
-    "Loss of training": ("train.loss", True),
-    "Held-out novel views, PSNR [dB]": ("val.psnr_novel", False),
-}
+_HELD_OUT = "Held-out novel views, PSNR [dB]"
+_CURVES = {"Loss of training": ("train.loss", True), _HELD_OUT: ("val.psnr_novel", False)}
 Lines = list[list[str]]  # cells by row, the head first
 
 
@@ -234,7 +232,10 @@ def _curves(results: list[RowResult], compare_with: str | None) -> list[Section]
     found, other = [], records.get(compare_with or "")
     for name, record in records.items():
         title, charts = trained[name].row.label, []
-        for label, (key, logarithmic) in _CURVES.items():
+        further = {
+            f"{_HELD_OUT}, {name}": (f"val/{name}.psnr_novel", False) for name in record.validated
+        }
+        for label, (key, logarithmic) in (_CURVES | further).items():
             lines = {title: key}
             if other is not None and other is not record and key in other.series:
                 record.series[f"{key} of another"] = other.series[key]

@@ -112,8 +112,9 @@ def _commands(
 def diverged(run: Path) -> str | None:
     """Says that a training that ended well has diverged all the same, from its log; or None."""
     log = read_log(run / "log.jsonl")
-    for event, name in (("train", "loss"), ("val", "validation's loss")):
-        if not math.isfinite(log.losses.get(event, 0.0)):
+    for event, loss in log.losses.items():
+        if not math.isfinite(loss):
+            name = "loss" if event == "train" else "validation's loss"
             return f"diverged: its last {name} is not finite"
     skipped = log.most.get("skipped", 0)
     if log.step and skipped > log.step / 2:

@@ -38,7 +38,6 @@ from ..render import render
 from .config import GambaConfig
 from .parts.patches import premultiplied, seen_cells
 from .parts.rays import EMPTY
-from .posing import reference_cameras
 
 PLAIN = 6 / 255  # a cell that differs by less in itself, and from those beside it, is plain
 MOST_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
@@ -75,18 +74,23 @@ def checked_detail(detail: Detail | None, config: GambaConfig, side: int) -> Det
 
 
 def split_front(
-    gaussians: Gaussians, image: Tensor, rgba: np.ndarray, config: GambaConfig, detail: Detail
+    gaussians: Gaussians,
+    image: Tensor,
+    rgba: np.ndarray,
+    config: GambaConfig,
+    detail: Detail,
+    camera: Cameras,
 ) -> Gaussians:
     """Splits the front of a reconstruction, where the picture shows more than one colour a cell.
 
     Args:
-        gaussians: ``[N]``, what a model with the decoder ``rays`` made of one picture seen by the
-            reference camera.
+        gaussians: ``[N]``, what a model with the decoder ``rays`` made of one picture.
         image: ``[H, W, 4]`` in [0, 1], straight alpha: the picture as this model took it, on the
             device of ``gaussians``.
         rgba: ``[S, S, 4]`` in [0, 1], straight alpha: the same picture at its own size.
         config: of the model.
         detail: children a side of a cell at most.
+        camera: ``[1]``, that of the picture, in the model's world: see ``posing``.
 
     Returns:
         Gaussians of the same frame: those that did not split, then at most ``MOST_CHILDREN``
@@ -104,7 +108,7 @@ def split_front(
     splits = counts[cells] > 1
     if not splits.any():
         return gaussians
-    camera = reference_cameras(config, 1).to(device)
+    camera = camera.to(device)
     is_front = torch.arange(gaussians.num, device=device) % config.ray_layers == 0
     front = gaussians.select(is_front)
     parent = cells.new_full((side * side,), -1)

@@ -60,9 +60,10 @@ def reconstruct(
     device = next(model.parameters()).device
     images = model_input(rgba, config).to(device)
     dtype = pick_precision(precision, device, config.width)
+    camera = reference_cameras(config, 1).to(device)
     with network_products(device, dtype):
-        gaussians = model(images, reference_cameras(config, 1).to(device))[0]
-    return split_front(gaussians, images[0], rgba, config, detail)
+        gaussians = model(images, camera)[0]
+    return split_front(gaussians, images[0], rgba, config, detail, camera)
 
 
 def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def curves_section(
         chosen: other charts.
     """
     if chosen is None:
-        chosen = list(_CHARTS)
+        chosen = [_with_datasets(chart, record.validated) for chart in _CHARTS]
         terms = [n for n in record.series if n.startswith("train.loss_")]
         if len(terms) > 1:
             names = {n.removeprefix("train.loss_").replace("_", " "): n for n in terms}
@@ -86,6 +86,16 @@ def curves_section(
             chosen.insert(5, Chart("Terms of the training loss, unweighted", names, True))
     drawn = [svg for chart in chosen if (svg := _draw(chart, record))]
     return Section(title, text if drawn else "The log holds no figures yet.", charts=drawn)
+
+
+def _with_datasets(chart: Chart, names: Sequence[str]) -> Chart:
+    """Adds the lines of further datasets, so far as there are colours: not those of input views."""
+    lines = dict(chart.lines)
+    for name in names:
+        for label, series in chart.lines.items():
+            if series.startswith("val.") and not series.endswith("_input"):
+                lines[f"{label}, {name}"] = series.replace("val.", f"val/{name}.", 1)
+    return replace(chart, lines=dict(list(lines.items())[: charts.COLOURS]))
 
 
 def _thinned(series: Series, exact: bool) -> list[Point]:
@@ -113,7 +123,7 @@ def _draw(chart: Chart, record: RunRecord) -> str:
     for place, (label, name) in enumerate(chart.lines.items()):
         series = record.series.get(name)
         if series and series.steps:
-            lines[label] = points = _thinned(series, chart.exact or name.startswith("val."))
+            lines[label] = points = _thinned(series, chart.exact or name.startswith("val"))
             last = f"{label} {_short(points[-1].y)}".strip()
             kind = "straight" if len(series.steps) <= _LEAST else "curve"
             drawn.append(charts.Series(last, points, kind, _COLOUR_OF.get(label, place)))

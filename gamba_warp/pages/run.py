@@ -128,14 +128,23 @@ def _about_curves(record: RunRecord, start: _Start) -> str:
 def _validation(record: RunRecord) -> list[Section]:
     """The last validation as a table."""
     rows = []
-    for view, name in (("input", "input view"), ("novel", "novel views")):
-        found = [record.series.get(f"val.{measure}_{view}") for measure in OF_PICTURES]
-        if any(found):
-            rows.append([name, *(f"{s.values[-1]:.4g}" if s else "absent" for s in found)])
+    for event, of in (("val", ""), *((f"val/{name}", f", {name}") for name in record.validated)):
+        for view, name in (("input", "input view"), ("novel", "novel views")):
+            found = [record.series.get(f"{event}.{measure}_{view}") for measure in OF_PICTURES]
+            if any(found):
+                figures = (f"{s.values[-1]:.4g}" if s else "absent" for s in found)
+                rows.append([f"{name}{of}", *figures])
     if not rows:
         return []
-    step = max(s.steps[-1] for n, s in record.series.items() if n.startswith("val."))
+    step = max(s.steps[-1] for n, s in record.series.items() if n.startswith("val"))
     text = f"Means over the held-out objects at step {step:,.0f}."
+    best = record.series.get("best.psnr")
+    if best and best.steps:
+        where = " over the datasets" if record.validated else ""
+        text += (
+            f" The best validation, by the mean PSNR of novel views{where}, is that of step "
+            f"{best.steps[-1]:,.0f} ({best.values[-1]:.4g} dB): best.safetensors."
+        )
     return [Section("Last validation", text, header=["", *OF_PICTURES.values()], table=rows)]
 
 

@@ -18,7 +18,8 @@ _MOST_STEPS = 10**12
 # Of a training line; a validation's figures are all wanted.
 _TRAIN = {"loss", "psnr", "lr", "grad_norm", "views_per_second", "seconds"}
 _NAME = re.compile(r"[a-z][a-z_]{0,30}")
-_MOST_SERIES = 60
+_EVENT = re.compile(r"train|best|val|val/[^/\x00-\x1f]{1,80}")  # the last of a further dataset
+_MOST_SERIES = 200
 _NO_FIGURES = {"step", "time", "minutes", "epoch"}
 
 
@@ -55,13 +56,15 @@ class RunRecord:
     """What a log says.
 
     Attributes:
-        series: figures by name, such as ``train.loss`` and ``val.psnr_novel``.
+        series: figures by name, such as ``train.loss``, ``val.psnr_novel`` and, of a further
+            dataset NAME, ``val/NAME.psnr_novel``; ``best.psnr`` has a point for each
+            validation that was the best so far, by its mean over the datasets.
         step: the last step.
         minutes: training time, resumed parts included.
         start: the last line of the event ``start``, or empty.
         end: the line of the event ``end`` after it, or empty.
         warnings: steps and messages, the last thousand.
-        losses: the last one of "train" and of "val"; NaN where it was not finite.
+        losses: the last one of "train" and of each "val"; NaN where it was not finite.
         most: the largest of "skipped" (steps) and "device_memory" (bytes), of all lines.
     """
 
@@ -73,6 +76,12 @@ class RunRecord:
     warnings: list[tuple[int, str]] = field(default_factory=list)
     losses: dict[str, float] = field(default_factory=dict)
     most: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def validated(self) -> list[str]:
+        """Names of the further datasets that were validated on, in the order of the log."""
+        found = [name[4:].rpartition(".")[0] for name in self.series if name.startswith("val/")]
+        return list(dict.fromkeys(found))
 
     def values(self, name: str) -> Sequence[float]:
         """The values of a figure by its name in ``series``; none where it lacks."""
@@ -106,7 +115,7 @@ def read_run_log(path: Path) -> RunRecord:
             record.minutes = max(last, default=0.0)
             record.start, record.end = line, {}
             began, before = clock or 0.0, record.minutes
-        elif event in ("train", "val"):
+        elif isinstance(event, str) and _EVENT.fullmatch(event):
             minutes = _number(line.get("minutes"))
             if minutes is None:
                 minutes = before + max(0.0, (clock or began) - began) / 60
@@ -115,7 +124,7 @@ def read_run_log(path: Path) -> RunRecord:
                 loss = _number(line["loss"])
                 record.losses[event] = math.nan if loss is None else loss
             for name, number in ((name, _number(value)) for name, value in line.items()):
-                wanted = event == "val" or name in _TRAIN or name.startswith("loss_")
+                wanted = event != "train" or name in _TRAIN or name.startswith("loss_")
                 if number is None or not wanted or name in _NO_FIGURES or not _NAME.fullmatch(name):
                     continue
                 name = f"{event}.{name}"

@@ -128,7 +128,8 @@ def test_what_lies_behind_a_faint_front_does_not_show_through():
         image = model_input(rgba, model.config)
         made = model(image, reference_cameras(model.config, 1))[0]
         made.colors[1::2] = 0.0  # a black back
-        sharp = split_front(made, image[0], rgba, model.config, 4)
+        camera = reference_cameras(model.config, 1)
+        sharp = split_front(made, image[0], rgba, model.config, 4, camera)
     assert input_view(sharp, model.config, rgba) > 18.5  # dB; 16.2 if it did
 
 
@@ -196,9 +197,10 @@ def test_a_cell_counts_as_much_as_its_alpha():
     faint = before.means[:, 0] > 0.02
     moved = replace(before, means=before.means * torch.where(faint, 1.2, 1.0)[:, None])
     moved.means[faint, 2] += 0.3
+    about = image, rgba, model.config, 2, reference_cameras(model.config, 1)
     depths = [
         each.means[(each.means[:, 0] < -0.01) & (each.scales[:, 0] < 0.013), 2]
-        for each in (split_front(one, image, rgba, model.config, 2) for one in (before, moved))
+        for each in (split_front(one, *about) for one in (before, moved))
     ]
     assert len(depths[0]) == len(depths[1]) > 500
     assert (depths[1] - depths[0]).abs().max() < 0.02

@@ -1,14 +1,12 @@
 """Objects that cannot be read: counted, named, passed over, and too many of them end the run."""
 
-from dataclasses import replace
-
 import pytest
 from helpers import micro
 from helpers.micro import ALONE, lines
 
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
-from gamba_warp.train.batches import Batches, fixed_batches, open_data
+from gamba_warp.train.batches import Batches, HeldOut, fixed_batches, open_data
 from gamba_warp.train.run import train
 
 
@@ -75,12 +73,12 @@ def test_whatever_one_object_raises_stops_no_other(root, monkeypatch, error):
 
 
 def test_a_validation_passes_over_what_it_cannot_read(root):
-    config, failures = micro.options(root, root, run={"val_views": 1}), {}
-    data = replace(open_data(config), validation=None, held_out=[0, 1, 2])
+    config, failures = micro.options(root, root), {}
+    part = HeldOut("other", open_data(config).train, [0, 1, 2])
     spoil(root, "b")
-    found = fixed_batches(data, config.model_config(), micro.SIZE, failures)
+    found = fixed_batches(part, 1, config.model_config(), micro.SIZE, failures)
     assert [batch.uids for batch in found] == [["clouda"], ["cloudc"]]
-    assert list(failures) == ["cloudb"]
+    assert list(failures) == ["other/cloudb"]
 
 
 def test_a_run_names_bad_objects_when_it_meets_them(root, tmp_path, capsys):
