@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from gamba_warp.batch import EXPECTED
-from gamba_warp.data.dataset import ViewDataset, evenly, open_dataset
+from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_dataset
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 
@@ -117,7 +117,12 @@ def _open_all(config: TrainConfig) -> TrainingData:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
+<<<<<<< .merge_file_BENxaw
     held_out = []
+=======
+    notes += filter(None, [background_note(train)])
+    validation, held_out = None, []
+>>>>>>> .merge_file_i7cwDw
     try:
         held_out.append(_held_out("", config.data, config.run.val_objects))
     except UserError as error:

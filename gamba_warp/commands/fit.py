@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -54,7 +55,7 @@ def fit_command(
         seed: Seed of all random numbers.
         device: Device that computes; auto is the GPU if there is one.
     """
-    from ..data.dataset import open_dataset
+    from ..data.dataset import background_note, open_dataset
     from ..fitting.densify import make_strategy
     from ..fitting.objects import FitJob, choose_objects, fit_objects, object_paths
 
@@ -65,6 +66,8 @@ def fit_command(
         raise UserError(f"--minutes {minutes:g} with --strategy {strategy}: {reason}")
     chosen = pick_device(device)
     dataset = open_dataset(folder, split)
+    if note := background_note(dataset):
+        print(f"warning: {folder}: {note}", file=sys.stderr)
     uids = choose_objects(dataset.uids, objects, limit)
     targets = (path for uid in uids for path in object_paths(out, uid).values())
     check_not_read(targets, [folder / uid for uid in uids])

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
@@ -136,7 +137,7 @@ def open_dataset(
     Args:
         folder: a dataset, a pack of one, or the folder of a single object.
         split: "all", "train", "val" or "test".
-        layout: "auto", "transforms", "gobjaverse" or "openlrm".
+        layout: "auto", "transforms", "nerf", "gobjaverse" or "openlrm".
         cache: whether decoded views are kept in memory, with 8 bits a channel.
 
     Raises:
@@ -255,7 +256,9 @@ class ViewDataset:
         for uid in self.uids:
             try:
                 files = self.files(uid)
-                for path in [*files.images, *(files.depths or []), *(files.backs or [])]:
+                for path in chain(
+                    files.images, *filter(None, (files.masks, files.depths, files.backs))
+                ):
                     # What lies in a pack was looked for above.
                     if isinstance(path, Path) and not os.path.exists(path):  # it never raises
                         raise UserError(f"{path}: no such file")
@@ -440,6 +443,8 @@ class ViewDataset:
             if stated not in (None, (width, height)):
                 wanted = f"{stated[0]}x{stated[1]}"
                 raise UserError(f"{path}: is {width}x{height}, but its cameras are for {wanted}")
+            if files.masks is not None:
+                picture = _masked(picture, files.masks[view])
             if size not in (None, height):
                 new = (max(1, round(width * size / height)), size)
                 check_size(*new, f"{path}: at height {size}")
@@ -454,6 +459,41 @@ class ViewDataset:
         from_size = (1.0, 1.0) if stated is None else original
         factor = [picture.shape[1] / from_size[0], picture.shape[0] / from_size[1], 1.0]
         return picture, files.Ks[view] * np.array(factor)[:, None]
+
+
+def _masked(picture: np.ndarray, path: Path) -> np.ndarray:
+    """RGBA ``[H, W, 4]`` uint8 whose alpha is multiplied with a grey picture of the same size.
+
+    A mask of zeros and ones is one of black and white, as nerfstudio takes it.
+    """
+    mask = load_rgba8(path)
+    if mask.shape != picture.shape:
+        got, wanted = (f"{x.shape[1]}x{x.shape[0]}" for x in (mask, picture))
+        raise UserError(f"{path}: the mask is {got}, its picture {wanted}")
+    if (mask[..., :2] != mask[..., 1:3]).any() or (mask[..., 3] != 255).any():
+        raise UserError(f"{path}: a mask is grey and opaque, white where the object is")
+    weight = mask[..., 0].astype(np.uint16)
+    if weight.max() == 1:
+        weight *= 255
+    alpha = (picture[..., 3] * weight + 127) // 255
+    return np.dstack([picture[..., :3], alpha.astype(np.uint8)])
+
+
+def background_note(dataset: ViewDataset) -> str | None:
+    """A line where a set shows no background apart from its objects; None where one is found.
+
+    The first view of up to eight objects is looked at; one that cannot be read is passed over.
+    """
+    seen = False
+    for uid in evenly(dataset.uids, 8):
+        with suppress(*EXPECTED):
+            pixels, _ = dataset.pictures(uid, [0])
+            if (pixels[..., 3] < 255).any():
+                return None
+            seen = True
+    if not seen:
+        return None
+    return "no picture has an alpha channel or a mask: what is behind an object counts as object"
 
 
 def _read_depth(path: Path | Stored, width: int, height: int) -> np.ndarray:

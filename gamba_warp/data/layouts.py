@@ -2,7 +2,11 @@
 
 - ``transforms``: ``<uid>/transforms.json`` as nerfstudio and Blender write it: ``w, h, fl_x, fl_y,
   cx, cy`` (or ``camera_angle_x``), for all frames or for each, and ``frames`` of ``file_path`` and
-  ``transform_matrix`` (camera to world, OpenGL). ``gamba data render`` writes this layout.
+  ``transform_matrix`` (camera to world, OpenGL). Without ``w`` and ``h`` the size is that of the
+  first picture. ``mask_path``, if every frame has one, is the object's alpha. ``gamba data render``
+  writes this layout.
+- ``nerf``: ``<uid>/transforms_train.json`` and, where they are there, ``transforms_val.json`` and
+  ``transforms_test.json`` of the same form: all their frames are views of one object.
 - ``gobjaverse``: ``<uid>/campos_512_v4/NNNNN/NNNNN.png`` and ``.json``, whose ``x, y, z, origin``
   are the camera's OpenCV axes and position in the world, which is z-up. Views that lack one of the
   two files, as an unfinished download leaves them, are passed over. ``<uid>/depth/NNNNN.png``, if
@@ -19,6 +23,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +32,7 @@ from msgspec import Meta, Struct
 
 from ..errors import UserError
 from ..files import walk
+from ..images import PICTURE_SUFFIXES, picture_size
 from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
 from ..untrusted.names import inside
@@ -43,7 +49,16 @@ _LARGEST = 1e9  # of any number in a camera file
 _TEXT = 500  # letters of a name or of an attribution
 _DEPTH = 64  # folders within folders
 # What of a lens a frame may state for itself.
-_LENS = {*("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "p1", "p2")}
+_DISTORTIONS = {*("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "b1", "b2", "sk_x", "sk_y")}
+_DISTORTIONS |= {*("s1", "s2", "s3", "s4", "distortion_params", "rolling_shutter")}
+_DISTORTIONS |= {*("is_fisheye", "equirectangular", "latlong", "orthographic", "is_orthographic")}
+_DISTORTIONS |= {f"ftheta_p{i}" for i in range(5)}
+_MODELS = "camera_model", "camera_type"
+# Those of nerfstudio and COLMAP that are pinholes where all distortion is 0.
+_PINHOLES = {*("pinhole", "simple_pinhole", "perspective", "opencv", "full_opencv", "radial")}
+_PINHOLES |= {"simple_radial"}
+_LENS = {*("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")}
+_LENS |= {*_DISTORTIONS, *_MODELS}
 _FIT = 0.02  # sides of the cube by which a simplified mesh may miss it
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
@@ -108,6 +123,7 @@ class ObjectFiles:
         camera_to_world: ``[V, 4, 4]`` float64, OpenGL frame, object units.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: width and height of each of the V pictures as the file states them, or None.
+        masks: V grey pictures that are multiplied with the alpha of ``images``, or None.
         depths: the V depth pictures, or None.
         backs: V pictures of the last surface's depth, or None.
         depth_unit: length of one step of the depth pictures, object units.
@@ -120,6 +136,7 @@ class ObjectFiles:
     camera_to_world: np.ndarray
     Ks: np.ndarray
     sizes: Sequence[tuple[int, int] | None]
+    masks: Sequence[Path] | None = None
     depths: Sequence[Path | Stored] | None = None
     backs: Sequence[Path | Stored] | None = None
     depth_unit: float = 1.0
@@ -229,25 +246,53 @@ def _camera_matrix(focal_x: float, focal_y: float, x: float, y: float) -> np.nda
     return np.array([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1.0]])
 
 
-def _intrinsics(values: dict, source: str) -> tuple[np.ndarray, tuple[int, int] | None]:
-    """Reads K and the size of one frame; without a stated size K is in fractions of it."""
-    for key in ("k1", "k2", "k3", "p1", "p2"):
-        if values.get(key):
-            value = repr(values[key])[:40]
-            raise UserError(f"{source}: {key} = {value}: lens distortion is not supported")
-    sized = "w" in values and "h" in values
-    width, height = (_side(values, key, source) if sized else 1 for key in "wh")
-    if "fl_x" in values and sized:
+def _check_lens(values: dict, source: str) -> None:
+    """Refuses every lens that is not a pinhole, by the name of what says so."""
+    for key in _MODELS:
+        model = values.get(key)
+        if model is not None and str(model).lower() not in _PINHOLES:
+            raise UserError(
+                f"{source}: {key} is {repr(model)[:40]}; only pinholes are read, so the pictures "
+                "must be undistorted first"
+            )
+    for key in sorted(_DISTORTIONS & values.keys()):
+        value = values[key]
+        if any(value) if isinstance(value, list) else value:
+            raise UserError(
+                f"{source}: {key} = {repr(value)[:40]}: lens distortion is not supported; "
+                "undistort the pictures first"
+            )
+
+
+def _intrinsics(
+    values: dict, source: str, size: Callable[[], tuple[int, int]] | None
+) -> tuple[np.ndarray, tuple[int, int] | None]:
+    """Reads K and the size of one frame; ``size`` gives one that the frame does not state.
+
+    Without either K is in fractions of the size, of a square picture.
+    """
+    _check_lens(values, source)
+    stated = None
+    if "w" in values and "h" in values:
+        stated = _side(values, "w", source), _side(values, "h", source)
+    elif size is not None:
+        stated = size()
+    width, height = stated or (1, 1)
+    if "fl_x" in values and stated:
         focal_x = _number(values, "fl_x", source)
-        focal_y = _number(values, "fl_y", source) if "fl_y" in values else focal_x
     elif "camera_angle_x" in values:
-        focal_x = focal_y = width * _focal(_number(values, "camera_angle_x", source), source)
+        focal_x = width * _focal(_number(values, "camera_angle_x", source), source)
     else:
         raise UserError(f"{source}: no camera: needs w, h, fl_x (fl_y, cx, cy), or camera_angle_x")
-    center_x = _number(values, "cx", source) if sized and "cx" in values else width / 2
-    center_y = _number(values, "cy", source) if sized and "cy" in values else height / 2
-    K = _camera_matrix(focal_x, focal_y, center_x, center_y)
-    return K, (width, height) if sized else None
+    if "fl_y" in values and stated:
+        focal_y = _number(values, "fl_y", source)
+    elif "camera_angle_y" in values and not ("fl_x" in values and stated):
+        focal_y = height * _focal(_number(values, "camera_angle_y", source), source)
+    else:
+        focal_y = focal_x
+    center_x = _number(values, "cx", source) if stated and "cx" in values else width / 2
+    center_y = _number(values, "cy", source) if stated and "cy" in values else height / 2
+    return _camera_matrix(focal_x, focal_y, center_x, center_y), stated
 
 
 def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
@@ -260,10 +305,12 @@ def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
     Raises:
         UserError: the file is bad; one line says where.
     """
-    return _posed_frames(path)[2:]
+    top, frames = _frames(path)
+    return _cameras(path, top, frames, None)
 
 
-def _posed_frames(path: Path) -> tuple[dict, list[dict], np.ndarray, np.ndarray, Sizes]:
+def _frames(path: Path) -> tuple[dict, list[dict]]:
+    """What the file states for all frames, and the frames."""
     top = read_document(path, object)
     if not isinstance(top, dict):
         raise UserError(f"{path}: expected a JSON object")
@@ -271,54 +318,97 @@ def _posed_frames(path: Path) -> tuple[dict, list[dict], np.ndarray, np.ndarray,
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: no frames")
     _check_count(len(frames), path)
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict) or "transform_matrix" not in frame:
+            raise UserError(f"{path}: frame {number}: no transform_matrix")
+    return top, frames
+
+
+def _cameras(
+    path: Path, top: dict, frames: list[dict], size: Callable[[], tuple[int, int]] | None
+) -> tuple[np.ndarray, np.ndarray, Sizes]:
     poses, lenses, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
     shared = None  # most files state one lens for all frames
     for frame, source in zip(frames, names):
-        if not isinstance(frame, dict) or "transform_matrix" not in frame:
-            raise UserError(f"{source}: no transform_matrix")
         poses.append(_matrix(frame["transform_matrix"], source))
         if own := {key: frame[key] for key in _LENS & frame.keys()}:
-            lenses.append(_intrinsics({**top, **own}, source))
+            lenses.append(_intrinsics({**top, **own}, source, size))
         else:
-            shared = shared or _intrinsics(top, source)
+            shared = shared or _intrinsics(top, source, size)
             lenses.append(shared)
     Ks, sizes = np.stack([K for K, _ in lenses]), [size for _, size in lenses]
     check_cameras(np.stack(poses), Ks, sizes, names)
-    return top, frames, np.stack(poses), Ks, sizes
+    return np.stack(poses), Ks, sizes
 
 
-def _read_transforms(folder: Path) -> ObjectFiles:
-    path = folder / "transforms.json"
-    top, frames, poses, Ks, sizes = _posed_frames(path)
-    files: dict[str, list[Path]] = {"file_path": [], "depth_file_path": [], "back_file_path": []}
+_PATHS = ("file_path", "mask_path", "depth_file_path", "back_file_path")
+
+
+def _pictures(path: Path, frames: list[dict]) -> dict[str, list[Path]]:
+    """The files that the frames name, by the name of the field."""
+    files: dict[str, list[Path]] = {key: [] for key in _PATHS}
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
         if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise UserError(f"{source}: no file_path")
         for key, paths in files.items():
             if frame.get(key):
-                paths.append(inside(folder, frame[key], source))
+                paths.append(inside(path.parent, frame[key], source))
         picture = files["file_path"][-1]
-        if not picture.suffix:  # Blender leaves it out
+        # Blender leaves the suffix out; what follows a dot may belong to the name then.
+        if picture.suffix.lower() not in PICTURE_SUFFIXES and not os.path.lexists(picture):
             found = [picture.with_name(picture.name + suffix) for suffix in PICTURES]
             files["file_path"][-1] = next((p for p in found if p.exists()), found[1])
-    for paths in files.values():
-        if repeated := next((p for p, n in Counter(paths).items() if n > 1), None):
+    for key, paths in files.items():
+        repeated = next((p for p, n in Counter(paths).items() if n > 1), None)
+        if repeated and key != "mask_path":  # one mask may serve all
             raise UserError(f"{path}: two frames have the picture {repeated.name}")
+    if 0 < len(files["mask_path"]) < len(frames):
+        raise UserError(f"{path}: {len(files['mask_path'])} of {len(frames)} frames have a mask")
+    return files
+
+
+def _read_transforms(folder: Path) -> ObjectFiles:
+    return _read_frames([folder / "transforms.json"])
+
+
+def _read_nerf(folder: Path) -> ObjectFiles:
+    paths = [folder / f"transforms_{part}.json" for part in ("train", "val", "test")]
+    return _read_frames([path for path in paths if os.path.lexists(path)])
+
+
+def _read_frames(paths: list[Path]) -> ObjectFiles:
+    """One object of the frames of all files; the first says what holds for the object."""
+    parts = []
+    files: dict[str, list[Path]] = {key: [] for key in _PATHS}
+    top: dict = {}
+    for path in paths:
+        own, frames = _frames(path)
+        top, found = top or own, _pictures(path, frames)
+        first = found["file_path"][0]
+        parts.append(_cameras(path, own, frames, cache(partial(picture_size, first))))
+        for key in _PATHS:
+            files[key] += found[key]
+    path, count = paths[0], len(files["file_path"])
+    _check_count(count, path)
     depth_unit = _number({"depth_unit": 1e-3, **top}, "depth_unit", str(path))
     if not 0 < depth_unit <= 1e3:
         raise UserError(f"{path}: depth_unit is {depth_unit:g}, expected above 0, at most 1000")
     attribution = top.get("attribution") or {}
     if not isinstance(attribution, dict):
         attribution = {"text": attribution}
-    images, depths, backs = files.values()
+    images, *others = files.values()
+    masks, depths, backs = (found if len(found) == count else None for found in others)
+    if files["mask_path"] and masks is None:
+        raise UserError(f"{path}: {len(files['mask_path'])} of {count} frames have a mask")
     return ObjectFiles(
         images=images,
-        camera_to_world=poses,
-        Ks=Ks,
-        sizes=sizes,
-        depths=depths if len(depths) == len(frames) else None,
-        backs=backs if len(backs) == len(frames) else None,
+        camera_to_world=np.concatenate([poses for poses, _, _ in parts]),
+        Ks=np.concatenate([Ks for _, Ks, _ in parts]),
+        sizes=[size for _, _, sizes in parts for size in sizes],
+        masks=masks,
+        depths=depths,
+        backs=backs,
         depth_unit=depth_unit,
         name=one_text(top.get("name") or ""),
         attribution={one_text(k): one_text(v) for k, v in attribution.items()},
@@ -350,6 +440,11 @@ class _View(Struct):
     y_fov: float | None = None
 
 
+def _aspect(picture: Path) -> float:
+    width, height = picture_size(picture)
+    return width / height
+
+
 def _read_gobjaverse(folder: Path) -> ObjectFiles:
     found = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
     _check_count(len(found), folder)
@@ -358,14 +453,21 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
     views = [view for view, files in zip(found, both) if all(map(os.path.lexists, files))]
     if not views:
         raise UserError(f"{folder / GOBJAVERSE}: no views that have both picture and camera")
+    aspect = 0.0  # of the first picture, opened where it is needed
     poses, Ks, names = [], [], [str(view / f"{view.name}.json") for view in views]
     for name in names:
         camera = read_document(name, _View)
         pose = _matrix(list(zip(camera.x, camera.y, camera.z, camera.origin)), name)
         pose[:3, 1:3] *= -1  # OpenCV to OpenGL
         poses.append(pose)
-        focal_x = GOBJAVERSE_FOCAL if camera.x_fov is None else _focal(camera.x_fov, name)
-        focal_y = focal_x if camera.y_fov is None else _focal(camera.y_fov, name)
+        if camera.x_fov is None or camera.y_fov is None:
+            # Pixels are square, the picture may not be.
+            aspect = aspect or _aspect(inside(views[0], f"{views[0].name}.png", name))
+        if camera.x_fov is None:
+            focal_x = GOBJAVERSE_FOCAL / aspect
+        else:
+            focal_x = _focal(camera.x_fov, name)
+        focal_y = focal_x * aspect if camera.y_fov is None else _focal(camera.y_fov, name)
         Ks.append(_camera_matrix(focal_x, focal_y, 0.5, 0.5))
     check_cameras(np.stack(poses), np.stack(Ks), [None] * len(views), names)
     depths = None
@@ -403,6 +505,7 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
 # Each layout has the name that marks an object's folder, and the folder's reader.
 LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
     "transforms": ("transforms.json", _read_transforms),
+    "nerf": ("transforms_train.json", _read_nerf),
     "gobjaverse": (GOBJAVERSE, _read_gobjaverse),
     "openlrm": ("intrinsics.npy", _read_openlrm),
 }

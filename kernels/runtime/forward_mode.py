@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 from torch import Tensor
 from torch.autograd import forward_ad
-
-Result = TypeVar("Result")
 
 
 def has_tangent(*values: Any) -> bool:
@@ -23,7 +21,7 @@ def has_tangent(*values: Any) -> bool:
     )
 
 
-def reverse_only(name: str, operator: Callable[..., Result]) -> Callable[..., Result]:
+def reverse_only(name: str, operator: Callable) -> Any:
     """Return the operator behind a check that no argument carries a tangent.
 
     torch calls a ``custom_op`` with the plain values and returns them without a tangent, so that
@@ -37,7 +35,7 @@ def reverse_only(name: str, operator: Callable[..., Result]) -> Callable[..., Re
         A function of the same arguments, which raises ``NotImplementedError`` for a tangent.
     """
 
-    def call(*args: Any) -> Result:
+    def call(*args: Any) -> Any:
         if has_tangent(*args):
             raise NotImplementedError(
                 f"{name}: forward-mode derivatives (torch.func.jvp, jacfwd, dual numbers) are not "

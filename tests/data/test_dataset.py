@@ -12,7 +12,7 @@ from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.cameras import orbit
-from gamba_warp.data.dataset import SPLITS, open_dataset, split_of, write_split
+from gamba_warp.data.dataset import SPLITS, background_note, open_dataset, split_of, write_split
 
 FOV = math.radians(49.1)
 FOCAL = 0.5 / math.tan(FOV / 2)
@@ -156,6 +156,79 @@ def test_blender_file(tmp_path):
     cameras = open_dataset(tmp_path).load(0, size=4).cameras
     want = torch.tensor([[FOCAL * 4, 0, 2], [0, FOCAL * 4, 2], [0, 0, 1]])
     torch.testing.assert_close(cameras.Ks[0], want)
+
+
+def test_an_angle_alone_of_a_picture_that_is_not_square(tmp_path):
+    """Pixels are square: the vertical focal length is the horizontal one, in pixels."""
+    path = write_transforms(tmp_path, count=1, width=8, height=6)
+    frame = json.loads(path.read_text())["frames"][0]
+    path.write_text(json.dumps({"camera_angle_x": FOV, "frames": [frame]}))
+    K = open_dataset(tmp_path).load(0).cameras.Ks[0]
+    torch.testing.assert_close(K, torch.tensor([[FOCAL * 8, 0, 4], [0, FOCAL * 8, 3], [0, 0, 1]]))
+    angles = {"camera_angle_x": FOV, "camera_angle_y": 2 * FOV, "frames": [frame]}
+    path.write_text(json.dumps(angles))
+    K = open_dataset(tmp_path).load(0).cameras.Ks[0]
+    assert K[1, 1] == pytest.approx(3 / math.tan(FOV))
+    # Numbers in pixels hold for the picture, whose size the file need not repeat.
+    path.write_text(json.dumps({"fl_x": 9, "fl_y": 7, "cx": 3, "cy": 2, "frames": [frame]}))
+    K = open_dataset(tmp_path).load(0).cameras.Ks[0]
+    assert K.tolist() == [[9, 0, 3], [0, 7, 2], [0, 0, 1]]
+
+
+def test_gobjaverse_of_pictures_that_are_not_square(tmp_path):
+    view = tmp_path / "0" / "10010" / "campos_512_v4" / "00000"
+    write_picture(view / "00000.png", 16, 8)
+    axes = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1], "origin": [0, 0, -2]}
+    for angles, focal in (({"x_fov": FOV}, FOCAL * 16), ({}, 8 * 1422.222 / 1024)):
+        (view / "00000.json").write_text(json.dumps(axes | angles))
+        K = open_dataset(tmp_path).load(0).cameras.Ks[0]
+        assert (K[0, 0], K[1, 1]) == pytest.approx((focal, focal))
+
+
+def test_masks_are_the_alpha(tmp_path):
+    path = write_transforms(tmp_path, count=2, width=8, height=6)
+    values = json.loads(path.read_text())
+    for number, frame in enumerate(values["frames"]):
+        Image.new("RGB", (8, 6), (10, 20, 30)).save(tmp_path / frame["file_path"])
+        frame["mask_path"] = f"mask{number}.png"
+        mask = np.zeros((6, 8), np.uint8)
+        mask[2:4, 3:5] = 1 if number else 255  # nerfstudio takes both for the object
+        Image.fromarray(mask).save(tmp_path / frame["mask_path"])
+    frames, values["frames"] = values["frames"], [dict(f) for f in values["frames"]]
+    path.write_text(json.dumps(values))
+    data = open_dataset(tmp_path)
+    images = data.load(0).images
+    assert images[..., 3].sum((1, 2)).tolist() == [4, 4] and (images[:, 2:4, 3:5, 3] == 1).all()
+    assert background_note(data) is None
+    for frame in values["frames"]:
+        del frame["mask_path"]
+    path.write_text(json.dumps(values))
+    assert "no picture has an alpha channel or a mask" in background_note(open_dataset(tmp_path))
+    values["frames"] = frames
+    path.write_text(json.dumps(values))
+    Image.new("L", (4, 6)).save(tmp_path / "mask0.png")
+    refused("mask0.png: the mask is 4x6, its picture 8x6", open_dataset(tmp_path).load, 0)
+    (tmp_path / "mask0.png").unlink()
+    assert "mask0.png: no such file" in next(iter(open_dataset(tmp_path).check().values()))
+
+
+def test_nerfs_own_layout(tmp_path):
+    """Three files of one object, whose frames have no suffix, but may have dots."""
+    path = write_transforms(tmp_path, count=3, width=8, height=6)
+    frames = json.loads(path.read_text())["frames"]
+    path.unlink()
+    for part, frame in zip(("train", "val", "test"), frames):
+        picture = tmp_path / frame["file_path"]
+        frame["file_path"] = f"./{part}/r_0.5"
+        (tmp_path / part).mkdir()
+        picture.rename(tmp_path / part / "r_0.5.png")
+        values = {"camera_angle_x": FOV, "frames": [frame]}
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps(values))
+    data = open_dataset(tmp_path)
+    assert (data.layout, data.num_views(0), data.check()) == ("nerf", 3, {})
+    got = data.load(0)
+    torch.testing.assert_close(got.cameras.viewmats, viewmats(3), atol=1e-6, rtol=0)
+    assert [path.parent.name for path in data.files(0).images] == ["train", "val", "test"]
 
 
 def test_resize_is_an_area_mean_without_bleeding(tmp_path):

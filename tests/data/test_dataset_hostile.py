@@ -102,6 +102,13 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"depth_unit": -1}, "depth_unit is -1"),
         ({"depth_unit": 1e8}, "depth_unit is 1e+08"),
         ({"k1": {"a": [1] * 1000}}, "lens distortion"),
+        ({"k4": 0.1}, "k4 = 0.1: lens distortion"),
+        ({"distortion_params": [0, 0.1]}, "distortion_params = [0, 0.1]: lens distortion"),
+        ({"is_fisheye": True}, "is_fisheye = True"),
+        ({"ftheta_p0": 0.1}, "ftheta_p0"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is 'EQUIRECTANGULAR'; only pinholes"),
+        ({"frame": {"camera_model": "OPENCV_FISHEYE"}}, "frame 1: camera_model"),
+        ({"frame": {"mask_path": "1.png"}}, "1 of 2 frames have a mask"),
         ({"applied_transform": [[1, 0], [0, 1]]}, "applied_transform has shape (2, 2)"),
         ({"applied_transform": "up"}, "applied_transform is not a matrix"),
         ({"applied_transform": [[0] * 4] * 3}, "moves no mesh"),
@@ -123,7 +130,7 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"frame": {"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
         ({"frame": {"transform_matrix": np.diag([2.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
     ],
-    ids=range(35),
+    ids=range(42),
 )
 def test_numbers_without_sense_are_one_line(tmp_path, values, message):
     transforms(tmp_path / "x", **values)
@@ -216,7 +223,7 @@ def test_depth_is_finite_and_not_negative(tmp_path):
 def test_pictures_that_would_fill_the_memory(tmp_path, monkeypatch):
     transforms(tmp_path / "x")
     frames = [{"file_path": "wide.png", "transform_matrix": POSE}]
-    values = {"camera_angle_x": 1.0, "frames": frames}
+    values = {"camera_angle_x": 1.0, "camera_angle_y": 1.0, "frames": frames}
     (tmp_path / "x" / "transforms.json").write_text(json.dumps(values))
     picture(tmp_path / "x" / "wide.png", (20_000, 1))
     data = open_dataset(tmp_path)

@@ -57,11 +57,31 @@ def assert_as_alone(pair, protocols, found):
         assert got["fscore"] == want["fscore"][f"{min(protocol.thresholds):g}"], label
 
 
-def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
+def test_each_row_is_what_its_protocol_gives(folders, monkeypatch):
     """Stages that rows have in common are computed once; that must change no figure."""
-    fields = ("points", "num_points", "seed", "unit", "chamfer", "align", "occupancy", "grid")
-    changes = {name: sensitivity._CHANGES[name][-1:] for name in (*fields, "iou_voxels")}
+    changes = {
+        "points": ("views",),
+        "num_points": (400,),
+        "seed": (1,),
+        "unit": (2.0,),
+        "chamfer": ("squared-sum",),
+        "align": (("scale", "yaw"),),
+        "occupancy": ("parity",),
+        "grid": ("lattice",),
+        "iou_voxels": (24,),
+    }
     monkeypatch.setattr(sensitivity, "_CHANGES", changes)
+    monkeypatch.setattr(sensitivity, "PRESETS", {})
+    protocols = sensitivity.variants(SMALL)
+    assert len(protocols) == 1 + len(changes)
+    pair = find_pairs(folders / "pred", folders / "gt")[0][0]
+    found = sensitivity.vary_pair(pair, SMALL, None, protocols)["variants"]
+    assert_as_alone(pair, protocols, found)
+
+
+def test_sheets_of_a_command(folders, monkeypatch, capfd):
+    monkeypatch.setattr(sensitivity, "_CHANGES", {"seed": (1,)})
+    monkeypatch.setattr(sensitivity, "PRESETS", {"default": SMALL})
     given = ["--points", "500", "--set", "iou_voxels=16", "--sensitivity", "--out"]
     words = [str(folders / side) for side in ("pred", "gt")]
     assert run("eval-geometry", [*words, *given, str(folders / "out")]) == 0
@@ -69,16 +89,13 @@ def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
     kept = json.loads((folders / "out" / "sensitivity.json").read_text())
     assert printed == (folders / "out" / "sensitivity.md").read_text()
     assert "</svg>" in (folders / "out" / "sensitivity.svg").read_text()
+    assert kept["rows"].keys() == sensitivity.variants(SMALL).keys()
+    assert [o["name"] for o in kept["objects"]] == ["a", "b"]
     (folders / "gt" / "b.ply").rename(folders / "gt" / "c.ply")
     assert run("eval-geometry", [*words, *given, str(folders / "fewer")]) == 1
     said = capfd.readouterr()
     assert "failed: b: no ground truth\nfailed: c: no prediction\n" in said.err
     assert "of 1 objects" in said.out
-    protocols = sensitivity.variants(SMALL)
-    assert kept["rows"].keys() == protocols.keys() and len(protocols) > 8
-    pair = find_pairs(folders / "pred", folders / "gt")[0][0]
-    found = next(o for o in kept["objects"] if o["name"] == "a")["variants"]
-    assert_as_alone(pair, protocols, found)
 
 
 def test_rows_that_differ_by_the_surface_or_the_thresholds_alone(folders):

@@ -70,7 +70,7 @@ def test_no_operator_with_a_gradient_is_without_the_check():
     for info in pkgutil.walk_packages(kernels.__path__, kernels.__name__ + "."):
         if info.name.endswith(".ops"):
             for name, value in vars(importlib.import_module(info.name)).items():
-                if isinstance(value, torch.library.CustomOpDef) and not name.startswith("_"):
+                if type(value).__name__ == "CustomOpDef" and not name.startswith("_"):
                     bare.add(name)
     assert bare == {"bin_op"}
 
