@@ -117,12 +117,8 @@ def _open_all(config: TrainConfig) -> TrainingData:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
-<<<<<<< .merge_file_BENxaw
-    held_out = []
-=======
     notes += filter(None, [background_note(train)])
-    validation, held_out = None, []
->>>>>>> .merge_file_i7cwDw
+    held_out = []
     try:
         held_out.append(_held_out("", config.data, config.run.val_objects))
     except UserError as error:
