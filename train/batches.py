@@ -104,7 +104,7 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
     if data.scanned and not config.views.train_on_gso:
         names = ", ".join(data.scanned[:3]) + (", ..." if len(data.scanned) > 3 else "")
         raise UserError(
-            f"names of Google Scanned Objects, which are for evaluation, among the objects ({names})"
+            f"names of Google Scanned Objects, which are for evaluation, among them ({names})"
             ": leave them out, or give --train-on-gso, which the model's card then states"
         )
     sizes = sorted({config.views.size, config.model_config().image_size})

@@ -214,7 +214,7 @@ class Trainer:
             data=", ".join(folder.name for folder in folders)[:2000],
             objects=len(objects),
             steps=self.step,
-            compute=f"{self.elapsed / 60:.0f} minutes of {self.world.size} {self.world.device.type}",
+            compute=f"{self.elapsed / 60:.0f} minutes, {self.world.size} x {self.world.device}",
             command=command_line(values)[:2000],
             seed=self.config.run.seed,
             use="not stated",
