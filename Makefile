@@ -9,7 +9,7 @@ STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
 .PHONY: setup demo test ptx debug hostile endurance bench study instructions docs lint format figures \
-        architecture constraints clean
+        scanned architecture constraints clean
 
 setup: $(STAMP)
 
@@ -115,6 +115,11 @@ format: $(STAMP)
 # puts an evaluation of the shipped model into its card first.
 figures: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m lab.figures $(REPORTS)
+
+# The tables of docs/scanned.md: renders the meshes of a folder and evaluates the shipped model on them.
+# make scanned MESHES=FOLDER OPTIONS="--no-lpips --limit 8"
+scanned: $(STAMP)
+	PYTHONPATH=docs $(BIN)/python -m lab.scanned $(MESHES) $(OPTIONS)
 
 # docs/architecture.svg and the table of docs/architecture.md, from today's imports.
 architecture: $(STAMP)

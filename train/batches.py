@@ -21,6 +21,7 @@ import torch
 
 from gamba_warp.batch import EXPECTED
 from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_dataset
+from gamba_warp.data.gso import scanned
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 
@@ -75,6 +76,12 @@ class TrainingData:
     notes: list[str] = field(default_factory=list)
 
     @property
+    def scanned(self) -> list[str]:
+        """Uids of the objects that have names of Google Scanned Objects."""
+        taken = [(self.train, self.objects), *((p.dataset, p.objects) for p in self.held_out)]
+        return scanned({dataset.uids[index] for dataset, indices in taken for index in indices})
+
+    @property
     def fingerprint(self) -> str:
         """A hash of the objects' names in their order; a run with another list is another run."""
         names = "\n".join(self.train.uids[i] for i in self.objects)
@@ -90,10 +97,16 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
 
     Raises:
         UserError: the folder or the object of ``--overfit`` does not exist, no object can be read,
-            or the device has no room for the pictures.
+            the device has no room for the pictures, or there are Google Scanned Objects.
     """
     one = config.views.overfit
     data = _open_all(config) if one is None else _open_one(config, one)
+    if data.scanned and not config.views.train_on_gso:
+        names = ", ".join(data.scanned[:3]) + (", ..." if len(data.scanned) > 3 else "")
+        raise UserError(
+            f"names of Google Scanned Objects, which are for evaluation, among them ({names})"
+            ": leave them out, or give --train-on-gso, which the model's card then states"
+        )
     sizes = sorted({config.views.size, config.model_config().image_size})
     packed = data.train.packed_size
     if packed is not None and sizes[-1] > packed:

@@ -76,6 +76,9 @@ class DataConfig:
         made_uses: Samples of each made object.
         made_views: Views of each made object.
         made_workers: Processes that make and render; the number changes no result.
+        train_on_gso: Take objects that have names of Google Scanned Objects. The paper and others
+            are evaluated on this set, so without the option a run refuses them, to train and to
+            validate on. With it OUT/model.json, the card of the weights, states their names.
         overfit: Train on this one object (uid or number) and validate on its training views: a
             smoke test.
         cache: Keep decoded pictures in memory.
@@ -101,6 +104,7 @@ class DataConfig:
     made_uses: Annotated[int, Meta(ge=1, le=10_000)] = 16
     made_views: Annotated[int, Meta(ge=2, le=1000)] = 12
     made_workers: Annotated[int, Meta(ge=1, le=1024)] = 1
+    train_on_gso: bool = False
     overfit: str | None = None
     cache: bool = False
     cache_device: bool = False

@@ -9,18 +9,20 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
+from gamba_warp.files import write_json
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.processes import stop_requests
 
 from .batches import Batches, HeldOut, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
-from .config import LengthConfig, TrainConfig
+from .config import LengthConfig, TrainConfig, command_line
 from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Moment, term_weights
@@ -196,9 +198,32 @@ class Trainer:
         if stop:
             return 128 + int(stop)
         if self.world.main:
-            best = [*self.models.values()][-1]
-            save_model(self.config.run.out / "model.safetensors", best)
+            self._save_model(self.config.run.out / "model.safetensors")
         return 0
+
+    def _save_model(self, path: Path) -> None:
+        """Writes the weights that are used, and beside them what they must not be judged by."""
+        from gamba_warp.pages.card import ModelCard, card_path
+
+        save_model(path, [*self.models.values()][-1])
+        if not (names := self.data.scanned):
+            return
+        values, objects = self.config.to_dict(), set(self.data.objects)
+        folders = [self.config.data, *self.config.views.extra]
+        card = ModelCard(
+            data=", ".join(folder.name for folder in folders)[:2000],
+            objects=len(objects),
+            steps=self.step,
+            compute=f"{self.elapsed / 60:.0f} minutes, {self.world.size} x {self.world.device}",
+            command=command_line(values)[:2000],
+            seed=self.config.run.seed,
+            use="not stated",
+            limits=[
+                f"Trained or validated on {len(names)} of Google Scanned Objects (--train-on-gso): "
+                f"figures on them are not of unseen objects: {', '.join(names)}"[:2000]
+            ],
+        )
+        write_json(card_path(path), msgspec.to_builtins(card))
 
     def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
         run, minutes = self.config.run, self.config.length.minutes
@@ -254,7 +279,7 @@ class Trainer:
     def _validate_on(
         self, part: HeldOut, objective: Objective
     ) -> tuple[dict[str, float], list[Tensor]]:
-        """Validates on the objects of one dataset, and logs the figures; returns ``validate``'s."""
+        """Validates on the objects of one dataset, and logs the figures, which it returns."""
         assert self.log is not None
         best, size = [*self.models.values()][-1], self.config.views.size
         about = (self.data.val_views, best.config, size, self._unread)
@@ -278,7 +303,7 @@ class Trainer:
             return
         path = self.config.run.out / "best.safetensors"
         try:
-            save_model(path, [*self.models.values()][-1])
+            self._save_model(path)
         except UserError as error:  # a checkpoint may have more luck, and the run goes on
             self.log.warn(self.step, str(error))
             return

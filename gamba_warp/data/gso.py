@@ -10,7 +10,9 @@ would be another protocol.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from functools import cache
+from importlib.resources import files
+from typing import Any, Literal
 
 from ..conventions import DEFAULT_FOV
 
@@ -21,7 +23,7 @@ FOV = DEFAULT_FOV  # degrees; not stated, that of the reference camera
 ELEVATIONS = (0.0, 20.0, 40.0)  # degrees
 AZIMUTHS = tuple(45.0 * number for number in range(8))  # degrees; at 0 the camera stands at -y
 VIEWS = len(ELEVATIONS) * len(AZIMUTHS)
-UP = "z"  # of the set's files
+UP: Literal["z"] = "z"  # of the set's files
 
 GROUPS: dict[str, tuple[str, ...]] = {
     group: tuple(names.split())
@@ -67,6 +69,22 @@ GROUPS: dict[str, tuple[str, ...]] = {
     }.items()
 }
 NAMES = tuple(sorted(name for group in GROUPS.values() for name in group))
+
+
+@cache
+def all_names() -> frozenset[str]:
+    """The names of all models of the set, 1,033 with the few that its owner took back.
+
+    Source: the table of names in MOVi (Kubric, ``challenges/movi/movi_e.py``), which all names of
+    the evaluation are in.
+    """
+    text = (files(__package__ or "gamba_warp.data") / "gso_names.txt").read_text(encoding="utf-8")
+    return frozenset(text.split())
+
+
+def scanned(uids: Iterable[str]) -> list[str]:
+    """Those of some objects that have a name of the set, which folders before it do not change."""
+    return sorted(uid for uid in uids if uid.rpartition("/")[2] in all_names())
 
 
 def protocol_of(there: Iterable[str]) -> dict[str, Any]:

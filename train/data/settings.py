@@ -13,6 +13,7 @@ from gamba_warp.conventions import DEFAULT_FOV
 if TYPE_CHECKING:
     import numpy as np
 
+Up = Literal["auto", "y", "z"]
 SPREAD = 0.2  # largest share by which a distance exceeds the least one, unless told
 # Fields of view of 20° to 70°, one for each object, evenly drawn by their logarithm.
 VARIED_CAMERAS: dict[str, Any] = {"fov": 37.4, "fov_spread": 1.87, "spread": 0.3}
@@ -44,7 +45,7 @@ class Settings:
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     depth: bool = False
     format: Literal["webp-lossless", "png"] = "webp-lossless"
-    up: Literal["auto", "y", "z"] = "auto"
+    up: Up = "auto"
     fronts: Annotated[int, Meta(ge=0, le=10_000)] = 1
     spread: Annotated[float, Meta(ge=0, le=10)] = SPREAD
     stretch: Annotated[float, Meta(ge=1, le=10)] = 1.0

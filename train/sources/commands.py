@@ -22,7 +22,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
 from gamba_warp.untrusted.ranges import Seed, ranged
 
-from ..data.settings import Settings
+from ..data.settings import Settings, Up
 from .objaverse_lists import Lists
 
 Item = TypeVar("Item")
@@ -280,35 +280,54 @@ def data_gso_command(
     out: tyro.conf.Positional[Path],
     source: Path,
     share: tyro.conf.OmitArgPrefixes[Share],
+    up: Up = "auto",
     size: Annotated[int, Meta(ge=8, le=4096)] = 512,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
 ) -> int:
     """Make the evaluation "gso" of a copy of Google Scanned Objects: 60 objects, 24 views of each.
 
-    Writes OUT/views (a dataset, all of it the test split; view 0 is the input) and OUT/meshes. What
-    is there is skipped, so a run that was stopped goes on. Objects that SOURCE lacks are named;
-    the exit code is then 1.
+    Writes OUT/views (a dataset, all of it the test split; view 0 is the input) and, of the set's
+    own layout, OUT/meshes. What is there is skipped, so a run that was stopped goes on. Objects
+    that SOURCE has and those that it lacks are named; where it lacks some the exit code is 1.
 
     Args:
         out: folder to make or to go on with.
-        source: folder of the set: a folder or a zip of each model, as the Fuel server gives them.
+        source: folder of the set: a folder or a zip of each model, as the Fuel server gives them;
+            or meshes with the set's names in any other layout, such as NAME.glb.
+        up: the axis that points up in files of another layout; auto: y for .glb and .gltf, and
+            others have to be told. Those of the Fuel server have z.
         share: which of them.
         size: pixels a side; the evaluation's are 512.
         workers: number of processes that render; 0 means one per core.
     """
-    from gamba_warp.data.gso import NAMES
+    from gamba_warp.data.gso import NAMES, UP
 
-    from .gso import make_views, take_models
+    from .gso import find_meshes_of, make_views, others_of, take_models, taken, up_of
 
     names = share.of(NAMES)
-    out = output_folder(out)
-    failures = take_models(source, out, names)
-    made, warnings, failed = make_views(out, names, size, workers)
+    meshes, truths, axis = find_meshes_of(source, names), source, ""
+    if meshes:
+        up = up_of(meshes, up)
+        axis = f" --up {up}"
+        out = output_folder(out)
+        failures = dict.fromkeys(names, f"not in {source}")
+    else:
+        if up not in ("auto", UP):
+            raise UserError(f"--up {up}: the set's own layout has z up")
+        out, up, truths = output_folder(out), UP, out / "meshes"
+        failures = take_models(source, out, names)
+        meshes = taken(out, names)
+    failures = {name: why for name, why in failures.items() if name not in {m.uid for m in meshes}}
+    print(f"{len(meshes)} of {len(names)} are there: {', '.join(mesh.uid for mesh in meshes)}")
+    if others := others_of(source):
+        left = f"{counted(others, 'other object')} of the set, not of the evaluation"
+        print(f"{left}: gamba data render {source} --out DATA")
+    made, warnings, failed = make_views(out, meshes, size, workers, up)
     failures |= failed
     code = _told(failures, "missing", warnings)
     views, missing = out / "views", f"{len(failures)} of {len(names)} missing"
     print(f"rendered {counted(made, 'object')} into {views}, {missing}")
     print(f"next: gamba eval-views --protocol gso --checkpoint MODEL --data {views} --out EVAL")
-    geometry = f"gamba eval-geometry EVAL/gaussians {out / 'meshes'}"
-    print(f"      {geometry} --protocol gso --data {views}")
+    geometry = f"gamba eval-geometry EVAL/gaussians {truths}"
+    print(f"      {geometry} --protocol gso{axis} --data {views}")
     return code

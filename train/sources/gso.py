@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 from gamba_warp.batch import progress_bar
@@ -17,13 +18,13 @@ from gamba_warp.data import gso
 from gamba_warp.data.dataset import SPLIT_VERSION
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_folder, output_folder, write_json
-from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
+from gamba_warp.formats.catalogue import CATALOGUE, Mesh, find_meshes
 from gamba_warp.untrusted.archives import open_zip
 from gamba_warp.untrusted.documents import read_bytes
 from gamba_warp.untrusted.names import inside
 
 from ..data.render import render_meshes, still_missing
-from ..data.settings import Settings
+from ..data.settings import Settings, Up
 
 MESH = "meshes/model.obj"
 METADATA = "metadata.pbtxt"
@@ -63,9 +64,52 @@ def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Pat
     if not found:
         raise UserError(
             f"--source {source}: holds none of the {len(names)} models "
-            f"(such as {names[0]}/{MESH} or {names[0]}.zip)"
+            f"(such as {names[0]}/{MESH}, {names[0]}.zip or {names[0]}.glb)"
         )
     return found
+
+
+def find_meshes_of(source: Path, names: Sequence[str]) -> list[Mesh]:
+    """The meshes of these names in a folder that has not the set's own layout.
+
+    Args:
+        source: the folder; ``find_meshes`` names what is in it.
+        names: which are looked for.
+
+    Returns:
+        Empty where the folder has the set's own layout, or none of them.
+    """
+    with suppress(UserError):
+        find_models(source, names)
+        return []
+    with suppress(UserError):
+        return [mesh for mesh in find_meshes(source) if mesh.uid in names]
+    return []
+
+
+def others_of(source: Path) -> int:
+    """How many of the set's models are in a folder that are not of the evaluation."""
+    others = sorted(gso.all_names() - {*gso.NAMES})
+    with suppress(UserError):
+        return len(find_models(source, others))
+    return len(find_meshes_of(source, others))
+
+
+def up_of(meshes: Sequence[Mesh], up: Up) -> Up:
+    """The axis that points up in meshes that have not the set's own layout.
+
+    Args:
+        meshes: their files.
+        up: what was asked for; auto where the format has to tell.
+
+    Raises:
+        UserError: it does not, because only glTF has an axis of its own; .obj files of the set have
+            z up where others have y.
+    """
+    for mesh in meshes:
+        if up == "auto" and mesh.path.suffix.lower() not in (".glb", ".gltf"):
+            raise UserError(f"{mesh.path}: may have y or z up; say which, with --up y or --up z")
+    return "y" if up == "auto" else up
 
 
 def take_model(name: str, path: Path, out: Path) -> None:
@@ -168,18 +212,27 @@ def take_models(source: Path, out: Path, names: Sequence[str]) -> dict[str, str]
     return failures
 
 
+def taken(out: Path, names: Sequence[str]) -> list[Mesh]:
+    """Those of the models that ``take_models`` has put into ``out/meshes``."""
+    meshes = out / "meshes"
+    if not any((meshes / name / "model.obj").is_file() for name in names):
+        return []
+    return [mesh for mesh in find_meshes(meshes) if mesh.uid in names]
+
+
 def make_views(
-    out: Path, names: Sequence[str], size: int, workers: int
+    out: Path, meshes: Sequence[Mesh], size: int, workers: int, up: Up = gso.UP
 ) -> tuple[int, dict[str, list[str]], dict[str, str]]:
-    """Renders those of the models that are in ``out/meshes`` into ``out/views``.
+    """Renders models into ``out/views``.
 
     All objects that are there are its test split.
 
     Args:
         out: folder of the evaluation.
-        names: of the models.
+        meshes: of the models.
         size: pixels a side.
         workers: processes; 0 means one per core.
+        up: the axis that points up in the files.
 
     Returns:
         The number of objects rendered now; by name, what was missing in a model's files; and by
@@ -188,13 +241,12 @@ def make_views(
     Raises:
         UserError: objects are there that were rendered otherwise.
     """
-    views, meshes = output_folder(out / "views"), out / "meshes"
-    if not any((meshes / name / "model.obj").is_file() for name in names):
+    views = output_folder(out / "views")
+    if not meshes:
         return 0, {}, {}
-    wanted = [mesh for mesh in find_meshes(meshes) if mesh.uid in names]
     # The same light for an object at each run.
-    settings = Settings(gso.VIEWS, size, gso.FOV, format="png", up=gso.UP, spread=0.0, poses="gso")
-    todo, damaged = still_missing(wanted, views, settings)
+    settings = Settings(gso.VIEWS, size, gso.FOV, format="png", up=up, spread=0.0, poses="gso")
+    todo, damaged = still_missing(meshes, views, settings)
     warnings, failures = render_meshes(todo, views, settings, workers)
     there = sorted(path.parent.name for path in views.glob("[!.]*/transforms.json"))
     split = {"version": SPLIT_VERSION, "train": [], "val": [], "test": there}

@@ -1,0 +1,108 @@
+"""The page of scanned objects: its tables are what the reports hold."""
+
+import json
+
+import pytest
+from lab import scanned
+from lab.figures.parts import marks
+
+from gamba_warp.image_metrics import METRICS
+
+
+def figures_of(psnr):
+    return {"psnr": psnr, "ssim": 0.8, "lpips": None, "mask_iou": 0.5}
+
+
+def record(name, psnr, flat):
+    baselines = {"billboard": {"psnr": flat}}
+    return {"name": name, "status": "ok", **figures_of(psnr), "baselines": baselines}
+
+
+def row(name, psnr, views="novel"):
+    cells = {key: None if v is None else {"mean": v} for key, v in figures_of(psnr).items()}
+    return {"views": views, "name": name, **cells}
+
+
+VIEWS = {
+    "protocol": {"source": {"path": "m.safetensors", "sha256": "0123456789abcdef77"}},
+    "num_ok": 2,
+    "table": [row("model", 20.5), row("retrieval", 99.0), row("billboard", 17.0)]
+    + [row("model", 38.0, "input")],
+    "objects": [record("a_cup", 19.0, 18.5), record("b", 22.0, 15.5)]
+    + [{"name": "c", "status": "failed"}],
+    "failures": [{"name": "c", "reason": "no such view"}],
+}
+SHAPES = {
+    "mean": {"chamfer": 0.04321, "normal_consistency": 0.7, "iou": 0.5},
+    "objects": [{"name": "b", "chamfer": 0.03, "normal_consistency": 0.75, "iou": 0.6}],
+    "failures": [],
+}
+
+
+def cells(table):
+    return [[cell.strip() for cell in line.strip("| ").split("|")] for line in table.splitlines()]
+
+
+def test_the_means_are_of_new_views_and_the_shapes_stand_with_the_model():
+    head, _, *rows = cells(scanned.figures(VIEWS, SHAPES).partition("\n\n")[0])
+    assert head[0] == "2 objects" and head[-3:] == ["Chamfer", "normals", "Volume IoU"]
+    assert rows == [
+        ["**this project**", "20.50", "0.800", "–", "0.500", "0.0432", "0.700", "0.500"],
+        ["billboard", "17.00", "0.800", "–", "0.500", "–", "–", "–"],
+    ]
+    assert scanned.figures(VIEWS, SHAPES).endswith("`m.safetensors`, SHA-256 0123456789abcdef.")
+
+
+def test_objects_stand_from_best_to_worst_and_failures_below():
+    text = scanned.objects(VIEWS, SHAPES)
+    table, _, failed = text.partition("\n\n")
+    _, _, *rows = cells(table)
+    assert [r[0] for r in rows] == ["b", "a cup"]
+    assert rows[0][-4:] == ["0.0300", "0.750", "0.600", "6.5"]
+    assert rows[1][1] == "19.00" and rows[1][-4:] == ["–", "–", "–", "0.5"]
+    assert failed == "Failed: c: no such view."
+
+
+def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch):
+    ran = []
+
+    def run(command, words):
+        ran.append([command, *words])
+        folder = (
+            tmp_path
+            / "out"
+            / {"eval-views": "eval", "eval-geometry": "shapes"}.get(command, "views")
+        )
+        folder.mkdir(parents=True)
+        (folder / "report.json").write_text(
+            json.dumps(VIEWS if command == "eval-views" else SHAPES)
+        )
+        return int(command == "eval-views")
+
+    monkeypatch.setattr(scanned.cli, "run", run)
+    page = tmp_path / "page.md"
+    parts = "\n".join("\n".join(marks("make scanned", name)) for name in ("figures", "objects"))
+    page.write_text(f"before\n{parts}\nafter\n")
+    assert scanned.main(tmp_path / "glb", out=tmp_path / "out", page=page) == 1
+    assert [words[0] for words in ran] == ["data render", "eval-views", "eval-geometry"]
+    assert ran[1][-1] != "--no-lpips" and str(tmp_path / "out" / "views") in ran[1]
+    assert ran[2][1:3] == [str(tmp_path / "out" / "eval" / "gaussians"), str(tmp_path / "glb")]
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n")
+    assert "| b " in text and "**this project**" in text
+
+
+def test_the_page_that_is_there_has_its_marks_and_every_metric():
+    text = scanned.PAGE.read_text(encoding="utf-8")
+    for name in ("figures", "objects"):
+        begin, end = marks("make scanned", name)
+        part = text.partition(begin)[2].partition(end)[0]
+        assert part.count("|") > 30
+        assert all(metric.head in part for metric in METRICS.values())
+
+
+@pytest.mark.parametrize("code", [2, 130])
+def test_a_command_that_was_refused_ends_it(tmp_path, monkeypatch, code):
+    monkeypatch.setattr(scanned.cli, "run", lambda command, words: code)
+    with pytest.raises(scanned.UserError, match=f"gamba data render: ended with exit code {code}"):
+        scanned.main(tmp_path, out=tmp_path / "out")
