@@ -60,6 +60,7 @@ BOXES = {
         2.4, 1, "kernels", "rasterize", ("Gaussians to pictures", "cpu/ and cuda/")
     ),
     "kernels.ssim": Box(4.4, 1, "kernels", "ssim", ("1 - SSIM of pictures", "and its slope")),
+    "kernels.triangles": Box(5.4, 1, "kernels", "triangles", ("faces that cut", "each other")),
     "kernels": Box(0, 2, "kernels", "kernels", ("public operators,", "loaded when used")),
     "kernels.bench": Box(1, 2, "kernels", "bench", ("run time against error", "of the operators")),
     "kernels.stress": Box(2, 2, "kernels", "stress", ("hostile cases", "against float64")),

@@ -31,7 +31,10 @@ class Room:
     later: tuple[str, ...] = ()
 
 
-_OPS = ("kernels.selective_scan", "kernels.causal_conv1d", "kernels.rasterize", "kernels.ssim")
+_OPS = (
+    *("kernels.selective_scan", "kernels.causal_conv1d", "kernels.rasterize", "kernels.ssim"),
+    "kernels.triangles",
+)
 _KERNELS = ("versions", "kernels.runtime", *_OPS, "kernels")
 _BENCH = tuple(f"kernels.bench{part}" for part in ("", ".core", ".cases", ".static"))
 _STRESS = tuple(f"kernels.stress{part}" for part in ("", ".core", ".oracles", ".cases"))
@@ -54,6 +57,7 @@ ROOMS = {
     "kernels.selective_scan": Room("Mamba's scan", ("versions", "kernels.runtime")),
     "kernels.causal_conv1d": Room("the convolution before it", ("versions", "kernels.runtime")),
     "kernels.ssim": Room("1 - SSIM of pictures and its slope", ("versions", "kernels.runtime")),
+    "kernels.triangles": Room("faces that cut each other", ("versions", "kernels.runtime")),
     "kernels.rasterize": Room("Gaussians to pictures", ("versions", "kernels.runtime")),
     "kernels": Room("the public operators, loaded when used", ("versions",), _OPS),
     "kernels.bench.core": Room(

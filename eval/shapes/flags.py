@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gamba_warp.kernels.triangles import cuts_itself
+
 from .shape import Mesh, directed_edges, merged
 
 FLAGS = {
@@ -53,7 +55,7 @@ def tidied(mesh: Mesh) -> Tidied:
         found.add("degenerate")
     if (repeated & ~flat).any():
         found.add("duplicate")
-    if len(kept.faces) and _cuts_itself(kept):
+    if len(kept.faces) and cuts_itself(kept.vertices, kept.faces):
         found.add("selfintersecting")
     return Tidied(kept, [flag for flag in FLAGS if flag in found])
 
@@ -77,15 +79,3 @@ def _edge_flags(mesh: Mesh) -> set[str]:
         if (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() < 0:  # 6 volumes, signed
             found.add("inverted")
     return found
-
-
-def _cuts_itself(mesh: Mesh) -> bool:
-    import pymeshlab  # which has no stubs
-
-    meshes = pymeshlab.MeshSet()  # pyright: ignore[reportAttributeAccessIssue]
-    copy = pymeshlab.Mesh(  # pyright: ignore[reportAttributeAccessIssue]
-        mesh.vertices, mesh.faces.astype(np.int32)
-    )
-    meshes.add_mesh(copy)
-    meshes.compute_selection_by_self_intersections_per_face()
-    return meshes.current_mesh().selected_face_number() > 0

@@ -26,7 +26,7 @@ def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> T
             the runs waits for a CUDA device.
 
     Raises:
-        TypeError: an argument is not a tensor, or of another dtype.
+        TypeError: an argument is not a dense tensor, or of another dtype.
         ValueError: both are given, a shape or device differs, ``cu_seqlens`` falls, does not begin
             at 0 or end at L, or ``seq_idx`` comes back to an earlier number of its row.
     """
@@ -38,6 +38,8 @@ def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> T
     name, given = ("seq_idx", seq_idx) if cu_seqlens is None else ("cu_seqlens", cu_seqlens)
     if not isinstance(given, Tensor):
         raise TypeError(f"{name} is {type(given).__name__}, must be a tensor")
+    if given.layout != torch.strided:
+        raise TypeError(f"{name} has layout {given.layout}, must be dense (torch.strided)")
     if given.dtype not in _DTYPES:
         raise TypeError(f"{name} has dtype {given.dtype}, allowed: {', '.join(map(str, _DTYPES))}")
     if given.device != x.device:
