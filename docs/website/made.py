@@ -23,7 +23,7 @@ from gamba_warp.train.data.raycast import Lights, RayCaster
 
 SEED = 7
 COLUMNS, ROWS = 8, 6
-SIDE = 128  # pixels of an object
+SIDE = 160  # pixels of an object
 FOV = 40.0  # degrees
 PICTURE = Path(__file__).parents[1] / "pictures" / "made.webp"
 
