@@ -8,7 +8,8 @@ from helpers.meshes import MTL, QUAD, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.formats.meshes import default_up, load_mesh, to_display, to_linear
+from gamba_warp.formats.materials import to_display, to_linear
+from gamba_warp.formats.meshes import default_up, load_mesh
 
 
 def test_textured_obj(tmp_path):

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from gamba_warp.formats.materials import to_linear
-from gamba_warp.formats.meshes import TexturedMesh, to_display
+from gamba_warp.formats.materials import to_display, to_linear
+from gamba_warp.formats.meshes import TexturedMesh
 from gamba_warp.versions import import_open3d
 
 SAMPLES = 3  # rays along each side of a pixel; odd, so that one goes through the pixel's centre
