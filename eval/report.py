@@ -196,10 +196,17 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     return lines + [f"failed: {item['name']}: {item['reason']}" for item in report["failures"]]
 
 
-def count_line(report: dict[str, Any], folder: Path | None) -> str:
-    """How many objects were evaluated and how many failed, and where the report is."""
+def count_line(report: dict[str, Any], folder: Path | None, beside: int) -> str:
+    """How many objects were evaluated and how many failed, and where the report is.
+
+    Args:
+        report: what ``make_report`` returns.
+        folder: where it was written, or None.
+        beside: the number of failures of baselines.
+    """
+    others = f", {beside} of baselines failed" if beside else ""
     file = f"; {folder / 'report.json'}" if folder else ""
-    return f"{report['num_ok']} evaluated, {report['num_failed']} failed{file}"
+    return f"{report['num_ok']} evaluated, {report['num_failed']} failed{others}{file}"
 
 
 @contextmanager

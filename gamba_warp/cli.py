@@ -25,7 +25,7 @@ COMMANDS = {
     "train": "Train a model on posed views.",
     "fit": "Posed views of an object to 3D Gaussians.",
     "data furniture": "Get 820 models.",
-    "data primitives": "Make models of simple solids.",
+    "data made": "Make models: toys, shoes, tools, boxes.",
     "data render": "Meshes to posed views.",
     "data pack": "Posed views to a few large files.",
     "data objaverse": "Objaverse, and its G-Objaverse views.",

@@ -1,6 +1,7 @@
 """Atomic writes: a file or folder is either whole or not there; what is unfinished has a name."""
 
 import errno
+import fnmatch
 import hashlib
 import json
 import os
@@ -205,11 +206,40 @@ def _last_written(entry: os.DirEntry) -> float:
     return max(e.stat(follow_symlinks=False).st_mtime for e in (entry, *inner))
 
 
+def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Yields what ``os.walk`` does, for linked folders too; nothing whose name begins with a dot.
+
+    A folder comes once, under the name without a link if it has one: links come after all else. A
+    link to a folder that ``root`` lies in is passed over. The caller may remove subfolders from
+    the list, which are then not entered; both lists are sorted.
+    """
+
+    def place(folder: str | Path) -> tuple[int, int] | None:
+        try:
+            status = os.stat(folder)
+        except OSError:  # it has gone meanwhile
+            return None
+        return status.st_dev, status.st_ino
+
+    seen = {None, *map(place, Path(os.path.realpath(root)).parents)}
+    waiting = [os.fspath(root)]
+    for start in waiting:  # which grows by the links that are found
+        for folder, subfolders, files in os.walk(start):
+            if (here := place(folder)) in seen:
+                subfolders.clear()
+                continue
+            seen.add(here)
+            subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
+            yield folder, subfolders, sorted(name for name in files if not name.startswith("."))
+            inner = [os.path.join(folder, name) for name in subfolders]
+            waiting += [path for path in inner if os.path.islink(path)]  # os.walk enters none
+
+
 def visible(folder: Path, pattern: str) -> Iterator[Path]:
-    """Yields what matches at any depth, but nothing whose name or folder begins with a dot."""
-    for path in folder.rglob(pattern):
-        if not any(part.startswith(".") for part in path.relative_to(folder).parts):
-            yield path
+    """Yields the files whose names match, at any depth (``walk``)."""
+    for inner, _, files in walk(folder):
+        for name in fnmatch.filter(files, pattern):
+            yield Path(inner, name)
 
 
 def write_json(path: str | Path, value: object) -> None:
@@ -260,6 +290,8 @@ def only_process(folder: Path, what: str) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     path = folder / ".lock"
+    if path.is_symlink():  # its target would be emptied
+        raise UserError(f"cannot lock {folder}: .lock is a link")
     lock = FileLock(path, timeout=0)
     try:
         lock.acquire()

@@ -40,6 +40,7 @@ EXTRA_OF = {
     "huggingface_hub": "hub",
     "imageio_ffmpeg": "video",
     "kornia": "eval",
+    "manifold3d": "mesh",
     "onnxruntime": "photo",
     "open3d": "mesh",
     "pillow_heif": "photo",
@@ -56,7 +57,7 @@ OWN = {
     "ablate": "all",
     "app": "app",
     "demo": "all",
-    "data primitives": "mesh",
+    "data made": "mesh",
     "data render": "mesh",
     "data gso": "mesh",
     "eval-geometry": "eval",
@@ -72,17 +73,17 @@ _SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
     "train": {"kornia", "tensorboard", "timm"},
-    "mesh": {*_SHAPES, "xatlas"},
-    "eval": {*_SHAPES, "xatlas"},
+    "mesh": {*_SHAPES, "manifold3d", "xatlas"},
+    "eval": {*_SHAPES, "manifold3d", "xatlas"},
     "fit": {"gsplat", "kornia"},
-    "app": {"gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", *_SHAPES},
+    "app": {"gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", "manifold3d", *_SHAPES},
     "all": set(EXTRA_OF),
 }
 # What a command cannot begin without; what only some of its options need is found missing then.
 NEEDS = {
     "ablate": ("kornia",),
     "app": ("gradio",),
-    "data primitives": ("trimesh",),
+    "data made": ("trimesh", "manifold3d", "skimage"),
     "data render": ("trimesh", "open3d"),
     "data gso": ("trimesh", "open3d"),
     "demo": _SHAPES,

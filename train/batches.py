@@ -7,6 +7,7 @@ needs no saved state, and a resumed run goes on with the very same batches.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -23,8 +24,10 @@ from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 
 from .config import TrainConfig
+from .data.pool import Pool, PoolOptions
 from .data.poses import front_views
 from .data.samples import Batch, choose_views, draw_change, join, load_sample
+from .data.settings import VARIED_CAMERAS, Settings
 from .ddp import World
 
 _TRIES = 100  # objects tried one after the other until one can be read
@@ -189,6 +192,7 @@ class Batches:
         self.world, self.novel, self.last = world, novel, last
         self.failures: dict[str, str] = {}
         self.waited = 0.0
+        self._made: Pool | None = None  # it begins with the first batch that is taken
         self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # an epoch's number and order
         self._pool = ThreadPoolExecutor(config.views.workers, thread_name_prefix="batches")
         self._waiting: dict[int, Future[Prepared]] = {}
@@ -200,6 +204,7 @@ class Batches:
             UserError: more than half of the objects, or 100 in a row, cannot be read.
         """
         began, end = time.perf_counter(), number + self.config.views.workers + 1
+        self._begin_made(number)
         for following in range(number, end if self.last is None else min(end, self.last)):
             if following not in self._waiting:
                 # The threads take their work in this order: when one comes to the joining, others
@@ -215,10 +220,13 @@ class Batches:
 
     def close(self) -> None:
         """Drops what has not begun; what has begun ends with a sample of each thread."""
+        if self._made is not None:
+            self._made.close()
         self._pool.shutdown(cancel_futures=True)
 
     def batch(self, number: int, novel: int) -> Batch:
         """Loads the ``number``-th batch here and now, with ``novel`` novel views."""
+        self._begin_made(number)
         return join([self.sample(n, novel) for n in self._numbers(number)])
 
     def sample(self, number: int, novel: int) -> Batch:
@@ -227,6 +235,7 @@ class Batches:
         Raises:
             UserError: as ``take``.
         """
+        self._begin_made(number // self.data.batch_size // self.world.size)
         return self._counted(self.prepare(number, novel))
 
     def prepare(self, number: int, novel: int) -> Prepared:
@@ -244,21 +253,62 @@ class Batches:
         change = None
         if views.mirror or views.recolor:
             change = draw_change(chance, views.mirror, views.recolor)
-        dataset, surfaces = self.data.train, self.config.loss.depth_weight > 0
+        surfaces = self.config.loss.depth_weight > 0
+
+        def loaded(dataset: ViewDataset, index: int) -> Batch:
+            first = reference
+            if front:
+                found = front_views(dataset.files(index).camera_to_world)
+                first = found[pick % len(found)]
+            chosen = choose_views(dataset.num_views(index), novel, first, rng)
+            about = (views.size, self.model, background, change, surfaces)
+            return load_sample(dataset, index, chosen, *about)
+
+        made = self._made_sample(number)
+        if made is not None:
+            assert self._made is not None
+            return Prepared(loaded(self._made.take(made), 0), [])
         failed: list[tuple[str, str]] = []
         for attempt in range(_TRIES):
             index = self._object(number + attempt)
             try:
-                count = dataset.num_views(index)
-                if front:
-                    found = front_views(dataset.files(index).camera_to_world)
-                    reference = found[pick % len(found)]
-                chosen = choose_views(count, novel, reference, rng)
-                about = (views.size, self.model, background, change, surfaces)
-                return Prepared(load_sample(dataset, index, chosen, *about), failed)
+                return Prepared(loaded(self.data.train, index), failed)
             except EXPECTED as error:
-                failed.append((dataset.uids[index], first_line(error)))
+                failed.append((self.data.train.uids[index], first_line(error)))
         return Prepared(None, failed)
+
+    def _made_sample(self, number: int) -> int | None:
+        """Number of a sample among the made ones of this process; None: it is of the datasets."""
+        share, own = self.config.views.made, self.data.batch_size
+        batch, position = number // own // self.world.size, number % own
+        local = batch * own + position  # among the samples of this process
+        before, after = math.floor(local * share), math.floor((local + 1) * share)
+        return before if after > before else None
+
+    def _begin_made(self, number: int) -> None:
+        """Starts the pool of made objects with the ``number``-th batch, where it is not there."""
+        views, world = self.config.views, self.world
+        if not views.made or self._made is not None:
+            return
+        pictures = Settings(
+            views=views.made_views,
+            size=max(views.size, self.model.image_size),
+            seed=self.config.run.seed,
+            depth=self.config.loss.depth_weight > 0,
+            fronts=views.made_views // 3,
+            light="varied",
+            up="y",
+            **VARIED_CAMERAS,
+        )
+        options = PoolOptions(
+            seed=self.config.run.seed,
+            rank=world.rank,
+            world=world.size,
+            uses=views.made_uses,
+            workers=views.made_workers,
+            views=pictures,
+        )
+        self._made = Pool(options, math.floor(number * self.data.batch_size * views.made))
 
     def _object(self, number: int) -> int:
         """Returns the object of the ``number``-th sample; each epoch has its own permutation."""

@@ -17,6 +17,7 @@ from msgspec import Meta
 from gamba_warp.conventions import DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig, Preset
+from gamba_warp.untrusted.documents import value_of
 from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options, option
 
 _Count = Annotated[int, Meta(ge=1, le=10**12)]
@@ -70,6 +71,11 @@ class DataConfig:
             it is any view.
         mirror: Share of the samples whose object is mirrored, with its cameras.
         recolor: Share of the samples whose colour channels change places and gamma.
+        made: Share of the samples that show made objects (gamba data made), which other processes
+            make and render while the model trains; the others are of the datasets.
+        made_uses: Samples of each made object.
+        made_views: Views of each made object.
+        made_workers: Processes that make and render; the number changes no result.
         overfit: Train on this one object (uid or number) and validate on its training views: a
             smoke test.
         cache: Keep decoded pictures in memory.
@@ -91,6 +97,10 @@ class DataConfig:
     front_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
     mirror: Annotated[float, Meta(ge=0, le=1)] = 0.0
     recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    made: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    made_uses: Annotated[int, Meta(ge=1, le=10_000)] = 16
+    made_views: Annotated[int, Meta(ge=2, le=1000)] = 12
+    made_workers: Annotated[int, Meta(ge=1, le=1024)] = 1
     overfit: str | None = None
     cache: bool = False
     cache_device: bool = False
@@ -260,6 +270,8 @@ class TrainConfig:
             raise UserError(
                 f"--lpips-crop {self.loss.lpips_crop}: must be 0, or 16 to --size {self.views.size}"
             )
+        if self.views.made and self.views.overfit is not None:
+            raise UserError("--made: --overfit trains on one object alone; leave one of them out")
         if self.loss.depth_weight and self.model_config().decoder != "rays":
             raise UserError('--depth-weight: only layers of the decoder "rays" have a depth')
         self.model_config()
@@ -278,10 +290,7 @@ class TrainConfig:
                 raise UserError(
                     f"--set {change}: expected FIELD=VALUE, FIELD of {', '.join(names)}"
                 )
-            try:
-                changes[name] = json.loads(text)
-            except (ValueError, RecursionError):
-                changes[name] = text
+            changes[name] = value_of(text)
         try:
             return replace(PRESETS[self.preset], **changes)
         except UserError as error:
@@ -297,14 +306,14 @@ class TrainConfig:
 # A run may go on with other values of these: they change where it reads and writes and how far it
 # goes, and not what a step computes. All others must stay as they were.
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers"}
-_MAY_CHANGE |= {"views.cache", "views.cache_device"}
+_MAY_CHANGE |= {"views.cache", "views.cache_device", "views.made_workers"}
 _MUST_STAY = {"run.seed"}
 _TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
 # The processes of one run may have these apart from one another; of files their contents count.
 _OF_A_MACHINE = {
     *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
     *("run.init", "run.encoder_weights", "run.device", "run.threads", "run.keep", "run.log"),
-    *("run.tensorboard", "views.cache_device"),
+    *("run.tensorboard", "views.cache_device", "views.made_workers"),
 }
 # The groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {

@@ -37,11 +37,11 @@ class Trainer:
         model: Gamba,
         data: TrainingData,
         world: World,
-        log: RunLog | None,
         lpips: Callable[[Tensor, Tensor], Tensor] | None,
     ) -> None:
-        """Takes a ``model`` on the world's device; only the main process has a ``log``."""
-        self.config, self.data, self.world, self.log, self.lpips = config, data, world, log, lpips
+        """Takes a ``model`` on the world's device."""
+        self.config, self.data, self.world, self.lpips = config, data, world, lpips
+        self.log: RunLog | None = None  # the main process gets one before it runs
         self.model = model
         self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
         self.ema = Ema(model, config.optim.ema) if config.optim.ema else None

@@ -88,6 +88,9 @@ def train(config: TrainConfig, world: World) -> int:
             model.to(world.device)
             if lpips is not None:
                 lpips.to(world.device)
+        trainer = Trainer(config, model, data, world, lpips)
+        changed = None if checkpoint is None else trainer.restore(checkpoint)
+        with world.together():  # the run is accepted: from here on it writes
             if world.main:
                 output_folder(run.out / "samples")
                 if not there:
@@ -99,8 +102,7 @@ def train(config: TrainConfig, world: World) -> int:
                 for folder in (run.out, run.out / "samples", run.out / "checkpoints"):
                     sweep(folder, age=0)
                 log = held.enter_context(contextlib.closing(RunLog(run.out, run.boards)))
-        trainer = Trainer(config, model, data, world, log, lpips)
-        changed = None if checkpoint is None else trainer.restore(checkpoint)
+        trainer.log = log
         if log is not None:
             notes = [*data.notes, *notes, *filter(None, (warning, changed))]
             _announce(trainer, log, checkpoint, notes)

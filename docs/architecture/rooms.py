@@ -44,7 +44,7 @@ _RESULTS = (
     "pages",
 )
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
-_TRAIN = (*("train.config", "train.objective", "train", "train.data", "train.sources"),)
+_TRAIN = (*("train.config", "train.objective", "train", "train.data", "train.data.made", "train.sources"),)
 _EVAL = ("eval", "eval.views", "eval.shapes")
 
 ROOMS = {
@@ -98,13 +98,17 @@ ROOMS = {
         (*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
     ),
     "measure": Room("benchmark and stress cases that need the model", _MEASURES),
-    "train.data": Room("furniture, rendering of meshes", _LIBRARY),
-    "train.sources": Room("published datasets, packs; commands of data", (*_LIBRARY, "train.data")),
+    "train.data.made": Room("objects without end, made of a seed", _LIBRARY),
+    "train.data": Room("furniture, rendering of meshes", (*_LIBRARY, "train.data.made")),
+    "train.sources": Room(
+        "published datasets, packs; commands of data",
+        (*_LIBRARY, "train.data", "train.data.made"),
+    ),
     "train.config": Room("the options of a run", _LIBRARY),
     "train.objective": Room("the losses", (*_LIBRARY, "train.config")),
     "train": Room(
         "batches, loop, checkpoints",
-        (*_LIBRARY, "train.config", "train.objective", "train.data", "train.sources"),
+        (*_LIBRARY, "train.config", "train.objective", "train.data", "train.data.made", "train.sources"),
         ("pages",),
     ),
     "eval": Room("the report that both evaluations share", _RESULTS),

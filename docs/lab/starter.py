@@ -17,11 +17,11 @@ from pathlib import Path
 import tyro
 
 from gamba_warp.batch import progress_bar
-from gamba_warp.data.dataset import split_of, write_split
+from gamba_warp.data.dataset import open_dataset, split_of, write_split
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, output_folder
 from gamba_warp.formats.catalogue import find_meshes
-from gamba_warp.formats.meshes import default_up, load_mesh
+from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.images import load_rgba
 from gamba_warp.train.data.render import render_object
 from gamba_warp.train.data.settings import Settings
@@ -106,10 +106,12 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
     for uid in progress_bar(OBJECTS, unit="object"):
         render_object(meshes[uid], out / "data", SETTINGS)
     write_split(out / "data", groups)
+    views = open_dataset(out / "data")
     for uid in held_out:
-        mesh = meshes[uid]  # its triangles in the frame of its views
-        model, _, _ = load_mesh(mesh.path).normalized(default_up(mesh.path), mesh.rotation)
-        bare = trimesh.Trimesh(model.vertices, model.faces, process=True)  # merges equal vertices
+        model, placement = load_mesh(meshes[uid].path), views.files(uid).placement
+        assert placement is not None  # it was rendered above
+        vertices = placement.points(model.vertices)  # in the world of its views
+        bare = trimesh.Trimesh(vertices, model.faces, process=True)  # merges equal vertices
         with atomic_path(out / "meshes" / f"{uid}.ply") as temporary:
             bare.export(temporary, vertex_normal=False)
     for uid in ICONS:

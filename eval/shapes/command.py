@@ -125,7 +125,7 @@ def eval_geometry_command(
         return _explained(options)
     if options.pred is None or options.gt is None:
         raise UserError("give PRED and GT: two files or two folders")
-    from ..report import count_line, csv_of, json_of, summary_lines
+    from ..report import FAILED, count_line, csv_of, json_of, summary_lines
     from .pairs import evaluate_shapes
     from .protocol import chosen_protocol
     from .table import page
@@ -134,8 +134,12 @@ def eval_geometry_command(
     if options.sensitivity:
         from .sensitivity import evaluate_variants
 
-        print(evaluate_variants(options, protocol), end="")
-        return 0
+        table, records = evaluate_variants(options, protocol)
+        print(table, end="")
+        failed = [record for record in records if record["status"] == FAILED]
+        for record in failed:
+            print(f"failed: {record['name']}: {record['reason']}", file=sys.stderr)
+        return 1 if failed else 0
     report = evaluate_shapes(options, protocol)
     parts = {"": report} | report["baselines"]
     for name, part in parts.items():
@@ -154,12 +158,15 @@ def eval_geometry_command(
                 print(f"{side + ' ' + key:<24} {text} of {report['num_ok']}")
     if any("unknown" in counts for counts in report["axes"].values()):
         print(f"{'':<24} unknown axes: coordinates are used as they are (--pred-axes, --up)")
-    print("\n".join([*summary_lines(report), count_line(report, options.out)]))
+    print("\n".join(summary_lines(report)))
+    beside = 0
     if report["baselines"]:
         print("\n" + page(report), end="")
         for name, part in report["baselines"].items():
+            beside += len(part["failures"])
             for item in part["failures"]:
                 print(f"failed: {item['name']} ({name}): {item['reason']}")
+    print(count_line(report, options.out, beside))
     return code
 
 

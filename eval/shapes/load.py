@@ -6,11 +6,12 @@ move the shape into the unit frame, and clean and flag its mesh. ``compare`` is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from gamba_warp.data.layouts import Placement
 from gamba_warp.errors import UserError
 from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
 from gamba_warp.formats.clouds import read_cloud
@@ -40,6 +41,12 @@ TO_Z_UP = {
 }
 # Those of the frames that predictions may be in; those of the truth's file depend on the file.
 FRAME_AXES = {"unit": "z-up", "reference": "opencv"}
+DATASET = "dataset"  # axes of the meshes that a dataset was rendered from, as it says them
+_FOLLOWED = "which was rendered of these meshes with another axis up; --up is followed"
+_OTHER_FILES = (
+    "other bounding boxes than the meshes that DATA was rendered from; DATA's axes are not used, "
+    "those of the format are (--up)"
+)
 
 
 @dataclass
@@ -51,7 +58,8 @@ class Evaluated:
         shape: in the truth's unit frame.
         flags: of the mesh (for Gaussians: of their surface), names from ``flags.FLAGS``.
         motion: what brought the file's coordinates into the unit frame.
-        axes: of the file, a key of ``TO_Z_UP`` or ``UNKNOWN``.
+        axes: of the file, a key of ``TO_Z_UP``, ``UNKNOWN``, or of a truth ``DATASET``.
+        warning: of a truth, why its place in its dataset is not used; or empty.
     """
 
     source: Shape
@@ -59,6 +67,7 @@ class Evaluated:
     flags: list[str]
     motion: Similarity
     axes: str
+    warning: str = ""
 
     @property
     def kind(self) -> str:
@@ -71,7 +80,10 @@ class Evaluated:
 
 
 def load_truth(
-    path: Path, protocol: GeometryProtocol, rotation: list[list[float]] | None = None
+    path: Path,
+    protocol: GeometryProtocol,
+    rotation: list[list[float]] | None = None,
+    placement: Placement | None = None,
 ) -> Evaluated:
     """Reads a true mesh or cloud and moves it into its unit frame.
 
@@ -79,6 +91,9 @@ def load_truth(
         path: file.
         protocol: says which axis of the file points up, and which flags are refused.
         rotation: ``[3, 3]``, applied first, for files whose object lies on its side; or None.
+        placement: of the mesh that the dataset was rendered from. It places the truth, in place of
+            the protocol and the rotation, where the file has that mesh's bounding box and the
+            protocol does not ask for another upward axis. None: there is none.
 
     Raises:
         UserError: it cannot be read, is made of Gaussians, or has no extent; or ``rotation``
@@ -88,11 +103,31 @@ def load_truth(
     if isinstance(shape, Gaussians):
         raise UserError(f"{path}: Gaussians, the truth must be a mesh or a point cloud")
     try:
-        axes = {"y": "opengl", "z": "z-up"}.get(protocol.up) or axes_of(path, shape)
+        asked, warning = {"y": "opengl", "z": "z-up"}.get(protocol.up), ""
+        if placement is not None and placement.fits(_positions(shape)):
+            if asked is None or _same_up(placement, TO_Z_UP[asked], rotation):
+                matrix, scale = placement.transform, placement.scale
+                motion = Similarity(matrix[:, :3], scale * matrix[:, 3], scale)
+                return _evaluated(shape, motion.apply(shape), motion, DATASET, protocol)
+            warning = f"--up {protocol.up} contradicts DATA, {_FOLLOWED}"
+        elif placement is not None and asked is None:
+            warning = _OTHER_FILES
+        axes = asked or axes_of(path, shape)
         motion = unit_motion(shape, axes, rotation)
-        return _evaluated(shape, motion.apply(shape), motion, axes, protocol)
+        found = _evaluated(shape, motion.apply(shape), motion, axes, protocol)
+        return replace(found, warning=warning)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def _same_up(
+    placement: Placement, turn: np.ndarray, rotation: list[list[float]] | None = None
+) -> bool:
+    """Tells if one direction in the file points up by a placement, and by a turn to z-up."""
+    if rotation is not None:
+        turn = turn @ np.asarray(rotation, np.float64)
+    up, other = placement.transform[2, :3], turn[2]
+    return up @ other > (1 - ROUNDED) * np.linalg.norm(up) * np.linalg.norm(other)
 
 
 def axes_of(path: Path, shape: Shape) -> str:

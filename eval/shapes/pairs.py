@@ -9,12 +9,13 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from gamba_warp.batch import progress_bar
@@ -22,8 +23,9 @@ from gamba_warp.data import gso
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, sha256, visible, write_text
-from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
+from gamba_warp.formats.catalogue import CATALOGUE, find_meshes, object_names
 from gamba_warp.untrusted.children import Failed, run_each
+from gamba_warp.untrusted.documents import read_lines
 from gamba_warp.versions import __version__, installed
 
 from ..report import (
@@ -45,6 +47,7 @@ from .table import PREDICTED, differences_of, lines_of, page, summaries
 
 if TYPE_CHECKING:
     from gamba_warp.data.dataset import ViewDataset
+    from gamba_warp.data.layouts import Placement
 
 PAIR_SECONDS = 3600.0  # a pair takes seconds, the slowest protocol on a huge shape minutes
 PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch")
@@ -59,16 +62,53 @@ class Pair(NamedTuple):
     """Two files of one object.
 
     Attributes:
-        name: of the object: the path within the folders, without suffix.
+        name: of the object: its uid in the dataset where there is one, else ``object_names``.
         pred: the predicted shape.
         gt: the true shape.
         rotation: ``[3, 3]`` that turns the true shape upright first, as its catalogue says; None.
+        placement: of the mesh that the dataset was rendered from, where it says it; None.
     """
 
     name: str
     pred: Path
     gt: Path
     rotation: list[list[float]] | None = None
+    placement: Placement | None = None
+
+
+class Objects(NamedTuple):
+    """What a dataset says of its objects.
+
+    Attributes:
+        uids: of the objects, by the names that their files have (``object_names``).
+        splits: by uid.
+    """
+
+    uids: dict[str, str]
+    splits: dict[str, str]
+
+
+def open_objects(data: Path | None) -> tuple[ViewDataset, Objects] | tuple[None, None]:
+    """The dataset that ``--data`` names, and what it says of its objects.
+
+    Raises:
+        UserError: it cannot be opened, two objects have one name, or its splits are bad.
+    """
+    if data is None:
+        return None, None
+    from gamba_warp.data.dataset import open_dataset, splits_of
+
+    dataset = open_dataset(data)
+    return dataset, Objects(_by_name(dataset.uids, data), splits_of(data, dataset.uids))
+
+
+def _by_name(uids: Iterable[str], folder: Path) -> dict[str, str]:
+    """Uids by the names that files of them have. Raises UserError where two have one name."""
+    uids, found = list(uids), dict[str, str]()
+    for name, uid in zip(object_names([PurePosixPath(uid) for uid in uids]), uids):
+        if found.setdefault(name, uid) != uid:
+            raise UserError(f"{folder}: '{uid}' and '{found[name]}' have one name, '{name}'")
+    return found
 
 
 def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[str, Any]:
@@ -91,12 +131,8 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         raise UserError("--frame reference and --data: give both or neither")
     listed = gso.NAMES if protocol.name == "gso" else ()
     assert options.pred is not None and options.gt is not None  # the command asks for them
-    found = find_all(options.pred, options.baseline, options.gt, listed)
-    dataset = None
-    if options.data is not None:
-        from gamba_warp.data.dataset import open_dataset
-
-        dataset = open_dataset(options.data)
+    dataset, known = open_objects(options.data)
+    found = find_all(options.pred, options.baseline, options.gt, listed, known)
     if options.paint and options.out is None:
         raise UserError("--paint: needs --out")
     folder = output_folder(options.out) if options.out is not None else None
@@ -146,6 +182,13 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     return report
 
 
+class _Noted(msgspec.Struct):
+    """A line of the journal."""
+
+    key: str
+    record: dict[str, Any]
+
+
 class Journal:
     """The records of an evaluation that is under way, so that an interrupted one goes on.
 
@@ -158,10 +201,8 @@ class Journal:
         self._decides = [protocol.to_json(), __version__, str(data and data.resolve())]
         self._known: dict[str, dict[str, Any]] = {}
         if self._file is not None and self._file.is_file():
-            for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines():
-                with suppress(ValueError, KeyError, TypeError):  # a line that was cut off
-                    entry = json.loads(line)
-                    self._known[entry["key"]] = entry["record"]
+            for noted in read_lines(self._file, _Noted):
+                self._known[noted.key] = noted.record
 
     def key(self, pair: Pair) -> str:
         """What decides the pair's record."""
@@ -190,7 +231,11 @@ Found = tuple[list[Pair], list[dict[str, str]]]  # what find_pairs returns
 
 
 def find_all(
-    pred: Path, baselines: Sequence[Path], gt: Path, listed: Iterable[str] = ()
+    pred: Path,
+    baselines: Sequence[Path],
+    gt: Path,
+    listed: Iterable[str] = (),
+    known: Objects | None = None,
 ) -> dict[str, Found]:
     """Pairs the predictions, and those of each baseline, with the truths.
 
@@ -199,6 +244,7 @@ def find_all(
         baselines: folders of other predictions.
         gt: true shapes.
         listed: names that the protocol lists: those that are missing are failures.
+        known: what the dataset says of its objects, where there is one.
 
     Returns:
         What ``find_pairs`` returns by name: ``PREDICTED``, and the names of the baselines' folders.
@@ -214,22 +260,23 @@ def find_all(
             raise UserError(f"--baseline {path}: there is another row of this name; rename it")
     expected = {name for path in folders.values() for name in _shapes_in(path)} if baselines else ()
     wanted = {*expected, *listed}
-    return {name: find_pairs(path, gt, wanted) for name, path in folders.items()}
+    return {name: find_pairs(path, gt, wanted, known) for name, path in folders.items()}
 
 
 def find_pairs(
-    pred: Path, gt: Path, expected: Iterable[str] = ()
+    pred: Path, gt: Path, expected: Iterable[str] = (), known: Objects | None = None
 ) -> tuple[list[Pair], list[dict[str, str]]]:
-    """Pairs two files, or the files of two folders by their names.
+    """Pairs two files, or the files of two folders by their names (``object_names``).
 
-    The name of a file is its path without suffix. Where the folder of truths has a
-    ``catalogue.json``, that gives the names of its files; such a folder is a library, of which only
-    what is predicted or expected is looked for.
+    Where the folder of truths has a ``catalogue.json``, that gives the names of its files; such a
+    folder is a library, of which only what is predicted or expected is looked for. Of the meshes of
+    a dataset, also the other objects of a split that a prediction is of.
 
     Args:
         pred: predicted shapes.
         gt: true shapes.
         expected: names of which a library must have a prediction, too.
+        known: what the dataset says of its objects, where there is one.
 
     Returns:
         The pairs, sorted by name, and a failure record of each name that has no or several
@@ -246,32 +293,45 @@ def find_pairs(
     if pred.is_file() or gt.is_file():
         raise UserError(f"{pred} and {gt}: give two files or two folders")
     predicted, rotations = _shapes_in(pred), {}
+    uids, splits = known or Objects({}, {})
+    wanted = {*predicted, *expected}
     if (gt / CATALOGUE).is_file():
         meshes = {mesh.uid: mesh for mesh in find_meshes(gt)}
-        true = {name: [meshes[name].path] for name in {*predicted, *expected} & meshes.keys()}
-        rotations = {name: meshes[name].rotation for name in true}
+        library = _by_name(meshes, gt)
+        true = {name: [meshes[library[name]].path] for name in wanted & library.keys()}
+        rotations = {name: meshes[library[name]].rotation for name in true}
+        uids = library | uids
     else:
-        true = _shapes_in(gt)
+        true = _shapes_in(gt, uids)
+        if known is not None:
+            parts = {splits[uids[name]] for name in wanted & uids.keys()}
+            wanted |= {name for name, uid in uids.items() if splits[uid] in parts}
+            true = {name: true[name] for name in wanted & true.keys()}
     pairs, failures = [], []
     for name in sorted({*predicted, *true, *expected}):
-        ours, theirs = predicted.get(name, []), true.get(name, [])
+        ours, theirs, uid = predicted.get(name, []), true.get(name, []), uids.get(name, name)
         if len(ours) == len(theirs) == 1:
-            pairs.append(Pair(name, ours[0], theirs[0], rotations.get(name)))
+            pairs.append(Pair(uid, ours[0], theirs[0], rotations.get(name)))
         elif not (ours and theirs):
-            failures.append(failure(name, "no ground truth" if ours else "no prediction"))
+            failures.append(failure(uid, "no ground truth" if ours else "no prediction"))
         else:
             files = ", ".join(path.name for path in (ours if len(ours) > 1 else theirs))
-            failures.append(failure(name, f"more than one file: {files}"))
+            failures.append(failure(uid, f"more than one file: {files}"))
     return pairs, failures
 
 
-def _shapes_in(folder: Path) -> dict[str, list[Path]]:
-    """The shape files in a folder by their paths without suffix. Raises UserError for none."""
+def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Path]]:
+    """The shape files in a folder by ``object_names``. Raises UserError for none.
+
+    A further file of one name is another object where it was rendered as one (``find_meshes``).
+    """
+    files = (path for path in visible(folder, "*") if path.suffix.lower() in SUFFIXES)
+    paths = sorted(path for path in files if path.is_file())
+    names = object_names([path.relative_to(folder).with_suffix("") for path in paths])
     found: dict[str, list[Path]] = {}
-    for path in sorted(visible(folder, "*")):
-        if path.is_file() and path.suffix.lower() in SUFFIXES:
-            name = path.relative_to(folder).with_suffix("").as_posix()
-            found.setdefault(name, []).append(path)
+    for name, path in zip(names, paths):
+        other = f"{name}-{path.suffix[1:].lower()}"
+        found.setdefault(other if name in found and other in rendered else name, []).append(path)
     if not found:
         raise UserError(f"{folder}: no files of {', '.join(SUFFIXES)} in it")
     return found
@@ -321,7 +381,7 @@ def evaluate_pair(
 
     stages = Stopwatch(3)
     with stages("load"):
-        truth = load_truth(pair.gt, protocol, pair.rotation)
+        truth = load_truth(pair.gt, protocol, pair.rotation, pair.placement)
         into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
         predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     with stages("compare"):
@@ -344,6 +404,7 @@ def evaluate_pair(
         "gt_flags": truth.flags,
         "pred_axes": predicted.axes,
         "gt_axes": truth.axes,
+        **({"gt_warning": truth.warning} if truth.warning else {}),
         "chamfer_turned": turned,
         "pred_sha256": sha256(pair.pred),
         "gt_sha256": sha256(pair.gt),
@@ -413,6 +474,7 @@ def _attempt(
             motion = Similarity(np.eye(3), np.zeros(3))
         elif dataset is not None:
             motion = out_of_reference(dataset, pair.name, protocol.reference, protocol.distance)
+            pair = pair._replace(placement=dataset.files(pair.name).placement)
         return evaluate(pair, protocol, motion)
     except UserError as error:
         return failure(pair.name, error)

@@ -13,7 +13,7 @@ from msgspec import Meta
 from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.errors import UserError
 from gamba_warp.surfaces.options import SurfaceOptions
-from gamba_warp.untrusted.documents import read_document
+from gamba_warp.untrusted.documents import read_document, value_of
 from gamba_warp.untrusted.ranges import Seed, check_options
 
 from .. import presets
@@ -36,7 +36,7 @@ from .occupancy import RULES
 Thresholds = Annotated[
     tuple[Annotated[float, Meta(gt=0, le=100)], ...], Meta(min_length=1, max_length=100)
 ]
-VERSION = 4  # goes up whenever the same protocol would give other numbers
+VERSION = 5  # goes up whenever the same protocol would give other numbers
 
 POINTS: dict[PointRule, str] = {
     "area": "area-uniform on the whole surface, inner faces included; faces given twice and faces "
@@ -59,8 +59,9 @@ FORMS: dict[ChamferForm, str] = {
 }
 DEFINITIONS = {
     "normalization": "truth centred on its bounding box, longest side 1, turned to z-up",
-    "axes": "of a file: asked for, else those of its format (Gaussians: opencv; .obj, .glb, .gltf: "
-    "opengl), else unknown; a prediction is turned into those of its frame where both are known",
+    "axes": "of a file: asked for, else of a truth what the dataset that was rendered of it says, "
+    "else those of its format (Gaussians: opencv; .obj, .glb, .gltf: opengl), else unknown; a "
+    "prediction is turned into those of its frame where both are known",
     "samples": "both shapes are drawn from with one seed: a shape and itself have distance 0",
     "chamfer_squared": FORMS["squared"],
     "accuracy": "mean nearest distance from predicted to true points",
@@ -194,10 +195,7 @@ def with_fields(protocol: GeometryProtocol, texts: Sequence[str]) -> GeometryPro
         if not sign or inner not in ("", "surface") or name not in place or field == "surface":
             known = ", ".join([*(k for k in value if k != "surface"), "surface.…"])
             raise UserError(f"--set {text}: not FIELD=JSON, FIELD one of {known}")
-        try:
-            place[name] = msgspec.json.decode(given)
-        except msgspec.DecodeError:
-            place[name] = given
+        place[name] = value_of(given)
     return _checked(value, f"--set {' '.join(texts)}")
 
 

@@ -18,7 +18,7 @@ from ..averages import mean_of
 from ..report import OK, check_finite, finite_or_none, stdout_to_stderr
 from ..tables import Lines, markdown
 from .command import ShapesOptions
-from .pairs import Pair, evaluate_pairs, find_pairs
+from .pairs import Pair, evaluate_pairs, find_pairs, open_objects
 from .protocol import PRESETS, GeometryProtocol
 from .shape import Similarity
 
@@ -82,7 +82,9 @@ def variants(protocol: GeometryProtocol) -> dict[str, GeometryProtocol]:
     return found | {f"protocol {', '.join(names)}": p for p, names in named.items()}
 
 
-def evaluate_variants(options: ShapesOptions, protocol: GeometryProtocol) -> str:
+def evaluate_variants(
+    options: ShapesOptions, protocol: GeometryProtocol
+) -> tuple[str, list[dict[str, Any]]]:
     """Evaluates all pairs under all variants; writes sensitivity.json, .md and .svg into OUT.
 
     Args:
@@ -90,19 +92,17 @@ def evaluate_variants(options: ShapesOptions, protocol: GeometryProtocol) -> str
         protocol: the chosen one.
 
     Returns:
-        The table, as sensitivity.md has it.
+        The table, as sensitivity.md has it, and the records of all objects.
 
     Raises:
         UserError: something cannot be opened or written, or no object could be evaluated.
     """
-    from gamba_warp.data.dataset import open_dataset
-
     if (protocol.frame == "reference") != (options.data is not None):
         raise UserError("--frame reference and --data: give both or neither")
     assert options.pred is not None and options.gt is not None
-    dataset = None if options.data is None else open_dataset(options.data)
+    dataset, known = open_objects(options.data)
     folder = None if options.out is None else output_folder(options.out)
-    pairs, failures = find_pairs(options.pred, options.gt)
+    pairs, failures = find_pairs(options.pred, options.gt, known=known)
     protocols = variants(protocol)
     vary = partial(vary_pair, protocols=protocols)
     with stdout_to_stderr():
@@ -128,7 +128,7 @@ def evaluate_variants(options: ShapesOptions, protocol: GeometryProtocol) -> str
         write_json(folder / "sensitivity.json", finite_or_none(report))
         write_text(folder / "sensitivity.md", page)
         write_text(folder / "sensitivity.svg", _chart(rows))
-    return page
+    return page, records
 
 
 def vary_pair(
@@ -151,7 +151,7 @@ def vary_pair(
     from .load import FRAME_AXES, load_prediction, load_truth
     from .metrics import align_shape, point_metrics, shape_iou
 
-    truth = load_truth(pair.gt, protocol, pair.rotation)
+    truth = load_truth(pair.gt, protocol, pair.rotation, pair.placement)
     axes = FRAME_AXES.get(protocol.frame, truth.axes)
     known: dict[Any, Any] = {}
 

@@ -116,7 +116,8 @@ class Similarity:
     """The motion ``x -> scale · rotation · x + translation``.
 
     Attributes:
-        rotation: ``[3, 3]`` float64, proper.
+        rotation: ``[3, 3]`` float64, proper; of a truth that was rendered stretched or mirrored,
+            what that was, too.
         translation: ``[3]`` float64.
         scale: > 0.
     """
@@ -140,7 +141,10 @@ class Similarity:
         if isinstance(shape, Mesh):
             return Mesh(self.points(shape.vertices), shape.faces)
         if isinstance(shape, Points):
-            normals = None if shape.normals is None else shape.normals @ self.rotation.T
+            normals = shape.normals
+            if normals is not None:
+                normals = normals @ np.linalg.inv(self.rotation)  # the transpose of a rotation
+                normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
             return Points(self.points(shape.positions), normals)
         import torch
 

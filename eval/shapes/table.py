@@ -83,16 +83,23 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
     """What a report says of the evaluated shapes besides metrics.
 
     Returns:
-        ``flags`` and ``axes``: for each side how many shapes have which; and ``warnings``: of turns
-        that would better the score by far.
+        ``flags`` and ``axes``: for each side how many shapes have which; and ``warnings``: of
+        truths that are not placed as the dataset says, and of turns that would better the score by
+        far.
     """
     done = [record for record in objects if record["status"] == OK]
     sides = ("pred", "gt")
     return {
         "flags": {s: dict(Counter(f for r in done for f in r[f"{s}_flags"])) for s in sides},
         "axes": {s: dict(Counter(r[f"{s}_axes"] for r in done)) for s in sides},
-        "warnings": turn_warnings(done),
+        "warnings": [*truth_warnings(done), *turn_warnings(done)],
     }
+
+
+def truth_warnings(done: list[dict[str, Any]]) -> list[str]:
+    """Says, of the records of the evaluated objects, of how many truths there is which warning."""
+    counts = Counter(record["gt_warning"] for record in done if "gt_warning" in record)
+    return [f"{count} of {len(done)} truths: {text}" for text, count in counts.items()]
 
 
 def turn_warnings(done: list[dict[str, Any]]) -> list[str]:

@@ -200,9 +200,9 @@ def thumbnails(images: Tensor) -> Tensor:
 class TrainingMeshes:
     """The meshes that a dataset was rendered from, by uid.
 
-    As for ``eval-geometry``, a file is turned to z-up by its suffix, after the rotation that
-    ``catalogue.json`` states, its bounding box is centred, and its longest side becomes 1: the
-    world of the views, unless they were rendered with ``--stretch``.
+    The dataset says how a file's points came into the world of its views. One that does not: the
+    file is turned to z-up by its suffix, after the rotation that ``catalogue.json`` states, its
+    bounding box is centred, and its longest side becomes 1.
     """
 
     def __init__(self, folder: Path, training: ViewDataset) -> None:
@@ -227,16 +227,22 @@ class TrainingMeshes:
             Triangles in the input camera's world: its axes, the object's centre as the origin.
 
         Raises:
-            UserError: there is no such mesh, or it or the view cannot be read.
+            UserError: there is no such mesh, it is not the one that was rendered, or it or the view
+                cannot be read.
         """
         if found.uid not in self.meshes:
             raise UserError(f"there is no mesh of the training object {found.uid}")
         mesh = self.meshes[found.uid]
-        upright, _, _ = load_mesh(mesh.path).normalized(default_up(mesh.path), mesh.rotation)
+        loaded, placement = load_mesh(mesh.path), self.training.files(found.uid).placement
+        if placement is None:
+            vertices = loaded.normalized(default_up(mesh.path), mesh.rotation)[0].vertices
+        elif placement.fits(loaded.vertices):
+            vertices = placement.points(loaded.vertices)
+        else:
+            raise UserError(f"{mesh.path}: not the mesh that DATA's {found.uid} was rendered from")
         viewmat = self.training.load(found.uid, views=[found.view]).cameras.viewmats[0].double()
         _, scale = relative_to_reference(viewmat[None], viewmat, distance)
-        vertices = scale.item() * upright.vertices @ viewmat[:3, :3].numpy().T
-        return Surface(vertices, upright.faces)
+        return Surface(scale.item() * vertices @ viewmat[:3, :3].numpy().T, loaded.faces)
 
     def save(self, path: Path, found: Found, distance: float) -> None:
         """Writes what ``place`` returns as a ``.ply``; the errors are those of both."""

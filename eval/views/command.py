@@ -160,7 +160,8 @@ def eval_views_command(
         print(f"left out: {name}: {reason}", file=sys.stderr)
     for item in report["failures"]:
         print(f"failed: {item['name']}: {item['reason']}", file=sys.stderr)
-    print(count_line(report, options.out), file=sys.stderr if json or csv else sys.stdout)
+    beside = len(report["failures"]) - report["num_failed"]
+    print(count_line(report, options.out, beside), file=sys.stderr if json or csv else sys.stdout)
     if report["interrupted"]:
         print("gamba: interrupted; the report has what was evaluated before", file=sys.stderr)
         return 130

@@ -73,7 +73,8 @@ class Job:
         device: torch device.
         baselines: by name.
         left_out: reasons by name, of baselines that cannot be had.
-        failures: ``{name, reason}`` of what failed beside objects.
+        missing: a failure record of each object of the protocol that the dataset lacks.
+        failures: ``{name, reason}`` of what failed of the baselines.
         retrieval: the baseline of this name, if it is one of them.
         meshes: of the training objects, to be placed as the retrieval's shapes; or None.
     """
@@ -86,6 +87,7 @@ class Job:
     device: str
     baselines: dict[str, Baseline] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    missing: list[dict[str, Any]] = field(default_factory=list)
     failures: list[dict[str, str]] = field(default_factory=list)
     retrieval: Retrieval | None = None
     meshes: TrainingMeshes | None = None
@@ -97,7 +99,7 @@ class Job:
         return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
 
     def fail(self, name: str, error: Exception | str) -> None:
-        """Notes a failure beside those of objects."""
+        """Notes a failure of a baseline."""
         self.failures.append({"name": name, "reason": failure(name, error)["reason"]})
 
     def shown(self, truth: Truth) -> dict[str, Shown]:
@@ -166,8 +168,8 @@ def open_job(options: ViewsOptions) -> Job:
         **rendered,
     )
     job = Job(predictions, dataset, uids, protocol, network, device)
-    for name in evaluation["missing"] if evaluation else ():
-        job.fail(name, f"an object of --protocol gso that is not in {options.data}")
+    reason = f"an object of --protocol gso that is not in {options.data}"
+    job.missing = [failure(name, reason) for name in (evaluation or {"missing": ()})["missing"]]
     folder = None if options.out is None else output_folder(options.out)
     ceiling = {}
     if options.ceiling is not None:
@@ -374,7 +376,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
     Args:
         job: what was done.
         data: the dataset, whose name the report holds.
-        objects: the records.
+        objects: the records; those of ``job.missing`` are added.
 
     Returns:
         Besides, ``baselines`` (their means), ``left_out_baselines`` (reasons by name), the rows
@@ -398,7 +400,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
     }
     report = make_report(
         protocol,
-        objects,
+        objects + job.missing,
         {"gamba_warp": __version__} | installed("torch", "kornia"),
         left_out=("baselines", "num_nearly_empty", "retrieval", "pictures"),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},

@@ -88,7 +88,7 @@ def _about(table: dict[str, Any]) -> str:
     text = (
         f"Every row has {value:g} {budget} of training, on {order} of {table['data']}. "
         f"Means over seeds and objects with {share:g} % bootstrap intervals over objects: the "
-        f"novel ones of {what['views']} views, {size}, of {what['objects']} objects of the part "
+        f"novel ones of {what['views']} views, {size}, of {_evaluated(table)} of the part "
         f"{what['split']}. An interval tells how far a mean depends on the choice of objects, and "
         "the spread between seeds how far it depends on chance in training."
     )
@@ -98,6 +98,16 @@ def _about(table: dict[str, Any]) -> str:
             "is one of the fit of one object."
         )
     return text
+
+
+def _evaluated(table: dict[str, Any]) -> str:
+    """How many objects the rows have figures of, and where that differs, how many were wanted."""
+    wanted = table["evaluation"]["objects"]
+    rows = [row for row in table["rows"] if row["figures"]]
+    counts = sorted({row["objects"] for row in rows}) or [0]
+    number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+    fewer = any(row["objects"] < wanted for row in rows if row["kind"] == "train")
+    return f"{number} objects" + (f" ({wanted} were asked for)" if fewer else "")
 
 
 def _cells(figures: Mapping[str, Any], keys: Iterable[str], signed: bool = False) -> list[str]:

@@ -58,6 +58,7 @@ def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
     memory = [part.peak_memory for part in ended]
     if on_gpu:
         memory = [round(log.most["device_memory"]) for log in logs if "device_memory" in log.most]
+    figures = _figures(result)
     status = "failed" if result.failed else "incomplete" if result.absent else "ok"
     return {
         "name": row.name,
@@ -68,7 +69,8 @@ def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
         "failed": {str(seed): reason for seed, reason in result.failed.items()},
         "absent": result.absent,
         "gaussians": result.gaussians,
-        "figures": _figures(result),
+        "objects": max((figure["objects"] for figure in figures.values()), default=0),
+        "figures": figures,
         "difference": _difference(result, reference),
         "step_seconds": _median([seed.step_seconds for seed in seeds.values()]),
         "steps": _median([log.step for log in logs]) if row.kind == "train" else None,

@@ -14,12 +14,14 @@ import hashlib
 import re
 import secrets
 import shutil
+from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping, Sequence
 from pathlib import PurePath
 from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
+from starlette.datastructures import FormData
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
 from starlette.requests import Request
@@ -27,7 +29,7 @@ from starlette.responses import JSONResponse, Response
 
 from ..errors import UserError, first_line
 from ..images import PICTURE_SUFFIXES
-from ..pages.serve import is_foreign
+from ..pages.serve import READ_SECONDS, is_foreign
 from ..untrusted.documents import parse_document
 from .cutting import examples
 from .shelf import KEPT, Shelf
@@ -50,17 +52,23 @@ _HEADERS = (
 _COOKIE = "gamba-visitor"
 _TOKEN = re.compile("[0-9a-f]{32}")
 _FILE, _UPLOAD, _JOIN = "/gradio_api/file=", "/gradio_api/upload", "/gradio_api/queue/join"
-_PROGRESS, _ALIVE = "/gradio_api/upload_progress", "/gradio_api/heartbeat/"
+_PROGRESS, _DATA = "/gradio_api/upload_progress", "/gradio_api/queue/data"
+_ALIVE = "/gradio_api/heartbeat/"
+_NO_COOKIE = "open the page first; it needs its cookie"
 _SESSION = re.compile(b"session_hash=[a-z0-9]{1,32}")  # all that an address may be followed by
 # All that the page asks for; gradio itself answers to eighty addresses.
 _READ = re.compile(
     "/|/theme[.]css|/favicon[.]ico|/(assets|static)/.*|/gradio_api/(file=.*|heartbeat/[a-z0-9]+"
-    "|queue/data|startup-events|upload_progress)",
+    "|queue/data|upload_progress)",
     re.DOTALL,
 )
 _MAX_CALL = 1 << 20  # bytes of a call of a function; a real one takes 2 kB
 _HEAD = 1 << 16  # bytes of an upload beside its files
-_UPLOAD_SECONDS = 300.0
+_CALL_SECONDS = READ_SECONDS  # until all of it is there
+UPLOAD_SECONDS = 300.0
+MAX_AT_ONCE = 16  # requests of one visitor
+# The rest is ignored: gradio fails with several ranges, or with other digits than ours.
+_RANGE = re.compile(b"bytes=([0-9]{1,15}-[0-9]{0,15}|-[0-9]{1,15})")
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -111,7 +119,8 @@ class Guard:
         max_bytes: int,
     ) -> None:
         self._app, self._shelf, self._inputs = app, shelf, inputs
-        self._max_bytes, self._coming = max_bytes, 0
+        self._max_bytes = max_bytes
+        self._coming: Counter[str] = Counter()  # bytes of uploads that are there so far
         self._shown = {str(path) for path, _ in examples()}
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
@@ -125,50 +134,61 @@ class Guard:
         elif scope["type"] != "http":
             await send({"type": "websocket.close", "code": 1008})
         else:
-            await self._answer(scope, receive, send)
+            # The token is the browser's secret, and the folder's name is in what the page says.
+            token = Request(scope).cookies.get(_COOKIE, "")
+            known = _TOKEN.fullmatch(token) is not None
+            visitor = hashlib.sha256(token.encode()).hexdigest()[:32] if known else None
+            scope[VISITOR] = visitor
+            with self._shelf.visited(visitor or "") as at_once:
+                await self._answer(scope, receive, send, at_once)
 
     async def _sweep(self) -> None:
         while True:
             await asyncio.sleep(KEPT / 6)
             await asyncio.to_thread(self._shelf.sweep)
 
-    async def _answer(self, scope: Message, receive: Receive, send: Send) -> None:
+    async def _answer(self, scope: Message, receive: Receive, send: Send, at_once: int) -> None:
         more = list(_HEADERS)
 
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [*message.get("headers", ()), *more]
+                theirs = [h for h in message.get("headers", ()) if h[0] != b"cookie"]
+                message["headers"] = [*theirs, *more]
             await send(message)
 
         # What a proxy would say of itself; gradio would make addresses of it.
         kept = [h for h in scope["headers"] if b"forwarded" not in h[0] and b"gradio" not in h[0]]
+        ranges = [value for name, value in kept if name == b"range"]
+        if len(ranges) > 1 or not all(map(_RANGE.fullmatch, ranges)):
+            kept = [h for h in kept if h[0] != b"range"]
         scope.update({"headers": kept, "scheme": "http"})
-        request, path = Request(scope, receive), scope["path"]
-        # The token is the browser's secret, and the folder's name is in what the page says.
-        token = request.cookies.get(_COOKIE, "")
-        known = _TOKEN.fullmatch(token) is not None
-        visitor = hashlib.sha256(token.encode()).hexdigest()[:32] if known else None
-        scope[VISITOR], answer = visitor, self._app
-        read: Receive = receive
+        request, path, visitor = Request(scope, receive), scope["path"], scope[VISITOR]
+        read, answer = receive, self._app
         try:
-            if is_foreign(request.headers):
+            if is_foreign(request.headers.items()):
                 raise HTTPException(421, "this page is that of 127.0.0.1, for its own pages alone")
+            if visitor and at_once > MAX_AT_ONCE:
+                raise HTTPException(503, "too many requests at once; try again")
             if request.method in ("GET", "HEAD") and _READ.fullmatch(path):
+                stated = request.headers.get("content-length", "0")
+                if stated != "0" or "transfer-encoding" in request.headers:
+                    raise HTTPException(400, "to ask for something takes no body")
                 if path == "/" and visitor is None:
                     cookie = f"{_COOKIE}={secrets.token_hex(16)}; HttpOnly; SameSite=Lax; Path=/"
                     more.append((b"set-cookie", cookie.encode()))
-                self._check_read(scope, visitor or "-")
+                self._check_read(scope, visitor)
                 if path == _PROGRESS:
                     answer = Response('data: {"msg": "done"}\n\n', media_type="text/event-stream")
             elif request.method != "POST" or path not in (_UPLOAD, _JOIN):
                 raise HTTPException(404, "there is nothing here")
             elif visitor is None:
-                raise HTTPException(403, "open the page first; it needs its cookie")
+                raise HTTPException(403, _NO_COOKIE)
             elif path == _UPLOAD:
                 answer = JSONResponse(await self._taken(request, visitor))
             else:
                 _check_size(request, _MAX_CALL)
-                body = self._checked(await request.body(), visitor)
+                body = await asyncio.wait_for(request.body(), _CALL_SECONDS)
+                body = self._checked(body, visitor)
                 pieces = iter([{"type": "http.request", "body": body}])
 
                 async def again() -> Message:
@@ -176,50 +196,59 @@ class Guard:
 
                 read = again
 
-        except HTTPException as error:
+        except (HTTPException, asyncio.TimeoutError) as error:
+            if not isinstance(error, HTTPException):
+                error = HTTPException(408, "what is sent took too long")
             line, kind = error.detail, "text/plain"
             if path == _JOIN:  # the page shows what a call's answer holds
                 line, kind = msgspec.json.encode({"detail": line}).decode(), "application/json"
             answer = Response(f"{line}\n", error.status_code, media_type=kind)
         await answer(scope, read, guarded)
 
-    def _check_read(self, scope: Message, visitor: str) -> None:
+    def _check_read(self, scope: Message, visitor: str | None) -> None:
         """Only what is the visitor's own; sessions are told apart by the visitor as well."""
         path, asked = scope["path"], scope.get("query_string", b"")
         if path.startswith(_FILE) and path.removeprefix(_FILE) not in self._shown:
             try:
-                self._shelf.file(path.removeprefix(_FILE), visitor)
+                self._shelf.file(path.removeprefix(_FILE), visitor or "-")
             except UserError as error:
                 raise HTTPException(403, str(error)) from None
-        elif path.startswith(_ALIVE):
-            scope["path"] += visitor
-        scope["query_string"] = asked + visitor.encode() if _SESSION.fullmatch(asked) else b""
+        elif path.startswith(_ALIVE) or path == _DATA:
+            if visitor is None:
+                raise HTTPException(403, _NO_COOKIE)
+            if path != _DATA:
+                scope["path"] += visitor
+        session = visitor and _SESSION.fullmatch(asked)
+        scope["query_string"] = asked + visitor.encode() if session else b""
 
     async def _taken(self, request: Request, visitor: str) -> list[str]:
-        """The files of an upload: never more than it states, nor more than all may take."""
-        stated = _check_size(request, self._max_bytes + _HEAD)
-        if self._coming + stated > self._shelf.limit:
-            raise HTTPException(503, "too much comes in at once; try again")
-        self._coming += stated
-        try:
-            await asyncio.to_thread(self._shelf.sweep, self._coming)
-            return await asyncio.wait_for(self._upload(request, visitor), _UPLOAD_SECONDS)
-        except asyncio.TimeoutError:
-            raise HTTPException(408, "the upload took too long") from None
-        finally:
-            self._coming -= stated
-
-    async def _upload(self, request: Request, visitor: str) -> list[str]:
         """Puts the files of a form on the shelf as they are; nobody looks into them yet."""
+        _check_size(request, self._max_bytes + _HEAD)
+        got = 0
+
+        async def counted() -> Message:
+            nonlocal got
+            message = await request.receive()
+            size = len(message.get("body", b""))
+            got += size
+            self._coming[visitor] += size
+            if self._coming[visitor] > self._shelf.own or self._coming.total() > self._shelf.limit:
+                raise HTTPException(503, "too much comes in at once; try again")
+            return message
+
+        form = FormData()
         try:
-            form = await request.form(max_files=4, max_fields=0)
-        except (HTTPException, MultiPartException) as error:
-            raise HTTPException(400, f"no upload of files ({first_line(error)})") from None
-        if not form:
-            raise HTTPException(400, "no upload of files")
-        try:
+            sent = Request(request.scope, counted).form(max_files=4, max_fields=0)
+            form = await asyncio.wait_for(sent, UPLOAD_SECONDS)
+            if not form:
+                raise HTTPException(400, "no upload of files")
             return [await asyncio.to_thread(self._keep, f, visitor) for f in form.values()]
+        except MultiPartException as error:
+            raise HTTPException(400, f"no upload of files ({first_line(error)})") from None
+        except UserError as error:
+            raise HTTPException(503, str(error)) from None
         finally:
+            self._coming -= Counter({visitor: got})
             await form.close()
 
     def _keep(self, file: Any, visitor: str) -> str:
@@ -227,7 +256,7 @@ class Guard:
             raise HTTPException(413, "the file is over the maximum allowed size")
         suffix = PurePath(file.filename or "").suffix.lower()
         name = f"picture{suffix if suffix in PICTURE_SUFFIXES else ''}"
-        path = self._shelf.place(visitor) / name
+        path = self._shelf.place(visitor, file.size) / name
         with open(path, "wb") as out:
             shutil.copyfileobj(file.file, out)
         return str(path)
@@ -256,11 +285,10 @@ class Guard:
         return msgspec.json.encode(call)
 
 
-def _check_size(request: Request, limit: int) -> int:
-    """The bytes that a request states; it must, and may not be over the limit."""
+def _check_size(request: Request, limit: int) -> None:
+    """A request must state how many bytes it sends, and may not be over the limit."""
     stated = request.headers.get("content-length", "")
     if not re.fullmatch("[0-9]{1,15}", stated):
         raise HTTPException(411, "what is sent must state its length")
     if int(stated) > limit:
         raise HTTPException(413, f"more than {limit >> 20} MB, the maximum allowed size")
-    return int(stated)

@@ -8,8 +8,11 @@ import queue
 import shutil
 import signal
 import socket
+import stat
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
@@ -23,7 +26,7 @@ from ..conventions import DeviceChoice
 from ..errors import UserError
 from ..files import only_process
 from ..untrusted.ranges import ranged
-from .shelf import Shelf
+from .shelf import MAX_OWN, Shelf
 
 if TYPE_CHECKING:
     import gradio as gr
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 PREFIX = "gamba-app-"
 _PAGES = 8  # whose pictures and results are kept at once
+BACKLOG = 64  # connections that are taken in one go; each takes a descriptor
 Result = TypeVar("Result")
 
 
@@ -62,17 +66,17 @@ def app_command(
     from ..model.checkpoint import load_model
     from ..photo.cutout import Ways
 
-    chosen, port = pick_device(device), free_port(port)
+    chosen, door = pick_device(device), listener(port)
     ways = Ways(matte_model=matte_model, device=chosen).checked()
     model = load_model(checkpoint, chosen, encoder_weights)
-    with work_folder() as folder:
+    with door, work_folder() as folder:
         quiet(folder)
         from .actions import Actions
         from .interface import build
 
-        turns, shelf = MainThread(), Shelf(folder)
+        turns, shelf = MainThread(), Shelf(folder, own=max(MAX_OWN, max_upload_mb << 20))
         page = build(Actions(model, ways, shelf, str(chosen), turns))
-        serve(page, shelf, port, max_upload_mb, open_browser, turns)
+        serve(page, shelf, door, max_upload_mb, open_browser, turns)
 
 
 class MainThread:
@@ -140,9 +144,16 @@ def work_folder() -> Iterator[Path]:
 
 
 def _remove_unheld(folder: Path) -> None:
-    if folder.is_symlink() or not folder.is_dir() or not os.access(folder, os.W_OK):
+    """Removes a folder that an ended ``gamba app`` of this user left; touches no other."""
+    try:
+        made = folder.lstat()
+    except OSError:  # it is gone
         return
-    if not (folder / ".lock").is_file():  # another process makes it just now, or it is not ours
+    # Anybody may put a folder of this name there, and links into it.
+    ours = os.name != "posix" or (made.st_uid == os.geteuid() and not made.st_mode & 0o077)
+    if not (stat.S_ISDIR(made.st_mode) and ours):
+        return
+    if not (folder / ".lock").is_file():  # another process makes it just now
         return
     try:
         with only_process(folder, "serves"):
@@ -160,91 +171,133 @@ def quiet(folder: Path) -> None:
         "GRADIO_ANALYTICS_ENABLED": "False",
         "GRADIO_SHARE": "False",
         "HF_HUB_DISABLE_TELEMETRY": "1",
-        # gradio asks its own server whether it is there, and must not ask a proxy.
-        "NO_PROXY": ",".join(filter(None, (os.environ.get("NO_PROXY"), HOST, "localhost"))),
     }
 
 
-def free_port(port: int) -> int:
-    """The port, or a free one for 0.
+def listener(port: int) -> socket.socket:
+    """A socket that has the port, or a free one for 0; nothing is answered before it is served.
 
     Raises:
         UserError: it is taken or not allowed.
     """
-    with socket.socket() as probe:
-        if os.name == "posix":  # elsewhere it would let two servers have one port
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, port))
-        except OSError as error:
-            raise UserError(f"--port {port}: {error.strerror}") from error
-        return probe.getsockname()[1]
+    taken = socket.socket()
+    if os.name == "posix":  # elsewhere it would let two servers have one port
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        taken.bind((HOST, port))
+        taken.listen(BACKLOG)
+    except OSError as error:
+        taken.close()
+        raise UserError(f"--port {port}: {error.strerror}") from error
+    return taken
 
 
 def serve(
-    page: gr.Blocks, shelf: Shelf, port: int, max_mb: int, open_browser: bool, turns: MainThread
+    page: gr.Blocks,
+    shelf: Shelf,
+    door: socket.socket,
+    max_mb: int,
+    open_browser: bool,
+    turns: MainThread,
 ) -> None:
     """Serves the page until Ctrl-C or SIGTERM.
 
     Args:
         page: of ``interface.build``.
         shelf: for the visitors' files.
-        port: a free one.
+        door: of ``listener``.
         max_mb: largest upload, MB.
         open_browser: whether the browser is opened; where there is none, the address is printed.
         turns: what this thread does meanwhile.
 
     Raises:
-        UserError: another process has taken the port meanwhile.
         KeyboardInterrupt: Ctrl-C.
     """
     import webbrowser
 
-    from starlette.middleware import Middleware
+    import gradio as gr
+    import uvicorn
+    from fastapi import FastAPI
 
+    from .connections import Connection
     from .guard import Guard
     from .interface import LOOK, inputs, theme
 
-    guard = Middleware(Guard, shelf=shelf, inputs=inputs(page), max_bytes=max_mb << 20)
-    try:
-        page.launch(
-            server_name=HOST,
-            server_port=port,
-            share=False,
-            inbrowser=False,
-            prevent_thread_lock=True,
-            quiet=True,
-            show_error=False,
-            max_threads=4,
-            max_file_size=max_mb << 20,
-            state_session_capacity=_PAGES,
-            footer_links=[],
-            run_history=False,
-            enable_monitoring=False,
-            ssr_mode=False,
-            pwa=False,
-            mcp_server=False,
-            strict_cors=True,
-            app_kwargs={"middleware": [guard]},
-            theme=theme(),
-            css_paths=LOOK,
+    port = door.getsockname()[1]
+    page.state_session_capacity = _PAGES
+    app = gr.mount_gradio_app(
+        FastAPI(openapi_url=None),
+        page,
+        "/",
+        server_name=HOST,
+        server_port=port,
+        show_error=False,
+        max_file_size=max_mb << 20,
+        footer_links=[],
+        run_history=False,
+        enable_monitoring=False,
+        ssr_mode=False,
+        pwa=False,
+        mcp_server=False,
+        theme=theme(),
+        css_paths=LOOK,
+    )
+    server = uvicorn.Server(
+        uvicorn.Config(
+            Guard(app, shelf, inputs(page), max_mb << 20),
+            http=Connection,
+            ws="none",
+            loop="asyncio",
+            lifespan="on",
+            backlog=BACKLOG,
+            log_level="error",
+            access_log=False,
+            proxy_headers=False,
         )
-    except OSError as error:
-        raise UserError(f"--port {port}: Address already in use") from error
-    logging.getLogger("uvicorn.error").addFilter(_is_ours)
+    )
+    new_defect = NewDefect()
+    logging.getLogger("uvicorn.error").addFilter(new_defect)
+    logging.getLogger("asyncio").addFilter(new_defect)
     logging.getLogger("python_multipart").setLevel(logging.ERROR)  # it warns of damaged uploads
-    address = f"http://{HOST}:{port}/"
-    print(f"{address} (Ctrl-C ends it)", flush=True)
+    thread = threading.Thread(target=server.run, args=[[door]], daemon=True)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    thread.start()
     try:
+        while not server.started:
+            if not thread.is_alive():
+                raise RuntimeError("the server did not start")
+            time.sleep(0.01)
+        address = f"http://{HOST}:{port}/"
+        print(f"{address} (Ctrl-C ends it)", flush=True)
         if open_browser:
             webbrowser.open(address)
         turns.work()
     finally:
-        page.close(verbose=False)
+        # It waits for no page that is open, and what breaks off now is no defect.
+        logging.getLogger("uvicorn.error").disabled = True
+        server.should_exit = server.force_exit = True
+        thread.join(timeout=5)
 
 
-def _is_ours(record: logging.LogRecord) -> bool:
-    """Whether a logged error may be our defect: a browser that leaves in the middle is none."""
-    error = record.exc_info[1] if record.exc_info else None
-    return type(error).__name__ not in ("ClientDisconnect", "LocalProtocolError")
+class NewDefect(logging.Filter):
+    """Lets an error be logged that may be our defect, once for each place that it comes from.
+
+    A browser that leaves in the middle is none, and nobody can flood the terminal.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen: set[tuple[str, str, int]] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether to log it."""
+        kind, _, place = record.exc_info or (None, None, None)
+        if kind is None:
+            return True
+        while place and place.tb_next:
+            place = place.tb_next
+        file, line = (place.tb_frame.f_code.co_filename, place.tb_lineno) if place else ("", 0)
+        defect = kind.__name__, file, line
+        new = defect not in self._seen
+        self._seen.add(defect)
+        return new and kind.__name__ not in ("ClientDisconnect", "LocalProtocolError")

@@ -30,7 +30,7 @@ from ..files import write_json
 from ..images import check_size, load_rgba8, open_picture
 from ..untrusted.documents import read_document
 from .layouts import LAYOUTS, ObjectFiles, Stored, find_objects
-from .packs import INDEX, open_pack, read_packed
+from .packs import INDEX, open_pack, read_index, read_packed
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of what is written; 1 had fewer objects in one group
@@ -115,12 +115,16 @@ def _read_split(root: Path) -> tuple[int, dict[str, str]]:
 
 
 def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
-    """The split of each object of a dataset, whose ``split.json`` may state it.
+    """The split of each object of a dataset, whose ``split.json`` or index of a pack may state it.
 
     Raises:
-        UserError: that file is bad.
+        UserError: that file, or the pack's index, is bad.
     """
-    _, stated = _read_split(Path(folder))
+    root = Path(folder)
+    if (root / INDEX).exists():
+        stated = {values["uid"]: str(values.get("split")) for values in read_index(root).objects}
+    else:
+        _, stated = _read_split(root)
     return {uid: stated.get(uid) or split_of(uid) for uid in uids}
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from ..errors import UserError
+from ..files import walk
 from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
 from ..untrusted.names import inside
@@ -43,6 +44,7 @@ _TEXT = 500  # letters of a name or of an attribution
 _DEPTH = 64  # folders within folders
 # What of a lens a frame may state for itself.
 _LENS = {*("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "p1", "p2")}
+_FIT = 0.02  # sides of the cube by which a simplified mesh may miss it
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
@@ -67,6 +69,36 @@ class Stored:
 Sizes = list[tuple[int, int] | None]
 
 
+@dataclass(frozen=True)
+class Placement:
+    """The way from a mesh's file to the world of the views that were rendered of it.
+
+    A point becomes ``scale · (transform · [x, 1])``: ``applied_scale`` and ``applied_transform`` of
+    ``transforms.json``. It has all that was done: the turn to z-up, a rotation of the catalogue,
+    ``--stretch``.
+
+    Attributes:
+        transform: ``[3, 4]`` float64, whose ``[3, 3]`` part can be inverted.
+        scale: > 0.
+    """
+
+    transform: np.ndarray
+    scale: float
+
+    def points(self, x: np.ndarray) -> np.ndarray:
+        """Moves ``[N, 3]``."""
+        return self.scale * (x @ self.transform[:, :3].T + self.transform[:, 3])
+
+    def fits(self, x: np.ndarray) -> bool:
+        """Tells if ``[N, 3]`` may be the mesh's vertices: then they fill the cube of the views.
+
+        Their bounding box is then centred, with a longest side of 1; a simplified mesh's nearly.
+        """
+        points = self.points(x)
+        low, high = points.min(0), points.max(0)
+        return bool(np.abs(low + high).max() / 2 <= _FIT and abs((high - low).max() - 1) <= _FIT)
+
+
 @dataclass
 class ObjectFiles:
     """Where the views of one object lie, and their cameras.
@@ -81,6 +113,7 @@ class ObjectFiles:
         depth_unit: length of one step of the depth pictures, object units.
         name: name for people.
         attribution: creator, licence, source; may be empty.
+        placement: of the mesh that was rendered, or None where the set does not say it.
     """
 
     images: Sequence[Path | Stored]
@@ -92,16 +125,17 @@ class ObjectFiles:
     depth_unit: float = 1.0
     name: str = ""
     attribution: dict[str, str] = field(default_factory=dict)
+    placement: Placement | None = None
 
 
-def _matrix(value: object, source: str) -> np.ndarray:
+def _matrix(value: object, source: str, what: str = "the pose") -> np.ndarray:
     """Makes a ``[4, 4]`` matrix of 3x4 or 4x4 nested numbers."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise UserError(f"{source}: the pose is not a matrix of numbers") from error
+        raise UserError(f"{source}: {what} is not a matrix of numbers") from error
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise UserError(f"{source}: the pose has shape {matrix.shape}, expected 3x4 or 4x4")
+        raise UserError(f"{source}: {what} has shape {matrix.shape}, expected 3x4 or 4x4")
     return np.concatenate([matrix[:3], [[0.0, 0.0, 0.0, 1.0]]])
 
 
@@ -158,6 +192,23 @@ def _number(values: dict[str, Any], key: str, source: str) -> float:
     if type(value) not in (int, float) or not abs(value) <= _LARGEST:  # a bool is no number
         raise UserError(f"{source}: {key} is {repr(value)[:40]}, expected a finite number")
     return float(value)
+
+
+def read_placement(values: dict[str, Any], source: str) -> Placement | None:
+    """Reads ``applied_transform`` and ``applied_scale``; None without the first.
+
+    Raises:
+        UserError: they are not numbers that a mesh can be moved by.
+    """
+    if values.get("applied_transform") is None:
+        return None
+    matrix = _matrix(values["applied_transform"], source, "applied_transform")[:3]
+    scale = _number({"applied_scale": 1.0, **values}, "applied_scale", source)
+    with np.errstate(all="ignore"):  # numbers that are not finite are told here
+        sound = (np.abs(matrix) <= _LARGEST).all() and scale > 0
+        if not sound or np.linalg.matrix_rank(matrix[:, :3]) < 3:
+            raise UserError(f"{source}: applied_transform or applied_scale moves no mesh")
+    return Placement(matrix, scale)
 
 
 def _side(values: dict[str, Any], key: str, source: str) -> int:
@@ -271,6 +322,7 @@ def _read_transforms(folder: Path) -> ObjectFiles:
         depth_unit=depth_unit,
         name=one_text(top.get("name") or ""),
         attribution={one_text(k): one_text(v) for k, v in attribution.items()},
+        placement=read_placement(top, str(path)),
     )
 
 
@@ -360,17 +412,16 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
     """Finds the layout's name and the objects' folders, sorted, at any depth.
 
     ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
-    Folders with a leading dot are passed over.
+    Folders with a leading dot are passed over; linked folders are entered (``files.walk``).
 
     Raises:
         UserError: the folders are nested too deep.
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
     found = []
-    for folder, subfolders, files in os.walk(root):
+    for folder, subfolders, files in walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _DEPTH:
             raise UserError(f"{root}: its folders are nested deeper than {_DEPTH}")
-        subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
         if mark := next((m for m in marks if m in files or m in subfolders), None):
             subfolders.clear()  # an object holds no objects
             marks, layout = {mark: marks[mark]}, marks[mark]

@@ -35,7 +35,15 @@ from ..errors import UserError
 from ..images import MAX_PIXELS
 from ..untrusted.documents import read_document
 from ..untrusted.names import inside, parts_of, plain_name
-from .layouts import MAX_SIDE, MAX_VIEWS, ObjectFiles, Stored, check_cameras, one_text
+from .layouts import (
+    MAX_SIDE,
+    MAX_VIEWS,
+    ObjectFiles,
+    Stored,
+    check_cameras,
+    one_text,
+    read_placement,
+)
 
 INDEX = "pack.json"
 FORMAT, VERSION = "gamba-pack", 1
@@ -67,6 +75,8 @@ class Entry(msgspec.Struct, kw_only=True, omit_defaults=True):
         depth_unit: length of a step, object units.
         name: name for people.
         attribution: creator, licence, source.
+        applied_transform: of the mesh that was rendered, as ``transforms.json`` has it; or None.
+        applied_scale: see above.
     """
 
     uid: str
@@ -84,6 +94,8 @@ class Entry(msgspec.Struct, kw_only=True, omit_defaults=True):
     depth_unit: Annotated[float, Meta(gt=0, le=1e3)] = 1.0
     name: _Text = ""
     attribution: Annotated[dict[_Text, _Text], Meta(max_length=100)] = {}
+    applied_transform: list[list[float]] | None = None
+    applied_scale: float = 1.0
 
 
 class Index(msgspec.Struct, kw_only=True):
@@ -203,6 +215,7 @@ def read_packed(folder: Path, values: dict[str, Any]) -> ObjectFiles:
         depth_unit=entry.depth_unit,
         name=one_text(entry.name),
         attribution={one_text(k): one_text(v) for k, v in entry.attribution.items()},
+        placement=read_placement(msgspec.structs.asdict(entry), name),
     )
 
 

@@ -4,18 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import msgspec
 import numpy as np
 
 from ..errors import UserError
+from ..files import visible
 from ..untrusted.documents import read_document
 from ..untrusted.names import MAX_NAME, parts_of, plain_name
 from .meshes import SUFFIXES
 
 CATALOGUE = "catalogue.json"  # beside the meshes: names and attribution, see ``find_meshes``
+# Names of files, and of the folders that they lie in, that say nothing of the object.
+NO_NAMES = frozenset(
+    "mesh meshes model model_normalized models normalized_model object raw_model scene source "
+    "textured untitled".split()
+)
+
+_LONG = MAX_NAME // 2  # bytes of a name; there is room for a suffix
+_DIGITS = 12  # of the hash that ends one that was longer
+_SHORTENED = re.compile(rf"[0-9a-f]{{{_DIGITS}}}$")
 
 
 @dataclass(frozen=True)
@@ -44,7 +55,7 @@ def find_meshes(folder: Path) -> list[Mesh]:
 
     ``catalogue.json`` in the folder, if there, has ``objects``: a list of ``model`` (path in the
     folder), ``uid``, ``name``, ``group`` (of variants that belong on one side of a split) and
-    ``attribution``. Other meshes are named by their path.
+    ``attribution``. Other meshes are named by their path (``object_names``).
 
     Raises:
         UserError: no such folder, no meshes, a bad catalogue, or two objects with one uid.
@@ -53,22 +64,20 @@ def find_meshes(folder: Path) -> list[Mesh]:
         raise UserError(f"{folder}: no such folder")
     known = _read_catalogue(folder / CATALOGUE)
     meshes: dict[str, Mesh] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() not in SUFFIXES or not path.is_file():
-            continue
-        relative = path.relative_to(folder)
-        if any(part.startswith(".") for part in relative.parts):
-            continue
-        entry = known.get(relative.as_posix())
-        uid = entry.uid if entry else _uid(relative)
+    files = (path for path in visible(folder, "*") if path.suffix.lower() in SUFFIXES)
+    paths = sorted(path for path in files if path.is_file())
+    told = _told([path.relative_to(folder).with_suffix("") for path in paths])
+    for path, parts in zip(paths, told):
+        entry = known.get(path.relative_to(folder).as_posix())
+        uid = entry.uid if entry else _uid(parts)
         if uid in meshes and not entry:
             uid = f"{uid}-{path.suffix[1:].lower()}"
         if uid in meshes:
             raise UserError(f"{path} and {meshes[uid].path} would both be '{uid}'")
         if entry is None:
-            meshes[uid] = Mesh(path, uid, path.stem, uid, {})
+            meshes[uid] = Mesh(path, uid, parts[-1], uid, {})
             continue
-        name, group = entry.name or path.stem, entry.group or uid
+        name, group = entry.name or parts[-1], entry.group or uid
         meshes[uid] = Mesh(path, uid, name, group, entry.attribution or {}, entry.rotation)
     if not meshes:
         raise UserError(f"{folder}: no mesh files ({', '.join(SUFFIXES)})")
@@ -124,13 +133,47 @@ def check_rotation(value: object, source: str) -> np.ndarray:
     return matrix
 
 
-def _uid(relative: Path) -> str:
-    """A folder's name from a path; ``chair/chair.obj`` is just ``chair``."""
-    parts = list(relative.with_suffix("").parts)
-    if len(parts) > 1 and parts[-1] == parts[-2]:
-        parts.pop()
+def object_names(paths: Sequence[PurePath]) -> list[str]:
+    """The names of the objects that files in one folder hold, each fit for one file's name.
+
+    ``a/b`` is ``a-b``. Where the last parts say nothing (``NO_NAMES``) or repeat the folder, the
+    folder gives the name: ``a/b/model`` and ``a/b/b`` are ``a-b`` too. A file whose folder's name
+    another one has as well keeps all parts. A name that this returned is left as it is.
+
+    Args:
+        paths: of the files in the folder, without suffix; files of one path are of one object.
+    """
+    return [_uid(parts) for parts in _told(paths)]
+
+
+def _told(paths: Sequence[PurePath]) -> list[tuple[str, ...]]:
+    """The parts of each path that name its object."""
+    short = [_telling(path.parts) for path in paths]
+    owners: dict[str, set[PurePath]] = {}
+    for path, parts in zip(paths, short):
+        owners.setdefault(_uid(parts), set()).add(path)
+    return [
+        parts if len(owners[_uid(parts)]) == 1 else _once(path.parts)
+        for path, parts in zip(paths, short)
+    ]
+
+
+def _telling(parts: tuple[str, ...]) -> tuple[str, ...]:
+    while len(parts) > 1 and parts[-1].lower() in NO_NAMES:
+        parts = parts[:-1]
+    return _once(parts)
+
+
+def _once(parts: tuple[str, ...]) -> tuple[str, ...]:
+    """``chair/chair`` is just ``chair``."""
+    return parts[:-1] if len(parts) > 1 and parts[-1] == parts[-2] else parts
+
+
+def _uid(parts: tuple[str, ...]) -> str:
+    """One name of parts, for a folder."""
     uid = re.sub(r"[^\w.-]+", "_", "-".join(parts)).lstrip(".") or "_"
-    if len(uid.encode()) > MAX_NAME // 2:  # room for a suffix; two long names stay apart
-        digest = hashlib.sha256(uid.encode()).hexdigest()[:12]
-        uid = uid.encode()[: MAX_NAME // 2].decode(errors="ignore") + digest
+    size = len(uid.encode())
+    if size > _LONG and not (size <= _LONG + _DIGITS and _SHORTENED.search(uid)):
+        digest = hashlib.sha256(uid.encode()).hexdigest()[:_DIGITS]  # two long names stay apart
+        uid = uid.encode()[:_LONG].decode(errors="ignore") + digest
     return uid

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -165,10 +166,15 @@ def save_model(
             "encoder_sha256" are taken.
 
     Raises:
+        TypeError: the path or the model is none, as where one stands in the place of the other.
         UserError: the file cannot be written.
         ValueError: ``extra_metadata`` has a key that is taken.
     """
     from safetensors.torch import save_file
+
+    if not isinstance(path, (str, PathLike)) or not isinstance(model, torch.nn.Module):
+        kinds = f"{type(path).__name__}, {type(model).__name__}"
+        raise TypeError(f"save_model takes the path, then the model, and got {kinds}")
 
     metadata = dict(extra_metadata or {})
     taken = [key for key in _OWN_KEYS if key in metadata]

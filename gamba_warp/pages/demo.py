@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from ..conventions import GREY, over_background
 from ..errors import UserError
 from ..formats.ply import load_ply
 from ..photo.cutout import cut_out
+from ..untrusted.documents import read_document
 from .card import OF_GROUNDS, OF_PICTURES, ModelCard, about_model, read_card
 from .curves import curves_section
 from .page import Section, demo_page
@@ -73,7 +73,7 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
         card = read_card(results.shipped)
     except UserError:
         card = None
-    report = json.loads((results.views / "report.json").read_bytes())
+    report = read_document(results.views / "report.json", dict[str, Any])
     strips = sorted((results.views / "strips").glob("*.png"))
     held_out = []
     for strip in strips:
@@ -141,12 +141,12 @@ def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | Non
     """Metrics of the models beside those of the baselines, on white and on other grounds."""
     models = {"the shipped model": report["mean"]}
     if (here := results.views_here / "report.json").exists():
-        models["the model trained here"] = json.loads(here.read_bytes())["mean"]
+        models["the model trained here"] = read_document(here, dict[str, Any])["mean"]
     others = {_BASELINES.get(name, name): mean for name, mean in report["baselines"].items()}
     figures = [(label, "new views", mean) for label, mean in (models | others).items()]
     figures += [(label, "input view", mean["input"]) for label, mean in models.items()]
     shapes = results.shapes / "report.json"
-    geometry = json.loads(shapes.read_bytes())["mean"] if shapes.exists() else {}
+    geometry = read_document(shapes, dict[str, Any])["mean"] if shapes.exists() else {}
     keys = ("chamfer", "normal_consistency", "iou")
     found = [f"{key.replace('_', ' ')} {_cell(geometry[key])}" for key in keys if key in geometry]
     text = f"Means over {report['num_ok']} held-out objects; LPIPS is better the lower it is. "

@@ -11,10 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import UserError
-from ..untrusted.documents import parse_document
+from ..untrusted import documents
 
-_LONGEST = 1 << 20  # bytes of a line; ours have a few hundred
 _MOST_WARNINGS = 1000
 _MOST_STEPS = 10**12
 # Of a training line; a validation's figures are all wanted.
@@ -137,20 +135,10 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
     Raises:
         UserError: as ``read_run_log``.
     """
-    if not path.is_file():
-        raise UserError(f"{path}: {'not a plain file' if path.exists() else 'no such file'}")
-    try:
-        with open(path, "rb") as file:
-            while data := file.readline(_LONGEST):
-                try:
-                    line = parse_document(data, dict[str, Any], str(path))
-                except UserError:
-                    continue
-                step = line.get("step")
-                if type(step) is int and 0 <= step <= _MOST_STEPS and "event" in line:
-                    yield line
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
+    for line in documents.read_lines(path, dict[str, Any]):
+        step = line.get("step")
+        if type(step) is int and 0 <= step <= _MOST_STEPS and "event" in line:
+            yield line
 
 
 def _number(value: object) -> float | None:

@@ -6,33 +6,40 @@ import contextlib
 import http.server
 import socket
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from ..errors import UserError
 
 HOSTS = ("127.0.0.1", "localhost")
+_TOLD = ("host", "origin", "sec-fetch-mode", "sec-fetch-site")
 _CONNECTIONS = 16  # at once; a browser opens six
-_READ_SECONDS = 10.0  # a request must be there within them, and each piece of the page be taken
-_PIECE = 1 << 16  # bytes
+READ_SECONDS = 10.0  # a request must be there within them, and each piece of the page be taken
+PIECE = 1 << 16  # bytes
 
 
-def is_foreign(headers: Mapping[str, str]) -> bool:
+def is_foreign(headers: Iterable[tuple[str, str]]) -> bool:
     """Whether a request to a server on 127.0.0.1 is not of its own page, nor of the user.
 
     A foreign web page in the same browser can send requests there, and even read the answers once
-    it has given its own name that address (DNS rebinding). The browser says so in these headers.
+    it has given its own name that address (DNS rebinding). The browser says so in these headers,
+    each of them once.
 
     Args:
-        headers: by names in small letters.
+        headers: all of the request, by their names.
     """
-    host, site = headers.get("host", ""), headers.get("sec-fetch-site")
+    said: dict[str, str] = {}
+    for name, value in ((name.lower(), value) for name, value in headers):
+        if name in said and name in _TOLD:
+            return True
+        said[name] = value
+    host, site = said.get("host", ""), said.get("sec-fetch-site")
     name, colon, port = host.partition(":")
     if name not in HOSTS or (colon and not port.isdecimal()):
         return True
-    if headers.get("origin") not in (None, f"http://{host}"):
+    if said.get("origin") not in (None, f"http://{host}"):
         return True
-    followed = headers.get("sec-fetch-mode") == "navigate"  # a link, whose page sees no answer
+    followed = said.get("sec-fetch-mode") == "navigate"  # a link, whose page sees no answer
     return not followed and site not in (None, "none", "same-origin")
 
 
@@ -90,7 +97,7 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
     """
 
     class Handler(http.server.BaseHTTPRequestHandler):
-        timeout = _READ_SECONDS  # of each single read and write
+        timeout = READ_SECONDS  # of each single read and write
 
         def handle(self) -> None:
             def end() -> None:
@@ -98,7 +105,7 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
                     self.connection.shutdown(socket.SHUT_RDWR)
 
             # A client that sends a letter now and then would pass every single read's limit.
-            timer = threading.Timer(_READ_SECONDS, end)
+            timer = threading.Timer(READ_SECONDS, end)
             timer.daemon = True
             self.reading = timer
             timer.start()
@@ -109,7 +116,7 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
 
         def do_GET(self) -> None:
             self.reading.cancel()
-            if is_foreign({name.lower(): value for name, value in self.headers.items()}):
+            if is_foreign(self.headers.items()):
                 self.send_error(421)
                 return
             if self.path != "/":
@@ -120,8 +127,8 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
             self.send_header("Content-Length", str(len(content)))
             self.end_headers()
             view = memoryview(content)
-            for start in range(0, len(view), _PIECE):  # a time limit is that of one piece
-                self.wfile.write(view[start : start + _PIECE])
+            for start in range(0, len(view), PIECE):  # a time limit is that of one piece
+                self.wfile.write(view[start : start + PIECE])
 
         def log_message(self, format: str, *args: object) -> None:
             """Says nothing."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -11,6 +12,7 @@ from ..errors import UserError
 
 MAX_BYTES = 64 << 20  # a file of 100,000 views takes 60 MB; ours take a few kB
 MAX_DEPTH = 32  # levels of lists and objects; ours have up to 6
+MAX_LINE = 1 << 20  # bytes of a line of JSON Lines; ours have a few hundred, or a few thousand
 
 Kind = TypeVar("Kind")
 
@@ -70,8 +72,8 @@ def parse_document(data: bytes | str, kind: Any, source: str) -> Any:
         UserError: it is not JSON, is nested deeper than ``MAX_DEPTH``, or is not of ``kind``; the
             message says where in the document.
     """
-    text = data.encode() if isinstance(data, str) else data
     try:
+        text = data.encode() if isinstance(data, str) else data
         check_depth(msgspec.json.decode(text.removeprefix(b"\xef\xbb\xbf")), source)
         return msgspec.json.decode(text.removeprefix(b"\xef\xbb\xbf"), type=kind)
     except msgspec.ValidationError as error:
@@ -80,6 +82,45 @@ def parse_document(data: bytes | str, kind: Any, source: str) -> Any:
         raise UserError(f"{source}: nested deeper than {MAX_DEPTH} levels") from error
     except (msgspec.MsgspecError, UnicodeError) as error:
         raise UserError(f"{source}: not valid JSON ({error})") from error
+
+
+@overload
+def read_lines(path: str | Path, kind: type[Kind]) -> Iterator[Kind]: ...
+@overload
+def read_lines(path: str | Path, kind: Any) -> Iterator[Any]: ...
+def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
+    """The whole lines of a JSON Lines file; what ``parse_document`` refuses is passed over.
+
+    A process that was killed leaves a line that is cut off.
+
+    Args:
+        path: file, UTF-8.
+        kind: of each line, as for ``read_document``.
+
+    Raises:
+        UserError: the file is missing, is no plain file, or cannot be read.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: {'not a plain file' if path.exists() else 'no such file'}")
+    try:
+        with open(path, "rb") as file:
+            while data := file.readline(MAX_LINE):
+                try:
+                    line = parse_document(data, kind, str(path))
+                except UserError:
+                    continue
+                yield line
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from error
+
+
+def value_of(text: str) -> Any:
+    """The value that an option's text means as JSON; the text itself where that is no JSON."""
+    try:
+        return parse_document(text, Any, "")
+    except UserError:
+        return text
 
 
 def check_depth(value: Any, source: str) -> None:

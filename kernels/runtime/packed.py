@@ -20,7 +20,8 @@ def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> T
         x: ``[B, L, D]``, the tokens.
         cu_seqlens: ``[S + 1]`` int32 or int64, ascending from 0 to L, where B is 1: sequence s has
             the tokens from ``cu_seqlens[s]`` to before ``cu_seqlens[s + 1]``, perhaps none. On CUDA
-            the values are not looked at, which would wait for the device, but bounded.
+            the values are not looked at, which would wait for the device, but bounded: by 0, L and
+            those before them. Results of tokens in no sequence are then undefined.
         seq_idx: ``[B, L]`` int32 or int64: a sequence is a run of equal numbers in a row. To find
             the runs waits for a CUDA device.
 
@@ -57,9 +58,9 @@ def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> T
         if len(fall):
             s = int(fall[0])
             raise ValueError(f"cu_seqlens falls from {given[s]} to {given[s + 1]} at entry {s + 1}")
-    ends = given.clamp(0, length).int()
+    ends = given.clamp(0, length).int().cummax(0).values  # no two sequences have a token in common
     begins = ends[:-1]
-    return torch.stack([torch.zeros_like(begins), begins, torch.maximum(begins, ends[1:])], 1)
+    return torch.stack([torch.zeros_like(begins), begins, ends[1:]], 1)
 
 
 def _runs(seq_idx: Tensor) -> Tensor:

@@ -92,8 +92,11 @@ def test_rows_run_once_and_their_figures_are_these(gamba, tmp_path, capsys):
     text = (tmp_path / "out" / "table.md").read_text()
     assert "| 23.00 [21.00, 25.00]" in text and "PSNR [dB] 12.72" in text and "b: Why." in text
     assert "| b - a | +1.00 [1.00, 1.00]" in text and "1.414" in text
+    assert "of 3 objects (27 were asked for) of the part test." in text
+    assert found["a"]["objects"] == 3 and made["evaluation"]["objects"] == 27
     assert "On black and on grey" in text and "| a | 19.00 [17.00, 21.00] | -" in text
     page = (tmp_path / "out" / "index.html").read_text()
+    assert "of 3 objects (27 were asked for) of the part test." in page
     assert page.count("<svg") == 4 and "23.00 <span>[21.00, 25.00]</span>" in page
     assert made["evaluation"]["views"] == 4 and made["budget"] == {"steps": 4}
     before = page

@@ -3,6 +3,7 @@
 import io
 import json
 import signal
+import socket
 from pathlib import Path
 
 import pytest
@@ -175,6 +176,71 @@ def test_our_own_pages_and_links_to_them_are_let_in(served, program):
         {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"},
     ):
         assert program.ask("/", **headers).status == 200, headers
+
+
+def raw(served, *lines):
+    """The connection, and the status of a request of these lines."""
+    host, port = served.host.split(":")
+    link = socket.create_connection((host, int(port)), timeout=30)
+    link.sendall("\r\n".join([*lines, "", ""]).encode("latin-1"))
+    answer = link.makefile("rb")
+    return answer, int(answer.readline().split()[1])
+
+
+def test_two_names_or_two_origins_are_refused(served):
+    ours, theirs = f"Host: {served.host}", "Host: evil.example"
+    for pair in ([ours, ours], [ours, theirs], [theirs, ours]):
+        assert raw(served, "GET / HTTP/1.1", *pair)[1] in (400, 421), pair
+    ours = f"Origin: http://{served.host}"
+    assert raw(served, "GET / HTTP/1.1", f"Host: {served.host}", ours)[1] == 200
+    for second in (ours, "Origin: http://evil.example"):
+        for pair in ([ours, second], [second, ours]):
+            assert raw(served, "GET / HTTP/1.1", f"Host: {served.host}", *pair)[1] == 421, pair
+
+
+def test_no_request_of_http_is_no_line_on_the_terminal(served):
+    """The fixture of this file sees what the command says."""
+    for line in ("nothing", "GET /\0 HTTP/1.1", "GET / HTTP/1.1\r\nA b"):
+        assert raw(served, line, f"Host: {served.host}")[1] == 400
+    upgrade = "Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Key: " + "a" * 22 + "=="
+    assert raw(served, "GET / HTTP/1.1", f"Host: {served.host}", *upgrade)[1] == 200
+
+
+def test_parts_of_a_file(program):
+    file = f"/gradio_api/file={program.upload(b'0123456789')}"
+    for value, part in (("0-1", b"01"), ("2-", b"23456789"), ("-3", b"789"), ("8-99", b"89")):
+        answer = program.ask(file, Range=f"bytes={value}")
+        assert (answer.status, answer.body) == (206, part), value
+        assert "cookie" not in answer.headers
+    assert program.ask(file, Range="bytes=10-").status == 416
+    assert program.ask(file, Range="bytes=10-11").status == 416
+    for value in ("0-1,2-3", "0-1-2", "\xb2-\xb3", "-", "0-" + "9" * 5000):
+        answer = program.ask(file, Range=f"bytes={value}")
+        assert (answer.status, answer.body) == (200, b"0123456789"), value
+    example = f"/gradio_api/file={examples()[0][0]}"
+    assert program.ask(example, Range="bytes=0-1,2-3").status == 200
+
+
+def test_a_page_that_is_open_is_heard_of(served, program):
+    cookie, host = f"Cookie: {program.headers['Cookie']}", f"Host: {served.host}"
+    place = f"GET /gradio_api/heartbeat/{program.session} HTTP/1.1"
+    assert raw(served, place, host)[1] == 403
+    answer, status = raw(served, place, host, cookie)
+    assert status == 200
+    assert "data: ALIVE\n" in iter(lambda: answer.readline().decode(), "")
+
+
+def test_half_sent_requests_stop_nothing(served, program):
+    """More of them than the server takes; the page is answered in between."""
+    host, port = served.host.split(":")
+    held = []
+    for _ in range(3):
+        for _ in range(60):
+            held.append(socket.create_connection((host, int(port))))
+            held[-1].sendall(b"GET / HTTP/1.1\r\n")
+        assert program.ask("/").status == 200
+    for link in held:
+        link.close()
 
 
 def test_forwarded_names_are_ignored(bare):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.app import FORM, MEGABYTES, Program, command, form, serving
+from helpers.browser import complains
 from PIL import Image
 
 from gamba_warp.formats.gaussians.files import read_gaussians
@@ -39,7 +40,7 @@ class Open:
     def hear(self, message) -> None:
         # gradio's own scripts warn of their own libraries; their errors count.
         theirs = "/assets/" in message.location.get("url", "")
-        if message.type == "error" or (message.type == "warning" and not theirs):
+        if message.type == "error" or (complains(message) and not theirs):
             self.complaints.append(f"{message.text} ({message.location})")
 
 

@@ -1,6 +1,7 @@
 """What the page's server lets in, leaves behind, and computes on."""
 
 import asyncio
+import hashlib
 import json
 import logging
 import os
@@ -18,13 +19,14 @@ from gamba_warp.app.shelf import Shelf
 from gamba_warp.errors import UserError
 
 
-def answered(host, kind="http", path="/", method="GET", shelf=None, body=b"", token=None):
-    """What the guard answers to a request: the messages, and whether it let it in."""
+def answered(host, kind="http", path="/", method="GET", shelf=None, body=b"", token=None, more=()):
+    """What the guard answers to a request: the messages, and the scopes that it let in."""
     sent, inside = [], []
 
     async def app(scope, receive, send):
         inside.append(scope)
-        await send({"type": "http.response.start", "status": 200, "headers": [(b"a", b"b")]})
+        answer = [(b"a", b"b"), (b"cookie", b"as gradio repeats it")]
+        await send({"type": "http.response.start", "status": 200, "headers": answer})
         await send({"type": "http.response.body", "body": b""})
 
     async def receive():
@@ -34,12 +36,20 @@ def answered(host, kind="http", path="/", method="GET", shelf=None, body=b"", to
         sent.append(message)
 
     headers = [] if host is None else [(b"host", host.encode())]
-    headers += [(b"content-type", FORM["Content-Type"].encode())]
+    headers += [(b"content-type", FORM["Content-Type"].encode()), *more]
     headers += [(b"content-length", str(len(body)).encode())]
     headers += [(b"cookie", f"gamba-visitor={token}".encode())] if token else []
-    scope = {"type": kind, "headers": headers, "path": path, "method": method}
-    asyncio.run(guard.Guard(app, shelf, {}, 1 << 20)(scope, receive, send))
-    return sent, bool(inside)
+    place, _, asked = path.partition("?")
+    scope = {"type": kind, "headers": headers, "path": place, "method": method}
+    scope["query_string"] = asked.encode()
+    layer = guard.Guard(app, shelf or Shelf(Path("unused")), {}, 1 << 20)
+    asyncio.run(layer(scope, receive, send))
+    return sent, inside
+
+
+def visitor_of(token):
+    """The name of a visitor's folder."""
+    return hashlib.sha256(token.encode()).hexdigest()[:32]
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:7860", "localhost:1", "127.0.0.1", "localhost"])
@@ -47,9 +57,70 @@ def test_our_own_names_are_let_in(host):
     sent, inside = answered(host)
     assert inside and sent[0]["status"] == 200
     headers = dict(sent[0]["headers"])
-    assert headers[b"a"] == b"b"
+    assert headers[b"a"] == b"b" and b"cookie" not in headers, "a script could read it"
+
+
+@pytest.mark.parametrize("host", ["localhost", "evil.example"])
+def test_every_answer_tells_the_browser_what_it_may_load(host):
+    headers = dict(answered(host)[0][0]["headers"])
     policy = headers[b"content-security-policy"].decode()
-    assert "default-src 'self'" in policy and "http" not in policy and "*" not in policy
+    assert "http" not in policy and "*" not in policy
+    told = dict(part.strip().split(" ", 1) for part in policy.split(";"))
+    for name in ("default-src", "base-uri", "form-action", "frame-ancestors"):
+        assert told[name] == "'self'", name
+    assert told["object-src"] == "'none'"
+    assert headers[b"referrer-policy"] == b"no-referrer"
+    assert headers[b"x-content-type-options"] == b"nosniff"
+
+
+@pytest.mark.parametrize("name", ["host", "origin", "sec-fetch-site", "sec-fetch-mode"])
+def test_what_a_browser_says_it_says_once(name):
+    said = {"host": "localhost", "origin": "http://localhost", "sec-fetch-site": "same-origin"}
+    value = said.get(name, "cors").encode()
+    once = [(name.encode(), value)] if name != "host" else []
+    assert answered("localhost", more=once)[1]
+    for second in (value, b"evil.example"):
+        for pair in ([value, second], [second, value]):
+            more = [(name.encode(), v) for v in pair]
+            sent, inside = answered(None if name == "host" else "localhost", more=more)
+            assert not inside and sent[0]["status"] == 421, pair
+
+
+@pytest.mark.parametrize("place", ["heartbeat/abc", "queue/data?session_hash=abc"])
+def test_a_session_is_told_apart_by_its_visitor(place):
+    """Whose heartbeat ends, of that visitor's session gradio forgets what it holds."""
+    path = f"/gradio_api/{place}"
+    for token in ("a" * 32, "b" * 32):
+        [scope] = answered("localhost", path=path, token=token)[1]
+        got = f"{scope['path']}?{scope['query_string'].decode()}"
+        assert got.rstrip("?") == path + visitor_of(token)
+    sent, inside = answered("localhost", path=path)
+    assert not inside and sent[0]["status"] == 403
+
+
+@pytest.mark.parametrize("value", ["bytes=0-1", "bytes=7-", "bytes=-2"])
+def test_plain_ranges_are_let_in(value):
+    [scope] = answered("localhost", path="/theme.css", more=[(b"range", value.encode())])[1]
+    assert (b"range", value.encode()) in scope["headers"]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *(["bytes=0-1,2-3"], ["bytes=0-1-2"], ["bytes=-"], ["bytes="], ["items=0-1"], ["0-1"]),
+        *(["bytes=\xb2-\xb3"], ["bytes=0-" + "9" * 5000], ["bytes=0-1"] * 2),
+    ],
+)
+def test_other_ranges_are_ignored(values):
+    more = [(b"range", value.encode("latin-1")) for value in values]
+    [scope] = answered("localhost", path="/theme.css", more=more)[1]
+    assert not [name for name, _ in scope["headers"] if name == b"range"]
+
+
+@pytest.mark.parametrize("more", [(b"content-length", b"5"), (b"transfer-encoding", b"chunked")])
+def test_who_only_asks_sends_no_body(more):
+    sent, inside = answered("localhost", more=[more])
+    assert not inside and sent[0]["status"] == 400
 
 
 @pytest.mark.parametrize(
@@ -87,39 +158,125 @@ def test_all_uploads_together_are_bounded(tmp_path):
         os.utime(paths[-1], (time.time() - 100 + k,) * 2)
         kept = [path for path in tmp_path.rglob("*") if path.is_file()]
         assert sum(path.stat().st_size for path in kept) <= shelf.limit
-    assert [path.is_file() for path in paths] == [False] * 6 + [True] * 3
+    assert [path.is_file() for path in paths] == [False] * 5 + [True] * 4
     assert not paths[0].parent.exists()
 
 
-def test_what_comes_in_at_once_is_bounded(tmp_path):
-    """Of four that dawdle with a megabyte each, the fourth is sent away."""
-    sent = [[] for _ in range(4)]
+def kept_file(shelf, visitor, size=1000):
+    path = shelf.place(visitor, size) / "picture.png"
+    path.write_bytes(bytes(size))
+    return path
 
-    async def receive():
-        await asyncio.sleep(60)
 
-    async def come():
-        layer = guard.Guard(None, Shelf(tmp_path, limit=7 << 19), {}, 1 << 20)
-        headers = [(b"host", b"localhost"), (b"cookie", b"gamba-visitor=" + b"a" * 32)]
-        headers += [(b"content-length", b"1048576")]
+def test_files_of_who_is_here_stay(tmp_path):
+    """Who is gone makes room first; where none is left, a new file is refused."""
+    shelf = Shelf(tmp_path, limit=3000)
+    with shelf.visited("a"):
+        first, left, last = (kept_file(shelf, visitor) for visitor in "aba")
+        for path, age in ((first, 90), (left, 50), (last, 9)):
+            os.utime(path, (time.time() - age,) * 2)
+        newer = kept_file(shelf, "c")
+        assert first.is_file() and last.is_file() and not left.exists(), "though it was newer"
+        with shelf.visited("c"), pytest.raises(UserError, match="leave no room"):
+            shelf.place("d", 1000)
+        assert newer.is_file() and not (tmp_path / "d").exists()
+        os.utime(first, (time.time() - shelves.KEPT - 9,) * 2)
+        shelf.sweep()
+        assert first.is_file(), "the page is open"
+    shelf.sweep()
+    assert not first.exists() and last.is_file() and newer.is_file()
+
+
+def test_a_visitor_displaces_its_own_files_alone(tmp_path):
+    shelf = Shelf(tmp_path, limit=9000, own=2000)
+    other = kept_file(shelf, "b")
+    os.utime(other, (1 << 30,) * 2)
+    os.utime(other, (time.time() - 99,) * 2)
+    mine = [kept_file(shelf, "a") for _ in range(4)]
+    assert [path.is_file() for path in (other, *mine)] == [True, False, False, True, True]
+
+
+def dawdled(shelf, uploads, seconds=0.3):
+    """Statuses of uploads at once, of (token, bytes that come and no more); and the guard."""
+    sent = [[] for _ in uploads]
+    layer = guard.Guard(None, shelf, {}, 1 << 20)
+
+    async def ask(k, token, content):
+        for _ in range(50 * k):  # one after the other
+            await asyncio.sleep(0)
+        pieces = [content[at : at + 65536] for at in range(0, len(content), 65536)]
+
+        async def receive():
+            if not pieces:
+                await asyncio.sleep(60)
+            await asyncio.sleep(0)
+            return {"type": "http.request", "body": pieces.pop(0), "more_body": True}
+
+        async def send(message):
+            sent[k].append(message.get("status"))
+
+        headers = [(b"host", b"localhost"), (b"content-length", b"1048576")]
+        headers += [(b"cookie", f"gamba-visitor={token * 32}".encode())]
         headers += [(b"content-type", FORM["Content-Type"].encode())]
         scope = {"type": "http", "method": "POST", "path": "/gradio_api/upload"}
+        await layer({**scope, "headers": headers}, receive, send)
 
-        async def ask(k):
-            async def send(message):
-                sent[k].append(message.get("status"))
-
-            await layer({**scope, "headers": list(headers)}, receive, send)
-
-        tasks = [asyncio.create_task(ask(k)) for k in range(4)]
-        await asyncio.wait(tasks, timeout=10, return_when=asyncio.FIRST_COMPLETED)
+    async def come():
+        tasks = [asyncio.create_task(ask(k, *upload)) for k, upload in enumerate(uploads)]
+        await asyncio.wait(tasks, timeout=seconds)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        assert layer._coming == 0, "who leaves makes room"
 
     asyncio.run(come())
-    assert sent == [[], [], [], [503, None]]
+    return [statuses[0] if statuses else None for statuses in sent], layer
+
+
+def test_what_is_stated_takes_no_room(tmp_path):
+    """One visitor states a megabyte sixteen times; another's file stays, and so does its page."""
+    shelf = Shelf(tmp_path, limit=3 << 20)
+    other = kept_file(shelf, visitor_of("b" * 32))
+    empty = form(b"")[:-20]
+    assert dawdled(shelf, [("a", empty)] * 16 + [("b", empty)])[0] == [None] * 17
+    assert other.is_file()
+
+
+def test_what_has_come_in_is_bounded(tmp_path):
+    """By visitor, and of all together; who leaves makes room."""
+    content = form(bytes(500_000))[:-20]
+    statuses, layer = dawdled(Shelf(tmp_path, own=700_000), [("a", content), ("a", content)])
+    assert sorted(statuses, key=str) == [503, None] and not layer._coming
+    each = [(token, content) for token in "abc"]
+    statuses, layer = dawdled(Shelf(tmp_path, limit=1_200_000), each)
+    assert sorted(statuses, key=str) == [503, None, None] and not layer._coming
+
+
+def test_requests_of_one_visitor_are_bounded(tmp_path):
+    empty = form(b"")[:-20]
+    shelf = Shelf(tmp_path)
+    assert dawdled(shelf, [("a", empty)] * 17 + [("b", empty)])[0] == [None] * 16 + [503, None]
+
+
+@pytest.mark.parametrize("name", ["_CALL_SECONDS", "UPLOAD_SECONDS"])
+def test_a_body_that_does_not_come_is_refused(monkeypatch, name):
+    monkeypatch.setattr(guard, name, 0.05)
+    path = "/gradio_api/upload" if "UPLOAD" in name else "/gradio_api/queue/join"
+    sent, start = [], [form(b"")[:-20]]
+
+    async def receive():
+        await asyncio.sleep(0.01)
+        return {"type": "http.request", "body": start.pop() if start else b" ", "more_body": True}
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", b"localhost"), (b"content-length", b"9999")]
+    headers += [(b"cookie", f"gamba-visitor={'a' * 32}".encode())]
+    headers += [(b"content-type", FORM["Content-Type"].encode())]
+    scope = {"type": "http", "method": "POST", "path": path, "headers": headers}
+    layer = guard.Guard(None, Shelf(Path("unused")), {}, 1 << 20)
+    asyncio.run(asyncio.wait_for(layer(scope, receive, send), 10))
+    assert sent[0]["status"] == 408 and b"took too long" in sent[1]["body"]
 
 
 def test_old_files_go_by_themselves(tmp_path, monkeypatch):
@@ -147,56 +304,87 @@ def test_nothing_of_the_environment_opens_the_server(monkeypatch, tmp_path):
     assert set(ours.values()) == {"False"}
 
 
-def test_the_folder_goes_and_so_do_those_of_the_killed(tmp_path, monkeypatch):
-    monkeypatch.setattr(server.tempfile, "gettempdir", lambda: str(tmp_path))
-    monkeypatch.setattr(server.tempfile, "tempdir", str(tmp_path))
-    killed, foreign = tmp_path / f"{server.PREFIX}killed", tmp_path / f"{server.PREFIX}foreign"
-    for folder in (killed, foreign):
-        folder.mkdir()
-        (folder / "picture.png").write_bytes(b"x")
-    (killed / ".lock").write_text("1\n")
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """The folder for temporary files, which is everybody's."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    monkeypatch.setattr(server.tempfile, "tempdir", str(folder))
+    return folder
+
+
+def left_folder(path, mode=0o700):
+    """What a killed process leaves."""
+    path.mkdir()
+    path.chmod(mode)
+    (path / "picture.png").write_bytes(b"x")
+    (path / ".lock").write_text("1\n")
+    return path
+
+
+def test_the_folder_goes_and_so_do_those_of_the_killed(temporary):
+    killed, foreign = (temporary / f"{server.PREFIX}{name}" for name in ("killed", "foreign"))
+    left_folder(killed)
+    (left_folder(foreign) / ".lock").unlink()
     with server.work_folder() as first:
         assert not killed.exists() and foreign.exists(), "without our lock it may be anybody's"
         (first / "sub").mkdir()
         with server.work_folder() as second:
             assert first.exists() and second != first, "another that runs keeps its own"
         assert not second.exists()
-    assert [p.name for p in tmp_path.iterdir()] == [foreign.name]
+    assert list(temporary.iterdir()) == [foreign]
 
 
-def test_a_link_is_not_followed(tmp_path, monkeypatch):
-    monkeypatch.setattr(server.tempfile, "gettempdir", lambda: str(tmp_path / "tmp"))
-    monkeypatch.setattr(server.tempfile, "tempdir", str(tmp_path / "tmp"))
-    (tmp_path / "tmp").mkdir()
-    home = tmp_path / "home"
-    home.mkdir()
-    (home / ".lock").touch()
-    os.symlink(home, tmp_path / "tmp" / f"{server.PREFIX}link")
+def test_a_link_is_not_followed(tmp_path, temporary):
+    """Neither one in a folder's place nor one in that of its lock, with any version of filelock."""
+    home = left_folder(tmp_path / "home")
+    (temporary / f"{server.PREFIX}folder").symlink_to(home)
+    left = left_folder(temporary / f"{server.PREFIX}lock")
+    (left / ".lock").unlink()
+    (left / ".lock").symlink_to(home / "picture.png")
     with server.work_folder():
-        assert home.exists()
+        assert (home / ".lock").exists() and left.exists()
+    assert (home / "picture.png").read_bytes() == b"x"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="folders have owners and modes on POSIX alone")
+def test_folders_of_others_are_left(temporary, monkeypatch):
+    ours = left_folder(temporary / f"{server.PREFIX}ours")
+    open_to_all = left_folder(temporary / f"{server.PREFIX}open", 0o777)
+    monkeypatch.setattr(server.os, "geteuid", lambda: os.getuid() + 1)
+    with server.work_folder():
+        assert ours.exists() and (ours / ".lock").read_text() == "1\n"
+    monkeypatch.undo()
+    monkeypatch.setattr(server.tempfile, "tempdir", str(temporary))
+    with server.work_folder():
+        assert not ours.exists() and open_to_all.exists()
+    assert (open_to_all / ".lock").read_text() == "1\n"
 
 
 def test_a_port_in_use_is_one_line():
-    import socket
-
-    with socket.socket() as taken:
-        taken.bind((server.HOST, 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    with server.listener(0) as taken:
+        host, port = taken.getsockname()
+        assert host == "127.0.0.1" and 0 < port < 65536
         with pytest.raises(UserError, match=f"--port {port}: Address already in use"):
-            server.free_port(port)
-    assert 0 < server.free_port(0) < 65536
+            server.listener(port)
+    server.listener(port).close()
 
 
-def test_a_browser_that_leaves_is_no_error():
-    def logged(error):
-        info = (type(error), error, None)
-        return server._is_ours(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), info))
+def test_a_defect_is_logged_once_and_a_browser_that_leaves_is_none():
+    new = server.NewDefect()
+
+    def logged(kind):
+        try:
+            raise kind
+        except Exception as error:
+            info = (type(error), error, error.__traceback__)
+        return new.filter(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), info))
 
     requests = pytest.importorskip("starlette.requests", reason="needs gradio")
     assert not logged(requests.ClientDisconnect())
-    assert logged(ZeroDivisionError())
-    assert server._is_ours(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), None))
+    assert [logged(ZeroDivisionError()) for _ in range(3)] == [True, False, False]
+    assert logged(OSError()), "another defect of the same line"
+    assert new.filter(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), None))
 
 
 def test_jobs_are_done_by_the_one_that_works():

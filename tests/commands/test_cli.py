@@ -53,7 +53,7 @@ def test_version(flag, capsys):
     "arguments, reason",
     [
         (["nonsense"], "unknown command 'nonsense'"),
-        (["data"], "'data' needs one of: data furniture, data primitives, data render"),
+        (["data"], "'data' needs one of: data furniture, data made, data render"),
         (["data", "nonsense"], "'data' needs one of"),
         (["--nonsense"], "unknown command '--nonsense'"),
     ],

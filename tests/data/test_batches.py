@@ -60,6 +60,18 @@ def test_a_run_has_the_same_weights_for_any_number_of_threads(data, tmp_path):
     assert losses[0] == losses[1] and len(losses[0]) == 4
 
 
+def test_a_mirrored_sample_keeps_its_views_and_its_background(data):
+    views = {"background": "random"}
+    plain, turned = (
+        Batches(open_data(config), config, ALONE, lambda _: 2, None)
+        for config in (micro.options(data, data, views=views | {"mirror": m}) for m in (0.0, 1.0))
+    )
+    for number in range(4):
+        one, other = (each.sample(number, 2) for each in (plain, turned))
+        assert one.uids == other.uids and torch.equal(one.background, other.background)
+        assert torch.equal(one.targets.flip(-2), other.targets)
+
+
 def test_each_process_takes_its_part(data):
     whole = batches_of(data, 4)
     parts = [batches_of(data, 2, 2, World(r, 2, ALONE.device), lambda _: 1) for r in (0, 1)]

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from pathlib import PurePath
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ from PIL import Image
 
 from gamba_warp.cameras import from_opengl, intrinsics
 from gamba_warp.cli import run
+from gamba_warp.data import gso
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.files import PART
-from gamba_warp.formats.catalogue import find_meshes
+from gamba_warp.formats.catalogue import find_meshes, object_names
 from gamba_warp.formats.meshes import load_mesh, to_linear
 from gamba_warp.train.data import render
 from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses
@@ -292,6 +294,43 @@ def test_uids_of_paths(tmp_path):
     refused("would both be 'same'", find_meshes, tmp_path)
 
 
+def test_where_a_file_says_nothing_its_folder_gives_the_name(tmp_path):
+    names = ["a/model.obj", "a/model.ply", "set/b/models/model_normalized.obj", "c/Scene.glb"]
+    names += ["d/mesh.obj", "d/textured.obj", "e/e.stl", "f/g.off", "model.off"]
+    for name in names:
+        write_box(tmp_path / name)
+    found = {mesh.uid: mesh.name for mesh in find_meshes(tmp_path)}
+    told = {"a": "a", "a-ply": "a", "set-b": "b", "c": "c", "e": "e", "f-g": "g", "model": "model"}
+    assert found == told | {"d-mesh": "mesh", "d-textured": "textured"}
+
+
+def test_a_name_of_an_object_is_its_own_name():
+    """So what is saved by its uid is found again, whatever the uid was made of."""
+    paths = ["a/b/model", "old chair (2)", "Ä" * 120, "b" * 240, "b" * 239 + "c", "..", "x/x/x"]
+    names = object_names([PurePath(path) for path in paths])
+    assert len(set(names)) == len(paths)
+    assert object_names([PurePath(name) for name in names]) == names
+    assert names[0] == "a-b" and object_names([PurePath(name) for name in gso.NAMES]) == list(
+        gso.NAMES
+    )
+
+
+def test_linked_folders_of_meshes_are_read_once(tmp_path):
+    meshes, other = tmp_path / "meshes", tmp_path / "other"
+    for path in (meshes / "a.ply", meshes / "z" / "b.ply", other / "deep" / "model.ply"):
+        write_box(path)
+    write_box(other / ".hidden" / "c.ply")
+    (meshes / "c").symlink_to(other / "deep")
+    (meshes / "again").symlink_to(meshes / "z")  # the name without a link stays
+    (meshes / "z" / "up").symlink_to(meshes)
+    (meshes / "above").symlink_to(tmp_path)
+    (meshes / "loop").symlink_to(meshes / "loop")
+    (other / "deep" / "loop").symlink_to(other / "deep")
+    assert [mesh.uid for mesh in find_meshes(meshes)] == ["a", "c", "z-b"]
+    (meshes / "more").symlink_to(other)
+    assert [mesh.uid for mesh in find_meshes(meshes)] == ["a", "c", "z-b"]
+
+
 @pytest.mark.parametrize(
     "options, message",
     [
@@ -322,9 +361,16 @@ def test_bad_folders(meshes, tmp_path):
     refused("catalogue.json", render_views, meshes, tmp_path / "data")
 
 
-def test_limit(meshes, tmp_path):
+def test_limit(meshes, tmp_path, capsys):
     assert render_views(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
     assert len(open_dataset(tmp_path / "data")) == 2
+    without = "training does not validate; eval-views needs --split"
+    assert f"\nthe val and test splits are empty; {without}\n" in capsys.readouterr().out
+    words = [str(tmp_path / "data"), str(tmp_path / "pack"), "--size", "16"]
+    assert run("data pack", words) == 0
+    assert f"\nthe val and test splits are empty; {without}\n" in capsys.readouterr().out
+    assert run("data pack", [*words[:1], str(tmp_path / "train"), "--split", "train"]) == 0
+    assert "empty" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,22 @@ def test_one_object_folder_is_a_dataset(tmp_path):
     assert data.load(0).images.shape[0] == 3
 
 
+def test_linked_objects_are_found_once(tmp_path):
+    data, other = tmp_path / "data", tmp_path / "other"
+    for folder in (data / "lamp", other / "deep" / "chair", other / "table"):
+        write_transforms(folder, count=1)
+    (data / "chair").symlink_to(other / "deep" / "chair")
+    (data / "set").symlink_to(other)
+    (data / "again").symlink_to(data / "lamp")
+    (other / "up").symlink_to(tmp_path)
+    (data / "gone").symlink_to(tmp_path / "nowhere")
+    found = open_dataset(data)
+    assert found.uids == ["chair", "lamp", "set/table"]
+    assert not found.check() and found.load("chair").images.shape[0] == 1
+    (tmp_path / "link").symlink_to(data)
+    assert open_dataset(tmp_path / "link").uids == found.uids
+
+
 def test_blender_file(tmp_path):
     path = write_transforms(tmp_path, count=1, width=8, height=8)
     frame = json.loads(path.read_text())["frames"][0]

@@ -102,6 +102,12 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"depth_unit": -1}, "depth_unit is -1"),
         ({"depth_unit": 1e8}, "depth_unit is 1e+08"),
         ({"k1": {"a": [1] * 1000}}, "lens distortion"),
+        ({"applied_transform": [[1, 0], [0, 1]]}, "applied_transform has shape (2, 2)"),
+        ({"applied_transform": "up"}, "applied_transform is not a matrix"),
+        ({"applied_transform": [[0] * 4] * 3}, "moves no mesh"),
+        ({"applied_transform": [[1e300, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "moves no mesh"),
+        ({"applied_transform": np.eye(3, 4).tolist(), "applied_scale": 0}, "moves no mesh"),
+        ({"applied_transform": np.eye(3, 4).tolist(), "applied_scale": "1"}, "applied_scale is"),
         ({"frames": {"0": {}}}, "no frames"),
         ({"frames": [7]}, "frame 0: no transform_matrix"),
         ({"frames": [{}] * 10_001}, "10001 views, at most 10000"),
@@ -117,7 +123,7 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"frame": {"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
         ({"frame": {"transform_matrix": np.diag([2.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
     ],
-    ids=range(29),
+    ids=range(35),
 )
 def test_numbers_without_sense_are_one_line(tmp_path, values, message):
     transforms(tmp_path / "x", **values)

@@ -17,7 +17,7 @@ from PIL import Image
 from gamba_warp import cli
 from gamba_warp.cameras import orbit
 from gamba_warp.data import packs
-from gamba_warp.data.dataset import open_dataset
+from gamba_warp.data.dataset import open_dataset, splits_of
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART
 from gamba_warp.train.sources import pack as writer
@@ -75,6 +75,21 @@ def assert_same(got, want):
     assert torch.equal(got.cameras.viewmats, want.cameras.viewmats)
     assert torch.equal(got.cameras.Ks, want.cameras.Ks)
     assert (got.cameras.width, got.cameras.height) == (want.cameras.width, want.cameras.height)
+
+
+def test_a_pack_says_how_its_meshes_were_placed(data, tmp_path):
+    path = data / "a" / "transforms.json"
+    placed = {
+        "applied_transform": [[0, 0, 2, 1], [1, 0, 0, 0.1], [0, 1, 0, -3]],
+        "applied_scale": 4,
+    }
+    path.write_text(json.dumps(json.loads(path.read_text()) | placed))
+    packed(data, tmp_path / "pack")
+    pack = open_dataset(tmp_path / "pack")
+    got = pack.files("a").placement
+    assert got.transform.tolist() == matrix and got.scale == 4
+    assert pack.files("d").placement is None
+    assert splits_of(tmp_path / "pack", UIDS) == splits_of(data, UIDS)
 
 
 SHARDS = pytest.mark.parametrize("shards", ["arrays", "webdataset"])

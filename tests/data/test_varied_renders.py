@@ -1,4 +1,4 @@
-"""Data that differs more: stretched objects, other fields of view, views from the front, solids."""
+"""Data that differs more: stretched objects, other fields of view, views from the front."""
 
 import json
 
@@ -11,12 +11,9 @@ from helpers.refusals import refused
 
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
-from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import load_mesh
-from gamba_warp.train.data import primitives
 from gamba_warp.train.data.poses import FRONT, front_views, look_at_origin, sample_poses
 from gamba_warp.train.data.raycast import Lights
-from gamba_warp.train.sources.commands import data_primitives_command
 
 QUICK = {"views": 3, "size": 17, "workers": 1}
 
@@ -126,48 +123,3 @@ def test_normals_of_a_stretched_mesh_stay_across_its_faces(tmp_path):
     assert np.allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-5)
     # Smooth over the side; 40 faces turn by 9 degrees each.
     assert ((mesh.normals[side].mean(1) * across[side]).sum(1) > 0.95).all()
-
-
-def test_primitives_are_the_same_again_and_differ_from_one_another(tmp_path, capsys):
-    out = tmp_path / "solids"
-    assert data_primitives_command(out, count=5, seed=3) == 0
-    assert "5 models" in capsys.readouterr().out
-    meshes = find_meshes(out)
-    assert [mesh.uid for mesh in meshes] == [f"primitive-3-0000{i}" for i in range(5)]
-    assert {split_of(mesh.group) for mesh in meshes} == {"train"}
-    assert {mesh.attribution["licence"] for mesh in meshes} == {"CC0 1.0"}
-    before = [mesh.path.read_bytes() for mesh in meshes]
-    meshes[1].path.unlink()
-    meshes[2].path.write_bytes(b"kept as it is")
-    data_primitives_command(out, count=5, seed=3)
-    assert meshes[1].path.read_bytes() == before[1] and len(set(before)) == 5
-    assert meshes[2].path.read_bytes() == b"kept as it is"
-
-
-@pytest.mark.parametrize("plan", [*primitives.PLANS, primitives.composition])
-def test_every_plan_makes_sound_textured_solids(plan, tmp_path, monkeypatch):
-    monkeypatch.setattr(primitives, "PLANS", [plan])
-    rng = np.random.default_rng([len(plan.__name__), 1])
-    (tmp_path / "one.glb").write_bytes(primitives.make_object(rng).export(file_type="glb"))
-    mesh = load_mesh(tmp_path / "one.glb")
-    assert not mesh.warnings and len(mesh.faces) >= 12
-    assert all(material.texture is not None for material in mesh.materials)
-    model = mesh.normalized("y")[0]
-    assert np.isfinite(model.vertices).all() and np.isfinite(model.normals).all()
-    assert np.ptp(model.vertices, axis=0).min() > 0.01  # nothing is flat
-
-
-def test_textures_are_colours_and_have_their_patterns():
-    rng = np.random.default_rng(0)
-    for pattern in primitives.PATTERNS:
-        values = pattern(rng)
-        assert values.shape == (primitives.TEXTURE,) * 2
-        assert values.min() >= 0 and values.max() <= 1
-        assert pattern is primitives.flat or np.ptp(values) > 0.3
-
-
-def test_another_catalogue_is_not_overwritten(tmp_path):
-    (tmp_path / "catalogue.json").write_text('{"objects": []}')
-    (tmp_path / "chair.glb").write_bytes(b"")
-    refused("there are other objects", data_primitives_command, tmp_path, count=1)
-    assert (tmp_path / "catalogue.json").read_text() == '{"objects": []}'

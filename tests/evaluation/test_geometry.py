@@ -279,9 +279,9 @@ def test_batch_lists_every_failure(tmp_path):
     assert reasons["lone"] == "no prediction" and reasons["extra"] == "no ground truth"
     assert "no faces" in reasons["faceless"] and "not finite" in reasons["nan"]
     done = {record["name"]: record for record in report["objects"] if record["status"] == "ok"}
-    assert done.keys() == {"good", "sub/cloud"}
+    assert done.keys() == {"good", "sub-cloud"}
     assert done["good"]["iou"] == 1 and done["good"]["kind"] == "mesh"
-    assert done["sub/cloud"]["iou"] is None and done["sub/cloud"]["kind"] == "points"
+    assert done["sub-cloud"]["iou"] is None and done["sub-cloud"]["kind"] == "points"
     assert report["mean"]["iou"] == 1 and report["num_failed"] == 5
     assert len((tmp_path / "out" / "objects.csv").read_text().splitlines()) == 8
 

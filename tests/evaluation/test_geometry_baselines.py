@@ -174,8 +174,9 @@ def test_a_truth_is_turned_as_its_catalogue_says(world):
     code, report = evaluated("eval-geometry", world / "out", *words)
     assert code == 0
     assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
-    with pytest.raises(UserError, match="also stretches"):
-        load_truth(path, protocol, np.diag([1.0, 1, 2]).tolist())
+    for wrong in ([1.0, 1, 2], [-1.0, 1, 1]):
+        with pytest.raises(UserError, match="also stretches or mirrors"):
+            load_truth(path, protocol, np.diag(wrong).tolist())
 
 
 def boxes(folder, **sides):
@@ -212,6 +213,7 @@ def test_differences_are_paired(tmp_path, capsys):
     text = (tmp_path / "out" / "table.md").read_text()
     printed = capsys.readouterr().out
     assert text in printed and "failed: c (near): no prediction" in printed
+    assert "\n3 evaluated, 0 failed, 1 of baselines failed;" in printed
     for row in ("predicted", "near", "far", "predicted - near", "predicted - far"):
         assert text.count(f"| {row.ljust(16)} |") == 2  # means and medians
     assert "F-score at 0.02" in text

@@ -21,6 +21,7 @@ def data(tmp_path_factory):
         micro.write_object(root / "views" / name, micro.cloud(seed))
         (root / "pred").mkdir(exist_ok=True)
         save_ply(root / "pred" / f"{name}.ply", micro.cloud(seed))
+    for name in THERE:
         (root / "meshes" / name).mkdir(parents=True)
         trimesh.creation.box().export(root / "meshes" / name / "model.obj")
     everything = {"version": 2, "test": [*THERE, "not of the list"]}
@@ -42,7 +43,11 @@ def test_views(data, tmp_path, monkeypatch, capsys):
     assert (said["name"], said["evaluated"], len(said["missing"])) == ("gso", 2, 58)
     assert said["others"] == ["not of the list"] and "elevation 0" in said["input"]
     assert {f["name"] for f in report["failures"]} == set(gso.NAMES) - set(THERE)
-    assert f"failed: {gso.NAMES[2]}: an object of --protocol gso" in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert f"failed: {gso.NAMES[2]}: an object of --protocol gso" in printed.err
+    assert printed.err.count("failed: ") == report["num_failed"] == 58
+    assert "\n2 evaluated, 58 failed;" in printed.out
+    assert [r["status"] for r in report["objects"]].count("failed") == 58
 
 
 def test_its_options_are_its_own(data, capsys):

@@ -115,6 +115,7 @@ def test_any_field_can_be_changed_and_the_change_is_named(capsys):
         ("unit=0", "Expected `float` >= 0.001 - at `$.unit`"),
         ("chamfer=half", "Invalid enum value 'half' - at `$.chamfer`"),
         ('align=["fly"]', "Invalid enum value 'fly' - at `$.align[0]`"),
+        ("unit=" + "[" * 10**5, "--set unit=[[["),
         ("surface.voxels=many", "Expected `int`, got `str` - at `$.surface.voxels`"),
     ],
 )

@@ -44,8 +44,8 @@ def test_variants_change_one_field_and_keep_the_place():
 
 def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
     """Stages that rows have in common are computed once; that must change no figure."""
-    fields = ("points", "num_points", "chamfer", "align", "occupancy", "iou_voxels")
-    changes = {name: sensitivity._CHANGES[name][-1:] for name in fields}
+    fields = ("points", "num_points", "seed", "unit", "chamfer", "align", "occupancy", "grid")
+    changes = {name: sensitivity._CHANGES[name][-1:] for name in (*fields, "iou_voxels")}
     monkeypatch.setattr(sensitivity, "_CHANGES", changes)
     given = ["--points", "500", "--set", "iou_voxels=16", "--sensitivity", "--out"]
     words = [str(folders / side) for side in ("pred", "gt")]
@@ -54,6 +54,11 @@ def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
     kept = json.loads((folders / "out" / "sensitivity.json").read_text())
     assert printed == (folders / "out" / "sensitivity.md").read_text()
     assert "</svg>" in (folders / "out" / "sensitivity.svg").read_text()
+    (folders / "gt" / "b.ply").rename(folders / "gt" / "c.ply")
+    assert run("eval-geometry", [*words, *given, str(folders / "fewer")]) == 1
+    said = capfd.readouterr()
+    assert "failed: b: no ground truth\nfailed: c: no prediction\n" in said.err
+    assert "of 1 objects" in said.out
     from gamba_warp.eval.shapes.load import load_prediction, load_truth
 
     protocols = sensitivity.variants(SMALL)
@@ -66,6 +71,8 @@ def test_each_row_is_what_its_protocol_gives(folders, monkeypatch, capfd):
         got = next(o for o in kept["objects"] if o["name"] == "a")["variants"][label]
         for key in ("chamfer", "iou", "noise_floor", "normal_consistency"):
             assert got[key] == want[key], (label, key)
+        least = f"{min(protocol.thresholds):g}"
+        assert got["fscore"] == want["fscore"][least], label
 
 
 def test_an_interrupted_evaluation_goes_on(folders):
@@ -73,7 +80,9 @@ def test_an_interrupted_evaluation_goes_on(folders):
     pairs, _ = find_pairs(folders / "pred", folders / "gt")
     first = evaluate_pairs(pairs[:1], SMALL, None, journal=Journal(folders, SMALL, None))
     noted = folders / "objects.jsonl"
-    noted.write_text(noted.read_text() + '{"key": "cut of')  # a line that was cut off
+    lines = noted.read_text()
+    # what is no record: nested too deeply, of another kind, and a line that was cut off
+    noted.write_text("[" * 10**5 + '\n{"key": "a", "record": 5}\n' + lines + '{"key": "cut of')
     pairs = [pair._replace(name="bad" if pair.name == "b" else pair.name) for pair in pairs]
     again = evaluate_pairs(
         pairs, SMALL, None, murderous_pair, journal=Journal(folders, SMALL, None)

@@ -13,7 +13,7 @@ from gamba_warp.pages import serve
 
 @pytest.fixture
 def address(monkeypatch) -> Iterator[tuple[str, int]]:
-    monkeypatch.setattr(serve, "_READ_SECONDS", 0.4)
+    monkeypatch.setattr(serve, "READ_SECONDS", 0.4)
     monkeypatch.setattr(serve, "_CONNECTIONS", 3)
     server = serve.page_server(b"hello" * 100_000, 0)
     threading.Thread(target=server.serve_forever, args=[0.02], daemon=True).start()

@@ -517,7 +517,7 @@ def trainer(folder: Path) -> Trainer:
     config = micro.options(folder / "data", folder / "run", TINY_SET, views=views)
     torch.manual_seed(0)
     model = Gamba(config.model_config())
-    return Trainer(config, model, open_data(config), micro.ALONE, None, None)
+    return Trainer(config, model, open_data(config), micro.ALONE, None)
 
 
 def checkpoints() -> Kinds:

@@ -20,7 +20,7 @@ from gamba_warp.images import save_image
 from gamba_warp.model import detail as subject
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.detail import COVER, checked_detail, split_front
+from gamba_warp.model.detail import checked_detail, split_front
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.model.predict import model_input, reconstruct
@@ -173,7 +173,19 @@ def test_children_lie_on_the_rays_of_their_own_pixels():
     model.decoder.scale_bias.data[0] = math.log(0.1)
     small = reconstruct(model, rgba, detail=2).scales[-200:]
     side = 0.5 * parents[:2].max() / 0.9
-    torch.testing.assert_close(small[:, :2], (COVER * side).expand(200, 2), rtol=0.02, atol=0)
+    torch.testing.assert_close(small[:, :2], (0.4 * side).expand(200, 2), rtol=0.02, atol=0)
+
+
+def test_two_rounds_correct_colours_at_all_pixels_and_opacities_at_twice_the_cells(monkeypatch):
+    model, sizes = fresh(), []
+
+    def counted(gaussians, camera):
+        sizes.append(camera.width)
+        return render(gaussians, camera)
+
+    monkeypatch.setattr(subject, "render", counted)
+    reconstruct(model, board(96, 4), detail=4)
+    assert sizes == [96, 48, 96, 48]
 
 
 def test_a_cell_counts_as_much_as_its_alpha():

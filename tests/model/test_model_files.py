@@ -69,6 +69,13 @@ def test_own_metadata_keys_are_protected(tmp_path):
         save_model(tmp_path / "m.safetensors", Gamba(micro(encoder="none")), {"config": "x"})
 
 
+def test_swapped_arguments_are_told(tmp_path):
+    model = Gamba(micro(encoder="none"))
+    with pytest.raises(TypeError, match="takes the path, then the model, and got Gamba, .*Path$"):
+        save_model(model, tmp_path / "m.safetensors")
+    assert not list(tmp_path.iterdir())
+
+
 def test_frozen_encoder_must_be_the_same(tmp_path):
     model = Gamba(micro(), "random")
     with torch.no_grad():

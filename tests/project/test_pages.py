@@ -4,8 +4,11 @@ import contextlib
 import functools
 import io
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from importlib.util import find_spec
 
 import pytest
@@ -221,6 +224,16 @@ def test_marked_python_runs(block, workplace):
         assert load_ply("photo.ply").num > 1000
         picture = load_rgba("view.png")
         assert picture.shape == (256, 256, 4) and (picture[..., :3] < 0.9).any()
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_a_script_beside_the_clone_finds_the_package(page, tmp_path):
+    """An installation of a checkout is found after folders beside the script, packages or not."""
+    (name,) = re.findall(r"^git clone <this repository> (\w+) ", (ROOT / page).read_text(), re.M)
+    (tmp_path / name / "gamba_warp").mkdir(parents=True)
+    (tmp_path / "script.py").write_text("from gamba_warp import __version__")
+    plain = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    subprocess.run([sys.executable, tmp_path / "script.py"], check=True, env=plain)
 
 
 def test_the_notebook_runs(workplace):

@@ -238,6 +238,14 @@ def test_a_lock_that_nobody_else_may_read(monkeypatch, tmp_path):
             pass
 
 
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
+    (tmp_path / "target").write_bytes(b"precious")
+    (tmp_path / ".lock").symlink_to(tmp_path / "target")
+    with pytest.raises(UserError, match=".lock is a link"), only_process(tmp_path, "trains"):
+        pass
+    assert (tmp_path / "target").read_bytes() == b"precious"
+
+
 def _text_without_encoding(path: Path) -> list[int]:
     """Lines that open text in an encoding that differs between systems."""
     lines = []

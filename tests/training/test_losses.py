@@ -118,16 +118,21 @@ def test_pictures_taken_together_are_those_taken_alone(monkeypatch):
 def test_crops_are_of_one_place_in_both_and_lie_inside():
     torch.manual_seed(0)
     values = torch.arange(2 * 3 * 8 * 9.0).view(2, 3, 8, 9, 1)
-    seen = set()
+    seen, pairs = set(), []
     for _ in range(200):
         got, want = random_crops(values, values + 1000, 7)
+        places = []
         assert got.shape == (2, 7, 7, 1) and want.equal(got + 1000)
         for index, crop in enumerate(got[..., 0]):
             corner = int(crop[0, 0]) - index * 216
             view, rest = divmod(corner, 72)
             y, x = divmod(rest, 9)
             assert crop.equal(values[index, view, y : y + 7, x : x + 7, 0])
-            seen.add((view, y, x))
+            places.append((view, y, x))
+        seen |= {*places}
+        pairs.append(places)
+    # Each object has its own view, row and column.
+    assert all(any(a[k] != b[k] for a, b in pairs) for k in range(3))
     assert seen == {(v, y, x) for v in range(3) for y in range(2) for x in range(3)}
 
 

@@ -23,6 +23,11 @@ from gamba_warp.train.step import weigh_views
 STILL = {"optim": {"lr": 1e-30, "weight_decay": 0.0, "ema": 0.0}, "length": {"steps": 1}}
 
 
+def times(folder):
+    """When each file was changed, the lock apart."""
+    return {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.name != ".lock"}
+
+
 @pytest.fixture(scope="module")
 def done(data, tmp_path_factory):
     """A run of eight steps, with a checkpoint at four."""
@@ -63,10 +68,15 @@ def test_a_finished_run_says_that_its_rate_rises_again(data, done, tmp_path, cap
 def test_other_losses_are_refused_and_init_is_named(data, done, tmp_path, capsys):
     shutil.copytree(done, tmp_path / "run")
     other = {"loss": {"mask_weight": 0.5}, "length": {"steps": 9}, "optim": {"ema": 0.5}}
+    before = times(tmp_path / "run")
     with pytest.raises(UserError, match=r"loss\.mask_weight \(1\.0 there, 0\.5 here\).*") as caught:
         run(data, tmp_path / "run", **other)
     way = f"--init {list_checkpoints(tmp_path / 'run')[-1]}, and another --out"
     assert way in str(caught.value) and "\n" not in str(caught.value)
+    assert times(tmp_path / "run") == before, "nothing is written by a run that is refused"
+    resumed = {"resume": str(list_checkpoints(done)[-1])}
+    refused(r"loss\.mask_weight", run, data, tmp_path / "other", run=resumed, **other)
+    assert not (tmp_path / "other").exists()
     init = list_checkpoints(done)[-1]
     capsys.readouterr()
     assert run(data, tmp_path / "new", run={"init": init}, **other) == 0

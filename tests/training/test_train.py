@@ -18,6 +18,7 @@ import pytest
 import torch
 from helpers import micro
 from helpers.micro import lines, run
+from helpers.model import micro as small
 from helpers.refusals import refused
 from PIL import Image
 from safetensors.torch import load_file
@@ -31,7 +32,8 @@ from gamba_warp.train import loop, step
 from gamba_warp.train.batches import choose_views
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.objective import losses
-from gamba_warp.train.optim import build_optimizer
+from gamba_warp.train.optim import Ema, build_optimizer
+from gamba_warp.vision.lpips import LPIPS
 
 
 def assert_same_files(a, b):
@@ -374,8 +376,28 @@ def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
     assert all(record["loss"] > 1.5 for record in lines(tmp_path / "late", "val"))
 
 
-def test_bfloat16_keeps_float32_weights(data, tmp_path):
-    assert run(data, tmp_path, optim={"precision": "bfloat16"}, length={"steps": 3}) == 0
+def test_bfloat16_keeps_float32_weights(data, tmp_path, monkeypatch):
+    """It is the precision of the network and of LPIPS in a step; a validation has float32."""
+    network, lpips, real = set(), set(), Gamba.forward
+
+    def spy(model, *arguments):
+        lower = torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu")
+        network.add((model.training, lower or torch.float32))
+        return real(model, *arguments)
+
+    class Square(LPIPS):
+        def __init__(self):
+            torch.nn.Module.__init__(self)
+
+        def forward(self, got, want, precision=torch.float32):
+            lpips.add((torch.is_grad_enabled(), precision))
+            return (got - want).square().mean((-3, -2, -1))
+
+    monkeypatch.setattr(Gamba, "forward", spy)
+    monkeypatch.setattr(losses, "load_lpips", Square)
+    groups = {"optim": {"precision": "bfloat16"}, "loss": {"lpips": "on"}, "run": {"val_every": 3}}
+    assert run(data, tmp_path, length={"steps": 3}, **groups) == 0
+    assert network == lpips == {(True, torch.bfloat16), (False, torch.float32)}
     weights = load_file(tmp_path / "model.safetensors")
     assert all(value.dtype == torch.float32 for value in weights.values())
     assert all(record["loss"] is not None for record in lines(tmp_path, "train"))
@@ -402,6 +424,17 @@ def test_decay_is_on_matrices_that_are_not_flagged(data):
         matching = [full for full in names.values() if full.endswith(name)]
         assert set(matching) <= without, name
     assert len(decayed["params"]) + len(plain["params"]) == len(names)
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_the_average_is_in_eval_mode_and_shares_a_frozen_encoder(frozen):
+    model = Gamba(small(encoder_frozen=frozen), "random").train()
+    average = Ema(model, 0.5).model
+    assert model.training and not any(part.training for part in average.modules())
+    assert (average.encoder is model.encoder) == frozen
+    trained = {id(p) for p in model.parameters() if p.requires_grad}
+    assert trained.isdisjoint(map(id, average.parameters()))
+    assert not any(p.requires_grad for p in average.parameters())
 
 
 def test_command_line(data, tmp_path, capsys):

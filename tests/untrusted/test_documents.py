@@ -8,7 +8,13 @@ import pytest
 from helpers.refusals import refused
 from msgspec import Meta
 
-from gamba_warp.untrusted.documents import parse_document, read_bytes, read_document
+from gamba_warp.untrusted.documents import (
+    parse_document,
+    read_bytes,
+    read_document,
+    read_lines,
+    value_of,
+)
 from gamba_warp.untrusted.ranges import Seed, check_options, ranged, wrong
 
 
@@ -40,6 +46,21 @@ def test_documents_that_are_read(tmp_path):
     assert read_document(path, dict[str, Seed]) == {"a": 5}
     path.write_text("[" * 32 + "]" * 32)
     assert read_document(path, Any)
+
+
+def test_lines_that_are_no_documents_are_passed_over(tmp_path):
+    path = tmp_path / "a.jsonl"
+    path.write_bytes(b'{"a": 1}\n' + b"[" * 10**5 + b'\n{"a": "b"}\n\xff\n\n{"a": 2}\n{"a": 3')
+    assert list(read_lines(path, dict[str, Seed])) == [{"a": 1}, {"a": 2}]
+    os.mkfifo(tmp_path / "pipe")
+    for name, reason in (("pipe", "not a plain file"), ("none", "no such file")):
+        refused(reason, lambda name: list(read_lines(tmp_path / name, Any)), name)
+
+
+def test_the_value_of_an_option_is_json_or_the_text_itself():
+    for text in ("word", "[1", "[" * 10**5, "\ud800", "NaN"):
+        assert value_of(text) == text
+    assert value_of("[1, 2.5]") == [1, 2.5] and value_of('"1"') == "1" and value_of("true") is True
 
 
 def test_only_plain_files_of_a_bounded_size_are_read(tmp_path):

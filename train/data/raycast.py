@@ -1,15 +1,16 @@
-"""A small ray caster for textured meshes; Open3D finds the hits, and numpy shades them."""
-
-from __future__ import annotations
+"""A small ray caster for textured meshes: Open3D finds the hits, a Warp kernel shades them."""
 
 import math
 from dataclasses import dataclass
+from typing import Any, no_type_check
 
 import numpy as np
+import warp as wp
 from PIL import Image
 
 from gamba_warp.formats.materials import to_display, to_linear
 from gamba_warp.formats.meshes import TexturedMesh
+from gamba_warp.kernels.runtime.views import struct
 from gamba_warp.versions import import_open3d
 
 SAMPLES = 3  # rays along each side of a pixel; odd, so that one goes through the pixel's centre
@@ -21,8 +22,6 @@ OPAQUE = 0.02  # transmittance below which a ray ends
 # that of the ambient light, and the tint of both lights.
 USUAL = {"height": (25, 70), "key": (0.5, 0.85), "ambient": (0.4, 0.6), "tint": (0.92, 1.0)}
 VARIED = {"height": (0, 90), "key": (0.3, 1.1), "ambient": (0.2, 0.7), "tint": (0.75, 1.0)}
-
-_TO_LINEAR = to_linear(np.arange(256) / 255.0)
 
 
 @dataclass
@@ -42,7 +41,7 @@ class Lights:
     head: float
 
     @classmethod
-    def sample(cls, rng: np.random.Generator, varied: bool = False) -> Lights:
+    def sample(cls, rng: np.random.Generator, varied: bool = False) -> "Lights":
         """Draws a key light and a fill light from above, ambient light and a lamp at the camera.
 
         Args:
@@ -61,64 +60,171 @@ class Lights:
             head=rng.uniform(0.1, 0.25),
         )
 
-    def shade(self, normals: np.ndarray, to_camera: np.ndarray) -> np.ndarray:
-        """Returns ``[P, 3]``, the light that white points with unit ``normals [P, 3]`` send on."""
-        lambert = np.maximum(normals @ self.directions.T.astype(np.float32), 0)
-        light = lambert @ self.colors.astype(np.float32)
-        light += (0.75 + 0.25 * normals[:, 2:]) * self.ambient.astype(np.float32)
-        light += self.head * np.maximum(_dot(normals, to_camera), 0)
-        return light
+
+@struct
+class _Surface:
+    """A mesh with its materials and lights, as ``_shade`` reads them.
+
+    Attributes:
+        normals: ``[3 F]`` unit normals of the faces' corners.
+        uvs: ``[3 F]`` of the corners.
+        colors: ``[3 F]`` display RGBA of the corners; empty where all are white.
+        face_normals: ``[F]`` unit.
+        density: ``[F]`` widths of a texture per object unit.
+        materials: ``[F]`` into those of the next.
+        plain: ``[M]`` linear RGBA of the materials, the colour premultiplied.
+        levels: number of halvings of a texture; 0 of a material without one.
+        texels: ``[T]`` display RGBA of all textures at every halved size.
+        starts: ``[M, L]`` first texel of a material's texture, halved so many times.
+        widths: ``[M, L]`` texels.
+        heights: ``[M, L]`` texels.
+        linear: ``[256]`` linear light of display values.
+        ambient: light from above; half of it comes from below.
+        to_lights: ``[K]`` unit vectors towards the lights.
+        lights: ``[K]`` linear colours.
+        head: strength of a lamp at the camera.
+    """
+
+    normals: wp.array(dtype=wp.vec3)
+    uvs: wp.array(dtype=wp.vec2)
+    colors: wp.array(dtype=wp.vec4)
+    face_normals: wp.array(dtype=wp.vec3)
+    density: wp.array(dtype=wp.float32)
+    materials: wp.array(dtype=wp.int32)
+    plain: wp.array(dtype=wp.vec4)
+    levels: wp.array(dtype=wp.int32)
+    texels: wp.array(dtype=wp.vec4ub)
+    starts: wp.array2d(dtype=wp.int64)
+    widths: wp.array2d(dtype=wp.int32)
+    heights: wp.array2d(dtype=wp.int32)
+    linear: wp.array(dtype=wp.float32)
+    ambient: wp.vec3
+    to_lights: wp.array(dtype=wp.vec3)
+    lights: wp.array(dtype=wp.vec3)
+    head: wp.float32
 
 
-class _Textures:
-    """The textures of all materials, at every halved size, in one flat array of texels."""
+@wp.func
+@no_type_check
+def _to_linear(display: wp.float32):
+    """Linear light of an sRGB display value in [0, 1]."""
+    return wp.where(display <= 0.04045, display / 12.92, wp.pow((display + 0.055) / 1.055, 2.4))
 
-    def __init__(self, mesh: TexturedMesh) -> None:
-        chains = [_halvings(m.texture) for m in mesh.materials]
-        deepest = max(map(len, chains))
-        levels = [[c[min(i, len(c) - 1)] for i in range(deepest)] for c in chains]
-        start, texels, starts = 0, [], {}
-        for picture in (p for chain in chains for p in chain):
-            starts[id(picture)] = start
-            texels.append(picture.reshape(-1, 4))
-            start += len(texels[-1])
-        self.texels = np.concatenate(texels)
-        self.starts = np.array([[starts[id(p)] for p in row] for row in levels])
-        self.widths = np.array([[p.shape[1] for p in row] for row in levels])
-        self.heights = np.array([[p.shape[0] for p in row] for row in levels])
-        self.colors = np.stack([m.color for m in mesh.materials]).astype(np.float32)
-        self.textured = np.array([m.texture is not None for m in mesh.materials])
 
-    def sample(self, material: np.ndarray, uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Samples ``[P, 4]`` linear RGBA, colour premultiplied, of the materials at the UVs."""
-        color = self.colors[material]
-        color[:, :3] *= color[:, 3:]
-        some = np.flatnonzero(self.textured[material])
-        if not len(some):
-            return color
-        material, uv, level = material[some], uv[some], level[some]
-        level = np.clip(level, 0, self.starts.shape[1] - 1)
-        start = self.starts[material, level]
-        width, height = self.widths[material, level], self.heights[material, level]
-        x = (uv[:, 0] - np.floor(uv[:, 0])) * width - 0.5
-        y = (1 - (uv[:, 1] - np.floor(uv[:, 1]))) * height - 0.5
-        x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-        fx, fy = (x - x0).astype(np.float32), (y - y0).astype(np.float32)
-        out = np.zeros((len(uv), 4), np.float32)
-        for dy, wy in ((0, 1 - fy), (1, fy)):
-            row = start + (y0 + dy) % height * width
-            for dx, wx in ((0, 1 - fx), (1, fx)):
-                texel = self.texels[row + (x0 + dx) % width]
-                weight = wx * wy * (texel[:, 3] * np.float32(1 / 255))
-                out[:, :3] += weight[:, None] * _TO_LINEAR[texel[:, :3]]
-                out[:, 3] += weight
-        color[some] *= out
-        return color
+@wp.func
+@no_type_check
+def _texel(s: _Surface, start: wp.int64, width: wp.int32, height: wp.int32, x: int, y: int):
+    """One texel as linear RGBA, colour premultiplied; textures repeat."""
+    column, row = x % width, y % height
+    if column < 0:
+        column += width
+    if row < 0:
+        row += height
+    value = s.texels[start + wp.int64(row) * wp.int64(width) + wp.int64(column)]
+    alpha = wp.float32(value[3]) / 255.0
+    red, green, blue = (
+        s.linear[wp.int32(value[0])],
+        s.linear[wp.int32(value[1])],
+        s.linear[wp.int32(value[2])],
+    )
+    return wp.vec4(alpha * red, alpha * green, alpha * blue, alpha)
+
+
+@wp.func
+@no_type_check
+def _textured(s: _Surface, material: int, uv: wp.vec2, level: int):
+    """Bilinear sample of a material's texture at one of its sizes."""
+    width, height = s.widths[material, level], s.heights[material, level]
+    start = s.starts[material, level]
+    x = (uv[0] - wp.floor(uv[0])) * wp.float32(width) - 0.5
+    y = (1.0 - (uv[1] - wp.floor(uv[1]))) * wp.float32(height) - 0.5
+    x0, y0 = wp.floor(x), wp.floor(y)
+    fx, fy = x - x0, y - y0
+    column, row = wp.int32(x0), wp.int32(y0)
+    top = (1.0 - fx) * _texel(s, start, width, height, column, row)
+    top += fx * _texel(s, start, width, height, column + 1, row)
+    low = (1.0 - fx) * _texel(s, start, width, height, column, row + 1)
+    low += fx * _texel(s, start, width, height, column + 1, row + 1)
+    return (1.0 - fy) * top + fy * low
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _shade(
+    s: _Surface,
+    spacing: wp.float32,
+    rays_in: wp.array(dtype=wp.int32),
+    directions_in: wp.array(dtype=wp.vec3),
+    distances_in: wp.array(dtype=wp.float32),
+    faces_in: wp.array(dtype=wp.uint32),
+    corners_in: wp.array(dtype=wp.vec2),
+    travelled_out: wp.array(dtype=wp.float32),
+    colors_out: wp.array(dtype=wp.vec4),
+    depths_out: wp.array(dtype=wp.float32),
+):
+    """Puts the surface that each ray has hit behind what it has seen so far.
+
+    Args:
+        s: the mesh and its lights.
+        spacing: distance between neighbouring rays at depth 1.
+        rays_in: numbers of the rays that have hit, as are their hits in the next arguments.
+        directions_in: of all rays, at depth 1.
+        distances_in: from where the ray went on to the hit, infinite for a miss.
+        faces_in: faces that were hit.
+        corners_in: barycentric weights of their second and third corner.
+        travelled_out: of all rays, depth that was reached; read, too.
+        colors_out: linear RGBA, colour premultiplied; read, too.
+        depths_out: depth where half of the light is blocked; read, too.
+    """
+    hit = wp.tid()
+    if not wp.isfinite(distances_in[hit]):
+        travelled_out[rays_in[hit]] = wp.inf
+        return
+    ray, face = rays_in[hit], wp.int32(faces_in[hit])
+    depth = travelled_out[ray] + distances_in[hit]
+    travelled_out[ray] = depth
+    b, c = corners_in[hit][0], corners_in[hit][1]
+    a = 1.0 - b - c
+    first = 3 * face
+    to_camera = -wp.normalize(directions_in[ray])
+    normal = a * s.normals[first] + b * s.normals[first + 1] + c * s.normals[first + 2]
+    # Faces have two sides, and the normal is that of the side that the camera sees.
+    side = wp.dot(s.face_normals[face], to_camera)
+    normal = wp.normalize(normal) * wp.where(side > 0.0, 1.0, wp.where(side < 0.0, -1.0, 0.0))
+    material = s.materials[face]
+    base = s.plain[material]
+    if s.levels[material] > 0:
+        size = wp.float32(s.widths[material, 0]) * wp.float32(s.heights[material, 0])
+        spread = s.density[face] * wp.sqrt(size) * depth * spacing
+        level = wp.int32(wp.rint(wp.log2(wp.max(spread, 1.0))))
+        uv = a * s.uvs[first] + b * s.uvs[first + 1] + c * s.uvs[first + 2]
+        base = wp.cw_mul(base, _textured(s, material, uv, wp.min(level, s.levels[material] - 1)))
+    if s.colors.shape[0] > 0:
+        blend = a * s.colors[first] + b * s.colors[first + 1] + c * s.colors[first + 2]
+        red, green, blue = _to_linear(blend[0]), _to_linear(blend[1]), _to_linear(blend[2])
+        alpha = blend[3]
+        base = wp.cw_mul(base, wp.vec4(alpha * red, alpha * green, alpha * blue, alpha))
+    light = (0.75 + 0.25 * normal[2]) * s.ambient
+    light += s.head * wp.max(wp.dot(normal, to_camera), 0.0) * wp.vec3(1.0)
+    for k in range(s.lights.shape[0]):
+        light += wp.max(wp.dot(normal, s.to_lights[k]), 0.0) * s.lights[k]
+    seen = colors_out[ray]
+    through, gloss = 1.0 - seen[3], GLOSS * base[3]
+    seen += through * wp.vec4(
+        (base[0] + gloss) * light[0],
+        (base[1] + gloss) * light[1],
+        (base[2] + gloss) * light[2],
+        base[3],
+    )
+    colors_out[ray] = seen
+    if seen[3] >= 0.5 and depths_out[ray] == 0.0:
+        depths_out[ray] = depth
 
 
 def _halvings(texture: np.ndarray | None) -> list[np.ndarray]:
+    """The texture at every halved size down to one texel; none without a texture."""
     if texture is None:
-        return [np.full((1, 1, 4), 255, np.uint8)]
+        return []
     chain = [np.ascontiguousarray(texture)]
     while max(chain[-1].shape[:2]) > 1:
         height, width = (max(1, n // 2) for n in chain[-1].shape[:2])
@@ -127,23 +233,11 @@ def _halvings(texture: np.ndarray | None) -> list[np.ndarray]:
     return chain
 
 
-def _blend(corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Blends the corners' values ``[P, 3, K]`` by barycentric ``weights [P, 3]`` to ``[P, K]``."""
-    return np.einsum("pck,pc->pk", corners, weights)
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("pk,pk->p", a, b)[:, None]
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.sqrt(_dot(vectors, vectors)), 1e-12)
-
-
 def _directions(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """World directions ``[H W, 3]`` of unit depth, through columns ``x [W]`` and rows ``y [H]``."""
-    local = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), -1.0)], -1)
-    return (local.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+    right, up, back = pose[:3, :3].T
+    across = x[:, None] * right - back
+    return (y[:, None, None] * up + across).astype(np.float32).reshape(-1, 3)
 
 
 class RayCaster:
@@ -164,19 +258,44 @@ class RayCaster:
             core.Tensor(mesh.vertices.astype(np.float32)),
             core.Tensor(mesh.faces.astype(np.uint32)),
         )
-        self._textures = _Textures(mesh)
         corners = mesh.vertices[mesh.faces]
         edges = corners[:, 1:] - corners[:, :1]
         normal = np.cross(edges[:, 0], edges[:, 1])
         area = np.linalg.norm(normal, axis=1)
-        self._face_normals = (normal / np.maximum(area, 1e-30)[:, None]).astype(np.float32)
         uv_edges = mesh.uvs[:, 1:] - mesh.uvs[:, :1]
         uv_area = np.abs(
             uv_edges[:, 0, 0] * uv_edges[:, 1, 1] - uv_edges[:, 0, 1] * uv_edges[:, 1, 0]
         )
-        # Texture widths per object unit; a texture's width times this is its texels per unit.
-        self._uv_density = np.sqrt(uv_area / np.maximum(area, 1e-12)).astype(np.float32)
-        self._has_colors = bool((mesh.colors != 255).any())
+        chains = [_halvings(m.texture) for m in mesh.materials]
+        sizes = np.zeros((3, len(chains), max(1, *map(len, chains))), np.int64)
+        start, texels = 0, [np.zeros((0, 4), np.uint8)]
+        for row, chain in enumerate(chains):
+            for level, picture in enumerate(chain):
+                sizes[:, row, level] = start, picture.shape[1], picture.shape[0]
+                texels.append(picture.reshape(-1, 4))
+                start += len(texels[-1])
+        plain = np.stack([m.color for m in mesh.materials]).astype(np.float32)
+        plain[:, :3] *= plain[:, 3:]
+        colors = np.zeros((0, 4), np.float32)
+        if (mesh.colors != 255).any():
+            colors = mesh.colors.reshape(-1, 4).astype(np.float32) / 255
+        s: Any = _Surface()
+        s.normals = _array(mesh.normals.reshape(-1, 3), wp.vec3)
+        s.uvs = _array(mesh.uvs.reshape(-1, 2), wp.vec2)
+        s.colors = _array(colors, wp.vec4)
+        s.face_normals = _array(normal / np.maximum(area, 1e-30)[:, None], wp.vec3)
+        s.density = _array(np.sqrt(uv_area / np.maximum(area, 1e-12)), wp.float32)
+        s.materials = _array(mesh.material_ids, wp.int32)
+        s.plain = _array(plain, wp.vec4)
+        s.levels = _array(np.array([len(chain) for chain in chains]), wp.int32)
+        s.texels = _array(np.concatenate(texels), wp.vec4ub)
+        s.starts = _array(sizes[0], wp.int64)
+        s.widths, s.heights = _array(sizes[1], wp.int32), _array(sizes[2], wp.int32)
+        s.linear = _array(to_linear(np.arange(256) / 255.0), wp.float32)
+        s.ambient, s.head = wp.vec3(*lights.ambient), lights.head
+        s.to_lights = _array(lights.directions, wp.vec3)
+        s.lights = _array(lights.colors, wp.vec3)
+        self._surface = s
 
     def render(self, pose: np.ndarray, size: int, fov: float) -> tuple[np.ndarray, np.ndarray]:
         """Renders one view.
@@ -254,50 +373,31 @@ class RayCaster:
         count = len(directions)
         color = np.zeros((count, 4), np.float32)
         depth = np.zeros(count, np.float32)
-        alive = np.arange(count)
         travelled = np.zeros(count, np.float32)
+        alive = np.arange(count, dtype=np.int32)
+        found = [_array(travelled, wp.float32), _array(color, wp.vec4), _array(depth, wp.float32)]
+        rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], 1)
         for _ in range(LAYERS):
+            hits = self._scene.cast_rays(self._o3d.core.Tensor(rays), nthreads=self.threads)
+            parts = hits["t_hit"], hits["primitive_ids"], hits["primitive_uvs"]
+            distances, faces, corners = (part.numpy() for part in parts)
+            seen = [
+                *(_array(alive, wp.int32), _array(directions, wp.vec3)),
+                *(_array(distances, wp.float32), _array(faces, wp.uint32)),
+                _array(corners, wp.vec2),
+            ]
+            inputs = [self._surface, spacing, *seen]
+            wp.launch(_shade, len(alive), inputs=inputs, outputs=found, device="cpu")
+            alive = alive[(color[alive, 3] < 1 - OPAQUE) & np.isfinite(travelled[alive])]
             if not len(alive):
                 break
+            travelled[alive] += STEP
             d = directions[alive]
             rays = np.concatenate([origin + travelled[alive, None] * d, d], 1)
-            hits = self._scene.cast_rays(self._o3d.core.Tensor(rays), nthreads=self.threads)
-            distance = hits["t_hit"].numpy()
-            hit = np.isfinite(distance)
-            alive, d = alive[hit], d[hit]
-            travelled[alive] += distance[hit]
-            faces = hits["primitive_ids"].numpy()[hit].astype(np.int64)
-            layer = self._surface(
-                faces, hits["primitive_uvs"].numpy()[hit], d, travelled[alive] * spacing
-            )
-            through = 1 - color[alive, 3:]
-            color[alive] += through * layer
-            blocked = (color[alive, 3] >= 0.5) & (depth[alive] == 0)
-            depth[alive[blocked]] = travelled[alive[blocked]]
-            alive = alive[color[alive, 3] < 1 - OPAQUE]
-            travelled[alive] += STEP
         return color, depth
 
-    def _surface(
-        self, faces: np.ndarray, bary: np.ndarray, directions: np.ndarray, footprint: np.ndarray
-    ) -> np.ndarray:
-        """Shades the hit points to ``[P, 4]`` linear RGBA, colour premultiplied."""
-        mesh = self.mesh
-        weights = np.column_stack([1 - bary[:, 0] - bary[:, 1], bary])
-        to_camera = -_unit(directions)
-        normals = _unit(_blend(mesh.normals[faces], weights))
-        # Faces have two sides, and the normal is that of the side that the camera sees.
-        normals *= np.sign(_dot(self._face_normals[faces], to_camera))
-        material = mesh.material_ids[faces]
-        uv = _blend(mesh.uvs[faces], weights)
-        texels = np.sqrt(self._textures.widths[:, 0] * self._textures.heights[:, 0])[material]
-        spread = self._uv_density[faces] * texels * footprint
-        level = np.round(np.log2(np.maximum(spread, 1.0))).astype(np.int64)
-        base = self._textures.sample(material, uv, level)
-        if self._has_colors:
-            vertex = _blend(mesh.colors[faces].astype(np.float32), weights / 255)
-            base[:, :3] *= to_linear(vertex[:, :3]) * vertex[:, 3:]
-            base[:, 3] *= vertex[:, 3]
-        base[:, :3] += GLOSS * base[:, 3:]
-        base[:, :3] *= self.lights.shade(normals, to_camera)
-        return base
+
+def _array(values: np.ndarray, dtype: Any) -> Any:
+    """Values as a Warp array, which shares their memory where they are of its type already."""
+    kind = wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype))
+    return wp.array(np.ascontiguousarray(values, kind), dtype=dtype, device="cpu", copy=False)

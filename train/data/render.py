@@ -11,7 +11,7 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,18 @@ from typing import Any
 import msgspec
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from gamba_warp.batch import progress_bar
 from gamba_warp.cameras import intrinsics
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import write_split
+from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_folder, write_json
 from gamba_warp.formats.catalogue import Mesh
-from gamba_warp.formats.meshes import default_up, load_mesh
+from gamba_warp.formats.meshes import TexturedMesh, default_up, load_mesh
 from gamba_warp.images import to_uint8
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_document
@@ -39,6 +41,70 @@ from .raycast import Lights, RayCaster
 from .settings import Settings
 
 DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
+
+
+@dataclass
+class Views:
+    """Pictures of one object, with their cameras.
+
+    Attributes:
+        images: ``[V, S, S, 4]`` uint8 RGBA, colour not premultiplied.
+        poses: ``[V, 4, 4]`` float64 camera to world, OpenGL frame, object units.
+        K: ``[3, 3]`` float64, pixels, of all views.
+        depths: ``[V, S, S]`` uint16 depth of the first surface, in steps of ``DEPTH_UNIT``, 0
+            where there is none; None where the settings ask for no depth.
+        backs: as ``depths``, of the last surface.
+        transform: ``[3, 4]``, from the file's points to the world before scaling.
+        scale: object units per unit of the file.
+    """
+
+    images: np.ndarray
+    poses: np.ndarray
+    K: np.ndarray
+    depths: np.ndarray | None
+    backs: np.ndarray | None
+    transform: np.ndarray
+    scale: float
+
+
+def draw_views(
+    model: TexturedMesh, uid: str, settings: Settings, rotation: ArrayLike | None = None
+) -> Views:
+    """Renders the views of one object, a function of the arguments alone.
+
+    Args:
+        model: the object in the file's frame; ``settings.up`` is "y" or "z".
+        uid: name of the object, from which, with the settings' seed, cameras and lights are drawn.
+        settings: options of the pictures.
+        rotation: ``[3, 3]``, applied to the file's points first; None: none.
+    """
+    digest = hashlib.sha256(f"{settings.seed} {uid}".encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+    # From a source of its own, so that views without these changes stay what they were.
+    stretch, fov = settings.drawn(np.random.default_rng(int.from_bytes(digest[8:16], "big")))
+    turn = np.diag(stretch) @ (np.eye(3) if rotation is None else np.asarray(rotation))
+    model, transform, scale = model.normalized(settings.up, turn)
+    caster = RayCaster(model, Lights.sample(rng, settings.light == "varied"))
+    used = model.vertices[np.unique(model.faces)]
+    if settings.poses == "gso":
+        poses = ring_poses(used, fov, gso.ELEVATIONS, gso.AZIMUTHS)[: settings.views]
+    else:
+        poses = sample_poses(used, settings.views, fov, rng, settings.fronts, settings.spread)
+    size, images, depths, backs = settings.size, [], [], []
+    for pose in poses:
+        picture, depth = caster.render(pose, size, fov)
+        images.append(to_uint8(picture))
+        if settings.depth:
+            depths.append(_steps(depth))
+            backs.append(_steps(caster.last_depth(pose, size, fov)))
+    near, far = (np.stack(each) if each else None for each in (depths, backs))
+    K = intrinsics(size, size, fov).double().numpy()
+    return Views(np.stack(images), poses, K, near, far, transform, scale)
+
+
+def _steps(depth: np.ndarray) -> np.ndarray:
+    """Depth in object units as the 16-bit steps of depth pictures."""
+    return np.clip(np.rint(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
 
 
 def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
@@ -53,36 +119,22 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
         UserError: the mesh cannot be read, or the folder cannot be written.
     """
     up = default_up(mesh.path) if settings.up == "auto" else settings.up
-    digest = hashlib.sha256(f"{settings.seed} {mesh.uid}".encode()).digest()
-    rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-    # From a source of its own, so that views without these changes stay what they were.
-    stretch, fov = settings.drawn(np.random.default_rng(int.from_bytes(digest[8:16], "big")))
-    turn = np.diag(stretch) @ (np.eye(3) if mesh.rotation is None else np.array(mesh.rotation))
-    model, transform, scale = load_mesh(mesh.path).normalized(up, turn)
-    caster = RayCaster(model, Lights.sample(rng, settings.light == "varied"))
-    used = model.vertices[np.unique(model.faces)]
-    if settings.poses == "gso":
-        poses = ring_poses(used, fov, gso.ELEVATIONS, gso.AZIMUTHS)[: settings.views]
-    else:
-        poses = sample_poses(used, settings.views, fov, rng, settings.fronts, settings.spread)
     plain_name(mesh.uid, str(mesh.path))
+    model = load_mesh(mesh.path)
+    views = draw_views(model, mesh.uid, replace(settings, up=up), mesh.rotation)
     suffix, options = "webp", {"lossless": True, "method": 2, "quality": 50}
     if settings.format == "png":
         suffix, options = "png", {}
     with atomic_folder(out / mesh.uid) as part:
         frames = []
-        for index, pose in enumerate(poses):
-            picture, depth = caster.render(pose, settings.size, fov)
+        for index, pose in enumerate(views.poses):
             frame = {"file_path": f"{index:03d}.{suffix}", "transform_matrix": pose.tolist()}
-            Image.fromarray(to_uint8(picture)).save(part / frame["file_path"], **options)
-            if settings.depth:
-                backs = caster.last_depth(pose, settings.size, fov)
-                for which, values in (("depth", depth), ("back", backs)):
-                    steps = np.clip(np.rint(values / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+            Image.fromarray(views.images[index]).save(part / frame["file_path"], **options)
+            for which, steps in (("depth", views.depths), ("back", views.backs)):
+                if steps is not None:
                     frame[f"{which}_file_path"] = f"{index:03d}_{which}.png"
-                    Image.fromarray(steps).save(part / frame[f"{which}_file_path"])
+                    Image.fromarray(steps[index]).save(part / frame[f"{which}_file_path"])
             frames.append(frame)
-        K = intrinsics(settings.size, settings.size, fov).double()
         values = {
             "uid": mesh.uid,
             "name": mesh.name,
@@ -90,13 +142,13 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
             "attribution": mesh.attribution,
             "w": settings.size,
             "h": settings.size,
-            "fl_x": K[0, 0].item(),
-            "fl_y": K[1, 1].item(),
-            "cx": K[0, 2].item(),
-            "cy": K[1, 2].item(),
+            "fl_x": views.K[0, 0],
+            "fl_y": views.K[1, 1],
+            "cx": views.K[0, 2],
+            "cy": views.K[1, 2],
             "up": "z",
-            "applied_transform": transform.tolist(),
-            "applied_scale": scale,
+            "applied_transform": views.transform.tolist(),
+            "applied_scale": views.scale,
             "warnings": model.warnings,
             "settings": vars(settings),
             "frames": frames,
@@ -191,6 +243,7 @@ def render_meshes(
 
 def _attempt(mesh: Mesh, out: Path, settings: Settings, threads: int) -> list[str] | str:
     """In a child process: the mesh's warnings, or the reason why it failed."""
+    quiet_warp()
     torch.set_num_threads(threads)
     try:
         return render_object(mesh, out, settings)

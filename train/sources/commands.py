@@ -1,4 +1,4 @@
-"""The commands that make data: ``gamba data furniture``, ``primitives``, ``render`` and the others.
+"""The commands that make data: ``gamba data furniture``, ``made``, ``render`` and the others.
 
 They parse, call and print. What is there already is skipped, so a command that was stopped goes on;
 what fails is told on stderr, and the exit code is then 1.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -26,6 +27,12 @@ from .objaverse_lists import Lists
 
 Item = TypeVar("Item")
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+# What an empty part of a set's split means.
+_WITHOUT = {
+    "train": "there is nothing to train on",
+    "val": "training does not validate",
+    "test": "eval-views needs --split",
+}
 _SHOWN = 20  # objects of Objaverse that are told one by one; the record has all
 
 
@@ -68,6 +75,18 @@ def _told(failures: Mapping[str, str], what: str, warnings: Mapping[str, list[st
     return 1 if failures else 0
 
 
+def _tell_empty(data: Path) -> None:
+    """Says in one line which parts of the split of a set, of some objects, hold none of them."""
+    from gamba_warp.data.dataset import open_dataset, splits_of
+
+    with suppress(UserError):  # no object is there, or what is wrong is said where it is read
+        there = {*splits_of(data, open_dataset(data).uids).values()}
+        empty = [name for name in _WITHOUT if name not in there]
+        if empty:
+            parts = f"{' and '.join(empty)} {'split is' if len(empty) == 1 else 'splits are'}"
+            print(f"the {parts} empty; {'; '.join(_WITHOUT[name] for name in empty)}")
+
+
 def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None = None) -> int:
     """Get 820 free textured models with icons: Sweet Home 3D's libraries, from Debian's package.
 
@@ -86,10 +105,10 @@ def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None 
 
 
 @ranged
-def data_primitives_command(
+def data_made_command(
     out: Out, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
 ) -> int:
-    """Make objects of simple solids with made-up textures, free of anybody's rights (.glb).
+    """Make toys, animals, shoes, tools, packages, furniture, free of anybody's rights (.glb).
 
     An object depends on the seed and its number alone; those that are there already are kept.
 
@@ -98,9 +117,9 @@ def data_primitives_command(
         count: number of objects.
         seed: seed of all objects.
     """
-    from ..data.primitives import make_primitives
+    from ..data.made import make_files
 
-    make_primitives(out, count, seed)
+    make_files(out, count, seed)
     print(f"{count} models in {out}; next: gamba data render {out} --out DATA")
     return 0
 
@@ -145,6 +164,8 @@ def data_render_command(
     rendered, failures = len(todo) - len(failures), failures | damaged
     code = _told(failures, "failed", warnings)
     print(f"rendered {counted(rendered, 'object')} into {out}, {len(failures)} failed")
+    if split == "all":
+        _tell_empty(out)
     return code
 
 
@@ -184,6 +205,8 @@ def data_pack_command(
         print(f"{counted(done.there, 'object')} in {out} already")
     made = f"packed {counted(done.written, 'object')} into {out}, {counted(done.shards, 'shard')}"
     print(f"{made}, {len(done.failures)} failed")
+    if split == "all":
+        _tell_empty(out)
     return _told(done.failures, "failed", {})
 
 
@@ -245,6 +268,8 @@ def data_objaverse_command(
         print(f"left out: {name}: {reason}", file=sys.stderr)
     if (rest := len(failures) - _SHOWN) > 0:
         print(f"left out: {rest:,} more, see {record}", file=sys.stderr)
+    if not meshes:
+        _tell_empty(out)
     following = "gamba data render {} --size 512 --out DATA" if meshes else "gamba train {} ..."
     print(f"next: {following.format(out)}")
     return 1 if failures else 0

@@ -86,12 +86,7 @@ def write_pack(
             settings, cannot be written, or its disk is full.
     """
     dataset = open_dataset(data, settings.split)
-    if dataset.layout == "pack":  # whose splits stand in its index
-        splits = {
-            values["uid"]: str(values.get("split")) for values in packs.read_index(data).objects
-        }
-    else:
-        splits = splits_of(data, dataset.uids)
+    splits = splits_of(data, dataset.uids)
     index = _begun(out, settings)  # before the folder is made
     out = output_folder(out)
     with only_process(out, "packs"):
@@ -198,6 +193,9 @@ def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> Bloc
         name=files.name,
         attribution=files.attribution,
     )
+    if files.placement is not None:
+        entry.applied_transform = files.placement.transform.tolist()
+        entry.applied_scale = files.placement.scale
     return entry, {"cameras": cameras, **arrays}
 
 

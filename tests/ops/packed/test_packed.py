@@ -88,6 +88,42 @@ def test_scan(lengths, channels, states, groups, rule, dtype, device, from_ptx):
         assert_as_alone(function, inputs, lengths, 1e-5)
 
 
+def test_scan_on_cuda_keeps_packed_sequences_whole(from_ptx):
+    """Where each row alone would be cut into four segments, the bits are those without a cut."""
+    lengths = [230, 0, 3]
+    inputs, cuts = scan_inputs(lengths, 5, 3), borders(lengths)
+    from_ptx()
+    results = []
+    for tuning in (cuda.Tuning(), cuda.Tuning(segments=4, back_segments=4)):
+        with patch.object(cuda, "FORCED", tuning):
+            x = leaves(inputs)
+            outs = scan(**x, cu_seqlens=cuts)
+            grads = gradients(x, outs, [torch.ones_like(out) for out in outs])
+            results.append([*outs, *grads.values()])
+    assert all(map(torch.equal, *results))
+
+
+def test_borders_that_nobody_looks_at_are_bounded(from_ptx):
+    """On CUDA and under torch.compile: those that fall end an empty sequence, none overlap."""
+    inputs = scan_inputs([70, 0, 60, 0], 5, 3)
+    tokens = conv_inputs(1, 130, 5, 4) | {"initial_state": torch.randn(4, 3, 5)}
+    from_ptx()
+    results = []
+    with patch.object(torch.compiler, "is_compiling", lambda: True):
+        for cuts in ([0, 70, 70, 130, 130], [-3, 70, 20, 200, 130]):
+            cuts = torch.tensor(cuts)
+            assert sequences(inputs["u"], cuts, None).tolist() == [
+                [0, 0, 70], [0, 70, 70], [0, 70, 130], [0, 130, 130]
+            ]  # fmt: skip
+            results.append([])
+            for function, given in ((scan, inputs), (conv, tokens)):
+                x = leaves(given)
+                outs = function(**x, cu_seqlens=cuts)
+                grads = gradients(x, outs, [torch.ones_like(out) for out in outs])
+                results[-1] += [*outs, *grads.values()]
+    assert all(map(torch.equal, *results))
+
+
 @pytest.mark.parametrize("threads", [2, 5])
 @pytest.mark.parametrize("channels, states", [(5, 4), (64, 16)])
 def test_scan_in_segments(channels, states, threads):
@@ -177,6 +213,7 @@ def test_pieces_cover_each_token_once():
             rows = sequences(torch.empty(1, length, 1), borders(lengths), None)
             found = pieces(rows, 1, length, tokens)
             assert len(found) == count_slots(rows, 1, length, tokens)
+            assert all(t0 < end for _, _, end, t0, s in found.tolist() if s >= 0), "none is empty"
             seen = [
                 (s, t)
                 for _, _, end, t0, s in found.tolist()

@@ -9,6 +9,7 @@ from helpers.scan import (
     compare,
     device_errors,
     every_discretization,
+    gradients,
     leaves,
     make,
     oracle,
@@ -73,7 +74,27 @@ def test_half_precision(dtype, of_delta, limit):
     compare(inputs | {"delta": inputs["delta"].to(of_delta)}, limit)
 
 
-@pytest.mark.parametrize("name", ["u", "delta", "A", "B", "C", "D", "z", "delta_bias"])
+@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.parametrize("name", ["B", "C"])
+def test_b_or_c_alone_in_half_precision(name, device, from_ptx):
+    """The other keeps its float32: results have the bits of both in float32."""
+    inputs = make(1, 20, 34, 3)
+    inputs[name] = inputs[name].bfloat16()
+    if device == "ptx":
+        from_ptx()
+    results = []
+    for tensors in (inputs, inputs | {name: inputs[name].float()}):
+        mine = leaves(tensors)
+        out = selective_scan(**mine, delta_softplus=True)
+        results.append({"out": out} | gradients(mine, [out], [torch.ones_like(out)]))
+    for key, got in results[0].items():
+        assert torch.equal(got, results[1][key].to(got.dtype)), key
+    assert results[0][name].dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize(
+    "name", ["u", "delta", "A", "B", "C", "D", "z", "delta_bias", "initial_state"]
+)
 def test_one_gradient_alone(name):
     assert_gradient_alone(selective_scan, make(2, 70, 20, 3), name, delta_softplus=True)
 

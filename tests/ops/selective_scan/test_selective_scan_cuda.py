@@ -135,7 +135,7 @@ def test_tunings_differ_by_rounding_only(tuned):
         assert any(not torch.equal(result[k], results[0][k]) for k in result)  # it was another
 
 
-@pytest.mark.parametrize("name", ["C", "z", "A", "D"])
+@pytest.mark.parametrize("name", ["C", "z", "A", "D", "initial_state"])
 def test_one_gradient_alone(name):
     """What is not asked for is left out of the kernel, and changes nothing."""
     inputs = make(1, 70, 20, 3)

@@ -1,0 +1,121 @@
+"""Objects that the project makes of seeds: closed, bounded, the same again, different from each other."""
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.refusals import refused
+
+from gamba_warp.data.dataset import split_of
+from gamba_warp.formats.catalogue import find_meshes
+from gamba_warp.formats.meshes import load_mesh
+from gamba_warp.train.data.made import make_object, textures
+from gamba_warp.train.data.made.looks import MAX_FACES
+from gamba_warp.train.data.made.objects import PLANS, made_by
+from gamba_warp.train.data.made.composition import composition
+from gamba_warp.train.sources.commands import data_made_command
+
+NUMBERS = range(40)
+
+
+@pytest.fixture(scope="module")
+def objects():
+    return [make_object(np.random.default_rng([5, number])) for number in NUMBERS]
+
+
+def test_the_same_seed_gives_the_same_bits(objects):
+    for number in (0, 7, 21, 33):
+        again, first = make_object(np.random.default_rng([5, number])), objects[number]
+        for name in ("vertices", "faces", "normals", "uvs", "colors", "material_ids"):
+            assert np.array_equal(getattr(again, name), getattr(first, name)), name
+        for one, other in zip(again.materials, first.materials, strict=True):
+            assert np.array_equal(one.color, other.color)
+            assert (one.texture is None) == (other.texture is None)
+            assert one.texture is None or np.array_equal(one.texture, other.texture)
+    assert len({mesh.vertices.tobytes() for mesh in objects}) == len(objects)
+
+
+def test_objects_are_closed_and_have_a_volume(objects):
+    for number, mesh in enumerate(objects):
+        edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all(), number
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        assert solid.is_watertight and solid.volume > 0, number
+
+
+def test_objects_are_bounded_and_sound(objects):
+    thin = 0
+    for mesh in objects:
+        assert 12 <= len(mesh.faces) <= MAX_FACES
+        for values in (mesh.vertices, mesh.normals, mesh.uvs):
+            assert np.isfinite(values).all()
+        # A face's normals are unit and on its own side, but for slivers, which have none.
+        corners = mesh.vertices[mesh.faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(across, axis=1)
+        big = area > 1e-6 * area.sum()
+        assert np.allclose(np.linalg.norm(mesh.normals, axis=2), 1, atol=1e-3)
+        own = (mesh.normals[big] * (across[big] / area[big, None])[:, None]).sum(2)
+        assert own.min() > 0.7  # cos 40 degrees is .77; the normals are float32
+        assert mesh.material_ids.max() < len(mesh.materials) and not mesh.warnings
+        sides = np.ptp(mesh.vertices, axis=0)
+        thin += sides.min() < 0.02 * sides.max()
+    assert thin <= 2
+
+
+def test_textures_are_small_and_of_colours(objects):
+    for mesh in objects:
+        for look in mesh.materials:
+            assert ((look.color >= 0) & (look.color <= 1)).all()
+            if look.texture is not None:
+                assert look.texture.dtype == np.uint8 and look.texture.shape[2] == 4
+                assert max(look.texture.shape[:2]) <= textures.PRINT
+                assert (look.texture[..., 3] == 255).all()
+    for name, pattern in textures.PATTERNS.items():
+        values = pattern(np.random.default_rng(0))
+        assert values.shape == (textures.SIDE,) * 2, name
+        assert values.min() >= 0 and values.max() <= 1 and np.ptp(values) > 0.05, name
+
+
+@pytest.mark.parametrize("plan", [*[plan for plan, _ in PLANS], composition])
+def test_every_plan_makes_objects(plan):
+    made = [made_by(plan, np.random.default_rng([9, number])) for number in range(2)]
+    found = [mesh for mesh in made if mesh is not None]
+    assert found
+    shapes = {tuple(np.round(np.ptp(mesh.vertices, axis=0), 6)) for mesh in found}
+    assert len(shapes) == len(found), "no two are alike"
+
+
+def test_files_are_the_same_again_and_kept_where_they_are(tmp_path, capsys):
+    out = tmp_path / "made"
+    assert data_made_command(out, count=4, seed=5) == 0
+    assert "4 models" in capsys.readouterr().out
+    meshes = find_meshes(out)
+    assert [mesh.uid for mesh in meshes] == [f"made-5-0000{i}" for i in range(4)]
+    assert {split_of(mesh.group) for mesh in meshes} == {"train"}
+    assert {mesh.attribution["licence"] for mesh in meshes} == {"CC0 1.0"}
+    before = [mesh.path.read_bytes() for mesh in meshes]
+    meshes[1].path.unlink()
+    meshes[2].path.write_bytes(b"kept as it is")
+    data_made_command(out, count=4, seed=5)
+    assert meshes[1].path.read_bytes() == before[1] and len(set(before)) == 4
+    assert meshes[2].path.read_bytes() == b"kept as it is"
+
+
+def test_files_hold_the_objects(tmp_path, objects):
+    data_made_command(tmp_path, count=3, seed=5)
+    for number, mesh in enumerate(find_meshes(tmp_path)):
+        read, made = load_mesh(mesh.path), objects[number]
+        assert not read.warnings and len(read.faces) == len(made.faces)
+        # float32 in the file
+        assert np.allclose(read.vertices.min(0), made.vertices.min(0), atol=1e-5)
+        assert np.allclose(read.vertices.max(0), made.vertices.max(0), atol=1e-5)
+        names = [look.texture is not None for look in read.materials]
+        used = [made.materials[i].texture is not None for i in np.unique(made.material_ids)]
+        assert sorted(names) == sorted(used)
+
+
+def test_another_catalogue_is_not_overwritten(tmp_path):
+    (tmp_path / "catalogue.json").write_text('{"objects": []}')
+    (tmp_path / "chair.glb").write_bytes(b"")
+    refused("there are other objects", data_made_command, tmp_path, count=1)
+    assert (tmp_path / "catalogue.json").read_text() == '{"objects": []}'

@@ -1,0 +1,125 @@
+"""Made objects that other processes render while a model trains: order, reuse, failures."""
+
+import collections
+import dataclasses
+import os
+
+import pytest
+from helpers import micro
+from helpers.micro import run, same_weights
+from helpers.refusals import refused
+
+from gamba_warp.errors import UserError
+from gamba_warp.train.batches import Batches, open_data
+from gamba_warp.train.data import pool as pools
+from gamba_warp.train.data.pool import Pool, PoolOptions
+from gamba_warp.train.data.settings import Settings
+
+VIEWS = Settings(views=3, size=16, seed=3, depth=True, fronts=1, up="y")
+OPTIONS = PoolOptions(seed=3, rank=0, world=1, uses=3, workers=1, views=VIEWS)
+
+
+@pytest.fixture
+def slots(monkeypatch):
+    monkeypatch.setattr(pools, "SLOTS", 5)
+
+
+@pytest.fixture
+def opened():
+    """Pools that end with the test."""
+    made = []
+
+    def open_pool(first=0, **changes):
+        made.append(Pool(dataclasses.replace(OPTIONS, **changes), first))
+        return made[-1]
+
+    yield open_pool
+    for each in made:
+        each.close()
+
+
+def test_every_object_is_used_as_often_as_told_in_rounds_that_differ(slots):
+    idle = object.__new__(Pool)
+    idle.options = OPTIONS
+    rounds = [[idle._object(5 * turn + place) for place in range(5)] for turn in range(30)]
+    assert all(len({*numbers}) == 5 for numbers in rounds)
+    uses = collections.Counter(number for numbers in rounds for number in numbers)
+    middle = {number for numbers in rounds[5:20] for number in numbers}
+    assert {uses[number] for number in middle} == {3}
+    news = [len({*after} - {*before}) for before, after in zip(rounds, rounds[1:])]
+    assert {1, 2} == {*news}  # 5 slots change within 3 rounds
+    other = object.__new__(Pool)
+    other.options = dataclasses.replace(OPTIONS, rank=1, world=2)
+    assert not {other._object(n) for n in range(60)} & {number * 2 for number in uses}
+
+
+def test_a_pool_that_begins_later_goes_on_with_the_same_pictures(slots, opened):
+    whole, late = opened(), opened(first=12, workers=2)
+    for sample in range(18):
+        before = whole.take(sample)
+        if sample >= 12:
+            after = late.take(sample)
+            assert before.uids == after.uids
+            one, two = before.load(0), after.load(0)
+            assert one.images.equal(two.images) and one.depths.equal(two.depths)
+            assert one.backs.equal(two.backs)
+            assert one.cameras.viewmats.equal(two.cameras.viewmats)
+            assert one.images[..., 3].max() == 1 and one.depths.max() > 0
+    assert len(whole._ready) <= 5 + 2 * 2 + pools.AHEAD  # those of older rounds are forgotten
+
+
+def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeypatch):
+    monkeypatch.setattr(pools, "_made", _dies)
+    with pytest.raises(UserError, match=r"made object \d+: its process died of signal 9"):
+        opened().take(0)
+
+
+def _dies(number, seed, settings):
+    os.kill(os.getpid(), 9)
+
+
+@pytest.mark.parametrize("share, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])
+def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, share, expected):
+    def batches(made):
+        views = {"made": made, "made_views": 3, "batch_size": 8}
+        options = micro.options(data, data, views=views)
+        return Batches(open_data(options), options, micro.ALONE)
+
+    plain, mixed = batches(0.0), batches(share)
+    try:
+        ours, theirs = mixed.batch(0, 2), plain.batch(0, 2)
+    finally:
+        mixed.close()
+    made = [uid.startswith("made-") for uid in ours.uids]
+    assert sum(made) == expected
+    assert ours.targets.shape == theirs.targets.shape
+    for number, is_made in enumerate(made):
+        same = ours.targets[number].equal(theirs.targets[number])
+        assert same == (not is_made)
+
+
+def test_a_resumed_run_has_the_same_bits_and_another_share_is_refused(data, tmp_path, capsys):
+    views = {"made": 0.5, "made_views": 3, "made_uses": 2}
+    assert run(data, tmp_path / "whole", length={"steps": 4}, views=views) == 0
+    half = tmp_path / "half"
+    assert run(data, half, length={"steps": 4}, views=views, run={"save_every": 2}) == 0
+    resumed = {"resume": str(half / "checkpoints" / "step_000002")}
+    again = tmp_path / "again"
+    assert run(data, again, length={"steps": 4}, views=views, run=resumed) == 0
+    assert same_weights(tmp_path / "whole" / "model.safetensors", again / "model.safetensors")
+    with pytest.raises(UserError, match=r"views\.made \(0\.5 there, 0\.25 here\)"):
+        run(
+            data, tmp_path / "other", length={"steps": 4}, views=views | {"made": 0.25}, run=resumed
+        )
+
+
+@pytest.mark.parametrize(
+    "views, reason",
+    [
+        ({"made": 1.5}, "--made"),
+        ({"made": 0.5, "overfit": "0"}, "--made: --overfit trains on one object alone"),
+        ({"made": 0.5, "made_uses": 0}, "--made-uses"),
+    ],
+)
+def test_absurd_options_are_refused(data, tmp_path, views, reason):
+    refused(reason, micro.options, data, tmp_path, views=views)

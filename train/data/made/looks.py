@@ -1,0 +1,306 @@
+"""What surfaces look like, and solids to a mesh with textures.
+
+A solid that is *stamped* remembers, at each point, where this lay when it was stamped (its *skin*),
+and the number of its look. Both stay through booleans, turns and bends, so that textures are laid
+on the parts as these were made.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from manifold3d import Manifold, Mesh
+
+from gamba_warp.formats.materials import Material, to_linear
+from gamba_warp.formats.meshes import CREASE, TexturedMesh
+
+from . import textures
+from .solids import extent, joined, solid_of
+
+SHARP = 40.0  # degrees; a sharper edge is not shaded smoothly
+MAX_FACES = 60_000
+THINNEST = 2e-4  # least volume, as a share of a cube of the longest side
+# Of a skin, for faces that look along x, y and z: the axes of u and v, and the signs of u and v
+# where the face looks to the positive side, so that print is never mirrored.
+_ACROSS = np.array([[2, 1], [0, 2], [0, 1]])
+_SIGNS = np.array([[-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+
+
+@dataclass
+class Look:
+    """How some of an object's parts look.
+
+    Attributes:
+        materials: one for all sides; or six, of the sides that look to +x, -x, +y, -y, +z and -z.
+        mapping: how the texture lies on the skin: "box", from the side that a face looks to,
+            repeated; "fit", the same, once over the skin's extent; "round", once about y.
+        repeats: of the texture over a unit, for "box"; about y, for "round".
+        low: least coordinates ``[3]`` of the skin of what is stamped with it.
+        high: greatest ones.
+    """
+
+    materials: list[Material]
+    mapping: str = "box"
+    repeats: float = 1.0
+    low: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
+    high: np.ndarray = field(default_factory=lambda: np.full(3, -np.inf))
+
+
+def material(pixels: np.ndarray) -> Material:
+    """A material of a picture ``[h, w, 3]`` uint8."""
+    full = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+    full[..., :3] = pixels
+    return Material(np.ones(4, np.float32), full)
+
+
+def plain_material(value: np.ndarray) -> Material:
+    """A material of one display colour ``[3]``."""
+    return Material(np.append(to_linear(np.clip(value, 0, 1)), 1).astype(np.float32))
+
+
+class Maker:
+    """What plans draw chance and looks from.
+
+    Args:
+        rng: source of chance.
+
+    Attributes:
+        rng: the same.
+        looks: those that were made.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.looks: list[Look] = []
+
+    def u(self, low: float, high: float) -> float:
+        """A number between two."""
+        return float(self.rng.uniform(low, high))
+
+    def chance(self, share: float) -> bool:
+        """True in a share of all cases."""
+        return bool(self.rng.random() < share)
+
+    def n(self, low: int, high: int) -> int:
+        """A whole number, the last included."""
+        return int(self.rng.integers(low, high + 1))
+
+    def pick(self, *options):
+        """One of some things."""
+        return options[self.rng.integers(len(options))]
+
+    def color(self, *kinds: str) -> np.ndarray:
+        """A colour of one of some kinds, see ``textures.color``."""
+        return textures.color(self.rng, self.pick(*kinds) if kinds else "any")
+
+    def add(self, look: Look) -> int:
+        """The number of a new look."""
+        self.looks.append(look)
+        return len(self.looks) - 1
+
+    def plain(self, *kinds: str) -> int:
+        """A look of one colour, of one of some kinds."""
+        return self.add(Look([plain_material(self.color(*kinds))]))
+
+    def painted(self, value: np.ndarray) -> int:
+        """A look of one given display colour."""
+        return self.add(Look([plain_material(value)]))
+
+    def pattern(self, patterns: Sequence[str] | str, *kinds: str, contrast: float = 0.0, mapping: str = "box", repeats: float = 0.0) -> int:
+        """A look of a pattern of two colours.
+
+        Args:
+            patterns: names in ``textures.PATTERNS`` to choose from.
+            kinds: of the first colour.
+            contrast: share of cases in which the second is another colour, not a shade.
+            mapping: see ``Look``.
+            repeats: the same; 0: drawn.
+        """
+        name = patterns if isinstance(patterns, str) else self.pick(*patterns)
+        first = self.color(*kinds)
+        second = self.color() if self.chance(contrast) else first * self.u(0.45, 0.85)
+        picture = textures.mixed(textures.PATTERNS[name](self.rng), first, second)
+        return self.add(Look([material(picture)], mapping, repeats or self.u(0.8, 2.5)))
+
+    def surface(self, *kinds: str) -> int:
+        """A look for anything: mostly one colour, sometimes a pattern."""
+        if self.chance(0.5):
+            return self.plain(*kinds)
+        quiet = ("plain", "clouded", "speckled", "brushed", "woven", "paneled")
+        loud = (*textures.PATTERNS,)
+        return self.pattern(quiet if self.chance(0.6) else loud, *kinds, contrast=0.3)
+
+    def wood(self) -> int:
+        """Wood, bare or stained."""
+        return self.pattern("grained", "wood", repeats=self.u(0.7, 1.6))
+
+    def metal(self) -> int:
+        """Metal, brushed or smooth."""
+        return self.pattern("brushed", "metal") if self.chance(0.5) else self.plain("metal", "dark")
+
+    def cloth(self, *kinds: str) -> int:
+        """Cloth: woven, knitted, striped, printed."""
+        names = ("woven", "woven", "knitted", "striped", "checked", "dotted", "flowered", "plain", "spotted")
+        return self.pattern(names, *kinds, contrast=0.4, repeats=self.u(1.5, 4))
+
+    def fur(self, *kinds: str) -> int:
+        """Fur or plush, of one colour or in patches."""
+        name = self.pick("furry", "furry", "speckled", "plain", "spotted")
+        return self.pattern(name, *(kinds or ("fur", "fur", "fur", "pastel", "toy")), contrast=0.35, repeats=self.u(1, 2.5))
+
+    def inks(self, count: int = 3) -> list[np.ndarray]:
+        """Colours of a print."""
+        return [self.color("toy", "toy", "dark", "white", "any") for _ in range(count)]
+
+    def printed(self, kind: str, ground: np.ndarray, mapping: str = "fit", inks: list[np.ndarray] | None = None, sides: bool = False) -> int:
+        """A look of printed matter.
+
+        Args:
+            kind: see ``textures.package``.
+            ground: colour of the paper.
+            mapping: see ``Look``.
+            inks: colours; None: drawn.
+            sides: whether what does not look to +z or -z is of the ground's colour.
+        """
+        picture = material(textures.package(self.rng, ground, inks or self.inks(), kind))
+        if not sides:
+            return self.add(Look([picture], mapping))
+        bare = plain_material(ground)
+        return self.add(Look([bare, bare, bare, bare, picture, bare], mapping))
+
+    def stamp(self, solid: Manifold, look: int) -> Manifold:
+        """The solid with its skin where it is now, all of it of one look."""
+        mesh = solid.to_mesh()
+        vertices = np.asarray(mesh.vert_properties)[:, :3]
+        return self.stamped(vertices, np.asarray(mesh.tri_verts), np.zeros(1), (look,))
+
+    def stamped(self, vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray, looks: Sequence[int]) -> Manifold:
+        """A solid of arrays, with its skin where it is.
+
+        Args:
+            vertices: ``[V, 3]``.
+            faces: ``[F, 3]``.
+            of_face: ``[F]`` indices into looks; ignored where there is one look.
+            looks: their numbers.
+        """
+        if not len(faces):
+            return Manifold()
+        runs = [0, 3 * len(faces)]
+        if len(looks) > 1:
+            order = np.argsort(of_face, kind="stable")
+            faces = faces[order]
+            counts = np.bincount(of_face.astype(int), minlength=len(looks))
+            looks = [look for look, count in zip(looks, counts) if count]
+            runs = [0, *np.cumsum(3 * counts[counts > 0])]
+        for number in looks:
+            look = self.looks[number]
+            look.low = np.minimum(look.low, vertices.min(0))
+            look.high = np.maximum(look.high, vertices.max(0))
+        points = np.concatenate([vertices, np.zeros_like(vertices), vertices], 1)
+        mesh = Mesh(
+            np.ascontiguousarray(points, np.float32),
+            np.ascontiguousarray(faces, np.uint32),
+            run_index=np.array(runs, np.uint32),
+            run_original_id=np.array(looks, np.uint32),
+        )
+        return Manifold(mesh)
+
+    def blended(self, blend, looks: Sequence[int]) -> Manifold:
+        """The stamped solid of a ``solids.Blend``, whose looks are indices into these."""
+
+        def stamp(vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> Manifold:
+            sound = solid_of(vertices, faces)
+            if sound.is_empty():
+                return sound
+            swapped = faces[:, ::-1]
+            probe = np.einsum("fk,fk->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
+            return self.stamped(vertices, faces if probe > 0 else swapped, of_face, looks)
+
+        return blend.solid(stamp)
+
+
+def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh | None:
+    """The union of stamped solids as a mesh with textures; None where it is empty or a sheet."""
+    whole = joined([s for s in solids if not s.is_empty()])
+    if whole.is_empty():
+        return None
+    low, high = extent(whole)
+    size = float((high - low).max())
+    if not np.isfinite(size) or whole.volume() < THINNEST * size**3:
+        return None
+    tolerance = 1e-4 * size
+    while whole.num_tri() > MAX_FACES:
+        whole = whole.simplify(tolerance)
+        tolerance *= 2
+    mesh = whole.calculate_normals(0, SHARP).to_mesh()
+    points = np.asarray(mesh.vert_properties)
+    corners = np.asarray(mesh.tri_verts).astype(np.int64)
+    number = np.repeat(np.asarray(mesh.run_original_id), np.diff(mesh.run_index) // 3).astype(np.int64)
+    same = np.arange(len(points))
+    same[np.asarray(mesh.merge_from_vert, np.int64)] = np.asarray(mesh.merge_to_vert, np.int64)
+    used, faces = np.unique(same[corners], return_inverse=True)
+    vertices = points[used, :3].astype(np.float64)
+    faces = faces.reshape(-1, 3)
+    smooth = points[corners, 3:6]
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    flat = np.cross(b - a, c - a)
+    length = np.linalg.norm(flat, axis=1, keepdims=True)
+    flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])[:, None]
+    # Where a cut left slivers a vertex may have the normal of another side.
+    normals = np.where((smooth * flat).sum(2, keepdims=True) > CREASE, smooth, flat)
+    uvs, ids, materials = _mapped(points[corners, 6:9], number, looks)
+    return TexturedMesh(
+        vertices=vertices,
+        faces=faces,
+        normals=normals.astype(np.float32),
+        uvs=uvs,
+        colors=np.full((len(faces), 3, 4), 255, np.uint8),
+        material_ids=ids,
+        materials=materials,
+    )
+
+
+def _mapped(skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarray, list[Material]]:
+    """UVs ``[F, 3, 2]``, materials' numbers ``[F]`` and materials of faces.
+
+    Args:
+        skin: ``[F, 3, 3]``.
+        number: ``[F]`` of looks.
+        looks: all of them.
+    """
+    across = np.cross(skin[:, 1] - skin[:, 0], skin[:, 2] - skin[:, 0])
+    axis = np.abs(across).argmax(1)
+    positive = np.take_along_axis(across, axis[:, None], 1)[:, 0] > 0
+    signs = _SIGNS[axis] * np.where(positive, 1, -1)[:, None]
+    signs[axis != 1, 1] = 1  # v is upwards on all walls
+    signs[(axis == 1), 0] = 1
+    uv = np.take_along_axis(skin, np.repeat(_ACROSS[axis][:, None], 3, 1), 2)
+    uvs = np.zeros((len(skin), 3, 2), np.float32)
+    ids = np.zeros(len(skin), np.int64)
+    materials: list[Material] = []
+    for index in np.unique(number):
+        look, mine = looks[index], np.flatnonzero(number == index)
+        side = 2 * axis[mine] + ~positive[mine]
+        ids[mine] = len(materials) + (side if len(look.materials) == 6 else 0)
+        materials += look.materials
+        if look.mapping == "box":
+            uvs[mine] = uv[mine] * signs[mine][:, None] * look.repeats
+            continue
+        size = np.maximum(look.high - look.low, 1e-6)
+        if look.mapping == "fit":
+            share = (uv[mine] - look.low[_ACROSS[axis[mine]]][:, None]) / size[_ACROSS[axis[mine]]][:, None]
+            s = signs[mine][:, None]
+            uvs[mine] = np.where(s > 0, share, 1 - share)
+            continue
+        points = skin[mine]
+        turn = np.arctan2(points[..., 0], points[..., 2]) / (2 * math.pi) + 0.5
+        turn -= np.round(turn - turn[:, :1])  # the corners of a face lie on one side of the seam
+        uvs[mine, :, 0] = turn * max(1, round(look.repeats))
+        uvs[mine, :, 1] = (points[..., 1] - look.low[1]) / size[1]
+        flat = axis[mine] == 1
+        if flat.any():
+            uvs[mine[flat]] = uv[mine[flat]] / size[[0, 2]].max()
+    return uvs, ids, materials
