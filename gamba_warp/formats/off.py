@@ -12,8 +12,8 @@ import numpy as np
 from ..errors import UserError
 from .headers import MAX_VALUES, lines_of, open_shape, read_table
 from .materials import SideFiles
-from .parts import Part, to_rgba8
-from .polygons import cut_polygons, spread
+from .parts import Part, cut_polygons, to_rgba8
+from .ply_data import spread
 
 # What vertices have besides a place: texture coordinates, colours, normals. Some files of
 # ModelNet40 have the counts behind the word, without a blank.

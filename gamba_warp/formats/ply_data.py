@@ -13,7 +13,13 @@ import numpy as np
 from ..errors import UserError
 from .headers import MAX_FILE, MAX_VALUES, compare_sizes, lines_of, open_shape, read_table
 from .ply_header import ORDERS, PlyElement, PlyHeader, PlyProperty, read_ply_header
-from .polygons import spread
+
+
+def spread(starts: np.ndarray, lengths: np.ndarray, step: int = 1) -> np.ndarray:
+    """``[M]`` the places of all items of lists that start at ``starts``, ``step`` apart."""
+    ends = np.cumsum(lengths)
+    within = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)
+    return np.repeat(starts, lengths) + within * step
 
 
 class PlyList(NamedTuple):

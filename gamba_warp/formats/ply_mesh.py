@@ -10,9 +10,8 @@ import numpy as np
 
 from ..errors import UserError
 from .materials import Material, SideFiles
-from .parts import Part, to_rgba8
+from .parts import Part, cut_polygons, to_rgba8
 from .ply_data import Columns, PlyList, read_ply
-from .polygons import cut_polygons
 
 _CORNERS = ("vertex_indices", "vertex_index")
 # What programs call the channels of a colour, and texture coordinates.

@@ -15,7 +15,7 @@ from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.formats import materials
-from gamba_warp.formats.headers import MAX_ZEROS
+from gamba_warp.formats.gltf_file import MAX_ZEROS
 from gamba_warp.formats.meshes import load_mesh
 
 V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
