@@ -5,33 +5,16 @@ What changes shape or colours and is not read is a warning that names it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
-import msgspec
 import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from .gltf_file import (
-    PACKED,
-    GltfFile,
-    Index,
-    Mesh,
-    Node,
-    Primitive,
-    Sampler,
-    Texture,
-    Vec2,
-    Vec3,
-    Vec4,
-    normalised,
-    open_gltf,
-    pose_matrix,
-)
+from .gltf_file import PACKED, GltfFile, Look, Primitive, TextureInfo, normalised, open_gltf
 from .headers import MAX_FILE, open_shape
 from .materials import Material, SideFiles, plain, to_display
 from .parts import Part, to_rgba8
@@ -39,73 +22,15 @@ from .parts import Part, to_rgba8
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _OTHERS = {0: "points", 1: "lines", 2: "a line loop", 3: "a line strip"}
 _REPEAT = 10497
-_GLOSS, _INSTANCES = "KHR_materials_pbrSpecularGlossiness", "EXT_mesh_gpu_instancing"
-# Extensions that are read, or change neither shape nor colours. Those that name a texture are
-# spoken of where it is used.
+_PICTURES = ("EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds")
+# Extensions that are read, change neither shape nor colours, or are spoken of where they are used.
 _KNOWN = {
-    *("EXT_lights_image_based", "EXT_texture_avif", "EXT_texture_webp", "FB_ngon_encoding"),
-    *("KHR_animation_pointer", "KHR_lights_punctual", "KHR_materials_emissive_strength"),
-    *("KHR_materials_ior", "KHR_materials_unlit", "KHR_materials_variants"),
-    *("KHR_mesh_quantization", "KHR_texture_basisu", "KHR_texture_transform", "KHR_xmp"),
-    *("KHR_xmp_json_ld", "MSFT_texture_dds", _GLOSS, _INSTANCES, *PACKED),
+    *("EXT_lights_image_based", "EXT_texture_webp", "FB_ngon_encoding", "KHR_lights_punctual"),
+    *("KHR_animation_pointer", "KHR_materials_emissive_strength", "KHR_materials_ior"),
+    *("KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit", "KHR_materials_variants"),
+    *("KHR_mesh_quantization", "KHR_texture_transform", "KHR_xmp", "KHR_xmp_json_ld"),
+    *(*_PICTURES, *PACKED),
 }
-
-
-class _Transform(msgspec.Struct):
-    offset: Vec2 = (0.0, 0.0)
-    rotation: float = 0.0
-    scale: Vec2 = (1.0, 1.0)
-    texCoord: Index | None = None
-
-
-class _TextureInfo(msgspec.Struct):
-    index: Index
-    texCoord: Index = 0
-    extensions: dict[str, Any] = {}
-
-
-class _Roughness(msgspec.Struct):
-    baseColorFactor: Vec4 = (1.0, 1.0, 1.0, 1.0)
-    baseColorTexture: _TextureInfo | None = None
-    metallicRoughnessTexture: _TextureInfo | None = None
-
-
-class _Gloss(msgspec.Struct):
-    diffuseFactor: Vec4 = (1.0, 1.0, 1.0, 1.0)
-    diffuseTexture: _TextureInfo | None = None
-    specularFactor: Vec3 = (1.0, 1.0, 1.0)
-    glossinessFactor: float = 1.0
-    specularGlossinessTexture: _TextureInfo | None = None
-
-
-class _Strength(msgspec.Struct):
-    emissiveStrength: float = 1.0
-
-
-class _Look(msgspec.Struct):
-    """A material of the document."""
-
-    pbrMetallicRoughness: _Roughness = msgspec.field(default_factory=_Roughness)
-    emissiveFactor: Vec3 = (0.0, 0.0, 0.0)
-    emissiveTexture: _TextureInfo | None = None
-    normalTexture: _TextureInfo | None = None
-    occlusionTexture: _TextureInfo | None = None
-    alphaMode: str = "OPAQUE"
-    alphaCutoff: float = 0.5
-    extensions: dict[str, Any] = {}
-
-
-class _Instances(msgspec.Struct):
-    attributes: dict[str, Index]
-
-
-@dataclass
-class _Surface:
-    """A material, and where its texture's coordinates are."""
-
-    material: Material | None
-    opaque: bool = True
-    info: _TextureInfo | None = None
 
 
 @dataclass
@@ -114,7 +39,7 @@ class _Triangles:
 
     vertices: np.ndarray
     faces: np.ndarray
-    surface: _Surface
+    material: Material | None
     normals: np.ndarray | None
     uvs: np.ndarray | None
     colors: np.ndarray | None
@@ -132,64 +57,41 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
     """
     with open_shape(path) as (stream, size):
         file = open_gltf(path, stream, size, lambda uri: sides.read(unquote(uri), uri))
-    yield from _Reader(file, sides).parts()
+    for name in file.extensions:
+        if name not in _KNOWN:
+            sides.warnings.append(f"the extension {name[:60]} is not read")
+    if len(file.document.scenes) > 1:
+        sides.warnings.append(f"one of {len(file.document.scenes)} scenes is read")
+    reader, known = _Reader(file, sides), {}
+    nodes = file.placed_nodes()
+    matrices = {index: matrix for _, index, matrix in nodes}
+    for node, _, matrix in nodes:
+        mesh = None if node.mesh is None else file.item("meshes", node.mesh)
+        for number, primitive in enumerate(mesh.primitives if mesh else ()):
+            weights = tuple(node.weights or mesh.weights)
+            key = node.mesh, number, weights
+            if key not in known:
+                known[key] = reader.triangles(primitive, weights)
+            if known[key] is not None:
+                skinned = node.skin is not None and "JOINTS_0" in primitive.attributes
+                pose = reader.pose(node.skin, primitive, matrices) if skinned else matrix
+                yield _moved(known[key], pose)
 
 
 class _Reader:
     def __init__(self, file: GltfFile, sides: SideFiles) -> None:
         self.file, self.sides, self.warn = file, sides, sides.warnings.append
-        self._surfaces: dict[int | None, _Surface] = {}
-        self._known: dict[tuple, _Triangles | None] = {}
-        self.note([*file.document.extensionsUsed, *file.document.extensionsRequired])
-        self.nodes = file.placed_nodes()
-        self.matrices = {index: matrix for _, index, matrix in self.nodes}
-        if len(file.document.scenes) > 1:
-            self.warn(f"one of {len(file.document.scenes)} scenes is read")
-
-    def note(self, extensions: Iterable[str]) -> None:
-        """Names the extensions that are not read."""
-        for name in extensions:
-            if name not in _KNOWN:
-                self.warn(f"the extension {name[:60]} is not read")
-
-    def parts(self) -> Iterator[Part]:
-        for node, _, matrix in self.nodes:
-            self.note(node.extensions)
-            if node.mesh is None:
-                continue
-            mesh: Mesh = self.file.item("meshes", node.mesh)
-            weights = tuple(node.weights or mesh.weights)
-            for number, primitive in enumerate(mesh.primitives):
-                key = node.mesh, number, weights
-                if key not in self._known:
-                    self._known[key] = self.triangles(primitive, weights)
-                found = self._known[key]
-                if found is None:
-                    continue
-                if node.skin is not None and "JOINTS_0" in primitive.attributes:
-                    yield _moved(found, self.pose(node.skin, primitive, len(found.vertices)))
-                elif _INSTANCES in node.extensions:
-                    for instance in self.instances(node):
-                        yield _moved(found, matrix @ instance)
-                else:
-                    yield _moved(found, matrix)
+        self._looks: dict[int, tuple[Material, TextureInfo | None]] = {}
 
     def triangles(self, primitive: Primitive, weights: tuple[float, ...]) -> _Triangles | None:
         """A primitive with its morph targets; None, and a warning, without triangles."""
-        self.note(primitive.extensions)
         if primitive.mode in _OTHERS:
             self.warn(f"{_OTHERS[primitive.mode]} beside the triangles are left out")
             return None
         if "POSITION" not in primitive.attributes:
             self.warn("a primitive without POSITION is left out")
             return None
-        position = self.file.item("accessors", primitive.attributes["POSITION"])
-        packed = [name for name in PACKED if name in primitive.extensions]
-        if packed and position.bufferView is None and position.sparse is None:
-            raise UserError(
-                f"{self.file.path}: packed by {packed[0]}, which is not read; unpack it first"
-            )
-        count = position.count
+        count = self.file.item("accessors", primitive.attributes["POSITION"]).count
 
         def attribute(name: str, *widths: int) -> np.ndarray | None:
             if name not in primitive.attributes:
@@ -200,8 +102,7 @@ class _Reader:
                 return None
             for weight, target in zip(weights, primitive.targets):
                 if weight and name in target:
-                    at = self.file.declared(target[name], Index, "a morph target")
-                    moves = self.file.values(at)
+                    moves = self.file.values(target[name])
                     if moves.shape != base.shape:
                         raise UserError(f"{self.file.path}: a morph target of another shape")
                     base = base + weight * moves.astype(np.float64)
@@ -215,187 +116,138 @@ class _Reader:
             indices = self.file.values(primitive.indices)[:, 0].astype(np.int64)
         if len(indices) and not 0 <= indices.min() <= indices.max() < count:
             raise UserError(f"{self.file.path}: a face names vertex {indices.max()} of {count}")
-        surface = self.surface(primitive.material)
+        material = info = None
+        opaque = True
+        if primitive.material is not None:
+            if primitive.material not in self._looks:
+                look = self.file.item("materials", primitive.material)
+                self._looks[primitive.material] = self.material(look)
+            material, info = self._looks[primitive.material]
+            opaque = self.file.item("materials", primitive.material).alphaMode == "OPAQUE"
         colors = attribute("COLOR_0", 3, 4)
         if colors is not None:
-            colors = normalised(colors)
-            light = to_display(np.clip(np.nan_to_num(colors[:, :3]), 0, 1))
-            alpha = colors[:, 3:] if not surface.opaque else colors[:, :0]
-            colors = to_rgba8(np.hstack([light, np.clip(alpha, 0, 1)]))
-        return _Triangles(
-            vertices.astype(np.float64),
-            _faces(self.file.path, indices, primitive.mode),
-            surface,
-            attribute("NORMAL", 3),
-            self.uvs(attribute, surface),
-            colors,
-        )
+            colors = np.clip(np.nan_to_num(normalised(colors)), 0, 1)
+            alpha = colors[:, :0] if opaque else colors[:, 3:]
+            colors = to_rgba8(np.hstack([to_display(colors[:, :3]), alpha]))
+        faces, normals = _faces(self.file.path, indices, primitive.mode), attribute("NORMAL", 3)
+        uvs = None if info is None else self.uvs(attribute, info)
+        return _Triangles(vertices.astype(np.float64), faces, material, normals, uvs, colors)
 
-    def uvs(self, attribute, surface: _Surface) -> np.ndarray | None:
-        """The texture coordinates ``[V, 2]`` of a surface, v upwards; None without any."""
-        if surface.info is None or surface.material is None or surface.material.texture is None:
-            return None
-        change = self.file.declared(
-            surface.info.extensions.get("KHR_texture_transform", {}), _Transform, "a texture"
-        )
-        number = surface.info.texCoord if change.texCoord is None else change.texCoord
+    def uvs(self, attribute, info: TextureInfo) -> np.ndarray | None:
+        """The coordinates ``[V, 2]`` of a texture, v upwards; None without any."""
+        change = info.extensions.KHR_texture_transform
+        number = info.texCoord if change.texCoord is None else change.texCoord
         uvs = attribute(f"TEXCOORD_{number}", 2)
         if uvs is None:
             return None
         cos, sin = np.cos(change.rotation), np.sin(change.rotation)
         turn = np.array([[cos, -sin], [sin, cos]])  # of rows
         uvs = (uvs.astype(np.float64) * change.scale) @ turn + change.offset
-        texture = self.file.item("textures", surface.info.index)
-        if texture.sampler is not None:
-            sampler: Sampler = self.file.item("samplers", texture.sampler)
+        sampler = self.file.item("textures", info.index).sampler
+        if sampler is not None:
+            sampler = self.file.item("samplers", sampler)
             outside = (np.abs(uvs - 0.5) > 0.5 + 1e-4).any(0)
             if any(outside & (np.array([sampler.wrapS, sampler.wrapT]) != _REPEAT)):
                 self.warn("a texture that does not repeat is drawn as one that does")
         return uvs * [1, -1] + [0, 1]
 
-    def surface(self, index: int | None) -> _Surface:
-        """A material of the document; without one a grey or the vertices' colours."""
-        if index not in self._surfaces:
-            if index is None:
-                self._surfaces[index] = _Surface(None)
-            else:
-                try:
-                    look = msgspec.json.decode(self.file.item("materials", index), type=_Look)
-                    self._surfaces[index] = self.made(look)
-                except msgspec.ValidationError as error:
-                    self.warn(f"material {index}: {error}")
-                    self._surfaces[index] = _Surface(None)
-        return self._surfaces[index]
-
-    def made(self, look: _Look) -> _Surface:
-        """What a material of the document looks like."""
-        self.note(look.extensions)
-        base = look.pbrMetallicRoughness
-        for name, unread in (
+    def material(self, look: Look) -> tuple[Material, TextureInfo | None]:
+        """What a material of the document looks like, and its texture's coordinates, if any."""
+        base, gloss = look.pbrMetallicRoughness, look.extensions.KHR_materials_pbrSpecularGlossiness
+        for name, info in (
             ("metallicRoughnessTexture", base.metallicRoughnessTexture),
             ("normalTexture", look.normalTexture),
             ("occlusionTexture", look.occlusionTexture),
         ):
-            if unread is not None:
+            if info is not None:
                 self.warn(f"{name} is not drawn")
-        color, info = np.array(base.baseColorFactor), base.baseColorTexture
-        if _GLOSS in look.extensions:
-            gloss = msgspec.convert(look.extensions[_GLOSS], _Gloss)
-            color, texture = self.glossy(gloss)
+        if gloss is not None:  # the older kind, diffuse and specular
+            from trimesh.visual.gloss import specular_to_pbr
+
+            pictures = [
+                self.texture(info)
+                for info in (gloss.diffuseTexture, gloss.specularGlossinessTexture)
+            ]
+            diffuse, specular = (p if p is None else Image.fromarray(p) for p in pictures)
+            found = specular_to_pbr(
+                diffuseFactor=gloss.diffuseFactor,
+                diffuseTexture=diffuse,
+                specularFactor=gloss.specularFactor,
+                glossinessFactor=gloss.glossinessFactor,
+                specularGlossinessTexture=specular,
+            )
+            color = np.array(found.get("baseColorFactor", np.ones(4)))
+            texture = found.get("baseColorTexture")
+            texture = None if texture is None else np.array(texture.convert("RGBA"))
             info = gloss.diffuseTexture or gloss.specularGlossinessTexture
         else:
+            color, info = np.array(base.baseColorFactor), base.baseColorTexture
             texture = self.texture(info)
-        dark = not color[:3].any() or (texture is not None and not texture[..., :3].any())
         if any(look.emissiveFactor):
-            if dark:
-                strong = look.extensions.get("KHR_materials_emissive_strength", {})
-                strength = msgspec.convert(strong, _Strength).emissiveStrength
+            if color[:3].any() and (texture is None or texture[..., :3].any()):
+                self.warn("light of a surface beside its base colour is not drawn")
+            else:
+                strength = look.extensions.KHR_materials_emissive_strength.emissiveStrength
                 color[:3] = np.array(look.emissiveFactor) * strength
                 info, texture = look.emissiveTexture, self.texture(look.emissiveTexture)
+        if look.alphaMode != "BLEND":
+            alpha = color[3] if texture is None else color[3] * texture[..., 3] / 255
+            shown = (alpha >= look.alphaCutoff) | (look.alphaMode == "OPAQUE")
+            if texture is None:
+                color[3] = shown
             else:
-                self.warn("light of a surface beside its base colour is not drawn")
-        if look.alphaMode == "OPAQUE":
-            color[3] = 1.0
-            if texture is not None:
-                texture[..., 3] = 255
-        elif look.alphaMode == "MASK":
-            cut = 255 * look.alphaCutoff
-            if texture is not None:
-                texture[..., 3] = np.where(texture[..., 3] * color[3] >= cut, 255, 0)
-                color[3] = 1.0
-            else:
-                color[3] = float(255 * color[3] >= cut)
-        return _Surface(Material(plain(color), texture), look.alphaMode == "OPAQUE", info)
+                color[3], texture[..., 3] = 1.0, np.where(shown, 255, 0)
+        return Material(plain(color), texture), None if texture is None else info
 
-    def glossy(self, gloss: _Gloss) -> tuple[np.ndarray, np.ndarray | None]:
-        """Colour and texture of a material of the older kind, diffuse and specular."""
-        from trimesh.visual.gloss import specular_to_pbr
-
-        textures = {
-            name: None if texture is None else Image.fromarray(texture)
-            for name, texture in (
-                ("diffuseTexture", self.texture(gloss.diffuseTexture)),
-                ("specularGlossinessTexture", self.texture(gloss.specularGlossinessTexture)),
-            )
-        }
-        found = specular_to_pbr(
-            diffuseFactor=gloss.diffuseFactor,
-            specularFactor=gloss.specularFactor,
-            glossinessFactor=gloss.glossinessFactor,
-            **textures,
-        )
-        picture = found.get("baseColorTexture")
-        texture = None if picture is None else np.array(picture.convert("RGBA"))
-        return np.array(found.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))), texture
-
-    def texture(self, info: _TextureInfo | None) -> np.ndarray | None:
+    def texture(self, info: TextureInfo | None) -> np.ndarray | None:
         """The picture of a texture; None, and a warning, where it cannot be had."""
         if info is None:
             return None
         try:
             texture = self.file.item("textures", info.index)
-            webp = texture.extensions.get("EXT_texture_webp", {})
-            webp = self.file.declared(webp, Texture, "a texture")
-            source = texture.source if webp.source is None else webp.source
+            source = texture.extensions.EXT_texture_webp.source
+            source = texture.source if source is None else source
             if source is None:
-                names = ", ".join(texture.extensions)[:80] or "nothing"
+                names = ", ".join(x for x in self.file.extensions if x in _PICTURES) or "nothing"
                 raise UserError(f"a texture's picture is named by {names}, which is not read")
-            image = self.file.item("images", source)
+            image, name = self.file.item("images", source), f"image {source}"
             if image.bufferView is not None:
-                return self.sides.texture(self.file.view(image.bufferView), f"image {source}")
-            uri = image.uri or ""
-            name = f"image {source}" if uri.startswith("data:") else unquote(uri[:100])
-            return self.sides.texture(self.file.content(uri), name)
+                return self.sides.texture(self.file.view(image.bufferView), name)
+            if not image.uri.startswith("data:"):
+                name = unquote(image.uri[:100])
+            return self.sides.texture(self.file.content(image.uri), name)
         except UserError as error:
             self.warn(str(error))
             return None
 
-    def pose(self, index: int, primitive: Primitive, count: int) -> np.ndarray:
+    def pose(self, index: int, primitive: Primitive, matrices: dict[int, np.ndarray]) -> np.ndarray:
         """``[V, 4, 4]`` the matrices of a skinned primitive's vertices in the scene."""
-        skin = self.file.item("skins", index)
-        missing = [joint for joint in skin.joints if joint not in self.matrices]
-        if missing or not skin.joints:
+        skin, path = self.file.item("skins", index), self.file.path
+        if not skin.joints or not matrices.keys() >= {*skin.joints}:
             self.warn("a skin with joints outside of the scene is not applied")
-            return np.broadcast_to(np.eye(4), (count, 4, 4))
-        joints = np.stack([self.matrices[joint] for joint in skin.joints])
+            return np.eye(4)
+        joints = np.stack([matrices[joint] for joint in skin.joints])
         if skin.inverseBindMatrices is not None:
             inverse = self.file.values(skin.inverseBindMatrices)
             if inverse.shape[1] != 16 or len(inverse) < len(joints):
-                raise UserError(f"{self.file.path}: skin {index} has no matrix for each joint")
+                raise UserError(f"{path}: skin {index} has no matrix for each joint")
             joints = joints @ inverse[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
-        total, sums, number = np.zeros((count, 4, 4)), np.zeros(count), 0
+        count = self.file.item("accessors", primitive.attributes["POSITION"]).count
+        total, sums, number = np.zeros((count, 4, 4)), np.zeros((count, 1, 1)), 0
         while f"JOINTS_{number}" in primitive.attributes:
             chosen, weights = (
                 self.file.values(primitive.attributes.get(f"{name}_{number}", MAX_FILE))
                 for name in ("JOINTS", "WEIGHTS")
             )
-            if not chosen.shape == weights.shape == (count, 4) or chosen.max(initial=0) >= len(
-                joints
-            ):
-                raise UserError(f"{self.file.path}: JOINTS_{number} or WEIGHTS_{number} is false")
+            same = chosen.shape == weights.shape == (count, 4)
+            if not same or chosen.max(initial=0) >= len(joints):
+                raise UserError(f"{path}: JOINTS_{number} or WEIGHTS_{number} is false")
             for column in range(4):
-                total += weights[:, column, None, None] * joints[chosen[:, column].astype(int)]
-                sums += weights[:, column]
+                weight = weights[:, column, None, None]
+                total += weight * joints[chosen[:, column].astype(np.int64)]
+                sums += weight
             number += 1
-        total[sums == 0], sums[sums == 0] = joints[0], 1.0
-        return total / sums[:, None, None]
-
-    def instances(self, node: Node) -> Iterator[np.ndarray]:
-        """The matrices ``[4, 4]`` of a mesh's copies within a node."""
-        given = self.file.declared(node.extensions[_INSTANCES], _Instances, _INSTANCES).attributes
-        still = {
-            "TRANSLATION": (0.0, 0.0, 0.0),
-            "ROTATION": (0.0, 0.0, 0.0, 1.0),
-            "SCALE": (1.0, 1.0, 1.0),
-        }
-        rows = {name: self.file.values(given[name]) for name in still if name in given}
-        count = min(map(len, rows.values()), default=1)
-        for name, values in still.items():
-            rows.setdefault(name, np.tile(values, (count, 1)))
-            if rows[name].shape != (count, len(values)):
-                raise UserError(f"{self.file.path}: {_INSTANCES}: {name} is false")
-        for pose in zip(*(rows[name] for name in still)):
-            yield pose_matrix(*pose)
+        return np.where(sums == 0, joints[0], total / np.where(sums == 0, 1, sums))
 
 
 def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
@@ -415,20 +267,14 @@ def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
 
 def _moved(found: _Triangles, matrix: np.ndarray) -> Part:
     """The part where a matrix ``[4, 4]``, or one for each vertex, puts it."""
-    turn = matrix[..., :3, :3]
-    if matrix.ndim == 2:
-        vertices = found.vertices @ turn.T + matrix[:3, 3]
-        inverse = np.linalg.pinv(turn) if np.isfinite(turn).all() else turn
-        normals = None if found.normals is None else found.normals @ inverse
-    else:
-        vertices = np.einsum("vij,vj->vi", turn, found.vertices) + matrix[:, :3, 3]
-        normals = None if found.normals is None else np.einsum("vij,vj->vi", turn, found.normals)
-    faces = found.faces
+    turn, faces = matrix[..., :3, :3], found.faces
+    vertices = (turn @ found.vertices[..., None])[..., 0] + matrix[..., :3, 3]
+    normals = found.normals
+    if normals is not None and matrix.ndim == 2:
+        normals = normals @ np.linalg.pinv(turn if np.isfinite(turn).all() else np.eye(3))
+    elif normals is not None:
+        normals = (turn @ normals[..., None])[..., 0]
     if np.nansum(np.linalg.det(turn)) < 0:  # mirrored: what was in front is behind
         faces = faces[:, ::-1]
-
-    def corners(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[faces]
-
-    material, colors = found.surface.material, corners(found.colors)
-    return Part(vertices, faces, material, corners(normals), corners(found.uvs), colors)
+    of_corners = (None if x is None else x[faces] for x in (normals, found.uvs, found.colors))
+    return Part(vertices, faces, found.material, *of_corners)

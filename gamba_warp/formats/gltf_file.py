@@ -6,6 +6,7 @@ An index, an offset or a length is checked where it is used: what nothing uses m
 from __future__ import annotations
 
 import base64
+import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -26,12 +27,12 @@ MAX_NODES = 200_000  # of a scene
 PACKED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_EXTENSION = re.compile(rb'"([A-Z]{2,10}_[a-z]\w{1,60})"\s*:')  # some files do not list them
 
 Index = Annotated[int, msgspec.Meta(ge=0, le=MAX_FILE)]
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
-Vec4 = tuple[float, float, float, float]
 _Kind = Literal[5120, 5121, 5122, 5123, 5125, 5126]
+_Vec2, _Vec3 = tuple[float, float], tuple[float, float, float]
+_Vec4 = tuple[float, float, float, float]
 
 
 class _Buffer(msgspec.Struct):
@@ -46,26 +47,19 @@ class _View(msgspec.Struct):
     byteStride: Annotated[int, msgspec.Meta(ge=1, le=252)] | None = None
 
 
-class _SparseIndices(msgspec.Struct):
-    bufferView: Index
-    componentType: Literal[5121, 5123, 5125]
-    byteOffset: Index = 0
-
-
-class _SparseValues(msgspec.Struct):
+class _Rows(msgspec.Struct):
     bufferView: Index
     byteOffset: Index = 0
+    componentType: Literal[5121, 5123, 5125] = 5121
 
 
 class _Sparse(msgspec.Struct):
     count: Index
-    indices: _SparseIndices
-    values: _SparseValues
+    indices: _Rows
+    values: _Rows
 
 
-class Accessor(msgspec.Struct):
-    """The numbers in a view of a buffer."""
-
+class _Accessor(msgspec.Struct):
     count: Index
     componentType: _Kind
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
@@ -82,35 +76,28 @@ class Primitive(msgspec.Struct):
     indices: Index | None = None
     material: Index | None = None
     mode: int = 4
-    targets: list[dict[str, Any]] = []
+    targets: list[dict[str, Index]] = []
     extensions: dict[str, Any] = {}
 
 
-class Mesh(msgspec.Struct):
-    """Primitives with the weights of their morph targets."""
-
+class _Mesh(msgspec.Struct):
     primitives: list[Primitive] = []
     weights: list[float] = []
 
 
-class Node(msgspec.Struct):
-    """A place in the scene, with what stands there."""
-
+class _Node(msgspec.Struct):
     mesh: Index | None = None
     skin: Index | None = None
     children: list[Index] = []
     weights: list[float] = []
     matrix: Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)] | None = None
-    translation: Vec3 = (0.0, 0.0, 0.0)
-    rotation: Vec4 = (0.0, 0.0, 0.0, 1.0)
-    scale: Vec3 = (1.0, 1.0, 1.0)
-    extensions: dict[str, Any] = {}
+    translation: _Vec3 = (0.0, 0.0, 0.0)
+    rotation: _Vec4 = (0.0, 0.0, 0.0, 1.0)
+    scale: _Vec3 = (1.0, 1.0, 1.0)
 
 
-class Skin(msgspec.Struct):
-    """The nodes that move a mesh's vertices."""
-
-    joints: list[Index] = []
+class _Skin(msgspec.Struct):
+    joints: list[Index]
     inverseBindMatrices: Index | None = None
 
 
@@ -118,43 +105,98 @@ class _Scene(msgspec.Struct):
     nodes: list[Index] = []
 
 
-class Texture(msgspec.Struct):
-    """A picture and how it goes on outside of it."""
+class _Webp(msgspec.Struct):
+    source: Index | None = None
 
+
+class _PictureExtensions(msgspec.Struct):
+    EXT_texture_webp: _Webp = msgspec.field(default_factory=_Webp)
+
+
+class _Texture(msgspec.Struct):
     source: Index | None = None
     sampler: Index | None = None
-    extensions: dict[str, Any] = {}
+    extensions: _PictureExtensions = msgspec.field(default_factory=_PictureExtensions)
 
 
-class Picture(msgspec.Struct):
-    """Where the bytes of a picture are."""
-
+class _Picture(msgspec.Struct):
     bufferView: Index | None = None
-    uri: str | None = None
+    uri: str = ""
 
 
-class Sampler(msgspec.Struct):
-    """How a texture goes on outside of its picture."""
-
+class _Sampler(msgspec.Struct):
     wrapS: int = 10497
     wrapT: int = 10497
 
 
-class Document(msgspec.Struct):
-    """What is read of a glTF document; materials are decoded by those who use them."""
+class _Transform(msgspec.Struct):
+    offset: _Vec2 = (0.0, 0.0)
+    rotation: float = 0.0
+    scale: _Vec2 = (1.0, 1.0)
+    texCoord: Index | None = None
 
+
+class _TextureExtensions(msgspec.Struct):
+    KHR_texture_transform: _Transform = msgspec.field(default_factory=_Transform)
+
+
+class TextureInfo(msgspec.Struct):
+    """A texture of a material, and where its coordinates are."""
+
+    index: Index
+    texCoord: Index = 0
+    extensions: _TextureExtensions = msgspec.field(default_factory=_TextureExtensions)
+
+
+class _Roughness(msgspec.Struct):
+    baseColorFactor: _Vec4 = (1.0, 1.0, 1.0, 1.0)
+    baseColorTexture: TextureInfo | None = None
+    metallicRoughnessTexture: TextureInfo | None = None
+
+
+class _Gloss(msgspec.Struct):
+    diffuseFactor: _Vec4 = (1.0, 1.0, 1.0, 1.0)
+    diffuseTexture: TextureInfo | None = None
+    specularFactor: _Vec3 = (1.0, 1.0, 1.0)
+    glossinessFactor: float = 1.0
+    specularGlossinessTexture: TextureInfo | None = None
+
+
+class _Strength(msgspec.Struct):
+    emissiveStrength: float = 1.0
+
+
+class _LookExtensions(msgspec.Struct):
+    KHR_materials_pbrSpecularGlossiness: _Gloss | None = None
+    KHR_materials_emissive_strength: _Strength = msgspec.field(default_factory=_Strength)
+
+
+class Look(msgspec.Struct):
+    """A material of the document."""
+
+    pbrMetallicRoughness: _Roughness = msgspec.field(default_factory=_Roughness)
+    emissiveFactor: _Vec3 = (0.0, 0.0, 0.0)
+    emissiveTexture: TextureInfo | None = None
+    normalTexture: TextureInfo | None = None
+    occlusionTexture: TextureInfo | None = None
+    alphaMode: str = "OPAQUE"
+    alphaCutoff: float = 0.5
+    extensions: _LookExtensions = msgspec.field(default_factory=_LookExtensions)
+
+
+class _Document(msgspec.Struct):
     buffers: list[_Buffer] = []
     bufferViews: list[_View] = []
-    accessors: list[Accessor] = []
-    meshes: list[Mesh] = []
-    nodes: list[Node] = []
-    skins: list[Skin] = []
+    accessors: list[_Accessor] = []
+    meshes: list[_Mesh] = []
+    nodes: list[_Node] = []
+    skins: list[_Skin] = []
     scenes: list[_Scene] = []
-    scene: Index | None = None
-    materials: list[msgspec.Raw] = []
-    textures: list[Texture] = []
-    images: list[Picture] = []
-    samplers: list[Sampler] = []
+    scene: Index = 0
+    materials: list[Look] = []
+    textures: list[_Texture] = []
+    images: list[_Picture] = []
+    samplers: list[_Sampler] = []
     extensionsUsed: list[str] = []
     extensionsRequired: list[str] = []
 
@@ -170,14 +212,16 @@ class GltfFile:
     Attributes:
         path: named in errors.
         document: what the file says.
+        extensions: the names of all that the document has anywhere.
         binary: the binary chunk of a ``.glb``, or None.
         side_file: reads what an URI names. Raises UserError.
     """
 
     path: Path
-    document: Document
-    binary: bytes | None = None
-    side_file: Callable[[str], bytes] = _no_side_file
+    document: _Document
+    extensions: list[str]
+    binary: bytes | None
+    side_file: Callable[[str], bytes]
     _buffers: dict[int, bytes] = field(default_factory=dict)
 
     def item(self, what: str, index: int) -> Any:
@@ -186,13 +230,6 @@ class GltfFile:
         if index >= len(items):
             raise UserError(f"{self.path}: broken header ({what}[{index}] of {len(items)})")
         return items[index]
-
-    def declared(self, value: Any, kind: Any, where: str) -> Any:
-        """A part of the document as a declared type. Raises UserError where it is not of it."""
-        try:
-            return msgspec.convert(value, kind)
-        except msgspec.ValidationError as error:
-            raise UserError(f"{self.path}: {where}: {error}") from error
 
     def content(self, uri: str) -> bytes:
         """The bytes that an URI holds itself, or names. Raises UserError."""
@@ -207,29 +244,34 @@ class GltfFile:
     def view(self, index: int) -> memoryview:
         """The bytes of a view. Raises UserError where its buffer has less."""
         view = self.item("bufferViews", index)
-        buffer = self.item("buffers", view.buffer)
         if view.buffer not in self._buffers:
-            self._buffers[view.buffer] = self._buffer_bytes(view.buffer, buffer)
-        there = buffer.byteLength - view.byteOffset
+            self._buffers[view.buffer] = self._buffer_bytes(view.buffer)
+        there = self.item("buffers", view.buffer).byteLength - view.byteOffset
         says = f"the bytes of view {index}"
         compare_sizes(self.path, says, view.byteLength, there, exact=False)
         data = memoryview(self._buffers[view.buffer])
         return data[view.byteOffset : view.byteOffset + view.byteLength]
 
-    def _buffer_bytes(self, index: int, buffer: _Buffer) -> bytes:
+    def _buffer_bytes(self, index: int) -> bytes:
+        buffer, data = self.item("buffers", index), self.binary
         if buffer.uri is not None:
             try:
                 data = self.content(buffer.uri)
             except UserError as error:
                 raise UserError(f"{self.path}: buffer {index}: {error}") from error
-        elif index == 0 and self.binary is not None:
-            data = self.binary
-        else:
-            packed = [name for name in PACKED if name in self.document.extensionsUsed]
-            reason = f", packed by {packed[0]}, which is not read" if packed else ""
-            raise UserError(f"{self.path}: buffer {index} has no bytes{reason}")
+        elif index > 0 or data is None:
+            self.refuse_packed()
+            raise UserError(f"{self.path}: buffer {index} has no bytes")
         compare_sizes(self.path, f"buffer {index}", buffer.byteLength, len(data), exact=False)
         return data
+
+    def refuse_packed(self) -> None:
+        """Raises UserError where the document has an extension that packs triangles."""
+        for name in self.extensions:
+            if name in PACKED:
+                raise UserError(
+                    f"{self.path}: packed by {name}, which is not read; unpack it first"
+                )
 
     def values(self, index: int) -> np.ndarray:
         """``[N, C]`` the numbers of an accessor, as they are stored; float64 if normalised.
@@ -239,38 +281,33 @@ class GltfFile:
         """
         accessor = self.item("accessors", index)
         kind, says = np.dtype(_KINDS[accessor.componentType]), f"values of accessor {index}"
-        shape = accessor.count, _WIDTHS[accessor.type]
+        shape, sparse = (accessor.count, _WIDTHS[accessor.type]), accessor.sparse
         if accessor.bufferView is None:
+            if sparse is None:
+                self.refuse_packed()
             wanted = kind.itemsize * shape[0] * shape[1]
             compare_sizes(self.path, f"{shape[0]} {says}", wanted, MAX_ZEROS, exact=False)
             rows = np.zeros(shape, kind)
         else:
-            rows = self._rows(accessor.bufferView, accessor.byteOffset, kind, shape, says)
-        if accessor.sparse is not None:
-            count, where, new = (
-                accessor.sparse.count,
-                accessor.sparse.indices,
-                accessor.sparse.values,
-            )
-            at = _KINDS[where.componentType]
-            found = self._rows(where.bufferView, where.byteOffset, at, (count, 1), says)[:, 0]
-            if count and found.max() >= shape[0]:
+            rows = self._rows(accessor, kind, shape, says)
+        if sparse is not None:
+            at = _KINDS[sparse.indices.componentType]
+            found = self._rows(sparse.indices, at, (sparse.count, 1), says)[:, 0]
+            if sparse.count and found.max() >= shape[0]:
                 raise UserError(f"{self.path}: {says}: changes value {found.max()} of {shape[0]}")
             rows = rows.copy()
-            changed = count, shape[1]
-            rows[found] = self._rows(new.bufferView, new.byteOffset, kind, changed, says)
+            rows[found] = self._rows(sparse.values, kind, (sparse.count, shape[1]), says)
         return normalised(rows) if accessor.normalized else rows
 
-    def _rows(
-        self, view: int, offset: int, kind: Any, shape: tuple[int, int], says: str
-    ) -> np.ndarray:
-        data, size = self.view(view), np.dtype(kind).itemsize
-        step = self.item("bufferViews", view).byteStride or size * shape[1]
+    def _rows(self, source: Any, kind: Any, shape: tuple[int, int], says: str) -> np.ndarray:
+        data, size = self.view(source.bufferView), np.dtype(kind).itemsize
+        step = self.item("bufferViews", source.bufferView).byteStride or size * shape[1]
         wanted = (shape[0] - 1) * step + size * shape[1] if shape[0] else 0
-        compare_sizes(self.path, f"{shape[0]} {says}", wanted, len(data) - offset, exact=False)
-        return np.ndarray(shape, kind, data, offset, (step, size))
+        there = len(data) - source.byteOffset
+        compare_sizes(self.path, f"{shape[0]} {says}", wanted, there, exact=False)
+        return np.ndarray(shape, kind, data, source.byteOffset, (step, size))
 
-    def placed_nodes(self) -> list[tuple[Node, int, np.ndarray]]:
+    def placed_nodes(self) -> list[tuple[_Node, int, np.ndarray]]:
         """Each node of the scene, its index, and its matrix ``[4, 4]`` in the scene.
 
         Raises:
@@ -278,11 +315,11 @@ class GltfFile:
         """
         document = self.document
         if document.scenes:
-            roots = self.item("scenes", document.scene or 0).nodes
+            roots = self.item("scenes", document.scene).nodes
         else:  # glTF without a scene: all nodes that are no children
             inner = {child for node in document.nodes for child in node.children}
             roots = [index for index in range(len(document.nodes)) if index not in inner]
-        found: list[tuple[Node, int, np.ndarray]] = []
+        found: list[tuple[_Node, int, np.ndarray]] = []
         left = [(root, np.eye(4)) for root in reversed(roots)]
         while left:
             if len(found) + len(left) > MAX_NODES:
@@ -292,7 +329,7 @@ class GltfFile:
             if node.matrix is not None:
                 matrix = above @ np.array(node.matrix).reshape(4, 4).T
             else:
-                matrix = above @ pose_matrix(node.translation, node.rotation, node.scale)
+                matrix = above @ _pose(node.translation, node.rotation, node.scale)
             found.append((node, index, matrix))
             left += [(child, matrix) for child in reversed(node.children)]
         return found
@@ -305,30 +342,28 @@ def normalised(values: np.ndarray) -> np.ndarray:
     return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
 
 
-def pose_matrix(
-    translation: Sequence[float], rotation: Sequence[float], scale: Sequence[float]
-) -> np.ndarray:
+def _pose(move: Sequence[float], rotation: Sequence[float], scale: Sequence[float]) -> np.ndarray:
     """``[4, 4]`` that scales, then turns by a quaternion xyzw of any length, then moves."""
     matrix = np.eye(4)
-    length = sum(float(part) ** 2 for part in rotation)
-    x, y, z, w = (float(part) / np.sqrt(length or 1.0) for part in rotation)
+    length = sum(part**2 for part in rotation) ** 0.5
+    x, y, z, w = (part / (length or 1.0) for part in rotation)
     matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     matrix[:3, :3] *= scale
-    matrix[:3, 3] = translation
+    matrix[:3, 3] = move
     return matrix
 
 
 def open_gltf(
     path: Path, file: BinaryIO, size: int, side_file: Callable[[str], bytes] = _no_side_file
 ) -> GltfFile:
-    """Reads the document of a ``.glb`` or ``.gltf`` file, and the first binary chunk.
+    """Reads the document of a glTF file, and its first binary chunk.
 
     Args:
-        path: its suffix says which of both it is.
+        path: if its suffix is ``.gltf``, the file is a document; else a container of one.
         file: at its start.
         size: of the file, bytes.
         side_file: reads what an URI names.
@@ -338,13 +373,15 @@ def open_gltf(
             an extension that packs triangles.
     """
     text, binary = file.read(), None
-    if path.suffix.lower() == ".glb":
+    if path.suffix.lower() != ".gltf":
         text, binary = _chunks(path, text, size)
-    document = parse_document(text, Document, str(path))
-    for name in PACKED:
-        if name in document.extensionsRequired:
-            raise UserError(f"{path}: packed by {name}, which is not read; unpack it first")
-    return GltfFile(path, document, binary, side_file)
+    document = parse_document(text, _Document, str(path))
+    names = [name.decode("ascii", "replace") for name in _EXTENSION.findall(text)]
+    names = list(dict.fromkeys([*document.extensionsUsed, *document.extensionsRequired, *names]))
+    gltf = GltfFile(path, document, names, binary, side_file)
+    if {*PACKED} & {*document.extensionsRequired}:
+        gltf.refuse_packed()
+    return gltf
 
 
 def _chunks(path: Path, data: bytes, size: int) -> tuple[bytes, bytes]:

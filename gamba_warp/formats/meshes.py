@@ -111,13 +111,13 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
     parts, materials, ids, count = [], [], {}, 0
     try:
         for part in _READERS[path.suffix.lower()](path, sides):
-            if not len(part.faces):
-                continue
             count += len(part.faces) + len(part.vertices)  # a scene may hold one part many times
             if count > MAX_PARTS:
                 raise UserError(
                     f"{path}: over {MAX_PARTS} vertices and faces, the limit for a mesh"
                 )
+            if not len(part.faces):
+                continue
             arrays, material = _flatten(part, sides, normals)
             number = ids.setdefault(id(material), len(materials))
             if number == len(materials):
