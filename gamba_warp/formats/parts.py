@@ -69,7 +69,7 @@ def cut_polygons(
         lengths: ``[P]``, the number of corners of each polygon.
 
     Returns:
-        ``[F, 3]`` int64 places in ``corners``.
+        ``[F, 3]`` int64, places in ``corners``.
 
     Raises:
         UserError: a corner is not the number of a point.
@@ -77,7 +77,7 @@ def cut_polygons(
     bad = ~((corners >= 0) & (corners < len(points)) & (corners == np.rint(corners)))
     if bad.any():
         raise UserError(f"{sides.path}: a face names vertex {corners[bad][0]} of {len(points)}")
-    first = np.cumsum(lengths) - lengths
+    corners, first = corners.astype(np.int64), np.cumsum(lengths) - lengths
     first, lengths = first[lengths >= 3], lengths[lengths >= 3]
     counts = lengths - 2
     step = spread(np.zeros_like(counts), counts)[:, None]

@@ -21,8 +21,8 @@ _FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute"
 def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
     """Yields the one part of a file; its faces have corners of their own.
 
-    A file is text if it begins with "solid", has a facet, and is not as long as the binary file
-    that it would be.
+    A file is text if it begins with "solid", has no zero bytes there, and is not as long as the
+    binary file that it would be.
 
     Raises:
         UserError: it holds less than it says, or a word is no number.
@@ -31,7 +31,7 @@ def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
         data = file.read()
     count = struct.unpack_from("<I", data, 80)[0] if size >= _HEAD else -1
     start = data[: 1 << 12].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
-    if size != _HEAD + 50 * count and start.startswith(b"solid") and b"facet" in start:
+    if size != _HEAD + 50 * count and start.startswith(b"solid") and b"\0" not in start:
         corners = _text_corners(path, data)
     else:
         if size < _HEAD:

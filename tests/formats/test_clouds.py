@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from helpers.refusals import refused
 
-from gamba_warp.errors import UserError
 from gamba_warp.formats.clouds import read_cloud
 from gamba_warp.formats.ply_data import read_ply
 from gamba_warp.versions import import_open3d
