@@ -59,9 +59,10 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
         file = open_gltf(path, stream, size, lambda uri: sides.read(unquote(uri), uri))
     for name in file.extensions:
         if name not in _KNOWN:
-            sides.warnings.append(f"the extension {name[:60]} is not read")
+            warn = sides.warnings.append if name.startswith("KHR_materials") else sides.omit
+            warn(f"the extension {name[:60]} is not read")
     if len(file.document.scenes) > 1:
-        sides.warnings.append(f"one of {len(file.document.scenes)} scenes is read")
+        sides.omit(f"one of {len(file.document.scenes)} scenes is read")
     reader, known = _Reader(file, sides), {}
     nodes = file.placed_nodes()
     matrices = {index: matrix for _, index, matrix in nodes}
@@ -86,10 +87,10 @@ class _Reader:
     def triangles(self, primitive: Primitive, weights: tuple[float, ...]) -> _Triangles | None:
         """A primitive with its morph targets; None, and a warning, without triangles."""
         if primitive.mode in _OTHERS:
-            self.warn(f"{_OTHERS[primitive.mode]} beside the triangles are left out")
+            self.sides.omit(f"{_OTHERS[primitive.mode]} beside the triangles are left out")
             return None
         if "POSITION" not in primitive.attributes:
-            self.warn("a primitive without POSITION is left out")
+            self.sides.omit("a primitive without POSITION is left out")
             return None
         count = self.file.item("accessors", primitive.attributes["POSITION"]).count
 
@@ -224,7 +225,7 @@ class _Reader:
         """``[V, 4, 4]`` the matrices of a skinned primitive's vertices in the scene."""
         skin, path = self.file.item("skins", index), self.file.path
         if not skin.joints or not matrices.keys() >= {*skin.joints}:
-            self.warn("a skin with joints outside of the scene is not applied")
+            self.sides.omit("a skin with joints outside of the scene is not applied")
             return np.eye(4)
         joints = np.stack([matrices[joint] for joint in skin.joints])
         if skin.inverseBindMatrices is not None:

@@ -69,14 +69,21 @@ class SideFiles:
     Attributes:
         path: the mesh's file.
         warnings: what was missing, not fit to be read or not understood, one line each.
+        omitted: those of the warnings that speak of the shape.
         left: bytes that side files may still have.
         texels: bytes that textures may still take.
     """
 
     path: Path
     warnings: list[str] = field(default_factory=list)
+    omitted: list[str] = field(default_factory=list)
     left: int = MAX_SIDE_FILES
     texels: int = MAX_SIDE_FILES
+
+    def omit(self, what: str) -> None:
+        """Warns of what is not read and changes the shape."""
+        self.warnings.append(what)
+        self.omitted.append(what)
 
     def read(self, *names: str) -> bytes:
         """What the first of these files that is there holds.

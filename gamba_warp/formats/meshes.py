@@ -44,7 +44,8 @@ class TexturedMesh:
         colors: ``[F, 3, 4]`` uint8 display RGBA; white where a face has none.
         material_ids: ``[F]`` int64 into ``materials``.
         materials: at least one.
-        warnings: what was missing and replaced, one line each.
+        warnings: what was missing and replaced, or is not read, one line each.
+        omitted: those of the warnings that speak of the shape.
     """
 
     vertices: np.ndarray
@@ -55,6 +56,7 @@ class TexturedMesh:
     material_ids: np.ndarray
     materials: list[Material]
     warnings: list[str] = field(default_factory=list)
+    omitted: list[str] = field(default_factory=list)
 
     def normalized(
         self, up: str = "z", rotation: ArrayLike | None = None
@@ -140,7 +142,8 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
         raise UserError(f"{path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
     if extent <= 0:
         raise UserError(f"{path}: all vertices are one point")
-    return TexturedMesh(**joined, materials=materials, warnings=list(dict.fromkeys(sides.warnings)))
+    told = (list(dict.fromkeys(lines)) for lines in (sides.warnings, sides.omitted))
+    return TexturedMesh(*joined.values(), materials, *told)
 
 
 def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Material]:

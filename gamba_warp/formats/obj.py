@@ -32,7 +32,8 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
         text = file.read().removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ")
     text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ")
     found = _Statements(path, text)
-    sides.warnings += [f"the statement {word} is not read" for word in sorted(found.unread)[:9]]
+    for word in sorted(found.unread)[:9]:
+        sides.omit(f"the statement {word} is not read")
     if b"#MRGB" in text:
         sides.warnings.append("the colours of ZBrush (#MRGB) are not read")
     points = np.array(found.points).reshape(-1, 3)

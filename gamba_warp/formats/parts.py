@@ -101,7 +101,7 @@ def cut_polygons(
     for index in np.flatnonzero(np.logical_or.reduceat(turns < -STRAIGHT, begins)):
         work -= (lengths[index] + 30) ** 2
         if work < 0:
-            sides.warnings.append("polygons that are not convex are too many: some are false")
+            sides.omit("polygons that are not convex are too many: some are false")
             break
         start, count = begins[index], lengths[index]
         ears = _ears(places[start : start + count], normals[index])

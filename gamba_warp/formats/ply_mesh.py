@@ -34,7 +34,7 @@ def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
         raise UserError(f"{path}: its vertices have no x, y and z, or its faces no indices")
     for name in data.elements:
         if name not in ("vertex", "face"):
-            sides.warnings.append(f"the element {name[:60]} is not read")
+            sides.omit(f"the element {name[:60]} is not read")
     given, lengths = lists[0]
     places = cut_polygons(sides, points, given, lengths)
     corners = given.astype(np.int64)[places]

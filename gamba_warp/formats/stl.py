@@ -39,7 +39,7 @@ def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
         compare_sizes(path, f"{count} faces", 50 * count, size - _HEAD, exact=False)
         behind = size - _HEAD - 50 * count
         if behind:
-            sides.warnings.append(f"{behind} bytes behind the faces are left out")
+            sides.omit(f"{behind} bytes behind the faces are left out")
         faces = np.frombuffer(data, _FACE, count, _HEAD)
         if b"COLOR=" in data[:80] or (faces["attribute"] & 0x8000).any():
             sides.warnings.append("the colours of an .stl file are not read")
