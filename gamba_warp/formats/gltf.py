@@ -14,20 +14,23 @@ import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from .gltf_file import PACKED, GltfFile, Look, Primitive, TextureInfo, normalised, open_gltf
-from .headers import MAX_FILE, open_shape
+from .gltf_file import PACKED, Entry, GltfFile, Index, Vec2, Vec3, Vec4, normalised, open_gltf
+from .headers import open_shape
 from .materials import Material, SideFiles, plain, to_display
 from .parts import Part, to_rgba8
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _OTHERS = {0: "points", 1: "lines", 2: "a line loop", 3: "a line strip"}
 _REPEAT = 10497
+_Weights = tuple[float, ...]
+_WHITE = (1.0, 1.0, 1.0, 1.0)
+_GLOSS = "KHR_materials_pbrSpecularGlossiness"
 _PICTURES = ("EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds")
 # Extensions that are read, change neither shape nor colours, or are spoken of where they are used.
 _KNOWN = {
     *("EXT_lights_image_based", "EXT_texture_webp", "FB_ngon_encoding", "KHR_lights_punctual"),
     *("KHR_animation_pointer", "KHR_materials_emissive_strength", "KHR_materials_ior"),
-    *("KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit", "KHR_materials_variants"),
+    *(_GLOSS, "KHR_materials_unlit", "KHR_materials_variants"),
     *("KHR_mesh_quantization", "KHR_texture_transform", "KHR_xmp", "KHR_xmp_json_ld"),
     *(*_PICTURES, *PACKED),
 }
@@ -61,49 +64,54 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
         if name not in _KNOWN:
             warn = sides.warnings.append if name.startswith("KHR_materials") else sides.omit
             warn(f"the extension {name[:60]} is not read")
-    if len(file.document.scenes) > 1:
-        sides.omit(f"one of {len(file.document.scenes)} scenes is read")
+    scenes = len(file.document.entries("scenes"))
+    if scenes > 1:
+        sides.omit(f"one of {scenes} scenes is read")
     reader, known = _Reader(file, sides), {}
     nodes = file.placed_nodes()
     matrices = {index: matrix for _, index, matrix in nodes}
     for node, _, matrix in nodes:
-        mesh = None if node.mesh is None else file.item("meshes", node.mesh)
-        for number, primitive in enumerate(mesh.primitives if mesh else ()):
-            weights = tuple(node.weights or mesh.weights)
-            key = node.mesh, number, weights
+        index, skin = node.get("mesh", Index), node.get("skin", Index)
+        if index is None:
+            continue
+        mesh = file.item("meshes", index)
+        weights = node.get("weights", _Weights, mesh.get("weights", _Weights, ()))
+        for number, primitive in enumerate(mesh.entries("primitives")):
+            key = index, number, weights
             if key not in known:
                 known[key] = reader.triangles(primitive, weights)
             if known[key] is not None:
-                skinned = node.skin is not None and "JOINTS_0" in primitive.attributes
-                pose = reader.pose(node.skin, primitive, matrices) if skinned else matrix
+                skinned = skin is not None and "JOINTS_0" in primitive.entry("attributes").values
+                pose = reader.pose(skin, primitive, matrices) if skinned else matrix
                 yield _moved(known[key], pose)
 
 
 class _Reader:
     def __init__(self, file: GltfFile, sides: SideFiles) -> None:
         self.file, self.sides, self.warn = file, sides, sides.warnings.append
-        self._looks: dict[int, tuple[Material, TextureInfo | None]] = {}
+        self._looks: dict[int, tuple[Material, Entry]] = {}
 
-    def triangles(self, primitive: Primitive, weights: tuple[float, ...]) -> _Triangles | None:
+    def triangles(self, primitive: Entry, weights: _Weights) -> _Triangles | None:
         """A primitive with its morph targets; None, and a warning, without triangles."""
-        if primitive.mode in _OTHERS:
-            self.sides.omit(f"{_OTHERS[primitive.mode]} beside the triangles are left out")
+        mode, given = primitive.get("mode", int, _TRIANGLES), primitive.entry("attributes")
+        if mode in _OTHERS:
+            self.sides.omit(f"{_OTHERS[mode]} beside the triangles are left out")
             return None
-        if "POSITION" not in primitive.attributes:
+        if "POSITION" not in given.values:
             self.sides.omit("a primitive without POSITION is left out")
             return None
-        count = self.file.item("accessors", primitive.attributes["POSITION"]).count
+        count = self.file.item("accessors", given.need("POSITION", Index)).need("count", Index)
 
         def attribute(name: str, *widths: int) -> np.ndarray | None:
-            if name not in primitive.attributes:
+            if name not in given.values:
                 return None
-            base = self.file.values(primitive.attributes[name])
+            base = self.file.values(given.need(name, Index))
             if base.shape[1] not in widths or len(base) != count:
                 self.warn(f"{name} of {len(base)} x {base.shape[1]} numbers is left out")
                 return None
-            for weight, target in zip(weights, primitive.targets):
-                if weight and name in target:
-                    moves = self.file.values(target[name])
+            for weight, target in zip(weights, primitive.entries("targets")):
+                if weight and name in target.values:
+                    moves = self.file.values(target.need(name, Index))
                     if moves.shape != base.shape:
                         raise UserError(f"{self.file.path}: a morph target of another shape")
                     base = base + weight * moves.astype(np.float64)
@@ -113,131 +121,136 @@ class _Reader:
         if vertices is None:
             raise UserError(f"{self.file.path}: vertices are not of 3 numbers")
         indices = np.arange(count)
-        if primitive.indices is not None:
-            indices = self.file.values(primitive.indices)[:, 0].astype(np.int64)
+        if "indices" in primitive.values:
+            indices = self.file.values(primitive.need("indices", Index))[:, 0].astype(np.int64)
         if len(indices) and not 0 <= indices.min() <= indices.max() < count:
             raise UserError(f"{self.file.path}: a face names vertex {indices.max()} of {count}")
-        material = info = None
-        opaque = True
-        if primitive.material is not None:
-            if primitive.material not in self._looks:
-                look = self.file.item("materials", primitive.material)
-                self._looks[primitive.material] = self.material(look)
-            material, info = self._looks[primitive.material]
-            opaque = self.file.item("materials", primitive.material).alphaMode == "OPAQUE"
+        material, opaque, uvs = None, True, None
+        if (index := primitive.get("material", Index)) is not None:
+            look = self.file.item("materials", index)
+            opaque = look.get("alphaMode", str, "OPAQUE") == "OPAQUE"
+            if index not in self._looks:
+                self._looks[index] = self.material(look)
+            material, info = self._looks[index]
+            uvs = None if material.texture is None else self.uvs(attribute, info)
         colors = attribute("COLOR_0", 3, 4)
         if colors is not None:
             colors = np.clip(np.nan_to_num(normalised(colors)), 0, 1)
             alpha = colors[:, :0] if opaque else colors[:, 3:]
             colors = to_rgba8(np.hstack([to_display(colors[:, :3]), alpha]))
-        faces, normals = _faces(self.file.path, indices, primitive.mode), attribute("NORMAL", 3)
-        uvs = None if info is None else self.uvs(attribute, info)
+        faces, normals = _faces(self.file.path, indices, mode), attribute("NORMAL", 3)
         return _Triangles(vertices.astype(np.float64), faces, material, normals, uvs, colors)
 
-    def uvs(self, attribute, info: TextureInfo) -> np.ndarray | None:
+    def uvs(self, attribute, info: Entry) -> np.ndarray | None:
         """The coordinates ``[V, 2]`` of a texture, v upwards; None without any."""
-        change = info.extensions.KHR_texture_transform
-        number = info.texCoord if change.texCoord is None else change.texCoord
+        change = info.entry("extensions").entry("KHR_texture_transform")
+        number = change.get("texCoord", Index, info.get("texCoord", Index, 0))
         uvs = attribute(f"TEXCOORD_{number}", 2)
         if uvs is None:
             return None
-        cos, sin = np.cos(change.rotation), np.sin(change.rotation)
+        rotation = change.get("rotation", float, 0.0)
+        cos, sin = np.cos(rotation), np.sin(rotation)
         turn = np.array([[cos, -sin], [sin, cos]])  # of rows
-        uvs = (uvs.astype(np.float64) * change.scale) @ turn + change.offset
-        sampler = self.file.item("textures", info.index).sampler
+        uvs = (uvs.astype(np.float64) * change.get("scale", Vec2, (1.0, 1.0))) @ turn
+        uvs += change.get("offset", Vec2, (0.0, 0.0))
+        sampler = self.file.item("textures", info.need("index", Index)).get("sampler", Index)
         if sampler is not None:
             sampler = self.file.item("samplers", sampler)
+            wraps = np.array([sampler.get(name, int, _REPEAT) for name in ("wrapS", "wrapT")])
             outside = (np.abs(uvs - 0.5) > 0.5 + 1e-4).any(0)
-            if any(outside & (np.array([sampler.wrapS, sampler.wrapT]) != _REPEAT)):
+            if any(outside & (wraps != _REPEAT)):
                 self.warn("a texture that does not repeat is drawn as one that does")
         return uvs * [1, -1] + [0, 1]
 
-    def material(self, look: Look) -> tuple[Material, TextureInfo | None]:
-        """What a material of the document looks like, and its texture's coordinates, if any."""
-        base, gloss = look.pbrMetallicRoughness, look.extensions.KHR_materials_pbrSpecularGlossiness
-        for name, info in (
-            ("metallicRoughnessTexture", base.metallicRoughnessTexture),
-            ("normalTexture", look.normalTexture),
-            ("occlusionTexture", look.occlusionTexture),
+    def material(self, look: Entry) -> tuple[Material, Entry]:
+        """What a material of the document looks like, and where it names its texture."""
+        base, more = look.entry("pbrMetallicRoughness"), look.entry("extensions")
+        for source, name in (
+            *((look, "normalTexture"), (look, "occlusionTexture")),
+            (base, "metallicRoughnessTexture"),
         ):
-            if info is not None:
+            if name in source.values:
                 self.warn(f"{name} is not drawn")
-        if gloss is not None:  # the older kind, diffuse and specular
-            from trimesh.visual.gloss import specular_to_pbr
-
-            pictures = [
-                self.texture(info)
-                for info in (gloss.diffuseTexture, gloss.specularGlossinessTexture)
-            ]
-            diffuse, specular = (p if p is None else Image.fromarray(p) for p in pictures)
-            found = specular_to_pbr(
-                diffuseFactor=gloss.diffuseFactor,
-                diffuseTexture=diffuse,
-                specularFactor=gloss.specularFactor,
-                glossinessFactor=gloss.glossinessFactor,
-                specularGlossinessTexture=specular,
-            )
-            color = np.array(found.get("baseColorFactor", np.ones(4)))
-            texture = found.get("baseColorTexture")
-            texture = None if texture is None else np.array(texture.convert("RGBA"))
-            info = gloss.diffuseTexture or gloss.specularGlossinessTexture
+        if _GLOSS in more.values:
+            color, texture, info = self.glossy(more.entry(_GLOSS))
         else:
-            color, info = np.array(base.baseColorFactor), base.baseColorTexture
-            texture = self.texture(info)
-        if any(look.emissiveFactor):
+            color, info = base.get("baseColorFactor", Vec4, _WHITE), base.entry("baseColorTexture")
+            color, texture = np.array(color), self.texture(info)
+        light = np.array(look.get("emissiveFactor", Vec3, (0.0, 0.0, 0.0)))
+        if light.any():
             if color[:3].any() and (texture is None or texture[..., :3].any()):
                 self.warn("light of a surface beside its base colour is not drawn")
             else:
-                strength = look.extensions.KHR_materials_emissive_strength.emissiveStrength
-                color[:3] = np.array(look.emissiveFactor) * strength
-                info, texture = look.emissiveTexture, self.texture(look.emissiveTexture)
-        if look.alphaMode != "BLEND":
+                strength = more.entry("KHR_materials_emissive_strength")
+                color[:3] = light * strength.get("emissiveStrength", float, 1.0)
+                info = look.entry("emissiveTexture")
+                texture = self.texture(info)
+        mode = look.get("alphaMode", str, "OPAQUE")
+        if mode != "BLEND":
             alpha = color[3] if texture is None else color[3] * texture[..., 3] / 255
-            shown = (alpha >= look.alphaCutoff) | (look.alphaMode == "OPAQUE")
+            shown = (alpha >= look.get("alphaCutoff", float, 0.5)) | (mode == "OPAQUE")
             if texture is None:
                 color[3] = shown
             else:
                 color[3], texture[..., 3] = 1.0, np.where(shown, 255, 0)
-        return Material(plain(color), texture), None if texture is None else info
+        return Material(plain(color), texture), info
 
-    def texture(self, info: TextureInfo | None) -> np.ndarray | None:
+    def glossy(self, gloss: Entry) -> tuple[np.ndarray, np.ndarray | None, Entry]:
+        """Colour and texture of a material of the older kind, diffuse and specular."""
+        from trimesh.visual.gloss import specular_to_pbr
+
+        names = ("diffuseTexture", "specularGlossinessTexture")
+        pictures = [(name, self.texture(gloss.entry(name))) for name in names]
+        found = specular_to_pbr(
+            diffuseFactor=gloss.get("diffuseFactor", Vec4, _WHITE),
+            specularFactor=gloss.get("specularFactor", Vec3, _WHITE[:3]),
+            glossinessFactor=gloss.get("glossinessFactor", float, 1.0),
+            **{name: x if x is None else Image.fromarray(x) for name, x in pictures},
+        )
+        texture = found.get("baseColorTexture")
+        texture = None if texture is None else np.array(texture.convert("RGBA"))
+        info = gloss.entry(names["diffuseTexture" not in gloss.values])
+        return np.array(found.get("baseColorFactor", _WHITE)), texture, info
+
+    def texture(self, info: Entry) -> np.ndarray | None:
         """The picture of a texture; None, and a warning, where it cannot be had."""
-        if info is None:
+        if not info.values:
             return None
         try:
-            texture = self.file.item("textures", info.index)
-            source = texture.extensions.EXT_texture_webp.source
-            source = texture.source if source is None else source
+            texture = self.file.item("textures", info.need("index", Index))
+            webp = texture.entry("extensions").entry("EXT_texture_webp")
+            source = webp.get("source", Index, texture.get("source", Index))
             if source is None:
                 names = ", ".join(x for x in self.file.extensions if x in _PICTURES) or "nothing"
                 raise UserError(f"a texture's picture is named by {names}, which is not read")
             image, name = self.file.item("images", source), f"image {source}"
-            if image.bufferView is not None:
-                return self.sides.texture(self.file.view(image.bufferView), name)
-            if not image.uri.startswith("data:"):
-                name = unquote(image.uri[:100])
-            return self.sides.texture(self.file.content(image.uri), name)
+            if (view := image.get("bufferView", Index)) is not None:
+                return self.sides.texture(self.file.view(view), name)
+            uri = image.get("uri", str, "")
+            name = name if uri.startswith("data:") else unquote(uri[:100])
+            return self.sides.texture(self.file.content(uri), name)
         except UserError as error:
             self.warn(str(error))
             return None
 
-    def pose(self, index: int, primitive: Primitive, matrices: dict[int, np.ndarray]) -> np.ndarray:
+    def pose(self, index: int, primitive: Entry, matrices: dict[int, np.ndarray]) -> np.ndarray:
         """``[V, 4, 4]`` the matrices of a skinned primitive's vertices in the scene."""
         skin, path = self.file.item("skins", index), self.file.path
-        if not skin.joints or not matrices.keys() >= {*skin.joints}:
+        chain, given = skin.need("joints", list[Index]), primitive.entry("attributes")
+        if not chain or not matrices.keys() >= {*chain}:
             self.sides.omit("a skin with joints outside of the scene is not applied")
             return np.eye(4)
-        joints = np.stack([matrices[joint] for joint in skin.joints])
-        if skin.inverseBindMatrices is not None:
-            inverse = self.file.values(skin.inverseBindMatrices)
+        joints = np.stack([matrices[joint] for joint in chain])
+        if "inverseBindMatrices" in skin.values:
+            inverse = self.file.values(skin.need("inverseBindMatrices", Index))
             if inverse.shape[1] != 16 or len(inverse) < len(joints):
                 raise UserError(f"{path}: skin {index} has no matrix for each joint")
             joints = joints @ inverse[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
-        count = self.file.item("accessors", primitive.attributes["POSITION"]).count
+        count = len(self.file.values(given.need("POSITION", Index)))
         total, sums, number = np.zeros((count, 4, 4)), np.zeros((count, 1, 1)), 0
-        while f"JOINTS_{number}" in primitive.attributes:
+        while f"JOINTS_{number}" in given.values:
             chosen, weights = (
-                self.file.values(primitive.attributes.get(f"{name}_{number}", MAX_FILE))
+                self.file.values(given.need(f"{name}_{number}", Index))
                 for name in ("JOINTS", "WEIGHTS")
             )
             same = chosen.shape == weights.shape == (count, 4)

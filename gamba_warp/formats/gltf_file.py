@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
@@ -30,175 +30,47 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "
 _EXTENSION = re.compile(rb'"([A-Z]{2,10}_[a-z]\w{1,60})"\s*:')  # some files do not list them
 
 Index = Annotated[int, msgspec.Meta(ge=0, le=MAX_FILE)]
+Vec2, Vec3 = tuple[float, float], tuple[float, float, float]
+Vec4 = tuple[float, float, float, float]
 _Kind = Literal[5120, 5121, 5122, 5123, 5125, 5126]
-_Vec2, _Vec3 = tuple[float, float], tuple[float, float, float]
-_Vec4 = tuple[float, float, float, float]
+_Width = Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+_Stride = Annotated[int, msgspec.Meta(ge=1, le=252)]
+_Matrix = Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)]
 
 
-class _Buffer(msgspec.Struct):
-    byteLength: Index
-    uri: str | None = None
+class Entry:
+    """An object of the document; what nobody asks for may be anything.
 
+    Attributes:
+        where: it stands, for errors.
+        values: by their names, not checked.
+    """
 
-class _View(msgspec.Struct):
-    buffer: Index
-    byteLength: Index
-    byteOffset: Index = 0
-    byteStride: Annotated[int, msgspec.Meta(ge=1, le=252)] | None = None
+    def __init__(self, where: str, values: Any) -> None:
+        if not isinstance(values, dict):
+            raise UserError(f"{where} is not an object")
+        self.where, self.values = where, values
 
+    def get(self, name: str, kind: Any, default: Any = None) -> Any:
+        """A value as a declared type; the default without one. Raises UserError."""
+        value = self.values.get(name)
+        return default if value is None else self.need(name, kind)
 
-class _Rows(msgspec.Struct):
-    bufferView: Index
-    byteOffset: Index = 0
-    componentType: Literal[5121, 5123, 5125] = 5121
+    def need(self, name: str, kind: Any) -> Any:
+        """A value as a declared type. Raises UserError where it is missing or not of it."""
+        try:
+            return msgspec.convert(self.values.get(name), kind)
+        except msgspec.ValidationError as error:
+            raise UserError(f"{self.where}.{name}: {error}") from error
 
+    def entry(self, name: str) -> Entry:
+        """An object in the object, empty without one. Raises UserError."""
+        return Entry(f"{self.where}.{name}", self.values.get(name) or {})
 
-class _Sparse(msgspec.Struct):
-    count: Index
-    indices: _Rows
-    values: _Rows
-
-
-class _Accessor(msgspec.Struct):
-    count: Index
-    componentType: _Kind
-    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
-    bufferView: Index | None = None
-    byteOffset: Index = 0
-    sparse: _Sparse | None = None
-    normalized: bool = False
-
-
-class Primitive(msgspec.Struct):
-    """Triangles, lines or points of one material."""
-
-    attributes: dict[str, Index] = {}
-    indices: Index | None = None
-    material: Index | None = None
-    mode: int = 4
-    targets: list[dict[str, Index]] = []
-    extensions: dict[str, Any] = {}
-
-
-class _Mesh(msgspec.Struct):
-    primitives: list[Primitive] = []
-    weights: list[float] = []
-
-
-class _Node(msgspec.Struct):
-    mesh: Index | None = None
-    skin: Index | None = None
-    children: list[Index] = []
-    weights: list[float] = []
-    matrix: Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)] | None = None
-    translation: _Vec3 = (0.0, 0.0, 0.0)
-    rotation: _Vec4 = (0.0, 0.0, 0.0, 1.0)
-    scale: _Vec3 = (1.0, 1.0, 1.0)
-
-
-class _Skin(msgspec.Struct):
-    joints: list[Index]
-    inverseBindMatrices: Index | None = None
-
-
-class _Scene(msgspec.Struct):
-    nodes: list[Index] = []
-
-
-class _Webp(msgspec.Struct):
-    source: Index | None = None
-
-
-class _PictureExtensions(msgspec.Struct):
-    EXT_texture_webp: _Webp = msgspec.field(default_factory=_Webp)
-
-
-class _Texture(msgspec.Struct):
-    source: Index | None = None
-    sampler: Index | None = None
-    extensions: _PictureExtensions = msgspec.field(default_factory=_PictureExtensions)
-
-
-class _Picture(msgspec.Struct):
-    bufferView: Index | None = None
-    uri: str = ""
-
-
-class _Sampler(msgspec.Struct):
-    wrapS: int = 10497
-    wrapT: int = 10497
-
-
-class _Transform(msgspec.Struct):
-    offset: _Vec2 = (0.0, 0.0)
-    rotation: float = 0.0
-    scale: _Vec2 = (1.0, 1.0)
-    texCoord: Index | None = None
-
-
-class _TextureExtensions(msgspec.Struct):
-    KHR_texture_transform: _Transform = msgspec.field(default_factory=_Transform)
-
-
-class TextureInfo(msgspec.Struct):
-    """A texture of a material, and where its coordinates are."""
-
-    index: Index
-    texCoord: Index = 0
-    extensions: _TextureExtensions = msgspec.field(default_factory=_TextureExtensions)
-
-
-class _Roughness(msgspec.Struct):
-    baseColorFactor: _Vec4 = (1.0, 1.0, 1.0, 1.0)
-    baseColorTexture: TextureInfo | None = None
-    metallicRoughnessTexture: TextureInfo | None = None
-
-
-class _Gloss(msgspec.Struct):
-    diffuseFactor: _Vec4 = (1.0, 1.0, 1.0, 1.0)
-    diffuseTexture: TextureInfo | None = None
-    specularFactor: _Vec3 = (1.0, 1.0, 1.0)
-    glossinessFactor: float = 1.0
-    specularGlossinessTexture: TextureInfo | None = None
-
-
-class _Strength(msgspec.Struct):
-    emissiveStrength: float = 1.0
-
-
-class _LookExtensions(msgspec.Struct):
-    KHR_materials_pbrSpecularGlossiness: _Gloss | None = None
-    KHR_materials_emissive_strength: _Strength = msgspec.field(default_factory=_Strength)
-
-
-class Look(msgspec.Struct):
-    """A material of the document."""
-
-    pbrMetallicRoughness: _Roughness = msgspec.field(default_factory=_Roughness)
-    emissiveFactor: _Vec3 = (0.0, 0.0, 0.0)
-    emissiveTexture: TextureInfo | None = None
-    normalTexture: TextureInfo | None = None
-    occlusionTexture: TextureInfo | None = None
-    alphaMode: str = "OPAQUE"
-    alphaCutoff: float = 0.5
-    extensions: _LookExtensions = msgspec.field(default_factory=_LookExtensions)
-
-
-class _Document(msgspec.Struct):
-    buffers: list[_Buffer] = []
-    bufferViews: list[_View] = []
-    accessors: list[_Accessor] = []
-    meshes: list[_Mesh] = []
-    nodes: list[_Node] = []
-    skins: list[_Skin] = []
-    scenes: list[_Scene] = []
-    scene: Index = 0
-    materials: list[Look] = []
-    textures: list[_Texture] = []
-    images: list[_Picture] = []
-    samplers: list[_Sampler] = []
-    extensionsUsed: list[str] = []
-    extensionsRequired: list[str] = []
+    def entries(self, name: str) -> list[Entry]:
+        """The objects of a list, empty without one. Raises UserError."""
+        items = self.get(name, list, [])
+        return [Entry(f"{self.where}.{name}[{i}]", item) for i, item in enumerate(items)]
 
 
 def _no_side_file(uri: str) -> bytes:
@@ -218,15 +90,18 @@ class GltfFile:
     """
 
     path: Path
-    document: _Document
+    document: Entry
     extensions: list[str]
     binary: bytes | None
     side_file: Callable[[str], bytes]
     _buffers: dict[int, bytes] = field(default_factory=dict)
+    _lists: dict[str, list[Entry]] = field(default_factory=dict)
 
-    def item(self, what: str, index: int) -> Any:
+    def item(self, what: str, index: int) -> Entry:
         """One of the document's lists' entries. Raises UserError where there is none."""
-        items = getattr(self.document, what)
+        if what not in self._lists:
+            self._lists[what] = self.document.entries(what)
+        items = self._lists[what]
         if index >= len(items):
             raise UserError(f"{self.path}: broken header ({what}[{index}] of {len(items)})")
         return items[index]
@@ -244,26 +119,29 @@ class GltfFile:
     def view(self, index: int) -> memoryview:
         """The bytes of a view. Raises UserError where its buffer has less."""
         view = self.item("bufferViews", index)
-        if view.buffer not in self._buffers:
-            self._buffers[view.buffer] = self._buffer_bytes(view.buffer)
-        there = self.item("buffers", view.buffer).byteLength - view.byteOffset
-        says = f"the bytes of view {index}"
-        compare_sizes(self.path, says, view.byteLength, there, exact=False)
-        data = memoryview(self._buffers[view.buffer])
-        return data[view.byteOffset : view.byteOffset + view.byteLength]
+        buffer, length = view.need("buffer", Index), view.need("byteLength", Index)
+        start = view.get("byteOffset", Index, 0)
+        if buffer not in self._buffers:
+            self._buffers[buffer] = self._buffer_bytes(buffer)
+        data = memoryview(self._buffers[buffer])
+        compare_sizes(
+            self.path, f"the bytes of view {index}", length, len(data) - start, exact=False
+        )
+        return data[start : start + length]
 
     def _buffer_bytes(self, index: int) -> bytes:
         buffer, data = self.item("buffers", index), self.binary
-        if buffer.uri is not None:
+        uri, length = buffer.get("uri", str), buffer.need("byteLength", Index)
+        if uri is not None:
             try:
-                data = self.content(buffer.uri)
+                data = self.content(uri)
             except UserError as error:
                 raise UserError(f"{self.path}: buffer {index}: {error}") from error
         elif index > 0 or data is None:
             self.refuse_packed()
             raise UserError(f"{self.path}: buffer {index} has no bytes")
-        compare_sizes(self.path, f"buffer {index}", buffer.byteLength, len(data), exact=False)
-        return data
+        compare_sizes(self.path, f"buffer {index}", length, len(data), exact=False)
+        return data[:length]
 
     def refuse_packed(self) -> None:
         """Raises UserError where the document has an extension that packs triangles."""
@@ -280,58 +158,61 @@ class GltfFile:
             UserError: they are not in the file.
         """
         accessor = self.item("accessors", index)
-        kind, says = np.dtype(_KINDS[accessor.componentType]), f"values of accessor {index}"
-        shape, sparse = (accessor.count, _WIDTHS[accessor.type]), accessor.sparse
-        if accessor.bufferView is None:
-            if sparse is None:
+        kind, says = np.dtype(_KINDS[accessor.need("componentType", _Kind)]), f"accessor {index}"
+        shape = accessor.need("count", Index), _WIDTHS[accessor.need("type", _Width)]
+        sparse = accessor.entry("sparse")
+        if accessor.get("bufferView", Index) is None:
+            if not sparse.values:
                 self.refuse_packed()
             wanted = kind.itemsize * shape[0] * shape[1]
-            compare_sizes(self.path, f"{shape[0]} {says}", wanted, MAX_ZEROS, exact=False)
+            compare_sizes(self.path, f"{shape[0]} values of {says}", wanted, MAX_ZEROS, exact=False)
             rows = np.zeros(shape, kind)
         else:
             rows = self._rows(accessor, kind, shape, says)
-        if sparse is not None:
-            at = _KINDS[sparse.indices.componentType]
-            found = self._rows(sparse.indices, at, (sparse.count, 1), says)[:, 0]
-            if sparse.count and found.max() >= shape[0]:
-                raise UserError(f"{self.path}: {says}: changes value {found.max()} of {shape[0]}")
+        if sparse.values:
+            count, where = sparse.need("count", Index), sparse.entry("indices")
+            at = _KINDS[where.need("componentType", Literal[5121, 5123, 5125])]
+            found = self._rows(where, at, (count, 1), says)[:, 0]
+            if count and found.max() >= shape[0]:
+                raise UserError(f"{self.path}: {says} changes value {found.max()} of {shape[0]}")
             rows = rows.copy()
-            rows[found] = self._rows(sparse.values, kind, (sparse.count, shape[1]), says)
-        return normalised(rows) if accessor.normalized else rows
+            rows[found] = self._rows(sparse.entry("values"), kind, (count, shape[1]), says)
+        return normalised(rows) if accessor.get("normalized", bool) else rows
 
-    def _rows(self, source: Any, kind: Any, shape: tuple[int, int], says: str) -> np.ndarray:
-        data, size = self.view(source.bufferView), np.dtype(kind).itemsize
-        step = self.item("bufferViews", source.bufferView).byteStride or size * shape[1]
+    def _rows(self, source: Entry, kind: Any, shape: tuple[int, int], says: str) -> np.ndarray:
+        index, start = source.need("bufferView", Index), source.get("byteOffset", Index, 0)
+        data, size = self.view(index), np.dtype(kind).itemsize
+        step = self.item("bufferViews", index).get("byteStride", _Stride, size * shape[1])
         wanted = (shape[0] - 1) * step + size * shape[1] if shape[0] else 0
-        there = len(data) - source.byteOffset
-        compare_sizes(self.path, f"{shape[0]} {says}", wanted, there, exact=False)
-        return np.ndarray(shape, kind, data, source.byteOffset, (step, size))
+        says = f"{shape[0]} values of {says}"
+        compare_sizes(self.path, says, wanted, len(data) - start, exact=False)
+        return np.ndarray(shape, kind, data, start, (step, size))
 
-    def placed_nodes(self) -> list[tuple[_Node, int, np.ndarray]]:
+    def placed_nodes(self) -> list[tuple[Entry, int, np.ndarray]]:
         """Each node of the scene, its index, and its matrix ``[4, 4]`` in the scene.
 
         Raises:
             UserError: there are over ``MAX_NODES``, or a node is its own ancestor.
         """
-        document = self.document
-        if document.scenes:
-            roots = self.item("scenes", document.scene).nodes
+        kind = list[Index]
+        if self.document.values.get("scenes"):
+            scene = self.item("scenes", self.document.get("scene", Index, 0))
+            roots = scene.get("nodes", kind, [])
         else:  # glTF without a scene: all nodes that are no children
-            inner = {child for node in document.nodes for child in node.children}
-            roots = [index for index in range(len(document.nodes)) if index not in inner]
-        found: list[tuple[_Node, int, np.ndarray]] = []
+            nodes = self.document.entries("nodes")
+            inner = {child for node in nodes for child in node.get("children", kind, [])}
+            roots = [index for index in range(len(nodes)) if index not in inner]
+        found: list[tuple[Entry, int, np.ndarray]] = []
         left = [(root, np.eye(4)) for root in reversed(roots)]
         while left:
             if len(found) + len(left) > MAX_NODES:
                 raise UserError(f"{self.path}: over {MAX_NODES} nodes, or nodes in a circle")
             index, above = left.pop()
             node = self.item("nodes", index)
-            if node.matrix is not None:
-                matrix = above @ np.array(node.matrix).reshape(4, 4).T
-            else:
-                matrix = above @ _pose(node.translation, node.rotation, node.scale)
+            matrix = node.get("matrix", _Matrix)
+            matrix = above @ (_pose(node) if matrix is None else np.reshape(matrix, (4, 4)).T)
             found.append((node, index, matrix))
-            left += [(child, matrix) for child in reversed(node.children)]
+            left += [(child, matrix) for child in reversed(node.get("children", kind, []))]
         return found
 
 
@@ -342,9 +223,9 @@ def normalised(values: np.ndarray) -> np.ndarray:
     return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
 
 
-def _pose(move: Sequence[float], rotation: Sequence[float], scale: Sequence[float]) -> np.ndarray:
+def _pose(node: Entry) -> np.ndarray:
     """``[4, 4]`` that scales, then turns by a quaternion xyzw of any length, then moves."""
-    matrix = np.eye(4)
+    matrix, rotation = np.eye(4), node.get("rotation", Vec4, (0.0, 0.0, 0.0, 1.0))
     length = sum(part**2 for part in rotation) ** 0.5
     x, y, z, w = (part / (length or 1.0) for part in rotation)
     matrix[:3, :3] = [
@@ -352,8 +233,8 @@ def _pose(move: Sequence[float], rotation: Sequence[float], scale: Sequence[floa
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, :3] *= scale
-    matrix[:3, 3] = move
+    matrix[:3, :3] *= node.get("scale", Vec3, (1.0, 1.0, 1.0))
+    matrix[:3, 3] = node.get("translation", Vec3, (0.0, 0.0, 0.0))
     return matrix
 
 
@@ -375,11 +256,12 @@ def open_gltf(
     text, binary = file.read(), None
     if path.suffix.lower() != ".gltf":
         text, binary = _chunks(path, text, size)
-    document = parse_document(text, _Document, str(path))
+    document = Entry(str(path), parse_document(text, dict[str, Any], str(path)))
+    needed = document.get("extensionsRequired", list[str], [])
     names = [name.decode("ascii", "replace") for name in _EXTENSION.findall(text)]
-    names = list(dict.fromkeys([*document.extensionsUsed, *document.extensionsRequired, *names]))
-    gltf = GltfFile(path, document, names, binary, side_file)
-    if {*PACKED} & {*document.extensionsRequired}:
+    names = dict.fromkeys([*document.get("extensionsUsed", list[str], []), *needed, *names])
+    gltf = GltfFile(path, document, list(names), binary, side_file)
+    if {*PACKED} & {*needed}:
         gltf.refuse_packed()
     return gltf
 

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from ...errors import UserError
 from ...gaussians import SH_C0, Gaussians
-from ..gltf_file import GltfFile, Primitive, open_gltf
+from ..gltf_file import Entry, GltfFile, Index, open_gltf
 from ..headers import open_shape
 from .arrays import flip_axes, sound_gaussians
 from .glb import COLOR_SPACE, EXTENSION, POINTS, harmonic_names
@@ -22,10 +22,15 @@ _STRAIGHT = 1e-4  # how far a node's matrix may be from a rotation times a numbe
 def holds_gaussians(path: Path, file: BinaryIO, size: int) -> bool:
     """Whether a .glb file has a primitive with the extension; False for whatever is damaged."""
     try:
-        meshes = open_gltf(path, file, size).document.meshes
+        meshes = open_gltf(path, file, size).document.entries("meshes")
+        return any(_splats(mesh) for mesh in meshes)
     except UserError:
         return False
-    return any(EXTENSION in p.extensions for mesh in meshes for p in mesh.primitives)
+
+
+def _splats(mesh: Entry) -> list[Entry]:
+    """The primitives of a mesh that have the extension."""
+    return [p for p in mesh.entries("primitives") if EXTENSION in p.entry("extensions").values]
 
 
 def load_glb(path: str | Path) -> Gaussians:
@@ -41,39 +46,42 @@ def load_glb(path: str | Path) -> Gaussians:
         file = open_gltf(path, stream, size)
     parts = []
     for node, _, matrix in file.placed_nodes():
-        primitives = [] if node.mesh is None else file.item("meshes", node.mesh).primitives
-        found = [p for p in primitives if EXTENSION in p.extensions]
+        index = node.get("mesh", Index)
+        found = [] if index is None else _splats(file.item("meshes", index))
         parts += [_moved(path, _primitive(file, primitive), matrix) for primitive in found]
     if not parts:
         raise UserError(f"{path}: no Gaussians in it (no primitive has {EXTENSION})")
     return flip_axes(_joined(parts))
 
 
-def _primitive(file: GltfFile, primitive: Primitive) -> Gaussians:
+def _primitive(file: GltfFile, primitive: Entry) -> Gaussians:
     """The Gaussians of one primitive in its own frame."""
-    path, options = file.path, primitive.extensions[EXTENSION]
-    options = options if isinstance(options, dict) else {}
+    path, options = file.path, primitive.entry("extensions").entry(EXTENSION).values
+    mode, given = primitive.get("mode", int, 4), primitive.entry("attributes")
     if options.get("extensions"):
         names = ", ".join(str(name)[:60] for name in options["extensions"])
         raise UserError(f"{path}: its Gaussians are packed by {names[:200]}, which is not read")
     space, kernel = options.get("colorSpace", COLOR_SPACE), options.get("kernel", "ellipse")
-    if space != COLOR_SPACE or kernel != "ellipse" or primitive.mode != POINTS:
+    if space != COLOR_SPACE or kernel != "ellipse" or mode != POINTS:
         raise UserError(
             f"{path}: Gaussians of colour space {str(space)[:40]!r}, kernel {str(kernel)[:40]!r} "
-            f"and mode {primitive.mode}; only {COLOR_SPACE}, ellipse and {POINTS} are read"
+            f"and mode {mode}; only {COLOR_SPACE}, ellipse and {POINTS} are read"
         )
 
     def read(name: str, width: int) -> np.ndarray:
-        if name not in primitive.attributes:
+        if name not in given.values:
             raise UserError(f"{path}: the Gaussians have no {name}")
-        accessor = file.item("accessors", primitive.attributes[name])
-        values = file.values(primitive.attributes[name])
-        if values.shape[1] != width or accessor.bufferView is None:
-            raise UserError(f"{path}: {name} is of type {accessor.type}, or has no data")
+        index = given.need(name, Index)
+        values = file.values(index)
+        if (
+            values.shape[1] != width
+            or file.item("accessors", index).get("bufferView", Index) is None
+        ):
+            raise UserError(f"{path}: {name} is not of type VEC{width}, or has no data")
         return values.astype(np.float64)
 
     degree = 0
-    while f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in primitive.attributes:
+    while f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in given.values:
         degree += 1
     if degree > 3:
         raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are read")
