@@ -81,8 +81,9 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
             if key not in known:
                 known[key] = reader.triangles(primitive, weights)
             if known[key] is not None:
-                skinned = skin is not None and "JOINTS_0" in primitive.entry("attributes").values
-                pose = reader.pose(skin, primitive, matrices) if skinned else matrix
+                pose = matrix
+                if skin is not None and "JOINTS_0" in primitive.entry("attributes").values:
+                    pose = reader.pose(skin, primitive, matrices)
                 yield _moved(known[key], pose)
 
 

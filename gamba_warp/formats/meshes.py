@@ -143,7 +143,7 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
     if extent <= 0:
         raise UserError(f"{path}: all vertices are one point")
     told = (list(dict.fromkeys(lines)) for lines in (sides.warnings, sides.omitted))
-    return TexturedMesh(*joined.values(), materials, *told)
+    return TexturedMesh(**joined, materials=materials, warnings=next(told), omitted=next(told))
 
 
 def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Material]:
@@ -153,9 +153,9 @@ def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Materia
     faces, vertices = part.faces, part.vertices
     if not used.all():
         faces, vertices = (np.cumsum(used) - 1)[faces], vertices[used]
-    bad = ~np.isfinite(vertices).all(1)
-    if bad.any():
-        raise UserError(f"{sides.path}: {bad.sum()} of {len(bad)} vertices are not finite")
+    bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
+    if bad:
+        raise UserError(f"{sides.path}: {bad} of {len(vertices)} vertices are not finite")
     material, uvs = part.material, part.uvs
     if material is None:
         material = Material(np.ones(4, np.float32))

@@ -73,11 +73,9 @@ def _primitive(file: GltfFile, primitive: Entry) -> Gaussians:
             raise UserError(f"{path}: the Gaussians have no {name}")
         index = given.need(name, Index)
         values = file.values(index)
-        if (
-            values.shape[1] != width
-            or file.item("accessors", index).get("bufferView", Index) is None
-        ):
-            raise UserError(f"{path}: {name} is not of type VEC{width}, or has no data")
+        accessor = file.item("accessors", index).values
+        if values.shape[1] != width or "bufferView" not in accessor:
+            raise UserError(f"{path}: {name} is of type {accessor['type']}, or has no data")
         return values.astype(np.float64)
 
     degree = 0
