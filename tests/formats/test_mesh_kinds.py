@@ -165,8 +165,8 @@ def test_spellings_of_obj(tmp_path, name):
 
 @pytest.mark.parametrize(
     "line",
-    ["v 1 0", "v 1 0 x", "v 1_0 0 0", "f 1 2 0", "f 1 2 +3", "f 1 2 3/", "f 1/2/3/4 2 3", "f /1 2 3",
-     "f 1 2 " + 99 * "1", "vt", "vn 1 2", "f 1 2 3.0", "v 1 0 0\0", "f 1 2 1_0"],
+    ["v 1 0", "v 1 0 x", "v 1_0 0 0", "f 1 2 0", "f 1 2 +3", "f 1 2 3/", "f 1/2/3/4 2 3",
+     "f /1 2 3", "f 1 2 " + 99 * "1", "vt", "vn 1 2", "f 1 2 3.0", "v 1 0 0\0", "f 1 2 1_0"],
 )  # fmt: skip
 def test_lines_of_obj_that_are_none(tmp_path, line):
     if line == "f 1 2 3/":  # without a texture coordinate
@@ -276,7 +276,7 @@ FACET = (
     "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
 )
 SOLIDS = {
-    "facet in the name": f"solid facetted endfacet vertex\n{FACET}endsolid facetted endfacet vertex\n",
+    "facet in the name": f"solid facetted endfacet vertex\n{FACET}endsolid facetted vertex\n",
     "upper case": f"solid a\n{FACET}endsolid a\n".upper(),
     "no name": f"solid\n{FACET}endsolid",
     "CR": f"solid a\n{FACET}endsolid a\n".replace("\n", "\r"),
