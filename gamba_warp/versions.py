@@ -69,7 +69,7 @@ OWN = {
     "import-released": "train",
     "train": "train",
 }
-_SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
+_SHAPES = ("kornia", "manifold3d", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
     "train": {"kornia", "tensorboard", "timm"},
@@ -87,8 +87,8 @@ NEEDS = {
     "ablate": ("kornia",),
     "app": ("gradio",),
     "data made": ("trimesh", "manifold3d", "skimage"),
-    "data render": ("trimesh", "open3d"),
-    "data gso": ("trimesh", "open3d"),
+    "data render": ("trimesh", "open3d", "manifold3d"),
+    "data gso": ("trimesh", "open3d", "manifold3d"),
     "demo": _SHAPES,
     "eval-geometry": _SHAPES,
     "eval-views": ("kornia",),

@@ -74,6 +74,12 @@ class Evaluated:
         """What the file holds: "gaussians", "mesh" or "points"."""
         return KINDS[type(self.source)]
 
+    @property
+    def warnings(self) -> list[str]:
+        """What a report says of the file, one line each."""
+        omitted = self.source.omitted if isinstance(self.source, Mesh) else ()
+        return [*([self.warning] if self.warning else []), *omitted]
+
     def is_closed(self) -> bool | None:
         """Whether the mesh is closed, as ``Mesh.is_closed`` says it; None for points."""
         return "open" not in self.flags if isinstance(self.shape, Mesh) else None
@@ -255,7 +261,7 @@ def load_shape(path: Path) -> Shape:
         shape = _load_points(path)
     else:
         mesh = load_mesh(path, normals=False)
-        shape = Mesh(mesh.vertices, mesh.faces)
+        shape = Mesh(mesh.vertices, mesh.faces, tuple(mesh.omitted))
     reach = np.abs(_positions(shape)).max()
     if reach > HUGE:
         raise UserError(f"{path}: coordinates reach {reach:.3g}, over {HUGE:g}")

@@ -9,10 +9,12 @@ import numpy as np
 import torch
 
 from gamba_warp.cameras import intrinsics, orbit
-from gamba_warp.files import atomic_path, write_text
+from gamba_warp.files import write_text
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import load_rgba, save_image, to_uint8
 from gamba_warp.pages.page import Section, page_text
+from gamba_warp.surfaces.extract import Surface
+from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.versions import import_open3d
 from gamba_warp.viewer.page import write_viewer
 
@@ -48,8 +50,6 @@ def paint(name: str, predicted: Mesh | Points, truth: Mesh | Points, folder: Pat
     Raises:
         UserError: a file cannot be written.
     """
-    import trimesh
-
     rows = []
     for end, shape, other in (("", predicted, truth), (".truth", truth, predicted)):
         path = folder / "painted" / f"{name}{end}.glb"
@@ -63,10 +63,8 @@ def paint(name: str, predicted: Mesh | Points, truth: Mesh | Points, folder: Pat
         colors = colors_of(distances(shape, other))
         rows.append(np.concatenate(list(pictures(shape, colors)), 1))
         if isinstance(shape, Mesh):
-            y_up = shape.vertices[:, [0, 2, 1]] * [1, 1, -1]
-            made = trimesh.Trimesh(y_up, shape.faces, vertex_colors=colors, process=False)
-            with atomic_path(path) as unfinished:
-                made.export(unfinished, file_type="glb")
+            opencv = shape.vertices[:, [0, 2, 1]] * [1, -1, 1]
+            save_mesh(path, Surface(opencv, shape.faces, colors / np.float32(255)))
     save_image(folder / "painted" / f"{name}.png", np.concatenate(rows))
 
 

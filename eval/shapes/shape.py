@@ -63,10 +63,12 @@ class Mesh:
     Attributes:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64, F > 0.
+        omitted: what of the file's shape is not read, one line each.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
+    omitted: tuple[str, ...] = ()
 
     def scene(self):
         """Returns an Open3D ``RaycastingScene`` that holds these triangles alone."""

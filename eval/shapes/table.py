@@ -84,22 +84,25 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
 
     Returns:
         ``flags`` and ``axes``: for each side how many shapes have which; and ``warnings``: of
-        truths that are not placed as the dataset says, and of turns that would better the score by
-        far.
+        truths that are not placed as the dataset says, of what of the files' shapes is not read,
+        and of turns that would better the score by far.
     """
     done = [record for record in objects if record["status"] == OK]
     sides = ("pred", "gt")
     return {
         "flags": {s: dict(Counter(f for r in done for f in r[f"{s}_flags"])) for s in sides},
         "axes": {s: dict(Counter(r[f"{s}_axes"] for r in done)) for s in sides},
-        "warnings": [*truth_warnings(done), *turn_warnings(done)],
+        "warnings": [*file_warnings(done), *turn_warnings(done)],
     }
 
 
-def truth_warnings(done: list[dict[str, Any]]) -> list[str]:
-    """Says, of the records of the evaluated objects, of how many truths there is which warning."""
-    counts = Counter(record["gt_warning"] for record in done if "gt_warning" in record)
-    return [f"{count} of {len(done)} truths: {text}" for text, count in counts.items()]
+def file_warnings(done: list[dict[str, Any]]) -> list[str]:
+    """Says, of the records of the evaluated objects, of how many files there is which warning."""
+    found = []
+    for key, name in (("gt_warnings", "truths"), ("pred_warnings", "predictions")):
+        counts = Counter(text for record in done for text in record.get(key, ()))
+        found += [f"{count} of {len(done)} {name}: {text}" for text, count in counts.items()]
+    return found
 
 
 def turn_warnings(done: list[dict[str, Any]]) -> list[str]:

@@ -15,6 +15,13 @@ from .headers import MAX_FILE, MAX_VALUES, compare_sizes, lines_of, open_shape, 
 from .ply_header import ORDERS, PlyElement, PlyHeader, PlyProperty, read_ply_header
 
 
+def spread(starts: np.ndarray, lengths: np.ndarray, step: int = 1) -> np.ndarray:
+    """``[M]`` the places of all items of lists that start at ``starts``, ``step`` apart."""
+    ends = np.cumsum(lengths)
+    within = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)
+    return np.repeat(starts, lengths) + within * step
+
+
 class PlyList(NamedTuple):
     """A property whose values are lists.
 
@@ -138,7 +145,7 @@ def _from_text(path: Path, lines: Iterator[str], element: PlyElement) -> Columns
         row = (wanted != got).argmax()
         raise UserError(f"{source} has a row of {got[row]} numbers, not {wanted[row]}")
     return {
-        item.name: _column(item, _typed(path, flat[_each(start, length, 1)], item), length)
+        item.name: _column(item, _typed(path, flat[spread(start, length, 1)], item), length)
         for item, start, length in zip(items, starts, lengths)
     }
 
@@ -193,13 +200,6 @@ def _walk(
     return np.array(starts), np.array(lengths), at
 
 
-def _each(starts: np.ndarray, lengths: np.ndarray, step: int) -> np.ndarray:
-    """``[M]`` the places of all items of lists that start at ``starts``, ``step`` apart."""
-    ends = np.cumsum(lengths)
-    within = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)
-    return np.repeat(starts, lengths) + within * step
-
-
 def _from_bytes(
     path: Path, data: bytes, at: int, element: PlyElement, order: str
 ) -> tuple[Columns, int]:
@@ -248,31 +248,7 @@ def _from_bytes(
         raise UserError(f"{path}: over {MAX_VALUES} numbers, the limit for one file")
     raw, columns = np.frombuffer(data, np.uint8), {}
     for i, item in enumerate(items):
-        places, size = _each(starts[i], lengths[i], steps[i][1]), steps[i][1]
+        places, size = spread(starts[i], lengths[i], steps[i][1]), steps[i][1]
         values = np.stack([raw[places + byte] for byte in range(size)], 1).view(kinds[i])[:, 0]
         columns[item.name] = _column(item, values, lengths[i])
     return columns, end
-
-
-def triangles(path: Path, faces: PlyList, count: int) -> np.ndarray:
-    """``[F, 3]`` int64 triangles of polygons, each as a fan around its first corner.
-
-    Polygons of fewer than three corners have no area and give no triangle.
-
-    Args:
-        path: named in errors.
-        faces: indices of vertices.
-        count: of the vertices.
-
-    Raises:
-        UserError: an index is out of range.
-    """
-    indices, lengths = faces.values.astype(np.int64), faces.lengths
-    bad = (faces.values < 0) | (faces.values >= count) | (indices != faces.values)
-    if bad.any():
-        raise UserError(f"{path}: a face names vertex {faces.values[bad][0]} of {count}")
-    first = np.cumsum(lengths) - lengths
-    fans = np.maximum(lengths - 2, 0)
-    middle = _each(first + 1, fans, 1)
-    corners = np.stack([np.repeat(first, fans), middle, middle + 1], 1)
-    return indices[corners]

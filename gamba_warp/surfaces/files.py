@@ -46,18 +46,27 @@ def save_mesh(path: str | Path, surface: Surface, axes: Axes = "opengl") -> None
     vertices, colors = surface.vertices, surface.colors
     if kind == "glb" or axes == "opengl":
         vertices = vertices * [1.0, -1.0, -1.0]
-    if kind == "glb" and colors is not None:
-        colors = to_linear(colors)
     if surface.texture is not None and kind in ("glb", "obj"):
         return _save_textured(Path(path), replace(surface, vertices=vertices), surface.texture)
     mesh = trimesh.Trimesh(vertices, surface.faces, process=False)
     if colors is not None and kind != "stl":
         opaque = np.ones((len(colors), 1), np.float32)
         mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(np.hstack([colors, opaque])))
-    data = cast("bytes | str", mesh.export(file_type=kind))  # a dict: other kinds
+    if colors is not None and kind == "glb":  # linear light of 8 bits is too coarse
+        mesh.visual = ColorVisuals(mesh)
+        mesh.vertex_attributes["COLOR_0"] = to_linear(colors)
+        data = cast(bytes, mesh.export(file_type=kind, tree_postprocessor=_name_colors))
+    else:
+        data = cast("bytes | str", mesh.export(file_type=kind))  # a dict: other kinds
     if isinstance(data, bytes) and kind == "ply":  # what no .ply says by itself
         data = data.replace(b"\nelement", f"\ncomment axes {axes}\nelement".encode(), 1)
     _write(Path(path), data)
+
+
+def _name_colors(tree: dict) -> None:
+    """Gives the colours of a glTF document their name, before which trimesh writes a line."""
+    for primitive in tree["meshes"][0]["primitives"]:
+        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
 
 
 def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:

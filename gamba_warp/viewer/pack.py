@@ -17,15 +17,14 @@ import torch
 
 from ..conventions import Axes
 from ..errors import UserError
-from ..formats.materials import to_linear
-from ..formats.meshes import TexturedMesh, load_mesh, to_display
+from ..formats.materials import to_display, to_linear
+from ..formats.meshes import TexturedMesh, load_mesh
 from ..gaussians import Gaussians
 from ..images import to_uint8
 
 _COUNTS = 0.05  # opacity from which a Gaussian counts for the object's extent
 _MOST = 6e4  # float16 ends at 65504
 
-_LINEAR = (".glb", ".gltf")  # the format's colours of vertices are linear light
 
 RECORD = np.dtype(
     [("means", "<f4", 3), ("look", "<f2", 4), ("scales", "<f2", 3), ("turns", "<i2", 3)]
@@ -158,9 +157,8 @@ def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
         UserError: as ``load_mesh``.
     """
     mesh = load_mesh(path)
-    linear = Path(path).suffix.lower() in _LINEAR
     vertices = mesh.vertices * ([1.0, -1.0, -1.0] if axes == "opengl" else 1.0)
-    paint = (255 * _corner_colors(mesh, linear) + 0.5).astype(np.int64)
+    paint = (255 * _corner_colors(mesh) + 0.5).astype(np.int64)
     # A vertex that has several colours becomes several.
     keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]
     found, corners = np.unique(keys, return_inverse=True)
@@ -168,10 +166,9 @@ def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
     return ViewedMesh(vertices[found >> 24], corners.reshape(mesh.faces.shape), colors)
 
 
-def _corner_colors(mesh: TexturedMesh, linear: bool) -> np.ndarray:
+def _corner_colors(mesh: TexturedMesh) -> np.ndarray:
     """``[F, 3, 3]`` display values: the product of material, texture and vertices' colours."""
-    light = mesh.colors[..., :3].astype(np.float32) / 255
-    light = light if linear else to_linear(light)
+    light = to_linear(mesh.colors[..., :3].astype(np.float32) / 255)
     for i, material in enumerate(mesh.materials):
         mine = mesh.material_ids == i
         light[mine] *= material.color[:3]

@@ -15,7 +15,8 @@ from PIL import Image
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.cli import run
 from gamba_warp.formats.gaussians.files import write_gaussians
-from gamba_warp.formats.meshes import load_mesh, to_linear
+from gamba_warp.formats.materials import to_linear
+from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.names import MESH_FORMATS
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.pages.serve import page_handler

@@ -351,3 +351,14 @@ def test_one_that_kills_its_process_stops_no_other(tmp_path, capfd, monkeypatch)
     assert code == 1 and report["failures"] == [{"name": "bad", "reason": reason}]
     assert [record["iou"] for record in report["objects"] if record["name"] != "bad"] == [1, 1, 1]
     assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
+
+
+def test_what_of_a_shape_is_not_read_is_in_the_report(tmp_path, capfd):
+    for name, more in (("pred", "l 1 2\nvp 0 0\n"), ("gt", "")):
+        text = box().export(file_type="obj")
+        (tmp_path / f"{name}.obj").write_text(text + more)
+    _, report = evaluate(capfd, tmp_path / "pred.obj", tmp_path / "gt.obj")
+    assert report["warnings"] == [
+        "1 of 1 predictions: the statement l is not read",
+        "1 of 1 predictions: the statement vp is not read",
+    ]

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from helpers.refusals import refused
 
-from gamba_warp.errors import UserError
 from gamba_warp.formats.clouds import read_cloud
-from gamba_warp.formats.ply_data import PlyList, read_ply, triangles
+from gamba_warp.formats.ply_data import read_ply
 from gamba_warp.versions import import_open3d
 
 COUNT = 2500
@@ -177,8 +176,3 @@ def test_lists_of_different_lengths(tmp_path, layout):
     assert data["face"]["weight"].tolist() == [1.5, 2.5, 3.5, 4.5]
     lists = data["face"]["vertex_indices"]
     assert lists.lengths.tolist() == [3, 4, 0, 5] and lists.values.sum() == 16
-    fans = triangles(tmp_path, lists, 4)
-    assert fans.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3], [3, 2, 1], [3, 1, 0], [3, 0, 1]]
-    for wrong in (-1, 4, 2**40):
-        with pytest.raises(UserError, match=f"names vertex {wrong} of 4"):
-            triangles(tmp_path, PlyList(np.array([0, 1, wrong]), np.array([3])), 4)

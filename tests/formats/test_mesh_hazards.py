@@ -15,7 +15,7 @@ from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.formats import materials
-from gamba_warp.formats.headers import MAX_ZEROS
+from gamba_warp.formats.gltf_file import MAX_ZEROS
 from gamba_warp.formats.meshes import load_mesh
 
 V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
@@ -165,6 +165,14 @@ def gltf(**changes):
 
 
 ACCESSOR = gltf()["accessors"][0]
+# Byte 3 of the float 1.0 is 63.
+SPARSE = {
+    "sparse": {
+        "count": 1,
+        "indices": {"bufferView": 0, "byteOffset": 3, "componentType": 5121},
+        "values": {"bufferView": 0},
+    }
+}
 DEEP = {"nodes": [{"mesh": 0, "extras": json.loads("[" * 500 + "]" * 500)}]}
 LIES = {
     "beyond": ({"accessors": [ACCESSOR | {"byteOffset": 12}]}, "3 values of accessor 0"),
@@ -173,21 +181,22 @@ LIES = {
     "no_view": ({"bufferViews": []}, "broken header"),
     "view": ({"bufferViews": [{"buffer": 0, "byteLength": 36, "byteOffset": 4}]}, "view 0"),
     "stride": ({"bufferViews": [{"buffer": 0, "byteLength": 36, "byteStride": 0}]}, "byteStride"),
-    "sparse": ({"accessors": [ACCESSOR | {"sparse": {"count": 1}}]}, "is sparse"),
+    "sparse": ({"accessors": [ACCESSOR | {"sparse": {"count": 1}}]}, "indices"),
+    "sparse_beyond": ({"accessors": [ACCESSOR | SPARSE]}, "changes value 63 of 3"),
     "zeros": (
-        {
-            "accessors": [
-                ACCESSOR,
-                *[{**ACCESSOR, "bufferView": None, "count": MAX_ZEROS // 36}] * 9,
-            ]
-        },
-        "accessor 4",
+        {"accessors": [{**ACCESSOR, "bufferView": None, "count": MAX_ZEROS // 12 + 1}]},
+        "values of accessor 0",
     ),
+    "circle": ({"nodes": [{"mesh": 0, "children": [0]}]}, "nodes in a circle"),
+    "no_mesh": ({"nodes": [{"mesh": 1}]}, "meshes[1] of 1"),
     "draco": ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "packed by KHR_draco"),
     "lists": ({"accessors": {}}, "array"),
     "deep": (DEEP, "nested"),
     "outside": ({"buffers": [{"byteLength": 36, "uri": "../secret.bin"}]}, "not found"),
-    "short": ({"buffers": [{"byteLength": 36, "uri": "data:;base64,AAAA"}]}, "cannot be read"),
+    "short": (
+        {"buffers": [{"byteLength": 36, "uri": "data:;base64,AAAA"}]},
+        "buffer 0 take 36 bytes",
+    ),
 }
 
 

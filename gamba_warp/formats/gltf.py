@@ -1,0 +1,295 @@
+"""Meshes of glTF: each primitive of the default scene where its nodes, skins and targets put it.
+
+What changes shape or colours and is not read is a warning that names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+from PIL import Image
+
+from ..errors import UserError
+from .gltf_file import PACKED, Entry, GltfFile, Index, Vec2, Vec3, Vec4, normalised, open_gltf
+from .headers import open_shape
+from .materials import Material, SideFiles, plain, to_display
+from .parts import Part, to_rgba8
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_OTHERS = {0: "points", 1: "lines", 2: "a line loop", 3: "a line strip"}
+_REPEAT = 10497
+_Weights = tuple[float, ...]
+_WHITE = (1.0, 1.0, 1.0, 1.0)
+_GLOSS = "KHR_materials_pbrSpecularGlossiness"
+_PICTURES = ("EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds")
+# Extensions that are read, change neither shape nor colours, or are spoken of where they are used.
+_KNOWN = {
+    *("EXT_lights_image_based", "EXT_texture_webp", "FB_ngon_encoding", "KHR_lights_punctual"),
+    *("KHR_animation_pointer", "KHR_materials_emissive_strength", "KHR_materials_ior"),
+    *(_GLOSS, "KHR_materials_unlit", "KHR_materials_variants"),
+    *("KHR_mesh_quantization", "KHR_texture_transform", "KHR_xmp", "KHR_xmp_json_ld"),
+    *(*_PICTURES, *PACKED),
+}
+
+
+@dataclass
+class _Triangles:
+    """A primitive in its own frame; all arrays but ``faces`` have a row for each vertex."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    material: Material | None
+    normals: np.ndarray | None
+    uvs: np.ndarray | None
+    colors: np.ndarray | None
+
+
+def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
+    """Yields the triangles of the default scene.
+
+    Args:
+        path: a ``.glb`` or ``.gltf`` file.
+        sides: reads what lies beside it, and takes the warnings.
+
+    Raises:
+        UserError: it is not what it says.
+    """
+    with open_shape(path) as (stream, size):
+        file = open_gltf(path, stream, size, lambda uri: sides.read(unquote(uri), uri))
+    for name in file.extensions:
+        if name not in _KNOWN:
+            warn = sides.warnings.append if name.startswith("KHR_materials") else sides.omit
+            warn(f"the extension {name[:60]} is not read")
+    scenes = len(file.document.entries("scenes"))
+    if scenes > 1:
+        sides.omit(f"one of {scenes} scenes is read")
+    reader, known = _Reader(file, sides), {}
+    nodes = file.placed_nodes()
+    matrices = {index: matrix for _, index, matrix in nodes}
+    for node, _, matrix in nodes:
+        index, skin = node.get("mesh", Index), node.get("skin", Index)
+        if index is None:
+            continue
+        mesh = file.item("meshes", index)
+        weights = node.get("weights", _Weights, mesh.get("weights", _Weights, ()))
+        for number, primitive in enumerate(mesh.entries("primitives")):
+            key = index, number, weights
+            if key not in known:
+                known[key] = reader.triangles(primitive, weights)
+            if known[key] is not None:
+                pose = matrix
+                if skin is not None and "JOINTS_0" in primitive.entry("attributes").values:
+                    pose = reader.pose(skin, primitive, matrices)
+                yield _moved(known[key], pose)
+
+
+class _Reader:
+    def __init__(self, file: GltfFile, sides: SideFiles) -> None:
+        self.file, self.sides, self.warn = file, sides, sides.warnings.append
+        self._looks: dict[int, tuple[Material, Entry]] = {}
+
+    def triangles(self, primitive: Entry, weights: _Weights) -> _Triangles | None:
+        """A primitive with its morph targets; None, and a warning, without triangles."""
+        mode, given = primitive.get("mode", int, _TRIANGLES), primitive.entry("attributes")
+        if mode in _OTHERS:
+            self.sides.omit(f"{_OTHERS[mode]} beside the triangles are left out")
+            return None
+        if "POSITION" not in given.values:
+            self.sides.omit("a primitive without POSITION is left out")
+            return None
+        count = self.file.item("accessors", given.need("POSITION", Index)).need("count", Index)
+
+        def attribute(name: str, *widths: int) -> np.ndarray | None:
+            if name not in given.values:
+                return None
+            base = self.file.values(given.need(name, Index))
+            if base.shape[1] not in widths or len(base) != count:
+                self.warn(f"{name} of {len(base)} x {base.shape[1]} numbers is left out")
+                return None
+            for weight, target in zip(weights, primitive.entries("targets")):
+                if weight and name in target.values:
+                    moves = self.file.values(target.need(name, Index))
+                    if moves.shape != base.shape:
+                        raise UserError(f"{self.file.path}: a morph target of another shape")
+                    base = base + weight * moves.astype(np.float64)
+            return base
+
+        vertices = attribute("POSITION", 3)
+        if vertices is None:
+            raise UserError(f"{self.file.path}: vertices are not of 3 numbers")
+        indices = np.arange(count)
+        if "indices" in primitive.values:
+            indices = self.file.values(primitive.need("indices", Index))[:, 0].astype(np.int64)
+        if len(indices) and not 0 <= indices.min() <= indices.max() < count:
+            raise UserError(f"{self.file.path}: a face names vertex {indices.max()} of {count}")
+        material, opaque, uvs = None, True, None
+        if (index := primitive.get("material", Index)) is not None:
+            look = self.file.item("materials", index)
+            opaque = look.get("alphaMode", str, "OPAQUE") == "OPAQUE"
+            if index not in self._looks:
+                self._looks[index] = self.material(look)
+            material, info = self._looks[index]
+            uvs = None if material.texture is None else self.uvs(attribute, info)
+        colors = attribute("COLOR_0", 3, 4)
+        if colors is not None:
+            colors = np.clip(np.nan_to_num(normalised(colors)), 0, 1)
+            alpha = colors[:, :0] if opaque else colors[:, 3:]
+            colors = to_rgba8(np.hstack([to_display(colors[:, :3]), alpha]))
+        faces, normals = _faces(self.file.path, indices, mode), attribute("NORMAL", 3)
+        return _Triangles(vertices.astype(np.float64), faces, material, normals, uvs, colors)
+
+    def uvs(self, attribute, info: Entry) -> np.ndarray | None:
+        """The coordinates ``[V, 2]`` of a texture, v upwards; None without any."""
+        change = info.entry("extensions").entry("KHR_texture_transform")
+        number = change.get("texCoord", Index, info.get("texCoord", Index, 0))
+        uvs = attribute(f"TEXCOORD_{number}", 2)
+        if uvs is None:
+            return None
+        rotation = change.get("rotation", float, 0.0)
+        cos, sin = np.cos(rotation), np.sin(rotation)
+        turn = np.array([[cos, -sin], [sin, cos]])  # of rows
+        uvs = (uvs.astype(np.float64) * change.get("scale", Vec2, (1.0, 1.0))) @ turn
+        uvs += change.get("offset", Vec2, (0.0, 0.0))
+        sampler = self.file.item("textures", info.need("index", Index)).get("sampler", Index)
+        if sampler is not None:
+            sampler = self.file.item("samplers", sampler)
+            wraps = np.array([sampler.get(name, int, _REPEAT) for name in ("wrapS", "wrapT")])
+            outside = (np.abs(uvs - 0.5) > 0.5 + 1e-4).any(0)
+            if any(outside & (wraps != _REPEAT)):
+                self.warn("a texture that does not repeat is drawn as one that does")
+        return uvs * [1, -1] + [0, 1]
+
+    def material(self, look: Entry) -> tuple[Material, Entry]:
+        """What a material of the document looks like, and where it names its texture."""
+        base, more = look.entry("pbrMetallicRoughness"), look.entry("extensions")
+        for source, name in (
+            *((look, "normalTexture"), (look, "occlusionTexture")),
+            (base, "metallicRoughnessTexture"),
+        ):
+            if name in source.values:
+                self.warn(f"{name} is not drawn")
+        if _GLOSS in more.values:
+            color, texture, info = self.glossy(more.entry(_GLOSS))
+        else:
+            color, info = base.get("baseColorFactor", Vec4, _WHITE), base.entry("baseColorTexture")
+            color, texture = np.array(color), self.texture(info)
+        light = np.array(look.get("emissiveFactor", Vec3, (0.0, 0.0, 0.0)))
+        if light.any():
+            if color[:3].any() and (texture is None or texture[..., :3].any()):
+                self.warn("light of a surface beside its base colour is not drawn")
+            else:
+                strength = more.entry("KHR_materials_emissive_strength")
+                color[:3] = light * strength.get("emissiveStrength", float, 1.0)
+                info = look.entry("emissiveTexture")
+                texture = self.texture(info)
+        mode = look.get("alphaMode", str, "OPAQUE")
+        if mode != "BLEND":
+            alpha = color[3] if texture is None else color[3] * texture[..., 3] / 255
+            shown = (alpha >= look.get("alphaCutoff", float, 0.5)) | (mode == "OPAQUE")
+            if texture is None:
+                color[3] = shown
+            else:
+                color[3], texture[..., 3] = 1.0, np.where(shown, 255, 0)
+        return Material(plain(color), texture), info
+
+    def glossy(self, gloss: Entry) -> tuple[np.ndarray, np.ndarray | None, Entry]:
+        """Colour and texture of a material of the older kind, diffuse and specular."""
+        from trimesh.visual.gloss import specular_to_pbr
+
+        names = ("diffuseTexture", "specularGlossinessTexture")
+        pictures = [(name, self.texture(gloss.entry(name))) for name in names]
+        found = specular_to_pbr(
+            diffuseFactor=gloss.get("diffuseFactor", Vec4, _WHITE),
+            specularFactor=gloss.get("specularFactor", Vec3, _WHITE[:3]),
+            glossinessFactor=gloss.get("glossinessFactor", float, 1.0),
+            **{name: x if x is None else Image.fromarray(x) for name, x in pictures},
+        )
+        texture = found.get("baseColorTexture")
+        texture = None if texture is None else np.array(texture.convert("RGBA"))
+        info = gloss.entry(names["diffuseTexture" not in gloss.values])
+        return np.array(found.get("baseColorFactor", _WHITE)), texture, info
+
+    def texture(self, info: Entry) -> np.ndarray | None:
+        """The picture of a texture; None, and a warning, where it cannot be had."""
+        if not info.values:
+            return None
+        try:
+            texture = self.file.item("textures", info.need("index", Index))
+            webp = texture.entry("extensions").entry("EXT_texture_webp")
+            source = webp.get("source", Index, texture.get("source", Index))
+            if source is None:
+                names = ", ".join(x for x in self.file.extensions if x in _PICTURES) or "nothing"
+                raise UserError(f"a texture's picture is named by {names}, which is not read")
+            image, name = self.file.item("images", source), f"image {source}"
+            if (view := image.get("bufferView", Index)) is not None:
+                return self.sides.texture(self.file.view(view), name)
+            uri = image.get("uri", str, "")
+            name = name if uri.startswith("data:") else unquote(uri[:100])
+            return self.sides.texture(self.file.content(uri), name)
+        except UserError as error:
+            self.warn(str(error))
+            return None
+
+    def pose(self, index: int, primitive: Entry, matrices: dict[int, np.ndarray]) -> np.ndarray:
+        """``[V, 4, 4]`` the matrices of a skinned primitive's vertices in the scene."""
+        skin, path = self.file.item("skins", index), self.file.path
+        chain, given = skin.need("joints", list[Index]), primitive.entry("attributes")
+        if not chain or not matrices.keys() >= {*chain}:
+            self.sides.omit("a skin with joints outside of the scene is not applied")
+            return np.eye(4)
+        joints = np.stack([matrices[joint] for joint in chain])
+        if "inverseBindMatrices" in skin.values:
+            inverse = self.file.values(skin.need("inverseBindMatrices", Index))
+            if inverse.shape[1] != 16 or len(inverse) < len(joints):
+                raise UserError(f"{path}: skin {index} has no matrix for each joint")
+            joints = joints @ inverse[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
+        count = len(self.file.values(given.need("POSITION", Index)))
+        total, sums, number = np.zeros((count, 4, 4)), np.zeros((count, 1, 1)), 0
+        while f"JOINTS_{number}" in given.values:
+            chosen, weights = (
+                self.file.values(given.need(f"{name}_{number}", Index))
+                for name in ("JOINTS", "WEIGHTS")
+            )
+            same = chosen.shape == weights.shape == (count, 4)
+            if not same or chosen.max(initial=0) >= len(joints):
+                raise UserError(f"{path}: JOINTS_{number} or WEIGHTS_{number} is false")
+            for column in range(4):
+                weight = weights[:, column, None, None]
+                total += weight * joints[chosen[:, column].astype(np.int64)]
+                sums += weight
+            number += 1
+        return np.where(sums == 0, joints[0], total / np.where(sums == 0, 1, sums))
+
+
+def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
+    """``[F, 3]`` triangles of a list, a strip or a fan, all turned alike."""
+    if mode == _TRIANGLES:
+        if len(indices) % 3:
+            raise UserError(f"{path}: {len(indices)} corners, which are no whole triangles")
+        return indices.reshape(-1, 3)
+    if mode not in (_STRIP, _FAN):
+        raise UserError(f"{path}: a primitive of mode {mode}")
+    at = np.arange(max(len(indices) - 2, 0))
+    odd = at % 2
+    corners = (at, at + 1 + odd, at + 2 - odd) if mode == _STRIP else (0 * at, at + 1, at + 2)
+    faces = indices[np.stack(corners, 1)]
+    return faces[(faces != np.roll(faces, 1, 1)).all(1)]  # strips are joined by faces without area
+
+
+def _moved(found: _Triangles, matrix: np.ndarray) -> Part:
+    """The part where a matrix ``[4, 4]``, or one for each vertex, puts it."""
+    turn, faces = matrix[..., :3, :3], found.faces
+    vertices = (turn @ found.vertices[..., None])[..., 0] + matrix[..., :3, 3]
+    normals = found.normals
+    if normals is not None and matrix.ndim == 2:
+        normals = normals @ np.linalg.pinv(turn if np.isfinite(turn).all() else np.eye(3))
+    elif normals is not None:
+        normals = (turn @ normals[..., None])[..., 0]
+    if np.nansum(np.linalg.det(turn)) < 0:  # mirrored: what was in front is behind
+        faces = faces[:, ::-1]
+    of_corners = (None if x is None else x[faces] for x in (normals, found.uvs, found.colors))
+    return Part(vertices, faces, found.material, *of_corners)

@@ -1,0 +1,288 @@
+"""The document of a glTF file, the numbers that its accessors name, and its nodes.
+
+An index, an offset or a length is checked where it is used: what nothing uses may be false.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO, Literal
+from urllib.parse import unquote_to_bytes
+
+import msgspec
+import numpy as np
+
+from ..errors import UserError
+from ..untrusted.documents import parse_document
+from .headers import MAX_FILE, compare_sizes
+
+MAX_ZEROS = 1 << 24  # bytes of an accessor that no bytes of the file stand behind
+MAX_NODES = 200_000  # of a scene
+# Extensions that pack triangles; a reader without them sees zeros.
+PACKED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_EXTENSION = re.compile(rb'"([A-Z]{2,10}_[a-z]\w{1,60})"\s*:')  # some files do not list them
+
+Index = Annotated[int, msgspec.Meta(ge=0, le=MAX_FILE)]
+Vec2, Vec3 = tuple[float, float], tuple[float, float, float]
+Vec4 = tuple[float, float, float, float]
+_Kind = Literal[5120, 5121, 5122, 5123, 5125, 5126]
+_Width = Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+_Stride = Annotated[int, msgspec.Meta(ge=1, le=252)]
+_Matrix = Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)]
+
+
+class Entry:
+    """An object of the document; what nobody asks for may be anything.
+
+    Attributes:
+        where: it stands, for errors.
+        values: by their names, not checked.
+    """
+
+    def __init__(self, where: str, values: Any) -> None:
+        if not isinstance(values, dict):
+            raise UserError(f"{where} is not an object")
+        self.where, self.values = where, values
+
+    def get(self, name: str, kind: Any, default: Any = None) -> Any:
+        """A value as a declared type; the default without one. Raises UserError."""
+        value = self.values.get(name)
+        return default if value is None else self.need(name, kind)
+
+    def need(self, name: str, kind: Any) -> Any:
+        """A value as a declared type. Raises UserError where it is missing or not of it."""
+        try:
+            return msgspec.convert(self.values.get(name), kind)
+        except msgspec.ValidationError as error:
+            raise UserError(f"{self.where}.{name}: {error}") from error
+
+    def entry(self, name: str) -> Entry:
+        """An object in the object, empty without one. Raises UserError."""
+        return Entry(f"{self.where}.{name}", self.values.get(name) or {})
+
+    def entries(self, name: str) -> list[Entry]:
+        """The objects of a list, empty without one. Raises UserError."""
+        items = self.get(name, list, [])
+        return [Entry(f"{self.where}.{name}[{i}]", item) for i, item in enumerate(items)]
+
+
+def _no_side_file(uri: str) -> bytes:
+    raise UserError("its numbers lie in another file, which is not read")
+
+
+@dataclass
+class GltfFile:
+    """A document, and the bytes that it speaks of.
+
+    Attributes:
+        path: named in errors.
+        document: what the file says.
+        extensions: the names of all that the document has anywhere.
+        binary: the binary chunk of a ``.glb``, or None.
+        side_file: reads what an URI names. Raises UserError.
+    """
+
+    path: Path
+    document: Entry
+    extensions: list[str]
+    binary: bytes | None
+    side_file: Callable[[str], bytes]
+    _buffers: dict[int, bytes] = field(default_factory=dict)
+    _lists: dict[str, list[Entry]] = field(default_factory=dict)
+
+    def item(self, what: str, index: int) -> Entry:
+        """One of the document's lists' entries. Raises UserError where there is none."""
+        if what not in self._lists:
+            self._lists[what] = self.document.entries(what)
+        items = self._lists[what]
+        if index >= len(items):
+            raise UserError(f"{self.path}: broken header ({what}[{index}] of {len(items)})")
+        return items[index]
+
+    def content(self, uri: str) -> bytes:
+        """The bytes that an URI holds itself, or names. Raises UserError."""
+        if not uri.startswith("data:"):
+            return self.side_file(uri)
+        head, _, data = uri.partition(",")
+        try:
+            return base64.b64decode(data) if head.endswith(";base64") else unquote_to_bytes(data)
+        except ValueError as error:
+            raise UserError(f"data that are not base64 ({error})") from error
+
+    def view(self, index: int) -> memoryview:
+        """The bytes of a view. Raises UserError where its buffer has less."""
+        view = self.item("bufferViews", index)
+        buffer, length = view.need("buffer", Index), view.need("byteLength", Index)
+        start = view.get("byteOffset", Index, 0)
+        if buffer not in self._buffers:
+            self._buffers[buffer] = self._buffer_bytes(buffer)
+        data = memoryview(self._buffers[buffer])
+        compare_sizes(
+            self.path, f"the bytes of view {index}", length, len(data) - start, exact=False
+        )
+        return data[start : start + length]
+
+    def _buffer_bytes(self, index: int) -> bytes:
+        buffer, data = self.item("buffers", index), self.binary
+        uri, length = buffer.get("uri", str), buffer.need("byteLength", Index)
+        if uri is not None:
+            try:
+                data = self.content(uri)
+            except UserError as error:
+                raise UserError(f"{self.path}: buffer {index}: {error}") from error
+        elif index > 0 or data is None:
+            self.refuse_packed()
+            raise UserError(f"{self.path}: buffer {index} has no bytes")
+        compare_sizes(self.path, f"buffer {index}", length, len(data), exact=False)
+        return data[:length]
+
+    def refuse_packed(self) -> None:
+        """Raises UserError where the document has an extension that packs triangles."""
+        for name in self.extensions:
+            if name in PACKED:
+                raise UserError(
+                    f"{self.path}: packed by {name}, which is not read; unpack it first"
+                )
+
+    def values(self, index: int) -> np.ndarray:
+        """``[N, C]`` the numbers of an accessor, as they are stored; float64 if normalised.
+
+        Raises:
+            UserError: they are not in the file.
+        """
+        accessor = self.item("accessors", index)
+        kind, says = np.dtype(_KINDS[accessor.need("componentType", _Kind)]), f"accessor {index}"
+        shape = accessor.need("count", Index), _WIDTHS[accessor.need("type", _Width)]
+        sparse = accessor.entry("sparse")
+        if accessor.get("bufferView", Index) is None:
+            if not sparse.values:
+                self.refuse_packed()
+            wanted = kind.itemsize * shape[0] * shape[1]
+            compare_sizes(self.path, f"{shape[0]} values of {says}", wanted, MAX_ZEROS, exact=False)
+            rows = np.zeros(shape, kind)
+        else:
+            rows = self._rows(accessor, kind, shape, says)
+        if sparse.values:
+            count, where = sparse.need("count", Index), sparse.entry("indices")
+            at = _KINDS[where.need("componentType", Literal[5121, 5123, 5125])]
+            found = self._rows(where, at, (count, 1), says)[:, 0]
+            if count and found.max() >= shape[0]:
+                raise UserError(f"{self.path}: {says} changes value {found.max()} of {shape[0]}")
+            rows = rows.copy()
+            rows[found] = self._rows(sparse.entry("values"), kind, (count, shape[1]), says)
+        return normalised(rows) if accessor.get("normalized", bool) else rows
+
+    def _rows(self, source: Entry, kind: Any, shape: tuple[int, int], says: str) -> np.ndarray:
+        index, start = source.need("bufferView", Index), source.get("byteOffset", Index, 0)
+        data, size = self.view(index), np.dtype(kind).itemsize
+        step = self.item("bufferViews", index).get("byteStride", _Stride, size * shape[1])
+        wanted = (shape[0] - 1) * step + size * shape[1] if shape[0] else 0
+        says = f"{shape[0]} values of {says}"
+        compare_sizes(self.path, says, wanted, len(data) - start, exact=False)
+        return np.ndarray(shape, kind, data, start, (step, size))
+
+    def placed_nodes(self) -> list[tuple[Entry, int, np.ndarray]]:
+        """Each node of the scene, its index, and its matrix ``[4, 4]`` in the scene.
+
+        Raises:
+            UserError: there are over ``MAX_NODES``, or a node is its own ancestor.
+        """
+        kind = list[Index]
+        if self.document.values.get("scenes"):
+            scene = self.item("scenes", self.document.get("scene", Index, 0))
+            roots = scene.get("nodes", kind, [])
+        else:  # glTF without a scene: all nodes that are no children
+            nodes = self.document.entries("nodes")
+            inner = {child for node in nodes for child in node.get("children", kind, [])}
+            roots = [index for index in range(len(nodes)) if index not in inner]
+        found: list[tuple[Entry, int, np.ndarray]] = []
+        left = [(root, np.eye(4)) for root in reversed(roots)]
+        while left:
+            if len(found) + len(left) > MAX_NODES:
+                raise UserError(f"{self.path}: over {MAX_NODES} nodes, or nodes in a circle")
+            index, above = left.pop()
+            node = self.item("nodes", index)
+            matrix = node.get("matrix", _Matrix)
+            matrix = above @ (_pose(node) if matrix is None else np.reshape(matrix, (4, 4)).T)
+            found.append((node, index, matrix))
+            left += [(child, matrix) for child in reversed(node.get("children", kind, []))]
+        return found
+
+
+def normalised(values: np.ndarray) -> np.ndarray:
+    """Integers as the fractions that they stand for in glTF; floats stay as they are."""
+    if values.dtype.kind == "f":
+        return values
+    return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
+
+
+def _pose(node: Entry) -> np.ndarray:
+    """``[4, 4]`` that scales, then turns by a quaternion xyzw of any length, then moves."""
+    matrix, rotation = np.eye(4), node.get("rotation", Vec4, (0.0, 0.0, 0.0, 1.0))
+    length = sum(part**2 for part in rotation) ** 0.5
+    x, y, z, w = (part / (length or 1.0) for part in rotation)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= node.get("scale", Vec3, (1.0, 1.0, 1.0))
+    matrix[:3, 3] = node.get("translation", Vec3, (0.0, 0.0, 0.0))
+    return matrix
+
+
+def open_gltf(
+    path: Path, file: BinaryIO, size: int, side_file: Callable[[str], bytes] = _no_side_file
+) -> GltfFile:
+    """Reads the document of a glTF file, and its first binary chunk.
+
+    Args:
+        path: if its suffix is ``.gltf``, the file is a document; else a container of one.
+        file: at its start.
+        size: of the file, bytes.
+        side_file: reads what an URI names.
+
+    Raises:
+        UserError: the container holds less or more than it says, the document is not one, or needs
+            an extension that packs triangles.
+    """
+    text, binary = file.read(), None
+    if path.suffix.lower() != ".gltf":
+        text, binary = _chunks(path, text, size)
+    document = Entry(str(path), parse_document(text, dict[str, Any], str(path)))
+    needed = document.get("extensionsRequired", list[str], [])
+    names = [name.decode("ascii", "replace") for name in _EXTENSION.findall(text)]
+    names = dict.fromkeys([*document.get("extensionsUsed", list[str], []), *needed, *names])
+    gltf = GltfFile(path, document, list(names), binary, side_file)
+    if {*PACKED} & {*needed}:
+        gltf.refuse_packed()
+    return gltf
+
+
+def _chunks(path: Path, data: bytes, size: int) -> tuple[bytes, bytes]:
+    if data[:4] != b"glTF":
+        raise UserError(f"{path}: not a .glb file")
+    if size < 12:
+        raise UserError(f"{path}: broken header ({size} bytes)")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise UserError(f"{path}: cannot be read as a mesh (version {version} of .glb, not 2)")
+    compare_sizes(path, "its header and chunks", length, size)
+    found: dict[bool, bytes] = {}
+    at = 12
+    while at + 8 <= size:
+        chunk, name = struct.unpack_from("<I4s", data, at)
+        compare_sizes(path, f"a chunk at byte {at}", chunk, size - at - 8, exact=False)
+        found.setdefault(name == b"JSON", data[at + 8 : at + 8 + chunk])
+        at += 8 + chunk
+    if True not in found:
+        raise UserError(f"{path}: no JSON chunk")
+    # Padded with blanks; some writers pad with zeros.
+    return found[True].rstrip(b"\0 "), found.get(False, b"")

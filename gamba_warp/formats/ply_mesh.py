@@ -1,0 +1,75 @@
+"""Meshes of ``.ply`` files: polygons with normals, colours and textures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from .materials import Material, SideFiles
+from .parts import Part, cut_polygons, to_rgba8
+from .ply_data import Columns, PlyList, read_ply
+
+_CORNERS = ("vertex_indices", "vertex_index")
+# What programs call the channels of a colour, and texture coordinates.
+_CHANNELS = ("{}", "diffuse_{}")
+_UVS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
+_TEXTURE = re.compile(r"TextureFile\s+(.*)", re.I)
+
+
+def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
+    """Yields the one part of a file.
+
+    Raises:
+        UserError: as ``read_ply``, or its vertices have no place, or its faces no corners.
+    """
+    data = read_ply(path)
+    vertices, faces = data.elements.get("vertex", {}), data.elements.get("face", {})
+    points = data.numbers("vertex", ("x", "y", "z"))
+    lists = [faces[name] for name in _CORNERS if isinstance(faces.get(name), PlyList)]
+    if points is None or not lists:
+        raise UserError(f"{path}: its vertices have no x, y and z, or its faces no indices")
+    for name in data.elements:
+        if name not in ("vertex", "face"):
+            sides.omit(f"the element {name[:60]} is not read")
+    given, lengths = lists[0]
+    places = cut_polygons(sides, points, given, lengths)
+    corners = given.astype(np.int64)[places]
+    owner = np.repeat(np.arange(len(lengths)), lengths)[places]
+    normals, colors = data.numbers("vertex", ("nx", "ny", "nz")), _colors(vertices)
+    if colors is not None:
+        colors = colors[corners]
+    elif (of_faces := _colors(faces)) is not None:
+        colors = of_faces[owner]
+    uvs, of_corners = None, faces.get("texcoord")
+    names = next((pair for pair in _UVS if {*pair} <= vertices.keys()), None)
+    if isinstance(of_corners, PlyList) and (of_corners.lengths == 2 * lengths).all():
+        uvs = of_corners.values.reshape(-1, 2)[places]
+    elif names is not None and (found := data.numbers("vertex", names)) is not None:
+        uvs = found[corners]
+    material = None
+    files = [m[1].strip() for m in map(_TEXTURE.match, data.header.comments) if m]
+    if files:
+        texture = sides.picture(files[0])
+        if len({*files}) > 1:
+            sides.warnings.append(f"one of {len({*files})} textures is read")
+        if texture is not None:
+            material = Material(np.ones(4, np.float32), texture)
+            if colors is not None:
+                sides.warnings.append("colours beside a texture are not drawn")
+                colors = None
+    normals = None if normals is None else normals[corners]
+    yield Part(points, corners, material, normals, uvs, colors)
+
+
+def _colors(columns: Columns) -> np.ndarray | None:
+    """``[N, 4]`` uint8 RGBA of an element; None where it has no colours."""
+    for name in _CHANNELS:
+        rgba = [columns.get(name.format(key)) for key in ("red", "green", "blue", "alpha")]
+        rgba = rgba[: 3 if rgba[3] is None else 4]
+        if all(isinstance(channel, np.ndarray) for channel in rgba):
+            return to_rgba8(np.stack(rgba, 1))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return None

@@ -1,0 +1,62 @@
+"""Meshes of STL files, binary and text."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from .headers import compare_sizes, open_shape, read_table
+from .materials import SideFiles
+from .parts import Part
+
+_HEAD = 84  # bytes of a binary file before its faces: a text and their number
+_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
+    """Yields the one part of a file; its faces have corners of their own.
+
+    A file is text if it begins with "solid", has no zero bytes there, and is not as long as the
+    binary file that it would be.
+
+    Raises:
+        UserError: it holds less than it says, or a word is no number.
+    """
+    with open_shape(path) as (file, size):
+        data = file.read()
+    count = struct.unpack_from("<I", data, 80)[0] if size >= _HEAD else -1
+    start = data[: 1 << 12].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if size != _HEAD + 50 * count and start.startswith(b"solid") and b"\0" not in start:
+        corners = _text_corners(path, data)
+    else:
+        if size < _HEAD:
+            raise UserError(f"{path}: {size} bytes are too few for an .stl file")
+        compare_sizes(path, f"{count} faces", 50 * count, size - _HEAD, exact=False)
+        behind = size - _HEAD - 50 * count
+        if behind:
+            sides.omit(f"{behind} bytes behind the faces are left out")
+        faces = np.frombuffer(data, _FACE, count, _HEAD)
+        if b"COLOR=" in data[:80] or (faces["attribute"] & 0x8000).any():
+            sides.warnings.append("the colours of an .stl file are not read")
+        corners = faces["corners"].reshape(-1, 3)
+    yield Part(corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3))
+
+
+def _text_corners(path: Path, data: bytes) -> np.ndarray:
+    """``[3 F, 3]``; of a name, which may be any words, nothing is taken."""
+    # Keywords of STL stand at the begin of a line, in either case.
+    text = data.replace(b"\r", b"\n").lower()
+    begun, ends, last = (
+        len(re.findall(rb"(?m)^[ \t]*" + word + rb"\b", text))
+        for word in (b"facet", b"endfacet", b"endsolid")
+    )
+    rows = re.findall(rb"(?m)^[ \t]*vertex[ \t]+(.*)$", text)
+    if not begun == ends == len(rows) / 3 or not last:
+        says = f"{begun} facets, {ends} of them with an end, and {len(rows)} vertices"
+        raise UserError(f"{path}: truncated or false, {says}")
+    return read_table((row.decode("ascii", "replace") for row in rows), str(path), (3,))

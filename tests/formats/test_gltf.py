@@ -1,0 +1,450 @@
+"""Meshes of glTF by their right values; whatever is not read is a warning that names it."""
+
+import base64
+import io
+import json
+
+import numpy as np
+import pytest
+from helpers.meshes import glb
+from helpers.refusals import refused
+from PIL import Image
+
+from gamba_warp.formats.materials import to_display, to_linear
+from gamba_warp.formats.meshes import load_mesh
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
+CORNERS = np.array([0, 1, 2, 0, 2, 3], "<u2")
+UVS = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")  # the picture upright
+# Rows from the top: red, green; blue, white.
+PAINT = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+
+
+class Document:
+    """A glTF document that grows by arrays; its first mesh is a square of one primitive."""
+
+    def __init__(self, **more):
+        self.binary = b""
+        self.tree = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": []}
+        self.attributes = {"POSITION": self.array(SQUARE)}
+        self.primitive = {"attributes": self.attributes, "indices": self.array(CORNERS)}
+        self.tree |= {"meshes": [{"primitives": [self.primitive]}], "nodes": [{"mesh": 0}]}
+        self.tree |= {"scenes": [{"nodes": [0]}]} | more
+
+    def view(self, data):
+        self.binary += bytes(-len(self.binary) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
+        self.binary += data
+        self.tree["bufferViews"].append(view)
+        return len(self.tree["bufferViews"]) - 1
+
+    def array(self, values, **more):
+        values = np.asarray(values)
+        width = values.size // len(values)
+        kind = _KINDS[values.dtype.str[1:]]
+        accessor = {"componentType": kind, "type": _TYPES[width], "count": len(values)}
+        accessor |= {"bufferView": self.view(values.tobytes())} | more
+        self.tree["accessors"].append(accessor)
+        return len(self.tree["accessors"]) - 1
+
+    def paint(self, info=(), texture=(), **material):
+        """Gives the square a texture, whose picture is ``PAINT``."""
+        pixels = io.BytesIO()
+        Image.fromarray(PAINT).save(pixels, "PNG")
+        self.tree["images"] = [{"bufferView": self.view(pixels.getvalue())}]
+        self.tree["textures"] = [{"source": 0} | dict(texture)]
+        roughness = {"baseColorTexture": {"index": 0} | dict(info)}
+        self.tree["materials"] = [{"pbrMetallicRoughness": roughness} | material]
+        self.primitive["material"] = 0
+        self.attributes.setdefault("TEXCOORD_0", self.array(UVS))
+        return self
+
+    def load(self, folder):
+        self.tree["buffers"] = [{"byteLength": len(self.binary)}]
+        path = folder / "a.glb"
+        path.write_bytes(glb(self.tree, self.binary))
+        return load_mesh(path)
+
+
+def places(mesh):
+    """The corners ``[F, 3, 3]``."""
+    return mesh.vertices[mesh.faces]
+
+
+def seen(mesh, at):
+    """The texel, display RGB, at a place ``[x, y]`` of the square."""
+    (face,) = (i for i in range(len(mesh.faces)) if _inside(places(mesh)[i], at))
+    corners = np.column_stack([places(mesh)[face][:, :2], np.ones(3)])
+    u, v = np.linalg.solve(corners.T, [*at, 1]) @ mesh.uvs[face]
+    texture = mesh.materials[mesh.material_ids[face]].texture
+    rows, columns = texture.shape[:2]
+    return texture[int((1 - v) % 1 * rows), int(u % 1 * columns), :3].tolist()
+
+
+def _inside(triangle, at):
+    edges = np.roll(triangle, -1, 0)[:, :2] - triangle[:, :2]
+    off = np.asarray(at) - triangle[:, :2]
+    return (edges[:, 0] * off[:, 1] - edges[:, 1] * off[:, 0] > 0).all()
+
+
+RED, GREEN, BLUE, WHITE = PAINT.reshape(4, 3).tolist()
+FOUR = [(0.2, 0.9), (0.9, 0.8), (0.1, 0.2), (0.8, 0.1)]  # of red, green, blue and white
+
+
+@pytest.mark.parametrize("kind", ["i1", "i2", "u1", "u2"])
+def test_normalised_integers_are_fractions(tmp_path, kind):
+    most = np.iinfo(kind).max
+    document = Document(extensionsUsed=["KHR_mesh_quantization"])
+    whole = (SQUARE * most).astype(kind)
+    document.attributes["POSITION"] = document.array(whole, normalized=True)
+    document.attributes["NORMAL"] = document.array(np.full((4, 3), [0, 0, most], kind))
+    document.attributes["TEXCOORD_0"] = document.array((UVS * most).astype(kind), normalized=True)
+    mesh = document.paint().load(tmp_path)
+    np.testing.assert_allclose(places(mesh), SQUARE[CORNERS.reshape(2, 3)], atol=1e-7)
+    assert [seen(mesh, at) for at in FOUR] == [RED, GREEN, BLUE, WHITE] and not mesh.warnings
+    np.testing.assert_allclose(mesh.normals[..., 2], 1)
+    document.attributes["POSITION"] = document.array(whole)
+    np.testing.assert_array_equal(places(document.load(tmp_path)).max((0, 1)), [most, most, 0])
+
+
+def test_rows_with_a_stride(tmp_path):
+    """Three numbers of 16 bits take eight bytes, as the format asks."""
+    document, rows = Document(), np.zeros((4, 4), "<i2")
+    rows[:, :3] = SQUARE * 7
+    document.attributes["POSITION"] = document.array(rows, type="VEC3")
+    document.tree["bufferViews"][-1]["byteStride"] = 8
+    np.testing.assert_array_equal(
+        places(document.load(tmp_path)), 7 * SQUARE[[[0, 1, 2], [0, 2, 3]]]
+    )
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
+@pytest.mark.parametrize("width", [3, 4])
+def test_colours_of_vertices_are_linear_light(tmp_path, kind, width):
+    display = np.array([[51, 128, 204, 0], [0, 255, 17, 99], [9, 90, 200, 1], [255, 1, 2, 3]])
+    light = to_linear(display / 255)
+    if kind != "f4":
+        light = np.rint(light * np.iinfo(kind).max)
+    document = Document()
+    values = light.astype(kind)[:, :width]
+    document.attributes["COLOR_0"] = document.array(np.ascontiguousarray(values), normalized=True)
+    mesh = document.load(tmp_path)
+    want = display[CORNERS.reshape(2, 3)] | [0, 0, 0, 255]  # without a material it is opaque
+    # The dark ones of 8 bits are as coarse as that, display 13 is linear 1 of 255.
+    assert np.abs(mesh.colors.astype(int) - want).max() <= (7 if kind == "u1" else 0)
+    assert not mesh.warnings  # and it is no part without colours
+
+
+def test_alpha_of_vertices_counts_where_the_material_blends(tmp_path):
+    document = Document(materials=[{"alphaMode": "BLEND"}])
+    document.primitive["material"] = 0
+    document.attributes["COLOR_0"] = document.array(np.full((4, 4), 0.4, "<f4"))
+    assert document.load(tmp_path).colors[..., 3].max() == 102
+    document.tree["materials"] = [{}]
+    assert document.load(tmp_path).colors[..., 3].min() == 255
+
+
+def test_texture_transform(tmp_path):
+    change = {"offset": [0.5, 0.5], "scale": [0.4, 0.4]}
+    mesh = Document().paint({"extensions": {"KHR_texture_transform": change}}).load(tmp_path)
+    assert {tuple(seen(mesh, at)) for at in FOUR} == {tuple(WHITE)} and not mesh.warnings
+    # A quarter turn, by the matrix of the extension's text: (u, v) is seen at (v, 1 - u).
+    change = {"rotation": np.pi / 2, "offset": [0, 1]}
+    mesh = Document().paint({"extensions": {"KHR_texture_transform": change}}).load(tmp_path)
+    for at in FOUR:
+        u, v = at[0], 1 - at[1]
+        row, column = int((1 - u) * 2), int(v * 2)
+        assert seen(mesh, at) == PAINT[row, column].tolist()
+
+
+@pytest.mark.parametrize("within", [False, True])
+def test_second_coordinates(tmp_path, within):
+    document = Document()
+    document.attributes["TEXCOORD_0"] = document.array(np.zeros((4, 2), "<f4"))
+    document.attributes["TEXCOORD_1"] = document.array(UVS)
+    change = {"extensions": {"KHR_texture_transform": {"texCoord": 1}}}
+    mesh = document.paint(change if within else {"texCoord": 1}).load(tmp_path)
+    assert [seen(mesh, at) for at in FOUR] == [RED, GREEN, BLUE, WHITE] and not mesh.warnings
+
+
+def test_webp_by_its_extension(tmp_path):
+    document = Document().paint()
+    document.tree["textures"] = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
+    mesh = document.load(tmp_path)
+    assert mesh.materials[0].texture is not None and not mesh.warnings
+
+
+def test_surfaces_that_only_shine(tmp_path):
+    document = Document().paint(emissiveTexture={"index": 0}, emissiveFactor=[1, 1, 1])
+    document.tree["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [0, 0, 0, 1]}
+    mesh = document.load(tmp_path)
+    assert [seen(mesh, at) for at in FOUR] == [RED, GREEN, BLUE, WHITE] and not mesh.warnings
+    assert mesh.materials[0].color.tolist() == [1, 1, 1, 1]
+    strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 0.5}}
+    document.tree["materials"][0] |= {"extensions": strength, "emissiveFactor": [1, 0.5, 0]}
+    del document.tree["materials"][0]["emissiveTexture"]
+    mesh = document.load(tmp_path)
+    assert mesh.materials[0].color.tolist() == [0.5, 0.25, 0, 1]
+
+
+@pytest.mark.parametrize(
+    "mode, alphas", [("OPAQUE", [1, 1]), ("MASK", [0, 1]), ("BLEND", [0.4, 0.6])]
+)
+def test_alpha(tmp_path, mode, alphas):
+    for alpha, want in zip((0.4, 0.6), alphas):
+        base = {"baseColorFactor": [1, 1, 1, alpha]}
+        document = Document(materials=[{"alphaMode": mode, "pbrMetallicRoughness": base}])
+        document.primitive["material"] = 0
+        np.testing.assert_allclose(document.load(tmp_path).materials[0].color[3], want)
+        material = document.paint(alphaMode=mode).tree["materials"][0]
+        material["pbrMetallicRoughness"] |= base
+        (material,) = document.load(tmp_path).materials
+        np.testing.assert_allclose(material.color[3] * material.texture[0, 0, 3] / 255, want)
+
+
+def test_diffuse_and_specular(tmp_path):
+    """The older kind of material: what is not metal has its diffuse colour."""
+    gloss = {"diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.04, 0.04, 0.04]}
+    extension = {"KHR_materials_pbrSpecularGlossiness": gloss}
+    document = Document(materials=[{"extensions": extension}])
+    document.primitive["material"] = 0
+    mesh = document.load(tmp_path)
+    np.testing.assert_allclose(mesh.materials[0].color[:3], [0.5, 0.25, 0.125], atol=0.02)
+    document.paint().tree["materials"] = [{"extensions": extension}]
+    gloss |= {"diffuseFactor": [1, 1, 1, 1], "diffuseTexture": {"index": 0}}
+    mesh = document.load(tmp_path)
+    got = [seen(mesh, at) for at in FOUR]
+    np.testing.assert_allclose(got, PAINT.reshape(4, 3), atol=12)  # trimesh's own rounding
+
+
+def test_strips_and_fans(tmp_path):
+    """All faces turn alike, whatever their number in the strip."""
+    rows = {5: [0, 1, 3, 2], 6: [0, 1, 2, 3]}
+    document = Document()
+    parts = [document.primitive]
+    for mode, indices in rows.items():
+        parts.append({"attributes": document.attributes, "mode": mode})
+        parts[-1]["indices"] = document.array(np.array(indices, "u1"))
+    document.tree["meshes"] = [{"primitives": parts}]
+    corners = places(document.load(tmp_path))
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert across.tolist() == [[0, 0, 1]] * 6
+
+
+def test_nodes(tmp_path):
+    half = np.sqrt(0.5)
+    matrix = [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 5, 6, 7, 1]  # by columns
+    nodes = [
+        {"children": [1, 2], "translation": [1, 2, 3]},
+        {"mesh": 0, "rotation": [0, 0, half, half], "scale": [2, 3, 1]},
+        {"mesh": 0, "matrix": matrix},
+        {"mesh": 0},  # in no scene
+    ]
+    mesh = Document(nodes=nodes, scenes=[{"nodes": [0]}]).load(tmp_path)
+    square = SQUARE[CORNERS.reshape(2, 3)].astype(float)
+    turned = square[..., [1, 0, 2]] * [-3, 2, 1] + [1, 2, 3]
+    np.testing.assert_allclose(places(mesh)[:2], turned, atol=1e-6)
+    np.testing.assert_allclose(places(mesh)[2:], square[..., [1, 0, 2]] * [-2, 2, 2] + [6, 8, 10])
+
+
+def test_a_mirroring_node_keeps_the_outside(tmp_path):
+    nodes = [{"mesh": 0}, {"mesh": 0, "scale": [-1, 1, 1]}]
+    document = Document(nodes=nodes, scenes=[{"nodes": [0, 1]}])
+    document.attributes["NORMAL"] = document.array(np.tile(np.array([0, 0, 1], "<f4"), (4, 1)))
+    mesh = document.load(tmp_path)
+    corners = places(mesh)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (across[:, 2] == 1).all() and (mesh.normals[..., 2] == 1).all()
+    assert corners[2:, :, 0].max() == 0 and corners[2:, :, 0].min() == -1
+
+
+def skinned(**more):
+    """The square, whose right side hangs on a joint that is 10 to the right."""
+    nodes = [{"mesh": 0, "skin": 0, "scale": [100, 100, 100]}, {}, {"translation": [10, 0, 0]}]
+    document = Document(nodes=nodes, scenes=[{"nodes": [0, 1, 2]}])
+    joints = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]], "u1")
+    document.attributes["JOINTS_0"] = document.array(joints)
+    document.attributes["WEIGHTS_0"] = document.array(np.eye(4, dtype="<f4")[[0, 0, 0, 0]])
+    inverse = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
+    inverse[1, 3, 0] = -8  # by columns
+    matrices = document.array(inverse.reshape(2, 16))
+    document.tree["skins"] = [{"joints": [1, 2], "inverseBindMatrices": matrices} | more]
+    return document
+
+
+def test_skins_stand_where_their_joints_are(tmp_path):
+    mesh = skinned().load(tmp_path)
+    want = np.array([[0, 0, 0], [3, 0, 0], [3, 1, 0], [0, 1, 0]])[CORNERS.reshape(2, 3)]
+    np.testing.assert_allclose(places(mesh), want)
+    for changes in ({"joints": [1, 9]}, {"joints": []}):
+        mesh = skinned(**changes).load(tmp_path)
+        assert "a skin with joints outside of the scene is not applied" in mesh.warnings
+        assert places(mesh).max() == 1  # the node of a skinned mesh does not move it
+    document = skinned(joints=[1])
+    refused("JOINTS_0 or WEIGHTS_0 is false", document.load, tmp_path)
+
+
+def test_morph_targets_and_sparse_values(tmp_path):
+    document = Document()
+    at, moves = np.array([2], "<u2"), np.array([[0, 0, 5]], "<f4")
+    sparse = {
+        "count": 1,
+        "indices": {"bufferView": document.view(at.tobytes()), "componentType": 5123},
+        "values": {"bufferView": document.view(moves.tobytes())},
+    }
+    accessor = {"componentType": 5126, "type": "VEC3", "count": 4, "sparse": sparse}
+    document.tree["accessors"].append(accessor)
+    document.primitive["targets"] = [{"POSITION": len(document.tree["accessors"]) - 1}]
+    assert not places(document.load(tmp_path))[..., 2].any()
+    document.tree["meshes"][0]["weights"] = [0.5]
+    assert places(document.load(tmp_path))[..., 2].max() == 2.5
+    document.tree["nodes"][0]["weights"] = [2]
+    assert places(document.load(tmp_path))[..., 2].max() == 10
+    document.attributes["POSITION"] = document.array(SQUARE, sparse=sparse)
+    document.primitive["targets"] = []
+    assert places(document.load(tmp_path))[:, :, 2].tolist() == [[0, 0, 5], [0, 5, 0]]
+
+
+def test_names_of_other_files_may_be_encoded(tmp_path):
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    document = Document().paint()
+    Image.fromarray(PAINT).save(folder / "wood dark.png")
+    document.tree["images"] = [{"uri": "wood%20dark.png"}]
+    document.tree["buffers"] = [{"byteLength": len(document.binary), "uri": "my%20model.bin"}]
+    (folder / "my model.bin").write_bytes(document.binary)
+    path = folder / "a.gltf"
+    path.write_text(json.dumps(document.tree))
+    mesh = load_mesh(path)
+    assert mesh.materials[0].texture is not None and not mesh.warnings
+    # The decoded name is what must stay inside of the folder.
+    (tmp_path / "out.bin").write_bytes(document.binary)
+    for name in ("..%2Fout.bin", "%2e%2e/out.bin", "%2e%2e%5cout.bin", str(tmp_path / "out.bin")):
+        document.tree["buffers"][0]["uri"] = name
+        path.write_text(json.dumps(document.tree))
+        refused("not found", load_mesh, path)
+    data = "data:application/octet-stream;base64," + base64.b64encode(document.binary).decode()
+    document.tree["buffers"][0]["uri"] = data
+    path.write_text(json.dumps(document.tree))
+    assert len(load_mesh(path).faces) == 2
+
+
+def without_position(document):
+    document.tree["meshes"][0]["primitives"].append({"attributes": {}})
+
+
+def changed(path, value):
+    """Changes a place of the document."""
+
+    def change(document):
+        place = document.tree
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = value
+
+    return change
+
+
+def beside(mode):
+    def change(document):
+        other = {"attributes": document.attributes, "mode": mode}
+        document.tree["meshes"][0]["primitives"].append(other)
+
+    return change
+
+
+MATERIAL = ("materials", 0)
+UNREAD = {
+    "points": (beside(0), "points beside the triangles are left out"),
+    "lines": (beside(1), "lines beside the triangles are left out"),
+    "a line loop": (beside(2), "a line loop beside the triangles are left out"),
+    "a line strip": (beside(3), "a line strip beside the triangles are left out"),
+    "no POSITION": (without_position, "a primitive without POSITION is left out"),
+    "scenes": (lambda d: d.tree["scenes"].append({}), "one of 2 scenes is read"),
+    "KTX2": (
+        changed(("textures", 0), {"extensions": {"KHR_texture_basisu": {"source": 0}}}),
+        "a texture's picture is named by KHR_texture_basisu, which is not read",
+    ),
+    "DDS": (
+        changed(("textures", 0), {"extensions": {"MSFT_texture_dds": {"source": 0}}}),
+        "a texture's picture is named by MSFT_texture_dds, which is not read",
+    ),
+    "no source": (
+        changed(("textures", 0), {}),
+        "a texture's picture is named by nothing, which is not read",
+    ),
+    "no picture": (changed(("images", 0), {"uri": "a.png"}), "a.png: not found"),
+    "clamp": (
+        lambda d: (
+            changed(("samplers",), [{"wrapS": 33071}])(d),
+            changed(("textures", 0, "sampler"), 0)(d),
+            d.attributes.update(TEXCOORD_0=d.array(2 * UVS)),
+        ),
+        "a texture that does not repeat is drawn as one that does",
+    ),
+    "light": (
+        changed((*MATERIAL, "emissiveFactor"), [0, 1, 0]),
+        "light of a surface beside its base colour is not drawn",
+    ),
+    **{
+        name: (changed((*MATERIAL, name), {"index": 0}), f"{name} is not drawn")
+        for name in ("normalTexture", "occlusionTexture")
+    },
+    "metal": (
+        changed((*MATERIAL, "pbrMetallicRoughness", "metallicRoughnessTexture"), {"index": 0}),
+        "metallicRoughnessTexture is not drawn",
+    ),
+    "short colours": (
+        lambda d: d.attributes.update(COLOR_0=d.array(SQUARE[:3])),
+        "COLOR_0 of 3 x 3 numbers is left out",
+    ),
+    "short normals": (
+        lambda d: d.attributes.update(NORMAL=d.array(SQUARE[:3])),
+        "NORMAL of 3 x 3 numbers is left out",
+    ),
+    **{
+        name: (changed((*MATERIAL, "extensions"), {name: {}}), f"the extension {name} is not read")
+        for name in ("KHR_materials_clearcoat", "KHR_materials_transmission", "MSFT_lod")
+    },
+    "instances": (
+        changed(("nodes", 0, "extensions"), {"EXT_mesh_gpu_instancing": {"attributes": {}}}),
+        "the extension EXT_mesh_gpu_instancing is not read",
+    ),
+    "listed": (changed(("extensionsUsed",), ["ADOBE_x"]), "the extension ADOBE_x is not read"),
+}
+
+
+@pytest.mark.parametrize("name", UNREAD)
+def test_what_is_not_read_is_named(tmp_path, name):
+    change, warning = UNREAD[name]
+    document = Document().paint()
+    assert not document.load(tmp_path).warnings
+    change(document)
+    mesh = document.load(tmp_path)
+    assert warning in mesh.warnings and len(mesh.faces) == 2
+
+
+def test_names_that_look_like_extensions_are_none(tmp_path):
+    document = Document(nodes=[{"mesh": 0, "name": "LP_body"}]).paint()
+    document.attributes["_BATCHID"] = 0
+    assert not document.load(tmp_path).warnings
+
+
+@pytest.mark.parametrize(
+    "name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"]
+)
+def test_packed_triangles_are_refused_by_name(tmp_path, name):
+    """Where a plain copy lies beside them, it is read."""
+    document = Document(extensionsUsed=[name])
+    assert len(document.load(tmp_path).faces) == 2
+    del document.tree["accessors"][0]["bufferView"]
+    refused(f"packed by {name}", document.load, tmp_path)
+    document = Document(extensionsRequired=[name])
+    refused(f"packed by {name}", document.load, tmp_path)
+
+
+def test_linear_light_of_all_displayed_values():
+    values = np.arange(256) / 255
+    np.testing.assert_array_equal(np.rint(255 * to_display(to_linear(values))), np.arange(256))
