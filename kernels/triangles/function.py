@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 import warp as wp
@@ -17,7 +19,7 @@ _PIECES = 64  # of a launch, so that no thread waits long for another
 
 
 def cuts_itself(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Tells if two faces of a mesh cut each other; see README for what that means.
+    """Return whether two faces of a mesh cut each other; see README for what that means.
 
     Args:
         vertices: ``[V, 3]``, finite, within 1e37 of the origin; those of one place are one.
@@ -47,16 +49,19 @@ def cuts_itself(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
 
 @wp.func
+@no_type_check
 def _corners(vertices: wp.array[wp.vec3d], faces: wp.array2d[wp.int32], i: int):
     return wp.matrix_from_rows(vertices[faces[i, 0]], vertices[faces[i, 1]], vertices[faces[i, 2]])
 
 
 @wp.func
+@no_type_check
 def _normal(t: wp.mat33d):
     return wp.cross(t[1] - t[0], t[2] - t[0])
 
 
 @wp.func
+@no_type_check
 def _heights(t: wp.mat33d, origin: wp.vec3d, normal: wp.vec3d):
     """Signed distances of the corners from a plane, times the normal's length."""
     return wp.vec3d(
@@ -65,6 +70,7 @@ def _heights(t: wp.mat33d, origin: wp.vec3d, normal: wp.vec3d):
 
 
 @wp.func
+@no_type_check
 def _apart(t: wp.mat33d, other: wp.mat33d, normal: wp.vec3d):
     """Tells if an edge of a triangle parts it from another one of its plane."""
     for k in range(3):
@@ -75,6 +81,7 @@ def _apart(t: wp.mat33d, other: wp.mat33d, normal: wp.vec3d):
 
 
 @wp.func
+@no_type_check
 def _span(t: wp.mat33d, heights: wp.vec3d, along: wp.vec3d):
     """Ends, along a line, of the part of a triangle in the plane that its heights are of."""
     low = wp.float64(wp.inf)
@@ -92,6 +99,7 @@ def _span(t: wp.mat33d, heights: wp.vec3d, along: wp.vec3d):
 
 
 @wp.func
+@no_type_check
 def _meet(a: wp.mat33d, b: wp.mat33d):
     """Tells if two triangles have a point in common (Möller 1997)."""
     zero = wp.float64(0.0)
@@ -112,6 +120,7 @@ def _meet(a: wp.mat33d, b: wp.mat33d):
 
 
 @wp.func
+@no_type_check
 def _cross_behind(a1: wp.vec3d, a2: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
     """Tells if two triangles with a corner at the origin have a ray from it in common.
 
@@ -137,6 +146,7 @@ def _cross_behind(a1: wp.vec3d, a2: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
 
 
 @wp.kernel
+@no_type_check
 def _cuts(
     offset: wp.int32,
     tree: wp.uint64,
