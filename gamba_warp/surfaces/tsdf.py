@@ -165,7 +165,16 @@ def fuse(
     if "indices" not in mesh.triangle or len(mesh.triangle["indices"]) == 0:
         raise UserError("the fused depth has no surface")
     positions, indices = mesh.vertex["positions"], mesh.triangle["indices"]
-    return positions.numpy().astype(np.float64), indices.numpy().astype(np.int64)
+    return _in_order(positions.numpy().astype(np.float64), indices.numpy().astype(np.int64))
+
+
+def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sort vertices and faces: Open3D's threads list the same ones in another order each time."""
+    vertices, renamed = np.unique(vertices, axis=0, return_inverse=True)
+    faces = renamed.reshape(-1)[faces]  # reshape: numpy 2.0 alone gives it two dimensions
+    first = faces.argmin(1)[:, None] + np.arange(3)
+    faces = np.take_along_axis(faces, first % 3, 1)
+    return vertices, faces[np.lexsort(faces.T[::-1])]
 
 
 def _image(depth: Tensor):

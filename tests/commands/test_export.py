@@ -49,6 +49,10 @@ def test_meshes_lie_where_the_gaussians_are(ball, tmp_path, surface):
     assert code == 0 and sorted(p.name for p in out.iterdir()) == sorted(
         f"egg-mesh.{kind}" for kind in MESH_FORMATS
     )
+    again = tmp_path / "again"
+    assert export(ball, "--out", again, "--mesh", "ply", "--surface", surface) == 0
+    same = "egg-mesh.ply"
+    assert (again / same).read_bytes() == (out / same).read_bytes()
     for kind in MESH_FORMATS:
         mesh = trimesh.load(out / f"egg-mesh.{kind}", force="mesh")
         center, size = mesh.bounds.mean(0), np.ptp(mesh.bounds, axis=0)
