@@ -107,10 +107,10 @@ def test_the_page_goes_from_the_best_to_the_worst(tmp_path, capfd):
     options = ["--points", "500", "--paint", "3", "--out", str(tmp_path / "out")]
     assert run("eval-geometry", [*words, *options]) == 0
     page = (tmp_path / "out" / "painted.html").read_text()
-    places = [page.index(f"of 3: {name}") for name in ("near", "deep/mid", "far")]
+    places = [page.index(f"of 3: {name}") for name in ("near", "deep-mid", "far")]
     assert places == sorted(places)
     folder = tmp_path / "out" / "painted"
-    for name in ("far", "near", "deep/mid"):
+    for name in ("far", "near", "deep-mid"):
         assert Image.open(folder / f"{name}.png").size == (4 * SIZE, 2 * SIZE)
         loaded = trimesh.load(folder / f"{name}.glb", force="mesh")
         assert len(loaded.faces) > 1000 and loaded.visual.vertex_colors[:, :3].std() > 1

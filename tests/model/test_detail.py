@@ -260,7 +260,7 @@ def test_children_of_what_is_not_finite_are_not_left_out():
     made = reconstruct(model, rgba, detail=1)
     with torch.inference_mode():
         made.opacities[3 * 200] = math.nan  # of the first layer
-        found = split_front(made, image, rgba, model.config, 4)
+        found = split_front(made, image, rgba, model.config, 4, reference_cameras(model.config, 1))
     assert found.opacities.isnan().sum() >= 16
 
 
