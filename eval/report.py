@@ -197,7 +197,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
 
 
 def count_line(report: dict[str, Any], folder: Path | None, beside: int) -> str:
-    """How many objects were evaluated and how many failed, and where the report is.
+    """Return the counts of evaluated and failed objects and the path of the report.
 
     Args:
         report: what ``make_report`` returns.

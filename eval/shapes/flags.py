@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gamba_warp.formats.parts import merged
 from gamba_warp.kernels.triangles import cuts_itself
 
-from .shape import Mesh, directed_edges, merged
+from .shape import Mesh, directed_edges
 
 FLAGS = {
     "open": "an edge belongs to an odd number of faces",

@@ -76,7 +76,7 @@ class Evaluated:
 
     @property
     def warnings(self) -> list[str]:
-        """What a report says of the file, one line each."""
+        """Warnings of the file for a report, one line each."""
         omitted = self.source.omitted if isinstance(self.source, Mesh) else ()
         return [*([self.warning] if self.warning else []), *omitted]
 

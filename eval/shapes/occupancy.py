@@ -8,8 +8,10 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from gamba_warp.formats.parts import merged
+
 from .command import OccupancyRule
-from .shape import Mesh, directed_edges, merged
+from .shape import Mesh, directed_edges
 
 VOTERS = 26  # rays from a point
 

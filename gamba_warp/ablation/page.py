@@ -99,7 +99,7 @@ def _about(table: dict[str, Any]) -> str:
 
 
 def _evaluated(table: dict[str, Any]) -> str:
-    """How many objects the rows have figures of, and where that differs, how many were wanted."""
+    """Number of evaluated objects of the rows; of those asked for too, where it differs."""
     wanted = table["evaluation"]["objects"]
     rows = [row for row in table["rows"] if row["figures"]]
     counts = sorted({row["objects"] for row in rows}) or [0]

@@ -290,7 +290,7 @@ class NewDefect(logging.Filter):
         self._seen: set[tuple[str, str, int]] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether to log it."""
+        """Return whether a record is logged."""
         kind, _, place = record.exc_info or (None, None, None)
         if kind is None:
             return True

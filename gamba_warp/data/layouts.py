@@ -310,7 +310,7 @@ def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
 
 
 def _frames(path: Path) -> tuple[dict, list[dict]]:
-    """What the file states for all frames, and the frames."""
+    """Values of all frames in a file, and its frames."""
     top = read_document(path, object)
     if not isinstance(top, dict):
         raise UserError(f"{path}: expected a JSON object")

@@ -164,7 +164,7 @@ class _Reader:
         return uvs * [1, -1] + [0, 1]
 
     def material(self, look: Entry) -> tuple[Material, Entry]:
-        """What a material of the document looks like, and where it names its texture."""
+        """Colour and texture of a material, and the entry that names its texture."""
         base, more = look.entry("pbrMetallicRoughness"), look.entry("extensions")
         for source, name in (
             *((look, "normalTexture"), (look, "occlusionTexture")),

@@ -39,10 +39,10 @@ _Matrix = Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)]
 
 
 class Entry:
-    """An object of the document; what nobody asks for may be anything.
+    """An object of the document; its values are checked when they are asked for.
 
     Attributes:
-        where: it stands, for errors.
+        where: place in the document, for errors.
         values: by their names, not checked.
     """
 

@@ -86,7 +86,7 @@ class SideFiles:
         self.omitted.append(what)
 
     def read(self, *names: str) -> bytes:
-        """What the first of these files that is there holds.
+        """Read the first of these files that exists.
 
         Raises:
             UserError: none is there, it is no plain file, or too large.

@@ -81,7 +81,7 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
 
 
 class _Statements:
-    """What the lines of a file say."""
+    """Statements of a file, line by line."""
 
     def __init__(self, path: Path, text: bytes) -> None:
         self.points, self.flat, self.straight = array("d"), array("d"), array("d")
@@ -158,7 +158,7 @@ class _Statements:
 
 
 def _library(lines: list[str], sides: SideFiles) -> dict[str, dict[str, str]]:
-    """What the MTL files say: of each material, its statements by their words in lower case."""
+    """Statements of each material of the MTL files, by their keywords in lower case."""
     found: dict[str, dict[str, str]] = {}
     for line in dict.fromkeys(lines):
         options: dict[str, str] = {}

@@ -15,6 +15,7 @@ from ..errors import UserError
 from ..files import atomic_path
 from ..formats.materials import to_linear
 from ..formats.names import MESH_FORMATS, MeshFormat
+from ..formats.parts import merged
 from ..gaussians import Gaussians
 from ..images import to_uint8
 from .extract import Surface, surface_of
@@ -78,7 +79,7 @@ def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
 
     # A vertex at a seam of the texture is there twice.
     corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
-    found, faces = np.unique(corners, axis=0, return_inverse=True)
+    found, faces = merged(corners)
     vertices, uvs = surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:]
     faces = faces.reshape(-1, 3)
     image = Image.fromarray(to_uint8(texture.image))

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..cameras import Cameras, fibonacci_sphere, intrinsics
 from ..errors import UserError
+from ..formats.parts import merged
 from ..gaussians import Gaussians
 from ..kernels.rasterize import depth_quantile
 from ..render import render
@@ -170,8 +171,8 @@ def fuse(
 
 def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sort vertices and faces: Open3D's threads list the same ones in another order each time."""
-    vertices, renamed = np.unique(vertices, axis=0, return_inverse=True)
-    faces = renamed.reshape(-1)[faces]  # reshape: numpy 2.0 alone gives it two dimensions
+    vertices, index = merged(vertices)
+    faces = index[faces]
     first = faces.argmin(1)[:, None] + np.arange(3)
     faces = np.take_along_axis(faces, first % 3, 1)
     return vertices, faces[np.lexsort(faces.T[::-1])]

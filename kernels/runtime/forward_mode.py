@@ -1,4 +1,4 @@
-"""Forward-mode derivatives, which our operators have not: torch would take them for zero."""
+"""Refusal of forward-mode derivatives, which torch would take for zero."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch.autograd import forward_ad
 
 
 def has_tangent(*values: Any) -> bool:
-    """Tell if a tensor among the values carries a tangent, of ``torch.func.jvp`` or a dual number.
+    """Return whether a value carries a tangent, of ``torch.func.jvp`` or of a dual number.
 
     Values that are no tensors, and tensors within lists, are passed over.
     """

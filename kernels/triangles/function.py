@@ -101,7 +101,7 @@ def _span(t: wp.mat33d, heights: wp.vec3d, along: wp.vec3d):
 @wp.func
 @no_type_check
 def _meet(a: wp.mat33d, b: wp.mat33d):
-    """Tells if two triangles have a point in common (Möller 1997)."""
+    """Return whether two triangles have a point in common (Möller 1997)."""
     zero = wp.float64(0.0)
     of_a = _normal(a)
     heights_b = _heights(b, a[0], of_a)
@@ -122,7 +122,7 @@ def _meet(a: wp.mat33d, b: wp.mat33d):
 @wp.func
 @no_type_check
 def _cross_behind(a1: wp.vec3d, a2: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Tells if two triangles with a corner at the origin have a ray from it in common.
+    """Return whether two triangles with a corner at the origin have a ray from it in common.
 
     Within both angles, not along an edge; triangles of one plane have none.
     """

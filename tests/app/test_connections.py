@@ -47,7 +47,7 @@ def asked(address, path="", end="\r\n\r\n"):
 
 
 def closed(client, seconds=5.0):
-    """Whether the server closes a connection within a time; what it sends is taken."""
+    """Return whether the server closes a connection within a time; its answers are read."""
     client.settimeout(seconds)
     try:
         while client.recv(1 << 16):

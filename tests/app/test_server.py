@@ -20,7 +20,7 @@ from gamba_warp.errors import UserError
 
 
 def answered(host, kind="http", path="/", method="GET", shelf=None, body=b"", token=None, more=()):
-    """What the guard answers to a request: the messages, and the scopes that it let in."""
+    """Messages of the guard for a request, and the scopes that it passes on."""
     sent, inside = [], []
 
     async def app(scope, receive, send):
@@ -169,7 +169,7 @@ def kept_file(shelf, visitor, size=1000):
 
 
 def test_files_of_who_is_here_stay(tmp_path):
-    """Who is gone makes room first; where none is left, a new file is refused."""
+    """Visitors that are gone make room first; without any, a new file is refused."""
     shelf = Shelf(tmp_path, limit=3000)
     with shelf.visited("a"):
         first, left, last = (kept_file(shelf, visitor) for visitor in "aba")
@@ -314,7 +314,7 @@ def temporary(tmp_path, monkeypatch):
 
 
 def left_folder(path, mode=0o700):
-    """What a killed process leaves."""
+    """Folder of a killed process."""
     path.mkdir()
     path.chmod(mode)
     (path / "picture.png").write_bytes(b"x")

@@ -436,7 +436,7 @@ def test_names_that_look_like_extensions_are_none(tmp_path):
     "name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"]
 )
 def test_packed_triangles_are_refused_by_name(tmp_path, name):
-    """Where a plain copy lies beside them, it is read."""
+    """Read the plain copy beside them."""
     document = Document(extensionsUsed=[name])
     assert len(document.load(tmp_path).faces) == 2
     del document.tree["accessors"][0]["bufferView"]

@@ -64,7 +64,7 @@ class Opened:
 
 
 def complains(message: Any) -> bool:
-    """Whether a message of Playwright's console is a complaint: of the page, or of its requests.
+    """Return whether a message of Playwright's console is an error of the page or its requests.
 
     A graphics driver warns of its own speed, most of all where it draws in software. What a page
     says has arguments, unlike what the browser says; a driver's errors are the page's.

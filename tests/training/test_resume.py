@@ -24,7 +24,7 @@ STILL = {"optim": {"lr": 1e-30, "weight_decay": 0.0, "ema": 0.0}, "length": {"st
 
 
 def times(folder):
-    """When each file was changed, the lock apart."""
+    """Times of the last change of each file but the lock."""
     return {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.name != ".lock"}
 
 

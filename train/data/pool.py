@@ -134,7 +134,7 @@ class Pool:
                 if failed and not self._closed:
                     number, reason = failed.popitem()
                     raise UserError(f"made object {number}: {reason}")
-        except Exception as error:  # nobody waits for this thread: ``take`` raises it
+        except Exception as error:  # ``take`` raises it in the caller's thread
             with self._changed:
                 self._failure = str(error)
                 self._changed.notify_all()

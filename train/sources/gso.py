@@ -88,7 +88,7 @@ def find_meshes_of(source: Path, names: Sequence[str]) -> list[Mesh]:
 
 
 def others_of(source: Path) -> int:
-    """How many of the set's models are in a folder that are not of the evaluation."""
+    """Number of the set's models in a folder that are not of the evaluation."""
     others = sorted(gso.all_names() - {*gso.NAMES})
     with suppress(UserError):
         return len(find_models(source, others))

@@ -89,7 +89,7 @@ def test_scan(lengths, channels, states, groups, rule, dtype, device, from_ptx):
 
 
 def test_scan_on_cuda_keeps_packed_sequences_whole(from_ptx):
-    """Where each row alone would be cut into four segments, the bits are those without a cut."""
+    """Packed rows equal uncut rows, bit for bit, where each alone is cut into four segments."""
     lengths = [230, 0, 3]
     inputs, cuts = scan_inputs(lengths, 5, 3), borders(lengths)
     from_ptx()

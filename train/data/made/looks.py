@@ -1,4 +1,4 @@
-"""What surfaces look like, and solids to a mesh with textures.
+"""Looks of surfaces, and meshes with textures made of solids.
 
 A solid that is *stamped* remembers, at each point, where this lay when it was stamped (its *skin*),
 and the number of its look. Both stay through booleans, turns and bends, so that textures are laid
@@ -32,7 +32,7 @@ _SIGNS = np.array([[-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
 
 @dataclass
 class Look:
-    """How some of an object's parts look.
+    """Look of some of an object's parts.
 
     Attributes:
         materials: one for all sides; or six, of the sides that look to +x, -x, +y, -y, +z and -z.
@@ -63,7 +63,7 @@ def plain_material(value: np.ndarray) -> Material:
 
 
 class Maker:
-    """What plans draw chance and looks from.
+    """Source of random numbers and of looks for plans.
 
     Args:
         rng: source of chance.

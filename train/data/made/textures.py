@@ -427,7 +427,7 @@ def package(
 
 
 def screen(rng: np.random.Generator) -> np.ndarray:
-    """What a display shows: black, or windows, or a home screen."""
+    """Picture of a display: black, windows, or a home screen."""
     sheet = Print(rng, color(rng, "dark") * 0.5)
     kind = rng.integers(4)
     if kind == 1:
