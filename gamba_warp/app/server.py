@@ -66,17 +66,17 @@ def app_command(
     from ..model.checkpoint import load_model
     from ..photo.cutout import Ways
 
-    chosen, door = pick_device(device), listener(port)
+    chosen, listening = pick_device(device), listener(port)
     ways = Ways(matte_model=matte_model, device=chosen).checked()
     model = load_model(checkpoint, chosen, encoder_weights)
-    with door, work_folder() as folder:
+    with listening, work_folder() as folder:
         quiet(folder)
         from .actions import Actions
         from .interface import build
 
         turns, shelf = MainThread(), Shelf(folder, own=max(MAX_OWN, max_upload_mb << 20))
         page = build(Actions(model, ways, shelf, str(chosen), turns))
-        serve(page, shelf, door, max_upload_mb, open_browser, turns)
+        serve(page, shelf, listening, max_upload_mb, open_browser, turns)
 
 
 class MainThread:
@@ -195,7 +195,7 @@ def listener(port: int) -> socket.socket:
 def serve(
     page: gr.Blocks,
     shelf: Shelf,
-    door: socket.socket,
+    listening: socket.socket,
     max_mb: int,
     open_browser: bool,
     turns: MainThread,
@@ -205,7 +205,7 @@ def serve(
     Args:
         page: of ``interface.build``.
         shelf: for the visitors' files.
-        door: of ``listener``.
+        listening: socket of ``listener``.
         max_mb: largest upload, MB.
         open_browser: whether the browser is opened; where there is none, the address is printed.
         turns: what this thread does meanwhile.
@@ -223,7 +223,7 @@ def serve(
     from .guard import Guard
     from .interface import LOOK, inputs, theme
 
-    port = door.getsockname()[1]
+    port = listening.getsockname()[1]
     page.state_session_capacity = _PAGES
     app = gr.mount_gradio_app(
         FastAPI(openapi_url=None),
@@ -259,7 +259,7 @@ def serve(
     logging.getLogger("uvicorn.error").addFilter(new_defect)
     logging.getLogger("asyncio").addFilter(new_defect)
     logging.getLogger("python_multipart").setLevel(logging.ERROR)  # it warns of damaged uploads
-    thread = threading.Thread(target=server.run, args=[[door]], daemon=True)
+    thread = threading.Thread(target=server.run, args=[[listening]], daemon=True)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     thread.start()
     try:

@@ -31,10 +31,10 @@ def address(monkeypatch):
 
     options = {"ws": "none", "lifespan": "off", "log_config": None, "timeout_keep_alive": 60}
     server = uvicorn.Server(uvicorn.Config(app, http=connections.Connection, **options))
-    door = socket.create_server(("127.0.0.1", 0))
-    thread = threading.Thread(target=server.run, args=[[door]], daemon=True)
+    listening = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, args=[[listening]], daemon=True)
     thread.start()
-    yield door.getsockname()
+    yield listening.getsockname()
     server.should_exit = server.force_exit = True
     thread.join(timeout=10)
     assert not thread.is_alive()
