@@ -57,7 +57,8 @@ _MODELS = "camera_model", "camera_type"
 # Those of nerfstudio and COLMAP that are pinholes where all distortion is 0.
 _PINHOLES = {*("pinhole", "simple_pinhole", "perspective", "opencv", "full_opencv", "radial")}
 _PINHOLES |= {"simple_radial"}
-_LENS = {*("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")}
+_PIXELS = "fl_x", "fl_y", "cx", "cy"
+_LENS = {*("w", "h", "camera_angle_x", "camera_angle_y"), *_PIXELS}
 _LENS |= {*_DISTORTIONS, *_MODELS}
 _FIT = 0.02  # sides of the cube by which a simplified mesh may miss it
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
@@ -278,20 +279,22 @@ def _intrinsics(
     elif size is not None:
         stated = size()
     width, height = stated or (1, 1)
-    if "fl_x" in values and stated:
+    if not stated and (pixels := [key for key in _PIXELS if key in values]):
+        raise UserError(f"{source}: {pixels[0]} is in pixels, so w and h are needed")
+    if "fl_x" in values:
         focal_x = _number(values, "fl_x", source)
     elif "camera_angle_x" in values:
         focal_x = width * _focal(_number(values, "camera_angle_x", source), source)
     else:
         raise UserError(f"{source}: no camera: needs w, h, fl_x (fl_y, cx, cy), or camera_angle_x")
-    if "fl_y" in values and stated:
+    if "fl_y" in values:
         focal_y = _number(values, "fl_y", source)
-    elif "camera_angle_y" in values and not ("fl_x" in values and stated):
+    elif "camera_angle_y" in values and "fl_x" not in values:
         focal_y = height * _focal(_number(values, "camera_angle_y", source), source)
     else:
         focal_y = focal_x
-    center_x = _number(values, "cx", source) if stated and "cx" in values else width / 2
-    center_y = _number(values, "cy", source) if stated and "cy" in values else height / 2
+    center_x = _number(values, "cx", source) if "cx" in values else width / 2
+    center_y = _number(values, "cy", source) if "cy" in values else height / 2
     return _camera_matrix(focal_x, focal_y, center_x, center_y), stated
 
 

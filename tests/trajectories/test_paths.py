@@ -217,6 +217,14 @@ BAD = {
         {"w": 9, "h": 9, "fl_x": 9, "k1": 0.5, "frames": [{"transform_matrix": [[1]]}]},
         "the pose has shape",
     ),
+    "pixels of no size": (
+        {
+            "camera_angle_x": 1,
+            "cx": 9,
+            "frames": [{"transform_matrix": np.eye(4).tolist()}],
+        },
+        "cx is in pixels, so w and h are needed",
+    ),
     "sizes": (
         [
             {
