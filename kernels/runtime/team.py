@@ -15,6 +15,7 @@ from typing import Any
 
 import warp as wp
 
+from .entry import Entry
 from .views import unkept
 
 wp.set_module_options({"enable_backward": False})
@@ -92,57 +93,10 @@ def has_team() -> bool:
     return _parallel != 0
 
 
-_MOST_EXTENTS = 1024  # that a kernel keeps
+_entries: dict[Any, Entry] = {}  # by kernel
 
 
-class _Entry:
-    """A kernel's compiled function and the C structures that it takes.
-
-    They are attributes of Warp's that are not public.
-
-    Raises:
-        AttributeError: this Warp has no such attributes; also TypeError, where they are others.
-    """
-
-    def __init__(self, kernel: wp.Kernel, command: Any, dim: tuple[int, ...], arguments: list):
-        self.rank = kernel.adj.kernel_dim
-        self.call = command.hooks.forward
-        self.address = ctypes.cast(self.call, ctypes.c_void_p).value
-        if not self.address:
-            raise TypeError("a recorded launch has no compiled function")
-        self.executable = command.module_exec  # keeps the function loaded
-        self.bounds: Any = type(command.bounds)
-        self.names = [arg.label for arg in kernel.adj.args]
-        fields = [(name, type(x)) for name, x in zip(self.names, command.params[1:])]
-        self.record: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
-        self._empty = [kind() for _, kind in fields]
-        self._structs = [i for i, x in enumerate(arguments) if hasattr(x, "__ctype__")]
-        self._extents: dict[tuple[int, ...], Any] = {}
-        self.extent(dim)  # so that an error comes now and not in a later launch
-        self.pack(arguments)
-
-    def pack(self, arguments: list) -> ctypes.Structure:
-        """The arguments as the compiled function takes them; an array that is None is empty."""
-        values = [y if x is None else x for x, y in zip(arguments, self._empty)]
-        for i in self._structs:
-            values[i] = values[i].__ctype__()
-        return self.record(*values)
-
-    def extent(self, dim: tuple[int, ...]) -> ctypes.Structure:
-        """The dimensions as the compiled function takes them; not to be changed."""
-        known = self._extents.get(dim)  # looked up once: another thread may clear them
-        if known is None:
-            if len(self._extents) >= _MOST_EXTENTS:
-                self._extents.clear()
-            known = self.bounds((*dim, *(1,) * (self.rank - len(dim))))
-            self._extents[dim] = known
-        return known
-
-
-_entries: dict[Any, _Entry] = {}  # by kernel
-
-
-def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> _Entry | None:
+def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> Entry | None:
     """The entry of a kernel; None, and no team from now on, where this Warp has no such thing.
 
     It is made by a launch that is recorded only, which checks the arguments; later launches have
@@ -154,7 +108,10 @@ def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> _Entry | None:
         except OSError as error:
             raise unkept(error) from error
         try:
-            _entries[kernel] = _Entry(kernel, command, dim, arguments)
+            entry = Entry(kernel, command, dim, arguments)
+            if not ctypes.cast(entry.call, ctypes.c_void_p).value:
+                raise TypeError("a recorded launch has no compiled function")
+            _entries[kernel] = entry
         except (AttributeError, TypeError) as error:
             if has_team():
                 warnings.warn(
@@ -191,7 +148,7 @@ def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, thr
         bounds[i], records[i] = entry.extent(dim), record
         offset += dim[0]
     job = _Job(
-        entry.address,
+        ctypes.cast(entry.call, ctypes.c_void_p).value,
         ctypes.addressof(bounds),
         ctypes.sizeof(entry.bounds),
         ctypes.addressof(records),

@@ -29,12 +29,14 @@ def _count(
     offset: wp.int32,
     grid: Grid,
     splats_in: Splats,
-    order_in: wp.array[wp.int32],
+    nearest_in: wp.array[wp.int64],
+    order_out: wp.array[wp.int32],
     counts_out: wp.array[wp.int32],
     box_counts_out: wp.array[wp.int64],
 ):
     j = offset + wp.tid()
-    i = order_in[j]
+    i = j / grid.num * grid.num + wp.int32(nearest_in[j])
+    order_out[j] = i
     extent = splats_in.extents[i]
     count = wp.int32(0)
     box_count = wp.int64(0)
@@ -59,6 +61,7 @@ def _emit(
     order_in: wp.array[wp.int32],
     offsets_in: wp.array[wp.int32],
     count_in: wp.array[wp.int64],
+    first: wp.int32,
     tiles_out: wp.array[wp.int32],
     gaussians_out: wp.array[wp.int32],
 ):
@@ -77,9 +80,24 @@ def _emit(
             # not one more than was counted: a compiler may round otherwise here than it did there
             last = wp.min(columns[1], columns[0] + end - p - 1)
             for tx in range(columns[0], last + 1):
-                L.store_int(tiles_out, p, row + tx)
+                L.store_int(tiles_out, p, first + row + tx)
                 L.store_int(gaussians_out, p, i)
                 p += 1
+
+
+@wp.kernel
+@no_type_check
+def _in_tile_order(
+    offset: wp.int32,
+    gaussians_in: wp.array[wp.int32],
+    emitted_in: wp.array[wp.int64],
+    pairs_out: wp.array[wp.int32],
+    rows_out: wp.array[wp.int32],
+):
+    k = offset + wp.tid()
+    row = wp.int32(emitted_in[k])
+    rows_out[k] = row
+    pairs_out[k] = gaussians_in[row]
 
 
 def bin_views(
@@ -94,28 +112,32 @@ def bin_views(
         exact: whether to read the number of pairs back and to make the lists as long.
     """
     depths = tensors[2]
-    device, (images, num) = depths.device, depths.shape
+    device, images = depths.device, len(depths)
     # stable: equal depths stay in the order of the Gaussians
-    order = torch.argsort(depths, dim=1, stable=True)
-    order += torch.arange(images, device=device)[:, None] * num
-    order = order.view(-1).int()
+    nearest = torch.argsort(depths, dim=1, stable=True)
+    order = torch.empty(depths.numel(), dtype=torch.int32, device=device)
     counts = torch.empty_like(order)
     box_counts = torch.empty_like(order, dtype=torch.int64)
     splats = Packed(Splats, *tensors, None)
-    launch(_count, order.numel(), [grid, splats, order], [counts, box_counts], device)
-    offsets = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0))
-    count, offsets = offsets[-1].clone(), offsets.int()
+    found = [order, counts, box_counts]
+    launch(_count, order.numel(), [grid, splats, nearest.view(-1)], found, device)
+    offsets = order.new_zeros(len(order) + 1)
+    torch.cumsum(counts, 0, dtype=torch.int32, out=offsets[1:])
+    count = counts.sum()
     room = _room(grid, depths, count, check, exact)
     tiles = images * grid.tiles_x * grid.tiles_y
+    # a sort of 16 bits takes half as long as one of 32
+    first, number = (-(1 << 15), torch.int16) if tiles < 1 << 16 else (0, torch.int32)
     # what stays free has the number behind the last tile's, so that it comes last
-    tile_of, gaussians = order.new_full((room,), tiles), order.new_zeros(room)
-    inputs = [grid, splats, order, offsets, count.view(1)]
+    tile_of, gaussians = order.new_full((room,), first + tiles), order.new_zeros(room)
+    inputs = [grid, splats, order, offsets, count.view(1), first]
     launch(_emit, order.numel() if room else 0, inputs, [tile_of, gaussians], device)
-    sorted_tiles, rows = torch.sort(tile_of, stable=True)
+    sorted_tiles, emitted = torch.sort(tile_of.to(number), stable=True)
     # not bincount: on CUDA it reads the largest value back
-    firsts = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+    firsts = torch.arange(first, first + tiles + 1, dtype=number, device=device)
     starts = torch.searchsorted(sorted_tiles, firsts, out_int32=True)
-    pairs, rows = gaussians[rows], rows.int()
+    pairs, rows = torch.empty_like(gaussians), torch.empty_like(gaussians)
+    launch(_in_tile_order, room, [gaussians, emitted], [pairs, rows], device)
     return Bins(order, offsets, pairs, rows, starts, box_pairs=box_counts.sum(), count=count)
 
 

@@ -21,7 +21,7 @@ from ...runtime.packed import count_slots
 from ...runtime.scalars import LOG2E, exp2
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
-from ..problem import DISCRETIZATIONS, Scan, sum_parts
+from ..problem import DISCRETIZATIONS, Scan
 from .backward import backward_kernel
 from .blocks import MARK, RUN, Sizes, block_shape
 from .forward import forward_kernel
@@ -141,6 +141,25 @@ def _carry_kernel(exponential: bool, reverse: bool):
             h = decay * h + own
 
     return carry
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _sum_parts(
+    # in
+    parts: int,
+    parts_in: wp.array2d(dtype=float),
+    # out
+    sums_out: wp.array4d(dtype=float),
+):
+    b, g, i = wp.tid()
+    first = (b * sums_out.shape[2] + g) * parts
+    # one after the other, as ``problem.sum_parts``
+    total = parts_in[first, i]
+    for part in range(1, parts):
+        total += parts_in[first + part, i]
+    states = sums_out.shape[3]
+    sums_out[b, i / states, g, i % states] = total
 
 
 class _Operands:
@@ -286,8 +305,11 @@ def backward(
         return o.empty(rows, o.length, o.states)
 
     def total(parts: Tensor) -> Tensor:
-        shape = (o.batch, o.groups, o.parts, o.length, o.states)
-        return sum_parts(parts.view(shape)).transpose(1, 2).contiguous()
+        total = o.empty(o.batch, o.length, o.groups, o.states)
+        if total.numel():
+            dim = o.batch, o.groups, o.length * o.states
+            cuda_launch(_sum_parts, dim, [o.parts, parts.flatten(1)], [total], device=o.device)
+        return total
 
     du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
     db, dc = sums("dB"), sums("dC")
