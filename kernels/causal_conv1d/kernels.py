@@ -21,6 +21,7 @@ CHUNK = 64  # tokens of a backward task, each with its own sum for the gradient 
 # Tokens that a CPU adds one after the other: equal terms would round to the same side 64 times.
 # CUDA has none: a second level of sums costs registers there.
 RUN = 16
+AHEAD = 8  # tokens whose loads a CUDA thread of the gradient has under way
 VALUES = {"cpu": (lanes, W), "cuda": (wp.float32, 1)}  # type of a value, and its channels
 
 
@@ -33,6 +34,7 @@ def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
         WIDTH=VALUES[device_type][1],
         PIECE=piece,
         RUN=RUN if on_cpu else 0,
+        AHEAD=AHEAD,
     )
 
 
