@@ -66,7 +66,8 @@ def choose(
     The model: a multiprocessor holds ``RESIDENT`` blocks at a time, and k blocks at once take
     k + 1/2 times as long as one would take at its full rate. P segments are walked (2 - 1/P) times
     in the forward; the gradient's walks are longer, so that they cost (4 - 1/P) / 3. Beginning
-    and ending a segment costs as much as ``OVERHEAD`` tokens. No GPU has timed it.
+    and ending a segment costs as much as ``OVERHEAD`` tokens. In one pass the forward has twice
+    the threads, of half as many states: CUDA.md has the times.
     """
     tuning = Tuning()
     if not batch or not length:
@@ -85,8 +86,10 @@ def choose(
 
         return min(range(1, min(units, MOST_SEGMENTS) + 1), key=cost)
 
+    forward = segments((tuning.channels, tuning.states), RESIDENT[0], 1.0)
     return tuning._replace(
-        segments=segments((tuning.channels, tuning.states), RESIDENT[0], 1.0),
+        segments=forward,
+        states=2 if forward == 1 else tuning.states,
         back_segments=segments((tuning.back_channels, tuning.back_states), RESIDENT[1], 3.0),
     )
 
