@@ -112,9 +112,11 @@ def _operations(device: torch.device) -> str:
         raise LeftOut("needs a checkout and pytest")
     command = [sys.executable, "-m", "pytest", "-m", "gpu", str(tests)]
     done = subprocess.run(command, cwd=tests.parents[1], capture_output=True, encoding="utf-8")
-    last = "".join([*filter(None, done.stdout.splitlines())][-1:])
+    lines = [*filter(None, done.stdout.splitlines())]
+    last = "".join(lines[-1:])
     if done.returncode:
-        raise AssertionError(last)
+        reasons = [line[1:].strip() for line in lines if line.startswith("E ")]
+        raise AssertionError(": ".join([last, *reasons[:1]]))
     if "passed" not in last:  # without a compiler it is skipped
         raise LeftOut(last)
     return "equal bit for bit, the approximate units within their bounds"

