@@ -113,6 +113,19 @@ def test_no_module_imports_an_extra_when_it_is_loaded():
                     assert not {name, name.partition(".")[0]} & set(versions.EXTRA_OF), (path, name)
 
 
+def test_training_loads_without_what_makes_objects(monkeypatch):
+    code = WITHOUT.rpartition("cli.main")[0] + "import gamba_warp.train.batches"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    from gamba_warp.train.data.pool import Pool, PoolOptions
+
+    real = versions.find_spec
+    monkeypatch.setattr(versions, "find_spec", lambda n: n != "manifold3d" and real(n) or None)
+    with pytest.raises(ModuleNotFoundError) as found:
+        Pool(PoolOptions(0, 0, 1, 1, 1, None), 0)
+    assert found.value.name == "manifold3d"
+
+
 @pytest.mark.slow
 def test_a_picture_becomes_gaussians_and_a_page_with_the_core_alone(tmp_path):
     picture = cut_out(tmp_path / "thing.png")

@@ -22,8 +22,8 @@ from gamba_warp.data.layouts import ObjectFiles, Stored
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.children import Failed, end_idle, run_each
+from gamba_warp.versions import NEEDS, require
 
-from .made import make_object
 from .render import DEPTH_UNIT, Views, draw_views
 from .settings import Settings
 
@@ -61,7 +61,11 @@ class Pool:
         Args:
             options: the pool's options.
             first: number of the first sample that is taken.
+
+        Raises:
+            ModuleNotFoundError: what makes objects needs a library that is not installed.
         """
+        require(*NEEDS["data made"])
         self.options = options
         self._first = first
         self._ready: dict[int, ViewDataset] = {}
@@ -167,6 +171,8 @@ def _order(seed: int, turn: int) -> np.ndarray:
 
 def _made(number: int, seed: int, settings: Settings) -> Views:
     """In a child process: an object's views."""
+    from .made import make_object  # needs libraries that a training without made objects does not
+
     quiet_warp()
     torch.set_num_threads(1)
     return draw_views(make_object(np.random.default_rng([seed, number])), str(number), settings)
