@@ -70,6 +70,14 @@ def say(line: str) -> None:
     tqdm.write(one_line(line))
 
 
+def warn(path: Path, lines: Iterable[str]) -> None:
+    """Prints in one line on stderr, above the bar, what of a file is not used; nothing of none."""
+    from tqdm import tqdm
+
+    if text := "; ".join(lines):
+        tqdm.write(one_line(f"warning: {path}: {text}"), file=sys.stderr)
+
+
 class Stages:
     """What a command is doing: shown behind the bar of ``for_each``, and timed.
 

@@ -48,6 +48,7 @@ def export_command(
     elevation: Elevation = 0.0,
     fov: Fov | None = None,
     distance: Distance | None = None,
+    drop_bad: bool = False,
     device: DeviceChoice = "auto",
 ) -> int:
     """Turns files of Gaussians into meshes, other splat formats, pages and turntables.
@@ -76,6 +77,8 @@ def export_command(
             large.
         distance: Its distance from the object's centre, in units of the longest side; 1.5 if not
             given.
+        drop_bad: Leave out Gaussians that cannot be drawn (a value that is not finite, a rotation
+            of length zero), and say how many; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
     from tqdm import tqdm
@@ -101,6 +104,7 @@ def export_command(
         texture=texture,
         device=pick_device(device),
         view=Viewpoint().changed(elevation, distance, fov),
+        drop_bad=drop_bad,
     )
     if not job.suffixes():
         raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")

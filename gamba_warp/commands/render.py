@@ -34,6 +34,7 @@ def render_command(
     distance: Distance | None = None,
     background: str = "white",
     depth: bool = False,
+    drop_bad: bool = False,
     device: DeviceChoice = "auto",
 ) -> int:
     """Renders Gaussians along a path of cameras: to a GIF, a video, or a folder of pictures.
@@ -57,10 +58,11 @@ def render_command(
         distance: Distance of the camera from the object's centre, in units of its longest side.
         background: white, black, gray, #rrggbb, or none (transparent, png only).
         depth: Also pictures of depth, 16 bits (png only).
+        drop_bad: Leave out Gaussians that cannot be drawn (a value that is not finite, a rotation
+            of length zero), and say how many; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from ..formats.gaussians.files import read_gaussians
-    from ..pages.export import find_gaussians
+    from ..pages.export import find_gaussians, read_told
     from ..surfaces.extract import unit_frame
     from ..trajectories.film import Film, parse_background, parse_size, plan_path, shoot
     from ..trajectories.movies import require_movie
@@ -103,7 +105,7 @@ def render_command(
 
     def one(target: str, path: Path) -> None:
         count = len(film.cameras.viewmats)
-        gaussians = read_gaussians(path)
+        gaussians = read_told(path, drop_bad)
         with progress_bar(total=count, desc=path.name, unit="view", leave=False) as bar:
             shoot(Path(target), kind, gaussians, unit_frame(gaussians), film, chosen, bar.update)
 

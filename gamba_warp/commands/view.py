@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from msgspec import Meta
 
-from ..batch import check_not_read
+from ..batch import check_not_read, warn
 from ..conventions import Axes
 from ..errors import UserError
 from ..files import output_folder
@@ -29,6 +29,7 @@ def view_command(
     elevation: Elevation = 0.0,
     fov: Fov | None = None,
     distance: Distance | None = None,
+    drop_bad: bool = False,
 ) -> None:
     """Shows Gaussians or a training run in a browser, as one HTML page without a network.
 
@@ -45,10 +46,12 @@ def view_command(
             large.
         distance: Distance of the camera from the object's centre at the start, in units of its
             longest side; 1.5 if not given.
+        drop_bad: Leave out Gaussians that cannot be drawn (a value that is not finite, a rotation
+            of length zero), and say how many; without it such a file is refused.
     """
     import tempfile
 
-    from ..formats.gaussians.files import read_gaussians
+    from ..pages.export import read_told
     from ..pages.run import write_run_page
     from ..pages.serve import page_server
     from ..trajectories.paths import Viewpoint
@@ -58,8 +61,11 @@ def view_command(
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
     if mesh is not None and file.is_dir():
         raise UserError(f"--mesh {mesh}: a training run has no mesh")
-    gaussians = None if file.is_dir() else read_gaussians(file)
-    surface = None if mesh is None else read_viewed_mesh(mesh, mesh_frame)
+    gaussians = None if file.is_dir() else read_told(file, drop_bad)
+    surface = None
+    if mesh is not None:
+        surface = read_viewed_mesh(mesh, mesh_frame)
+        warn(mesh, surface.warnings)
     if out is not None:
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"

@@ -35,21 +35,27 @@ class Part:
     colors: np.ndarray | None = None
 
 
-def to_rgba8(values: np.ndarray) -> np.ndarray:
-    """Makes uint8 RGBA ``[N, 4]`` of display colours ``[N, 3 or more]`` of any type and range.
+def color_range(values: np.ndarray) -> int:
+    """The number that is full light in colours of any type.
 
     Integers reach to 255, those of 16 bits to 65535; floats to 1, or to the smallest of these three
     that they fit.
     """
+    if values.dtype == np.uint8:
+        return 255
+    top = np.nan_to_num(values, posinf=0).max(initial=0)
+    if values.dtype.kind == "f" and top <= 2:  # some programs go a little over 1
+        return 1
+    return 65535 if values.dtype == np.uint16 or top > 255 else 255
+
+
+def to_rgba8(values: np.ndarray) -> np.ndarray:
+    """Makes uint8 RGBA ``[N, 4]`` of display colours ``[N, 3 or more]`` of any ``color_range``."""
     out = np.full((len(values), 4), 255, np.uint8)
     values = np.asarray(values)[:, :4]
     if values.dtype != np.uint8:
-        top = np.nan_to_num(values, posinf=0).max(initial=0)
-        if values.dtype.kind == "f" and top <= 2:  # some programs go a little over 1
-            most = 1
-        else:
-            most = 65535 if values.dtype == np.uint16 or top > 255 else 255
-        values = np.clip(np.nan_to_num(values.astype(np.float64)) / most, 0, 1) * 255 + 0.5
+        full = np.nan_to_num(values.astype(np.float64)) / color_range(values)
+        values = np.clip(full, 0, 1) * 255 + 0.5
     out[:, : values.shape[1]] = values
     return out
 

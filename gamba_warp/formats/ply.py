@@ -21,6 +21,7 @@ from ..versions import __version__
 from .gaussians.arrays import MIN_SCALE, export_arrays, flip_axes, sound_gaussians
 from .gaussians.compressed import is_compressed, unpacked
 from .headers import open_shape
+from .parts import color_range
 from .ply_data import read_ply
 from .ply_header import PlyHeader, read_ply_header
 
@@ -34,6 +35,7 @@ _GROUPS = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
+_RGB = ("red", "green", "blue")
 _REST = re.compile(r"f_rest_\d+")
 
 
@@ -87,19 +89,21 @@ def ended_header(lines: list[str]) -> bytes:
     return "\n".join([*lines, "end_header", ""]).encode("ascii", "replace")
 
 
-def load_ply(path: str | Path) -> Gaussians:
+def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     """Reads a 3DGS ``.ply``, from this or another program, as one object.
 
     It may be binary, text, or compressed (packed in chunks of 256, ``formats.gaussians.compressed``
-    says how). Normals and other properties are passed over. Without harmonics colours are clipped
-    to [0, 1].
+    says how). Normals, other properties and other elements are passed over. Where there is no
+    ``f_dc_*``, ``red green blue`` are the colours, as nerfstudio's ``ns-export`` writes them.
+    Without harmonics colours are clipped to [0, 1]. A scale of -inf is size 0; an opacity of inf is
+    1, of -inf 0. ``left_out`` as for ``sound_gaussians``.
 
     Returns:
         Float32 Gaussians on the CPU, ``quats`` normalised.
 
     Raises:
         UserError: not a file, not a ``.ply``, truncated or longer than it says, an attribute
-            missing, a value not finite or over ``MAX_REACH``, or a rotation of length zero.
+            missing, or Gaussians that ``sound_gaussians`` refuses.
     """
     path = Path(path)
     with open_shape(path, MAX_FILE) as (file, _):
@@ -108,24 +112,27 @@ def load_ply(path: str | Path) -> Gaussians:
             arrays = unpacked(path, read_ply(path))
         else:
             arrays = _activated(path, _vertices(path, header))
-    gaussians = sound_gaussians(path, arrays)
+    gaussians = sound_gaussians(path, arrays, left_out)
     return flip_axes(gaussians) if TURNED in header.comments else gaussians
 
 
 def _activated(path: Path, vertices: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The values of the vertices' properties. Raises UserError where one is missing."""
+    plain = vertices.keys().isdisjoint(_GROUPS["colors"]) and vertices.keys() >= {*_RGB}
+    groups = _GROUPS | {"colors": _RGB} if plain else _GROUPS
     arrays = {}
     with np.errstate(over="ignore"):
-        for name, properties in _GROUPS.items():
+        for name, properties in groups.items():
             missing = [p for p in properties if p not in vertices]
             if missing:
                 raise UserError(f"{path}: no property {', '.join(missing)}; not Gaussians")
             arrays[name] = np.stack([vertices[p].astype(np.float32) for p in properties], 1)
-        if not all(np.isfinite(value).all() for value in arrays.values()):
-            return arrays | {"opacities": arrays["opacities"][:, 0]}  # refused with the reason
         arrays["scales"] = np.exp(arrays["scales"])
         arrays["opacities"] = 1 / (1 + np.exp(-arrays["opacities"][:, 0].astype(np.float64)))
-    arrays["colors"] = arrays["colors"] * SH_C0 + 0.5
+    if plain:
+        arrays["colors"] /= color_range(np.stack([vertices[p] for p in _RGB], 1))
+    else:
+        arrays["colors"] = arrays["colors"] * SH_C0 + 0.5
     rest = sum(_REST.fullmatch(name) is not None for name in vertices)
     if rest not in (0, 9, 24, 45) or not all(f"f_rest_{i}" in vertices for i in range(rest)):
         raise UserError(
@@ -140,11 +147,12 @@ def _activated(path: Path, vertices: dict[str, np.ndarray]) -> dict[str, np.ndar
 
 def _vertices(path: Path, header: PlyHeader) -> dict[str, np.ndarray]:
     """The vertices' properties of a text or binary file. Raises UserError."""
-    if not header.elements or header.elements[0].name != "vertex":
-        raise UserError(f"{path}: the .ply header does not begin with 'element vertex COUNT'")
-    if not header.elements[0].properties:
+    vertex = next((element for element in header.elements if element.name == "vertex"), None)
+    if vertex is None:
+        raise UserError(f"{path}: the .ply header has no 'element vertex COUNT'")
+    if not vertex.properties:
         raise UserError(f"{path}: vertices have no properties")
-    for name, _, length in header.elements[0].properties:
+    for name, _, length in vertex.properties:
         if length:
             raise UserError(f"{path}: vertex property {name} is a list, not a plain number")
     found = read_ply(path, MAX_FILE).elements["vertex"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from ..errors import UserError
 
 MAX_HEADER = 1 << 16  # bytes
+_END = re.compile(rb"[\r\n]end_header[ \t]*\r?\n")  # a line of its own; a comment may say it
 MAX_DIGITS = 18  # of a count, so that it fits 64 bits
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}  # format to numpy's byte order
 TYPES = {
@@ -79,13 +81,12 @@ def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
     head = file.read(MAX_HEADER)
     if not head.startswith(b"ply"):
         raise UserError(f"{path}: not a .ply file")
-    end = head.find(b"end_header")
-    start = head.find(b"\n", end) + 1
-    if end < 0 or start == 0:
+    end = _END.search(head)
+    if end is None:
         raise UserError(f"{path}: the .ply header has no end")
     layout, comments = "none", []
     elements: list[PlyElement] = []
-    for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
+    for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
         match words[:1]:
             case ["format"] if layout == "none" and len(words) > 1:
@@ -103,7 +104,7 @@ def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
                 if not elements:
                     raise UserError(f"{path}: the .ply header has a property before any element")
                 elements[-1].properties.append(_property(path, words))
-    return PlyHeader(layout, comments, elements, start)
+    return PlyHeader(layout, comments, elements, end.end())
 
 
 def _property(path: Path, words: list[str]) -> PlyProperty:

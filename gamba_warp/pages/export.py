@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from ..batch import STAGES, say
+from ..batch import STAGES, say, warn
 from ..data.preprocess import composite
 from ..errors import UserError
 from ..formats.gaussians.files import (
@@ -149,10 +149,12 @@ class ExportJob(ObjectFiles):
     Attributes:
         device: device that renders.
         view: from where turntables and pages look, in units of the object's longest side.
+        drop_bad: whether Gaussians that cannot be drawn are left out; else their file is refused.
     """
 
     device: torch.device
     view: Viewpoint = Viewpoint()
+    drop_bad: bool = False
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
@@ -195,6 +197,22 @@ def holds_gaussians(path: Path) -> bool:
         return True
 
 
+def read_told(path: Path, drop_bad: bool) -> Gaussians:
+    """Reads a file of Gaussians for a command; a line on stderr says how many are left out.
+
+    Args:
+        path: the file.
+        drop_bad: whether Gaussians that cannot be drawn are left out; else their file is refused.
+
+    Raises:
+        UserError: as ``read_gaussians``.
+    """
+    left_out: list[str] = []
+    gaussians = read_gaussians(path, left_out if drop_bad else None)
+    warn(path, left_out)
+    return gaussians
+
+
 def export(name: str, path: Path, job: ExportJob) -> str:
     """Writes everything that was asked for of one file of Gaussians.
 
@@ -209,7 +227,7 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     Raises:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
     """
-    gaussians, count = to_be_written(read_gaussians(path), job.options.min_opacity)
+    gaussians, count = to_be_written(read_told(path, job.drop_bad), job.options.min_opacity)
     drawn = job.options.page or job.options.turntable != "none"
     shown = gaussians.in_unit(*unit_frame(gaussians)) if drawn else gaussians
     section = Section(name, table=[("Gaussians", f"{gaussians.num:,}")], **asdict(job.view))

@@ -67,8 +67,8 @@ def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.nd
     Each Gaussian is evaluated at the points it reaches, and nowhere else.
 
     Args:
-        gaussians: one object; Gaussians outside [-1, 1]^3 are left out, and so are alpha under
-            0.005 and what reaches beyond [-1.1, 1.1]^3.
+        gaussians: one object; Gaussians outside [-1, 1]^3 or without volume are left out, and so
+            are alpha under 0.005 and what reaches beyond [-1.1, 1.1]^3.
         voxels: number of grid points a unit.
 
     Returns:
@@ -83,11 +83,15 @@ def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.nd
     gaussians = gaussians.select(
         (gaussians.opacities > LEAST) & (gaussians.means.abs() < 1).all(-1)
     )
-    if gaussians.num == 0:
-        raise UserError("no visible Gaussian within [-1, 1]^3")
     axes = torch.diag_embed(gaussians.scales)
     if gaussians.quats is not None:
         axes = quaternion_to_rotation_matrix(gaussians.quats) @ axes
+    to_unit, flat = torch.linalg.inv_ex(axes)
+    if flat.any():
+        solid = flat == 0
+        gaussians, axes, to_unit = gaussians.select(solid), axes[solid], to_unit[solid]
+    if gaussians.num == 0:
+        raise UserError("no visible Gaussian within [-1, 1]^3")
     reach = (2 * torch.log(gaussians.opacities / LEAST)).sqrt()[:, None] * axes.norm(dim=-1)
     half = _rounded_up((reach * voxels).ceil().long().clamp(1, voxels))  # along each axis
     position = gaussians.means * voxels
@@ -99,7 +103,6 @@ def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.nd
         size = " x ".join(map(str, shape))
         raise UserError(f"{voxels} voxels a unit: a grid of {size} points is over {MOST_POINTS:,}")
     absorbed = torch.zeros(shape)
-    to_unit = torch.linalg.inv(axes)
     boxes, kinds = half.unique(dim=0, return_inverse=True)
     order = kinds.argsort(stable=True)
     # Gaussians of one size are evaluated together.

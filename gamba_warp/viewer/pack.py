@@ -137,11 +137,13 @@ class ViewedMesh(NamedTuple):
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64.
         colors: ``[V, 3]`` float32, display values in [0, 1].
+        warnings: of the file, as ``TexturedMesh`` has them.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray
+    warnings: list[str]
 
 
 def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
@@ -163,7 +165,8 @@ def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
     keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]
     found, corners = np.unique(keys, return_inverse=True)
     colors = np.stack([found >> 16 & 255, found >> 8 & 255, found & 255], 1) / np.float32(255)
-    return ViewedMesh(vertices[found >> 24], corners.reshape(mesh.faces.shape), colors)
+    faces = corners.reshape(mesh.faces.shape)
+    return ViewedMesh(vertices[found >> 24], faces, colors, mesh.warnings)
 
 
 def _corner_colors(mesh: TexturedMesh) -> np.ndarray:

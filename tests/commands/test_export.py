@@ -1,3 +1,4 @@
+import struct
 import threading
 import urllib.error
 import urllib.request
@@ -147,6 +148,41 @@ def test_mesh_files_are_read_back(tmp_path, kind):
     again = load_mesh(tmp_path / f"a.{kind}")
     assert len(again.faces) == len(ball.faces)
     assert abs(np.linalg.norm(again.vertices, axis=1) - 0.4).max() < 1e-6
+
+
+@pytest.mark.parametrize("command", ["export", "view", "render"])
+def test_gaussians_that_cannot_be_drawn_are_left_out_when_asked(ball, tmp_path, capsys, command):
+    """One line says how many; the others are drawn as if these had never been there."""
+    data = bytearray(ball.read_bytes())
+    start = data.index(b"end_header\n") + 11
+    data[start : start + 4] = struct.pack("<f", float("nan"))
+    bad, good = tmp_path / "bad" / "egg.ply", tmp_path / "good" / "egg.ply"
+    for path, content in ((bad, data), (good, None)):
+        path.parent.mkdir()
+        if content:
+            path.write_bytes(content)
+    whole = load_ply(ball)
+    save_ply(good, whole.select(torch.arange(whole.num) > 0))
+    options, name = {
+        "export": (["--mesh", "none", "--splats", "splat"], "egg.splat"),
+        "view": (["--no-open-browser"], "egg.html"),
+        "render": (["--size", "24"], "egg.png"),
+    }[command]
+    made = []
+    for path in (good, bad):
+        out = path.parent / "out"
+        place = out if command == "export" else out / name
+        words = [path, "--out", place, *options]
+        if path == bad:
+            assert run(command, [str(word) for word in words]) > 0
+            assert "1 of 2500 Gaussians have means" in capsys.readouterr().err
+            words.append("--drop-bad")
+        assert run(command, [str(word) for word in words]) == 0
+        made.append((out / name).read_bytes())
+    assert made[0] == made[1]
+    lines = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    reason = "1 of 2500 Gaussians have means that are not finite: left out"
+    assert lines == [f"warning: {bad}: {reason}"]
 
 
 def test_view_writes_the_page_and_serves_only_it(ball, tmp_path, monkeypatch, capsys):

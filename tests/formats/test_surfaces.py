@@ -55,6 +55,19 @@ def test_a_sphere_within_a_voxel(method):
     assert surface.is_watertight() == mesh.is_watertight
 
 
+def test_what_has_no_volume_has_no_density():
+    """A scale of 0, which a file says by a logarithm of -inf."""
+    ball = at(0.4 * fibonacci_sphere(600), sigma=0.03)
+    ball.quats = torch.randn(600, 4)
+    flat = torch.arange(600) % 5 == 0
+    ball.scales[flat, 0] = 0
+    want, where = opacity_volume(ball.select(~flat), 24)
+    volume, origin = opacity_volume(ball, 24)
+    np.testing.assert_array_equal(volume, want)
+    np.testing.assert_array_equal(origin, where)
+    refused("no visible Gaussian", opacity_volume, ball.select(flat), 24)
+
+
 @pytest.mark.parametrize("method", ["tsdf", "density"])
 def test_a_cube(method):
     cube = trimesh.creation.box((0.7, 0.7, 0.7))

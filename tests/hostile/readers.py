@@ -107,6 +107,12 @@ def _view(path: Path, out: Path) -> Any:
     return page.read_text(encoding="utf-8")
 
 
+def _thinned(path: Path, out: Path) -> Any:
+    """Gaussians without those that cannot be drawn, and what is said of these."""
+    left_out: list[str] = []
+    return read_gaussians(path, left_out), left_out
+
+
 def _predictions(path: Path, out: Path) -> Any:
     opened: Any = open_predictions(path, 1.5, "cpu")
     names = [p.relative_to(path).with_suffix("").as_posix() for p in sorted(path.rglob("*.ply"))]
@@ -307,6 +313,7 @@ READERS = {
     "picture-folder": Reader(_pictures, sound.each(sound.picture), seeds.picture_folders, 3, True),
     "cut-out": Reader(_prepare, sound.cut_out, seeds.masked_pictures, 4),
     "gaussians": Reader(alone(read_gaussians), sound.gaussians, seeds.splats),
+    "gaussians-thinned": Reader(_thinned, sound.thinned, seeds.thinned_splats, 4),
     "gaussians-folder": Reader(
         _predictions, sound.each(sound.gaussians), seeds.splat_folders, 3, True
     ),

@@ -83,7 +83,7 @@ def _pcd(data: bytes) -> np.ndarray | str | None:
 
 
 def _ply(data: bytes) -> np.ndarray | str | None:
-    head, end, rest = data.partition(b"end_header")
+    head, end, rest = data.partition(b"\nend_header")
     lines = [line.split() for line in head.splitlines()]
     elements = [words for words in lines if words[:1] == [b"element"]]
     names = [words[-1] for words in lines if words[:1] == [b"property"]]

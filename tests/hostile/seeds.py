@@ -53,6 +53,10 @@ EPS = (
 )
 _POSE = [[1.0, 0, 0, 0], [0, 0, -1.0, -1.5], [0, 1.0, 0, 0]]
 _SIZE = 8
+_OWN = [  # what a Gaussian of a .ply has beside its colours
+    *((name, "<f4") for name in ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2")),
+    *((f"rot_{i}", "<f4") for i in range(4)),
+]
 _DATE = (2020, 1, 1, 0, 0, 0)
 
 
@@ -157,6 +161,16 @@ def splats() -> Kinds:
         "gaussians-text": {"object.ply": ply_bytes(text)},
         "gaussians-harmonics": {"object.ply": gaussians(degree=3)},
     }
+    rows = PlyData.read(io.BytesIO(gaussians()))["vertex"].data
+    plain = np.zeros(len(rows), [*_OWN, *((name, "u1") for name in ("red", "green", "blue"))])
+    for name, *_ in _OWN:
+        plain[name] = rows[name]
+    plain["scale_0"][0], plain["opacity"][1:3] = -np.inf, [-np.inf, np.inf]
+    lens = np.array([(9.0, 7)], [("focal", "<f4"), ("id", "u1")])
+    elements = [PlyElement.describe(lens, "camera"), PlyElement.describe(plain, "vertex")]
+    for form, text in (("gaussians-rgb", False), ("gaussians-rgb-text", True)):
+        data = PlyData(elements, text, "<", comments=["said before end_header"])
+        seeds[form] = {"object.ply": ply_bytes(data)}
     for kind in ("compressed-ply", "splat", "spz", "glb"):
         name = "object." + ("ply" if kind == "compressed-ply" else kind)
         seeds[f"gaussians-{kind}"] = {name: gaussians(300 if "ply" in kind else 12, kind, 1)}
@@ -180,6 +194,16 @@ def spz_4(data: bytes) -> bytes:
         frames, at = frames + frame, at + size
     head = struct.pack("<4sIIBBBB", magic, 4, count, degree, bits, flags | 2, len(sizes))
     return head + struct.pack("<I12x", 32 + len(extension)) + extension + table + frames
+
+
+def thinned_splats() -> Kinds:
+    """The same, and a file with Gaussians that cannot be drawn."""
+    data = PlyData.read(io.BytesIO(gaussians(degree=1)))
+    rows = data["vertex"].data
+    rows["x"][0], rows["f_rest_3"][1], rows["scale_1"][2] = np.nan, np.inf, 80
+    for i in range(4):
+        rows[f"rot_{i}"][3] = 0
+    return splats() | {"gaussians-nan": {"object.ply": ply_bytes(data)}}
 
 
 def splat_folders() -> Kinds:
@@ -359,6 +383,20 @@ def split() -> Kinds:
 def datasets() -> Kinds:
     """Datasets in each layout."""
     angle = {"camera_angle_x": 0.8, "frames": [{"file_path": "./r_0", "transform_matrix": _POSE}]}
+    # NeRF's own layout: a file of each part, and names without a suffix
+    nerf = {f"{part}/r_{i}.png": png() for part in ("train", "val") for i in range(2)}
+    for part in ("train", "val"):
+        paths = [f"./{part}/r_{i}" for i in range(2)]
+        frames = [{"file_path": path, "rotation": 0.1, "transform_matrix": _POSE} for path in paths]
+        nerf[f"transforms_{part}.json"] = as_json({"camera_angle_x": 0.8, "frames": frames})
+    masked = transforms("chair")
+    values = json.loads(masked["chair/transforms.json"])
+    for frame in values["frames"]:
+        frame["mask_path"] = f"mask_{frame['file_path']}"
+        opaque = Image.fromarray(rgba(_SIZE)[..., :3])
+        masked[f"chair/{frame['file_path']}"] = encoded(opaque)
+        masked[f"chair/{frame['mask_path']}"] = encoded(Image.fromarray(rgba(_SIZE)[..., 3]))
+    masked["chair/transforms.json"] = as_json(values)
     camera = {"x": [1.0, 0, 0], "y": [0, 0, -1.0], "z": [0, 1.0, 0], "origin": [0, -1.5, 0]}
     camera = as_json(camera | {"x_fov": 0.8, "y_fov": 0.8})
     folder = "chair/campos_512_v4/00000/00000"
@@ -367,6 +405,8 @@ def datasets() -> Kinds:
     lrm |= {f"chair/pose/{name}.npy": npy(np.array(_POSE)) for name in ("000", "001")}
     return split() | {
         "blender": {"transforms.json": as_json(angle), "r_0.png": png()},
+        "nerf": nerf,
+        "masks": masked,
         "gobjaverse": {f"{folder}.json": camera, f"{folder}.png": png()},
         "openlrm": lrm,
     }

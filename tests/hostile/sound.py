@@ -94,7 +94,7 @@ def alpha(result, path, out):
     _in_unit("an alpha", result)
 
 
-def gaussians(result, path, out):
+def gaussians(result, path, out, lost=0):
     """Finite Gaussians with unit rotations and positive scales, as many as the file has."""
     named = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
     tensors = {name: value for name, value in named.items() if value is not None}
@@ -109,7 +109,16 @@ def gaussians(result, path, out):
     # Another kind of file may have a .ply behind its own end.
     elif data.startswith(b"ply") and (f := re.search(rb"element\s+vertex\s+(\d+)", data)):
         stated = int(f[1])
-    assert stated in (None, result.num), f"{result.num} Gaussians, the file states {stated}"
+    there = result.num + lost
+    assert stated in (None, there), f"{there} Gaussians, the file states {stated}"
+
+
+def thinned(result, path, out):
+    """Sound Gaussians, which are as many as the file has together with those left out."""
+    kept, lines = result
+    said = [re.fullmatch(r"(\d+) of \d+ Gaussians have .*: left out", line) for line in lines]
+    assert all(said), f"what is left out is not said: {lines}"
+    gaussians(kept, path, out, sum(int(found[1]) for found in said))
 
 
 def mesh(result, path, out):

@@ -94,6 +94,8 @@ def test_view_shows_a_mesh_too(ball, tmp_path, capsys):
     command = ["view", str(ball), "--mesh", str(tmp_path / "mesh.glb"), "--out", str(page)]
     assert run([*command, "--no-open-browser"]) == 0
     assert '"faces": 1' in page.read_text()
+    warned = f"warning: {tmp_path / 'mesh.glb'}: a part has no material: grey"
+    assert warned in capsys.readouterr().err.splitlines()
     (tmp_path / "bad.glb").write_bytes(b"no mesh")
     page.unlink()
     assert run([*command[:3], str(tmp_path / "bad.glb"), "--out", str(page)]) == 2

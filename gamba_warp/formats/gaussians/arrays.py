@@ -66,7 +66,9 @@ def export_arrays(
     return arrays
 
 
-def sound_gaussians(path: str | Path, arrays: dict[str, np.ndarray]) -> Gaussians:
+def sound_gaussians(
+    path: str | Path, arrays: dict[str, np.ndarray], left_out: list[str] | None = None
+) -> Gaussians:
     """Arrays of a file, activated values in any order of bytes, as one object.
 
     Without harmonics colours are clipped to [0, 1]; with them a base colour may lie outside.
@@ -75,40 +77,54 @@ def sound_gaussians(path: str | Path, arrays: dict[str, np.ndarray]) -> Gaussian
         path: named in errors.
         arrays: as ``export_arrays`` returns them; ``harmonics`` may be missing, quaternions may
             have any length > 0.
+        left_out: gets a line of how many Gaussians are left out because they cannot be drawn: a
+            value that is not finite, means or scales over ``MAX_REACH``, a scale below 0, or a
+            rotation of length zero. None: a file that has one is refused.
 
     Returns:
         Float32 Gaussians on the CPU, ``quats`` normalised.
 
     Raises:
-        UserError: no Gaussian, a value not finite or over ``MAX_REACH``, a scale below 0, or a
-            rotation of length zero.
+        UserError: no Gaussian, none that can be drawn, or one that cannot where ``left_out`` is
+            None.
     """
     values: dict[str, torch.Tensor] = {}
+    odd: dict[str, torch.Tensor] = {}  # the Gaussians whose value of a name is not finite
     count = len(arrays["opacities"])
     if count == 0:
         raise UserError(f"{path}: holds no Gaussians")
     for name, array in arrays.items():
         with np.errstate(over="ignore"):
             array = np.ascontiguousarray(array, np.float32)
-        finite = np.isfinite(array.reshape(count, -1)).all(1)
-        if not finite.all():
-            bad = np.count_nonzero(~finite)
-            raise UserError(f"{path}: {bad} of {count} Gaussians have {name} that are not finite")
         values[name] = torch.from_numpy(array if array.flags.writeable else array.copy())
+        finite = torch.from_numpy(np.isfinite(array.reshape(count, -1)).all(1))
+        if not finite.all():
+            odd[name] = ~finite
+    checks: dict[str, torch.Tensor] = {}
+    if odd:
+        checks[f"{' or '.join(odd)} that are not finite"] = torch.stack([*odd.values()]).any(0)
     for name in ("means", "scales"):
-        reach = float(values[name].abs().max())
-        if reach > MAX_REACH:
-            raise UserError(f"{path}: {name} reach {reach:.3g}, over {MAX_REACH:g}")
-    bad = int((values["scales"] < 0).any(1).sum())
+        far = (values[name].abs() > MAX_REACH) & values[name].isfinite()
+        checks[f"{name} over {MAX_REACH:g}"] = far.any(1)
+    checks["scales below 0"] = (values["scales"] < 0).any(1)
+    checks["rotations of length zero"] = (values["quats"] == 0).all(1)
+    bad = {reason: which for reason, which in checks.items() if which.any()}
     if bad:
-        raise UserError(f"{path}: {bad} of {count} Gaussians have scales below 0")
+        keep = ~torch.stack([*bad.values()]).any(0)
+        kept = int(keep.sum())
+        line = f"{count - kept} of {count} Gaussians have {', or '.join(bad)}"
+        if left_out is None or kept == 0:
+            advice = "; gamba export --drop-bad leaves such out" if kept else ""
+            raise UserError(f"{path}: {line}{advice}")
+        left_out.append(f"{line}: left out")
+        values = {name: value[keep] for name, value in values.items()}
     harmonics = values.get("harmonics")
     if harmonics is not None and harmonics.shape[1] == 0:
         harmonics = None
     colors = values["colors"]
     return Gaussians(
         means=values["means"],
-        quats=_unit(path, values["quats"]),
+        quats=_unit(values["quats"]),
         scales=values["scales"],
         opacities=values["opacities"].clamp(0, 1),
         colors=colors.clamp(0, 1) if harmonics is None else colors,
@@ -116,16 +132,13 @@ def sound_gaussians(path: str | Path, arrays: dict[str, np.ndarray]) -> Gaussian
     )
 
 
-def _unit(path: str | Path, quats: torch.Tensor) -> torch.Tensor:
-    """Quaternions of length 1. Raises UserError where one has no direction."""
+def _unit(quats: torch.Tensor) -> torch.Tensor:
+    """Quaternions of length 1, of such that are not zero."""
     lengths = quats.norm(dim=1, keepdim=True)
     odd = ((lengths == 0) | ~lengths.isfinite())[:, 0]  # the squares leave float32's range
     if odd.any():
         quats[odd] /= quats[odd].abs().amax(1, keepdim=True)
         lengths = quats.norm(dim=1, keepdim=True)
-        bad = int((~(lengths > 0)).sum())
-        if bad:
-            raise UserError(f"{path}: {bad} rotations have length zero")
     return quats / lengths
 
 

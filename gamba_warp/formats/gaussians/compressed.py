@@ -155,7 +155,9 @@ def _between(
 ) -> np.ndarray:
     low, high = (_table(path, data, "chunk", names, np.float32)[at] for names in pair)
     with np.errstate(all="ignore"):  # a stranger's bounds; the result is checked
-        return low.astype(np.float64) * (1 - steps) + high.astype(np.float64) * steps
+        values = low.astype(np.float64) * (1 - steps) + high.astype(np.float64) * steps
+    # Nothing lies between bounds of which one is infinite.
+    return np.where(np.isfinite(low) & np.isfinite(high), values, np.nan)
 
 
 def _join(steps: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:

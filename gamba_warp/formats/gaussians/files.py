@@ -53,7 +53,7 @@ def splat_kind(path: str | Path) -> SplatFormat | None:
     return {".splat": "splat", ".spz": "spz"}.get(path.suffix.lower())  # type: ignore[return-value]
 
 
-def read_gaussians(path: str | Path) -> Gaussians:
+def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     """Reads one object's Gaussians by what the file holds, and then by its name.
 
     ``.ply`` (binary, text or compressed), ``.splat``, ``.spz`` and ``.glb`` with
@@ -61,6 +61,8 @@ def read_gaussians(path: str | Path) -> Gaussians:
 
     Args:
         path: the file.
+        left_out: gets a line of how many Gaussians are left out because they cannot be drawn (a row
+            of NaN, a rotation of length zero); None: a file that has one is refused.
 
     Returns:
         Float32 Gaussians on the CPU in OpenCV's axes (y down), ``quats`` normalised; without
@@ -79,7 +81,7 @@ def read_gaussians(path: str | Path) -> Gaussians:
     reader = readers[0] if readers else by_name.get(path.suffix.lower())  # says what is wrong
     if reader is None:
         raise UserError(f"{path}: not Gaussians ({', '.join(SPLAT_SUFFIXES)})")
-    return reader(path)
+    return reader(path, left_out)
 
 
 def comments_of(path: str | Path) -> list[str]:

@@ -33,8 +33,10 @@ def _splats(mesh: Entry) -> list[Entry]:
     return [p for p in mesh.entries("primitives") if EXTENSION in p.entry("extensions").values]
 
 
-def load_glb(path: str | Path) -> Gaussians:
+def load_glb(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     """Reads all Gaussians of a ``.glb``'s scene, moved as its nodes say, as one object.
+
+    ``left_out`` as for ``sound_gaussians``; it gets a line of each primitive.
 
     Raises:
         UserError: not a file, not ``.glb``, truncated or false, no Gaussians in it, an attribute
@@ -48,13 +50,14 @@ def load_glb(path: str | Path) -> Gaussians:
     for node, _, matrix in file.placed_nodes():
         index = node.get("mesh", Index)
         found = [] if index is None else _splats(file.item("meshes", index))
-        parts += [_moved(path, _primitive(file, primitive), matrix) for primitive in found]
+        for primitive in found:
+            parts.append(_moved(path, _primitive(file, primitive, left_out), matrix, left_out))
     if not parts:
         raise UserError(f"{path}: no Gaussians in it (no primitive has {EXTENSION})")
     return flip_axes(_joined(parts))
 
 
-def _primitive(file: GltfFile, primitive: Entry) -> Gaussians:
+def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> Gaussians:
     """The Gaussians of one primitive in its own frame."""
     path, options = file.path, primitive.entry("extensions").entry(EXTENSION).values
     mode, given = primitive.get("mode", int, 4), primitive.entry("attributes")
@@ -99,10 +102,12 @@ def _primitive(file: GltfFile, primitive: Entry) -> Gaussians:
         raise UserError(
             f"{path}: scales below 0; a draft of {EXTENSION} stored logarithms, which is not read"
         )
-    return sound_gaussians(path, arrays)
+    return sound_gaussians(path, arrays, left_out)
 
 
-def _moved(path: Path, gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
+def _moved(
+    path: Path, gaussians: Gaussians, matrix: np.ndarray, left_out: list[str] | None
+) -> Gaussians:
     """The Gaussians moved by a node. Raises UserError where it stretches or mirrors."""
     if not np.isfinite(matrix).all():
         raise UserError(f"{path}: a node's place is not finite")
@@ -118,7 +123,7 @@ def _moved(path: Path, gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
         torch.from_numpy(turn).float(), torch.from_numpy(matrix[:3, 3].copy()).float(), scale
     )
     arrays = {name: value.numpy() for name, value in vars(moved).items() if value is not None}
-    return sound_gaussians(path, arrays)
+    return sound_gaussians(path, arrays, left_out)
 
 
 def _joined(parts: list[Gaussians]) -> Gaussians:

@@ -60,10 +60,11 @@ def save_splat(path: str | Path, gaussians: Gaussians) -> str | None:
     return f"{path}: the harmonics are lost, a .splat has one colour for all directions."
 
 
-def load_splat(path: str | Path) -> Gaussians:
+def load_splat(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     """Reads a ``.splat`` file, from this or another program, as one object.
 
     The format has no header: any file of whole records whose values make sense is taken.
+    ``left_out`` as for ``sound_gaussians``.
 
     Raises:
         UserError: not a file, no whole number of records, or values that are not those of
@@ -87,4 +88,5 @@ def load_splat(path: str | Path) -> Gaussians:
             "opacities": rgba[:, 3],
             "colors": rgba[:, :3],
         },
+        left_out,
     )

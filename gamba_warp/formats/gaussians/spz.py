@@ -77,8 +77,10 @@ def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
     return f"{path}: the format clips {' and '.join(lost)}." if lost else None
 
 
-def load_spz(path: str | Path) -> Gaussians:
+def load_spz(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     """Reads an ``.spz`` file of version 1 to 4, from this or another program, as one object.
+
+    ``left_out`` as for ``sound_gaussians``.
 
     Raises:
         UserError: not a file, not ``.spz``, of another version, truncated or longer than it says,
@@ -120,7 +122,7 @@ def load_spz(path: str | Path) -> Gaussians:
         "colors": colors,
         "harmonics": harmonics,
     }
-    return flip_axes(sound_gaussians(path, arrays))
+    return flip_axes(sound_gaussians(path, arrays, left_out))
 
 
 def _bytes(values: np.ndarray) -> bytes:

@@ -14,7 +14,9 @@ from helpers.judges.splats import check
 from helpers.meshes import glb
 
 from gamba_warp.errors import UserError
+from gamba_warp.formats.gaussians.compressed import BOUNDS
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
+from gamba_warp.formats.gaussians.splat import RECORD
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
 
 
@@ -138,6 +140,70 @@ def test_a_compressed_ply_with_bounds_that_are_not_finite(sound):
     start = data.index(b"end_header\n") + 11
     path.write_bytes(data[:start] + struct.pack("<f", float("nan")) + data[start + 4 :])
     refused(path, "not finite")
+
+
+def nan_first(kind, data):
+    """The file with a position of its first Gaussian that is not finite, and how many share it."""
+    nan = struct.pack("<f", float("nan"))
+    if kind == "spz":  # its first version has positions of 16-bit floats
+        head = struct.pack("<4sIIBBBB", b"NGSP", 1, 300, 0, 12, 0, 0)
+        means = np.ones((300, 3), "<f2")
+        means[0, 0] = np.nan
+        return gzip.compress(head + means.tobytes() + bytes([128]) * (300 * 10)), 1
+    if kind == "glb":
+        start = 28 + struct.unpack_from("<I", data, 12)[0]
+    else:
+        start = 0 if kind == "splat" else data.index(b"end_header\n") + 11
+    # In a compressed file it is a bound of a chunk of 256.
+    return data[:start] + nan + data[start + 4 :], 256 if "compressed" in kind else 1
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_what_cannot_be_drawn_is_left_out_when_asked(sound, kind):
+    path, whole = sound(kind)
+    data, lost = nan_first(kind, whole)
+    path.write_bytes(data)
+    reason = f"{lost} of 300 Gaussians have means that are not finite"
+    refused(path, reason, "gamba export --drop-bad")
+    lines = []
+    left = read_gaussians(path, lines)
+    assert lines == [f"{reason}: left out"]
+    assert left.num == 300 - lost and left.means.isfinite().all()
+    path.write_bytes(whole)
+    lines.clear()
+    want = read_gaussians(path, lines).select(torch.arange(300) >= lost)
+    assert lines == []
+    if kind != "spz":  # which is another object above
+        for name, value in vars(left).items():
+            assert value is None or torch.equal(value, getattr(want, name)), name
+
+
+def test_each_reason_is_named_once_and_all_bad_is_refused(tmp_path):
+    path = tmp_path / "a.splat"
+    records = np.zeros(5, RECORD)
+    records["quats"] = 200
+    records["means"][0], records["scales"][0] = np.nan, np.nan
+    records["means"][1, 2] = 1e30
+    records["scales"][2] = -1
+    records["quats"][3] = 128  # of which all numbers are 0
+    path.write_bytes(records.tobytes())
+    lines = []
+    assert read_gaussians(path, lines).num == 1
+    assert lines == [
+        "4 of 5 Gaussians have means or scales that are not finite, or means over 1e+18, "
+        "or scales below 0, or rotations of length zero: left out"
+    ]
+    path.write_bytes(records[:4].tobytes())
+    with pytest.raises(UserError, match=r"4 of 4 .* length zero$"):
+        read_gaussians(path, [])
+
+
+def test_an_infinite_bound_of_a_chunk_shrinks_nobody(sound):
+    """Of 256 Gaussians between -inf and a logarithm nobody knows the size."""
+    path, data = sound("compressed-ply")
+    start = data.index(b"end_header\n") + 11 + 4 * BOUNDS.index("min_scale_x")
+    path.write_bytes(data[:start] + struct.pack("<f", -np.inf) + data[start + 4 :])
+    refused(path, "256 of 300 Gaussians have scales that are not finite")
 
 
 @pytest.mark.parametrize("count", [1, 8, 10, 72])
