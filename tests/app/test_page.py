@@ -181,7 +181,9 @@ def test_too_large_an_upload_is_refused(opened, served, tmp_path):
     # The server itself refuses it, too.
     program = Program(served.host).opened()
     assert program.ask("/gradio_api/upload", form(big.read_bytes()), **FORM).status == 413
-    left = [p for p in served.temporary.rglob("*") if p.is_file() and p.stat().st_size > 1 << 20]
+    # Warp keeps headers in a folder of its own while it compiles
+    files = (p for p in served.temporary.rglob("*") if not p.parent.name.startswith("wp_pch_"))
+    left = [p for p in files if p.is_file() and p.stat().st_size > 1 << 20]
     assert not left, "nothing of it is kept"
 
 
