@@ -62,7 +62,7 @@ def render_command(
             of length zero), and say how many; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from ..pages.export import find_gaussians, read_told
+    from ..pages.export import find_gaussians, read_with_warning
     from ..surfaces.extract import unit_frame
     from ..trajectories.film import Film, parse_background, parse_size, plan_path, shoot
     from ..trajectories.movies import require_movie
@@ -105,7 +105,7 @@ def render_command(
 
     def one(target: str, path: Path) -> None:
         count = len(film.cameras.viewmats)
-        gaussians = read_told(path, drop_bad)
+        gaussians = read_with_warning(path, drop_bad)
         with progress_bar(total=count, desc=path.name, unit="view", leave=False) as bar:
             shoot(Path(target), kind, gaussians, unit_frame(gaussians), film, chosen, bar.update)
 

@@ -51,7 +51,7 @@ def view_command(
     """
     import tempfile
 
-    from ..pages.export import read_told
+    from ..pages.export import read_with_warning
     from ..pages.run import write_run_page
     from ..pages.serve import page_server
     from ..trajectories.paths import Viewpoint
@@ -61,7 +61,7 @@ def view_command(
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
     if mesh is not None and file.is_dir():
         raise UserError(f"--mesh {mesh}: a training run has no mesh")
-    gaussians = None if file.is_dir() else read_told(file, drop_bad)
+    gaussians = None if file.is_dir() else read_with_warning(file, drop_bad)
     surface = None
     if mesh is not None:
         surface = read_viewed_mesh(mesh, mesh_frame)

@@ -197,7 +197,7 @@ def holds_gaussians(path: Path) -> bool:
         return True
 
 
-def read_told(path: Path, drop_bad: bool) -> Gaussians:
+def read_with_warning(path: Path, drop_bad: bool) -> Gaussians:
     """Reads a file of Gaussians for a command; a line on stderr says how many are left out.
 
     Args:
@@ -227,7 +227,7 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     Raises:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
     """
-    gaussians, count = to_be_written(read_told(path, job.drop_bad), job.options.min_opacity)
+    gaussians, count = to_be_written(read_with_warning(path, job.drop_bad), job.options.min_opacity)
     drawn = job.options.page or job.options.turntable != "none"
     shown = gaussians.in_unit(*unit_frame(gaussians)) if drawn else gaussians
     section = Section(name, table=[("Gaussians", f"{gaussians.num:,}")], **asdict(job.view))

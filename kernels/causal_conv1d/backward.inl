@@ -3,24 +3,23 @@
 #include "window.h"
 const auto douts = rows_(dout_in, b, 0, d, width), dxs = rows_(dx_out, b, 0, d, width);
 const auto dstates = rows_(dstate_out, own, 0, d, width);
-const F one = F{} + 1.0f;
 F g0 = F{}, g1 = F{}, g2 = F{}, sums[5] = {}, run[5] = {};
 auto complete = [&] {
     for (int i = 0; i < 5; ++i) sums[i] = sums[i] + run[i], run[i] = F{};
 };
-auto step = [&](int t, F x3, F g3) {
-    if (t < stop) {
+auto step = [&](int t, F x3, F g3, bool inside, bool own) {
+    if (inside) {
         if (use_silu) {
             const F y = fma_(w0, x0, fma_(w1, x1, fma_(w2, x2, fma_(w3, x3, bias))));
             const F s = sigmoid_(y);
             g3 = g3 * fma_(y * s, one - s, s);
         }
-        if (t < end) {
+        if (own) {
             run[0] = fma_(g3, x0, run[0]), run[1] = fma_(g3, x1, run[1]);
             run[2] = fma_(g3, x2, run[2]), run[3] = fma_(g3, x3, run[3]);
             run[4] = run[4] + g3;
         }
-    } else x3 = x2, g3 = F{};
+    }
     const F dx = fma_(w3, g0, fma_(w2, g1, fma_(w1, g2, w0 * g3)));
     if (t - 3 >= t0) {
         if (dx_out.shape[1] > 0) write_(dxs, t - 3, dx);
@@ -29,29 +28,25 @@ auto step = [&](int t, F x3, F g3) {
     g0 = g1, g1 = g2, g2 = g3;
     if (RUN > 0 && (t - t0) % RUN == RUN - 1) complete();
 };
-#if WIDTH == 1
-// As in the forward, for a few tokens at a time.
-for (int first = t0; first < end + 3; first += AHEAD) {
+int t = t0;
+#if WIDTH == 2  // as in the forward
+for (; xs.paired && douts.paired && dxs.paired && t + AHEAD <= end; t += AHEAD) {
     F xs_ahead[AHEAD], gs_ahead[AHEAD];
 #pragma unroll
-    for (int i = 0; i < AHEAD; ++i) {
-        const int t = first + i < stop ? first + i : stop - 1;
-        xs_ahead[i] = read_(xs, t), gs_ahead[i] = read_(douts, t);
-    }
-#pragma unroll
     for (int i = 0; i < AHEAD; ++i)
-        if (first + i < end + 3) step(first + i, xs_ahead[i], gs_ahead[i]);
+        xs_ahead[i] = read_(xs, t + i), gs_ahead[i] = read_(douts, t + i);
+#pragma unroll
+    for (int i = 0; i < AHEAD; ++i) step(t + i, xs_ahead[i], gs_ahead[i], true, true);
 }
-#else
-for (int t = t0; t < end + 3; ++t) {
-    F x3 = F{}, g3 = F{};
+#endif
+for (; t < end + 3; ++t) {
+    F x3 = x2, g3 = F{};
     if (t < stop) {
         x3 = read_(xs, t), g3 = read_(douts, t);
         next_(xs, t), next_(douts, t);
     }
-    step(t, x3, g3);
+    step(t, x3, g3, t < stop, t < end);
 }
-#endif
 complete();
 F* const dweight = (F*)dweight_out.data + (size_t)task * 5 * taps + k;
 if (dweight_out.shape[1] > 0)

@@ -7,21 +7,22 @@ auto step = [&](int t, F x3) {
     put_(ys, t, y, stream);
     x0 = x1, x1 = x2, x2 = x3;
 };
-#if WIDTH == 1
-// No load can pass a store, which might write what it reads: so all loads come first.
-F ahead[PIECE];
+int t = t0;
+#if WIDTH == 2
+// No load can pass a store, which might write what it reads: so those of some tokens come first.
+for (; xs.paired && ys.paired && t + AHEAD <= end; t += AHEAD) {
+    F ahead[AHEAD];
 #pragma unroll
-for (int i = 0; i < PIECE; ++i) ahead[i] = read_(xs, t0 + i < end ? t0 + i : end - 1);
+    for (int i = 0; i < AHEAD; ++i) ahead[i] = read_(xs, t + i);
 #pragma unroll
-for (int i = 0; i < PIECE; ++i)
-    if (t0 + i < end) step(t0 + i, ahead[i]);
-#else
-for (int t = t0; t < end; ++t) {
+    for (int i = 0; i < AHEAD; ++i) step(t + i, ahead[i]);
+}
+#endif
+for (; t < end; ++t) {
     const F x3 = read_(xs, t);
     next_(xs, t);
     step(t, x3);
 }
-#endif
-#if defined(__x86_64__) && WIDTH > 1  // the last channels of a row of tasks
+#if defined(__x86_64__) && WIDTH > 2  // the last channels of a row of tasks
 if (stream && d + WIDTH >= x_in.shape[2]) __builtin_ia32_sfence();
 #endif

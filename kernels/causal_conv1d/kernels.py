@@ -1,7 +1,7 @@
 """Causal depthwise convolution of at most four taps, with SiLU: the step before the scan.
 
-One C++ body serves both devices: its values are lanes of sixteen channels on a CPU and single
-floats, one thread each, on CUDA. Equations 1 and 2 of README.md.
+One C++ body serves both devices: its values are lanes of sixteen channels on a CPU and pairs of
+them, one thread each, on CUDA. Equations 1 and 2 of README.md.
 """
 
 import functools
@@ -16,13 +16,14 @@ from ..runtime.native import native, native_kernel
 from ..runtime.scalars import BITS, EXP2, RECIPROCAL
 
 TAPS = 4
-STRIP = 16  # tokens of a forward task; few, because each row may lie in another page
+# Tokens of a forward task; on a CPU few, because each row may lie in another page.
+STRIP = {"cpu": 16, "cuda": 32}
 CHUNK = 64  # tokens of a backward task, each with its own sum for the gradient of the weight
 # Tokens that a CPU adds one after the other: equal terms would round to the same side 64 times.
 # CUDA has none: a second level of sums costs registers there.
 RUN = 16
-AHEAD = 8  # tokens whose loads a CUDA thread of the gradient has under way
-VALUES = {"cpu": (lanes, W), "cuda": (wp.float32, 1)}  # type of a value, and its channels
+AHEAD = 8  # tokens whose loads a CUDA thread has under way
+VALUES = {"cpu": (lanes, W), "cuda": (wp.vec2, 2)}  # type of a value, and its channels
 
 
 def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
@@ -35,6 +36,7 @@ def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
         PIECE=piece,
         RUN=RUN if on_cpu else 0,
         AHEAD=AHEAD,
+        PAIR="unsigned long long" if io == torch.float32 else "unsigned",
     )
 
 
@@ -54,7 +56,7 @@ def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:
 @functools.cache
 def forward_kernel(device_type: str, io: torch.dtype) -> Any:
     """The kernel for tensors of dtype ``io`` on a device of that type (README, equation 1)."""
-    text = _text("forward.inl", device_type, io, STRIP)
+    text = _text("forward.inl", device_type, io, STRIP[device_type])
     inputs = {**_window(device_type, io), "stream": int}
     outputs = {"y_out": wp.array3d(dtype=WARP_DTYPES[io])}
     return native_kernel("conv_forward", text, inputs, outputs, indices="task, k")

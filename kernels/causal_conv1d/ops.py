@@ -69,11 +69,11 @@ def conv(x, weight, bias, state, packed, silu):
 
     ``packed`` are the sequences (``runtime.packed``), or None.
     """
-    strips, where = _pieces(x, packed, STRIP)
+    kind = kind_of(x.device)
+    strips, where = _pieces(x, packed, STRIP[kind])
     x = lane_contiguous(x)
     blocks, w, v, rows = _operands(x, weight, bias, state)
     out = _empty(x, tuple(x.shape))
-    kind = kind_of(x.device)
     kernel = forward_kernel(kind, x.dtype)
     stream = int(kind == "cpu" and streams([out]))
     inputs = [int(silu), where, x, w, v, rows, stream]

@@ -1,25 +1,57 @@
 // What both kernels begin with. A value F is WIDTH channels, from the head of kernels.py: sixteen
-// lanes on a CPU, one number on CUDA.
-#if WIDTH == 1
-typedef float F;
-auto fma_ = [](F a, F b, F c) -> F { return a * b + c; };
-auto sigmoid_ = [&](F x) -> F { return reciprocal_(1.0f + exp2_(-1.4426950408889634f * x)); };
-auto rows_ = [](auto& array, int b, int t0, int d, int) {
+// lanes on a CPU, two numbers on CUDA.
+#if WIDTH == 2
+struct F {
+    float a, b;
+    F operator+(F o) const { return F{a + o.a, b + o.b}; }
+    F operator-(F o) const { return F{a - o.a, b - o.b}; }
+    F operator*(F o) const { return F{a * o.a, b * o.b}; }
+};
+auto fma_ = [](F x, F y, F z) -> F { return x * y + z; };
+auto sigmoid_ = [&](F x) -> F {
+    auto one = [&](float v) { return reciprocal_(1.0f + exp2_(-1.4426950408889634f * v)); };
+    return F{one(x.a), one(x.b)};
+};
+const F one{1.0f, 1.0f};
+auto rows_ = [](auto& array, int b, int t0, int d, int width) {
     typedef decltype(array.data + 0) Row;
     struct Rows {
         Row first;
         size_t step;  // bytes
+        int width;
+        bool paired;  // both channels are one access
         Row row(int t) const { return (Row)((char*)first + t * step); }
     };
     char* const at =
         (char*)array.data + (size_t)b * array.strides[0] + (size_t)t0 * array.strides[1];
-    return Rows{(Row)at + d, (size_t)array.strides[1]};
+    const Row first = (Row)at + d;
+    const size_t step = array.strides[1];
+    return Rows{first, step, width, width == 2 && ((size_t)first | step) % sizeof(PAIR) == 0};
 };
-auto read_ = [](const auto& rows, int t) -> F { return (F)*rows.row(t); };
-auto write_ = [](const auto& rows, int t, F v) { *rows.row(t) = (ELEMENT)v; };
+auto read_ = [](const auto& rows, int t) -> F {
+    const auto row = rows.row(t);
+    if (!rows.paired) return F{(float)row[0], rows.width == 2 ? (float)row[1] : 0.0f};
+    const PAIR bits = *(const PAIR*)row;
+    ELEMENT e[2];
+    memcpy(e, &bits, sizeof bits);
+    return F{(float)e[0], (float)e[1]};
+};
+auto write_ = [](const auto& rows, int t, F v) {
+    const auto row = rows.row(t);
+    const ELEMENT e[2] = {(ELEMENT)v.a, (ELEMENT)v.b};
+    if (rows.paired) {
+        PAIR bits;
+        memcpy(&bits, e, sizeof bits);
+        *(PAIR*)row = bits;
+        return;
+    }
+    row[0] = e[0];
+    if (rows.width == 2) row[1] = e[1];
+};
 auto put_ = [&](const auto& rows, int t, F v, bool) { write_(rows, t, v); };
 auto next_ = [](const auto&, int) {};
 #else
+const F one = F{} + 1.0f;
 // Each row lies in another page, so no processor foresees that the next task wants its next lanes.
 auto next_ = [](const auto& rows, int t) { __builtin_prefetch(rows.row(t) + WIDTH); };
 #endif

@@ -119,8 +119,10 @@ def test_empty(batch, length):
 def test_strided_input():
     inputs = make(2, 40, 20, 4)
     dense = causal_conv1d(**inputs)
-    inputs["x"] = torch.cat([inputs["x"], inputs["x"]], -1)[..., :20]
-    assert torch.equal(causal_conv1d(**inputs), dense)
+    x = inputs["x"]
+    # CUDA loads two channels at once where their places allow it
+    for x in (torch.cat([x, x], -1)[..., :20], torch.cat([x[..., :1], x], -1)[..., 1:]):
+        assert torch.equal(causal_conv1d(**inputs | {"x": x}), dense)
 
 
 def test_causal_conv1d_signature():
