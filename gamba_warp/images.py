@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError, features
@@ -339,7 +339,7 @@ def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Im
     from PIL import ImageCms
 
     source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-    space = source.profile.xcolor_space.strip()
+    space = cast(Any, source.profile).xcolor_space.strip()  # Pillow's stub has none of it
     if space not in {"L": ("GRAY", "RGB"), "RGB": ("RGB",), "CMYK": ("CMYK",)}[mode]:
         raise ValueError(f"it is of {space}, the picture of {mode}")
     own = "L" if space == "GRAY" else space
