@@ -54,7 +54,9 @@ class Cameras:
 def intrinsics(width: int, height: int, fov: float = DEFAULT_FOV) -> Tensor:
     """Returns K ``[3, 3]`` float32 of square pixels, a centred axis and a vertical fov, degrees."""
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return torch.tensor(
+        [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]], dtype=torch.float32
+    )
 
 
 def from_opengl(camera_to_world: Tensor) -> Tensor:
@@ -65,7 +67,7 @@ def from_opengl(camera_to_world: Tensor) -> Tensor:
 
 def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
     """Returns ``[4, 4]`` float32 of the reference camera, which looks at the origin along +z."""
-    viewmat = torch.eye(4)
+    viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[2, 3] = distance
     return viewmat
 

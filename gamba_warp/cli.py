@@ -7,13 +7,14 @@ import io
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import is_dataclass
 from typing import Any, get_args, get_type_hints
 
 from .devices import keep_memory, quiet_warp, share_cores
-from .errors import UserError
+from .errors import FileWarning, UserError
 from .files import DISK_ERRORS
 from .versions import __version__, advice, missing
 
@@ -200,12 +201,23 @@ def _complain(text: str) -> None:
         print(f"gamba: {text}", file=sys.stderr, flush=True)
 
 
+_ordinary = warnings.formatwarning
+
+
+def _told(message: Any, category: type[Warning], *where: Any, **others: Any) -> str:
+    """A warning as it is printed: of a file one line, which needs no place in the code."""
+    if issubclass(category, FileWarning):
+        return f"gamba: warning: {message}\n"
+    return _ordinary(message, category, *where, **others)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the console script."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names of files need not be UTF-8
             stream.reconfigure(errors="backslashreplace")
+    warnings.formatwarning = _told
     try:
         code = _main(arguments)
         sys.stdout.flush()

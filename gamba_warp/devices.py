@@ -174,6 +174,23 @@ def _count(network: int = 0, float32: int = 0) -> None:
 
 
 @contextmanager
+def float32_weights() -> Iterator[None]:
+    """Networks that are made inside are of float32, whatever torch's default dtype is.
+
+    The operators take no float64, and random weights are drawn otherwise in it. The default is the
+    process's: where it is another, other threads see this one meanwhile.
+    """
+    import torch
+
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@contextmanager
 def network_products(device: torch.device, precision: torch.dtype | None = None) -> Iterator[None]:
     """Matrix products inside are those of a network: in ``precision``, by the fastest library.
 

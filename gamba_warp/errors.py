@@ -1,4 +1,4 @@
-"""The one exception that means: the input is at fault, not the program."""
+"""The exception, and the warning, that mean: the input is at fault, not the program."""
 
 MOST_LETTERS = 600  # of a message; our longest own, the list of a model's fields, takes 450
 
@@ -14,6 +14,10 @@ class UserError(Exception):
 
     def __init__(self, message: object = "") -> None:
         super().__init__(one_line(str(message)))
+
+
+class FileWarning(UserWarning):
+    """One line about a file that is read, but not in all that it says."""
 
 
 def first_line(error: BaseException | str) -> str:

@@ -1,21 +1,24 @@
 """Reading and writing pictures; any common file becomes RGBA, and errors name the file.
 
 Every picture of a stranger is opened by ``open_picture``: few formats, bounded before decoding.
+``to_rgba`` makes sRGB with alpha of what it holds.
 """
 
+import functools
+import io
 import os
 import stat
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError, features
 
-from .errors import UserError, first_line
+from .errors import FileWarning, UserError, first_line, one_line
 from .files import atomic_path
 from .versions import to_install
 
@@ -29,6 +32,8 @@ PICTURE_SUFFIXES |= {".heic", ".heif", ".avif"}
 
 _COUNTED = 16 << 20  # bytes of a file whose frames are counted, which reads all of it
 _BAND = 1 << 22  # pixels that are converted at once
+_PLAIN = ("L", "LA", "RGB", "RGBA", "CMYK")  # modes that have no palette, and 8 bits
+_MOST_PROFILE = 4 << 20  # bytes; a press's profile takes 3 MB
 _ORIENTATION = 0x0112  # of EXIF
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -121,16 +126,19 @@ def _without_warnings() -> Iterator[None]:
         yield
 
 
-def load_rgba(path: str | Path, longest: int | None = None) -> np.ndarray:
+def load_rgba(
+    path: str | Path, longest: int | None = None, warn: Callable[[str], None] | None = None
+) -> np.ndarray:
     """Reads one still picture.
 
-    Grey, palette, RGB, CMYK and RGBA files of 8 and 16 bits are converted, and EXIF rotation is
-    applied. HEIC needs pillow-heif.
+    Grey, palette, RGB, CMYK and RGBA files of 8 and 16 bits are converted to sRGB, by their colour
+    profile if they have one, and EXIF rotation is applied. HEIC needs pillow-heif.
 
     Args:
         path: the file.
         longest: pixels; a picture that is at least four times as long is reduced by a whole
             factor, weighted by alpha, to no less than twice this. None keeps its size.
+        warn: as for ``to_rgba``.
 
     Returns:
         ``[H, W, 4]`` float32 in [0, 1], colour not premultiplied; alpha 1 where the file has none.
@@ -139,18 +147,13 @@ def load_rgba(path: str | Path, longest: int | None = None) -> np.ndarray:
         UserError: the file is missing, empty, not a picture, truncated, animated or too large.
     """
     with _still(path) as image:
-        factor = 1 if longest is None else max(image.size) // (2 * longest)
-        if factor > 1:
-            if image.mode != "F":
-                image = image.convert("I" if image.mode.startswith("I") else "RGBA")
-            image = image.reduce(factor)
-        return _to_rgba(_upright(image), np.float32)
+        return to_rgba(image, path, np.float32, longest, turned=True, warn=warn)
 
 
 def load_rgba8(path: str | Path) -> np.ndarray:
     """As ``load_rgba``, but ``[H, W, 4]`` uint8, a quarter of the memory."""
     with _still(path) as image:
-        return _to_rgba(_upright(image), np.uint8)
+        return to_rgba(image, path, np.uint8, turned=True)
 
 
 def picture_size(path: str | Path) -> tuple[int, int]:
@@ -210,16 +213,75 @@ def _orientation(image: Image.Image) -> int:
     return value if value in _UPRIGHT else 1
 
 
-def _upright(image: Image.Image) -> Image.Image:
-    orientation = _orientation(image)
-    if orientation not in _UPRIGHT:
-        return image
-    turned = image.transpose(_UPRIGHT[orientation])
-    image.close()  # two large pictures are too much beside the floats
-    return turned
+def to_rgba(
+    image: Image.Image,
+    name: object,
+    dtype: type = np.uint8,
+    longest: int | None = None,
+    *,
+    turned: bool = False,
+    profiled: bool = True,
+    warn: Callable[[str], None] | None = None,
+) -> np.ndarray:
+    """Decodes a picture of ``open_picture``; what it held is freed on the way.
+
+    Args:
+        image: not decoded yet.
+        name: what to call it in a warning.
+        dtype: float32 or uint8 of the result.
+        longest: as for ``load_rgba``.
+        turned: whether EXIF rotation is applied.
+        profiled: whether colours are converted to sRGB by the profile in the file.
+        warn: takes a line where the profile cannot be used, and colours are taken for sRGB. None:
+            Python's warnings, once for a line.
+
+    Returns:
+        ``[H, W, 4]`` float32 in [0, 1] or uint8, colour not premultiplied.
+    """
+    convert = _conversion(image, name, warn or _warn_once) if profiled else None
+    plain = _with_alpha(image)
+    orientation = _orientation(image) if turned else 1
+    factor = 1 if longest is None else max(plain.size) // (2 * longest)
+    if factor > 1:
+        plain = (plain.convert("I") if plain.mode.startswith("I") else plain).reduce(factor)
+    if orientation in _UPRIGHT:
+        plain = plain.transpose(_UPRIGHT[orientation])
+    if plain is not image:
+        image.close()  # two large pictures are too much beside the floats
+    return _pixels(plain, dtype, convert)
 
 
-def _to_rgba(image: Image.Image, dtype: type) -> np.ndarray:
+def _with_alpha(image: Image.Image) -> Image.Image:
+    """The picture in a mode of ``_PLAIN``, I or F, where a transparent value became alpha."""
+    key, raw = image.info.get("transparency"), _raw_mode(image)
+    if key is None or image.mode in ("P", "PA"):
+        grey = image.mode.startswith(("I", "F"))
+        if image.mode == "1":
+            return image.convert("L")
+        return image if grey or image.mode in _PLAIN else image.convert("RGBA")
+    if image.mode.startswith("I"):  # Pillow would cut 16 bits off at 255, and lose alpha
+        values = np.asarray(image).astype(np.uint32)
+        alpha = np.where(values == key, 0, 255).astype(np.uint8)
+        grey = ((values + 128) // 257).astype(np.uint8)
+        return Image.merge("LA", [Image.fromarray(x) for x in (grey, alpha)])
+    # Pillow scales the pixels to 8 bits, but not the value. Of 16 bits it keeps the high byte.
+    if raw == "RGB;16B":
+        image.info["transparency"] = tuple(value >> 8 for value in key)
+    elif raw in ("L;2", "L;4"):
+        image.info["transparency"] = key * {"L;2": 85, "L;4": 17}[raw]
+    return image.convert("RGBA")
+
+
+def _raw_mode(image: Image.Image) -> str | None:
+    """How the file holds the pixels, in Pillow's words; known before they are decoded."""
+    tiles = getattr(image, "tile", None)
+    raw = tiles[0][3] if tiles else None
+    return raw if isinstance(raw, str) else None
+
+
+def _pixels(
+    image: Image.Image, dtype: type, convert: Callable[[Image.Image], Image.Image] | None
+) -> np.ndarray:
     """``[H, W, 4]`` float32 in [0, 1] or uint8, made in bands, since floats take the most room."""
     out = np.empty((image.height, image.width, 4), dtype)
     grey, top = image.mode.startswith(("I", "F")), 65535.0  # PIL reads 16-bit colour as 8-bit
@@ -234,15 +296,94 @@ def _to_rgba(image: Image.Image, dtype: type) -> np.ndarray:
         band, part = image.crop(box), out[box[1] : box[3]]
         if grey:
             values = np.clip(np.nan_to_num(np.asarray(band, dtype=np.float32)) / top, 0.0, 1.0)
-            part[..., :3] = (
-                values[..., None] if dtype == np.float32 else to_uint8(values)[..., None]
-            )
-            part[..., 3] = 1.0 if dtype == np.float32 else 255
-        elif dtype == np.float32:
+            if convert is None:
+                part[..., :3] = (
+                    values[..., None] if dtype == np.float32 else to_uint8(values)[..., None]
+                )
+                part[..., 3] = 1.0 if dtype == np.float32 else 255
+                continue
+            band = Image.fromarray(to_uint8(values))
+        band = band if convert is None else convert(band)
+        if dtype == np.float32:
             np.divide(np.asarray(band.convert("RGBA")), np.float32(255.0), out=part)
         else:
             part[...] = np.asarray(band.convert("RGBA"))
     return out
+
+
+def _conversion(
+    image: Image.Image, name: object, warn: Callable[[str], None]
+) -> Callable[[Image.Image], Image.Image] | None:
+    """What brings 8-bit pixels of this picture to sRGB; None where they are, or nobody can."""
+    if "icc_profile" not in image.info:
+        return None
+    profile = image.info["icc_profile"]
+    try:
+        if not isinstance(profile, bytes) or not 0 < len(profile) <= _MOST_PROFILE:
+            raise ValueError("it is damaged or too large")
+        grey = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
+        mode = "L" if grey else "CMYK" if image.mode == "CMYK" else "RGB"
+        return _from_profile(profile, mode)
+    except Exception as error:  # littleCMS is missing, or its errors, of many types
+        reason = first_line(error)
+        warn(f"{name}: its colour profile is not used ({reason}); colours are taken for sRGB")
+        return None
+
+
+@functools.lru_cache(8)
+def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Image] | None:
+    """What brings pixels of L, RGB or CMYK, alpha beside them, from a profile to sRGB.
+
+    None where that moves no value by more than 1: such a profile is sRGB, and the rest rounding.
+    """
+    from PIL import ImageCms
+
+    source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+    space = cast(Any, source.profile).xcolor_space.strip()  # Pillow's stub has none of it
+    if space not in {"L": ("GRAY", "RGB"), "RGB": ("RGB",), "CMYK": ("CMYK",)}[mode]:
+        raise ValueError(f"it is of {space}, the picture of {mode}")
+    own = "L" if space == "GRAY" else space
+    # Of grey littleCMS keeps a few steps for speed; a table of all 256 needs none.
+    flags = ImageCms.Flags.NOOPTIMIZE if mode == "L" else ImageCms.Flags.NONE
+    srgb = ImageCms.createProfile("sRGB")
+    transform = ImageCms.buildTransform(source, srgb, own, "RGB", flags=flags)
+
+    def colours(band: Image.Image) -> Image.Image:
+        made = ImageCms.applyTransform(band.convert(own), transform)
+        assert made is not None  # as it is not made in place
+        return made
+
+    levels = np.arange(256, dtype=np.uint8)
+    if mode == "L":  # grey stays grey, as masks have to
+        table = np.asarray(colours(Image.fromarray(levels[None])))[0, :, 1]
+        if np.abs(table.astype(int) - levels).max() <= 1:
+            return None
+        return _beside_alpha(lambda band: band.convert("L").point(table.tolist()))
+    if mode == "RGB":
+        grid = np.stack(np.meshgrid(*3 * [levels[::15]]), -1).reshape(18, -1, 3)
+        if np.abs(np.asarray(colours(Image.fromarray(grid))).astype(int) - grid).max() <= 1:
+            return None
+    return _beside_alpha(colours)
+
+
+def _beside_alpha(
+    colours: Callable[[Image.Image], Image.Image],
+) -> Callable[[Image.Image], Image.Image]:
+    """The same for pictures with alpha, which stays as it is."""
+
+    def convert(band: Image.Image) -> Image.Image:
+        made = colours(band)
+        if "A" in band.mode:
+            made.putalpha(band.getchannel("A"))
+        return made
+
+    return convert
+
+
+@functools.lru_cache(1024)
+def _warn_once(line: str) -> None:
+    with _QUIET:  # while another thread has no warnings, this one would be lost
+        warnings.warn(one_line(line), FileWarning, stacklevel=2)
 
 
 def to_uint8(picture: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from gamba_warp.batch import check_not_read, progress_bar
 from gamba_warp.conventions import GREY, WHITE
 from gamba_warp.data import gso
-from gamba_warp.data.dataset import ViewDataset, open_dataset
+from gamba_warp.data.dataset import ViewDataset, background_note, open_dataset
 from gamba_warp.devices import pick_device
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_text
@@ -194,6 +194,8 @@ def open_job(options: ViewsOptions) -> Job:
     if options.baselines:
         _add_baselines(job, options)
     job.baselines |= ceiling
+    if note := background_note(dataset):
+        print(f"warning: {options.data}: {note}", file=sys.stderr)
     return job
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from ..images import open_picture, to_uint8
+from ..images import open_picture, to_rgba
 from ..untrusted.documents import read_bytes
 from ..untrusted.names import inside
 
@@ -106,21 +106,25 @@ class SideFiles:
             if not re.fullmatch(_AS_IT_IS[option], numbers):
                 self.warnings.append(f"{shown}: the option -{option} is not read")
         try:
-            return self.texture(self.read(name), shown)
+            return self.texture(self.read(name), shown, profiled=True)
         except UserError as error:
             self.warnings.append(str(error))
             return None
 
-    def texture(self, data: bytes | memoryview, name: str) -> np.ndarray | None:
-        """A picture as ``[h, w, 4]`` uint8 RGBA; None where it cannot be decoded."""
+    def texture(
+        self, data: bytes | memoryview, name: str, profiled: bool = False
+    ) -> np.ndarray | None:
+        """A picture as ``[h, w, 4]`` uint8 RGBA; None where it cannot be decoded.
+
+        Colour profiles count if ``profiled``; glTF 2.0 wants them ignored (3.8.3, images).
+        """
         try:
             with open_picture(io.BytesIO(data), name) as image:
-                if image.mode.startswith("I"):  # Pillow would cut 16 bits off at 255
-                    image = Image.fromarray(to_uint8(np.asarray(image, np.float32) / 65535))
-                image = image.convert("RGBA")
+                pixels = to_rgba(image, name, profiled=profiled, warn=self.warnings.append)
         except UserError as error:
             self.warnings.append(str(error))
             return None
+        image = Image.fromarray(pixels)
         while max(image.size) > MAX_TEXTURE:
             image = image.reduce(2)
         self.texels -= 4 * image.width * image.height

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from ..errors import UserError
-from ..images import open_picture
+from ..images import open_picture, to_rgba
 from .headers import open_shape
 from .materials import GREY, Material, SideFiles, plain, to_linear
 from .parts import Part, cut_polygons, to_rgba8
@@ -235,9 +236,10 @@ def _mask(texture: np.ndarray, name: str, sides: SideFiles) -> None:
     shown = " ".join(name[:100].split())
     try:
         with open_picture(io.BytesIO(sides.read(name)), shown) as image:
-            alpha = image.convert("RGBA").getchannel("A")
+            rgba = Image.fromarray(to_rgba(image, shown, profiled=False))
+            alpha = rgba.getchannel("A")
             if alpha.getextrema()[0] == 255:
-                alpha = image.convert("L")
+                alpha = rgba.convert("L")
             texture[..., 3] = np.asarray(alpha.resize((texture.shape[1], texture.shape[0])))
     except UserError as error:
         sides.warnings.append(str(error))

@@ -193,7 +193,7 @@ def _children(
     seen = F.avg_pool2d(picture, picture.shape[-1] // size)[0][:, row, column].T
     own = parent[row // count * side + column // count]
     K = camera.resized(size, size).Ks[0]
-    across = (torch.stack([column, row], -1) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
+    across = (torch.stack([column, row], -1).to(K) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
     points = torch.cat([across, torch.ones_like(depth)], -1) * depth
     quats = None if front.quats is None else front.quats[own]
     across_view = (front.scales[own] / count).clamp_min(COVER * camera.viewmats[0, 2, 3] / K[1, 1])

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..cameras import Cameras
 from ..conventions import over_background
-from ..devices import network_products
+from ..devices import float32_weights, network_products
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
@@ -38,6 +38,7 @@ class Gamba(Pretrained, nn.Module):
             backward pass; this takes less memory and a third more time.
     """
 
+    @float32_weights()
     def __init__(
         self,
         config: GambaConfig,

@@ -190,7 +190,7 @@ def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
     bins = _shape(found, _COORDS, 2)[1]
     points = found.pop(_COORDS)
     limit = _decimal(points[0, -1].to(stored)) if points.numel() else 0.0
-    even = torch.linspace(-limit, limit, bins)
+    even = torch.linspace(-limit, limit, bins, dtype=torch.float32)
     # Even points are even no more once each is rounded: by half a unit of the last place of the
     # largest at most, 0.0016 in bfloat16 at 0.4, where the points are 0.04 apart. 1e-6 is for the
     # sum by which a float32 point was made.

@@ -155,7 +155,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         ModuleNotFoundError: a library that a file of ``ways`` needs is not installed.
     """
     ways = Ways() if ways is None else ways
-    rgba, why = load_rgba(path, longest=WORKING_SIZE), ""
+    rgba, why = load_rgba(path, WORKING_SIZE, ways.say), ""
     method: Method | None = None
     if ways.mask is not None:
         rgba[..., 3] = read_mask(ways.mask, path)

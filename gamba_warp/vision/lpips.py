@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from ..devices import float32_weights
 from .vgg import VGG16Trunk
 from .weights import WIDTHS, read_cached
 
@@ -19,6 +20,7 @@ class LPIPS(nn.Module):
     shift: Tensor
     scale: Tensor
 
+    @float32_weights()
     def __init__(self, state: dict[str, Tensor]) -> None:
         """Takes torchvision's ``features.N.*`` and ``lin0`` .. ``lin4``, each ``[C]``."""
         super().__init__()

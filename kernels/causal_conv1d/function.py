@@ -91,8 +91,10 @@ def causal_conv1d(
             raise TypeError(f"{name} is {type(value).__name__}, must be a tensor")
         if value.dtype not in DTYPES:
             raise TypeError(f"{name} has dtype {value.dtype}, allowed: {DTYPES}")
-        if value.device != x.device or x.device.type not in ("cpu", "cuda"):
-            raise ValueError(f"{name} is on {value.device}, x is on {x.device}; cpu or cuda")
+        if value.device != x.device:
+            raise ValueError(f"{name} is on {value.device}, x is on {x.device}: allowed is one")
+    if x.device.type not in ("cpu", "cuda"):
+        raise ValueError(f"x is on {x.device}, allowed are cpu and cuda")
     if x.dim() != 3 or x.shape[2] == 0:
         raise ValueError(f"x has shape {tuple(x.shape)}, must be [B, L, D] with D >= 1")
     packed = sequences(x, cu_seqlens, seq_idx)

@@ -27,7 +27,7 @@ def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
     The result may lie in the memory of ``x``.
     """
     if x is None:
-        return torch.zeros(rows, channels, device=like.device)
+        return torch.zeros(rows, channels, dtype=torch.float32, device=like.device)
     x = x.reshape(like.shape[2], -1).T.float()
     if x.shape != (rows, channels):
         x = torch.constant_pad_nd(x, (0, channels - x.shape[1], rows - x.shape[0], 0))
@@ -103,7 +103,8 @@ def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     dx = _empty(x, (batch, length if need_x else 0, channels))
     dstate = x.new_zeros(len(rows), TAPS - 1 if need_state else 0, channels)
     make = torch.empty if packed is None else torch.zeros  # a piece may have no token
-    dweight = make(chunks, 5 if need_weight or need_bias else 0, blocks * width, device=x.device)
+    shape = chunks, 5 if need_weight or need_bias else 0, blocks * width
+    dweight = make(shape, dtype=torch.float32, device=x.device)
     shaped = dweight.view(*dweight.shape[:2], blocks, width) if width > 1 else dweight
     _launch(
         x,

@@ -2,6 +2,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,7 @@ import pytest
 import tyro
 
 from gamba_warp import __version__, cli
-from gamba_warp.errors import UserError
+from gamba_warp.errors import FileWarning, UserError
 from gamba_warp.vision.weights import DOWNLOAD_MB
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -352,3 +353,12 @@ def test_names_that_are_not_utf_8_can_be_printed(tmp_path):
 def test_bad_options_of_stress(arguments, reason, capsys):
     assert exit_code(["stress", *arguments]) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_warnings_of_files_are_one_line(monkeypatch):
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    with pytest.raises(SystemExit):
+        cli.main(["--version"])
+    line = warnings.formatwarning("a.png: odd", FileWarning, "images.py", 3)
+    assert line == "gamba: warning: a.png: odd\n"
+    assert "images.py:3: UserWarning: b" in warnings.formatwarning("b", UserWarning, "images.py", 3)

@@ -203,12 +203,21 @@ def test_a_full_disk_under_the_index_leaves_the_pack_as_it_was(data, tmp_path, m
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
 
 
+def test_views_without_alpha_are_packed_and_told(data, tmp_path, capsys):
+    for path in data.rglob("[0-9].png"):
+        Image.open(path).convert("RGB").save(path)
+    assert cli.run("data pack", [str(data), str(tmp_path / "pack"), "--size", "6"]) == 0
+    said = capsys.readouterr().err
+    assert f"warning: {data}: no picture has an alpha channel or a mask" in said
+
+
 def test_objects_that_cannot_be_read_are_left_out_and_told(data, tmp_path, capsys):
     (data / "b/c/1.png").write_bytes(b"no picture")
     out = tmp_path / "pack"
     assert cli.run("data pack", [str(data), str(out), "--size", "6"]) == 1
     said = capsys.readouterr()
     assert "packed 2 objects" in said.out and "failed: b/c: " in said.err
+    assert "warning" not in said.err
     assert open_dataset(out).uids == ["a", "d"]
     with pytest.raises(UserError, match="no object can be packed"):
         write_pack(data / "b", tmp_path / "other", PackSettings(), 1)

@@ -55,6 +55,16 @@ def data(tmp_path):
     return tmp_path
 
 
+def test_true_views_without_alpha_are_told(data, capsys):
+    evaluate(data)
+    assert "warning" not in capsys.readouterr().err
+    for path in (data / "data").rglob("*.png"):
+        Image.open(path).convert("RGB").save(path)
+    evaluate(data)
+    line = f"warning: {data / 'data'}: no picture has an alpha channel or a mask"
+    assert capsys.readouterr().err.count(line) == 1
+
+
 def evaluate(folder, *options):
     places = (folder / name for name in ("pred", "data", "out"))
     return eval_views(*places, "--split", "all", "--no-baselines", *options)

@@ -7,11 +7,19 @@ import zlib
 
 import numpy as np
 import pytest
-from helpers.images import bad_files, colours, encoded
+from helpers.images import (
+    ADOBE_RGB,
+    DISPLAY_P3,
+    SRGB,
+    bad_files,
+    colour_profile,
+    colours,
+    encoded,
+)
 from helpers.refusals import refused, refused_at
 from PIL import EpsImagePlugin, Image, ImageOps
 
-from gamba_warp.errors import UserError
+from gamba_warp.errors import FileWarning, UserError
 from gamba_warp.files import atomic_path, output_folder, write_json
 from gamba_warp.images import (
     load_rgba,
@@ -64,12 +72,15 @@ def test_16_bit_grey_keeps_its_range(tmp_path, suffix):
     assert (got[..., :3] == got[..., :1]).all() and (got[..., 3] == 1).all()
 
 
-def png16(values):
-    """A 16-bit RGB or RGBA PNG, which Pillow reads but cannot write."""
+def png16(values, key=None, bits=16):
+    """A PNG of few or many bits and a transparent value, which Pillow reads but cannot write."""
     height, width, channels = values.shape
-    kind = {3: 2, 4: 6}[channels]
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0))]
+    kind = {1: 0, 3: 2, 4: 6}[channels]
+    high = values.astype(">u2").reshape(height, -1)
+    of_bits = np.unpackbits(high.view(np.uint8), axis=1).reshape(height, -1, 16)[..., -bits:]
+    rows = b"".join(b"\0" + row.tobytes() for row in np.packbits(of_bits.reshape(height, -1), 1))
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0))]
+    chunks += [] if key is None else [(b"tRNS", np.array(key, ">u2").tobytes())]
     chunks += [(b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
     body = b"".join(
         struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
@@ -78,12 +89,125 @@ def png16(values):
     return b"\x89PNG\r\n\x1a\n" + body
 
 
+@pytest.mark.parametrize("channels, bits", [(1, 2), (1, 4), (1, 8), (1, 16), (3, 8), (3, 16)])
+def test_a_transparent_value_becomes_alpha(tmp_path, channels, bits):
+    """Whatever the bits: Pillow compares 8-bit pixels with the value as the file has it."""
+    most = 2**bits - 1
+    values = np.random.default_rng(0).integers(0, most, (5, 7, channels))
+    values[1, 2] = values[4, 0] = most  # what no other pixel is
+    values[0, 0] = 0
+    for key in ([most] * channels, [0] * channels):
+        (tmp_path / "a.png").write_bytes(png16(values, key, bits))
+        for got in (load_rgba(tmp_path / "a.png"), load_rgba8(tmp_path / "a.png") / 255):
+            np.testing.assert_array_equal(got[..., 3], (values != key).any(-1))
+            want = np.broadcast_to(values / most, (5, 7, 3))
+            # Of 16 bits of colour Pillow keeps the high byte.
+            np.testing.assert_allclose(got[..., :3], want, atol=1.01 / 255 if bits == 16 else 1e-6)
+    large = np.kron(values, np.ones((16, 16, 1), int))
+    (tmp_path / "a.png").write_bytes(png16(large, [most] * channels, bits))
+    alpha = load_rgba(tmp_path / "a.png", 14)[..., 3]  # by blocks of four
+    np.testing.assert_array_equal(alpha[::4, ::4], (values != most).any(-1))
+
+
 @pytest.mark.parametrize("channels", [3, 4])
 def test_16_bit_colour_is_read_to_8_bits(tmp_path, channels):
     values = np.random.default_rng(0).integers(0, 65536, (5, 7, channels))
     (tmp_path / "a.png").write_bytes(png16(values))
     got = load_rgba(tmp_path / "a.png")[..., :channels]
     np.testing.assert_allclose(got, values / 65535, atol=1.01 / 255)  # Pillow keeps the high byte
+
+
+def in_srgb(pixels, columns, gamma):
+    """Values of 0 to 255 of a space with a gamma, in sRGB."""
+    linear = (pixels / 255.0) ** gamma @ np.array(columns).T
+    linear = np.clip(linear @ np.linalg.inv(SRGB).T, 0, 1)
+    return 255 * np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "jpg", "webp"])
+@pytest.mark.parametrize("columns, gamma", [(ADOBE_RGB, 2.2), (DISPLAY_P3, 1.8)])
+def test_colour_profiles_become_srgb(tmp_path, suffix, columns, gamma, recwarn):
+    path = tmp_path / f"a.{suffix}"
+    mode = "RGB" if suffix == "jpg" else "RGBA"
+    options = {"webp": {"lossless": True, "exact": True}, "jpg": {"quality": 100}}.get(suffix, {})
+    colours(mode).save(path, icc_profile=colour_profile(columns, gamma), **options)
+    with Image.open(path) as image:
+        before = np.asarray(image.convert("RGBA"))
+    want = in_srgb(before[..., :3], columns, gamma)
+    for got in (255 * load_rgba(path), load_rgba8(path)):
+        # Half a step of rounding, and one of littleCMS's tables.
+        np.testing.assert_allclose(got[..., :3], want, atol=1.5)
+        np.testing.assert_array_equal(got[..., 3], before[..., 3])
+    assert np.abs(want - before[..., :3]).max() > 20 and not recwarn.list
+
+
+def test_a_profile_of_srgb_leaves_every_bit(tmp_path):
+    from PIL import ImageCms
+
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for mode in ("RGB", "RGBA", "P", "L", "LA", "1"):
+        colours(mode).save(tmp_path / "a.png", icc_profile=srgb)
+        colours(mode).save(tmp_path / "b.png")
+        np.testing.assert_array_equal(load_rgba(tmp_path / "a.png"), load_rgba(tmp_path / "b.png"))
+
+
+@pytest.mark.parametrize("columns", [None, ADOBE_RGB], ids=["grey", "rgb"])
+@pytest.mark.parametrize("mode", ["L", "LA", "I;16"])
+def test_grey_has_profiles_too(tmp_path, mode, columns):
+    """And stays grey, as masks have to."""
+    values = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    grey = Image.fromarray(257 * values.astype(np.uint16)) if mode == "I;16" else None
+    if mode != "I;16":
+        grey = Image.fromarray(values).convert(mode)
+    grey.save(tmp_path / "a.png", icc_profile=colour_profile(columns, 1.0))
+    got = load_rgba(tmp_path / "a.png")
+    want = in_srgb(np.repeat(values[..., None], 3, -1), SRGB, 1.0)
+    np.testing.assert_allclose(255 * got[..., :3], want, atol=1)  # of which rounding is a half
+    assert (got[..., :3] == got[..., :1]).all() and (got[..., 3] == 1).all()
+
+
+def test_cmyk_goes_by_its_profile(tmp_path):
+    inks = Image.new("CMYK", (64, 64), (255, 255, 0, 0))
+    inks.paste((0, 0, 0, 255), (0, 0, 32, 64))
+    for suffix in ("jpg", "tiff"):
+        inks.save(tmp_path / f"a.{suffix}", icc_profile=colour_profile("CMYK"))
+        got = 255 * load_rgba(tmp_path / f"a.{suffix}", 8)
+        assert got.shape == (16, 16, 4)
+        # L* of 75 and of 50, in sRGB; 8 bits of L* in the profile's table are half a step of ours.
+        assert np.abs(got[8, 4, :3] - 185.5).max() < 2 and np.abs(got[8, 12, :3] - 118.9).max() < 2
+
+
+@pytest.mark.parametrize(
+    "mode, profile, reason",
+    [
+        ("RGB", b"no profile", ""),
+        ("RGBA", colour_profile(ADOBE_RGB)[:200], ""),
+        ("RGB", colour_profile("CMYK"), "it is of CMYK, the picture of RGB"),
+        ("CMYK", colour_profile(SRGB), "it is of RGB, the picture of CMYK"),
+        ("L", bytes(5 << 20), "damaged or too large"),
+    ],
+)
+def test_what_is_no_profile_is_said_and_keeps_the_pixels(tmp_path, mode, profile, reason):
+    path = tmp_path / "a.tiff"
+    colours(mode).save(path, icc_profile=profile)
+    with pytest.warns(FileWarning, match=f"a.tiff: its colour profile is not used.*{reason}"):
+        got = load_rgba(path)
+    want = np.asarray(colours(mode).convert("RGBA")) / np.float32(255)
+    np.testing.assert_array_equal(got, want)
+
+
+def test_without_littlecms_the_pixels_stay(tmp_path, monkeypatch):
+    from PIL import ImageCms
+
+    def missing(*_):
+        raise ImportError("no littleCMS")
+
+    monkeypatch.setattr(ImageCms, "ImageCmsProfile", missing)
+    colours().save(tmp_path / "a.png", icc_profile=colour_profile(ADOBE_RGB, 2.1))
+    said = []
+    got = load_rgba(tmp_path / "a.png", warn=said.append)
+    np.testing.assert_array_equal(got[..., :3], np.asarray(colours()) / np.float32(255))
+    assert len(said) == 1 and "a.png" in said[0] and "no littleCMS" in said[0]
 
 
 def test_float_tiff_is_scaled_and_stays_finite(tmp_path):

@@ -4,6 +4,7 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from helpers.images import ADOBE_RGB, colour_profile, colours
 from helpers.meshes import MTL, QUAD, write_quad
 from helpers.refusals import refused
 from PIL import Image
@@ -150,6 +151,28 @@ def test_transparency_of_mtl(tmp_path):
     Image.fromarray(np.full((4, 4), 64, np.uint8)).save(tmp_path / "mask.png")
     path = write_quad(tmp_path, mtl=MTL + "map_d mask.png\n")
     assert (load_mesh(path).materials[0].texture[..., 3] == 64).all()
+    Image.fromarray(np.full((4, 4), 64 * 257, np.uint16)).save(tmp_path / "mask.png")
+    assert (load_mesh(path).materials[0].texture[..., 3] == 64).all()
+
+
+def test_colour_profiles_of_textures(tmp_path):
+    """They count beside an .obj; glTF wants them ignored, as its renderers do."""
+    path, image = write_quad(tmp_path), colours("RGB", (16, 16))
+    image.save(tmp_path / "paint.png")
+    before = load_mesh(path).materials[0].texture
+    image.info["icc_profile"] = colour_profile(ADOBE_RGB)
+    image.save(tmp_path / "paint.png")
+    profiled = load_mesh(path)
+    moved = profiled.materials[0].texture[..., :3].astype(int) - before[..., :3]
+    assert np.abs(moved).max() > 20 and not profiled.warnings
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), image=image)
+    box.export(tmp_path / "a.glb")
+    assert b"iCCP" in (tmp_path / "a.glb").read_bytes()
+    glb = load_mesh(tmp_path / "a.glb")
+    np.testing.assert_array_equal(glb.materials[0].texture, before)
+    image.save(tmp_path / "paint.png", icc_profile=b"none")
+    assert "paint.png: its colour profile is not used" in load_mesh(path).warnings[0]
 
 
 def test_glb_scene(tmp_path):

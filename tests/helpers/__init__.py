@@ -39,3 +39,20 @@ def assert_rel_rms(got, want, limit: float, name: str) -> None:
     assert torch.isfinite(got).all(), f"{name}: not finite"
     error = rel_rms(got, want)
     assert error <= limit, f"{name}: relative rms error {error:.3g} > {limit:.3g}"
+
+
+def in_default_float64(function):
+    """What a function returns where torch's default dtype is float64."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        return function()
+    finally:
+        torch.set_default_dtype(before)
+
+
+def assert_default_dtype_changes_nothing(function):
+    """The tensors that a function returns are the same bits of the same dtype, in any default."""
+    for want, got in zip(function(), in_default_float64(function), strict=True):
+        assert got.dtype == want.dtype
+        torch.testing.assert_close(got, want, rtol=0, atol=0, equal_nan=True)

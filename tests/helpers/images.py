@@ -37,6 +37,49 @@ def png_of_size(width, height):
     return b"\x89PNG\r\n\x1a\n" + body
 
 
+# Columns of linear red, green and blue to XYZ at D50, as the published profiles hold them.
+SRGB = [[0.4361, 0.3852, 0.1431], [0.2225, 0.7169, 0.0606], [0.0139, 0.0971, 0.7141]]
+ADOBE_RGB = [[0.6097, 0.2053, 0.1492], [0.3111, 0.6257, 0.0632], [0.0195, 0.0609, 0.7446]]
+DISPLAY_P3 = [[0.5151, 0.2920, 0.1571], [0.2412, 0.6922, 0.0666], [-0.0011, 0.0419, 0.7841]]
+
+
+def colour_profile(columns=None, gamma=2.2):
+    """A small ICC profile: of RGB with these columns, of CMYK (``"CMYK"``), or of grey.
+
+    CMYK is of an L* that falls in a straight line with each ink, from 100 to 0 with all four.
+    """
+
+    def numbers(*values):
+        return struct.pack(f">{len(values)}i", *(round(65536 * value) for value in values))
+
+    curve = b"curv" + bytes(4) + struct.pack(">IHH", 1, round(256 * gamma), 0)
+    tags = {b"wtpt": b"XYZ " + bytes(4) + numbers(0.9642, 1, 0.8249)}
+    if columns == "CMYK":
+        space, kind = b"CMYK", b"prtrLab "
+        inks = np.stack(np.meshgrid(*[[0, 1]] * 4, indexing="ij"), -1).reshape(-1, 4)
+        lab = np.full((16, 3), 128, np.uint8)
+        lab[:, 0] = np.round(255 - 63.75 * inks.sum(1))
+        same = bytes(range(256))
+        table = b"mft1" + bytes(4) + bytes([4, 3, 2, 0]) + numbers(1, 0, 0, 0, 1, 0, 0, 0, 1)
+        tags[b"A2B0"] = table + 4 * same + lab.tobytes() + 3 * same
+    elif columns is None:
+        space, kind = b"GRAY", b"mntrXYZ "
+        tags[b"kTRC"] = curve
+    else:
+        space, kind = b"RGB ", b"mntrXYZ "
+        for name, column in zip("rgb", zip(*columns)):
+            tags[f"{name}XYZ".encode()] = b"XYZ " + bytes(4) + numbers(*column)
+            tags[f"{name}TRC".encode()] = curve
+    at, table, data = 132 + 12 * len(tags), struct.pack(">I", len(tags)), b""
+    for name, content in tags.items():
+        content += bytes(-len(content) % 4)
+        table += struct.pack(">4sII", name, at + len(data), len(content))
+        data += content
+    head = struct.pack(">I4sI", at + len(data), bytes(4), 0x02400000) + kind[:4] + space + kind[4:]
+    head += bytes(12) + b"acsp" + bytes(28) + numbers(0.9642, 1, 0.8249)
+    return head.ljust(128, b"\0") + table + data
+
+
 def bad_files(folder):
     """Writes files that cannot be read as a picture; yields name, path and the expected reason."""
     first, second = colours("P"), colours("P", (7, 5)).transpose(Image.Transpose.ROTATE_180)

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 import trimesh
 from helpers import micro
+from helpers.images import ADOBE_RGB, colour_profile
 from helpers.matting import matting_network
 from helpers.published import gobjaverse as published_views
 from helpers.published import gso as published_scans
@@ -97,12 +98,17 @@ def pictures() -> Kinds:
     return {
         "png-rgba": {"photo.png": encoded(cut)},
         "png-16": {"photo.png": encoded(Image.fromarray(wide))},
+        "png-16-key": {"photo.png": encoded(Image.fromarray(wide), transparency=0)},
+        "png-profile": {"photo.png": encoded(cut, icc_profile=colour_profile(ADOBE_RGB))},
         "png-palette": {"photo.png": palette},
         "png-grey": {"photo.png": encoded(grey)},
         "png-bit": {"photo.png": encoded(grey.convert("1"))},
         "jpeg": {"photo.jpg": encoded(plain, "JPEG", exif=exif)},
         "jpeg-progressive": {"photo.jpg": encoded(plain, "JPEG", progressive=True)},
         "jpeg-cmyk": {"photo.jpg": encoded(plain.convert("CMYK"), "JPEG")},
+        "jpeg-press": {
+            "photo.jpg": encoded(plain.convert("CMYK"), "JPEG", icc_profile=colour_profile("CMYK"))
+        },
         "webp": {"photo.webp": encoded(cut, "WEBP", lossless=True)},
         "webp-lossy": {"photo.webp": encoded(cut, "WEBP", quality=70)},
         "gif": {"photo.gif": encoded(plain.quantize(16), "GIF")},

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from helpers import assert_rel_rms
-from helpers.model import inputs, micro
+from helpers import assert_default_dtype_changes_nothing, assert_rel_rms
+from helpers.model import FIELDS, inputs, micro
 from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, orbit
@@ -182,3 +182,29 @@ def test_config_json_errors(change, words):
 )
 def test_config_refuses(changes, words):
     refused(words, micro, **changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"decoder": "rays", "ray_cells": 2, "encoder": "none"},
+        {"decoder": "triplane", "triplane_size": 3, "mixer": "attention"},
+        {"image_tokens": "mixed", "predict_rotation": True},
+    ],
+    ids=str,
+)
+def test_a_default_of_float64_changes_nothing(changes):
+    """Weights are drawn, and Gaussians predicted, as where the default dtype is float32."""
+
+    def run():
+        torch.manual_seed(0)
+        model = Gamba(micro(**changes), "random")
+        shape = 2, 12, 12, model.config.input_channels
+        out = model(torch.rand(shape, dtype=torch.float32), inputs(2)[1])
+        made = [getattr(out, name) for name in FIELDS]
+        sum(values.sum() for values in made).backward()
+        parameters = [p for p in model.parameters() if p.grad is not None]
+        return [*made, *model.state_dict().values(), *(p.grad for p in parameters)]
+
+    assert_default_dtype_changes_nothing(run)

@@ -195,6 +195,7 @@ def data_pack_command(
         limit: stop after this many objects.
         workers: number of threads that decode; 0 means one per core.
     """
+    from gamba_warp.data.dataset import background_note, open_dataset
     from gamba_warp.kernels.runtime.system import cores
 
     from .pack import PackSettings, write_pack
@@ -207,6 +208,8 @@ def data_pack_command(
     print(f"{made}, {len(done.failures)} failed")
     if split == "all":
         _tell_empty(out)
+    if note := background_note(open_dataset(out)):
+        print(f"warning: {data}: {note}", file=sys.stderr)
     return _told(done.failures, "failed", {})
 
 

@@ -142,8 +142,8 @@ class RayDecoder(nn.Module):
         base = torch.logit(cells.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
         Ks, viewmats = cameras.Ks[cells.picture], cameras.viewmats[cells.picture]
         side = self.config.patch_size // self.config.ray_cells
-        x = (side * (cells.column + 0.5) - Ks[:, 0, 2]) / Ks[:, 0, 0]
-        y = (side * (cells.row + 0.5) - Ks[:, 1, 2]) / Ks[:, 1, 1]
+        x = (side * (cells.column.to(Ks) + 0.5) - Ks[:, 0, 2]) / Ks[:, 0, 0]
+        y = (side * (cells.row.to(Ks) + 0.5) - Ks[:, 1, 2]) / Ks[:, 1, 1]
         turn, shift = viewmats[:, :3, :3], viewmats[:, None, :3, 3]
         distance = shift.norm(dim=-1, keepdim=True)
         footprint = side * distance / Ks[:, 1, 1, None, None]

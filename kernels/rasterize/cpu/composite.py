@@ -83,7 +83,7 @@ _sum_rows = native_kernel(
 
 def _workers(size: int) -> Packed:
     """Room for ``size`` lanes of each worker."""
-    workspace = torch.empty(torch.get_num_threads() * size * 16)
+    workspace = torch.empty(torch.get_num_threads() * size * 16, dtype=torch.float32)
     return Packed(Workers, torch.zeros(1, dtype=torch.int32), workspace)
 
 

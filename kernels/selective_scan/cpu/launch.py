@@ -125,7 +125,7 @@ def _entries(x: Tensor) -> Tensor:
 def _rows(states: Tensor | None):
     """States ``[.., D, N]`` as the kernels take them; None has no rows."""
     if states is None:
-        return torch.empty(0, 1, 1)
+        return torch.empty(0, 1, 1, dtype=torch.float32)
     return states.contiguous().view(-1, *states.shape[-2:])
 
 
@@ -139,7 +139,7 @@ class _Operands:
         self.kind = Kind(x.u.dtype, x.delta.dtype, x.discretization, tuning)
         self.options = int(x.softplus), int(x.z is not None)
         u, delta = lane_contiguous(x.u), lane_contiguous(x.delta)
-        zero = torch.zeros(y.channels, 1)
+        zero = x.A.new_zeros(y.channels, 1)
         skip, bias = (zero if v is None else v.float()[:, None] for v in (x.D, x.delta_bias))
         channel = torch.cat([x.A, x.A.abs().amax(1, keepdim=True), skip, bias], 1)
         z = u if x.z is None else lane_contiguous(x.z)
@@ -162,11 +162,11 @@ class _Operands:
         """Memory of lanes for each piece of a launch, ``rows`` for each state."""
         y = self.layout
         pieces = max(1, min(torch.get_num_threads(), y.tasks))
-        return view(torch.empty(pieces, rows * y.states, W), lanes)
+        return view(torch.empty(pieces, rows * y.states, W, dtype=torch.float32), lanes)
 
     def states(self) -> Tensor:
         y = self.layout
-        return torch.empty(y.segments, y.sequences, y.channels, y.states)
+        return torch.empty(y.segments, y.sequences, y.channels, y.states, dtype=torch.float32)
 
     def advance(self, first: Tensor | None, last: Tensor, product: Tensor | None, starts: Tensor):
         """Walks without outputs: states after each segment, and the products of the decays."""
@@ -234,7 +234,7 @@ def backward(
     dout = x.u.new_zeros(1, 1, y.channels).expand_as(x.u) if dout is None else dout
     dout = lane_contiguous(dout)
     if x.C is None:
-        s.c = torch.zeros(1, 1, 1, y.states).expand_as(s.b)
+        s.c = s.b.new_zeros(1, 1, 1, y.states).expand_as(s.b)
 
     def like(x: Tensor, needed: bool) -> Tensor:
         return empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), x.dtype)
@@ -251,7 +251,7 @@ def backward(
     du, ddelta, dz = like(x.u, need_u), like(x.delta, need_delta), like(x.u, need_z)
     db, dc = parts(need_B), parts(need_C)
     make = torch.empty if x.packed is None else torch.zeros  # some have no chunk
-    dchannel = make(y.chunks, 2, y.blocks, W)
+    dchannel = make(y.chunks, 2, y.blocks, W, dtype=torch.float32)
     s.run(
         kernels.backward_kernel(s.kind),
         [s.b, s.c, view(starts, lanes), dout, _rows(dlast if through else None)],

@@ -203,18 +203,18 @@ class _Operands:
         self.z = self.u if x.z is None else lane_contiguous(x.z)
         self.A = x.A.float().contiguous()
         self.B, self.C = x.B.to(matrix), C.to(matrix)
-        zero = torch.zeros(self.channels, device=self.device)
+        zero = torch.zeros(self.channels, dtype=torch.float32, device=self.device)
         self.skip, self.bias = (
             zero if v is None else v.float().contiguous() for v in (x.D, x.delta_bias)
         )
         if state is None:
             shape = self.sequences, self.channels, self.states
-            self.state = torch.zeros(shape, device=self.device)
+            self.state = torch.zeros(shape, dtype=torch.float32, device=self.device)
         else:
             self.state = state.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
 
     def empty(self, *shape: int) -> Tensor:
-        return torch.empty(shape, device=self.device)
+        return torch.empty(shape, dtype=torch.float32, device=self.device)
 
     def inputs(self, save: bool = False) -> list:
         """What the forward and the gradient begin with."""
@@ -320,8 +320,8 @@ def backward(
     if x.packed is not None:
         runs = count_slots(x.packed, o.batch, o.length, RUN * MARK)
     dfirst = torch.empty_like(o.state)
-    da = torch.zeros(runs, o.channels, o.states, device=o.device)
-    dskip, dbias = torch.zeros(2, runs, o.shape.rows, o.channels, device=o.device)
+    da = o.state.new_zeros(runs, o.channels, o.states)
+    dskip, dbias = o.state.new_zeros(2, runs, o.shape.rows, o.channels)
     if o.u.numel():
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state

@@ -179,3 +179,11 @@ def test_operator_contract():
     """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
     arguments = (*leaves(make(2, 7, 5, 3)).values(), None, True)
     torch.library.opcheck(torch.ops.gamba_warp.causal_conv1d.default, arguments)
+
+
+def test_devices_without_kernels_are_named():
+    x, weight = torch.randn(1, 4, 8), torch.randn(8, 4)
+    with pytest.raises(ValueError, match="^x is on meta, allowed are cpu and cuda$"):
+        causal_conv1d(x.to("meta"), weight.to("meta"))
+    with pytest.raises(ValueError, match="^weight is on meta, x is on cpu: allowed is one$"):
+        causal_conv1d(x, weight.to("meta"))

@@ -99,7 +99,7 @@ class Mamba(nn.Module):
         vars(self.dt_proj.bias)["_no_reinit"] = True
         states = torch.arange(1, d_state + 1, dtype=torch.float32, device=device)
         self.A_log = nn.Parameter(states.log().repeat(inner, 1))
-        self.D = nn.Parameter(torch.ones(inner, device=device))
+        self.D = nn.Parameter(torch.ones(inner, dtype=torch.float32, device=device))
         for parameter in (self.A_log, self.D):
             vars(parameter)["_no_weight_decay"] = True
         self.out_proj = nn.Linear(inner, d_model, bias=bias, **at)
