@@ -121,8 +121,8 @@ def test_strided_input():
     dense = causal_conv1d(**inputs)
     x = inputs["x"]
     # CUDA loads two channels at once where their places allow it
-    for x in (torch.cat([x, x], -1)[..., :20], torch.cat([x[..., :1], x], -1)[..., 1:]):
-        assert torch.equal(causal_conv1d(**inputs | {"x": x}), dense)
+    for strided in (torch.cat([x, x], -1)[..., :20], torch.cat([x[..., :1], x], -1)[..., 1:]):
+        assert torch.equal(causal_conv1d(**inputs | {"x": strided}), dense)
 
 
 def test_causal_conv1d_signature():
