@@ -93,11 +93,13 @@ def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> 
         "opacities": read(f"{EXTENSION}:OPACITY", 1)[:, 0],
         "colors": read(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3) * SH_C0 + 0.5,
     }
-    if degree:
-        arrays["harmonics"] = np.stack([read(name, 3) for name in harmonic_names(degree)], 1)
+    harmonics = [read(name, 3) for name in harmonic_names(degree)]
     counts = {name: len(value) for name, value in arrays.items()}
+    counts |= {f"coefficient {i}": len(value) for i, value in enumerate(harmonics)}
     if len(set(counts.values())) > 1:
         raise UserError(f"{path}: false header, its attributes have {counts} values")
+    if harmonics:
+        arrays["harmonics"] = np.stack(harmonics, 1)
     if (arrays["scales"] < 0).any():
         raise UserError(
             f"{path}: scales below 0; a draft of {EXTENSION} stored logarithms, which is not read"

@@ -239,6 +239,7 @@ CHANGES = {
     "linear": (lambda t, p: p["extensions"][NAME].update({"colorSpace": "lin"}), "lin"),
     "triangles": (lambda t, p: p.update({"mode": 4}), "mode 4"),
     "other counts": (lambda t, p: t["accessors"][3].update({"count": 9}), "false header"),
+    "other harmonics": (lambda t, p: t["accessors"][7].update({"count": 9}), "false header"),
     "too many": (lambda t, p: t["accessors"][0].update({"count": 9999}), "truncated or false"),
     "circle": (lambda t, p: t["nodes"][0].update({"children": [0]}), "circle"),
     "stretched": (lambda t, p: t["nodes"][0].update({"scale": [1, 2, 1]}), "stretches"),
