@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
-from ..devices import float32_weights
 from ..errors import UserError, first_line
 from ..untrusted.torch_files import read_torch
 from .config import MAX_PARAMETERS, GambaConfig
@@ -103,7 +102,6 @@ class _ViT(nn.Module):
 Weights = str | Path | Mapping[str, Tensor]
 
 
-@float32_weights()
 def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder | None:
     """Builds the encoder that ``config`` names, with its weights.
 
@@ -150,7 +148,6 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
     return ImageEncoder(_ViT(vit, config), vit.num_features, config)
 
 
-@float32_weights()
 def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
     """Builds the encoder that ``config`` names as shapes alone, on the meta device.
 

@@ -84,3 +84,9 @@ def test_ssim():
         return dissimilarity(got, want, slope=True)
 
     assert_default_dtype_changes_nothing(run)
+
+
+def test_the_cuda_path(from_ptx):
+    from_ptx()
+    test_scan(packed=False, options=True)
+    test_convolution(packed=False, options=True)
