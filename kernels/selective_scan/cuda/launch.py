@@ -150,19 +150,20 @@ def _carry_kernel(exponential: bool, reverse: bool):
 @no_type_check
 def _sum_parts(
     # in
+    groups: int,
     parts: int,
     parts_in: wp.array2d(dtype=float),
     # out
     sums_out: wp.array4d(dtype=float),
 ):
-    b, g, i = wp.tid()
-    first = (b * sums_out.shape[2] + g) * parts
+    row, i = wp.tid()
+    first = row * parts
     # one after the other, as ``problem.sum_parts``
     total = parts_in[first, i]
     for part in range(1, parts):
         total += parts_in[first + part, i]
     states = sums_out.shape[3]
-    sums_out[b, i / states, g, i % states] = total
+    sums_out[row / groups, i / states, row % groups, i % states] = total
 
 
 class _Operands:
@@ -310,8 +311,9 @@ def backward(
     def total(parts: Tensor) -> Tensor:
         total = o.empty(o.batch, o.length, o.groups, o.states)
         if total.numel():
-            dim = o.batch, o.groups, o.length * o.states
-            cuda_launch(_sum_parts, dim, [o.parts, parts.flatten(1)], [total], device=o.device)
+            inputs = [o.groups, o.parts, parts.flatten(1)]
+            dim = o.batch * o.groups, o.length * o.states
+            cuda_launch(_sum_parts, dim, inputs, [total], device=o.device)
         return total
 
     du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
