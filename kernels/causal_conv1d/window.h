@@ -25,7 +25,7 @@ auto rows_ = [](auto& array, int b, int t0, int d, int width) {
     char* const at =
         (char*)array.data + (size_t)b * array.strides[0] + (size_t)t0 * array.strides[1];
     const Row first = (Row)at + d;
-    const size_t step = array.strides[1];
+    const size_t step = (size_t)array.strides[1];
     return Rows{first, step, width, width == 2 && ((size_t)first | step) % sizeof(PAIR) == 0};
 };
 auto read_ = [](const auto& rows, int t) -> F {
