@@ -3,15 +3,18 @@
 The network sees the picture at ``image_size``; a photograph has more pixels. So after the network
 each front cell may become k x k Gaussians, its children, each on the ray of its own small pixel:
 
-- depth, and what the network added to the opacity that alpha gives, are interpolated between the
-  cells. A cell counts as much as its alpha, so what is hardly there has no say. The opacity is at
-  least that of an opaque surface: a network that is not sure of the depth makes a faint front,
-  and then the colours of what lies behind it, which has no detail, show through.
+- depth, what the network added to the opacity that alpha gives, and how far a parent lies off its
+  ray, are interpolated between the cells. A cell counts as much as its alpha, so what is hardly
+  there has no say. The opacity is over a half where alpha is 1: a network that is not sure of
+  the depth makes a faint front, and then the colours of what lies behind it, which has no detail,
+  show through.
 - colour and alpha are those of the picture at k times the cells.
 - the sizes are the parent's, 1/k of them across the view, but so large there that neighbours
   overlap: at ``image_size`` a rasterizer's own widening covers the gaps between small Gaussians, at
   k times that it does not. Along the view they stay, so that no crack opens from the side.
-- a parent lies up to a pixel off its ray, its children do not: it cost the input view several dB.
+- a parent lies up to a pixel off its ray. Its children go a part of that way: on their rays they
+  would part from cells that do not split, and all the way their pixels would show beside the
+  picture's.
 
 What is plain does not split. Cells with background in them or beside them split in 2 x 2 at most:
 a rasterizer widens every Gaussian by a part of its own pixel, so the more of them stand along a
@@ -41,8 +44,11 @@ from .parts.rays import EMPTY
 
 PLAIN = 6 / 255  # a cell that differs by less in itself, and from those beside it, is plain
 MOST_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
-COVER = 0.4  # standard deviation of a child across the view at least, in sides of its cell
-SURE = 2.0  # logit of a child's opacity at least, where alpha is 1
+SURE = 0.5  # logit of a child's opacity at least, where alpha is 1
+# By detail: the standard deviation of a child across the view at least, in sides of its cell, and
+# the share of its parent's way off the ray (docs/lab/rays.md has what others gave).
+COVER = {2: 0.4, 4: 0.45}
+OFF = {2: 0.5, 4: 0.125}
 ROUNDS = 2  # of correction
 SURER = 8.0  # how much the logit of an opacity rises where a whole unit of alpha is missing
 FAINT = 0.05  # alpha of a rendered pixel under which its colour says little
@@ -113,7 +119,7 @@ def split_front(
     front = gaussians.select(is_front)
     parent = cells.new_full((side * side,), -1)
     parent[cells] = torch.arange(len(cells), device=device)
-    fields = _fields(front, cells, alpha, config.distance)
+    fields = _fields(front, cells, alpha, camera)
     made = [
         _children(front, parent, fields, counts == count, count, picture, camera)
         for count in sorted({2, detail})
@@ -149,17 +155,27 @@ def _children_a_side(picture: Tensor, alpha: Tensor, detail: int) -> Tensor:
     return counts
 
 
-def _fields(front: Gaussians, cells: Tensor, alpha: Tensor, distance: float) -> Tensor:
-    """What is interpolated, as a map of the cells, ``[1, 3, n, n]``; each is weighted by alpha.
+def _fields(front: Gaussians, cells: Tensor, alpha: Tensor, camera: Cameras) -> Tensor:
+    """What is interpolated, as a map of the cells, ``[1, 5, n, n]``; each is weighted by alpha.
 
-    Depth along the ray, what the network added to the logit of the opacity, and the weight.
+    Depth along the ray, what the network added to the logit of the opacity, how far a parent lies
+    off its ray, x and y, and the weight.
     """
+    side = alpha.shape[-1]
     weight = alpha.flatten()[cells]
     opacity = (torch.logit(front.opacities, 1e-6) - EMPTY * (weight - 1)).clamp_min(SURE)
-    depth = front.means[:, 2] + distance
-    fields = alpha.new_zeros(3, alpha.numel())
-    fields[:, cells] = torch.stack([depth, opacity, torch.ones_like(depth)]) * weight
-    return fields.view(1, 3, *alpha.shape[-2:])
+    points = front.means + camera.viewmats[0, :3, 3]
+    depth = points[:, 2]
+    K = camera.resized(side, side).Ks[0]
+    off = points[:, :2] - depth[:, None] * _across(cells // side, cells % side, K)
+    fields = alpha.new_zeros(5, alpha.numel())
+    fields[:, cells] = torch.stack([depth, opacity, *off.T, torch.ones_like(depth)]) * weight
+    return fields.view(1, 5, side, side)
+
+
+def _across(row: Tensor, column: Tensor, K: Tensor) -> Tensor:
+    """X and y of the rays of pixels at depth 1, ``[.., 2]``."""
+    return (torch.stack([column, row], -1).to(K) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
 
 
 def _children(
@@ -176,7 +192,7 @@ def _children(
     Args:
         front: the parents.
         parent: ``[cells²]``, which of them is that of a cell.
-        fields: ``[1, 3, cells, cells]``, see ``_fields``.
+        fields: ``[1, 5, cells, cells]``, see ``_fields``.
         mask: ``[cells²]`` bool, which cells split.
         count: children a side of a cell.
         picture: ``[1, 4, H, W]``, see ``premultiplied``.
@@ -189,14 +205,15 @@ def _children(
     grid = mask.view(side, 1, side, 1).expand(side, count, side, count).reshape(size, size)
     row, column = grid.nonzero(as_tuple=True)
     fine = F.interpolate(fields, (size, size), mode="bilinear")[0][:, row, column].T
-    depth, opacity = (fine[:, :2] / fine[:, 2:]).split(1, -1)
+    depth, opacity, off = (fine[:, :4] / fine[:, 4:]).split([1, 1, 2], -1)
     seen = F.avg_pool2d(picture, picture.shape[-1] // size)[0][:, row, column].T
     own = parent[row // count * side + column // count]
-    K = camera.resized(size, size).Ks[0]
-    across = (torch.stack([column, row], -1).to(K) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
-    points = torch.cat([across, torch.ones_like(depth)], -1) * depth
+    detail, K = picture.shape[-1] // side, camera.resized(size, size).Ks[0]
+    across = depth * _across(row, column, K) + OFF[detail] * off
+    points = torch.cat([across, depth], -1)
     quats = None if front.quats is None else front.quats[own]
-    across_view = (front.scales[own] / count).clamp_min(COVER * camera.viewmats[0, 2, 3] / K[1, 1])
+    least = COVER[detail] * camera.viewmats[0, 2, 3] / K[1, 1]
+    across_view = (front.scales[own] / count).clamp_min(least)
     children = Gaussians(
         means=points - camera.viewmats[0, :3, 3],
         quats=quats,

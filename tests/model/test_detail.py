@@ -20,7 +20,7 @@ from gamba_warp.images import save_image
 from gamba_warp.model import detail as subject
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.detail import checked_detail, split_front
+from gamba_warp.model.detail import COVER, OFF, checked_detail, split_front
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.model.predict import model_input, reconstruct
@@ -154,7 +154,24 @@ def test_no_crack_opens_from_the_side():
         assert (other - one).abs().mean() < 0.02
 
 
-def test_children_lie_on_the_rays_of_their_own_pixels():
+def test_children_go_half_of_the_way_that_parents_lie_off_their_rays():
+    model, rgba = fresh(), board(48, 2)
+    with torch.inference_mode():
+        image, camera = model_input(rgba, model.config), reference_cameras(model.config, 1)
+        found = []
+        for off in (0.0, 0.004):
+            made = model(image, camera)[0]
+            made.means[:, 0] += off
+            split = split_front(made, image[0], rgba, model.config, 2, camera)
+            found.append(split.means[-200:])
+    torch.testing.assert_close(
+        found[1] - found[0], torch.tensor([0.002, 0.0, 0.0]).expand(200, 3), atol=1e-6, rtol=0
+    )
+
+
+def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
+    """But for the share of their parent's way off its ray."""
+    monkeypatch.setitem(OFF, 2, 0.0)
     model, rgba = fresh(), board(48, 2)
     model.decoder.scale_bias.data[0] = math.log(0.9)  # sides of a cell
     found = reconstruct(model, rgba, detail=2)
@@ -174,7 +191,7 @@ def test_children_lie_on_the_rays_of_their_own_pixels():
     model.decoder.scale_bias.data[0] = math.log(0.1)
     small = reconstruct(model, rgba, detail=2).scales[-200:]
     side = 0.5 * parents[:2].max() / 0.9
-    torch.testing.assert_close(small[:, :2], (0.4 * side).expand(200, 2), rtol=0.02, atol=0)
+    torch.testing.assert_close(small[:, :2], (COVER[2] * side).expand(200, 2), rtol=0.02, atol=0)
 
 
 def test_two_rounds_correct_colours_at_all_pixels_and_opacities_at_twice_the_cells(monkeypatch):
