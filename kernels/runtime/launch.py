@@ -122,7 +122,7 @@ def cuda_launch(
         _launch_again(entry, dim, arguments, stream)
         return
     try:
-        command = wp.launch(
+        command: Any = wp.launch(
             kernel, dim, arguments, block_dim=block_dim, stream=stream, record_cmd=True
         )
     except OSError as error:
