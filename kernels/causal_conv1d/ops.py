@@ -3,13 +3,12 @@
 import torch
 from torch import Tensor
 
-from ..runtime.forward_mode import reverse_only
 from ..runtime.lanes import streams
 from ..runtime.launch import launch
 from ..runtime.memory import empty
+from ..runtime.operator import operator
 from ..runtime.packed import count_slots, pieces
 from ..runtime.stand_in import kind_of
-from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, VALUES, backward_kernel, forward_kernel
 
@@ -60,7 +59,6 @@ def _pieces(x: Tensor, rows: Tensor | None, tokens: int) -> tuple[int, Tensor]:
     return count_slots(rows, batch, length, tokens), pieces(rows, batch, length, tokens)
 
 
-@without_compiler
 @torch.library.custom_op(
     "gamba_warp::causal_conv1d", mutates_args=(), schema=f"({_ARGUMENTS}) -> Tensor"
 )
@@ -86,7 +84,6 @@ def _(x, weight, bias, state, packed, silu):
     return torch.empty_like(x, memory_format=torch.contiguous_format)
 
 
-@without_compiler
 @torch.library.custom_op(
     "gamba_warp::causal_conv1d_backward",
     mutates_args=(),
@@ -148,8 +145,6 @@ def _no_second_gradient(ctx, *grads):
     raise RuntimeError("causal_conv1d: second derivatives are not supported")
 
 
-conv.register_autograd(_gradient, setup_context=_setup_context)
-
-
+conv = operator(conv, "causal_conv1d", _setup_context, _gradient)
 _conv_backward.register_autograd(_no_second_gradient)
-conv = reverse_only("causal_conv1d", conv)
+_conv_backward = operator(_conv_backward, "causal_conv1d")

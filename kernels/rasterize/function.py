@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -99,10 +98,9 @@ def rasterization(
         alpha_max=alpha_max, t_min=t_min, sh_degree=sh_degree, render_mode=render_mode,
         rasterize_mode=rasterize_mode,
     )  # fmt: skip
-    lead = check_inputs(tensors, options)
-    views, batch = viewmats.shape[-3], math.prod(lead)
-    flat: dict[str, Any] = {k: _flat(x, batch, len(lead)) for k, x in tensors.items()}
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat.values()
+    check_inputs(tensors, options)
+    given: tuple[Any, ...] = tuple(map(_dense, tensors.values()))
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = given
     if sh_degree is not None:
         colors = colors_from_harmonics(sh_degree, colors, means, viewmats).contiguous()
     lens = LensOptions(
@@ -111,36 +109,34 @@ def rasterization(
         antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
     ).numbers()  # fmt: skip
     # colours only cull here, so their gradient is no reason to compute that of the geometry
-    projected = project(means, quats, scales, opacities, colors.detach(), viewmats, Ks, lens)
-    # with the caller's dimensions first: a gradient retained on meta's tensors must be on the way
-    projected = Projected(*(x.view(*lead, *x.shape[1:]) for x in projected))
-    per_view = Projected(*(x.reshape(batch * views, *x.shape[len(lead) + 1 :]) for x in projected))
-    channels = _channels(render_mode, colors, per_view.depths.view(batch, views, means.shape[1]))
-    colors_per_view, channels = channels.dim() == 4, channels.reshape(-1, channels.shape[-1])
-    size = Size(width, height, views, int(colors_per_view), skip.bits())
+    projected = Projected(
+        *project(means, quats, scales, opacities, colors.detach(), viewmats, Ks, lens)
+    )
+    channels = _channels(render_mode, colors, projected.depths)
+    colors_per_view = int(channels.dim() > means.dim())
+    size = Size(width, height, viewmats.shape[-3], colors_per_view, skip.bits())
     limits = Limits(alpha_min, alpha_max, t_min)
-    *splats, status = (x.detach() for x in per_view)
+    *splats, status = (x.detach() for x in projected)
     bins = Bins(*bin_op(*splats, width, height, alpha_min, size.skip))
-    skipped = None if torch.compiler.is_compiling() else bins.box_pairs.new_full((), -1)
-    drawn = per_view.means2d, per_view.conics, per_view.view_opacities, channels
+    tiles, compiling = bins.starts.numel() - 1, torch.compiler.is_compiling()
+    skipped = None if compiling else bins.starts.new_zeros(tiles)
+    drawn = projected.means2d, projected.conics, projected.view_opacities, channels
     renders, alphas, *walk = composite(*drawn, list(bins), list(size), list(limits), skipped)
     renders = _finish(render_mode, renders, alphas, backgrounds)
-    renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
     meta = Meta(Call(splats, size, limits), bins, Walk(*walk), status, skipped)
     # under gsplat's names
     meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
-    meta.update(opacities=projected.view_opacities, radii=projected.extents.ceil().int())
-    meta.update(width=width, height=height, tile_size=TILE)
+    meta.update(opacities=projected.view_opacities, width=width, height=height, tile_size=TILE)
     return renders, alphas, meta
 
 
-def _flat(x: Tensor | None, size: int, lead: int) -> Tensor | None:
-    """One batch dimension of the given size for the leading ones; contiguous float32."""
-    return None if x is None else x.reshape(size, *x.shape[lead:]).float().contiguous()
+def _dense(x: Tensor | None) -> Tensor | None:
+    """Contiguous float32."""
+    return None if x is None else x.float().contiguous()
 
 
 def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
-    """What is blended: ``[B, N, C]`` shared by the views, or ``[B, V, N, C]``.
+    """Channels to blend: ``[.., N, C]`` shared by the views, or ``[.., V, N, C]``.
 
     An expected depth needs the sum of the weights too, which is a channel of ones. ``alphas`` is
     that sum but for rounding: it is made as 1 - T, and where a pixel is faint, it has lost digits.
@@ -153,8 +149,8 @@ def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
     if render_mode.endswith("ED"):
         parts.append(torch.ones_like(parts[0]))
     if "RGB" in render_mode:
-        if colors.dim() == 3:
-            colors = colors[:, None].expand(-1, depths.shape[1], -1, -1)
+        if colors.dim() == depths.dim():
+            colors = colors[..., None, :, :].expand(*depths.shape, -1)
         parts.append(colors)
     return torch.cat(parts, -1)
 
@@ -168,5 +164,5 @@ def _finish(render_mode: str, renders: Tensor, alphas: Tensor, backgrounds: Tens
     elif render_mode != "RGB":
         depth, renders = renders.split([1, renders.shape[-1] - 1], -1)
     if backgrounds is not None and renders.shape[-1]:
-        renders = renders + (1.0 - alphas) * backgrounds.flatten(0, 1)[:, None, None]
+        renders = renders + (1.0 - alphas) * backgrounds[..., None, None, :]
     return renders if depth is None else torch.cat([renders, depth], -1)

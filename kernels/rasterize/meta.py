@@ -15,7 +15,7 @@ class Call(NamedTuple):
     """What was drawn, and how: enough to make the lists anew.
 
     Attributes:
-        splats: means2d, conics, depths, opacities and extents of I views, without gradients.
+        splats: means2d, conics, depths, opacities and extents, without gradients.
         size: what ``composite`` was given, like the limits.
         limits: what ``composite`` was given.
     """
@@ -34,7 +34,7 @@ class Call(NamedTuple):
         size = self.size._replace(colors_per_view=1)
         picture = size.width, size.height, self.limits.alpha_min, size.skip
         bins = bin_op(means2d, conics, depths, opacities, extents, *picture, True)
-        color = torch.ones_like(depths).view(-1, 1)
+        color = torch.ones_like(depths)[..., None]
         splats = means2d, conics, opacities, color
         _, _, *walk = composite(*splats, list(bins), list(size), list(self.limits), None)
         return Bins(*bins), Walk(*walk)
@@ -47,8 +47,9 @@ class Meta(dict):
     Gaussian) pairs without and with the exact test; ``pairs_walked``: until every pixel of the tile
     had stopped; ``blocks_walked``: 4 x 4 blocks of pixels evaluated for them; ``pairs_used``,
     ``blocks_used``, ``gaussians_used``: pairs, blocks, (view, Gaussian) that contributed;
-    ``tiles`` and ``tiles_empty``; ``tiles_skipped``: not walked by the latest backward, being empty
-    or without upstream gradient. The last one is None before a backward and under torch.compile.
+    ``tiles`` and ``tiles_empty``; ``tiles_skipped``: walked by no backward so far, being empty or
+    without upstream gradient. The last one is None before a backward and under torch.compile.
+    ``radii``, a tensor, is computed at the first look too.
 
     On CUDA, where the lists of a call had no room for its pairs, they are made once more for these
     counts, with room. A key keeps its first value; after the replay of a CUDA graph
@@ -66,7 +67,11 @@ class Meta(dict):
 
     def __missing__(self, key: str):
         if key == "tiles_skipped":
-            return None if self._skipped is None or self._skipped < 0 else int(self._skipped)
+            skipped = 0 if self._skipped is None else int((self._skipped == 1).sum())
+            return skipped if skipped or self._skipped is not None and self._skipped.any() else None
+        if key == "radii":
+            self[key] = self._drawn.splats[-1].ceil().int()
+            return self[key]
         if key not in _COUNTS:
             raise KeyError(key)
         walks = key not in ("culled", "pairs_box", "pairs", "tiles")

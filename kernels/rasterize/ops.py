@@ -4,6 +4,7 @@ They hold no arithmetic: each calls the launchers of its file. ``function.py`` j
 operator takes tensors and plain numbers only, so each named tuple comes as a list of its values.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import List
@@ -11,9 +12,8 @@ from typing import List
 import torch
 from torch import Tensor
 
-from ..runtime.forward_mode import reverse_only
+from ..runtime.operator import operator
 from ..runtime.stand_in import kind_of
-from ..runtime.start import without_compiler
 from .constants import BLOCKS
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
@@ -44,7 +44,6 @@ def _projector(device: torch.device) -> Callable[..., None]:
     return project_on_lanes if kind_of(device) == "cpu" else project_on_threads
 
 
-@without_compiler
 @torch.library.custom_op(_OP + "project", mutates_args=())
 def project(
     means: Tensor,
@@ -64,12 +63,11 @@ def project(
 
 @project.register_fake
 def _(means, quats, scales, opacities, colors, viewmats, Ks, lens):
-    shape = (*viewmats.shape[:2], means.shape[1])
+    shape = (*viewmats.shape[:-2], means.shape[-2])
     floats = tuple(means.new_empty(*shape, *size) for size in PROJECTED_SIZES)
     return *floats, means.new_empty(shape, dtype=torch.int32)
 
 
-@without_compiler
 @torch.library.custom_op(_OP + "project_vjp", mutates_args=())
 def _project_vjp(
     inputs: List[Tensor | None],
@@ -112,8 +110,8 @@ def _project_backward(ctx, *cotangents):
     return *v_gaussians, None, v_viewmats, None, None
 
 
-project.register_autograd(_project_backward, setup_context=_project_setup)
-project = reverse_only("rasterization", project)
+project = operator(project, "rasterization", _project_setup, _project_backward)
+_project_vjp = operator(_project_vjp, "rasterization")
 
 
 def _bin_views(device: torch.device, exact: bool) -> Callable[..., Bins]:
@@ -129,7 +127,6 @@ def _refuse_too_many(pairs: int) -> None:
         )
 
 
-@without_compiler
 @torch.library.custom_op(_OP + "bin", mutates_args=())
 def bin_op(
     means2d: Tensor,
@@ -149,11 +146,11 @@ def bin_op(
     needed before: ``cuda/capacity.py``. The length of the lists is known only at run time.
 
     Args:
-        means2d: ``[I, N, 2]``, and so on as ``project_forward`` returns them, with I = B * V.
-        conics: ``[I, N, 3]``.
-        depths: ``[I, N]``.
-        view_opacities: ``[I, N]``.
-        extents: ``[I, N, 2]``, zero where culled.
+        means2d: ``[.., N, 2]``, and so on as ``project_forward`` returns them, of I views.
+        conics: ``[.., N, 3]``.
+        depths: ``[.., N]``.
+        view_opacities: ``[.., N]``.
+        extents: ``[.., N, 2]``, zero where culled.
         width: pixels.
         height: pixels.
         alpha_min: what is fainter than this is not drawn.
@@ -165,12 +162,13 @@ def bin_op(
             that is not read back is not refused: the pictures are then made without lists.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
     """
-    images, num = depths.shape
+    splats = means2d, conics, depths, view_opacities, extents
+    splats = [x.flatten(0, depths.dim() - 2) for x in splats]
+    images, num = splats[2].shape
     tiling = Tiling(width, height)
     if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
         raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
     grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
-    splats = means2d, conics, depths, view_opacities, extents
     b = _bin_views(depths.device, exact)(grid, splats, _refuse_too_many)
     return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs, b.count
 
@@ -181,7 +179,7 @@ def _(means2d, conics, depths, *rest):
         return depths.new_empty(shape, dtype=dtype)
 
     width, height = rest[2], rest[3]
-    tiles = depths.shape[0] * Tiling(width, height).count
+    tiles = depths.shape[:-1].numel() * Tiling(width, height).count
     count, pairs = depths.numel(), torch.library.get_ctx().new_dynamic_size()
     return tuple(
         Bins(
@@ -196,7 +194,9 @@ def _(means2d, conics, depths, *rest):
     )
 
 
-@without_compiler
+bin_op = operator(bin_op, "rasterization")
+
+
 @torch.library.custom_op(_OP + "composite", mutates_args=())
 def composite(
     means2d: Tensor,
@@ -208,27 +208,28 @@ def composite(
     limits: List[float],
     skipped: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blends the pairs: pictures, alphas and the fields of a ``Walk``.
+    """Blend the pairs: pictures, alphas and the fields of a ``Walk``.
 
-    ``colors`` is ``[I * N, C]`` or, shared by the views, ``[B * N, C]``. The lists hold what
-    ``Bins``, ``Size`` and ``Limits`` hold. Backward counts the tiles that it skips into
-    ``skipped``, int64 without dimensions.
+    ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
+    Gaussians or, shared by the views, one for each of an object's. The lists hold the values of
+    ``Bins``, ``Size`` and ``Limits``. Backward raises the numbers of tiles in ``skipped``, ``[I *
+    tiles]`` int32, to 1 if it skips a tile and to 2 if it walks it.
     """
-    splats = Drawn(means2d, conics, view_opacities, colors)
+    splats = Drawn(means2d, conics, view_opacities, colors.flatten(0, -2))
     given = splats, Bins(*bins), _picture(means2d, size, limits)
     renders, alphas, w = _compositor(means2d.device).composite_forward(*given)
     return renders, alphas, w.transmittances, w.stops, w.blocks, w.walked, w.blocks_walked
 
 
 def _picture(means2d: Tensor, size: list[int], limits: list[float]) -> Picture:
-    return make_picture(Size(*size), Limits(*limits), num=means2d.shape[1])
+    return make_picture(Size(*size), Limits(*limits), num=means2d.shape[-2])
 
 
 @composite.register_fake
 def _(means2d, conics, view_opacities, colors, bins, size, *rest):
     width, height = Size(*size).width, Size(*size).height
-    images, pairs = means2d.shape[0], Bins(*bins).pairs
-    tiles = images * Tiling(width, height).count
+    images, pairs = means2d.shape[:-2], Bins(*bins).pairs
+    tiles = images.numel() * Tiling(width, height).count
     walk = Walk(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=pairs.new_empty(tiles * BLOCKS, 16),
@@ -236,11 +237,11 @@ def _(means2d, conics, view_opacities, colors, bins, size, *rest):
         walked=pairs.new_empty(tiles),
         blocks_walked=pairs.new_empty(tiles, dtype=torch.int64),
     )
-    renders = colors.new_empty(images, height, width, colors.shape[1])
-    return renders, colors.new_empty(images, height, width, 1), *walk
+    renders = colors.new_empty(*images, height, width, colors.shape[-1])
+    return renders, colors.new_empty(*images, height, width, 1), *walk
 
 
-@without_compiler
+# It changes ``skipped``, which is not declared: compilers, which would have to know, pass None.
 @torch.library.custom_op(_OP + "composite_vjp", mutates_args=())
 def _composite_vjp(
     splats: List[Tensor],
@@ -249,20 +250,23 @@ def _composite_vjp(
     limits: List[float],
     walk: List[Tensor],
     v_pixels: List[Tensor],
+    skipped: Tensor | None,
     geometry: bool,
 ) -> List[Tensor]:
-    given = Drawn(*splats), Bins(*bins), _picture(splats[0], size, limits), Walk(*walk)
+    if skipped is None:
+        skipped = torch.zeros_like(Walk(*walk).walked)
+    drawn = Drawn(*splats)
+    drawn = drawn._replace(colors=drawn.colors.flatten(0, -2))
+    given = drawn, Bins(*bins), _picture(splats[0], size, limits), Walk(*walk)
     backward = _compositor(splats[0].device).composite_backward
-    grads, skipped = backward(*given, v_pixels, geometry)
-    return [skipped, *(g for g in grads if g is not None)]
+    return [g for g in backward(*given, v_pixels, skipped, geometry) if g is not None]
 
 
 @_composite_vjp.register_fake
-def _(splats, bins, size, limits, walk, v_pixels, geometry):
+def _(splats, bins, size, limits, walk, v_pixels, skipped, geometry):
     *geometries, colors = splats
-    v_colors = colors.new_empty(*splats[2].shape, colors.shape[1])
-    v_geometry = map(torch.empty_like, geometries) if geometry else ()
-    return [torch.empty_like(Walk(*walk).walked), *v_geometry, v_colors]
+    v_colors = colors.new_empty(*splats[2].shape, colors.shape[-1])
+    return [*(map(torch.empty_like, geometries) if geometry else ()), v_colors]
 
 
 def _composite_setup(ctx, inputs, output):
@@ -283,13 +287,12 @@ def _composite_backward(ctx, *cotangents):
         for v, shape in zip(cotangents, ctx.shapes)
     ]
     geometry = any(needs[:3]) or not size.skip & UNASKED
-    given = splats, bins, ctx.size, ctx.limits, walk, v_pixels, geometry
-    skipped, *grads, v_colors = _composite_vjp(*given)
-    if ctx.skipped is not None:
-        ctx.skipped.copy_(skipped.sum())
-    if not size.colors_per_view and size.views:
-        images, num, channels = v_colors.shape
-        v_colors = v_colors.view(images // size.views, size.views, num, channels).sum(1)
+    given = splats, bins, ctx.size, ctx.limits, walk, v_pixels, ctx.skipped, geometry
+    *grads, v_colors = _composite_vjp(*given)
+    if not size.colors_per_view and size.views > 1:
+        *images, num, channels = v_colors.shape
+        objects = math.prod(images) // size.views
+        v_colors = v_colors.view(objects, size.views, num, channels).sum(1)
     # without a view there is nothing to sum
     v_colors = v_colors.reshape(colors.shape) if v_colors.numel() else torch.zeros_like(colors)
     grads = [*(grads or [None] * 3), v_colors]
@@ -297,5 +300,5 @@ def _composite_backward(ctx, *cotangents):
     return *grads, [None] * len(bins), None, None, None
 
 
-composite.register_autograd(_composite_backward, setup_context=_composite_setup)
-composite = reverse_only("rasterization", composite)
+composite = operator(composite, "rasterization", _composite_setup, _composite_backward)
+_composite_vjp = operator(_composite_vjp, "rasterization")

@@ -4,6 +4,7 @@ Forward has a thread for each (view, Gaussian). The gradient has one for each Ga
 over its views: sums over views are then in a fixed order. README.md §1 and §4 hold the maths.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, no_type_check
 
@@ -473,25 +474,26 @@ def project_on_threads(images: int, num: int, arguments: list, device: torch.dev
 def project_forward(
     inputs: Sequence[Any], lens: Lens, run: Callable[..., None] = project_on_threads
 ) -> Projected:
-    """Projects B objects of N Gaussians into V views each; float32, contiguous tensors.
+    """Project objects of N Gaussians into V views each; float32, contiguous tensors.
 
     Args:
-        inputs: means ``[B, N, 3]``, quats ``[B, N, 4]`` or None, scales ``[B, N, 3]``, opacities
-            ``[B, N]``; colors ``[B, N, C]`` or ``[B, V, N, C]``, only to cull what is not finite;
-            viewmats ``[B, V, 4, 4]`` and Ks ``[B, V, 3, 3]``.
+        inputs: means ``[.., N, 3]``, quats ``[.., N, 4]`` or None, scales ``[.., N, 3]``,
+            opacities ``[.., N]``; colors ``[.., N, C]`` or ``[.., V, N, C]``, only to cull what is
+            not finite; viewmats ``[.., V, 4, 4]`` and Ks ``[.., V, 3, 3]``.
         lens: from ``make_lens``.
         run: launcher of the device.
     """
     *gaussians, colors, viewmats, Ks = inputs
-    (batch, views), num, device = viewmats.shape[:2], colors.shape[-2], colors.device
+    shape, num, device = viewmats.shape[:-2], colors.shape[-2], colors.device
     projected = Projected(
-        *(empty_on(device, [batch, views, num, *size], torch.float32) for size in PROJECTED_SIZES),
-        status=empty_on(device, [batch, views, num], torch.int32),
+        *(empty_on(device, [*shape, num, *size], torch.float32) for size in PROJECTED_SIZES),
+        status=empty_on(device, [*shape, num], torch.int32),
     )
     if projected.status.numel():
         scene = Packed(Scene, *gaussians, viewmats, Ks)
-        arguments = [views, num, lens, scene, int(colors.dim() == 4), colors.flatten(0, -2)]
-        run(batch * views, num, [*arguments, Packed(Splats, *projected)], device)
+        per_view = int(colors.dim() > gaussians[0].dim())
+        arguments = [shape[-1], num, lens, scene, per_view, colors.flatten(0, -2)]
+        run(shape.numel(), num, [*arguments, Packed(Splats, *projected)], device)
     return projected
 
 
@@ -517,7 +519,8 @@ def project_backward(
             of ``cpu/project_vjp.py``, or None.
     """
     *gaussians, viewmats, Ks = inputs
-    (batch, views, num), means = status.shape, gaussians[0]
+    (*lead, views, num), means = status.shape, gaussians[0]
+    batch = math.prod(lead)
     # the kernel writes all of a gradient, where there is a view
     grads = [
         None
@@ -541,6 +544,6 @@ def project_backward(
             arguments = [views, num, lens, *given, v_viewmats]
             launch(_project_vjp, batch * num, arguments, [], means.device)
     if v_viewmats is not None:
-        v_viewmats = v_viewmats.sum(1).view(batch, views, 3, 4)
+        v_viewmats = v_viewmats.sum(1).view(*lead, views, 3, 4)
         v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))
     return [*grads, v_viewmats]

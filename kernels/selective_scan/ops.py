@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..runtime.forward_mode import reverse_only
+from ..runtime.operator import operator
 from ..runtime.stand_in import kind_of
-from ..runtime.start import without_compiler
 from .cpu import launch as cpu
 from .problem import Scan
 
@@ -26,7 +25,6 @@ def _implementation(x: Scan):
     return cuda
 
 
-@without_compiler
 @torch.library.custom_op(
     "gamba_warp::selective_scan",
     mutates_args=(),
@@ -47,7 +45,6 @@ def _(*args):
     return out if x.C is not None else out.new_empty(x.u.shape[0], 0, x.u.shape[2]), last, saved
 
 
-@without_compiler
 @torch.library.custom_op(
     "gamba_warp::selective_scan_backward",
     mutates_args=(),
@@ -97,6 +94,6 @@ def _no_second_gradient(ctx, *grads):
     raise RuntimeError("selective_scan: second derivatives are not supported")
 
 
-scan.register_autograd(_gradient, setup_context=_setup_context)
+scan = operator(scan, "selective_scan", _setup_context, _gradient)
 _scan_backward.register_autograd(_no_second_gradient)
-scan = reverse_only("selective_scan", scan)
+_scan_backward = operator(_scan_backward, "selective_scan")

@@ -54,7 +54,7 @@ class Rows:
 
     sums: wp.array2d[wp.float32]  # [P, 6 + C]
     written: wp.array[wp.uint8]  # [P], 0 where a row was not written and is not read
-    skipped: wp.array[wp.int32]  # [tiles], 1 where a tile was not walked
+    skipped: wp.array[wp.int32]  # [tiles], raised to 1 where a tile is skipped, to 2 where walked
     geometry: int  # whether anything but colours is asked for
 
 
@@ -88,7 +88,7 @@ def _workers(size: int) -> Packed:
 
 
 def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tensor, Tensor, Walk]:
-    """Blends I views; float32, contiguous tensors on the CPU.
+    """Blend I views; float32, contiguous tensors on the CPU.
 
     Args:
         splats: what is drawn.
@@ -96,13 +96,13 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         picture: from ``make_picture``.
 
     Returns:
-        ``renders [I, H, W, C]``, ``alphas [I, H, W, 1]`` and a ``Walk``.
+        ``renders [.., H, W, C]``, ``alphas [.., H, W, 1]`` and a ``Walk``.
     """
     colors = splats.colors
-    images, channels = splats.means2d.shape[0], colors.shape[1]
-    tiles = images * picture.tiles_x * picture.tiles_y
-    renders = colors.new_zeros(images, picture.height, picture.width, channels)
-    alphas = colors.new_zeros(images, picture.height, picture.width, 1)
+    images, channels = splats.means2d.shape[:-2], colors.shape[1]
+    tiles = images.numel() * picture.tiles_x * picture.tiles_y
+    renders = colors.new_zeros(*images, picture.height, picture.width, channels)
+    alphas = colors.new_zeros(*images, picture.height, picture.width, 1)
     walk = Walk(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
@@ -123,8 +123,14 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
 
 
 def composite_backward(
-    splats: Drawn, bins: Bins, picture: Picture, walk: Walk, v_pixels: list[Tensor], geometry: bool
-) -> tuple[Drawn, Tensor]:
+    splats: Drawn,
+    bins: Bins,
+    picture: Picture,
+    walk: Walk,
+    v_pixels: list[Tensor],
+    skipped: Tensor,
+    geometry: bool,
+) -> Drawn:
     """Gradients of ``composite_forward`` by (view, Gaussian), from a row of sums for each pair.
 
     Args:
@@ -132,16 +138,13 @@ def composite_backward(
         bins: as forward.
         picture: as forward.
         walk: as returned forward.
-        v_pixels: gradients of the renders ``[I, H, W, C]`` and the alphas ``[I, H, W, 1]``.
-        geometry: whether anything but colours is asked for.
-
-    Returns:
-        The gradients and ``skipped [tiles]`` int32, 1 where a tile was not walked.
+        v_pixels: gradients of the renders ``[.., H, W, C]`` and the alphas ``[.., H, W, 1]``.
+        skipped: ``[tiles]`` int32, raised to 1 for a tile that is skipped and 2 for one walked.
+        geometry: True to compute more than the gradient of the colours.
     """
     channels = splats.colors.shape[1]
     sums = empty([bins.pairs.numel(), 6 + channels], torch.float32)
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
-    skipped = torch.empty_like(walk.walked)
     arguments = [
         picture,
         Packed(Gaussians, *splats),
@@ -152,7 +155,7 @@ def composite_backward(
         Packed(Rows, sums, written, skipped, int(geometry)),
     ]
     parallel_launch(_composite_vjp, torch.get_num_threads(), arguments)
-    return reduce_rows(sums, written, splats, bins, geometry), skipped
+    return reduce_rows(sums, written, splats, bins, geometry)
 
 
 def reduce_rows(sums: Tensor, written: Tensor, splats: Drawn, bins: Bins, geometry: bool) -> Drawn:

@@ -31,7 +31,8 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
         for (int c = 0; c <= channels; ++c) nonzero |= v[c] != 0.0f;
     }
     const bool wanted = any_(nonzero) || (every && !(picture.skip & ZERO_UPSTREAM));
-    rows.skipped.data[index] = !wanted;
+    int& skipped = rows.skipped.data[index];
+    skipped = wanted ? 2 : skipped > 1 ? skipped : 1;
     if (!wanted) continue;
     F Ts[BLOCKS], Rs[BLOCKS];  // transmittance, and what lies behind
     const I* const stops = (const I*)walk.stops.data + tile.first;

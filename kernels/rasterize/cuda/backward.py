@@ -221,8 +221,8 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
         wanted = any_of(some)
         if wanted == 0:
             walked = 0
-        if walked > 0 and p.lane == 0:
-            rows_out.skipped[p.tile] = 0
+        if p.lane == 0:
+            wp.atomic_max(rows_out.skipped, p.tile, wp.where(walked > 0, 2, 1))
 
         waiting = wp.int32(0)
         for done in range(0, walked, WARP):

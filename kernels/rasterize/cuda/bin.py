@@ -5,8 +5,9 @@ over sorts behind the last tile. Where the pairs have no room, none is written a
 empty: then ``composite_unlisted`` makes the pictures.
 """
 
+import functools
 from collections.abc import Callable, Sequence
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import torch
 import warp as wp
@@ -32,7 +33,7 @@ def _count(
     nearest_in: wp.array[wp.int64],
     order_out: wp.array[wp.int32],
     counts_out: wp.array[wp.int32],
-    box_counts_out: wp.array[wp.int64],
+    totals_out: wp.array2d[wp.int64],
 ):
     j = offset + wp.tid()
     i = j / grid.num * grid.num + wp.int32(nearest_in[j])
@@ -48,56 +49,92 @@ def _count(
             columns = tile_columns(grid, ellipse, extent, ty)
             count += wp.max(columns[1] - columns[0] + 1, 0)
         box_count = box_pairs(grid, ellipse.mean, extent)
-    counts_out[j] = count
-    box_counts_out[j] = box_count
+    if j == 0:
+        counts_out[0] = 0  # so that their running sum says where each begins
+    counts_out[j + 1] = count
+    totals_out[0, j] = wp.int64(count)
+    totals_out[1, j] = box_count
 
 
-@wp.kernel
-@no_type_check
-def _emit(
-    offset: wp.int32,
-    grid: Grid,
-    splats_in: Splats,
-    order_in: wp.array[wp.int32],
-    offsets_in: wp.array[wp.int32],
-    count_in: wp.array[wp.int64],
-    first: wp.int32,
-    tiles_out: wp.array[wp.int32],
-    gaussians_out: wp.array[wp.int32],
-):
-    j = offset + wp.tid()
-    i = order_in[j]
-    p = offsets_in[j]
-    end = offsets_in[j + 1]
-    extent = splats_in.extents[i]
-    if extent[0] > 0.0 and count_in[0] <= wp.int64(tiles_out.shape[0]):
-        limit = q_limit(splats_in.opacities[i], grid.alpha_min)
-        ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
-        rows = tile_rows(grid, ellipse.mean[1], extent[1])
-        for ty in range(rows[0], rows[1] + 1):
-            columns = tile_columns(grid, ellipse, extent, ty)
-            row = ((i // grid.num) * grid.tiles_y + ty) * grid.tiles_x
-            # not one more than was counted: a compiler may round otherwise here than it did there
-            last = wp.min(columns[1], columns[0] + end - p - 1)
-            for tx in range(columns[0], last + 1):
-                L.store_int(tiles_out, p, first + row + tx)
-                L.store_int(gaussians_out, p, i)
-                p += 1
+@functools.cache
+def _tile_kernels(number: Any):
+    """The kernels that write and read the numbers of tiles, of this type, between the sort."""
 
+    @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
+    def emit(
+        offset: wp.int32,
+        grid: Grid,
+        splats_in: Splats,
+        order_in: wp.array[wp.int32],
+        offsets_in: wp.array[wp.int32],
+        count_in: wp.array[wp.int64],
+        first: wp.int32,
+        behind: wp.int32,
+        tiles_out: wp.array(dtype=number),
+        gaussians_out: wp.array[wp.int32],
+    ):
+        j = offset + wp.tid()
+        size = tiles_out.shape[0]
+        if j < size and (wp.int64(j) >= count_in[0] or count_in[0] > wp.int64(size)):
+            tiles_out[j] = number(behind)
+        if j < order_in.shape[0] and count_in[0] <= wp.int64(size):
+            i = order_in[j]
+            p = offsets_in[j]
+            end = offsets_in[j + 1]
+            extent = splats_in.extents[i]
+            if extent[0] > 0.0:
+                limit = q_limit(splats_in.opacities[i], grid.alpha_min)
+                ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
+                rows = tile_rows(grid, ellipse.mean[1], extent[1])
+                for ty in range(rows[0], rows[1] + 1):
+                    columns = tile_columns(grid, ellipse, extent, ty)
+                    row = ((i // grid.num) * grid.tiles_y + ty) * grid.tiles_x
+                    # no more than were counted: a compiler may round otherwise here than there
+                    last = wp.min(columns[1], columns[0] + end - p - 1)
+                    for tx in range(columns[0], last + 1):
+                        tiles_out[p] = number(first + row + tx)
+                        L.store_int(gaussians_out, p, i)
+                        p += 1
+            for free in range(p, end):  # where rounding found fewer
+                tiles_out[free] = number(behind)
+                L.store_int(gaussians_out, free, i)
 
-@wp.kernel
-@no_type_check
-def _in_tile_order(
-    offset: wp.int32,
-    gaussians_in: wp.array[wp.int32],
-    emitted_in: wp.array[wp.int64],
-    pairs_out: wp.array[wp.int32],
-    rows_out: wp.array[wp.int32],
-):
-    k = offset + wp.tid()
-    row = wp.int32(emitted_in[k])
-    rows_out[k] = row
-    pairs_out[k] = gaussians_in[row]
+    @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
+    def in_tile_order(
+        offset: wp.int32,
+        tiles_in: wp.array(dtype=number),
+        emitted_in: wp.array[wp.int64],
+        gaussians_in: wp.array[wp.int32],
+        count_in: wp.array[wp.int64],
+        first: wp.int32,
+        pairs_out: wp.array[wp.int32],
+        rows_out: wp.array[wp.int32],
+        starts_out: wp.array[wp.int32],
+    ):
+        k = offset + wp.tid()
+        size = tiles_in.shape[0]
+        if k < size:
+            row = wp.int32(emitted_in[k])
+            g = wp.int32(0)
+            if wp.int64(k) < count_in[0] and count_in[0] <= wp.int64(size):
+                g = gaussians_in[row]
+            rows_out[k] = row
+            pairs_out[k] = g
+        if k < starts_out.shape[0]:
+            # the first pair whose tile is k or later
+            low = wp.int32(0)
+            high = size
+            while low < high:
+                middle = low + (high - low) / 2
+                if wp.int32(tiles_in[middle]) < first + k:
+                    low = middle + 1
+                else:
+                    high = middle
+            starts_out[k] = low
+
+    return emit, in_tile_order
 
 
 def bin_views(
@@ -115,30 +152,31 @@ def bin_views(
     device, images = depths.device, len(depths)
     # stable: equal depths stay in the order of the Gaussians
     nearest = torch.argsort(depths, dim=1, stable=True)
-    order = torch.empty(depths.numel(), dtype=torch.int32, device=device)
-    counts = torch.empty_like(order)
-    box_counts = torch.empty_like(order, dtype=torch.int64)
+    num = depths.numel()
+    order = torch.empty(num, dtype=torch.int32, device=device)
+    make = torch.empty if num else torch.zeros
+    counts = make(num + 1, dtype=torch.int32, device=device)
+    totals = torch.empty(2, num, dtype=torch.int64, device=device)
     splats = Packed(Splats, *tensors, None)
-    found = [order, counts, box_counts]
-    launch(_count, order.numel(), [grid, splats, nearest.view(-1)], found, device)
-    offsets = order.new_zeros(len(order) + 1)
-    torch.cumsum(counts, 0, dtype=torch.int32, out=offsets[1:])
-    count = counts.sum()
+    launch(_count, num, [grid, splats, nearest.view(-1)], [order, counts, totals], device)
+    offsets = counts.cumsum(0, dtype=torch.int32)
+    totals = totals.sum(1)
+    count = totals[:1]
     room = _room(grid, depths, count, check, exact)
     tiles = images * grid.tiles_x * grid.tiles_y
     # a sort of 16 bits takes half as long as one of 32
-    first, number = (-(1 << 15), torch.int16) if tiles < 1 << 16 else (0, torch.int32)
-    # what stays free has the number behind the last tile's, so that it comes last
-    tile_of, gaussians = order.new_full((room,), first + tiles), order.new_zeros(room)
-    inputs = [grid, splats, order, offsets, count.view(1), first]
-    launch(_emit, order.numel() if room else 0, inputs, [tile_of, gaussians], device)
-    sorted_tiles, emitted = torch.sort(tile_of.to(number), stable=True)
-    # not bincount: on CUDA it reads the largest value back
-    firsts = torch.arange(first, first + tiles + 1, dtype=number, device=device)
-    starts = torch.searchsorted(sorted_tiles, firsts, out_int32=True)
-    pairs, rows = torch.empty_like(gaussians), torch.empty_like(gaussians)
-    launch(_in_tile_order, room, [gaussians, emitted], [pairs, rows], device)
-    return Bins(order, offsets, pairs, rows, starts, box_pairs=box_counts.sum(), count=count)
+    short = tiles < 1 << 16
+    first, dtype = (-(1 << 15), torch.int16) if short else (0, torch.int32)
+    emit, in_tile_order = _tile_kernels(wp.int16 if short else wp.int32)
+    tile_of, gaussians = order.new_empty(room, dtype=dtype), order.new_empty(room)
+    # free places have the number behind the last tile's, so that they come last
+    inputs = [grid, splats, order, offsets, count, first, first + tiles]
+    launch(emit, max(num, room) if room else 0, inputs, [tile_of, gaussians], device)
+    sorted_tiles, emitted = torch.sort(tile_of, stable=True)
+    pairs, rows, starts = order.new_empty(room), order.new_empty(room), order.new_empty(tiles + 1)
+    inputs = [sorted_tiles, emitted, gaussians, count, first]
+    launch(in_tile_order, max(room, tiles + 1), inputs, [pairs, rows, starts], device)
+    return Bins(order, offsets, pairs, rows, starts, box_pairs=totals[1].clone(), count=totals[0])
 
 
 def _room(
@@ -165,5 +203,5 @@ def _room(
     size = max(room.capacity, depths.numel())
     if capturing:
         capacity.captured(room, size)
-    capacity.tell(room, count.view(1))
+    capacity.tell(room, count)
     return size

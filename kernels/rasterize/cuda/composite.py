@@ -61,10 +61,10 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
     """
     colors = splats.colors
-    images, channels = splats.means2d.shape[0], colors.shape[1]
-    tiles = images * picture.tiles_x * picture.tiles_y
-    renders = colors.new_empty(images, picture.height, picture.width, channels)
-    alphas = colors.new_empty(images, picture.height, picture.width, 1)
+    images, channels = splats.means2d.shape[:-2], colors.shape[1]
+    tiles = images.numel() * picture.tiles_x * picture.tiles_y
+    renders = colors.new_empty(*images, picture.height, picture.width, channels)
+    alphas = colors.new_empty(*images, picture.height, picture.width, 1)
     parts = parts_of_tile(tiles, colors.device)
     walk = Walk(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
@@ -85,20 +85,25 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
 
 
 def composite_backward(
-    splats: Drawn, bins: Bins, picture: Picture, walk: Walk, v_pixels: list[Tensor], geometry: bool
-) -> tuple[Drawn, Tensor]:
+    splats: Drawn,
+    bins: Bins,
+    picture: Picture,
+    walk: Walk,
+    v_pixels: list[Tensor],
+    skipped: Tensor,
+    geometry: bool,
+) -> Drawn:
     """As ``composite_backward`` of the CPU."""
     colors = splats.colors
     tiles, channels = walk.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
     v_pairs = colors.new_zeros(bins.pairs.numel(), parts, row_length(channels))
-    skipped = torch.ones_like(walk.walked)
     _launch(
         lambda count: backward_kernels(count, geometry, parts),
-        (tiles * parts, splats.means2d.shape[0] * parts),
+        (tiles * parts, splats.means2d.shape[:-2].numel() * parts),
         picture,
         splats,
         [Packed(Lists, *bins), Packed(Walked, *walk), Packed(Pixels, *v_pixels)],
         [Packed(Rows, v_pairs, skipped)],
     )
-    return reduce_rows(v_pairs, splats, bins, geometry), skipped
+    return reduce_rows(v_pairs, splats, bins, geometry)

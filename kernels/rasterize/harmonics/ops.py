@@ -5,10 +5,9 @@ from typing import List
 import torch
 from torch import Tensor
 
-from ...runtime.forward_mode import reverse_only
 from ...runtime.launch import launch
+from ...runtime.operator import operator
 from ...runtime.stand_in import kind_of
-from ...runtime.start import without_compiler
 from ...runtime.views import Packed
 from ..project import empty_on
 from . import cpu, cuda
@@ -35,7 +34,6 @@ def _empty_colors(coefficients: Tensor, means: Tensor, centers: Tensor) -> Tenso
     return means.new_empty(*centers.shape[:2], means.shape[1], coefficients.shape[-1])
 
 
-@without_compiler
 @torch.library.custom_op(_OP, mutates_args=())
 def harmonics(
     degree: int, clamped: bool, coefficients: Tensor, means: Tensor, centers: Tensor
@@ -54,7 +52,6 @@ def _(degree, clamped, coefficients, means, centers):
     return _empty_colors(coefficients, means, centers)
 
 
-@without_compiler
 @torch.library.custom_op(_OP + "_vjp", mutates_args=())
 def _harmonics_vjp(
     degree: int, clamped: bool, seen: List[Tensor], v_colors: Tensor, wanted: List[bool]
@@ -92,8 +89,8 @@ def _backward(ctx, v_colors):
     return None, None, *(next(grads) if want else None for want in wanted)
 
 
-harmonics.register_autograd(_backward, setup_context=_setup)
-harmonics = reverse_only("spherical harmonics", harmonics)
+harmonics = operator(harmonics, "spherical harmonics", _setup, _backward)
+_harmonics_vjp = operator(_harmonics_vjp, "spherical harmonics")
 
 
 def colors_from_harmonics(
@@ -102,15 +99,20 @@ def colors_from_harmonics(
     """Colours seen from each camera, ``max(0, ½ + Σ_k Y_k(direction) coefficient_k)``.
 
     Args:
-        degree: as for ``colors_seen_from``, like ``coefficients`` and ``means``.
-        viewmats: ``[B, V, 4, 4]``, rigid.
+        degree: as for ``colors_seen_from``.
+        coefficients: ``[.., N, K, D]``.
+        means: ``[.., N, 3]``.
+        viewmats: ``[.., V, 4, 4]``, rigid.
 
     Returns:
-        as ``colors_seen_from``.
+        ``[.., V, N, D]``.
     """
     rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centers = -(rotation.mT @ translation[..., None])[..., 0]
-    return colors_seen_from(degree, coefficients, means, centers)
+    lead, batch = means.shape[:-2], means.shape[:-2].numel()
+    rows = (x.reshape(batch, *x.shape[len(lead) :]) for x in (coefficients, means, centers))
+    colors = colors_seen_from(degree, *rows)
+    return colors.view(*lead, *colors.shape[1:])
 
 
 def colors_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:

@@ -13,10 +13,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ...runtime.forward_mode import has_tangent
 from ...runtime.lanes import PRELUDE, W
 from ...runtime.launch import parallel_launch
 from ...runtime.native import native, native_kernel
+from ...runtime.operator import has_tangent
 
 _PLAIN = (Tensor, torch.nn.Parameter)  # no fake tensor, which has no memory
 _FEW = 64  # tasks of sixteen channels below which one thread is as fast as several

@@ -5,7 +5,7 @@ import torch
 from helpers import assert_rel_rms
 from helpers.raster import GRADIENT, NAMES, PICTURE, compare, leaves, make, near_a_cut
 
-from gamba_warp.kernels.rasterize import ops, rasterization
+from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_from_harmonics
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.rasterize.tiles import Limits, Size
@@ -181,7 +181,7 @@ def test_fake_results_have_the_real_shapes():
     extents = torch.full_like(means2d, 5.0)
     bins = (means2d, conics, depths, opacities, extents, width, height, 1 / 255, 127)
     checks = ("test_schema", "test_faketensor")
-    torch.library.opcheck(ops.bin_op, bins, test_utils=checks)
+    torch.library.opcheck(torch.ops.gamba_warp.rasterize_bin.default, bins, test_utils=checks)
     size = Size(width=width, height=height, views=views, colors_per_view=0, skip=127)
     limits = Limits(alpha_min=1 / 255, alpha_max=0.99, t_min=1e-4)
     lists = list(meta.bins), list(size), list(limits)
