@@ -29,8 +29,8 @@ auto step = [&](int t, F x3, F g3, bool inside, bool own) {
     if (RUN > 0 && (t - t0) % RUN == RUN - 1) complete();
 };
 int t = t0;
-#if WIDTH == 2  // as in the forward
-for (; xs.paired && douts.paired && dxs.paired && t + AHEAD <= end; t += AHEAD) {
+#if defined(__CUDA_ARCH__)  // as in the forward
+for (; xs.whole && douts.whole && dxs.whole && t + AHEAD <= end; t += AHEAD) {
     F xs_ahead[AHEAD], gs_ahead[AHEAD];
 #pragma unroll
     for (int i = 0; i < AHEAD; ++i)

@@ -8,9 +8,9 @@ auto step = [&](int t, F x3) {
     x0 = x1, x1 = x2, x2 = x3;
 };
 int t = t0;
-#if WIDTH == 2
+#if defined(__CUDA_ARCH__)
 // No load can pass a store, which might write what it reads: so those of some tokens come first.
-for (; xs.paired && ys.paired && t + AHEAD <= end; t += AHEAD) {
+for (; xs.whole && ys.whole && t + AHEAD <= end; t += AHEAD) {
     F ahead[AHEAD];
 #pragma unroll
     for (int i = 0; i < AHEAD; ++i) ahead[i] = read_(xs, t + i);
@@ -23,6 +23,6 @@ for (; t < end; ++t) {
     next_(xs, t);
     step(t, x3);
 }
-#if defined(__x86_64__) && WIDTH > 2  // the last channels of a row of tasks
+#if defined(__x86_64__) && !defined(__CUDA_ARCH__)  // the last channels of a row of tasks
 if (stream && d + WIDTH >= x_in.shape[2]) __builtin_ia32_sfence();
 #endif

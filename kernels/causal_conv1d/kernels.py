@@ -1,6 +1,6 @@
 """Causal depthwise convolution of at most four taps, with SiLU: the step before the scan.
 
-One C++ body serves both devices: its values are lanes of sixteen channels on a CPU and pairs of
+One C++ body serves both devices: its values are lanes of sixteen channels on a CPU and a few of
 them, one thread each, on CUDA. Equations 1 and 2 of README.md.
 """
 
@@ -17,13 +17,14 @@ from ..runtime.scalars import BITS, EXP2, RECIPROCAL
 
 TAPS = 4
 # Tokens of a forward task; on a CPU few, because each row may lie in another page.
-STRIP = {"cpu": 16, "cuda": 32}
-CHUNK = 64  # tokens of a backward task, each with its own sum for the gradient of the weight
+STRIP = {"cpu": 16, "cuda": 128}
+# Tokens of a backward task, each with its own sum for the gradient of the weight.
+CHUNK = {"cpu": 64, "cuda": 128}
 # Tokens that a CPU adds one after the other: equal terms would round to the same side 64 times.
 # CUDA has none: a second level of sums costs registers there.
 RUN = 16
 AHEAD = 8  # tokens whose loads a CUDA thread has under way
-VALUES = {"cpu": (lanes, W), "cuda": (wp.vec2, 2)}  # type of a value, and its channels
+VALUES = {"cpu": (lanes, W), "cuda": (wp.vec4, 4)}  # type of a value, and its channels
 
 
 def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
@@ -36,7 +37,6 @@ def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
         PIECE=piece,
         RUN=RUN if on_cpu else 0,
         AHEAD=AHEAD,
-        PAIR="unsigned long long" if io == torch.float32 else "unsigned",
     )
 
 
@@ -65,7 +65,8 @@ def forward_kernel(device_type: str, io: torch.dtype) -> Any:
 @functools.cache
 def backward_kernel(device_type: str, io: torch.dtype) -> Any:
     """The kernel of the gradients (README, equation 2); those of the weight are one sum a chunk."""
-    text, rows = _text("backward.inl", device_type, io, CHUNK), wp.array3d(dtype=WARP_DTYPES[io])
+    text = _text("backward.inl", device_type, io, CHUNK[device_type])
+    rows = wp.array3d(dtype=WARP_DTYPES[io])
     inputs = {**_window(device_type, io), "dout_in": rows}
     sums = wp.array3d(dtype=VALUES[device_type][0])
     outputs = {"dx_out": rows, "dstate_out": rows, "dweight_out": sums}

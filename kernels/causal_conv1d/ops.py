@@ -92,9 +92,9 @@ def _(x, weight, bias, state, packed, silu):
 def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     need_x, need_weight, need_bias, need_state = needs
     batch, length, channels = x.shape
-    chunks, where = _pieces(x, packed, CHUNK)
-    x = lane_contiguous(x)
     kind = kind_of(x.device)
+    chunks, where = _pieces(x, packed, CHUNK[kind])
+    x = lane_contiguous(x)
     value, width = VALUES[kind]
     blocks, w, v, rows = _operands(x, weight, bias, state)
     dx = _empty(x, (batch, length if need_x else 0, channels))

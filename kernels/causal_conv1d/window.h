@@ -1,54 +1,82 @@
 // What both kernels begin with. A value F is WIDTH channels, from the head of kernels.py: sixteen
-// lanes on a CPU, two numbers on CUDA.
-#if WIDTH == 2
+// lanes on a CPU, a few numbers on CUDA.
+#if defined(__CUDA_ARCH__)
 struct F {
-    float a, b;
-    F operator+(F o) const { return F{a + o.a, b + o.b}; }
-    F operator-(F o) const { return F{a - o.a, b - o.b}; }
-    F operator*(F o) const { return F{a * o.a, b * o.b}; }
+    float v[WIDTH];
+    F operator+(F o) const {
+#pragma unroll
+        for (int i = 0; i < WIDTH; ++i) o.v[i] = v[i] + o.v[i];
+        return o;
+    }
+    F operator-(F o) const {
+#pragma unroll
+        for (int i = 0; i < WIDTH; ++i) o.v[i] = v[i] - o.v[i];
+        return o;
+    }
+    F operator*(F o) const {
+#pragma unroll
+        for (int i = 0; i < WIDTH; ++i) o.v[i] = v[i] * o.v[i];
+        return o;
+    }
+};
+auto each_ = [](auto value) -> F {
+    F f;
+#pragma unroll
+    for (int i = 0; i < WIDTH; ++i) f.v[i] = value(i);
+    return f;
 };
 auto fma_ = [](F x, F y, F z) -> F { return x * y + z; };
 auto sigmoid_ = [&](F x) -> F {
-    auto one = [&](float v) { return reciprocal_(1.0f + exp2_(-1.4426950408889634f * v)); };
-    return F{one(x.a), one(x.b)};
+    return each_([&](int i) { return reciprocal_(1.0f + exp2_(-1.4426950408889634f * x.v[i])); });
 };
-const F one{1.0f, 1.0f};
+const F one = each_([](int) { return 1.0f; });
+// One access of all channels; of words, since the compiler would pack 64 bits by shifts.
+struct alignas(sizeof(ELEMENT) * WIDTH) Whole {
+    unsigned words[sizeof(ELEMENT) * WIDTH / sizeof(unsigned)];
+};
 auto rows_ = [](auto& array, int b, int t0, int d, int width) {
     typedef decltype(array.data + 0) Row;
     struct Rows {
         Row first;
         size_t step;  // bytes
         int width;
-        bool paired;  // both channels are one access
+        bool whole;  // all channels are one access
         Row row(int t) const { return (Row)((char*)first + t * step); }
     };
     char* const at =
         (char*)array.data + (size_t)b * array.strides[0] + (size_t)t0 * array.strides[1];
     const Row first = (Row)at + d;
     const size_t step = (size_t)array.strides[1];
-    return Rows{first, step, width, width == 2 && ((size_t)first | step) % sizeof(PAIR) == 0};
+    return Rows{first, step, width, width == WIDTH && ((size_t)first | step) % sizeof(Whole) == 0};
 };
-auto read_ = [](const auto& rows, int t) -> F {
+auto read_ = [&](const auto& rows, int t) -> F {
     const auto row = rows.row(t);
-    if (!rows.paired) return F{(float)row[0], rows.width == 2 ? (float)row[1] : 0.0f};
-    const PAIR bits = *(const PAIR*)row;
-    ELEMENT e[2];
-    memcpy(e, &bits, sizeof bits);
-    return F{(float)e[0], (float)e[1]};
+    if (!rows.whole) return each_([&](int i) { return i < rows.width ? (float)row[i] : 0.0f; });
+    const Whole whole = *(const Whole*)row;
+    return each_([&](int i) {
+        const int bit = i * 8 * sizeof(ELEMENT);
+        const unsigned bits = whole.words[bit / 32] >> bit % 32;
+        ELEMENT e;
+        memcpy(&e, &bits, sizeof e);
+        return (float)e;
+    });
 };
-auto write_ = [](const auto& rows, int t, F v) {
+auto write_ = [](const auto& rows, int t, F f) {
     const auto row = rows.row(t);
-    const ELEMENT e[2] = {(ELEMENT)v.a, (ELEMENT)v.b};
-    if (rows.paired) {
-        PAIR bits;
-        memcpy(&bits, e, sizeof bits);
-        *(PAIR*)row = bits;
+    ELEMENT e[WIDTH];
+#pragma unroll
+    for (int i = 0; i < WIDTH; ++i) e[i] = (ELEMENT)f.v[i];
+    if (rows.whole) {
+        Whole whole;
+        memcpy(&whole, e, sizeof whole);
+        *(Whole*)row = whole;
         return;
     }
-    row[0] = e[0];
-    if (rows.width == 2) row[1] = e[1];
+#pragma unroll
+    for (int i = 0; i < WIDTH; ++i)
+        if (i < rows.width) row[i] = e[i];
 };
-auto put_ = [&](const auto& rows, int t, F v, bool) { write_(rows, t, v); };
+auto put_ = [&](const auto& rows, int t, F f, bool) { write_(rows, t, f); };
 auto next_ = [](const auto&, int) {};
 #else
 const F one = F{} + 1.0f;

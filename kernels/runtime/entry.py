@@ -5,7 +5,9 @@ runs. A launch that is recorded once says what it has made of them; later launch
 have the same kinds of arguments and fill the same structures.
 """
 
+import copy
 import ctypes
+import threading
 from typing import Any
 
 import warp as wp
@@ -30,7 +32,7 @@ class Entry:
 
     def __init__(self, kernel: wp.Kernel, command: Any, dim: tuple[int, ...], arguments: list):
         self.rank = kernel.adj.kernel_dim
-        self.command = command
+        self._command, self._own = command, threading.local()
         self.call = command.hooks.forward
         self.executable = command.module_exec  # keeps the function loaded
         self.bounds: Any = type(command.bounds)
@@ -38,11 +40,19 @@ class Entry:
         fields = [(name, type(x)) for name, x in zip(self.names, command.params[1:])]
         self.record: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
         self.offsets = [getattr(self.record, name).offset for name in self.names]
+        self.addresses: Any = ctypes.c_void_p * (1 + len(fields))
         self._empty = [kind() for _, kind in fields]
         self._structs = [i for i, x in enumerate(arguments) if hasattr(x, "__ctype__")]
         self._extents: dict[tuple[int, ...], Any] = {}
         self.extent(dim)  # so that an error comes now and not in a later launch
         self.pack(arguments)
+
+    def command(self) -> Any:
+        """The recorded command, a copy for each thread, to be changed before it is launched."""
+        own = getattr(self._own, "command", None)
+        if own is None:
+            own = self._own.command = copy.copy(self._command)
+        return own
 
     def pack(self, arguments: list) -> ctypes.Structure:
         """The arguments as the compiled function takes them; an array that is None is empty."""

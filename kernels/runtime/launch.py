@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import ctypes
 import functools
 import os
@@ -142,8 +141,8 @@ def _launch_again(entry: Entry, dim: tuple[int, ...], arguments: list, stream: w
     record, bounds = entry.pack(arguments), entry.extent(dim)
     first = ctypes.addressof(record)
     places = [ctypes.addressof(bounds), *(first + offset for offset in entry.offsets)]
-    command = copy.copy(entry.command)  # another thread may launch the same kernel
-    command.bounds, command.params_addr = bounds, (ctypes.c_void_p * len(places))(*places)
+    command = entry.command()
+    command.bounds, command.params_addr = bounds, entry.addresses(*places)
     command.launch(stream)
 
 
@@ -153,13 +152,12 @@ _streams: dict[tuple[torch.device, int], wp.Stream] = {}
 
 def _stream(device: torch.device) -> wp.Stream:
     """Warp's object of torch's current stream, which takes as long to make as a short launch."""
-    stream = torch.cuda.current_stream(device)
-    key = device, stream.cuda_stream
+    key = device, torch._C._cuda_getCurrentRawStream(device.index)
     known = _streams.get(key)
     if known is None:
         if len(_streams) >= _MOST_STREAMS:
             _streams.clear()
-        known = _streams[key] = wp.stream_from_torch(stream)
+        known = _streams[key] = wp.stream_from_torch(torch.cuda.current_stream(device))
     return known
 
 

@@ -1,6 +1,7 @@
 """Launches on CUDA after a kernel's first, without a GPU: what they hand to Warp."""
 
 import ctypes
+import threading
 
 import pytest
 import torch
@@ -74,12 +75,14 @@ def test_later_launches_hand_over_their_own_arguments(handed):
     assert len(handed) == 3 and len(launches._entries) == 1
 
 
-def test_each_launch_has_a_command_of_its_own(handed):
+def test_each_thread_has_a_command_of_its_own(handed):
     call(torch.randn(3), 1, (3, 2))
     (entry,) = launches._entries.values()
-    before = entry.command.bounds, entry.command.params_addr
-    call(torch.randn(3), 2, (5, 2))
-    assert (entry.command.bounds, entry.command.params_addr) == before
+    before = entry.command().bounds, entry.command().params_addr
+    thread = threading.Thread(target=call, args=(torch.randn(3), 2, (5, 2)))
+    thread.start()
+    thread.join()
+    assert (entry.command().bounds, entry.command().params_addr) == before and len(handed) == 2
 
 
 @pytest.mark.parametrize("lacks", ["hooks", "params", "module_exec"])
