@@ -1,4 +1,4 @@
-"""``make architecture``: writes docs/architecture.svg and the table of docs/architecture.md."""
+"""``make architecture``: write docs/architecture.svg and the table of docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -8,43 +8,45 @@ from pathlib import Path
 from lab.figures.parts import with_parts
 
 from .imports import Import, read_imports
+from .packages import PACKAGES, edges, refused
 from .picture import arrows, draw
-from .rooms import ROOMS, edges, refused
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def picture(entries: list[Import]) -> str:
-    """The text of docs/architecture.svg."""
-    at_once = edges([entry for entry in entries if not entry.lazy], by_room=True)
-    return draw(arrows(at_once, edges(entries, by_room=True)))
+    """Return the text of docs/architecture.svg."""
+    at_once = edges([entry for entry in entries if not entry.lazy], by_package=True)
+    return draw(arrows(at_once, edges(entries, by_package=True)))
 
 
 def table(entries: list[Import]) -> str:
-    """The table of docs/architecture.md: each room, what it holds, what it imports today."""
-    at_once = edges([entry for entry in entries if not entry.lazy], by_room=True)
-    any_time = edges(entries, by_room=True)
+    """Return the table of docs/architecture.md: contents and imports of each package."""
+    at_once = edges([entry for entry in entries if not entry.lazy], by_package=True)
+    any_time = edges(entries, by_package=True)
     lines = [
-        "| room | holds | imports | only when a function needs it |",
+        "| package | holds | imports | imports inside functions |",
         "| --- | --- | --- | --- |",
     ]
-    for name, room in ROOMS.items():
+    for name, package in PACKAGES.items():
         now = at_once.get(name, set())
         cells = (now, any_time.get(name, set()) - now)
-        texts = (", ".join(r for r in ROOMS if r in cell) for cell in cells)
-        lines.append(f"| `{name}` | {room.holds} | {' | '.join(texts)} |")
+        texts = (", ".join(r for r in PACKAGES if r in cell) for cell in cells)
+        lines.append(f"| `{name}` | {package.holds} | {' | '.join(texts)} |")
     return "\n".join(lines)
 
 
 def page(text: str, entries: list[Import]) -> str:
-    """The page with its table made anew; ``text`` is the page as it stands."""
-    return with_parts(text, "make architecture", {"rooms": table(entries)})
+    """Return the page ``text`` with its table rewritten."""
+    return with_parts(text, "make architecture", {"packages": table(entries)})
 
 
 if __name__ == "__main__":
     found = read_imports(ROOT)
     if reasons := [*filter(None, map(refused, found))]:
-        sys.exit("\n".join([*reasons, "mend these imports first: see docs/architecture/rooms.py"]))
+        sys.exit(
+            "\n".join([*reasons, "fix these imports first: see docs/architecture/packages.py"])
+        )
     (ROOT / "docs" / "architecture.svg").write_text(picture(found))
     document = ROOT / "docs" / "architecture.md"
     document.write_text(page(document.read_text(), found))

@@ -1,4 +1,4 @@
-"""Reads what every module of the repository imports, without running any of it."""
+"""Imports of every module of the repository, read without running it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-# Folder of the checkout -> the package that it is once installed (setup.cfg, package_dir).
+# Folder of the checkout -> installed package (setup.cfg, package_dir).
 FOLDERS = {
     "gamba_warp": "gamba_warp",
     "kernels": "gamba_warp.kernels",
@@ -19,15 +19,15 @@ _DOTTED = re.compile(r"\.{0,2}[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\.?$")
 
 @dataclass(frozen=True)
 class Import:
-    """One import statement, or one string that names a module of ours.
+    """One import statement, or one string that names a module of the project.
 
     Attributes:
-        source: the module that imports.
-        name: what it imports, in full: ``torch.nn.functional``, ``gamba_warp.files.atomic_path``.
-        target: the module of ours that ``name`` lies in, or None for a library.
+        source: the importing module.
+        name: full name: ``torch.nn.functional``, ``gamba_warp.files.atomic_path``.
+        target: the module of the project that has ``name``, or None for a library.
         line: line of the file, from 1.
-        lazy: whether it waits for a call: inside a function, under TYPE_CHECKING, or a string.
-        text: whether a string names it (``"module:function"``, ``import_module("module")``).
+        lazy: True inside a function, under TYPE_CHECKING, or for a string.
+        text: True for a string (``"module:function"``, ``import_module("module")``).
     """
 
     source: str
@@ -39,7 +39,7 @@ class Import:
 
 
 def modules(root: Path) -> dict[str, Path]:
-    """Every module of the checkout at ``root``: its full name -> its file."""
+    """Map the full name of every module of the checkout at ``root`` to its file."""
     found = {}
     for folder, package in FOLDERS.items():
         for path in sorted((root / folder).rglob("*.py")):
@@ -51,7 +51,7 @@ def modules(root: Path) -> dict[str, Path]:
 
 
 def read_imports(root: Path) -> list[Import]:
-    """All imports of all modules of the checkout at ``root``."""
+    """Return all imports of all modules of the checkout at ``root``."""
     files = modules(root)
     return [entry for module in files for entry in _Reader(module, files).read()]
 
@@ -98,7 +98,7 @@ class _Reader(ast.NodeVisitor):
             self._text(node.value, node)
 
     def _text(self, value: str, node: ast.AST) -> None:
-        """Takes a string for an import if it is the name of a module of ours, and dotted."""
+        """Record a dotted string that names a module of the project as an import."""
         name = value.partition(":")[0]
         if "." not in name or not _DOTTED.match(name):
             return
@@ -114,7 +114,7 @@ class _Reader(ast.NodeVisitor):
             self._add(full, node, text=True)
 
     def visit_Expr(self, node: ast.Expr) -> None:  # noqa: N802
-        if not isinstance(node.value, ast.Constant):  # a docstring is no code
+        if not isinstance(node.value, ast.Constant):  # a docstring is not code
             self.generic_visit(node)
 
     def visit_If(self, node: ast.If) -> None:  # noqa: N802

@@ -1,4 +1,4 @@
-"""Draws the rooms as boxes on floors, and what imports what as arrows, into one SVG."""
+"""SVG diagram of the packages, as boxes on levels, and their imports, as arrows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ svg { font-family: ui-sans-serif, system-ui, "Segoe UI", "DejaVu Sans", sans-ser
 
 @dataclass(frozen=True)
 class Box:
-    """A room of the picture: its place in columns and floors (0 is the ground), and its words."""
+    """A package of the diagram: its column, its floor (0 is the lowest) and its text."""
 
     column: float
     floor: int
@@ -39,12 +39,12 @@ class Box:
 
     @property
     def x(self) -> float:
-        """The middle, in pixels from the left."""
+        """Centre, in pixels from the left."""
         return MARGIN + WIDTH / 2 + self.column * COLUMN
 
     @property
     def top(self) -> float:
-        """The upper edge, in pixels from the top."""
+        """Upper edge, in pixels from the top."""
         return HEAD + (FLOORS - 1 - self.floor) * ROW
 
 
@@ -59,25 +59,23 @@ BOXES = {
     "kernels.rasterize": Box(
         2.4, 1, "kernels", "rasterize", ("Gaussians to pictures", "cpu/ and cuda/")
     ),
-    "kernels.ssim": Box(4.4, 1, "kernels", "ssim", ("1 - SSIM of pictures", "and its slope")),
-    "kernels.triangles": Box(5.4, 1, "kernels", "triangles", ("faces that cut", "each other")),
+    "kernels.ssim": Box(4.4, 1, "kernels", "ssim", ("1 - SSIM of pictures", "and its gradient")),
+    "kernels.triangles": Box(5.4, 1, "kernels", "triangles", ("intersecting", "faces")),
     "kernels": Box(0, 2, "kernels", "kernels", ("public operators,", "loaded when used")),
     "kernels.bench": Box(1, 2, "kernels", "bench", ("run time against error", "of the operators")),
     "kernels.stress": Box(2, 2, "kernels", "stress", ("hostile cases", "against float64")),
-    "words": Box(3.4, 2, "gamba_warp", "words", ("gaussians, cameras,", "render, images, files")),
+    "core": Box(3.4, 2, "gamba_warp", "core", ("gaussians, cameras,", "render, images, files")),
     "compat": Box(0, 3, "gamba_warp", "compat", ("other packages' names", "over our kernels")),
-    "untrusted": Box(
-        3.4, 3, "gamba_warp", "untrusted", ("what strangers' files", "go through first")
-    ),
+    "untrusted": Box(3.4, 3, "gamba_warp", "untrusted", ("validation of", "untrusted files")),
     "data": Box(2.5, 4, "gamba_warp", "data", ("datasets,", "preprocessing")),
     "formats": Box(4, 4, "gamba_warp", "formats", (".ply .splat .glb,", "meshes, their headers")),
-    "vision": Box(1.4, 4, "gamba_warp", "vision", ("VGG16, LPIPS:", "weights to fetch")),
+    "vision": Box(1.4, 4, "gamba_warp", "vision", ("VGG16, LPIPS,", "their weights")),
     "model": Box(1.6, 6, "gamba_warp", "model", ("posing, tokens, blocks,", "decoder")),
     "surfaces": Box(4, 5, "gamba_warp", "surfaces", ("Gaussians to meshes:", "TSDF, density")),
     "fitting": Box(2.8, 5, "gamba_warp", "fitting", ("one object", "by optimisation")),
-    "photo": Box(0.4, 5, "gamba_warp", "photo", ("any photograph", "to a cut-out object")),
+    "photo": Box(0.4, 5, "gamba_warp", "photo", ("cut-outs", "of photographs")),
     "trajectories": Box(
-        6.4, 5, "gamba_warp", "trajectories", ("paths of cameras,", "their files, movies")
+        6.4, 5, "gamba_warp", "trajectories", ("camera paths,", "their files, movies")
     ),
     "viewer": Box(5.2, 5, "gamba_warp", "viewer", ("the 3D viewer", "and its pages")),
     "app": Box(4, 11, "gamba_warp", "app", ("the local", "web app")),
@@ -94,23 +92,23 @@ BOXES = {
 FLOORS = 1 + max(box.floor for box in BOXES.values())
 
 
-def box_of(room: str) -> str:
-    """The box that a room is drawn in: a folder of operators has one, train/data is in train."""
-    parts = room.split(".")
+def box_of(package: str) -> str:
+    """Return the box of a package: an operator has one, train/data is drawn in train."""
+    parts = package.split(".")
     return ".".join(parts[:2]) if parts[0] == "kernels" else parts[0]
 
 
 def arrows(at_once: dict[str, set[str]], any_time: dict[str, set[str]]) -> dict:
-    """The arrows to draw, each with whether it is there only for functions that need it.
+    """Return the arrows to draw; the value is True if all imports are inside functions.
 
-    Those that follow from others are left out: if commands import pages, and pages import model,
-    an arrow from commands to model says nothing new.
+    Implied arrows are left out: if commands import pages, and pages import model, an arrow from
+    commands to model is redundant.
     """
     graph: dict[str, set[str]] = defaultdict(set)
     firm = set()
     for entries in (at_once, any_time):
-        for here, rooms in entries.items():
-            for there in rooms:
+        for here, packages in entries.items():
+            for there in packages:
                 pair = (box_of(here), box_of(there))
                 if pair[0] != pair[1] and set(pair) <= set(BOXES):
                     graph[pair[0]].add(pair[1])
@@ -129,13 +127,13 @@ def arrows(at_once: dict[str, set[str]], any_time: dict[str, set[str]]) -> dict:
 
 
 def draw(drawn: dict) -> str:
-    """The SVG of ``arrows``."""
+    """Return the SVG of ``arrows``."""
     width = MARGIN * 2 + WIDTH + max(box.column for box in BOXES.values()) * COLUMN
     height = HEAD + FLOORS * ROW - (ROW - HEIGHT) + MARGIN
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" '
         f'width="{width:.0f}" height="{height:.0f}" role="img" '
-        'aria-label="The rooms of gamba_warp and what imports what">',
+        'aria-label="The packages of gamba_warp and what imports what">',
         f"<style>{_STYLE}</style>",
         '<defs><marker id="head" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
         'markerHeight="7" orient="auto"><path class="head" d="M0 0 8 4 0 8z"/></marker></defs>',
@@ -151,8 +149,8 @@ def draw(drawn: dict) -> str:
             f'<rect class="box {box.folder}" x="{left:.0f}" y="{box.top:.0f}" width="{WIDTH}" '
             f'height="{HEIGHT}" rx="6"/>'
         )
-        words = zip((17, 32, 45), ("name", "text", "text"), (box.title, *box.text), strict=True)
-        lines += [_text(box.x, box.top + y, kind, text) for y, kind, text in words]
+        rows = zip((17, 32, 45), ("name", "text", "text"), (box.title, *box.text), strict=True)
+        lines += [_text(box.x, box.top + y, kind, text) for y, kind, text in rows]
     return "\n".join([*lines, "</svg>", ""])
 
 
@@ -167,7 +165,7 @@ def _legend() -> list[str]:
         lines.append(f'<rect class="box {folder}" x="{x:.0f}" y="14" width="16" height="16"/>')
         lines.append(_text(x + 22, 26, "note", f"{folder}/", "start"))
         x += 52 + 7.5 * len(folder)
-    for later, text in (("", "imports"), (" later", "imports when a function needs it")):
+    for later, text in (("", "imports"), (" later", "imports inside functions")):
         path = f'd="M{x:.0f} 22h34"'
         lines.append(f'<path class="arrow{later}" marker-end="url(#head)" {path}/>')
         lines.append(_text(x + 42, 26, "note", text, "start"))
@@ -176,7 +174,7 @@ def _legend() -> list[str]:
 
 
 def _routes(drawn: dict) -> dict:
-    """Every arrow's points: down from its box, through the gaps of the floors between, and in."""
+    """Return the points of every arrow: down from its box, through gaps of the floors between."""
     outs, ins = defaultdict(list), defaultdict(list)
     for here, there in drawn:
         outs[here].append(there)
@@ -209,7 +207,7 @@ def _length(here: str, there: str) -> tuple:
 
 
 def _gap(floor: int, wanted: float, taken: list[float]) -> float:
-    """The x nearest to ``wanted`` that no box and no other arrow of the floor has."""
+    """Return the free x nearest to ``wanted``: outside all boxes and other arrows of the floor."""
     boxes = [box.x for box in BOXES.values() if box.floor == floor]
 
     def free(x: float) -> bool:
@@ -221,7 +219,7 @@ def _gap(floor: int, wanted: float, taken: list[float]) -> float:
 
 
 def _curve(points: list[tuple[float, float]]) -> str:
-    """A smooth path: straight through the floors, curved between them."""
+    """Return a smooth path: straight through the floors, curved between them."""
     path = f"M{points[0][0]:.0f} {points[0][1]:.0f}"
     for (x0, y0), (x1, y1) in zip(points[::2], points[1::2], strict=True):
         bend = (y1 - y0) * 0.5

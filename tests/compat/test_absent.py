@@ -70,7 +70,7 @@ def test_names_that_are_here_are_so_under_every_path():
 )
 def test_the_pages_list_them_all(page, packages):
     text = (DOCS / page).read_text(encoding="utf-8")
-    (section,) = re.findall(r"(?s)\n## Names that are not here\n(.*?)\n## ", text)
+    (section,) = re.findall(r"(?s)\n## Unsupported names\n(.*?)\n## ", text)
     tables = re.findall(r"(?s)\| --- \| --- \|\n(.*?)\n\n", section + "\n\n")
     for table, package in zip(tables, packages, strict=True):
         listed = {}

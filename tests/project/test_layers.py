@@ -1,11 +1,11 @@
-"""Which room may import which (docs/architecture/rooms.py), and what every room must keep to."""
+"""Allowed imports between packages (docs/architecture/packages.py)."""
 
 import configparser
 from pathlib import Path
 
 import pytest
 from architecture.imports import modules, read_imports
-from architecture.rooms import ROOMS, circle, edges, refused, room_of
+from architecture.packages import PACKAGES, circle, edges, package_of, refused
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -17,7 +17,7 @@ def entries():
 
 
 def _refusals(folder: Path, files: dict[str, str]) -> list[str]:
-    """What the rules say of a small made-up checkout."""
+    """Return the violations in a small made-up checkout."""
     for name, text in {"gamba_warp/__init__.py": "", **files}.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -31,25 +31,25 @@ def test_imports(entries):
 
 
 def test_no_circles(entries):
-    assert not circle(edges(entries, by_room=True)), "rooms, by any import"
-    assert not circle(edges(entries, by_room=False)), "modules, by what runs when they are loaded"
+    assert not circle(edges(entries, by_package=True)), "packages, by any import"
+    assert not circle(edges(entries, by_package=False)), "modules, by imports at load time"
 
 
 def test_the_table_has_no_circle():
-    allowed = {name: {*room.may, *room.later} for name, room in ROOMS.items()}
+    allowed = {name: {*package.may, *package.later} for name, package in PACKAGES.items()}
     assert not circle(allowed)
-    assert {there for rooms in allowed.values() for there in rooms} <= set(ROOMS)
+    assert {there for packages in allowed.values() for there in packages} <= set(PACKAGES)
 
 
-def test_every_room_is_there():
-    found = {room_of(module) for module in modules(ROOT)}
-    assert found == set(ROOMS)
+def test_every_package_is_there():
+    found = {package_of(module) for module in modules(ROOT)}
+    assert found == set(PACKAGES)
 
 
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
-        ("kernels/rasterize/a.py", "from gamba_warp.files import x", "may import words not"),
+        ("kernels/rasterize/a.py", "from gamba_warp.files import x", "may import core not"),
         ("kernels/rasterize/a.py", "from ..selective_scan import x", "kernels.selective_scan not"),
         ("kernels/runtime/a.py", "import kornia", "kernels import only"),
         ("kernels/runtime/a.py", "try:\n    import kornia\nexcept: ...", "kernels import only"),
@@ -110,17 +110,17 @@ def test_what_is_allowed(tmp_path, name, text):
     assert _refusals(tmp_path, {**files, name: text}) == []
 
 
-def test_a_folder_that_is_no_room_is_refused(tmp_path):
-    with pytest.raises(KeyError, match="lies in no room"):
+def test_an_unlisted_folder_is_refused(tmp_path):
+    with pytest.raises(KeyError, match="is in no package"):
         _refusals(
             tmp_path, {"gamba_warp/attic/a.py": "from .b import x", "gamba_warp/attic/b.py": ""}
         )
 
 
 def test_circles_are_seen(tmp_path):
-    def found(by_room, **files):
+    def found(by_package, **files):
         _refusals(tmp_path, {f"gamba_warp/{name}.py": text for name, text in files.items()})
-        return circle(edges(read_imports(tmp_path), by_room))
+        return circle(edges(read_imports(tmp_path), by_package))
 
     here = ["gamba_warp.a", "gamba_warp.b", "gamba_warp.a"]
     assert found(False, a="from .b import x", b="from . import a") == here
