@@ -1,4 +1,4 @@
-"""What holds for all tests: rewritten asserts in helpers, the marker ``gpu``, a fixed seed."""
+"""Configuration of all tests: rewritten asserts in helpers, the marker ``gpu``, a fixed seed."""
 
 import contextlib
 import os
@@ -17,11 +17,11 @@ from helpers.browser import browser, browser_page  # noqa: E402, F401
 from ptx.launch import interpreted  # noqa: E402
 from ptx.machine import Missing  # noqa: E402
 
-# No test fetches a matting model, or uses one that rembg keeps on this machine.
+# No test downloads a matting model, or uses one cached by rembg on this machine.
 os.environ["GAMBA_OFFLINE"] = "1"
 os.environ["U2NET_HOME"] = os.devnull
 
-# A script that runs us in the background has us ignore Ctrl-C, and so every process of a test too.
+# A script that runs pytest in the background makes every process of a test ignore Ctrl-C, too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -34,14 +34,14 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_unconfigure():
-    """Removes NVRTC's precompiled headers, 80 MB, which it leaves where ``os._exit`` ends us."""
+    """Remove NVRTC's precompiled headers, 80 MB, which remain after ``os._exit``."""
     for folder in Path(tempfile.gettempdir()).glob(f"__nvrtc_auto_pch_{os.getpid()}_*"):
         shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_call(item):
-    """Skips what executes PTX (tests/ptx) where there is no compiler or no NVRTC."""
+    """Skip tests that execute PTX (tests/ptx) without a compiler or NVRTC."""
     outcome = yield
     if outcome.excinfo and isinstance(outcome.excinfo[1], Missing):
         outcome.force_exception(pytest.skip.Exception(str(outcome.excinfo[1])))
@@ -49,7 +49,7 @@ def pytest_runtest_call(item):
 
 @pytest.fixture
 def from_ptx():
-    """Called, has tensors of the CPU take the CUDA path from there on, executed from PTX."""
+    """Function that makes CPU tensors take the CUDA path from then on, executed from PTX."""
     machines = []
     with contextlib.ExitStack() as stack:
         yield lambda: machines.append(stack.enter_context(interpreted()))
@@ -59,7 +59,7 @@ def from_ptx():
 
 @pytest.fixture
 def one_thread():
-    """Pictures of a few pixels take longer on several threads than on one."""
+    """Use one thread, which is faster for pictures of a few pixels."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -68,7 +68,7 @@ def one_thread():
 
 @pytest.fixture
 def no_nohup():
-    """SIGHUP ends a process, as it does not where the tests themselves run below nohup."""
+    """Let SIGHUP end a process, even if the tests themselves run under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)

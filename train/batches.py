@@ -1,7 +1,7 @@
-"""What a run trains on: its objects, and batches of their views.
+"""Training data of a run: its objects, and batches of their views.
 
-A sample is a function of the seed and of its number in the run alone. So the order of the data
-needs no saved state, and a resumed run goes on with the very same batches.
+A sample is a function of the seed and of its number in the run. The order of the data therefore
+needs no saved state, and a resumed run continues with the same batches.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from .data.samples import Batch, choose_views, draw_change, join, load_sample
 from .data.settings import VARIED_CAMERAS, Settings
 from .ddp import World
 
-_TRIES = 100  # objects tried one after the other until one can be read
-# With --overfit all views share the network's one pass, and rendering them is cheap beside it.
+_TRIES = 100  # objects tried in turn until one can be read
+# With --overfit all views share one forward pass of the network; rendering them is cheap beside it.
 _OVERFIT_VIEWS = 9
 
 
@@ -41,8 +41,8 @@ class HeldOut(NamedTuple):
     """Objects of one dataset that a run validates on.
 
     Attributes:
-        name: the folder's name of a further dataset; empty for that of DATA.
-        dataset: what they belong to.
+        name: folder name of a further dataset; empty for DATA.
+        dataset: the dataset.
         objects: indices into it.
     """
 
@@ -53,15 +53,15 @@ class HeldOut(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a run trains and validates on.
+    """Training and validation data of a run.
 
     Attributes:
         train: dataset with the objects to train on.
-        objects: indices into ``train``, which may repeat; one pass over the list is an epoch.
+        objects: indices into ``train``, possibly repeated; one pass over the list is an epoch.
         reference: the input view, or None for any.
         batch_size: objects per batch and process.
-        novel: novel views per object at every step; None means as many as the schedule says.
-        held_out: what is validated on, by dataset; those that hold no object are not there.
+        novel: novel views per object at every step; None means the schedule's number.
+        held_out: validation objects by dataset; datasets without any are left out.
         val_views: novel views per object in a validation; None means all.
         notes: lines for the user.
     """
@@ -77,34 +77,34 @@ class TrainingData:
 
     @property
     def scanned(self) -> list[str]:
-        """Uids of the objects that have names of Google Scanned Objects."""
+        """Uids of the objects named as in Google Scanned Objects."""
         taken = [(self.train, self.objects), *((p.dataset, p.objects) for p in self.held_out)]
         return scanned({dataset.uids[index] for dataset, indices in taken for index in indices})
 
     @property
     def fingerprint(self) -> str:
-        """A hash of the objects' names in their order; a run with another list is another run."""
+        """Hash of the objects' names in order; a run with another list is another run."""
         names = "\n".join(self.train.uids[i] for i in self.objects)
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
 def open_data(config: TrainConfig, device: torch.device | None = None) -> TrainingData:
-    """Opens the dataset as the options say.
+    """Open the datasets of a run.
 
     Args:
         config: options of the run.
-        device: where ``--cache-device`` keeps the pictures to train on; None: nowhere.
+        device: device on which ``--cache-device`` keeps the training pictures; None disables it.
 
     Raises:
         UserError: the folder or the object of ``--overfit`` does not exist, no object can be read,
-            the device has no room for the pictures, or there are Google Scanned Objects.
+            the pictures do not fit on the device, or the data has Google Scanned Objects.
     """
     one = config.views.overfit
     data = _open_all(config) if one is None else _open_one(config, one)
     if data.scanned and not config.views.train_on_gso:
         names = ", ".join(data.scanned[:3]) + (", ..." if len(data.scanned) > 3 else "")
         raise UserError(
-            f"names of Google Scanned Objects, which are for evaluation, among them ({names})"
+            f"the data has Google Scanned Objects, which are for evaluation ({names})"
             ": leave them out, or give --train-on-gso, which the model's card then states"
         )
     sizes = sorted({config.views.size, config.model_config().image_size})
@@ -114,7 +114,7 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
             f"{config.data} is packed at {packed} pixels; its pictures are enlarged to {sizes[-1]}"
         )
     if config.views.cache_device and device is not None:
-        data.train.keep(sorted(set(data.objects)), sizes, device, config.views.workers)
+        data.train.preload(sorted(set(data.objects)), sizes, device, config.views.workers)
     return data
 
 
@@ -157,7 +157,7 @@ def _open_all(config: TrainConfig) -> TrainingData:
 
 
 def _held_out(name: str, folder: Path, count: int) -> HeldOut:
-    """Chooses ``count`` of the objects of the val split that can be read, evenly spaced."""
+    """Choose ``count`` evenly spaced readable objects of the val split."""
     dataset = open_dataset(folder, "val")
     bad = dataset.check()
     good = [i for i, uid in enumerate(dataset.uids) if uid not in bad]
@@ -165,7 +165,7 @@ def _held_out(name: str, folder: Path, count: int) -> HeldOut:
 
 
 def _open_one(config: TrainConfig, name: str) -> TrainingData:
-    """Opens the one object that ``--overfit`` names; an epoch is a pass over its views."""
+    """Open the object of ``--overfit``; an epoch is a pass over its views."""
     views = config.views
     dataset = open_dataset(config.data, "all", cache=True)
     if name in dataset.uids:
@@ -185,11 +185,11 @@ def _open_one(config: TrainConfig, name: str) -> TrainingData:
 
 
 class Prepared(NamedTuple):
-    """A batch as threads make it, before its failures count.
+    """Batch prepared by threads, before its failures are counted.
 
     Attributes:
-        batch: the batch, or None where too many objects in a row cannot be read.
-        failures: uids of objects that could not be read, each with its reason, in their order.
+        batch: the batch, or None if too many objects in a row cannot be read.
+        failures: uids of unreadable objects with the reasons, in order.
     """
 
     batch: Batch | None
@@ -197,16 +197,15 @@ class Prepared(NamedTuple):
 
 
 class Batches:
-    """The batches of a run, by their number (see the module's docstring).
+    """Batches of a run, by number (see the module's docstring).
 
-    As many as there are threads are prepared ahead. A batch is the same for any number of threads,
-    and so is the step at which an error is raised: what fails on a thread counts only when its
-    batch is taken.
+    One batch per thread is prepared ahead. A batch is the same for any number of threads, and so is
+    the step at which an error is raised: a failure on a thread counts when its batch is taken.
 
     Attributes:
         failures: reasons by uid, of the objects that could not be read so far.
-        waited: seconds in ``take``, until it is set to 0.
-        model: configuration of the model that the samples are for.
+        waited: seconds spent in ``take``, until it is set to 0.
+        model: configuration of the model.
     """
 
     def __init__(
@@ -217,27 +216,27 @@ class Batches:
         novel: Callable[[int], int] = lambda number: 0,
         last: int | None = None,
     ) -> None:
-        """Prepares nothing yet.
+        """Create the thread pool; nothing is prepared yet.
 
         Args:
-            data: what is trained on.
+            data: training data.
             config: options of the run.
-            world: this process, whose part of each batch is taken to its device.
-            novel: number of novel views by the number of a batch; it is asked when the batch is
-                begun, so where it goes by the clock, it is that of ``workers`` batches before.
-            last: number of batches of the run; None: no end.
+            world: this process; its part of each batch is moved to its device.
+            novel: number of novel views of a batch, by its number. It is called when the batch is
+                begun, so a schedule by the clock is ``workers`` batches behind.
+            last: number of batches of the run; None means no limit.
         """
         self.data, self.config, self.model = data, config, config.model_config()
         self.world, self.novel, self.last = world, novel, last
         self.failures: dict[str, str] = {}
         self.waited = 0.0
-        self._made: Pool | None = None  # it begins with the first batch that is taken
-        self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # an epoch's number and order
+        self._made: Pool | None = None  # started with the first batch
+        self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # epoch and its permutation
         self._pool = ThreadPoolExecutor(config.views.workers, thread_name_prefix="batches")
         self._waiting: dict[int, Future[Prepared]] = {}
 
     def take(self, number: int) -> Batch:
-        """Waits for the ``number``-th batch, on the device, and starts those that follow it.
+        """Wait for the ``number``-th batch, on the device, and start the next ones.
 
         Raises:
             UserError: more than half of the objects, or 100 in a row, cannot be read.
@@ -246,45 +245,45 @@ class Batches:
         self._begin_made(number)
         for following in range(number, end if self.last is None else min(end, self.last)):
             if following not in self._waiting:
-                # The threads take their work in this order: when one comes to the joining, others
-                # have begun all samples, and it waits for no thread that waits for it.
+                # Threads take work in this order. When one reaches the join, others have begun all
+                # its samples, so it never waits for a thread that waits for it.
                 novel = self.novel(following)
                 parts = [
                     self._pool.submit(self.prepare, n, novel) for n in self._numbers(following)
                 ]
-                self._waiting[following] = self._pool.submit(self._joined, parts)
-        batch = self._counted(self._waiting.pop(number).result()).to(self.world.device)
+                self._waiting[following] = self._pool.submit(self._join_samples, parts)
+        batch = self._record_failures(self._waiting.pop(number).result()).to(self.world.device)
         self.waited += time.perf_counter() - began
         return batch
 
     def close(self) -> None:
-        """Drops what has not begun; what has begun ends with a sample of each thread."""
+        """Cancel the waiting samples; each thread finishes its current one."""
         if self._made is not None:
             self._made.close()
         self._pool.shutdown(cancel_futures=True)
 
     def batch(self, number: int, novel: int) -> Batch:
-        """Loads the ``number``-th batch here and now, with ``novel`` novel views."""
+        """Load the ``number``-th batch synchronously, with ``novel`` novel views."""
         self._begin_made(number)
         return join([self.sample(n, novel) for n in self._numbers(number)])
 
     def sample(self, number: int, novel: int) -> Batch:
-        """Loads the ``number``-th sample; an object that cannot be read gives way to the next.
+        """Load the ``number``-th sample; an unreadable object is replaced by the next.
 
         Raises:
             UserError: as ``take``.
         """
         self._begin_made(number // self.data.batch_size // self.world.size)
-        return self._counted(self.prepare(number, novel))
+        return self._record_failures(self.prepare(number, novel))
 
     def prepare(self, number: int, novel: int) -> Prepared:
-        """As ``sample``, but what fails is only told: threads may prepare samples in any order."""
+        """Load a sample like ``sample``, but only report failures; safe in any order on threads."""
         views, seed = self.config.views, self.config.run.seed
         rng = np.random.default_rng([seed, 2, number])
         background = torch.ones(3) if views.background == "white" else torch.zeros(3)
         if views.background == "random":
             background = torch.from_numpy(rng.random(3, dtype=np.float32))
-        # From a source of its own, so that runs without changes stay what they were.
+        # A separate generator, so that runs without augmentation stay the same.
         chance = np.random.default_rng([seed, 3, number])
         reference = self.data.reference
         front = reference is None and chance.random() < views.front_share
@@ -317,15 +316,15 @@ class Batches:
         return Prepared(None, failed)
 
     def _made_sample(self, number: int) -> int | None:
-        """Number of a sample among the made ones of this process; None: it is of the datasets."""
-        share, own = self.config.views.made, self.data.batch_size
-        batch, position = number // own // self.world.size, number % own
-        local = batch * own + position  # among the samples of this process
+        """Number among the made samples of this process; None if the sample is of a dataset."""
+        share, size = self.config.views.made, self.data.batch_size
+        batch, position = number // size // self.world.size, number % size
+        local = batch * size + position  # among the samples of this process
         before, after = math.floor(local * share), math.floor((local + 1) * share)
         return before if after > before else None
 
     def _begin_made(self, number: int) -> None:
-        """Starts the pool of made objects with the ``number``-th batch, where it is not there."""
+        """Start the pool of made objects at the ``number``-th batch, unless running or unused."""
         views, world = self.config.views, self.world
         if not views.made or self._made is not None:
             return
@@ -350,10 +349,10 @@ class Batches:
         self._made = Pool(options, math.floor(number * self.data.batch_size * views.made))
 
     def _object(self, number: int) -> int:
-        """Returns the object of the ``number``-th sample; each epoch has its own permutation."""
+        """Return the object of the ``number``-th sample; each epoch has its own permutation."""
         objects = self.data.objects
         epoch, position = divmod(number, len(objects))
-        known, order = self._order  # both at once, for other threads replace them
+        known, order = self._order  # read both at once: other threads replace them
         if known != epoch:
             rng = np.random.default_rng([self.config.run.seed, 1, epoch])
             order = rng.permutation(len(objects))
@@ -361,12 +360,12 @@ class Batches:
         return objects[order[position]]
 
     def _numbers(self, number: int) -> range:
-        """The samples of the ``number``-th batch that this process works on."""
+        """Samples of the ``number``-th batch for this process."""
         share = self.data.batch_size
         first = (number * self.world.size + self.world.rank) * share
         return range(first, first + share)
 
-    def _joined(self, parts: list[Future[Prepared]]) -> Prepared:
+    def _join_samples(self, parts: list[Future[Prepared]]) -> Prepared:
         samples = [part.result() for part in parts]
         failures = [failure for sample in samples for failure in sample.failures]
         good = [sample.batch for sample in samples if sample.batch is not None]
@@ -375,8 +374,8 @@ class Batches:
         batch = join(good)
         return Prepared(batch.pinned() if self.world.device.type == "cuda" else batch, failures)
 
-    def _counted(self, prepared: Prepared) -> Batch:
-        """Records what failed, in the order of the run, and returns the batch."""
+    def _record_failures(self, prepared: Prepared) -> Batch:
+        """Record failures in the order of the run, and return the batch."""
         for uid, reason in prepared.failures:
             self.failures[uid] = reason
             bad, known = len(self.failures), len(set(self.data.objects))
@@ -391,10 +390,10 @@ class Batches:
 def fixed_batches(
     part: HeldOut, views: int | None, config: GambaConfig, size: int, failures: dict[str, str]
 ) -> Iterator[Batch]:
-    """Yields the batches of a validation, one object each, always the same views, on white.
+    """Yield the batches of a validation: one object each, fixed views, on white.
 
-    View 0 is the input; ``views`` others follow, evenly spaced in the list, or all. An object that
-    cannot be read is passed over, with its reason in ``failures``.
+    View 0 is the input, followed by ``views`` others, evenly spaced, or by all. An unreadable
+    object is skipped, with its reason in ``failures``.
     """
     dataset = part.dataset
     for index in part.objects:

@@ -1,6 +1,6 @@
-"""Boards that show a run while it goes on: TensorBoard, and Weights & Biases.
+"""Live logging of a run to TensorBoard and to Weights & Biases.
 
-A board is written beside the run's own log and may fail; ``RunLog`` then goes on without it.
+A board is written beside the run's own log. If it fails, ``RunLog`` continues without it.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from gamba_warp.versions import to_install
 
 
 def check_boards(names: Sequence[str]) -> None:
-    """Refuses a board that was asked for by name and is not installed, before a run begins.
+    """Check before a run that the requested boards are installed.
 
     Raises:
-        UserError: it says how to install it.
+        UserError: a board is missing; the message says how to install it.
     """
     if "wandb" in names and find_spec("wandb") is None:
-        raise UserError(f"--log wandb: it is not installed: {to_install('wandb')}")
+        raise UserError(f"--log wandb: not installed: {to_install('wandb')}")
 
 
 def open_board(name: str, run: Path) -> TensorBoard | Wandb | None:
-    """Opens "tensorboard" or "wandb" for a run's folder; None if TensorBoard is not installed.
+    """Open "tensorboard" or "wandb" for a run folder; None if TensorBoard is not installed.
 
     Raises:
-        Exception: whatever stops it; so may what is made, in ``write`` and ``close``.
+        Exception: any error of the board; its ``write`` and ``close`` may raise as well.
     """
     if name == "wandb":
         return Wandb(run)
@@ -45,7 +45,7 @@ def open_board(name: str, run: Path) -> TensorBoard | Wandb | None:
 
 
 def _scalars(event: str, values: Mapping[str, object]) -> dict[str, float]:
-    """The numbers of a line, as ``event/name``."""
+    """Numbers of a log line, named ``event/name``."""
     return {
         f"{event}/{name}": value
         for name, value in values.items()
@@ -54,56 +54,56 @@ def _scalars(event: str, values: Mapping[str, object]) -> dict[str, float]:
 
 
 class TensorBoard:
-    """Files for TensorBoard, in ``RUN/tensorboard``."""
+    """TensorBoard files in ``RUN/tensorboard``."""
 
     def __init__(self, writer: Any) -> None:
-        """Takes a ``SummaryWriter``."""
+        """Wrap a ``SummaryWriter``."""
         self.writer = writer
 
     def write(self, event: str, step: int, values: Mapping[str, object]) -> None:
-        """Writes the numbers of a line."""
+        """Write the numbers of a log line."""
         for name, value in _scalars(event, values).items():
             self.writer.add_scalar(name, value, step)
 
     def close(self) -> None:
-        """Closes the files."""
+        """Close the files."""
         self.writer.close()
 
 
-class _Known(msgspec.Struct):
-    """``RUN/wandb.json``: by it a resumed run goes on where it stood."""
+class _WandbFile(msgspec.Struct):
+    """``RUN/wandb.json``: the id with which a resumed run continues."""
 
     id: Annotated[str, msgspec.Meta(pattern="^[0-9a-z]{1,64}$")]
 
 
 class Wandb:
-    """A run of Weights & Biases, whose own files lie in ``RUN/wandb``.
+    """Run of Weights & Biases, with its files in ``RUN/wandb``.
 
-    Where it goes (server, project, online or not) is said by wandb's own settings, such as the
-    environment's ``WANDB_PROJECT`` and ``WANDB_MODE``.
+    Server, project and online mode follow from wandb's own settings, such as the environment
+    variables ``WANDB_PROJECT`` and ``WANDB_MODE``.
     """
 
     def __init__(self, run: Path) -> None:
-        """Begins a run, or goes on with the one that ``RUN/wandb.json`` names."""
+        """Begin a run, or resume the one of ``RUN/wandb.json``."""
         import wandb  # pyright: ignore[reportMissingImports]: optional
 
         path = run / "wandb.json"
         try:
-            number = read_document(path, _Known).id
-        except UserError:  # there is none, or it is damaged
+            number = read_document(path, _WandbFile).id
+        except UserError:  # missing or damaged
             number = secrets.token_hex(8)
             write_json(path, {"id": number})
-        # Its own way of catching the output would break the progress bar; it asks nobody for long.
+        # wandb's capture of the output would break the progress bar; its login prompt times out.
         quiet = wandb.Settings(console="off", silent=True, save_code=False, login_timeout=30)
-        place = {"dir": str(run), "id": number, "name": run.resolve().name}
-        self.run = wandb.init(**place, resume="allow", settings=quiet)
-        # Not wandb's own count of steps, which cannot go back to that of a checkpoint.
+        about = {"dir": str(run), "id": number, "name": run.resolve().name}
+        self.run = wandb.init(**about, resume="allow", settings=quiet)
+        # wandb's own step counter cannot go back to the step of a checkpoint.
         self.run.define_metric("step")
         self.run.define_metric("*", step_metric="step")
-        self._code = 1  # of a run that does not come to its end
+        self._code = 1  # exit code of a run that does not reach its end
 
     def write(self, event: str, step: int, values: Mapping[str, object]) -> None:
-        """Sends the numbers of a line, and at the start the configuration."""
+        """Send the numbers of a log line, and at the start the configuration."""
         if event == "start":
             self.run.config.update(values.get("config", {}), allow_val_change=True)
         if event == "end":
@@ -111,5 +111,5 @@ class Wandb:
         self.run.log({"step": step, **_scalars(event, values)})
 
     def close(self) -> None:
-        """Ends the run; without it, wandb says that it crashed."""
+        """Finish the run; otherwise wandb marks it as crashed."""
         self.run.finish(exit_code=self._code)

@@ -1,7 +1,7 @@
-"""Checkpoints: folders ``RUN/checkpoints/step_000123/``, each of which is whole or does not exist.
+"""Checkpoints: folders ``RUN/checkpoints/step_000123/``, written atomically.
 
 A checkpoint holds ``model.safetensors`` and ``ema.safetensors``, models that every command can
-load, ``state.pt``, the tensors and plain values that a bit-identical continuation needs too, and
+load; ``state.pt``, the further tensors and plain values of a bit-identical continuation; and
 ``checksums.json``, the SHA-256 of each of these files.
 """
 
@@ -32,13 +32,13 @@ from .optim import NewLength
 STATE_VERSION = 1
 CHECKSUMS = "checksums.json"
 _NAME = re.compile(r"step_(\d+)")
-_NEEDED = {"model.safetensors": "", "state.pt": ""}  # whatever the list of checksums says
+_NEEDED = {"model.safetensors": "", "state.pt": ""}  # required even if not in the checksums
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=10**12)]
 
 
 class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    """The fields of ``state.pt``: all that a continued run needs beside the weights."""
+    """Fields of ``state.pt``: everything beside the weights that a resumed run needs."""
 
     version: int
     config: dict[str, Any]
@@ -52,37 +52,37 @@ class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     optimizer: dict[str, Any]
     rng: Any
     rng_cuda: list[Any]
-    new_length: NewLength = NewLength()  # older versions have none
+    new_length: NewLength = NewLength()  # missing in older versions
     best: float = -math.inf
 
 
 def step_of(checkpoint: Path) -> int:
-    """The step of a checkpoint of ``list_checkpoints``, by its name."""
+    """Return the step of a checkpoint from its folder name."""
     return int(checkpoint.name.split("_")[1])
 
 
 def list_checkpoints(run: Path) -> list[Path]:
-    """Lists the run's checkpoints, oldest first."""
+    """List the run's checkpoints, oldest first."""
     folder = run / "checkpoints"
     found = [p for p in folder.iterdir() if _NAME.fullmatch(p.name)] if folder.is_dir() else []
     return sorted(found, key=step_of)
 
 
 def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict, keep: int) -> Path:
-    """Writes a checkpoint, whole or not at all, and removes the oldest ones.
+    """Write a checkpoint atomically, and remove the oldest ones.
 
     Args:
         run: the run folder.
         step: optimizer steps done.
-        models: models by file stem, which ``save_model`` writes.
+        models: models by file stem, written by ``save_model``.
         state: content of ``state.pt``, nested tensors and plain values.
-        keep: number of checkpoints left up to this step; those of later steps stay.
+        keep: number of checkpoints up to this step that remain; later ones stay.
 
     Returns:
         The checkpoint's folder, ``RUN/checkpoints/step_<step>``.
 
     Raises:
-        UserError: it cannot be written; older checkpoints are untouched.
+        UserError: the checkpoint cannot be written; older checkpoints are untouched.
     """
     folder = run / "checkpoints"
     target = folder / f"step_{step:06d}"
@@ -93,13 +93,13 @@ def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict,
             save_model(temporary / f"{name}.safetensors", model)
         try:
             torch.save(state, temporary / "state.pt")
-        except RuntimeError as error:  # of its writer of zip files
+        except RuntimeError as error:  # raised by torch's zip writer
             reason = f"state.pt cannot be written whole, is the disk full? ({reason_of(error)})"
             raise OSError(reason) from error
         write_json(temporary / CHECKSUMS, {p.name: sha256(p) for p in sorted(temporary.iterdir())})
     write_json(run / "latest.json", {"checkpoint": f"checkpoints/{target.name}", "step": step})
     done = list_checkpoints(run)
-    # Those of later steps are another branch, or damaged: they must not push out this one.
+    # Later steps are another branch, or damaged: they must not displace this one.
     older = done[: done.index(target)]
     for old in older[: max(0, len(older) + 1 - keep)]:
         try:
@@ -112,22 +112,22 @@ def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict,
 def find_checkpoint(
     run: Path, resume: str, warn: Callable[[str], None] = warnings.warn
 ) -> Path | None:
-    """Finds the checkpoint that ``--resume`` means, or None for a fresh start.
+    """Find the checkpoint of ``--resume``; None for a fresh start.
 
     Args:
         run: the run folder.
-        resume: "auto" (the newest whole one of the run folder, if any), "never", or the path of a
-            checkpoint or of another run folder.
-        warn: is given one line for each damaged checkpoint that "auto" passes over.
+        resume: "auto" (the newest intact checkpoint of the run folder, if any), "never", or the
+            path of a checkpoint or of another run folder.
+        warn: called with one line for each damaged checkpoint that "auto" skips.
 
     Raises:
-        UserError: the run folder holds checkpoints in spite of "never", the path holds none, or
-            what it holds is damaged; the message names the newest whole one.
+        UserError: the run folder holds checkpoints despite "never", the path holds none, or its
+            checkpoint is damaged; the message names the newest intact one.
     """
     if resume in ("auto", "never"):
         found = list_checkpoints(run)
         if found and resume == "never":
-            raise UserError(f"{run}: holds a run already; give another --out or --resume auto")
+            raise UserError(f"{run}: already holds a run; give another --out or --resume auto")
         return _newest_whole(found, warn) if found else None
     path = Path(resume)
     if not (path / "state.pt").is_file():
@@ -145,7 +145,7 @@ def find_checkpoint(
 
 
 def _newest_whole(found: list[Path], warn: Callable[[str], None]) -> Path:
-    """The newest checkpoint that is not damaged. Raises UserError where all are."""
+    """Return the newest intact checkpoint. Raises UserError if all are damaged."""
     reasons = []
     for checkpoint in reversed(found):
         reason = damage(checkpoint)
@@ -158,9 +158,9 @@ def _newest_whole(found: list[Path], warn: Callable[[str], None]) -> Path:
 
 
 def damage(checkpoint: Path) -> str | None:
-    """Says what is wrong with a checkpoint's files, or None where all are as they were written.
+    """Describe the damage of a checkpoint's files; None if they are intact.
 
-    Files of older versions, without ``checksums.json``, have only their own checks.
+    Checkpoints of older versions, without ``checksums.json``, only get the checks of each format.
     """
     try:
         listed = checkpoint / CHECKSUMS
@@ -170,43 +170,43 @@ def damage(checkpoint: Path) -> str | None:
             return None
         for name, wanted in {**_NEEDED, **read_document(listed, dict[str, _Digest])}.items():
             path = checkpoint / plain_name(name, str(listed))
-            if path.is_symlink() or not path.is_file():  # to read a pipe would not end
+            if path.is_symlink() or not path.is_file():  # reading a pipe would never end
                 return f"{path}: damaged, not a plain file"
             if sha256(path) != wanted:
-                return f"{path}: damaged, it is not what was written (SHA-256)"
+                return f"{path}: damaged, its content has changed (SHA-256)"
     except UserError as error:
         return str(error)
     return None
 
 
 def read_state(checkpoint: Path) -> dict[str, Any]:
-    """Reads ``state.pt`` onto the CPU.
+    """Read ``state.pt`` onto the CPU.
 
     Raises:
-        UserError: the file is missing, truncated or of another kind.
+        UserError: the file is missing, truncated or of another format.
     """
     path = checkpoint / "state.pt"
     state = read_torch(path, "damaged, take an older checkpoint")
     if not isinstance(state, dict):
-        raise UserError(f"{path}: damaged, it holds no state of a run")
+        raise UserError(f"{path}: damaged, it does not hold the state of a run")
     return state
 
 
 def check_state(state: dict[str, Any], source: str) -> State:
-    """Checks kinds and ranges of what ``Trainer.state`` made; the optimizer's part has its own.
+    """Check types and ranges of a ``Trainer.state``, except the optimizer's part.
 
     Raises:
-        UserError: a field is missing, unknown, of another kind or out of its range.
+        UserError: a field is missing, unknown, of the wrong type or out of range.
     """
     try:
         fields = msgspec.convert(state, State)
-        msgspec.json.encode(fields.config)  # plain values alone, which can be compared
+        msgspec.json.encode(fields.config)  # only plain values, so that they can be compared
         for rng in (fields.rng, *fields.rng_cuda):
             if not isinstance(rng, torch.Tensor) or rng.dtype != torch.uint8 or rng.ndim != 1:
-                raise ValueError("rng holds no state of a generator")
-        torch.Generator().set_state(fields.rng)  # a state of another kind is refused here
+                raise ValueError("rng is not the state of a generator")
+        torch.Generator().set_state(fields.rng)  # raises on an invalid state
     except (ValueError, TypeError, RuntimeError, AttributeError) as error:
-        # msgspec's is a ValueError, but it takes a tensor for a mapping without keys
+        # msgspec raises a ValueError, but it treats a tensor as a mapping without keys
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
     return fields
 
@@ -214,20 +214,20 @@ def check_state(state: dict[str, Any], source: str) -> State:
 def read_run(
     checkpoint: Path, config: TrainConfig, others: dict[str, Any]
 ) -> tuple[State, LengthConfig]:
-    """Reads ``state.pt`` of a run that goes on, after it is checked, and how long that was to be.
+    """Read and check the ``state.pt`` of a resumed run; also return its planned length.
 
     Args:
         checkpoint: the checkpoint's folder.
-        config: options of the run that goes on.
-        others: further fields of the state that must be as they are here.
+        config: options of the resumed run.
+        others: further fields of the state that must have these values.
 
     Raises:
         UserError: the state is damaged, or of a run with other options, data or number of
-            processes; the message names what differs, and how to go on all the same.
+            processes; the message names the differences, and how to continue nevertheless.
     """
     stored, source = read_state(checkpoint), str(checkpoint / "state.pt")
     version = stored.get("version")
-    if type(version) is not int or version != STATE_VERSION:  # a tensor has no plain truth
+    if type(version) is not int or version != STATE_VERSION:  # a tensor's comparison may raise
         raise UserError(f"{checkpoint}: state of version {str(version)[:40]!r}")
     state = check_state(stored, source)
     differing = config_differences(state.config, config.to_dict())
@@ -236,7 +236,7 @@ def read_run(
             differing.append(f"{name} ({str(getattr(state, name))[:80]} there, {value} here)")
     if differing:
         raise UserError(
-            f"{checkpoint}: is of another run: {', '.join(differing[:20])}; to go on from its "
+            f"{checkpoint}: belongs to another run: {', '.join(differing[:20])}; to start from its "
             f"weights alone: --init {checkpoint}, and another --out"
         )
     try:
@@ -246,15 +246,15 @@ def read_run(
 
 
 def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Path:
-    """Finds the model file that ``--init`` means.
+    """Find the model file of ``--init``.
 
     Args:
-        path: a model file; or a checkpoint's folder, or a run folder, whose newest whole checkpoint
-            it then is. Of a checkpoint these are the averaged weights, if it has such.
-        warn: is given one line for each damaged checkpoint that is passed over.
+        path: a model file, a checkpoint's folder, or a run folder, of which the newest intact
+            checkpoint is taken. The averaged weights of a checkpoint are preferred.
+        warn: called with one line for each damaged checkpoint that is skipped.
 
     Raises:
-        UserError: there is none, or a checkpoint is damaged.
+        UserError: no model is found, or a checkpoint is damaged.
     """
     if not path.is_dir():
         return path
@@ -271,7 +271,7 @@ def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Pat
 
 
 def initial_differences(path: Path, config: TrainConfig, objects: str) -> list[str] | None:
-    """Compares this run with the one that made a model file, if that is known.
+    """Compare this run with the one that made a model file, if it is known.
 
     Args:
         path: the model file; a checkpoint's state or a run's ``config.json`` may lie beside it.
@@ -279,7 +279,7 @@ def initial_differences(path: Path, config: TrainConfig, objects: str) -> list[s
         objects: ``TrainingData.fingerprint`` of this run.
 
     Returns:
-        What differs, each with both values; None where the file's run is not known.
+        Differences, each with both values; None if the run of the file is unknown.
     """
     try:
         if (path.parent / "state.pt").is_file():
@@ -288,13 +288,13 @@ def initial_differences(path: Path, config: TrainConfig, objects: str) -> list[s
         else:
             stored, theirs = read_document(path.parent / "config.json", dict[str, Any]), objects
         differing = config_differences(stored, config.to_dict(), free=True)
-    except (UserError, AttributeError, TypeError):  # weights alone are what was asked for
+    except (UserError, AttributeError, TypeError):  # the weights alone suffice
         return None
     return differing + (["the list of objects"] if theirs != objects else [])
 
 
 def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:
-    """Reads the tensors of a model file that fit a model of the same configuration.
+    """Read the tensors of a model file for a model of the same configuration.
 
     Raises:
         UserError: the file is missing, damaged or not finite, or its configuration differs; the
@@ -304,7 +304,7 @@ def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:
     stored, wanted = asdict(config), asdict(model.config)
     differing = [name for name in wanted if stored[name] != wanted[name]]
     if differing:
-        raise UserError(f"{path}: is a model of another {', '.join(differing)}")
+        raise UserError(f"{path}: is a model with another {', '.join(differing)}")
     try:
         return read_weights(path, model)
     except ValueError as error:
@@ -312,9 +312,9 @@ def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:
 
 
 def load_weights(path: Path, model: Gamba) -> None:
-    """Loads a model file into a model of the same configuration.
+    """Load a model file into a model of the same configuration.
 
     Raises:
-        UserError: as for ``read_weights_of``; the model is then as it was.
+        UserError: as for ``read_weights_of``; the model is then unchanged.
     """
     model.load_stored_state(read_weights_of(path, model))

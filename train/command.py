@@ -18,11 +18,11 @@ _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 4,000
 
 
 def train_command(config: tyro.conf.OmitArgPrefixes[TrainConfig]) -> int:
-    """Trains a model on posed views.
+    """Train a model on posed views.
 
     Loss, optimizer and schedules are the paper's. Writes checkpoints, log.jsonl, sample pictures
     and at the end model.safetensors into the run folder. Ctrl-C saves and stops; the same command
-    goes on. Several GPUs: torchrun --nproc-per-node N -m gamba_warp.train DATA ...
+    resumes. Several GPUs: torchrun --nproc-per-node N -m gamba_warp.train DATA ...
     """
     import torch
 
@@ -36,19 +36,19 @@ def train_command(config: tyro.conf.OmitArgPrefixes[TrainConfig]) -> int:
 
 
 def expand(arguments: list[str]) -> list[str]:
-    """Puts the options of the run or recipe that is named in its place, before all others.
+    """Replace ``--config`` or ``--recipe`` by the options it stands for, before all others.
 
-    With ``--help`` it prints what the recipe sets.
+    With ``--help``, print the recipe's options.
 
     Args:
         arguments: of ``gamba train``, each option once.
 
     Returns:
-        The same without ``--config``; of an option that is then there twice the last one counts.
+        The arguments without ``--config``; if an option occurs twice, the last one counts.
 
     Raises:
-        UserError: nothing is named, or both, the file is no run's config.json, or there is no
-            such recipe.
+        UserError: the name is missing, both are given, the file is not the config.json of a run, or
+            the recipe is unknown.
     """
     words = [
         part
@@ -68,7 +68,7 @@ def expand(arguments: list[str]) -> list[str]:
     if helped:
         print(table_of(name) + "\n")
         return rest
-    # DATA may stand at either end of the words about a recipe, and first where there is a --config.
+    # DATA may come first or last beside a recipe, and first beside --config.
     first = rest[:1] if rest and not rest[0].startswith("-") else []
     if chosen == "--recipe":
         taken = recipe_words(name, rest, os.environ)
@@ -80,22 +80,22 @@ def expand(arguments: list[str]) -> list[str]:
 
 
 def _options_of(path: Path) -> list[str]:
-    """DATA and the options that a config.json means."""
+    """DATA and the options of a config.json, as command line arguments."""
     from gamba_warp.untrusted.documents import read_document
 
     path = path / "config.json" if path.is_dir() else path
     try:
         values = read_document(path, dict[str, Any], _MAX_CONFIG)
     except UserError as error:
-        raise UserError(f"{error}; this is no run's config.json, with a run's options") from error
-    values.pop("model", None)  # it follows from the preset and --set
+        raise UserError(f"{error}; this is not the config.json of a run") from error
+    values.pop("model", None)  # follows from the preset and --set
     parts = [part for part in values.values() if not isinstance(part, dict)]
     parts += [v for part in values.values() if isinstance(part, dict) for v in part.values()]
     for value in (v for part in parts for v in (part if isinstance(part, list) else [part])):
         if str(value).startswith("-"):
-            raise UserError(f"{path}: {str(value)[:100]!r} is no value of an option")
+            raise UserError(f"{path}: {str(value)[:100]!r} is not a valid value of an option")
     config = config_of(values, str(path))
     words = shlex.split(command_line(config.to_dict()))[2:]
-    if config.run.recipe:  # the record of it; its options are there already
+    if config.run.recipe:  # kept as a record; its options are already there
         words += ["--recipe", config.run.recipe]
     return words

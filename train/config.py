@@ -29,18 +29,17 @@ RecipeName = Literal["paper", "tiny", "rays"]
 
 @dataclass(frozen=True, kw_only=True)
 class LengthConfig:
-    """How long to train. The schedules end with the steps or epochs, else with the minutes.
+    """Length of the training. The schedules end with the steps or epochs, else with the minutes.
 
     Attributes:
         steps: Number of optimizer steps.
         epochs: Number of passes over the objects, or with --overfit over its views; 400 if no limit
-            is given at all.
+            is given.
         minutes: Training time, resumed parts included. If it is the only limit, the schedules
-            follow the clock, and two runs are not the same to the bit. A run may be resumed with
-            another length: the learning rate then goes on from where it was, and the rest of its
-            fall ends with the new length. Where the fall was over, or almost so, it first rises
-            again to what a run of the new length has there, over a tenth of the steps that are
-            left, and the command says so.
+            follow the clock, and two runs are not bit-identical. A run may be resumed with another
+            length: the learning rate then continues from its current value and reaches 0 at the new
+            end. If it was already near 0, it first rises to the value of a run of the new length,
+            over a tenth of the remaining steps, and the command says so.
     """
 
     steps: _Count | None = None
@@ -50,7 +49,7 @@ class LengthConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DataConfig:
-    """What a step sees.
+    """Data of a training step.
 
     Attributes:
         batch_size: Objects per step and process, before accumulation; 8 if not given, or 1 with
@@ -58,34 +57,32 @@ class DataConfig:
         accumulate: Batches per optimizer step.
         size: Side of the rendered pictures, pixels.
         views_first: Novel views per object at the start.
-        views_last: Novel views per object at the end; the number grows in equal shares of the run.
-        views_per_object: A fixed number of novel views, in place of the growing one; 9 with
-            --overfit.
+        views_last: Novel views per object at the end; the number grows evenly over the run.
+        views_per_object: Fixed number of novel views instead of the growing one; 9 with --overfit.
         background: Colour behind the rendered and the true pictures; "random" draws one for each
-            object and step. The input picture always lies on the model's own background.
-        reference: The view that is the input: any, or always the first; "auto" is first with
-            --overfit.
+            object and step. The input picture always has the model's own background.
+        reference: Input view: any, or always the first; "auto" is first with --overfit.
         extra: More datasets, whose training objects are added to those of DATA.
         front_share: Share of the samples whose input is a view from the front: the object's first,
-            or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation; of the others
-            it is any view.
+            or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation. The other
+            samples take any view.
         mirror: Share of the samples whose object is mirrored, with its cameras.
-        recolor: Share of the samples whose colour channels change places and gamma.
+        recolor: Share of the samples whose colour channels are permuted and change gamma.
         made: Share of the samples that show made objects (gamba data made), which other processes
-            make and render while the model trains; the others are of the datasets.
+            make and render during the training; the others are of the datasets.
         made_uses: Samples of each made object.
         made_views: Views of each made object.
-        made_workers: Processes that make and render; the number changes no result.
-        train_on_gso: Take objects that have names of Google Scanned Objects. The paper and others
-            are evaluated on this set, so without the option a run refuses them, to train and to
-            validate on. With it OUT/model.json, the card of the weights, states their names.
+        made_workers: Processes that make and render; the number does not change the result.
+        train_on_gso: Accept objects named as in Google Scanned Objects. The paper and others
+            evaluate on this set, so without the option a run refuses them for training and
+            validation. With it OUT/model.json, the card of the weights, states their names.
         overfit: Train on this one object (uid or number) and validate on its training views: a
             smoke test.
         cache: Keep decoded pictures in memory.
-        cache_device: Decode all pictures at the start and keep them on the device that trains, with
+        cache_device: Decode all pictures at the start and keep them on the training device, with
             8 bits a channel. Depth pictures are read when they are used.
-        workers: Threads that decode pictures ahead of the training, and batches that lie ready at
-            most; the number changes no result.
+        workers: Threads that decode pictures ahead of the training; also the largest number of
+            batches kept ready. The number does not change the result.
     """
 
     batch_size: Annotated[int, Meta(ge=1, le=100_000)] | None = None
@@ -117,26 +114,26 @@ class LossConfig:
 
     Attributes:
         mask_weight: Weight of the alpha channel's squared error.
-        lpips: Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" demands them. On a
-            CPU it multiplies a step's time (docs/train-your-own.md).
+        lpips: Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" requires them. On a
+            CPU it multiplies the time of a step (docs/train-your-own.md).
         lpips_weight: Weight of LPIPS.
-        lpips_after: Leave LPIPS out for this many steps; it can hold a young model in a white
-            collapse.
+        lpips_after: Leave LPIPS out for this many steps; early in training it can keep the model
+            in a white collapse.
         lpips_crop: Side of a random square, in pixels, that LPIPS compares in one view of each
             object; 0 compares all views whole, which on a CPU would take most of a step.
-        ssim_weight: Weight of 1 - SSIM; the paper has no such term.
-        novel_weight: Weight of each novel view against the input view, in all terms but LPIPS of
-            crops; the mean over the views stays a mean.
-        depth_weight: Weight of the depth of Gaussians: that of the first layer of "rays" is held to
-            the input view's first surface, that of the last layer to the last. The data needs depth
-            pictures (gamba data render --depth); the paper has no such term.
+        ssim_weight: Weight of 1 - SSIM; not in the paper.
+        novel_weight: Weight of each novel view relative to the input view, in all terms but LPIPS
+            of crops; the result is a weighted mean over the views.
+        depth_weight: Weight of the depth loss: the first layer of "rays" is pulled to the first
+            surface of the input view, the last layer to the last surface. The data needs depth
+            pictures (gamba data render --depth); not in the paper.
         radial_mask: The radial mask constraint on the projected centres (paper Table 2).
         rdist_weight: Weight of the radial mask constraint at the start.
         rdist_epochs: Epochs over which the weight of the radial mask constraint falls linearly to
             0.
-        rdist_share: Largest share of the run in which that weight falls; it matters where the run
-            is short.
-        rdist_steps: Steps over which that weight falls, in place of --rdist-epochs and
+        rdist_share: Largest share of the run over which that weight falls; it matters in short
+            runs.
+        rdist_steps: Steps over which that weight falls, instead of --rdist-epochs and
             --rdist-share.
     """
 
@@ -160,19 +157,19 @@ class OptimConfig:
     """AdamW, and the running average of the weights.
 
     Attributes:
-        lr: Peak learning rate; after a warm-up it falls to 0 as --schedule says.
-        schedule: "cosine" falls from the warm-up on, along half a cosine; "trapezoid" stays at the
-            peak and falls linearly at the end, so that a longer run begins as a shorter one does.
+        lr: Peak learning rate; after a warm-up it falls to 0 according to --schedule.
+        schedule: "cosine" falls along half a cosine from the end of the warm-up; "trapezoid" stays
+            at the peak and falls linearly at the end, so runs of different lengths begin alike.
         decay_share: Share of the run in which "trapezoid" falls.
         warmup_steps: Steps of the linear warm-up, a tenth of the run at most.
-        weight_decay: Weight decay of matrices, except those that a module flags.
+        weight_decay: Weight decay of matrices, except those flagged by a module.
         beta2: Second-moment decay of AdamW.
         clip: Largest norm of the gradient.
         ema: Decay of the weights' running average, shorter at the start; 0 turns it off.
         precision: Precision of the products in the network, by autocast; parameters, losses and
-            rendering stay float32. "auto" is bfloat16 where a trial of 50 ms finds it faster, on
-            all processes, else float32; it chooses anew whenever the run goes on.
-        max_skipped: Give up after so many non-finite steps in a row.
+            rendering stay float32. "auto" is bfloat16 if a trial of 50 ms finds it faster on all
+            processes, else float32; a resumed run chooses again.
+        max_skipped: Give up after this many non-finite steps in a row.
     """
 
     lr: Annotated[float, Meta(gt=0, le=10)] = 1e-3
@@ -193,33 +190,33 @@ class RunConfig:
 
     Attributes:
         out: Run folder.
-        config: Take the options of another run: its folder, or its config.json. Options beside this
-            one replace those, and so does DATA if it comes first; without --out that run itself
-            goes on.
-        recipe: Options that belong together: "paper" is the paper's training, with 256 objects a
-            step over all processes; "tiny" or "rays" that of the shipped model, at its size.
-            Options beside it win; with --help it shows what the recipe sets, and from where.
-        resume: "auto" goes on where the run folder stands; else "never", or the path of a
-            checkpoint.
+        config: Take the options of another run: its folder, or its config.json. Further options
+            override them, and so does DATA if it comes first; without --out that run itself is
+            resumed.
+        recipe: Set of options: "paper" is the paper's training, with 256 objects a step over all
+            processes; "tiny" or "rays" is that of the shipped model, at its size. Further options
+            override it; with --help it shows the recipe's options and their sources.
+        resume: "auto" resumes from the newest checkpoint of the run folder; else "never", or the
+            path of a checkpoint.
         init: Start from the weights of this model file, checkpoint or run folder (same
-            architecture; the averaged weights where there are such), with a fresh optimizer. A run
-            of other losses or data goes on so, in another --out.
+            architecture; the averaged weights if there are any), with a fresh optimizer. Use it
+            with another --out to continue with other losses or data.
         encoder_weights: File of the image encoder's weights, or "random" to train one from scratch.
         log_every: Steps between two lines of the log.
         val_every: Steps between two validations (and sample pictures); 0 for none.
-        val_objects: Held-out objects to validate on, of each dataset.
-        val_views: Novel views of each of these, evenly spaced in the list; --overfit takes all.
-        val_extra: More datasets, whose held-out objects are validated on by themselves, under their
+        val_objects: Held-out objects of each dataset to validate on.
+        val_views: Novel views of each, evenly spaced in the list; --overfit takes all.
+        val_extra: More datasets, whose held-out objects are validated separately, under their
             folder's name. OUT/best.safetensors is of the validation with the best PSNR of novel
-            views: the mean over DATA and these, each of which counts the same.
+            views, the unweighted mean over DATA and these.
         save_every: Steps between two checkpoints; one is always saved at the end.
-        keep: Checkpoints kept; the oldest go first.
+        keep: Number of checkpoints kept; the oldest are removed first.
         tensorboard: Write TensorBoard files, if it is installed.
-        log: Boards beside TensorBoard: "wandb" is Weights & Biases, which its own settings send
-            where they say (WANDB_PROJECT, WANDB_MODE=offline).
-        device: Device that computes; "auto" is the GPU if there is one.
+        log: Boards beside TensorBoard: "wandb" is Weights & Biases, configured by its own settings
+            (WANDB_PROJECT, WANDB_MODE=offline).
+        device: Device to train on; "auto" is the GPU if there is one.
         threads: Number of CPU threads; all cores if not given.
-        recompute: Keep only the blocks' inputs for the gradient and run each block again there: the
+        recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
             same result in less memory and more time.
         seed: Seed of the initial weights and of the order of the data.
     """
@@ -246,13 +243,13 @@ class RunConfig:
 
     @property
     def boards(self) -> tuple[str, ...]:
-        """Names of the boards that are written beside the log."""
+        """Names of the boards written beside the log."""
         return (*(("tensorboard",) if self.tensorboard else ()), *dict.fromkeys(self.log))
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Trains a model on posed views (``gamba data render`` makes them).
+    """Train a model on posed views (``gamba data render`` makes them).
 
     Attributes:
         data: Dataset folder.
@@ -279,18 +276,18 @@ class TrainConfig:
                 f"--lpips-crop {self.loss.lpips_crop}: must be 0, or 16 to --size {self.views.size}"
             )
         if self.views.made and self.views.overfit is not None:
-            raise UserError("--made: --overfit trains on one object alone; leave one of them out")
+            raise UserError("--made: --overfit trains on one object; leave one of them out")
         if self.run.val_extra and self.views.overfit is not None:
             raise UserError("--val-extra: --overfit validates on its object; leave one of them out")
         if self.loss.depth_weight and self.model_config().decoder != "rays":
-            raise UserError('--depth-weight: only layers of the decoder "rays" have a depth')
+            raise UserError('--depth-weight: needs the decoder "rays", whose layers have a depth')
         self.model_config()
 
     def model_config(self) -> GambaConfig:
-        """The preset with the changes of ``--set``.
+        """Return the preset with the changes of ``--set``.
 
         Raises:
-            UserError: no such field, or a value that does not fit.
+            UserError: a field is unknown, or its value invalid.
         """
         names = [f.name for f in fields(GambaConfig)]
         changes = {}
@@ -307,25 +304,25 @@ class TrainConfig:
             raise UserError(f"--set: {error}") from error
 
     def to_dict(self) -> dict:
-        """JSON-ready values, the model's full configuration under ``model``."""
+        """Return JSON-ready values, with the model's full configuration under ``model``."""
         values = json.loads(json.dumps(asdict(self), default=str))
         values["model"] = json.loads(self.model_config().to_json())
         return values
 
 
-# A run may go on with other values of these: they change where it reads and writes and how far it
-# goes, and not what a step computes. All others must stay as they were.
+# A run may be resumed with other values of these: they change where it reads and writes and how
+# long it is, but not the result of a step. All others must stay the same.
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers"}
 _MAY_CHANGE |= {"views.cache", "views.cache_device", "views.made_workers"}
 _MUST_STAY = {"run.seed"}
-_TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
-# The processes of one run may have these apart from one another; of files their contents count.
-_OF_A_MACHINE = {
+_COMPARED_IF_FREE = {"data", "length.steps", "length.epochs", "length.minutes"}
+# These may differ between the processes of one run; files are compared by content.
+_PER_MACHINE = {
     *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
     *("run.init", "run.encoder_weights", "run.device", "run.threads", "run.keep", "run.log"),
     *("run.tensorboard", "run.val_extra", "views.cache_device", "views.made_workers"),
 }
-# The groups of options in a run's config.json; "model" follows from the preset and --set.
+# Groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {
     "length": LengthConfig,
     "views": DataConfig,
@@ -337,14 +334,14 @@ GROUPS = {
 
 
 def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:
-    """The options that a ``to_dict`` value without ``model`` means; what it lacks is a default.
+    """Convert a ``to_dict`` value without ``model`` to options; missing ones get their default.
 
     Args:
-        values: perhaps a stranger's.
-        source: where they come from, for the error's message.
+        values: untrusted values.
+        source: their origin, for the error message.
 
     Raises:
-        UserError: an option is unknown, or its value is wrong; names it.
+        UserError: an option is unknown or has an invalid value; the message names it.
     """
     try:
         config = msgspec.convert(values, TrainConfig, dec_hook=lambda kind, value: kind(value))
@@ -357,23 +354,22 @@ def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:
 
 
 def config_differences(stored: dict, current: dict, free: bool = False) -> list[str]:
-    """Compares two ``to_dict`` values; an option that one of them lacks has its default there.
+    """Compare two ``to_dict`` values; a missing option counts as its default.
 
     Args:
-        stored: of the run that is gone on with; an older version may have known fewer options.
+        stored: of the resumed run; an older version may have fewer options.
         current: of this run.
-        free: whether those that may change when a run goes on are compared, too, apart from where
-            it reads and writes.
+        free: also compare the data and the length, which may change when a run is resumed.
 
     Returns:
-        The fields that differ, each with both values.
+        The differing fields, each with both values.
     """
     defaults = _flatten(_defaults())
     old, new = ({**defaults, **_flatten(values)} for values in (stored, current))
     differing = []
     for name in sorted(old.keys() | new.keys()):
         may_change = name in _MAY_CHANGE or name.split(".")[0] in _MAY_CHANGE
-        compared = not may_change or name in _MUST_STAY or (free and name in _TELLING)
+        compared = not may_change or name in _MUST_STAY or (free and name in _COMPARED_IF_FREE)
         if old.get(name) != new.get(name) and compared:
             there, here = (str(values.get(name))[:80] for values in (old, new))
             differing.append(f"{name} ({there} there, {here} here)")
@@ -381,16 +377,16 @@ def config_differences(stored: dict, current: dict, free: bool = False) -> list[
 
 
 def options_of_all(values: dict) -> dict[str, object]:
-    """The options that all processes of a run must have in common.
+    """Options that all processes of a run must have in common.
 
     Args:
-        values: of ``to_dict``.
+        values: result of ``to_dict``.
 
     Returns:
-        Values by name. Left out is where a machine reads and writes, and how fast it does so.
+        Values by name, without paths, devices and numbers of workers of a machine.
     """
     flat = _flatten({name: value for name, value in values.items() if name not in ("data", "set")})
-    return {name: value for name, value in flat.items() if name not in _OF_A_MACHINE}
+    return {name: value for name, value in flat.items() if name not in _PER_MACHINE}
 
 
 def _defaults() -> dict:
@@ -408,15 +404,15 @@ def _flatten(values: dict, prefix: str = "") -> dict:
 
 
 def command_line(values: dict) -> str:
-    """The ``gamba train`` command that means a ``to_dict`` value; defaults are left out."""
+    """Return the ``gamba train`` command of a ``to_dict`` value, without defaults."""
     words = ["gamba", "train", str(values.get("data")), "--preset", str(values.get("preset"))]
     if values.get("set"):
         words += ["--set", *map(str, values["set"])]
     for group, default in _defaults().items():
-        if group == "model":  # it follows from the preset and --set
+        if group == "model":  # follows from the preset and --set
             continue
         for name, value in values.get(group, {}).items():
-            # A recipe's options are there by themselves, and those that were given have won.
+            # The recipe's options are already in the values, overridden by the given ones.
             if name not in default or value == default[name] or name == "recipe":
                 continue
             if isinstance(value, bool):

@@ -1,7 +1,7 @@
-"""One process or many: ``torchrun -m gamba_warp.train ...`` sets the environment read here.
+"""Training on one or several processes; ``torchrun -m gamba_warp.train ...`` sets the environment.
 
-Where one process ends with an error, all end, each with one line: what may fail on one process
-alone is done inside ``World.together``, and who waits for one that is gone learns it from gloo.
+If one process fails, all end, each with a one-line message: code that may fail on a single process
+runs inside ``World.together``, and gloo reports a lost process to those that wait for it.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from gamba_warp.devices import pick_precision
 from gamba_warp.errors import UserError, first_line
 
 Result = TypeVar("Result")
-_MEETING = timedelta(minutes=5)  # processes start at different times
-_LONGEST = timedelta(minutes=30)  # for which they wait for one another later
-_SHOWN = 4  # names of a list that a message shows
-# What gloo and NCCL say where another process has gone; of a defect they say other things.
-_GONE = re.compile(
+_JOIN_TIMEOUT = timedelta(minutes=5)  # processes start at different times
+_TIMEOUT = timedelta(minutes=30)  # of every later exchange
+_MAX_SHOWN = 4  # names of a list that a message shows
+# Messages of gloo and NCCL about a lost process, as opposed to a bug.
+_LOST_PEER = re.compile(
     r"connection (was )?(closed|reset|refused)|broken pipe|remote process|socket closed"
     r"|timed? ?out|heartbeat|gloo/transport",
     re.IGNORECASE,
@@ -42,7 +42,7 @@ _GONE = re.compile(
 
 @dataclass(frozen=True)
 class World:
-    """This process among all processes of the run.
+    """Process group of a run, as seen from this process.
 
     Attributes:
         rank: number of this process, 0 to ``size`` - 1; rank 0 logs, validates and saves.
@@ -56,11 +56,11 @@ class World:
 
     @property
     def main(self) -> bool:
-        """Whether this is the process that writes files."""
+        """True if this process writes files."""
         return self.rank == 0
 
     def total(self, *values: float) -> list[float]:
-        """Sums each value over all processes, on the CPU, so that nobody waits for a GPU."""
+        """Sum each value over all processes, on the CPU to avoid waiting for a GPU."""
         if self.size == 1:
             return list(values)
         tensor = torch.tensor(values, dtype=torch.float64)
@@ -68,45 +68,46 @@ class World:
         return tensor.tolist()
 
     def precision(self, name: Precision, width: int) -> torch.dtype:
-        """The dtype of ``pick_precision``, and float32 where the processes do not agree."""
+        """Return the dtype of ``pick_precision``, or float32 if the processes disagree."""
         chosen = pick_precision(name, self.device, width)
         (lower,) = self.total(float(chosen != torch.float32))
         return chosen if lower in (0, self.size) else torch.float32
 
     def mean(self, figures: dict[str, float]) -> dict[str, float]:
-        """Averages each figure over all processes, which must have the same names of figures."""
+        """Average each figure over all processes, which must have the same names."""
         sums = self.total(*(figures[name] for name in sorted(figures)))
         return {name: value / self.size for name, value in zip(sorted(figures), sums)}
 
     def gather(self, value: Any) -> list[Any]:
-        """Gives every process what each of them has, by rank; what torch can pickle."""
+        """Gather a picklable value from all processes, by rank."""
         found = [value] * self.size
         if self.size > 1:
             dist.all_gather_object(found, value)
         return found
 
     def on_main(self, action: Callable[[], Result]) -> Result:
-        """Gives every process what the main one makes; what torch can pickle, tensors too.
+        """Run an action on the main process and broadcast its picklable result.
 
         Raises:
             UserError: as ``together``.
         """
-        held: list[Any] = [None]
+        result: list[Any] = [None]
         with self.together():
             if self.main:
-                held = [action()]
+                result = [action()]
         if self.size > 1:
-            dist.broadcast_object_list(held, 0)
-        return held[0]
+            dist.broadcast_object_list(result, 0)
+        return result[0]
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """What is done in it ends on all processes with an error if it does so on one of them.
+        """Raise on all processes if the body raises on one.
 
-        In it the processes must not exchange anything.
+        The body must not communicate between processes.
 
         Raises:
-            UserError: of another process, which it names; an error of this one stays what it is.
+            UserError: another process, named in the message, has failed; an error of this process
+                is re-raised unchanged.
         """
         if self.size == 1:
             yield
@@ -114,7 +115,7 @@ class World:
         failed = None
         try:
             yield
-        except Exception as error:  # any: the others must not wait for this process
+        except Exception as error:  # any kind: the others must not wait for this process
             failed = error
         reasons = self.gather([socket.gethostname(), "" if failed is None else first_line(failed)])
         if failed is not None:
@@ -124,14 +125,14 @@ class World:
                 raise UserError(f"process {rank} on {host}: {reason}")
 
     def wrap(self, model: Module) -> Module:
-        """The model itself, or with several processes one that averages their gradients.
+        """Return the model itself, or with several processes a wrapper that averages gradients.
 
-        Its weights are then those of rank 0. Buffers are constants here, so they are not sent
-        around at each step.
+        The wrapper takes the weights of rank 0. Buffers are constants, so they are not synchronized
+        at each step.
         """
         if self.size == 1:
             return model
-        # Versions of torch name this option differently.
+        # The name of this option depends on the version of torch.
         known = inspect.signature(DistributedDataParallel).parameters
         name = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
         group = dist.new_group(backend="nccl") if self.device.type == "cuda" else None
@@ -139,14 +140,14 @@ class World:
         return DistributedDataParallel(model, **options)
 
     def agree(self, facts: Callable[[], Mapping[str, dict[str, object]]]) -> None:
-        """Refuses processes that would not do the same work.
+        """Check that all processes have the same setup.
 
         Args:
-            facts: gives names and values by subject, all of which must be the same on all
-                processes; it is not called where there is one process alone.
+            facts: returns names and values by subject, which must be equal on all processes; not
+                called with a single process.
 
         Raises:
-            UserError: they are not; the same line on all processes, with what differs.
+            UserError: they differ; the same line on all processes, with the differences.
         """
         if self.size == 1:
             return
@@ -164,9 +165,9 @@ class World:
             pairs = {k: (theirs.get(k, "missing"), ours.get(k, "missing")) for k in ours | theirs}
             differing = {key: pair for key, pair in sorted(pairs.items()) if pair[0] != pair[1]}
             shown = [f"{k} is {str(b)[:60]}, not {str(a)[:60]}" for k, (b, a) in differing.items()]
-            more = [f"{len(shown) - _SHOWN} more"] if len(shown) > _SHOWN else []
+            more = [f"{len(shown) - _MAX_SHOWN} more"] if len(shown) > _MAX_SHOWN else []
             if shown:
-                parts.append(f"{subject}: {', '.join(shown[:_SHOWN] + more)}")
+                parts.append(f"{subject}: {', '.join(shown[:_MAX_SHOWN] + more)}")
         like = f", like {len(others) - 1} more," if len(others) > 1 else ""
         raise UserError(
             f"process {others[0]} on {name}{like} is not set up as process 0 on {host}: "
@@ -176,14 +177,14 @@ class World:
 
 @contextmanager
 def world(device: str = "auto") -> Iterator[World]:
-    """Joins the processes that torchrun started, or makes a world of this process alone.
+    """Join the processes started by torchrun, or make a world of this single process.
 
     Args:
         device: "auto", "cpu" or "cuda".
 
     Raises:
-        UserError: "cuda" was asked for, and there is no GPU for this process; or another process
-            cannot be reached, or has gone.
+        UserError: "cuda" without a GPU for this process, or another process cannot be reached or
+            has ended.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("--device cuda: no CUDA GPU is available")
@@ -201,15 +202,15 @@ def world(device: str = "auto") -> Iterator[World]:
         yield World(rank=0, size=1, device=chosen)
         return
     try:
-        # What is small (stop flags, errors) goes through gloo; ``wrap`` takes NCCL for gradients
-        # on GPUs, after it is known that all processes have one.
+        # Small messages (stop flags, errors) use gloo; ``wrap`` uses NCCL for gradients on GPUs,
+        # once it is known that all processes have one.
         store = _fresh_store(rank, size)
-        dist.init_process_group("gloo", store=store, rank=rank, world_size=size, timeout=_LONGEST)
+        dist.init_process_group("gloo", store=store, rank=rank, world_size=size, timeout=_TIMEOUT)
         yield World(rank, size, chosen)
     except RuntimeError as error:
         text = re.sub(r"\[[^][]*\.(cc|cpp):\d+\] ", "", first_line(error))
         network = isinstance(error, (dist.DistNetworkError, dist.DistStoreError))
-        if not network and not _GONE.search(str(error)):
+        if not network and not _LOST_PEER.search(str(error)):
             raise
         raise UserError(
             f"process {rank} on {socket.gethostname()} has lost the others: one of them has ended, "
@@ -221,24 +222,24 @@ def world(device: str = "auto") -> Iterator[World]:
 
 
 def _fresh_store(rank: int, size: int) -> Store:
-    """A store of these processes alone, without what processes before them have left.
+    """Store of these processes only, without entries of earlier ones.
 
-    torchrun's own store outlives the processes that it starts anew, and holds the addresses of dead
-    ones, for which torch waits in vain: tried with torch 2.15. torch 2.6 tells them apart by the
-    number of restarts, which each machine counts for itself. Here each process has a random name,
-    and they go on when all have seen the same names.
+    torchrun's own store outlives restarted processes and keeps the addresses of dead ones, for
+    which torch waits in vain (tried with torch 2.15). torch 2.6 tells them apart by the number of
+    restarts, which each machine counts separately. Here each process has a random name, and all
+    continue once they have seen the same names.
     """
     host, port = os.environ.get("MASTER_ADDR", "127.0.0.1"), os.environ.get("MASTER_PORT", "29500")
     served = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
-    store = TCPStore(host, int(port), None, served, timeout=_MEETING, wait_for_workers=False)
+    store = TCPStore(host, int(port), None, served, timeout=_JOIN_TIMEOUT, wait_for_workers=False)
     names, seen = ([f"gamba/{what}/{r}" for r in range(size)] for what in ("name", "seen"))
     store.set(names[rank], secrets.token_hex(8))
-    limit = time.monotonic() + _MEETING.total_seconds()
+    limit = time.monotonic() + _JOIN_TIMEOUT.total_seconds()
     while time.monotonic() < limit:
-        group = store.multi_get(names)  # waits for who has not come at all
+        group = store.multi_get(names)  # waits for processes that have not joined
         together = b",".join(group)
         store.set(seen[rank], together.decode())
         if {*store.multi_get(seen)} == {together}:
             return PrefixStore(f"gamba/{group[0].decode()}", store)
         time.sleep(0.02)
-    raise UserError(f"not all of {size} processes have come to {host}:{port}")
+    raise UserError(f"not all of {size} processes have joined at {host}:{port}")

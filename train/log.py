@@ -1,4 +1,4 @@
-"""The run's log: one JSON object per line, boards beside it, and sample pictures."""
+"""Log of a run: one JSON object per line, boards, and sample pictures."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from .boards import TensorBoard, Wandb, open_board
 
 
 class RunLog:
-    """Appends to ``RUN/log.jsonl``; every line has ``event``, ``step`` and ``time`` (Unix, s).
+    """Append to ``RUN/log.jsonl``; every line has ``event``, ``step`` and ``time`` (Unix, s).
 
-    Nothing that goes wrong here stops a run: it is said once, and the run goes on without.
+    Errors of the log never stop a run: each writer's first error is reported, then it is dropped.
     """
 
     def __init__(self, run: Path, boards: Sequence[str] = ()) -> None:
-        """Opens the log in the run folder.
+        """Open the log in the run folder.
 
         Args:
             run: the run folder.
-            boards: names that ``open_board`` knows.
+            boards: names for ``open_board``.
 
         Raises:
             UserError: the file cannot be written.
         """
         try:
-            # Without a buffer, what could not be written is known at once and nowhere kept.
+            # Unbuffered, so that a failed write is known at once and leaves nothing pending.
             self._file = open(run / "log.jsonl", "a+b", buffering=0)
-            size = self._file.seek(0, os.SEEK_END)  # 0 of a device, which would never end
+            size = self._file.seek(0, os.SEEK_END)  # 0 for a device, whose reading would never end
             self._file.seek(0)
-            self._cut(self._file.read(size).rfind(b"\n") + 1)
+            self._truncate(self._file.read(size).rfind(b"\n") + 1)
         except OSError as error:
             raise UserError(f"cannot write {run / 'log.jsonl'}: {error.strerror}") from error
         self._run = run
@@ -61,26 +61,26 @@ class RunLog:
 
     @contextmanager
     def _guarded(self, name: str) -> Iterator[None]:
-        """Says the first error of each writer in one line, and goes on."""
+        """Report the first error of each writer in one line, and continue."""
         try:
             yield
-        except Exception as error:  # a board's thread hands on whatever stopped it
+        except Exception as error:  # a board's thread may raise anything
             if name not in self._said:
                 self._said.add(name)
                 say(f"gamba train: {name} cannot be written, the run goes on: {reason_of(error)}")
             self._boards.pop(name, None)
 
-    def _cut(self, size: int) -> None:
-        """Takes away what a full disk or a kill left of a line."""
+    def _truncate(self, size: int) -> None:
+        """Remove a partial line left by a full disk or a kill."""
         if os.fstat(self._file.fileno()).st_size > size:
             os.ftruncate(self._file.fileno(), size)
 
     def write(self, event: str, step: int, **values: object) -> None:
-        """Writes a line; numbers that are not finite become null.
+        """Write a line; non-finite numbers become null.
 
-        The events are start, train, val (of a further dataset val/NAME), best, warning and end.
+        The events are start, train, val (val/NAME for a further dataset), best, warning and end.
         """
-        line = {"event": event, "step": step, "time": round(time.time(), 3), **_plain(values)}
+        line = {"event": event, "step": step, "time": round(time.time(), 3), **_to_json(values)}
         data = (json.dumps(line) + "\n").encode()
         with self._guarded("log.jsonl"):
             size = os.fstat(self._file.fileno()).st_size
@@ -88,33 +88,33 @@ class RunLog:
                 if self._file.write(data) != len(data):
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             except OSError:
-                self._cut(size)
+                self._truncate(size)
                 raise
         for name, board in [*self._boards.items()]:
             with self._guarded(name):
                 board.write(event, step, values)
 
     def warn(self, step: int, message: str) -> None:
-        """Prints one line above the progress bar and logs it."""
+        """Print one line above the progress bar and log it."""
         say(f"gamba train: {message}")
         self.write("warning", step, message=message)
 
     def sample(self, step: int, path: Path, rows: list[Tensor]) -> None:
-        """Writes sample pictures, see ``save_strip``; where that fails, warns."""
+        """Write sample pictures, see ``save_strip``; warn if that fails."""
         try:
             save_strip(path, rows)
         except UserError as error:
             self.warn(step, str(error))
 
     def page(self) -> None:
-        """Writes the run's page, ``RUN/index.html``, from what was logged so far."""
+        """Write the run's page, ``RUN/index.html``, from the log so far."""
         with self._guarded("index.html"):
             from gamba_warp.pages.run import write_run_page
 
             write_run_page(self._run)
 
     def close(self) -> None:
-        """Closes the files."""
+        """Close the files."""
         self._file.close()
         for name, board in [*self._boards.items()]:
             with self._guarded(name):
@@ -122,17 +122,17 @@ class RunLog:
 
 
 def say(text: str, file: TextIO | None = None) -> None:
-    """Prints a line above the progress bar; one that nobody can read any more is no error.
+    """Print a line above the progress bar, ignoring output errors.
 
-    A terminal that was closed (SIGHUP) and a full disk under the standard output raise OSError.
+    A closed terminal (SIGHUP) and a full disk under the standard output raise OSError.
     """
     with suppress(OSError):
         tqdm.write(text, file or sys.stdout)
         (file or sys.stdout).flush()
 
 
-class Quiet:
-    """A text stream for a progress bar, which stops no run where it cannot be written."""
+class SafeStream:
+    """Text stream for a progress bar that ignores write errors."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -141,26 +141,26 @@ class Quiet:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> None:
-        """Writes, or does nothing."""
+        """Write, ignoring errors."""
         with suppress(OSError):
             self._stream.write(text)
 
     def flush(self) -> None:
-        """Flushes, or does nothing."""
+        """Flush, ignoring errors."""
         with suppress(OSError):
             self._stream.flush()
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.6g}") if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {name: _plain(inner) for name, inner in value.items()}
+        return {name: _to_json(inner) for name, inner in value.items()}
     return value
 
 
 def save_strip(path: Path, rows: list[Tensor]) -> None:
-    """Writes pictures as one PNG: each of ``rows`` is ``[V, H, W, 3]`` in [0, 1], left to right."""
+    """Write pictures as one PNG: each of ``rows`` is ``[V, H, W, 3]`` in [0, 1], left to right."""
     strips = [torch.cat(list(row), dim=1) for row in rows]
     width = max(strip.shape[1] for strip in strips)
     padded = [torch.nn.functional.pad(s, (0, 0, 0, width - s.shape[1]), value=1.0) for s in strips]
@@ -168,16 +168,16 @@ def save_strip(path: Path, rows: list[Tensor]) -> None:
 
 
 def run_bar(total: int | None, minutes: float | None, step: int, spent: float, main: bool) -> tqdm:
-    """The bar of a run: of its minutes if they are limited, or else of its steps.
+    """Progress bar of a run: of its minutes if they are limited, else of its steps.
 
     Args:
-        total: steps of the run, or None where only minutes limit it.
+        total: steps of the run, or None if only minutes limit it.
         minutes: its time limit, or None.
-        step: steps that are done.
-        spent: minutes that are spent.
-        main: whether this process draws it; that of another draws nothing.
+        step: steps done.
+        spent: minutes spent.
+        main: True if this process draws the bar.
     """
-    file = Quiet(sys.stderr if main else io.StringIO())
+    file = SafeStream(sys.stderr if main else io.StringIO())
     if minutes is None:
         return progress_bar(total=total, initial=step, unit="step", file=file)
     form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:g} min{postfix}"

@@ -1,4 +1,4 @@
-"""The training loop: ``Trainer.run`` is the loop, ``Trainer.train_step`` one optimizer step."""
+"""Training loop: ``Trainer.run`` is the loop, ``Trainer.train_step`` one optimizer step."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoin
 from .config import LengthConfig, TrainConfig, command_line
 from .ddp import World
 from .log import RunLog, run_bar, say
-from .objective.losses import Moment, term_weights
+from .objective.losses import Progress, term_weights
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
 from .step import Objective, collapse_reason, compute_gradients, health, validate
 
 
 class Trainer:
-    """Trains a model on one dataset; it holds the model, its optimizer and their state."""
+    """Training of a model: holds the model, its optimizer and their state."""
 
     def __init__(
         self,
@@ -41,13 +41,13 @@ class Trainer:
         world: World,
         lpips: Callable[[Tensor, Tensor], Tensor] | None,
     ) -> None:
-        """Takes a ``model`` on the world's device."""
+        """Set up the training of a ``model`` that is on the world's device."""
         self.config, self.data, self.world, self.lpips = config, data, world, lpips
-        self.log: RunLog | None = None  # the main process gets one before it runs
+        self.log: RunLog | None = None  # set on the main process before it runs
         self.model = model
         self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
         self.ema = Ema(model, config.optim.ema) if config.optim.ema else None
-        # By the stem of their files; the last is the one that is used.
+        # By file stem; the last one is used for validation and as the result.
         self.models = {"model": model} | ({"ema": self.ema.model} if self.ema else {})
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self.wrapped = world.wrap(model)
@@ -57,9 +57,9 @@ class Trainer:
         self.elapsed = 0.0  # seconds of training, resumed parts included
         self._collapsed = False
         self._best = -math.inf  # PSNR of the best validation
-        self._unread: dict[str, str] = {}  # reasons by uid, of objects to validate on
-        self._named: set[str] = set()  # uids whose failure was said
-        self._saved = self._validated = -1  # the step of the last checkpoint and validation
+        self._unread: dict[str, str] = {}  # reasons by uid, of validation objects
+        self._named: set[str] = set()  # uids whose failure was reported
+        self._saved = self._validated = -1  # step of the last checkpoint and validation
         self.steps_per_epoch = len(data.objects) / (data.batch_size * world.size * self.accumulate)
         self.schedule = self._schedule(config.length)
         self.total = total = self.schedule.total
@@ -83,14 +83,14 @@ class Trainer:
         return self._unread | self._batches.failures
 
     def _name_failures(self) -> None:
-        """Warns of each object that could not be read, once."""
+        """Warn once of each object that could not be read."""
         for uid in [uid for uid in self.failures if uid not in self._named]:
             self._named.add(uid)
             if self.log is not None:
                 self.log.warn(self.step, f"{uid} is skipped: {self.failures[uid]}")
 
     def novel_views(self, step: int) -> int:
-        """Returns V, the number of novel views at a step."""
+        """Return V, the number of novel views at a step."""
         views = self.config.views
         if self.data.novel is not None:
             return self.data.novel
@@ -100,17 +100,17 @@ class Trainer:
     def _weights(self, validates: bool = False) -> dict[str, float]:
         epochs = self.step / self.steps_per_epoch
         done = self.schedule.progress(self.step, self.elapsed)
-        return term_weights(self.config.loss, Moment(self.step, epochs, done, validates))
+        return term_weights(self.config.loss, Progress(self.step, epochs, done, validates))
 
     def train_step(self) -> dict[str, float]:
-        """Makes one optimizer step; returns its figures, some of them those of its last batch.
+        """Make one optimizer step; return its figures, some of them of the last batch only.
 
-        With several processes, losses and the model's health are the means over all of them.
+        With several processes, losses and the model's health are means over all of them.
 
-        A step whose loss or gradient is not finite leaves the weights alone and is counted.
+        A step with a non-finite loss or gradient leaves the weights unchanged and is counted.
 
         Raises:
-            UserError: there are too many such steps in a row, or data cannot be read.
+            UserError: too many such steps in a row, or data cannot be read.
         """
         started = time.perf_counter()
         config, batches, first = self.config, self._batches, self.step * self.accumulate
@@ -128,7 +128,7 @@ class Trainer:
         )
         loss, norm = torch.stack([made.loss, made.norm]).tolist()
         bad = not (math.isfinite(loss) and math.isfinite(norm))
-        number, total = self.world.total(bad, loss)  # so that all processes do alike
+        number, total = self.world.total(bad, loss)  # all processes must act alike
         self._apply(number > 0, "gradient" if math.isfinite(total) else "loss")
         loss = total / self.world.size
         seconds = time.perf_counter() - started
@@ -138,13 +138,13 @@ class Trainer:
         figures["views_per_second"] = views / seconds
         if self.step % config.run.log_every == 0:
             terms = made.result.terms.items()
-            own = {f"loss_{name}": term.mean().item() for name, term in terms}
-            known = health(made.result, made.batch).items()
-            figures |= self.world.mean(own | {name: value.item() for name, value in known})
+            losses = {f"loss_{name}": term.mean().item() for name, term in terms}
+            state = health(made.result, made.batch).items()
+            figures |= self.world.mean(losses | {name: value.item() for name, value in state})
         return figures
 
     def _apply(self, bad: bool, what: str) -> None:
-        """Updates the weights, or skips the step because of ``what``, and counts the step."""
+        """Update the weights, or skip the step because its ``what`` is not finite; count it."""
         self.step += 1
         if not bad:
             self.skipped_in_row = 0
@@ -163,7 +163,7 @@ class Trainer:
             )
 
     def run(self) -> int:
-        """Trains until the end, the time limit or a signal, and then saves a checkpoint.
+        """Train until the end, the time limit or a signal, then save a checkpoint.
 
         Returns:
             0, or 128 + the number of the signal that stopped the run.
@@ -202,7 +202,7 @@ class Trainer:
         return 0
 
     def _save_model(self, path: Path) -> None:
-        """Writes the weights that are used, and beside them what they must not be judged by."""
+        """Write the result's weights, with a card if scanned objects must not judge them."""
         from gamba_warp.pages.card import ModelCard, card_path
 
         save_model(path, [*self.models.values()][-1])
@@ -248,12 +248,12 @@ class Trainer:
             self.save()
 
     def _validate(self) -> None:
-        """Validates the averaged weights on the main process; the others wait."""
+        """Validate the averaged weights on the main process; the others wait."""
         if self._validated == self.step or not self.config.run.val_every:
             return
         self._validated = self.step
 
-        def alone() -> None:
+        def validate_all() -> None:
             if self.log is None or not self.data.held_out:
                 return
             objective = Objective(self._weights(validates=True), self.lpips)
@@ -267,19 +267,19 @@ class Trainer:
                     continue
                 psnr.append(figures.get("psnr_novel", figures["psnr_input"]))
                 rows += pictures
-            if len(psnr) == len(self.data.held_out):  # others could not be compared with these
+            if len(psnr) == len(self.data.held_out):  # else not comparable with earlier ones
                 self._keep_best(sum(psnr) / len(psnr))
             if rows:
                 path = self.config.run.out / "samples" / f"step_{self.step:06d}.png"
                 self.log.sample(self.step, path, rows)
                 self.log.page()
 
-        self.world.on_main(alone)
+        self.world.on_main(validate_all)
 
     def _validate_on(
         self, part: HeldOut, objective: Objective
     ) -> tuple[dict[str, float], list[Tensor]]:
-        """Validates on the objects of one dataset, and logs the figures, which it returns."""
+        """Validate on the objects of one dataset; log and return the figures."""
         assert self.log is not None
         best, size = [*self.models.values()][-1], self.config.views.size
         about = (self.data.val_views, best.config, size, self._unread)
@@ -293,18 +293,18 @@ class Trainer:
         return figures, rows
 
     def _keep_best(self, psnr: float) -> None:
-        """Writes ``best.safetensors`` where a validation is better than all that came before.
+        """Write ``best.safetensors`` if a validation is better than all before.
 
         Args:
-            psnr: dB, of novel views (or of inputs, where there are none), the mean over datasets.
+            psnr: dB, of novel views (of inputs without novel ones), the mean over datasets.
         """
         assert self.log is not None
-        if not psnr > self._best:  # nor is one that is not a number
+        if not psnr > self._best:  # also for NaN
             return
         path = self.config.run.out / "best.safetensors"
         try:
             self._save_model(path)
-        except UserError as error:  # a checkpoint may have more luck, and the run goes on
+        except UserError as error:  # the run continues; a later write may succeed
             self.log.warn(self.step, str(error))
             return
         self._best = psnr
@@ -313,7 +313,7 @@ class Trainer:
             say(f"step {self.step}: best so far, mean PSNR of the datasets {psnr:.4g} -> {path}")
 
     def save(self) -> None:
-        """Writes a checkpoint on the main process, once per step; the others wait."""
+        """Write a checkpoint on the main process, once per step; the others wait."""
 
         def write() -> None:
             if self._saved != self.step:
@@ -324,7 +324,7 @@ class Trainer:
         self.world.on_main(write)
 
     def state(self) -> dict:
-        """Returns all that a continued run needs beside the weights: tensors and plain values."""
+        """Return everything a resumed run needs beside the weights: tensors and plain values."""
         return {
             "version": STATE_VERSION,
             "config": self.config.to_dict(),
@@ -343,10 +343,10 @@ class Trainer:
         }
 
     def restore(self, checkpoint: Path) -> str | None:
-        """Continues from a checkpoint, bit-identically on one device.
+        """Continue from a checkpoint, bit-identically on one device.
 
         Returns:
-            A line about the learning rate if the run's length is another one now.
+            A line about the learning rate if the run's length has changed, else None.
 
         Raises:
             UserError: the checkpoint is damaged, or belongs to a run with another configuration,
@@ -361,8 +361,8 @@ class Trainer:
             weights = {n: read_weights_of(files[n], model) for n, model in self.models.items()}
             return state, length, moments, weights
 
-        # Everything is read and checked before any of it is loaded. The processes need no disk in
-        # common: the main one reads.
+        # Everything is read and checked before anything is loaded. Only the main process reads, so
+        # no shared disk is needed.
         state, length, moments, weights = self.world.on_main(read)
         old = replace(self._schedule(length), since=state.new_length)
         for name, model in self.models.items():

@@ -1,4 +1,4 @@
-"""AdamW, the running average of the weights, and the schedules of a run."""
+"""AdamW, the exponential moving average of the weights, and the schedules of a run."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from gamba_warp.model.gamba import Gamba
 
 from .config import OptimConfig
 
-# A learning rate under this share of what a run of the new length has at that step is no rate to
-# go on with; it rises over this share of what is left.
+# After a change of length, a learning rate below the share _LOW of the new schedule's first rises
+# over the share _RISE of the remaining steps.
 _LOW, _RISE = 0.1, 0.1
 
 
 def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.optim.AdamW:
-    """Makes AdamW with weight decay on the matrices that are not flagged ``_no_weight_decay``.
+    """Make AdamW with weight decay on the matrices that are not flagged ``_no_weight_decay``.
 
     The loop sets the learning rate before each step.
     """
@@ -41,19 +41,19 @@ def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.op
 def checked_moments(
     optimizer: torch.optim.AdamW, stored: dict[str, Any], source: Path
 ) -> dict[str, Any]:
-    """Checks what an optimizer's ``state_dict`` gave a file against the optimizer itself.
+    """Check the stored ``state_dict`` of an optimizer against the optimizer itself.
 
     Args:
-        optimizer: of the model that goes on.
-        stored: the file's ``state_dict``. Its settings are not taken: they follow from the run's
+        optimizer: of the resumed model.
+        stored: the file's ``state_dict``. Its settings are ignored: they follow from the run's
             configuration, which must be the same.
-        source: the file, for the error's message.
+        source: the file, for the error message.
 
     Returns:
-        What ``optimizer.load_state_dict`` takes.
+        A state for ``optimizer.load_state_dict``.
 
     Raises:
-        UserError: a moment is unknown, of another shape or kind, or not finite.
+        UserError: a moment is unknown, of the wrong shape or type, or not finite.
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     moments = stored.get("state")
@@ -69,7 +69,7 @@ def checked_moments(
             for name, value in entry.items():
                 wanted = torch.Size() if name == "step" else parameters[index].shape
                 if not isinstance(value, Tensor) or value.dtype != torch.float32:
-                    raise ValueError(f"{name} of parameter {index} is no float32 tensor")
+                    raise ValueError(f"{name} of parameter {index} is not a float32 tensor")
                 if value.shape != wanted:
                     raise ValueError(f"{name} of parameter {index} is {tuple(value.shape)}")
                 if not value.isfinite().all() or (name != "exp_avg" and bool((value < 0).any())):
@@ -80,7 +80,7 @@ def checked_moments(
 
 
 class Ema:
-    """A copy of the model whose weights are an exponential average of the trained ones.
+    """Copy of the model whose weights are an exponential moving average of the trained ones.
 
     Attributes:
         model: the copy, in eval mode; a frozen encoder is shared, not copied.
@@ -99,7 +99,7 @@ class Ema:
 
     @torch.no_grad()
     def update(self) -> None:
-        """Moves the average towards the model's present weights."""
+        """Move the average towards the model's current weights."""
         averages, weights = map(list, zip(*self._pairs))
         move = get_ema_multi_avg_fn(ema_decay(self.updates, self.decay))
         move(averages, weights, None)
@@ -107,7 +107,7 @@ class Ema:
 
 
 def novel_views(progress: float, first: int, last: int) -> int:
-    """Returns the novel views per object, which grow evenly over the run (paper: 2 to 6).
+    """Return the number of novel views per object, which grows evenly over the run (paper: 2 to 6).
 
     Args:
         progress: share of the run that is done, 0 to 1.
@@ -120,19 +120,19 @@ def novel_views(progress: float, first: int, last: int) -> int:
 
 
 def ema_decay(updates: int, decay: float) -> float:
-    """Returns the running average's decay after ``updates`` updates; it grows up to ``decay``."""
+    """Return the moving average's decay after ``updates`` updates; it grows up to ``decay``."""
     return min(decay, (1 + updates) / (10 + updates))
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewLength:
-    """When a run was last resumed with another length, and what its learning rate was then.
+    """State of a run when it was last resumed with another length.
 
     Attributes:
         step: optimizer steps done; 0 if the length never changed.
         elapsed: seconds of training done.
-        share: the learning rate, in shares of its peak.
-        rises: whether the rate first goes to that of the new length's own schedule.
+        share: the learning rate then, as a share of its peak.
+        rises: True if the rate first moves to the new length's own schedule.
     """
 
     step: Annotated[int, Meta(ge=0, le=10**12)] = 0
@@ -143,13 +143,13 @@ class NewLength:
 
 @dataclass(frozen=True)
 class Schedule:
-    """The learning rate over a run, which goes on without a jump where the run's length changes.
+    """Learning rate over a run; continuous even if the run's length changes.
 
     Attributes:
         optim: the options.
-        total: optimizer steps of the run, or None where only ``minutes`` limit it.
+        total: optimizer steps of the run, or None if only ``minutes`` limit it.
         minutes: training time of the run, if it is limited.
-        since: where the length last changed.
+        since: last change of the length.
     """
 
     optim: OptimConfig
@@ -158,21 +158,21 @@ class Schedule:
     since: NewLength = NewLength()
 
     def progress(self, step: int, elapsed: float) -> float:
-        """Returns the share of the run that is done, 0 to 1, by steps or else by the clock."""
+        """Return the share of the run that is done, 0 to 1, by steps or else by the clock."""
         if self.total is not None:
             return min(1.0, step / self.total)
         assert self.minutes is not None  # a run without steps and epochs has minutes
         return min(1.0, elapsed / (60 * self.minutes))
 
     def share(self, step: int, elapsed: float) -> float:
-        """Returns the learning rate of the next step, in shares of its peak.
+        """Return the learning rate of the next step, as a share of its peak.
 
         Args:
             step: optimizer steps done.
             elapsed: seconds of training done.
         """
         total, began = self.total, float(self.since.step)
-        if total is None:  # it follows from the speed so far
+        if total is None:  # estimated from the speed so far
             total = step / max(self.progress(step, elapsed), 1e-6)
             total = max(total, self.optim.warmup_steps + 1)
             began = self.since.elapsed * step / max(elapsed, 1e-9)
@@ -180,7 +180,7 @@ class Schedule:
             return self._planned(step, total)
         if total <= began:
             return self.since.share
-        if not self.since.rises:  # the rest of the fall, from there to 0 at the new end
+        if not self.since.rises:  # the rest of the fall, to 0 at the new end
             share, left = self.since.share, (total - step) / (total - began)
             if self.optim.schedule == "trapezoid":
                 falls = min(self.optim.decay_share * total, total - began)
@@ -191,7 +191,7 @@ class Schedule:
         return self.since.share + rise * (self._planned(step, total) - self.since.share)
 
     def _planned(self, step: float, total: float) -> float:
-        """The rate of a run whose length never changed."""
+        """Rate of a run whose length never changed."""
         warmup = self.optim.warmup_steps
         if self.total is not None:
             warmup = min(warmup, 0.1 * total)
@@ -202,7 +202,7 @@ class Schedule:
         return _half_cosine((step - warmup) / max(1e-12, total - warmup))
 
     def after(self, old: Schedule, step: int, elapsed: float) -> tuple[Schedule, str | None]:
-        """Goes on where a run of perhaps another length stands.
+        """Continue a run, possibly of another length.
 
         Args:
             old: the schedule so far.
@@ -210,7 +210,7 @@ class Schedule:
             elapsed: seconds of training done.
 
         Returns:
-            The schedule from here, and a line about it if the length changed.
+            The schedule from here on, and a line about it if the length changed.
         """
         if (self.total, self.total or self.minutes) == (old.total, old.total or old.minutes):
             return replace(self, since=old.since), None
@@ -223,9 +223,9 @@ class Schedule:
             f"the run's length is now {self}, not {old}: the learning rate goes on from {rates[0]}"
         )
         if rises:
-            text += f", goes to {rates[1]}, the new length's own, in a tenth of what is left,"
+            text += f", goes to {rates[1]}, the new length's own, in a tenth of the rest,"
         text = f"{text} and falls to 0 at the end"
-        over = self.progress(step, elapsed) >= 1  # then there is nothing to say
+        over = self.progress(step, elapsed) >= 1  # the run is over: no message
         return replace(self, since=since), None if over else text
 
     def __str__(self) -> str:

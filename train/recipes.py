@@ -1,7 +1,7 @@
-"""Recipes of ``gamba train --recipe``: options that belong together, each with where it is from.
+"""Recipes of ``gamba train --recipe``: sets of options, each with its source.
 
-A recipe's options stand before all others on the command line, so that a given option wins. This
-module imports nothing that is slow.
+A recipe's options precede all others on the command line, so that a given option overrides them.
+This module avoids slow imports.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from .config import RecipeName
 
 
 class Recipe(NamedTuple):
-    """A recipe.
+    """Recipe of training options.
 
     Attributes:
-        about: what it is for, one line.
-        settings: its options, in the order of the command line; and what states them: a line of the
+        about: its purpose, one line.
+        settings: its options, in the order of the command line, with their sources: a line of the
             paper, or the reason of a choice.
-        batch: objects of a step, of all processes and accumulated batches together; None: the
-            settings have a batch of each process.
+        batch: objects of a step, over all processes and accumulated batches; None if the settings
+            give the batch of each process.
     """
 
     about: str
@@ -81,23 +81,23 @@ BATCH_SOURCE = '§4.1: "a batch size of 256"'
 
 
 def recipe_words(name: str, arguments: Sequence[str], environment: Mapping[str, str]) -> list[str]:
-    """The options of a recipe.
+    """Options of a recipe.
 
     Args:
         name: one of ``RECIPES``.
-        arguments: of the same command, the recipe's name left out: they may have ``--accumulate``
-            and ``--batch-size``, which the size of a process's batch follows from.
-        environment: of this process; torchrun says in ``WORLD_SIZE`` how many processes there are.
+        arguments: of the same command, without the recipe's name; ``--accumulate`` and
+            ``--batch-size`` among them determine the batch of a process.
+        environment: of this process; torchrun sets ``WORLD_SIZE`` to the number of processes.
 
     Returns:
-        Words of the command line, that of ``--recipe`` itself included.
+        Words of the command line, including ``--recipe`` itself.
 
     Raises:
-        UserError: there is no such recipe, or its batch does not divide by the processes and
+        UserError: the recipe is unknown, or its batch does not divide by the processes and
             accumulated batches.
     """
-    recipe, given = _named(name), {}
-    for word, following in zip(arguments, [*arguments[1:], ""]):  # the last of a name counts
+    recipe, given = _recipe_of(name), {}
+    for word, following in zip(arguments, [*arguments[1:], ""]):  # the last of each name counts
         key, equals, value = word.partition("=")
         given[key.replace("_", "-")] = value if equals else following
     words = ["--recipe", name, *(word for text in recipe.settings for word in shlex.split(text))]
@@ -116,7 +116,7 @@ def recipe_words(name: str, arguments: Sequence[str], environment: Mapping[str, 
     return [*words, option("batch_size"), str(share)]
 
 
-def _named(name: str) -> Recipe:
+def _recipe_of(name: str) -> Recipe:
     found = {str(known): recipe for known, recipe in RECIPES.items()}
     if name not in found:
         raise UserError(f"--recipe {name[:40]}: expected one of {', '.join(found)}")
@@ -124,12 +124,12 @@ def _named(name: str) -> Recipe:
 
 
 def table_of(name: str) -> str:
-    """What a recipe sets, a line an option, each with its source; for people.
+    """Readable table of a recipe's options, one per line with its source.
 
     Raises:
-        UserError: there is no such recipe.
+        UserError: the recipe is unknown.
     """
-    recipe = _named(name)
+    recipe = _recipe_of(name)
     rows = dict(recipe.settings)
     if recipe.batch is not None:
         rows[f"--batch-size {recipe.batch} / (processes x accumulate)"] = BATCH_SOURCE
@@ -139,6 +139,6 @@ def table_of(name: str) -> str:
 
 
 def announce(words: Sequence[str], environment: Mapping[str, str] = os.environ) -> None:
-    """Prints what a recipe comes to, once for all processes of torchrun."""
+    """Print the options of a recipe, once for all processes of torchrun."""
     if environment.get("RANK", "0") == "0":
         print(f"recipe {words[1]}: {shlex.join(words[2:])}")

@@ -1,4 +1,4 @@
-"""One run of ``gamba train``, from the options to the exit code."""
+"""A run of ``gamba train``, from the options to the exit code."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _PICTURES = 16  # objects whose first picture is compared between processes
 
 
 def train(config: TrainConfig, world: World) -> int:
-    """Trains as configured on this process's device.
+    """Train as configured on this process's device.
 
     Args:
         config: the options.
@@ -50,11 +50,11 @@ def train(config: TrainConfig, world: World) -> int:
         0; 1 if some objects could not be read; 128 + n if signal n stopped it (resumable).
 
     Raises:
-        UserError: bad data, options or run folder, or the processes do not have the same.
+        UserError: invalid data, options or run folder, or they differ between processes.
     """
     run, notes, started = config.run, [], ""
     log = None
-    there = run.out.is_dir()  # one that is not there is made only when nothing is bad
+    there = run.out.is_dir()  # a missing folder is made only after all checks
     with contextlib.ExitStack() as held:
 
         def claim() -> Path | None:
@@ -67,11 +67,11 @@ def train(config: TrainConfig, world: World) -> int:
             data = open_data(config, world.device)
             lpips, warning = open_lpips(config, world.device.type)
         world.agree(lambda: _facts(config, data, world, lpips is not None))
-        checkpoint = world.on_main(claim)  # the others go by what it finds
+        checkpoint = world.on_main(claim)  # the others use its result
         _refuse_newer(world, run.out if run.resume == "auto" else None, checkpoint)
         torch.manual_seed(run.seed)
-        # TF32 where there is a GPU; no effect on a CPU. It is meant for the network's products,
-        # forward and backward; geometry makes none (cameras.exact_product), SSIM's keep all digits.
+        # TF32 on a GPU; no effect on a CPU. It applies to the network's products, forward and
+        # backward; geometry has none (cameras.exact_product), and SSIM's keep full precision.
         torch.set_float32_matmul_precision("high")
         with world.together():
             model = Gamba(config.model_config(), run.encoder_weights)
@@ -80,7 +80,7 @@ def train(config: TrainConfig, world: World) -> int:
                 path = find_initial(run.init, notes.append)
                 load_weights(path, model)
                 differing = initial_differences(path, config, data.fingerprint)
-                whose = "; of what run they are is not known"
+                whose = "; their run is not known"
                 if differing is not None:
                     others = f"other {', '.join(differing[:20])}"
                     whose = f", of a run with {others if differing else 'the same options'}"
@@ -90,14 +90,14 @@ def train(config: TrainConfig, world: World) -> int:
                 lpips.to(world.device)
         trainer = Trainer(config, model, data, world, lpips)
         changed = None if checkpoint is None else trainer.restore(checkpoint)
-        with world.together():  # the run is accepted: from here on it writes
+        with world.together():  # all checks have passed: from here on files are written
             if world.main:
                 output_folder(run.out / "samples")
                 if not there:
                     held.enter_context(only_process(run.out, "trains"))
                     if list_checkpoints(run.out):
                         raise UserError(
-                            f"{run.out}: another process trained here meanwhile; start again"
+                            f"{run.out}: another process has trained here meanwhile; start again"
                         )
                 for folder in (run.out, run.out / "samples", run.out / "checkpoints"):
                     sweep(folder, age=0)
@@ -109,7 +109,7 @@ def train(config: TrainConfig, world: World) -> int:
             if started:
                 say(started)
         code = trainer.run()
-        failures = {uid: why for own in world.gather(trainer.failures) for uid, why in own.items()}
+        failures = {u: why for each in world.gather(trainer.failures) for u, why in each.items()}
         if log is not None:
             _report(trainer, log, code, failures)
         return code or int(bool(failures))
@@ -118,9 +118,9 @@ def train(config: TrainConfig, world: World) -> int:
 def _facts(
     config: TrainConfig, data: TrainingData, world: World, lpips: bool
 ) -> Mapping[str, dict[str, object]]:
-    """What all processes must have in common, see ``World.agree``.
+    """Facts that all processes must have in common, see ``World.agree``.
 
-    Of the data: a hash by object, of its cameras and, of some objects, of the first picture.
+    For the data: a hash per object of its cameras and, for some objects, of the first picture.
     """
     chosen, contents = sorted(set(data.objects)), {}
     read = evenly(chosen, _PICTURES)
@@ -131,7 +131,7 @@ def _facts(
         for numbers in (files.camera_to_world, files.Ks):
             digest.update(numbers.tobytes())
         if index in read:
-            with contextlib.suppress(*EXPECTED):  # the training says so where it matters
+            with contextlib.suppress(*EXPECTED):  # the training reports it when it matters
                 digest.update(data.train.load(index, [0], depths=0).images.numpy().tobytes())
         contents[data.train.uids[index]] = digest.hexdigest()[:16]
     known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
@@ -143,9 +143,9 @@ def _facts(
 
 
 def _refuse_newer(world: World, out: Path | None, checkpoint: Path | None) -> None:
-    """Refuses to go back where another process sees a newer checkpoint than the main one.
+    """Raise if another process sees a newer checkpoint than the main one.
 
-    Without a shared disk this is so when the processes are counted in another order than before.
+    Without a shared disk this happens if the processes are ranked in another order than before.
     """
     taken = -1 if checkpoint is None else step_of(checkpoint)
     seen = world.gather((socket.gethostname(), list_checkpoints(out) if out else []))
@@ -161,7 +161,7 @@ def _refuse_newer(world: World, out: Path | None, checkpoint: Path | None) -> No
 
 
 def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: list[str]) -> None:
-    """Says at the beginning what is trained on what, and what is missing."""
+    """Report the setup of the run at its beginning."""
     config, data = trainer.config, trainer.data
     values = config.to_dict()
     write_json(config.run.out / "config.json", values)
@@ -188,7 +188,7 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
 
 
 def _report(trainer: Trainer, log: RunLog, code: int, failures: dict[str, str]) -> None:
-    """Says at the end what went wrong on the way, on any process."""
+    """Report at the end the failures of all processes."""
     memory = {}
     if trainer.world.device.type == "cuda":
         memory = {"device_memory": torch.cuda.max_memory_allocated(trainer.world.device)}

@@ -1,4 +1,4 @@
-"""What is computed on batches: losses, gradients, the model's health, and the validation."""
+"""Computations on batches: losses, gradients, the model's health, and the validation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gamba_warp.render import Rendering, render
 from gamba_warp.vision.lpips import LPIPS
 
 from .data.samples import Batch
-from .objective.losses import Seen, loss_terms, rendered_psnr, total_loss
+from .objective.losses import LossInputs, loss_terms, rendered_psnr, total_loss
 from .objective.radial_mask import NEAR, project_means
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
@@ -29,16 +29,16 @@ STRIP_VIEWS, STRIP_OBJECTS = 6, 4  # views and objects of a validation's sample 
 
 
 class Objective(NamedTuple):
-    """What a batch is compared by.
+    """Objective of the training.
 
     Attributes:
-        weights: those of ``term_weights``; a name that is not there has weight 0, and ``novel``,
-            the weight of each novel view against the input view in all terms that have one value
-            per view, 1.
+        weights: result of ``term_weights``; missing names have weight 0, except ``novel``, the
+            weight of each novel view relative to the input view in all terms with one value per
+            view, which defaults to 1.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
-        lpips_crop: as for ``Seen``.
-        precision: dtype of the products in the network, and of those in LPIPS that bear it; all
-            else is float32.
+        lpips_crop: as for ``LossInputs``.
+        precision: dtype of the products in the network, and of those in LPIPS that tolerate it;
+            everything else is float32.
     """
 
     weights: Mapping[str, float]
@@ -48,8 +48,8 @@ class Objective(NamedTuple):
 
 
 @dataclass
-class Forward:
-    """What ``forward`` returns.
+class StepResult:
+    """Result of ``forward``.
 
     Attributes:
         loss: scalar, with its graph.
@@ -66,20 +66,20 @@ class Forward:
     target: Tensor
 
 
-def forward(model: Callable, batch: Batch, objective: Objective) -> Forward:
-    """Predicts, renders all V+1 views and compares them with the true ones (paper eq. loss_train).
+def forward(model: Callable, batch: Batch, objective: Objective) -> StepResult:
+    """Predict, render all V+1 views and compute the loss (paper eq. loss_train).
 
     Args:
         model: ``Gamba`` or a wrapper of it.
         batch: a batch on the model's device.
-        objective: what it is compared by.
+        objective: loss weights and LPIPS.
     """
     weights, lpips, crop, precision = objective
     with network_products(batch.inputs.device, precision):
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
-    seen = Seen(
+    inputs = LossInputs(
         rendering.rgb,
         rendering.alpha,
         target,
@@ -90,18 +90,18 @@ def forward(model: Callable, batch: Batch, objective: Objective) -> Forward:
         batch.cameras,
         batch.input_cameras,
         batch.surfaces,
-        getattr(getattr(model, "module", model), "config", None),  # DDP has it inside
+        getattr(getattr(model, "module", model), "config", None),  # DDP wraps the model
     )
-    terms = loss_terms(seen, weights)
+    terms = loss_terms(inputs, weights)
     weighted = weigh_views(terms, weights.get("novel", 1.0), target.shape[1])
-    return Forward(total_loss(weighted, weights), terms, gaussians, rendering, target)
+    return StepResult(total_loss(weighted, weights), terms, gaussians, rendering, target)
 
 
 def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str, Tensor]:
-    """Makes the mean of each term over the views a weighted one.
+    """Scale the terms so that their mean over the views is a weighted one.
 
     Args:
-        terms: by name, ``[B, V+1]`` with the input view first; those of other shapes are left.
+        terms: by name, ``[B, V+1]`` with the input view first; other shapes are unchanged.
         novel: weight of each novel view against the input view, >= 0.
         views: V+1.
     """
@@ -109,17 +109,17 @@ def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str,
         return terms
     shares = torch.full((views,), novel)
     shares[0] = 1.0
-    shares *= views / shares.sum()  # the mean that follows divides by the views
+    shares *= views / shares.sum()  # the later mean divides by the number of views
     whole = {name: term for name, term in terms.items() if term.ndim == 2}  # not LPIPS of crops
     return terms | {name: term * shares.to(term) for name, term in whole.items()}
 
 
 class Gradients(NamedTuple):
-    """What ``compute_gradients`` returns beside the gradients themselves.
+    """Result of ``compute_gradients``; the gradients themselves are in the parameters.
 
     Attributes:
         loss: scalar, the mean over the batches, without a graph.
-        norm: scalar, the norm of the gradient before it is clipped.
+        norm: scalar, the norm of the gradient before clipping.
         batch: the last batch.
         result: result of ``forward`` on the last batch.
     """
@@ -127,7 +127,7 @@ class Gradients(NamedTuple):
     loss: Tensor
     norm: Tensor
     batch: Batch
-    result: Forward
+    result: StepResult
 
 
 def compute_gradients(
@@ -139,13 +139,13 @@ def compute_gradients(
     clip: float,
     count: int = 1,
 ) -> Gradients:
-    """Sets the parameters' gradients to those of the mean loss over some batches, and clips them.
+    """Set the parameters' gradients to those of the mean loss over some batches, and clip them.
 
     Several processes exchange their gradients once, with the last batch.
 
     Args:
         model: ``Gamba`` or a wrapper of it.
-        optimizer: the optimizer whose parameters get gradients; it makes no step here.
+        optimizer: the optimizer whose parameters get gradients; no step is made here.
         batches: ``count`` batches on the model's device.
         objective: as for ``forward``.
         clip: largest norm of the gradient.
@@ -167,8 +167,8 @@ def compute_gradients(
 
 
 @torch.no_grad()
-def health(result: Forward, batch: Batch) -> dict[str, Tensor]:
-    """Computes scalars that show a collapse before the loss does.
+def health(result: StepResult, batch: Batch) -> dict[str, Tensor]:
+    """Compute scalars that show a collapse before the loss does.
 
     Returns:
         ``psnr`` of the batch in dB; ``mean_alpha`` of the rendered and ``target_alpha`` of the true
@@ -192,7 +192,7 @@ def health(result: Forward, batch: Batch) -> dict[str, Tensor]:
 
 
 def collapse_reason(figures: Mapping[str, float]) -> str | None:
-    """Says in one line what has collapsed by the figures of ``health``; None while all is well."""
+    """Describe a collapse by the figures of ``health`` in one line; None without one."""
     if figures["target_alpha"] > 0 and figures["mean_alpha"] < 0.1 * figures["target_alpha"]:
         return f"the pictures are almost empty (mean alpha {figures['mean_alpha']:.2g})"
     if figures["visible_share"] < 0.02:
@@ -206,22 +206,21 @@ def collapse_reason(figures: Mapping[str, float]) -> str | None:
 def validate(
     model: Gamba, batches: Iterable[Batch], objective: Objective, device: torch.device
 ) -> tuple[dict[str, float], list[Tensor]]:
-    """Computes the validation's figures, as means over objects in float32.
+    """Compute the validation's figures, as means over objects in float32.
 
     Args:
-        model: the model; it is switched to eval mode, and back.
+        model: the model; switched to eval mode, and back.
         batches: batches of one object each on white, the input view first, from
             ``fixed_batches``.
         objective: as for ``forward``.
         device: the model's device.
 
     Returns:
-        ``loss``, and ``psnr`` (dB), ``ssim``, ``mask_iou`` and, if it is given, ``lpips``, all of
-        whole pictures on white, and ``psnr_black`` and ``psnr_grey`` of them on these (LPIPS there
-        too would nearly triple the time of a validation); each with ``_input`` for the input view
-        and ``_novel`` for the mean over the others, where there are any; pictures under 11x11 have
-        no ``ssim``. And rows ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the
-        first objects.
+        Figures: ``loss``; ``psnr`` (dB), ``ssim``, ``mask_iou`` and, if given, ``lpips`` of whole
+        pictures on white; ``psnr_black`` and ``psnr_grey`` on these backgrounds (LPIPS on them
+        would nearly triple the time). All but ``loss`` end in ``_input`` for the input view and
+        ``_novel`` for the mean over the others, if any; pictures under 11x11 have no ``ssim``.
+        And rows ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the first objects.
     """
     was_training = model.training
     model.eval()
@@ -245,9 +244,9 @@ def validate(
 
 
 def _measures(
-    result: Forward, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
+    result: StepResult, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
 ) -> dict[str, Tensor]:
-    """The measures of a validation's object, each ``[V+1]``."""
+    """Metrics of a validation object, each ``[V+1]``."""
     rgb, alpha, true = result.rendering.rgb[0], result.rendering.alpha[0], batch.targets[0]
     got, want = rgb.clamp(0, 1), result.target[0]
 

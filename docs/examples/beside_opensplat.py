@@ -1,4 +1,4 @@
-"""The rasterizer on a CPU beside OpenSplat's, in turns, forward and with gradients.
+"""Compares the rasterizer on a CPU with OpenSplat's, alternating, forward and with gradients.
 
     git clone https://github.com/pierotofy/OpenSplat
     python docs/examples/beside_opensplat.py OpenSplat
@@ -6,9 +6,9 @@
 OpenSplat's operator for CPUs is one file of C++ over torch, ``rasterizer/gsplat-cpu``. It is
 compiled here with -O3 -march=native against the installed torch (a C++ compiler and ninja are
 needed) and called as OpenSplat calls it: its projection under autograd, its blending as a function
-with its backward. It walks with one thread; torch's operators of its projection take all. It
-culls nothing behind the camera, so all scenes lie in front. The figures of docs/large-scenes.md
-are the output of this script.
+with its backward. The blending uses one thread; torch's operators of its projection use all. It
+does not cull Gaussians behind the camera, so all scenes lie in front. The figures of
+docs/large-scenes.md are the output of this script.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ void release(int64_t lists) { delete[] reinterpret_cast<Lists *>(lists); }
 
 
 def build(checkout: Path) -> Any:
-    """OpenSplat's operator, compiled against this torch. Raises SystemExit without its source."""
+    """Compile OpenSplat's operator against this torch. Raises SystemExit without its source."""
     folder = checkout / "rasterizer" / "gsplat-cpu"
     if not (folder / "gsplat_cpu.cpp").is_file():
         raise SystemExit(f"error: {checkout} is no checkout of OpenSplat: no {folder}")
@@ -117,14 +117,14 @@ def opensplat(peer: Any, g: dict[str, Tensor], viewmat: Tensor, K: Tensor, width
 
 
 def ours(g: dict[str, Tensor], viewmat: Tensor, K: Tensor, width: int, height: int):
-    """Picture ``[H, W, 3]`` and alphas ``[H, W]`` of the rasterizer here."""
+    """Picture ``[H, W, 3]`` and alphas ``[H, W]`` of our rasterizer."""
     options = {"viewmats": viewmat[None], "Ks": K[None], "width": width, "height": height}
     rgb, alphas, _ = rasterization(**g, **options)
     return rgb[0], alphas[0, ..., 0]
 
 
 def milliseconds(run: Callable, g: dict[str, Tensor], view: tuple, gradients: bool) -> float:
-    """One call; with gradients of all leaves where these are asked for."""
+    """Time one call, optionally with gradients of all leaves."""
     with torch.set_grad_enabled(gradients):
         leaves = {name: x.clone().requires_grad_(gradients) for name, x in g.items()}
         start = time.perf_counter()
@@ -135,7 +135,7 @@ def milliseconds(run: Callable, g: dict[str, Tensor], view: tuple, gradients: bo
 
 
 def main() -> None:
-    """Reads the options from the command line."""
+    """Read the options from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("checkout", type=Path, help="a checkout of OpenSplat")
     parser.add_argument("--turns", type=int, default=5)

@@ -1,8 +1,8 @@
-"""A small Mamba language model of characters: trains on Python's own help texts, then writes.
+"""Small Mamba language model of characters, trained on Python's own help texts.
 
-Run ``python docs/examples/char_mamba.py``. The text is ``pydoc_data.topics``, which comes with
-Python (what ``help("if")`` prints). With mamba-ssm installed, and a CUDA device, the same program
-runs on it when the two lines that import from ``gamba_warp.compat`` are changed.
+Run ``python docs/examples/char_mamba.py``. The text is ``pydoc_data.topics`` of Python (the output
+of ``help("if")``). With mamba-ssm installed, and a CUDA device, the same program runs on mamba-ssm
+after a change of the two lines that import from ``gamba_warp.compat``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class CharModel(nn.Module):
         self.head = nn.Linear(width, letters)
 
     def forward(self, letters: Tensor, inference_params: InferenceParams | None = None) -> Tensor:
-        """Maps letters ``[B, L]`` to the next ones' logits ``[B, L, alphabet]``."""
+        """Map letters ``[B, L]`` to the next ones' logits ``[B, L, alphabet]``."""
         hidden = self.embedding(letters)
         for norm, layer in zip(self.norms, self.layers):
             hidden = hidden + layer(norm(hidden), inference_params=inference_params)
@@ -46,7 +46,7 @@ def read_text() -> tuple[Tensor, str]:
 
 
 def train(model: CharModel, text: Tensor, steps: int, batch: int = 16, length: int = 128) -> float:
-    """Trains on random pieces of the text; prints the loss, and returns the last average."""
+    """Train on random pieces of the text; print the loss, and return the last average."""
     optimizer = torch.optim.AdamW(model.parameters(), lr=4e-3, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, total_steps=max(steps, 2))
     average, start = 0.0, time.perf_counter()
@@ -69,7 +69,7 @@ def train(model: CharModel, text: Tensor, steps: int, batch: int = 16, length: i
 
 @torch.no_grad()
 def write(model: CharModel, prompt: Tensor, letters: int, temperature: float = 0.7) -> Tensor:
-    """Goes on from a prompt ``[L]``: all of it at once, then letter by letter from the states."""
+    """Continue a prompt ``[L]``: all of it at once, then letter by letter from the states."""
     model.eval()
     cache = InferenceParams(max_seqlen=len(prompt) + letters, max_batch_size=1)
     given, written = prompt[None], [prompt]
@@ -82,7 +82,7 @@ def write(model: CharModel, prompt: Tensor, letters: int, temperature: float = 0
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Trains, prints what it writes, and returns the last loss."""
+    """Train, print a generated text, and return the last loss."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--letters", type=int, default=400, help="how many to write")

@@ -1,14 +1,14 @@
-"""Compares methods by their files, in one table: how pictures and meshes of any method must look.
+"""Compares methods by their files in one table, with the expected form of pictures and meshes.
 
-Run ``python docs/examples/compare_methods.py --out out/compare`` in a checkout; it takes the
+Run ``python docs/examples/compare_methods.py --out out/compare`` in a checkout; it uses the
 starter set, and ends with the table of ``gamba compare``. The methods:
 
 - **shipped**: the shipped model, evaluated as a model. Its pictures and Gaussians are written too.
-- **retrieval**, **billboard**: two baselines as somebody else's results, folders of pictures named
-  as the true ones are. They have no meshes, and "-" in the table.
+- **retrieval**, **billboard**: two baselines in the form of external results, folders of pictures
+  named like the true ones. They have no meshes, and "-" in the table.
 - **hull**: the convex hull of the *true* shape, in grey. No method can make it from one picture;
-  it stands for a program that is not ours: pictures with cameras of their own
-  (``transforms.json``), and meshes in the frame of the true ones.
+  it stands for an external program: pictures with their own cameras (``transforms.json``), and
+  meshes in the frame of the true ones.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gamba_warp.files import STARTER
 
 
 def gamba(*words: object) -> None:
-    """Runs a command as a user types it; ends the program where it fails."""
+    """Run a command like a user; exit on failure."""
     print("$ gamba", *words)
     name, *arguments = map(str, words)
     if name == "data":
@@ -35,7 +35,7 @@ def gamba(*words: object) -> None:
 
 
 def evaluate_shipped(out: Path, options: argparse.Namespace) -> list[str]:
-    """Evaluates the shipped model's views; returns the names of the objects."""
+    """Evaluate the shipped model's views; return the names of the objects."""
     gamba(
         *("eval-views", "--checkpoint", STARTER / "rays.safetensors", "--out", out / "shipped"),
         *("--save-gaussians", "--save-pictures", *common(options)),
@@ -45,16 +45,16 @@ def evaluate_shipped(out: Path, options: argparse.Namespace) -> list[str]:
 
 
 def common(options: argparse.Namespace) -> list[object]:
-    """The options that all evaluations of views share; else ``gamba compare`` refuses them."""
+    """Options common to all evaluations of views, as required by ``gamba compare``."""
     words: list[object] = ["--data", options.data, "--limit", options.objects]
     words += ["--views", options.views, "--device", "cpu", "--strips", 0, "--sheet", 0]
     return words if options.lpips else [*words, "--no-lpips"]
 
 
 def make_hulls(out: Path, meshes: Path, uids: list[str], cameras: int) -> None:
-    """The fourth method's files: ``meshes/NAME.ply``, and ``pictures/NAME`` with cameras.
+    """Make the fourth method's files: ``meshes/NAME.ply``, and ``pictures/NAME`` with cameras.
 
-    ``data render`` puts its cameras where the dataset's are, for it has the same seed.
+    ``data render`` uses the dataset's cameras, because it has the same seed.
     """
     (out / "meshes").mkdir(parents=True, exist_ok=True)
     for uid in uids:
@@ -68,7 +68,7 @@ def make_hulls(out: Path, meshes: Path, uids: list[str], cameras: int) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Makes the files of all methods, evaluates them and prints the table."""
+    """Make the files of all methods, evaluate them and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("out/compare"))
     parser.add_argument("--data", type=Path, default=STARTER / "data", help="posed views")
@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
         gamba("eval-views", *words, *common(options))
         reports[name] = [place]
 
-    # Shapes: a file for each object, of the names of the true ones.
+    # Shapes: a file for each object, named like the true ones.
     truths = out / "truths"
     truths.mkdir(exist_ok=True)
     for uid in uids:

@@ -3,8 +3,8 @@
     pip install '.[fit]'         # in the checkout
     python docs/examples/fit_photograph.py --out astronaut.png
 
-Everything here is gsplat's interface: with ``gsplat`` for ``gamba_warp.compat.gsplat`` in the two
-imports, and tensors on a GPU, the same script runs on gsplat's CUDA code.
+The script only uses gsplat's interface: with ``gsplat`` instead of ``gamba_warp.compat.gsplat`` in
+the two imports, and tensors on a GPU, it runs on gsplat's CUDA code.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def start(count: int) -> dict[str, torch.nn.Parameter]:
 
 
 def draw(params: dict[str, torch.nn.Parameter], width: int, height: int, absgrad: bool):
-    """The picture from a camera at z = -2, whose longer side sees -1 to 1, and gsplat's info."""
+    """Render from z = -2, where the longer side covers -1 to 1; also return gsplat's info."""
     focal = float(max(width, height))
     viewmat = torch.eye(4)
     viewmat[2, 3] = 2.0
@@ -79,7 +79,7 @@ def strategy_of(name: str, steps: int, most: int):
 
 
 def fit(target: Tensor, name: str = "mcmc", steps: int = 400, count: int = 400, most: int = 1200):
-    """Fits and prints; returns the picture ``[H, W, 3]``, its PSNR and the number of Gaussians."""
+    """Fit and print; return the picture ``[H, W, 3]``, its PSNR and the number of Gaussians."""
     torch.manual_seed(0)
     height, width, _ = target.shape
     params = start(count)
@@ -90,7 +90,7 @@ def fit(target: Tensor, name: str = "mcmc", steps: int = 400, count: int = 400, 
         picture, info = draw(params, width, height, name != "mcmc")
         strategy.step_pre_backward(params, optimizers, state, step, info)
         loss = (picture - target).abs().mean()
-        if name == "mcmc":  # what is not needed fades, and is put where it is needed
+        if name == "mcmc":  # unneeded Gaussians fade and are relocated
             loss = loss + 1e-3 * params["opacities"].sigmoid().mean()
         loss.backward()
         for optimizer in optimizers.values():

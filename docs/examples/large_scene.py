@@ -37,7 +37,7 @@ SIZES = ((512, 512), (1920, 1080))
 
 
 def texture_colors(mesh: TexturedMesh, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Display colours ``[P, 3]`` at places in faces: corner colour times material times texture."""
+    """Display colours ``[P, 3]`` at points of faces: corner colour times material times texture."""
     colors = to_linear((mesh.colors[face][..., :3] / 255.0 * weights[..., None]).sum(1))
     uv = (mesh.uvs[face] * weights[..., None]).sum(1)
     for number, material in enumerate(mesh.materials):
@@ -142,14 +142,14 @@ def frames_a_second(
 
 
 def save_picture(path: Path, rgb: Tensor) -> None:
-    """Writes a picture ``[H, W, 3]`` as PNG."""
+    """Write a picture ``[H, W, 3]`` as PNG."""
     from PIL import Image
 
     Image.fromarray((rgb.clamp(0, 1) * 255).round().byte().numpy()).save(path)
 
 
 def main() -> None:
-    """Reads the options from the command line."""
+    """Read the options from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="meshes, or the .ply that a run has written")
     parser.add_argument("--out", type=Path, help="the .ply to be written")

@@ -1,7 +1,7 @@
-"""Times one Mamba layer beside mambapy's and mamba-ssm's reference formula, on the same weights.
+"""Times one Mamba layer, mambapy's, and mamba-ssm's reference formula, on the same weights.
 
 Run ``python docs/examples/layer_speed.py`` with mambapy installed (``pip install '.[peers]'``). The
-layers take turns, so that other work on the machine meets all of them.
+layers alternate, so that other work on the machine affects all of them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gamba_warp.compat.mamba_ssm import Mamba
 
 
 def reference(layer: Mamba, tokens: Tensor) -> Tensor:
-    """What mamba-ssm computes without its extensions: a loop over the tokens in torch."""
+    """Result of mamba-ssm without its extensions: a loop over the tokens in torch."""
     x, z = layer.in_proj(tokens).mT.chunk(2, dim=1)
     x = torch.nn.functional.silu(layer.conv1d(x)[..., : tokens.shape[1]])
     sizes = [layer.dt_rank, layer.d_state, layer.d_state]
@@ -35,14 +35,14 @@ def reference(layer: Mamba, tokens: Tensor) -> Tensor:
 
 
 def twin(layer: Mamba, width: int) -> MambaBlock:
-    """Makes mambapy's block with the layer's weights."""
+    """Make mambapy's block with the layer's weights."""
     block = MambaBlock(MambaConfig(d_model=width, n_layers=1))
     block.load_state_dict(layer.state_dict())
     return block
 
 
 def compare(width: int, length: int, turns: int) -> None:
-    """Prints medians in milliseconds, and how far the others' outputs and gradients are."""
+    """Print medians in milliseconds, and the differences of outputs and gradients."""
     torch.manual_seed(0)
     layer = Mamba(width)
     block = twin(layer, width)
@@ -82,7 +82,7 @@ def compare(width: int, length: int, turns: int) -> None:
 
 
 def main() -> None:
-    """Reads the sizes from the command line."""
+    """Read the sizes from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--widths", type=int, nargs="+", default=[256, 768])
     parser.add_argument("--length", type=int, default=1024)

@@ -1,4 +1,4 @@
-"""What a texture is worth: meshes of one object, rendered flat, beside the Gaussians themselves.
+"""Effect of a texture: meshes of one object, rendered flat, compared with the Gaussians.
 
 python docs/examples/mesh_quality.py out/photo.ply
 python docs/examples/mesh_quality.py              # a ball with stripes, finer than any model makes
@@ -44,7 +44,7 @@ def striped_ball(count=30_000, stripes=30):
 
 
 def shade(surface: Surface, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Colours ``[P, 3]`` of places in faces: of the texture between texels, or of the corners."""
+    """Colours ``[P, 3]`` of points of faces: of the texture between texels, or of the corners."""
     if surface.texture is None:
         assert surface.colors is not None
         return (surface.colors[surface.faces[face]] * weights[..., None]).sum(1)
@@ -82,7 +82,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def main() -> None:
-    """Prints a row for each mesh."""
+    """Print a row for each mesh."""
     gaussians = read_gaussians(sys.argv[1]) if len(sys.argv) > 1 else striped_ball()
     gaussians = gaussians.in_unit(*unit_frame(gaussians))
     cameras = sphere_cameras(VIEWS, 0.9, PIXELS)

@@ -1,10 +1,10 @@
-"""What one object costs in a training step: operations, kept memory, and what the weights take.
+"""Cost of one object in a training step: operations, kept memory, and memory of the weights.
 
     python docs/examples/step_cost.py paper
 
 Products and convolutions are counted by torch while the network runs once with one block and once
-with two; all else follows, since blocks are alike. The image encoder is a stand-in of the same
-shape. It needs no GPU, and says nothing of time.
+with two; the rest follows, since blocks are alike. The image encoder is a stand-in of the same
+shape. No GPU is needed, and time is not measured.
 """
 
 import argparse
@@ -21,7 +21,7 @@ _BYTES = {"weights": 4, "gradients": 4, "AdamW's moments": 8, "running average":
 
 
 class StandIn(torch.nn.Module):
-    """Tokens of an image encoder's shape; frozen, as it is in the presets."""
+    """Tokens of an image encoder's shape; frozen, as in the presets."""
 
     frozen = True
 
@@ -65,7 +65,7 @@ def measure(config: GambaConfig, depth: int, recompute: bool) -> list[float]:
 
 
 def main() -> None:
-    """Prints the table of one preset."""
+    """Print the table of one preset."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("preset", choices=sorted(PRESETS))
     config = PRESETS[parser.parse_args().preset]

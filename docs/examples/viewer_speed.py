@@ -2,9 +2,9 @@
 
     python docs/examples/viewer_speed.py 4096 16384
 
-Each object is a bumpy ball that its Gaussians cover about three times. It is turned for some
-seconds until the viewer has found what this machine can do, then for some more, which are measured.
-Needs playwright (in the extra test) and an installed Chromium.
+Each object is a bumpy ball covered about three times by its Gaussians. It is turned for some
+seconds until the viewer has adapted to the machine, then for some more, which are measured. Needs
+playwright (in the extra test) and an installed Chromium.
 """
 
 import argparse
@@ -57,7 +57,7 @@ def ball(n: int) -> Gaussians:
 
 
 def measure(browser, n: int, folder: Path, seconds: float) -> None:
-    """Prints one line about ``n`` Gaussians."""
+    """Print one line about ``n`` Gaussians."""
     path = folder / f"{n}.html"
     write_viewer(path, "Ball", ball(n), camera=(1.5, 49.1, 0.0))
     page = browser.new_page(viewport={"width": 1280, "height": 720})
@@ -81,7 +81,7 @@ def measure(browser, n: int, folder: Path, seconds: float) -> None:
 
 
 def main() -> None:
-    """Measures each number of Gaussians that was asked for."""
+    """Measure each requested number of Gaussians."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("numbers", type=int, nargs="+")
     parser.add_argument("--seconds", type=float, default=4.0)

@@ -4,7 +4,7 @@
     PYTHONPATH=docs python -m lab.scanned FOLDER --checkpoint MODEL --page none
 
 It renders the meshes at 128² (nine views each, the first from the front), and compares five of them
-and the shapes, as the page says. Views that are there already are kept.
+and the shapes, as described on the page. Existing views are kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .figures.parts import with_parts
 
 PAGE = Path(__file__).parents[1] / "scanned.md"
 SHAPES = {"chamfer": ("Chamfer", 4), "normal_consistency": ("normals", 3), "iou": ("Volume IoU", 3)}
-_SKIPPED = ("retrieval",)  # of the same set, so it says nothing here
+_SKIPPED = ("retrieval",)  # of the same set, so meaningless here
 
 
 def main(
@@ -44,13 +44,13 @@ def main(
 
     Args:
         folder: of the meshes, named by object.
-        data: their views, where they are rendered already.
-        out: folder of what is made.
+        data: their views, if already rendered.
+        out: folder of the results.
         checkpoint: the model.
-        limit: only so many objects, evenly spaced by name.
-        lpips: LPIPS too, most of the time.
-        up: the axis that points up in the files; auto goes by their format.
-        page: whose tables are written; none only prints them.
+        limit: number of objects, evenly spaced by name.
+        lpips: also compute LPIPS, which takes most of the time.
+        up: the axis that points up in the files; auto depends on their format.
+        page: the page to update; none only prints the tables.
 
     Returns:
         0, or the exit code of an evaluation in which objects failed.
@@ -78,7 +78,7 @@ def main(
 
 
 def _run(command: str, *words: object) -> int:
-    """Runs a command; objects that fail are told there and are no error here."""
+    """Run a command, which reports failed objects; these are not an error here."""
     code = cli.run(command, [*map(str, words)])
     if code not in (0, 1):
         raise UserError(f"gamba {command}: ended with exit code {code}")
@@ -86,7 +86,7 @@ def _run(command: str, *words: object) -> int:
 
 
 def figures(views: dict[str, Any], shapes: dict[str, Any]) -> str:
-    """The table of means: the model and the baselines in new views, the model's shapes beside.
+    """Table of means: new views of the model and the baselines, and the model's shapes.
 
     Args:
         views: report of eval-views.
@@ -111,7 +111,7 @@ def figures(views: dict[str, Any], shapes: dict[str, Any]) -> str:
 
 
 def objects(views: dict[str, Any], shapes: dict[str, Any]) -> str:
-    """The table of all objects from best to worst, by the PSNR of new views.
+    """Table of all objects from best to worst, by the PSNR of new views.
 
     Args:
         views: report of eval-views.

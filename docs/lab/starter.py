@@ -1,10 +1,10 @@
 """Makes the starter set in ``starter/``: forty of the furniture models, small enough to ship.
 
 ``gamba data furniture --out FURNITURE``, then
-``PYTHONPATH=docs python -m lab.starter FURNITURE --out starter``. The same call makes the same
-files again, but the set in the repository is older: its cameras are others. The split is that of
-the whole furniture set (by group, see ``gamba_warp.data.dataset``), so nothing that is held out
-here is trained on there. The repository keeps ``data/`` as one file, which ``make setup`` unpacks:
+``PYTHONPATH=docs python -m lab.starter FURNITURE --out starter``. The same call gives the same
+files, but the set in the repository is older, with other cameras. The split is that of the whole
+furniture set (by group, see ``gamba_warp.data.dataset``), so held-out objects here are not training
+objects there. The repository stores ``data/`` as one file, which ``make setup`` unpacks:
 ``cd starter; tar --sort=name --mtime=@0 --owner=0 --group=0 -cf data.tar data``.
 """
 
@@ -42,7 +42,7 @@ blendswap-cc-0-cuckooclock scopia-cat scopia-futon scopia-jacuzzi
 blendswap-cc-0-horse2 blendswap-cc-0-teddybear scopia-dog-house scopia-toaster
 """.split()
 
-# These are single pictures by another renderer, of objects that are in no training split.
+# Single pictures by another renderer, of objects outside the training split.
 ICONS = """
 blendswap-cc-0-horse2 blendswap-cc-0-kitchenaid blendswap-cc-0-teddybear
 blendswap-cc-by-decorativeplant blendswap-cc-by-fordfocus katorlegaz-fire-hydrant
@@ -67,11 +67,11 @@ Licences: [CC BY 3.0](https://creativecommons.org/licenses/by/3.0/),
 
 
 def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
-    """Makes the starter set from the furniture models.
+    """Make the starter set from the furniture models.
 
     Args:
-        furniture: what `gamba data furniture` made.
-        out: the folder to make, afresh.
+        furniture: output folder of `gamba data furniture`.
+        out: the new folder.
     """
     import trimesh
 

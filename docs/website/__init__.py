@@ -1,1 +1,1 @@
-"""What turns the pages of this folder into the site (mkdocs.yml)."""
+"""Conversion of the pages of this folder to the site (mkdocs.yml)."""

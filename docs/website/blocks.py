@@ -1,4 +1,4 @@
-"""The blocks of code in README and pages, and the commands in them, for the tests."""
+"""Code blocks of README and pages, and their commands, for the tests."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _BLOCK = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block.
+    """Fenced block.
 
     Attributes:
         path: the page.
         line: of its first line in the page, from 1.
         kind: its language.
-        text: what is in it.
-        runs: whether a test runs it.
-        small: options to be added when it runs, by command.
+        text: its content.
+        runs: True if a test runs it.
+        small: options to add when it runs, by command.
     """
 
     path: Path
@@ -64,9 +64,9 @@ def blocks(kind: str) -> list[Block]:
 
 
 def commands(block: Block) -> list[list[str]]:
-    """The words of each command of a shell block; comments, pipes and redirections left out.
+    """Words of each command of a shell block, without comments, pipes and redirections.
 
-    Of a loop the first turn is taken.
+    For a loop, those of the first iteration.
     """
     text = block.text.replace("\\\n", " ")
     for name, first in re.findall(r"^for (\w+) in (\S+)", text, re.MULTILINE):

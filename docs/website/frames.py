@@ -2,8 +2,8 @@
 
     python docs/website/frames.py
 
-Everything in it is 3D Gaussians: the object, which the shipped model made of a picture of the
-starter set, the cube, the camera of the picture, and the axes. Only the names are written over it.
+Everything in it is 3D Gaussians: the object, reconstructed by the shipped model from a picture of
+the starter set, the cube, the camera of the picture, and the axes. Only the names are drawn on top.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Line = tuple[tuple[float, ...], tuple[float, ...], tuple[float, float, float]]
 
 
 def main() -> None:
-    """Writes the picture."""
+    """Write the picture."""
     viewmat = orbit(torch.tensor([48.0]), elevation=20.0, distance=3.0)
     viewmat[:, :3, 3] += viewmat[:, :3, :3] @ torch.tensor([0.0, 0.0, 0.45])  # looks between both
     cameras = Cameras(viewmat, intrinsics(SIDE, SIDE, 44.0)[None], SIDE, SIDE)
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def cube() -> list[Line]:
-    """The twelve edges of the object's cube, of side 1 about the origin."""
+    """Twelve edges of the object's cube, of side 1 about the origin."""
     found: list[Line] = []
     for axis in range(3):
         for a in (-0.5, 0.5):
@@ -97,7 +97,7 @@ def lines(segments: list[Line], width: float) -> Gaussians:
 
 
 def joined(*parts: Gaussians) -> Gaussians:
-    """Several sets of Gaussians as one; those without rotations get the one that is none."""
+    """Concatenate sets of Gaussians; those without rotations get the identity."""
     none = torch.tensor([1.0, 0, 0, 0])
     quats = [none.expand(p.num, 4) if p.quats is None else p.quats for p in parts]
     names = ("means", "scales", "opacities", "colors")
@@ -106,7 +106,7 @@ def joined(*parts: Gaussians) -> Gaussians:
 
 
 def write_names(panel: Image.Image, title: str, axes, cameras: Cameras) -> None:
-    """Writes a title, and the axes' names at their ends."""
+    """Write a title, and the axes' names at their ends."""
     draw = ImageDraw.Draw(panel)
     draw.text((14, 10), title, fill="black", font=ImageFont.load_default(20))
     for name, axis, color in zip("xyz", axes, (RED, GREEN, BLUE)):
@@ -119,7 +119,7 @@ def write_names(panel: Image.Image, title: str, axes, cameras: Cameras) -> None:
 
 
 def pixel(point: Tensor, cameras: Cameras) -> tuple[float, float]:
-    """Where a point ``[3]`` is seen, in pixels."""
+    """Project a point ``[3]`` to pixels."""
     t = cameras.viewmats[0, :3, :3] @ point + cameras.viewmats[0, :3, 3]
     u = cameras.Ks[0] @ (t / t[2])
     return u[0].item(), u[1].item()

@@ -28,7 +28,7 @@ _tree: list[tempfile.TemporaryDirectory] = []
 
 @event_priority(100)
 def on_config(config):
-    """Shows mkdocstrings the package as it is once installed: kernels/ is gamba_warp.kernels."""
+    """Show mkdocstrings the installed layout of the package: kernels/ is gamba_warp.kernels."""
     tree = tempfile.TemporaryDirectory(prefix="gamba-warp-site-")
     _tree.append(tree)
     package = Path(tree.name) / "gamba_warp"
@@ -42,7 +42,7 @@ def on_config(config):
 
 
 def on_files(files: Files, config) -> Files:
-    """Adds the pages of files outside docs/ that are linked, directly or through one another."""
+    """Add the pages of files outside docs/ that are linked, directly or indirectly."""
     waiting = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
     notebooks = sorted((ROOT / "docs").rglob("*.ipynb"))
     waiting += [str(path.relative_to(ROOT)) for path in notebooks] + list(ALWAYS)
@@ -63,7 +63,7 @@ def on_files(files: Files, config) -> Files:
 
 
 def on_page_markdown(markdown: str, page, config, files) -> str:
-    """Turns links between files of the repository into links between pages."""
+    """Turn links between files of the repository into links between pages."""
     path = _origin.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     if is_code(path) or path.endswith(".ipynb"):
         return markdown
@@ -71,7 +71,7 @@ def on_page_markdown(markdown: str, page, config, files) -> str:
 
 
 def on_nav(nav, config, files):
-    """Puts pages that mkdocs.yml does not name at the end, so a new page is found at once."""
+    """Put pages that mkdocs.yml does not name at the end, so that a new page is visible."""
     from mkdocs.structure.nav import Section
     from mkdocs.structure.pages import Page
 
@@ -92,13 +92,13 @@ def on_nav(nav, config, files):
 
 
 def on_shutdown():
-    """Removes the folder of links that mkdocstrings read."""
+    """Remove the folder of links for mkdocstrings."""
     while _tree:
         _tree.pop().cleanup()
 
 
 def _content(path: str) -> str | bytes:
-    """What the page of a file outside docs/ says."""
+    """Content of the page of a file outside docs/."""
     if path.endswith(".ipynb"):
         return _notebook(ROOT / path)
     if not is_code(path):
@@ -124,7 +124,7 @@ def _notebook(path: Path) -> str:
 
 
 def _keep_what_is_there(entries: list, files: Files) -> None:
-    """Takes entries out of the navigation whose page is not there (yet)."""
+    """Remove entries without a page from the navigation."""
     for entry in list(entries):
         for value in entry.values() if isinstance(entry, dict) else [entry]:
             if isinstance(value, list):

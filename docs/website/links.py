@@ -1,9 +1,8 @@
-"""Links between the files of the repository, as a page of the site needs them.
+"""Conversion of links between files of the repository to links of the site.
 
-The pages are written for readers of the repository too, so a link names a file relative to the
-file that it stands in: ``../kernels/rasterize/README.md``, ``examples/char_mamba.py``. On the site
-each such file is a page: those of docs/ where they are, other Markdown under ``repository/``, code
-under ``code/``.
+The pages are also read in the repository, so a link is relative to its file:
+``../kernels/rasterize/README.md``, ``examples/char_mamba.py``. On the site each linked file is a
+page: those of docs/ at their path, other Markdown under ``repository/``, code under ``code/``.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ FENCE = re.compile(r"^( *)(```+).*?^\1\2 *$", re.MULTILINE | re.DOTALL)
 
 
 def outside_code(text: str, change: Callable[[str], str]) -> str:
-    """Changes the parts of a Markdown text that are in no fenced block.
+    """Change the parts of a Markdown text outside fenced blocks.
 
     Args:
         text: Markdown.
         change: maps one part to its new text.
 
     Returns:
-        The text with its fenced blocks as they were.
+        The text with unchanged fenced blocks.
     """
     parts, end = [], 0
     for block in FENCE.finditer(text):
@@ -37,7 +36,7 @@ def outside_code(text: str, change: Callable[[str], str]) -> str:
 
 
 def targets(text: str, path: str) -> list[str]:
-    """The files that a Markdown file links to, relative to the repository.
+    """Files linked by a Markdown file, relative to the repository.
 
     Args:
         text: Markdown.
@@ -55,14 +54,14 @@ def targets(text: str, path: str) -> list[str]:
 
 
 def page_of(path: str) -> str:
-    """The place on the site, before it is built, of a file of the repository.
+    """Return the source path on the site of a file of the repository.
 
     Args:
         path: relative to the repository.
 
     Returns:
-        A path relative to docs/: README.md is the first page, what lies in docs/ is where it is,
-        other Markdown is under ``repository/``, and a file that is no Markdown under ``code/``.
+        A path relative to docs/: README.md is the first page, files in docs/ keep their path, other
+        Markdown is under ``repository/``, and all other files under ``code/``.
     """
     if path == "README.md":
         return "index.md"
@@ -77,17 +76,17 @@ def page_of(path: str) -> str:
 
 
 def is_code(path: str) -> bool:
-    """Whether a file is shown as a page with its text: programs, settings, build files."""
+    """True if a file is shown as a page with its text: programs, settings, build files."""
     return Path(path).suffix in (".py", ".sh", ".cfg", ".toml", ".cff", "")
 
 
 def rewritten(text: str, path: str, page: str) -> str:
-    """A Markdown text with its links as the site needs them.
+    """Rewrite the links of a Markdown text for the site.
 
     Args:
         text: Markdown.
         path: the file that holds it, relative to the repository.
-        page: its place on the site (``page_of``).
+        page: its path on the site (``page_of``).
     """
 
     def one(link: re.Match) -> str:

@@ -38,7 +38,7 @@ def front_view(mesh: TexturedMesh, rng: np.random.Generator) -> np.ndarray:
 
 
 def main(path: Path) -> None:
-    """Writes the picture."""
+    """Write the picture."""
     cells = []
     for number in range(COLUMNS * ROWS):
         rng = np.random.default_rng([SEED, number])

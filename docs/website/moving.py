@@ -1,8 +1,8 @@
-"""Draws docs/pictures/turntables.webp: objects that the shipped model was not trained on, turning.
+"""Draws docs/pictures/turntables.webp: turning objects outside the shipped model's training set.
 
     python docs/website/moving.py data/furniture128
 
-Left of each pair is the input, right of it what the shipped model makes of that one picture. The
+Left of each pair is the input, right of it the shipped model's reconstruction of that picture. The
 objects are of the test split, one of a kind, chosen by eye; docs/pictures/held-out.webp has the
 best, the middle and the worst by PSNR.
 """
@@ -25,14 +25,14 @@ OBJECTS = (
 )
 COLUMNS = 3
 SIDE = 200  # pixels of the input and of the turntable
-CROP = 10  # of these, left out at each edge, where nothing is
+CROP = 10  # empty pixels left out at each edge
 FRAMES = 40
-MILLISECONDS = 100  # that a frame stays
+MILLISECONDS = 100  # duration of a frame
 PICTURE = Path(__file__).parents[1] / "pictures" / "turntables.webp"
 
 
 def main(data: Path) -> None:
-    """Writes the picture.
+    """Write the picture.
 
     Args:
         data: made by `gamba data furniture` and `gamba data render`.

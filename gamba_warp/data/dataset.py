@@ -1,8 +1,7 @@
 """Posed views on disk; ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
 
-Layouts are described in ``layouts.py``, packs in ``packs.py``. ``split.json`` in the root names the
-uids of ``train``, ``val`` and ``test``; where a uid is in none, ``split_of`` decides by the hash of
-its name.
+Layouts are described in ``layouts.py``, packs in ``packs.py``. ``split.json`` in the root lists the
+uids of ``train``, ``val`` and ``test``; ``split_of`` places other uids by the hash of the name.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ from ..errors import UserError
 from ..files import write_json
 from ..images import check_size, load_rgba8, open_picture
 from ..untrusted.documents import read_document
-from .layouts import LAYOUTS, ObjectFiles, Stored, find_objects
+from .layouts import LAYOUTS, DecodedPicture, ObjectFiles, find_objects
 from .packs import INDEX, open_pack, read_index, read_packed
 
 SPLITS = ("train", "val", "test")
-SPLIT_VERSION = 2  # of what is written; 1 had fewer objects in one group
+SPLIT_VERSION = 2  # of written files; version 1 had fewer objects in one group
 Item = TypeVar("Item")
-MAX_LOADED = 128 << 20  # pixels of all views of an object that are loaded together: 2 GB
+MAX_LOADED = 128 << 20  # pixels of all loaded views of an object: 2 GB
 
 
 @dataclass
@@ -45,11 +44,11 @@ class ObjectViews:
 
     Attributes:
         uid: the object's name within its dataset.
-        name: name for people.
+        name: readable name.
         images: ``[V, H, W, 4]`` float32 RGBA in [0, 1], colour not premultiplied.
         cameras: V cameras, float32, in object units (the object's bounding cube has side 1).
-        depths: ``[V, H, W]`` float32 along the optical axis, 0 for the background; or None. Of the
-            first views only, where ``load`` was asked for no more.
+        depths: ``[V, H, W]`` float32 along the optical axis, 0 for the background; or None. Fewer
+            than V, of the first views, if ``load`` was called so.
         backs: as ``depths``, of the last surface behind a pixel; or None.
         attribution: creator, licence, source; may be empty.
     """
@@ -64,25 +63,25 @@ class ObjectViews:
 
 
 def evenly(items: Sequence[Item], count: int) -> list[Item]:
-    """Chooses ``count`` items, evenly spaced from the first on; all of them if there are fewer."""
+    """Choose ``count`` items, evenly spaced from the first on; all of them if there are fewer."""
     count = min(count, len(items))
     return [items[k * len(items) // count] for k in range(count)]
 
 
 def split_of(key: str) -> str:
-    """Returns the split (train 80 %, val 10 %, test 10 %) by the hash of a uid or of its group."""
+    """Return the split (train 80 %, val 10 %, test 10 %) by the hash of a uid or of its group."""
     digest = hashlib.sha256(key.encode(errors="surrogatepass")).digest()
     part = int.from_bytes(digest[:8], "big") % 100
     return "train" if part < 80 else "val" if part < 90 else "test"
 
 
 def write_split(folder: str | Path, groups: Mapping[str, str]) -> None:
-    """Writes ``split.json`` into the dataset's root, atomically.
+    """Write ``split.json`` into the dataset's root, atomically.
 
     Args:
         folder: root of the dataset.
-        groups: group by uid. All versions of one thing share a group, so that none is in the test
-            split while its twin is in train. An object on its own has its uid as group.
+        groups: group by uid. All versions of one thing share a group, so that they are in the same
+            split. The group of a single object is its uid.
     """
     parts: dict[str, list[str]] = {name: [] for name in SPLITS}
     for uid in sorted(groups):
@@ -91,7 +90,7 @@ def write_split(folder: str | Path, groups: Mapping[str, str]) -> None:
 
 
 class _Split(msgspec.Struct):
-    """What ``split.json`` holds: the uids of each part; those that are not there do no harm."""
+    """Content of ``split.json``: the uids of each part; unknown ones are ignored."""
 
     version: int | None = None
     train: list[str | int] = []
@@ -100,7 +99,7 @@ class _Split(msgspec.Struct):
 
 
 def _read_split(root: Path) -> tuple[int, dict[str, str]]:
-    """The version of ``split.json``, and what it states of each uid; without the file nothing."""
+    """Read the version and the split by uid of ``split.json``; empty without the file."""
     path = root / "split.json"
     if not path.exists():
         return SPLIT_VERSION, {}
@@ -116,10 +115,10 @@ def _read_split(root: Path) -> tuple[int, dict[str, str]]:
 
 
 def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
-    """The split of each object of a dataset, whose ``split.json`` or index of a pack may state it.
+    """Return the split of each object, by ``split.json`` or the index of a pack, else by hash.
 
     Raises:
-        UserError: that file, or the pack's index, is bad.
+        UserError: that file, or the pack's index, is invalid.
     """
     root = Path(folder)
     if (root / INDEX).exists():
@@ -132,17 +131,17 @@ def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
 def open_dataset(
     folder: str | Path, split: str = "all", layout: str = "auto", cache: bool = False
 ) -> ViewDataset:
-    """Finds the objects under a folder, without decoding anything yet.
+    """Find the objects under a folder, without decoding anything yet.
 
     Args:
         folder: a dataset, a pack of one, or the folder of a single object.
         split: "all", "train", "val" or "test".
         layout: "auto", "transforms", "nerf", "gobjaverse" or "openlrm".
-        cache: whether decoded views are kept in memory, with 8 bits a channel.
+        cache: keep decoded views in memory, with 8 bits a channel.
 
     Raises:
-        UserError: the folder does not exist, holds no objects or none of the split, or its
-            ``split.json`` or the index of the pack is bad.
+        UserError: the folder does not exist, has no objects or none of the split, or its
+            ``split.json`` or the index of the pack is invalid.
     """
     root = Path(folder)
     if split not in ("all", *SPLITS):
@@ -177,13 +176,13 @@ def open_dataset(
 
 
 class ViewDataset:
-    """Objects with posed views, made by ``open_dataset``; it may be sent to worker processes.
+    """Objects with posed views, made by ``open_dataset``; picklable for worker processes.
 
     Attributes:
-        uids: names of the objects, which are their paths under the root, sorted.
+        uids: names of the objects, their paths under the root, sorted.
         layout: layout of the folders, or "pack".
-        split_version: version of the rule, or of the file, that made the split.
-        packed_size: height of the pictures of a pack; None: files have what size they have.
+        split_version: version of the rule or of the file that defines the split.
+        packed_size: height of the pictures of a pack; None for files, of any size.
     """
 
     def __init__(
@@ -194,24 +193,24 @@ class ViewDataset:
         split_version: int = SPLIT_VERSION,
         packed_size: int | None = None,
     ) -> None:
-        """``readers`` read the files of each object, by uid; ``cache`` as for ``open_dataset``."""
+        """Make a dataset of one file reader per uid; ``cache`` as for ``open_dataset``."""
         self.uids = list(readers)
         self.layout, self.split_version, self.packed_size = layout, split_version, packed_size
         self._readers = dict(readers)
         self._files: dict[str, ObjectFiles] = {}
-        # A path and a size give the picture, and the (width, height) of the file.
+        # By path and size: the picture, and the (width, height) of the file.
         self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
         self._pictures = {} if cache else None
-        self._kept: dict[tuple[str, int], tuple[Tensor, np.ndarray]] = {}
+        self._preloaded: dict[tuple[str, int], tuple[Tensor, np.ndarray]] = {}
 
     def __len__(self) -> int:
         return len(self.uids)
 
     def joined(self, name: str, other: ViewDataset) -> ViewDataset:
-        """Returns a set with the objects of both; those of ``other`` come last, as ``name/uid``.
+        """Return a dataset with the objects of both; those of ``other`` come last, as ``name/uid``.
 
         Raises:
-            UserError: an object has such a name already.
+            UserError: such a name already exists.
         """
         added = {f"{name}/{uid}": reader for uid, reader in other._readers.items()}
         if twice := sorted(added.keys() & self._readers.keys()):
@@ -226,16 +225,16 @@ class ViewDataset:
         )
 
     def files(self, index: int | str) -> ObjectFiles:
-        """Returns paths, poses and intrinsics of one object, which are read once.
+        """Return paths, poses and intrinsics of one object, which are read once.
 
         Raises:
-            UserError: the object's camera files are missing or bad; the message names the file.
+            UserError: the object's camera files are missing or invalid; the message names the file.
         """
         uid = self._uid(index)
         if uid not in self._files:
             try:
                 self._files[uid] = self._readers[uid]()
-            except OSError as error:  # of a folder; the readers name the file otherwise
+            except OSError as error:  # of a folder; for files the readers raise UserError
                 raise UserError(f"{error.filename or uid}: {error.strerror or error}") from error
         return self._files[uid]
 
@@ -247,11 +246,11 @@ class ViewDataset:
         return index
 
     def num_views(self, index: int | str) -> int:
-        """Returns V, the number of views of one object; the errors are those of ``files``."""
+        """Return V, the number of views of one object; raises as ``files``."""
         return len(self.files(index).images)
 
     def check(self) -> dict[str, str]:
-        """Returns reasons by uid, for objects with bad cameras or missing pictures."""
+        """Return reasons by uid, for objects with invalid cameras or missing pictures."""
         bad = {}
         for uid in self.uids:
             try:
@@ -259,30 +258,29 @@ class ViewDataset:
                 for path in chain(
                     files.images, *filter(None, (files.masks, files.depths, files.backs))
                 ):
-                    # What lies in a pack was looked for above.
-                    if isinstance(path, Path) and not os.path.exists(path):  # it never raises
+                    # Pictures in a pack were checked above.
+                    if isinstance(path, Path) and not os.path.exists(path):  # never raises
                         raise UserError(f"{path}: no such file")
             except UserError as error:
                 bad[uid] = str(error)
         return bad
 
-    def keep(
+    def preload(
         self, objects: Sequence[int], sizes: Sequence[int], device: torch.device, workers: int = 1
     ) -> None:
-        """Decodes pictures and keeps them on a device, with 8 bits a channel; draws a bar.
+        """Decode pictures and keep them on a device, with 8 bits a channel, with a progress bar.
 
-        ``load`` gives them on that device from then on, and cameras and depths on the CPU. What it
-        gives is the same to the bit: the pictures are divided there as they are on the CPU.
+        ``load`` then returns pictures on that device, and cameras and depths on the CPU. The values
+        are bit-identical to those decoded on the CPU.
 
         Args:
-            objects: indices of those that are kept. One that cannot be read is left out; it raises
-                its error when it is loaded.
+            objects: indices of the objects. Unreadable ones are skipped and raise when loaded.
             sizes: heights, pixels.
-            device: where they are kept.
-            workers: number of threads that decode.
+            device: device for the pictures.
+            workers: number of decoding threads.
 
         Raises:
-            UserError: the device, a GPU, has no room for them.
+            UserError: the pictures do not fit into the GPU's memory.
         """
         if device.type == "cuda":
             views = sum(self.num_views(index) for index in objects)
@@ -297,7 +295,7 @@ class ViewDataset:
         def decode(key: tuple[str, int]) -> None:
             with suppress(*EXPECTED):
                 pixels, Ks = self.pictures(key[0], None, key[1])
-                self._kept[key] = torch.from_numpy(pixels).to(device), Ks
+                self._preloaded[key] = torch.from_numpy(pixels).to(device), Ks
 
         keys = [(self.uids[index], size) for index in objects for size in sizes]
         with ThreadPoolExecutor(workers) as pool:
@@ -312,27 +310,27 @@ class ViewDataset:
         size: int | None = None,
         depths: int | None = None,
     ) -> ObjectViews:
-        """Decodes views of one object.
+        """Decode views of one object.
 
         Args:
             index: position in ``uids``, or a uid.
             views: numbers of the views, in this order; None means all. Only their files are opened.
-            size: height of the returned pictures, whose width follows; None keeps the files' size.
+            size: height of the returned pictures; the width follows. None keeps the files' size.
                 Colour is premultiplied and area-filtered, so that no background bleeds in; depth
                 takes the nearest sample.
-            depths: of how many of these views, the first ones, the depth pictures are read, where
-                there are any; None means of all.
+            depths: number of these views, from the first, whose depth pictures are read, if there
+                are any; None means all.
 
         Raises:
-            UserError: a file is missing, broken, or not of the size that the cameras state.
+            UserError: a file is missing, damaged, or not of the size stated by the cameras.
         """
         uid = self._uid(index)
         files, wanted = self.files(uid), self._wanted(uid, views, size)
-        if size is not None and (uid, size) in self._kept:
-            pixels, Ks = self._kept[uid, size]
+        if size is not None and (uid, size) in self._preloaded:
+            pixels, Ks = self._preloaded[uid, size]
             chosen, Ks = pixels[torch.tensor(wanted, device=pixels.device)], Ks[wanted]
-            # By a tensor: a GPU would divide by a plain number by multiplying with its inverse,
-            # whose last bit is another.
+            # Divide by a tensor: for a Python number a GPU multiplies with the inverse, which
+            # differs in the last bit.
             images = chosen.float() / torch.tensor(255.0, device=chosen.device)
         else:
             pixels, Ks = self.pictures(uid, wanted, size)
@@ -355,13 +353,13 @@ class ViewDataset:
         )
 
     def _wanted(self, uid: str, views: Sequence[int] | None, size: int | None) -> list[int]:
-        """The numbers of the views that are asked for, of which there must be some."""
+        """Return the numbers of the requested views; raise for an empty or invalid list."""
         count = self.num_views(uid)
         wanted = list(range(count)) if views is None else [int(v) for v in views]
         if not wanted:
-            raise UserError(f"{uid}: no views asked for")
+            raise UserError(f"{uid}: no views requested")
         if outside := [v for v in wanted if not 0 <= v < count]:
-            raise UserError(f"{uid}: view {outside[0]} asked for, it has {count}")
+            raise UserError(f"{uid}: view {outside[0]} requested, it has {count}")
         if size is not None and size < 1:
             raise UserError(f"size {size}: must be at least 1")
         return wanted
@@ -369,12 +367,12 @@ class ViewDataset:
     def pictures(
         self, index: int | str, views: Sequence[int] | None = None, size: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Decodes views of one object and leaves them as they are decoded.
+        """Decode views of one object to 8 bits.
 
         Args:
-            index: as for ``load``, as are the others.
-            views: see above.
-            size: see above.
+            index: as for ``load``.
+            views: as for ``load``.
+            size: as for ``load``.
 
         Returns:
             RGBA ``[V, H, W, 4]`` uint8, colour not premultiplied, and K ``[V, 3, 3]`` float64 in
@@ -407,12 +405,12 @@ class ViewDataset:
     def depth_steps(
         self, index: int | str, width: int, height: int, views: Sequence[int] | None = None
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Reads depth pictures of an object, of its first and of its last surfaces.
+        """Read depth pictures of an object, of its first and of its last surfaces.
 
         Args:
             index: as for ``load``.
-            width: of the pictures, pixels.
-            height: see above.
+            width: width of the pictures, pixels.
+            height: height of the pictures, pixels.
             views: numbers of the views; None means all.
 
         Returns:
@@ -434,11 +432,11 @@ class ViewDataset:
     def _view(
         self, files: ObjectFiles, view: int, size: int | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Loads RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the size asked for."""
+        """Load RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the requested size."""
         path, stated = files.images[view], files.sizes[view]
         found = self._pictures.get((path, size)) if self._pictures is not None else None
         if found is None:
-            picture = path.read() if isinstance(path, Stored) else load_rgba8(path)
+            picture = path.read() if isinstance(path, DecodedPicture) else load_rgba8(path)
             height, width = picture.shape[:2]
             if stated not in (None, (width, height)):
                 wanted = f"{stated[0]}x{stated[1]}"
@@ -448,8 +446,8 @@ class ViewDataset:
             if size not in (None, height):
                 new = (max(1, round(width * size / height)), size)
                 check_size(*new, f"{path}: at height {size}")
-                # PIL premultiplies RGBA by itself, and its box filter is the exact area average, so
-                # that no background bleeds in.
+                # PIL premultiplies RGBA itself, and its box filter is the exact area average, so no
+                # background bleeds in.
                 kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
                 picture = np.asarray(Image.fromarray(picture).resize(new, kind))
             found = picture, (width, height)
@@ -462,16 +460,16 @@ class ViewDataset:
 
 
 def _masked(picture: np.ndarray, path: Path) -> np.ndarray:
-    """RGBA ``[H, W, 4]`` uint8 whose alpha is multiplied with a grey picture of the same size.
+    """Multiply the alpha of RGBA ``[H, W, 4]`` uint8 with a grey picture of the same size.
 
-    A mask of zeros and ones is one of black and white, as nerfstudio takes it.
+    A mask of zeros and ones counts as black and white, as in nerfstudio.
     """
     mask = load_rgba8(path)
     if mask.shape != picture.shape:
         got, wanted = (f"{x.shape[1]}x{x.shape[0]}" for x in (mask, picture))
         raise UserError(f"{path}: the mask is {got}, its picture {wanted}")
     if (mask[..., :2] != mask[..., 1:3]).any() or (mask[..., 3] != 255).any():
-        raise UserError(f"{path}: a mask is grey and opaque, white where the object is")
+        raise UserError(f"{path}: a mask must be grey and opaque, white on the object")
     weight = mask[..., 0].astype(np.uint16)
     if weight.max() == 1:
         weight *= 255
@@ -480,25 +478,25 @@ def _masked(picture: np.ndarray, path: Path) -> np.ndarray:
 
 
 def background_note(dataset: ViewDataset) -> str | None:
-    """A line where a set shows no background apart from its objects; None where one is found.
+    """Warning if the pictures of a dataset have no transparent background, else None.
 
-    The first view of up to eight objects is looked at; one that cannot be read is passed over.
+    Checks the first view of up to eight objects, skipping unreadable ones.
     """
-    seen = False
+    checked = False
     for uid in evenly(dataset.uids, 8):
         with suppress(*EXPECTED):
             pixels, _ = dataset.pictures(uid, [0])
             if (pixels[..., 3] < 255).any():
                 return None
-            seen = True
-    if not seen:
+            checked = True
+    if not checked:
         return None
-    return "no picture has an alpha channel or a mask: what is behind an object counts as object"
+    return "no picture has an alpha channel or a mask: the background counts as part of the object"
 
 
-def _read_depth(path: Path | Stored, width: int, height: int) -> np.ndarray:
-    """Reads depth ``[height, width]`` float32 in steps of the file, by its nearest samples."""
-    if isinstance(path, Stored):
+def _read_depth(path: Path | DecodedPicture, width: int, height: int) -> np.ndarray:
+    """Read depth ``[height, width]`` float32 in steps of the file, by nearest samples."""
+    if isinstance(path, DecodedPicture):
         image = Image.fromarray(path.read())
         opened = nullcontext(image)
     else:

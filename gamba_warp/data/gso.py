@@ -1,10 +1,10 @@
-"""The evaluation ``gso``: which Google Scanned Objects, seen from where, at which size.
+"""Evaluation ``gso``: its 60 Google Scanned Objects, poses and picture size.
 
-The paper (§4.1) evaluates 60 objects of the set at 512² and does not name them. So these 60 are
-another choice, fixed by name: ten of each of six groups, chosen for variety by their names alone,
-before any of them was rendered or reconstructed here. The names are those of the 1,030 models that
-the set's owner GoogleResearch publishes on the Fuel server. The list never changes; another one
-would be another protocol.
+The paper (§4.1) evaluates 60 objects of the set at 512² and does not name them. These 60 are
+another choice, fixed by name: ten of each of six groups, chosen for variety by their names only,
+before any of them was rendered or reconstructed here. The names are from the 1,030 models that the
+set's owner GoogleResearch publishes on the Fuel server. The list never changes; another list would
+be another protocol.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..conventions import DEFAULT_FOV
 SIZE = 512  # pixels, §4.1: "at a spatial resolution of 512 × 512"
 FOV = DEFAULT_FOV  # degrees; not stated, that of the reference camera
 # The first view is the input: §4.1 "a default camera pose with both zero elevation and azimuth".
-# How many other views there are, and where, is not stated.
+# Number and poses of the other views are not stated.
 ELEVATIONS = (0.0, 20.0, 40.0)  # degrees
 AZIMUTHS = tuple(45.0 * number for number in range(8))  # degrees; at 0 the camera stands at -y
 VIEWS = len(ELEVATIONS) * len(AZIMUTHS)
@@ -73,28 +73,28 @@ NAMES = tuple(sorted(name for group in GROUPS.values() for name in group))
 
 @cache
 def all_names() -> frozenset[str]:
-    """The names of all models of the set, 1,033 with the few that its owner took back.
+    """Names of all models of the set, 1,033 with the few that its owner has withdrawn.
 
-    Source: the table of names in MOVi (Kubric, ``challenges/movi/movi_e.py``), which all names of
-    the evaluation are in.
+    Source: the table of names in MOVi (Kubric, ``challenges/movi/movi_e.py``), which includes all
+    names of the evaluation.
     """
     text = (files(__package__ or "gamba_warp.data") / "gso_names.txt").read_text(encoding="utf-8")
     return frozenset(text.split())
 
 
 def scanned(uids: Iterable[str]) -> list[str]:
-    """Those of some objects that have a name of the set, which folders before it do not change."""
+    """Uids named as models of the set, ignoring parent folders, sorted."""
     return sorted(uid for uid in uids if uid.rpartition("/")[2] in all_names())
 
 
 def protocol_of(there: Iterable[str]) -> dict[str, Any]:
-    """What a report of this evaluation says of it.
+    """Description of this evaluation for a report.
 
     Args:
-        there: names of the objects that are evaluated.
+        there: names of the evaluated objects.
 
     Returns:
-        The size, the poses, which objects of the list are missing and which are not of it.
+        The size, the poses, the missing objects of the list, and the evaluated ones outside it.
     """
     found = set(there)
     return {

@@ -1,16 +1,16 @@
-"""The folder layouts of posed views that can be read; all give the same ``ObjectFiles``.
+"""Folder layouts of posed views; all are read into the same ``ObjectFiles``.
 
-- ``transforms``: ``<uid>/transforms.json`` as nerfstudio and Blender write it: ``w, h, fl_x, fl_y,
-  cx, cy`` (or ``camera_angle_x``), for all frames or for each, and ``frames`` of ``file_path`` and
+- ``transforms``: ``<uid>/transforms.json`` of nerfstudio and Blender: ``w, h, fl_x, fl_y, cx, cy``
+  (or ``camera_angle_x``), for all frames or for each, and ``frames`` of ``file_path`` and
   ``transform_matrix`` (camera to world, OpenGL). Without ``w`` and ``h`` the size is that of the
   first picture. ``mask_path``, if every frame has one, is the object's alpha. ``gamba data render``
   writes this layout.
-- ``nerf``: ``<uid>/transforms_train.json`` and, where they are there, ``transforms_val.json`` and
+- ``nerf``: ``<uid>/transforms_train.json`` and optionally ``transforms_val.json`` and
   ``transforms_test.json`` of the same form: all their frames are views of one object.
 - ``gobjaverse``: ``<uid>/campos_512_v4/NNNNN/NNNNN.png`` and ``.json``, whose ``x, y, z, origin``
-  are the camera's OpenCV axes and position in the world, which is z-up. Views that lack one of the
-  two files, as an unfinished download leaves them, are passed over. ``<uid>/depth/NNNNN.png``, if
-  there for all views, has their depth (``gamba data objaverse --depth`` makes it of ``_nd.exr``).
+  are the camera's OpenCV axes and position in the world, which is z-up. Views without one of the
+  two files, as in an unfinished download, are skipped. ``<uid>/depth/NNNNN.png``, if present for
+  all views, has their depth (``gamba data objaverse --depth`` makes it from ``_nd.exr``).
 - ``openlrm``: ``<uid>/rgba/NNN.png``, ``pose/NNN.npy`` (3x4, camera to world, OpenGL) and
   ``intrinsics.npy`` (3x2: focal lengths, principal point, width and height); the world's cube has
   side 2.
@@ -42,42 +42,42 @@ GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON sta
 GOBJAVERSE_DEPTH = "depth"  # folder beside that of the views
 GOBJAVERSE_DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
 MAX_VIEWS = 10_000  # of an object
-MAX_SIDE = 16_384  # pixels that a camera may state
-NEAREST, FARTHEST = 1e-3, 1e4  # of a camera from the object's centre, as the file states it
+MAX_SIDE = 16_384  # pixels of a camera
+NEAREST, FARTHEST = 1e-3, 1e4  # camera's distance from the object's centre, in the file's units
 SHORTEST, LONGEST = 1e-2, 1e3  # focal lengths, in sides of the picture
 _LARGEST = 1e9  # of any number in a camera file
-_TEXT = 500  # letters of a name or of an attribution
-_DEPTH = 64  # folders within folders
-# What of a lens a frame may state for itself.
+_MAX_TEXT = 500  # letters of a name or of an attribution
+_MAX_DEPTH = 64  # levels of nested folders
+# Lens parameters that may be given per frame.
 _DISTORTIONS = {*("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "b1", "b2", "sk_x", "sk_y")}
 _DISTORTIONS |= {*("s1", "s2", "s3", "s4", "distortion_params", "rolling_shutter")}
 _DISTORTIONS |= {*("is_fisheye", "equirectangular", "latlong", "orthographic", "is_orthographic")}
 _DISTORTIONS |= {f"ftheta_p{i}" for i in range(5)}
 _MODELS = "camera_model", "camera_type"
-# Those of nerfstudio and COLMAP that are pinholes where all distortion is 0.
+# Camera models of nerfstudio and COLMAP that are pinholes if all distortion is 0.
 _PINHOLES = {*("pinhole", "simple_pinhole", "perspective", "opencv", "full_opencv", "radial")}
 _PINHOLES |= {"simple_radial"}
 _PIXELS = "fl_x", "fl_y", "cx", "cy"
 _LENS = {*("w", "h", "camera_angle_x", "camera_angle_y"), *_PIXELS}
 _LENS |= {*_DISTORTIONS, *_MODELS}
-_FIT = 0.02  # sides of the cube by which a simplified mesh may miss it
+_FIT = 0.02  # tolerance for a simplified mesh, in sides of the cube
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
-class Stored:
-    """A picture that is decoded already and lies in a larger file (``packs.py``).
+class DecodedPicture:
+    """Decoded picture in memory or inside a larger file (``packs.py``).
 
     Attributes:
-        stem: as of a path; it has no name of its own.
+        stem: empty, in place of a path's.
     """
 
     stem = ""
 
     def read(self) -> np.ndarray:
-        """Its pixels: RGBA ``[H, W, 4]`` uint8, or depth ``[H, W]`` float32 in steps.
+        """Return the pixels: RGBA ``[H, W, 4]`` uint8, or depth ``[H, W]`` float32 in steps.
 
         Raises:
-            UserError: it is damaged.
+            UserError: the picture is damaged.
         """
         raise NotImplementedError
 
@@ -87,14 +87,14 @@ Sizes = list[tuple[int, int] | None]
 
 @dataclass(frozen=True)
 class Placement:
-    """The way from a mesh's file to the world of the views that were rendered of it.
+    """Transform from a mesh's file to the world of its rendered views.
 
     A point becomes ``scale · (transform · [x, 1])``: ``applied_scale`` and ``applied_transform`` of
-    ``transforms.json``. It has all that was done: the turn to z-up, a rotation of the catalogue,
+    ``transforms.json``. It includes the rotation to z-up, a rotation of the catalogue and
     ``--stretch``.
 
     Attributes:
-        transform: ``[3, 4]`` float64, whose ``[3, 3]`` part can be inverted.
+        transform: ``[3, 4]`` float64 with an invertible ``[3, 3]`` part.
         scale: > 0.
     """
 
@@ -102,13 +102,13 @@ class Placement:
     scale: float
 
     def points(self, x: np.ndarray) -> np.ndarray:
-        """Moves ``[N, 3]``."""
+        """Transform points ``[N, 3]``."""
         return self.scale * (x @ self.transform[:, :3].T + self.transform[:, 3])
 
     def fits(self, x: np.ndarray) -> bool:
-        """Tells if ``[N, 3]`` may be the mesh's vertices: then they fill the cube of the views.
+        """True if ``[N, 3]`` may be the mesh's vertices: they fill the cube of the views.
 
-        Their bounding box is then centred, with a longest side of 1; a simplified mesh's nearly.
+        Their bounding box is then centred, with a longest side of 1; for a simplified mesh nearly.
         """
         points = self.points(x)
         low, high = points.min(0), points.max(0)
@@ -117,29 +117,29 @@ class Placement:
 
 @dataclass
 class ObjectFiles:
-    """Where the views of one object lie, and their cameras.
+    """Files and cameras of the views of one object.
 
     Attributes:
-        images: the V pictures: paths, or what lies in a pack.
+        images: the V pictures: paths, or pictures in a pack.
         camera_to_world: ``[V, 4, 4]`` float64, OpenGL frame, object units.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
-        sizes: width and height of each of the V pictures as the file states them, or None.
-        masks: V grey pictures that are multiplied with the alpha of ``images``, or None.
+        sizes: width and height of each of the V pictures as stated by the file, or None.
+        masks: V grey pictures to multiply with the alpha of ``images``, or None.
         depths: the V depth pictures, or None.
         backs: V pictures of the last surface's depth, or None.
         depth_unit: length of one step of the depth pictures, object units.
-        name: name for people.
+        name: readable name.
         attribution: creator, licence, source; may be empty.
-        placement: of the mesh that was rendered, or None where the set does not say it.
+        placement: of the rendered mesh, or None if unknown.
     """
 
-    images: Sequence[Path | Stored]
+    images: Sequence[Path | DecodedPicture]
     camera_to_world: np.ndarray
     Ks: np.ndarray
     sizes: Sequence[tuple[int, int] | None]
     masks: Sequence[Path] | None = None
-    depths: Sequence[Path | Stored] | None = None
-    backs: Sequence[Path | Stored] | None = None
+    depths: Sequence[Path | DecodedPicture] | None = None
+    backs: Sequence[Path | DecodedPicture] | None = None
     depth_unit: float = 1.0
     name: str = ""
     attribution: dict[str, str] = field(default_factory=dict)
@@ -147,7 +147,7 @@ class ObjectFiles:
 
 
 def _matrix(value: object, source: str, what: str = "the pose") -> np.ndarray:
-    """Makes a ``[4, 4]`` matrix of 3x4 or 4x4 nested numbers."""
+    """Convert 3x4 or 4x4 nested numbers to a ``[4, 4]`` matrix."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -160,29 +160,30 @@ def _matrix(value: object, source: str, what: str = "the pose") -> np.ndarray:
 def check_cameras(
     poses: np.ndarray, Ks: np.ndarray, sizes: Sequence[tuple[int, int] | None], names: Sequence[str]
 ) -> None:
-    """Refuses cameras that cannot be those of an object's views.
+    """Check that cameras are plausible for views of an object.
 
     Args:
         poses: ``[V, 4, 4]`` float64, camera to world.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: V widths and heights, pixels, or None.
-        names: of the V views, for the message.
+        names: names of the V views, for the message.
 
     Raises:
-        UserError: a pose is no rotation with a place near the object, or a K does not suit the
-            size.
+        UserError: a pose is not a rotation with a position near the object, or a K does not match
+            the size.
     """
     size = np.array([size or (1, 1) for size in sizes])
-    with np.errstate(all="ignore"):  # numbers that are not finite are told below
-        turns, places = poses[:, :3, :3], np.linalg.norm(poses[:, :3, 3], axis=1)
-        square = np.isclose(turns @ turns.swapaxes(1, 2), np.eye(3), atol=1e-2).all((1, 2))
+    with np.errstate(all="ignore"):  # non-finite numbers are reported below
+        rotations, distances = poses[:, :3, :3], np.linalg.norm(poses[:, :3, 3], axis=1)
+        products = rotations @ rotations.swapaxes(1, 2)
+        orthogonal = np.isclose(products, np.eye(3), atol=1e-2).all((1, 2))
         focal, center = Ks[:, (0, 1), (0, 1)] / size, Ks[:, :2, 2] / size
         positive = np.isfinite(Ks).all((1, 2)) & (focal > 0).all(1)
-        sound = {
+        checks = {
             "the pose is not finite, or over {most:g}": (np.abs(poses) <= _LARGEST).all((1, 2)),
-            "the pose's 3x3 part is not a rotation": square & ~(np.linalg.det(turns) < 0),
-            "the camera is {place:g} from the object's centre, expected {near:g} to {far:g}": (
-                (places >= NEAREST) & (places <= FARTHEST)
+            "the pose's 3x3 part is not a rotation": orthogonal & ~(np.linalg.det(rotations) < 0),
+            "the camera is {distance:g} from the object's centre, expected {near:g} to {far:g}": (
+                (distances >= NEAREST) & (distances <= FARTHEST)
             ),
             "focal lengths must be positive": positive,
             "focal lengths of {focal[0]:g} and {focal[1]:g} sides of the picture, expected "
@@ -198,34 +199,34 @@ def check_cameras(
         "short": SHORTEST,
         "long": LONGEST,
     }
-    for reason, good in sound.items():
-        if not good.all():
-            view = int(good.argmin())
-            reason = reason.format(place=places[view], focal=focal[view], **limits)
+    for reason, valid in checks.items():
+        if not valid.all():
+            view = int(valid.argmin())
+            reason = reason.format(distance=distances[view], focal=focal[view], **limits)
             raise UserError(f"{names[view]}: {reason}")
 
 
 def _number(values: dict[str, Any], key: str, source: str) -> float:
     value = values[key]
-    if type(value) not in (int, float) or not abs(value) <= _LARGEST:  # a bool is no number
+    if type(value) not in (int, float) or not abs(value) <= _LARGEST:  # excludes bool
         raise UserError(f"{source}: {key} is {repr(value)[:40]}, expected a finite number")
     return float(value)
 
 
 def read_placement(values: dict[str, Any], source: str) -> Placement | None:
-    """Reads ``applied_transform`` and ``applied_scale``; None without the first.
+    """Read ``applied_transform`` and ``applied_scale``; None without the first.
 
     Raises:
-        UserError: they are not numbers that a mesh can be moved by.
+        UserError: they are not finite or not invertible.
     """
     if values.get("applied_transform") is None:
         return None
     matrix = _matrix(values["applied_transform"], source, "applied_transform")[:3]
     scale = _number({"applied_scale": 1.0, **values}, "applied_scale", source)
-    with np.errstate(all="ignore"):  # numbers that are not finite are told here
-        sound = (np.abs(matrix) <= _LARGEST).all() and scale > 0
-        if not sound or np.linalg.matrix_rank(matrix[:, :3]) < 3:
-            raise UserError(f"{source}: applied_transform or applied_scale moves no mesh")
+    with np.errstate(all="ignore"):  # non-finite numbers are reported here
+        valid = (np.abs(matrix) <= _LARGEST).all() and scale > 0
+        if not valid or np.linalg.matrix_rank(matrix[:, :3]) < 3:
+            raise UserError(f"{source}: applied_transform or applied_scale is not invertible")
     return Placement(matrix, scale)
 
 
@@ -237,7 +238,7 @@ def _side(values: dict[str, Any], key: str, source: str) -> int:
 
 
 def _focal(angle: float, source: str) -> float:
-    """The focal length, in sides of the picture, of a field of view in radians."""
+    """Focal length, in sides of the picture, of a field of view in radians."""
     if not 0 < angle < math.pi:
         raise UserError(f"{source}: a field of view of {angle:g} radians, expected 0 to pi")
     return 0.5 / math.tan(angle / 2)
@@ -248,7 +249,7 @@ def _camera_matrix(focal_x: float, focal_y: float, x: float, y: float) -> np.nda
 
 
 def _check_lens(values: dict, source: str) -> None:
-    """Refuses every lens that is not a pinhole, by the name of what says so."""
+    """Raise for any lens other than a pinhole, naming the field."""
     for key in _MODELS:
         model = values.get(key)
         if model is not None and str(model).lower() not in _PINHOLES:
@@ -268,9 +269,9 @@ def _check_lens(values: dict, source: str) -> None:
 def _intrinsics(
     values: dict, source: str, size: Callable[[], tuple[int, int]] | None
 ) -> tuple[np.ndarray, tuple[int, int] | None]:
-    """Reads K and the size of one frame; ``size`` gives one that the frame does not state.
+    """Read K and the size of one frame; ``size`` returns it if the frame does not state one.
 
-    Without either K is in fractions of the size, of a square picture.
+    Without a size K is in fractions of a square picture.
     """
     _check_lens(values, source)
     stated = None
@@ -299,21 +300,21 @@ def _intrinsics(
 
 
 def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
-    """The cameras of a file in the form of ``transforms.json``, whatever its pictures are.
+    """Read the cameras of a file in the form of ``transforms.json``, ignoring its pictures.
 
     Returns:
         ``camera_to_world [V, 4, 4]`` float64 (OpenGL), ``Ks [V, 3, 3]`` float64 and the V sizes,
-        as ``ObjectFiles`` has them.
+        as in ``ObjectFiles``.
 
     Raises:
-        UserError: the file is bad; one line says where.
+        UserError: the file is invalid; one line says where.
     """
     top, frames = _frames(path)
     return _cameras(path, top, frames, None)
 
 
 def _frames(path: Path) -> tuple[dict, list[dict]]:
-    """Values of all frames in a file, and its frames."""
+    """Read the values common to all frames of a file, and its frames."""
     top = read_document(path, object)
     if not isinstance(top, dict):
         raise UserError(f"{path}: expected a JSON object")
@@ -331,11 +332,11 @@ def _cameras(
     path: Path, top: dict, frames: list[dict], size: Callable[[], tuple[int, int]] | None
 ) -> tuple[np.ndarray, np.ndarray, Sizes]:
     poses, lenses, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
-    shared = None  # most files state one lens for all frames
+    shared = None  # most files have one lens for all frames
     for frame, source in zip(frames, names):
         poses.append(_matrix(frame["transform_matrix"], source))
-        if own := {key: frame[key] for key in _LENS & frame.keys()}:
-            lenses.append(_intrinsics({**top, **own}, source, size))
+        if lens := {key: frame[key] for key in _LENS & frame.keys()}:
+            lenses.append(_intrinsics({**top, **lens}, source, size))
         else:
             shared = shared or _intrinsics(top, source, size)
             lenses.append(shared)
@@ -348,7 +349,7 @@ _PATHS = ("file_path", "mask_path", "depth_file_path", "back_file_path")
 
 
 def _pictures(path: Path, frames: list[dict]) -> dict[str, list[Path]]:
-    """The files that the frames name, by the name of the field."""
+    """Files named by the frames, by the name of the field."""
     files: dict[str, list[Path]] = {key: [] for key in _PATHS}
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
@@ -358,13 +359,13 @@ def _pictures(path: Path, frames: list[dict]) -> dict[str, list[Path]]:
             if frame.get(key):
                 paths.append(inside(path.parent, frame[key], source))
         picture = files["file_path"][-1]
-        # Blender leaves the suffix out; what follows a dot may belong to the name then.
+        # Blender omits the suffix; a dot may then be part of the name.
         if picture.suffix.lower() not in PICTURE_SUFFIXES and not os.path.lexists(picture):
             found = [picture.with_name(picture.name + suffix) for suffix in PICTURES]
             files["file_path"][-1] = next((p for p in found if p.exists()), found[1])
     for key, paths in files.items():
         repeated = next((p for p, n in Counter(paths).items() if n > 1), None)
-        if repeated and key != "mask_path":  # one mask may serve all
+        if repeated and key != "mask_path":  # frames may share a mask
             raise UserError(f"{path}: two frames have the picture {repeated.name}")
     if 0 < len(files["mask_path"]) < len(frames):
         raise UserError(f"{path}: {len(files['mask_path'])} of {len(frames)} frames have a mask")
@@ -381,15 +382,15 @@ def _read_nerf(folder: Path) -> ObjectFiles:
 
 
 def _read_frames(paths: list[Path]) -> ObjectFiles:
-    """One object of the frames of all files; the first says what holds for the object."""
+    """Read one object from the frames of all files; its common values are those of the first."""
     parts = []
     files: dict[str, list[Path]] = {key: [] for key in _PATHS}
     top: dict = {}
     for path in paths:
-        own, frames = _frames(path)
-        top, found = top or own, _pictures(path, frames)
+        common, frames = _frames(path)
+        top, found = top or common, _pictures(path, frames)
         first = found["file_path"][0]
-        parts.append(_cameras(path, own, frames, cache(partial(picture_size, first))))
+        parts.append(_cameras(path, common, frames, cache(partial(picture_size, first))))
         for key in _PATHS:
             files[key] += found[key]
     path, count = paths[0], len(files["file_path"])
@@ -413,27 +414,27 @@ def _read_frames(paths: list[Path]) -> ObjectFiles:
         depths=depths,
         backs=backs,
         depth_unit=depth_unit,
-        name=one_text(top.get("name") or ""),
-        attribution={one_text(k): one_text(v) for k, v in attribution.items()},
+        name=one_line(top.get("name") or ""),
+        attribution={one_line(k): one_line(v) for k, v in attribution.items()},
         placement=read_placement(top, str(path)),
     )
 
 
-def one_text(value: object) -> str:
-    """One line for people, of whatever stands in a field."""
-    return " ".join(str(value).split())[:_TEXT]
+def one_line(value: object) -> str:
+    """Convert any value of a field to one line of text."""
+    return " ".join(str(value).split())[:_MAX_TEXT]
 
 
 def _check_count(count: int, path: Path) -> None:
     if count > MAX_VIEWS:
-        raise UserError(f"{path}: {count} views, at most {MAX_VIEWS} are read")
+        raise UserError(f"{path}: {count} views, at most {MAX_VIEWS} are supported")
 
 
 _Axis = Annotated[list[float], Meta(min_length=3, max_length=3)]
 
 
 class _View(Struct):
-    """What ``NNNNN.json`` of G-Objaverse holds: OpenCV axes, position, angles in radians."""
+    """Content of G-Objaverse's ``NNNNN.json``: OpenCV axes, position, angles in radians."""
 
     x: _Axis
     y: _Axis
@@ -451,12 +452,12 @@ def _aspect(picture: Path) -> float:
 def _read_gobjaverse(folder: Path) -> ObjectFiles:
     found = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
     _check_count(len(found), folder)
-    # A broken link is there, and told when it is read.
+    # A broken link counts as present, and raises when it is read.
     both = [[view / f"{view.name}{suffix}" for suffix in (".json", ".png")] for view in found]
     views = [view for view, files in zip(found, both) if all(map(os.path.lexists, files))]
     if not views:
-        raise UserError(f"{folder / GOBJAVERSE}: no views that have both picture and camera")
-    aspect = 0.0  # of the first picture, opened where it is needed
+        raise UserError(f"{folder / GOBJAVERSE}: no views with both picture and camera")
+    aspect = 0.0  # of the first picture, opened only if needed
     poses, Ks, names = [], [], [str(view / f"{view.name}.json") for view in views]
     for name in names:
         camera = read_document(name, _View)
@@ -501,11 +502,11 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
     poses = np.stack([_matrix(read_array(path, (3, 4)), str(path)) for path in paths])
     sizes = [(width, height)] * len(images)
     check_cameras(poses, Ks, sizes, [f"{lens}, pose/{path.name}" for path in paths])
-    poses[:, :3, 3] *= 0.5  # its objects fill a cube of side 2, ours of side 1
+    poses[:, :3, 3] *= 0.5  # OpenLRM's objects fill a cube of side 2, ours of side 1
     return ObjectFiles(images, poses, Ks, sizes)
 
 
-# Each layout has the name that marks an object's folder, and the folder's reader.
+# Per layout: the file or folder that marks an object's folder, and the folder's reader.
 LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
     "transforms": ("transforms.json", _read_transforms),
     "nerf": ("transforms_train.json", _read_nerf),
@@ -515,10 +516,10 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
 
 
 def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
-    """Finds the layout's name and the objects' folders, sorted, at any depth.
+    """Find the layout's name and the objects' folders, sorted, at any depth.
 
     ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
-    Folders with a leading dot are passed over; linked folders are entered (``files.walk``).
+    Folders with a leading dot are skipped; linked folders are entered (``files.walk``).
 
     Raises:
         UserError: the folders are nested too deep.
@@ -526,10 +527,10 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
     found = []
     for folder, subfolders, files in walk(root):
-        if folder.count(os.sep) > str(root).count(os.sep) + _DEPTH:
-            raise UserError(f"{root}: its folders are nested deeper than {_DEPTH}")
+        if folder.count(os.sep) > str(root).count(os.sep) + _MAX_DEPTH:
+            raise UserError(f"{root}: its folders are nested deeper than {_MAX_DEPTH}")
         if mark := next((m for m in marks if m in files or m in subfolders), None):
-            subfolders.clear()  # an object holds no objects
+            subfolders.clear()  # objects are not nested
             marks, layout = {mark: marks[mark]}, marks[mark]
             found.append(Path(folder))
     return layout, sorted(found)

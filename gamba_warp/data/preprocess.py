@@ -1,6 +1,6 @@
-"""The steps from a picture to the model's input: masks, plain backgrounds, centring, compositing.
+"""Steps from a picture to the model's input: masks, plain backgrounds, centring, compositing.
 
-``photo/cutout.py`` says which of them apply to a picture.
+``photo/cutout.py`` chooses the steps for a picture.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..images import load_rgba, picture_size
 from ..untrusted.torch_files import read_torch
 
 BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
-WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model sees more
+WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model uses more
 
 SAM_FILES = (
     "published are sam_vit_b_01ec64.pth (375 MB; ViT-L and ViT-H are larger) at "
@@ -28,19 +28,19 @@ SAM_FILES = (
 )
 
 _TRANSPARENT = 0.5  # a picture with any alpha below this has a cut-out object
-PRESENT = 0.05  # alpha from which a pixel counts for the object's bounds
+PRESENT = 0.05  # least alpha of a pixel within the object's bounds
 _PLAIN_TOLERANCE = 0.07  # largest colour difference within a plain background
 _PLAIN_SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
 _MIN_OBJECT = 16  # least size of an object, pixels
 
 
 def has_alpha(rgba: np.ndarray) -> bool:
-    """Whether a picture ``[H, W, 4]`` has an object cut out: some of it is transparent."""
+    """True if the object of a picture ``[H, W, 4]`` is cut out: some of it is transparent."""
     return bool(rgba[..., 3].min() < _TRANSPARENT)
 
 
 def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
-    """Alpha ``[H, W]`` in [0, 1] of a mask's file, reduced as ``load_rgba`` reduces the picture.
+    """Read alpha ``[H, W]`` in [0, 1] from a mask file, reduced like the picture in ``load_rgba``.
 
     Raises:
         UserError: the mask, or the picture's size, cannot be read, or they differ in size.
@@ -54,10 +54,10 @@ def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
 
 
 def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
-    """Removes a plain background, which has the colour of most of the picture's border.
+    """Remove a plain background, which has the colour of most of the picture's border.
 
-    The background is filled from the border, so areas of its colour that the object encloses stay.
-    Along the edge alpha is fractional, and the background's share is taken out of the colour, so no
+    The background is filled from the border, so areas of its colour inside the object stay. Along
+    the edge alpha is fractional, and the background's share is removed from the colour, so no
     fringe is left on another background.
 
     Args:
@@ -79,7 +79,7 @@ def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
     at_edge = np.unique(np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]]))
     background = np.isin(areas, at_edge[at_edge > 0])
     rim = dilation(background, disk(2)) & ~background
-    # A rim pixel mixes background and object, and the object has the largest difference near it.
+    # A rim pixel mixes background and object; the largest difference nearby is the object's.
     full = dilation(np.where(background, 0.0, difference), np.ones((5, 5)))
     share = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
     alpha = np.where(background, 0.0, np.where(rim, share, 1.0))
@@ -90,7 +90,7 @@ def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
 
 
 def without_specks(alpha: np.ndarray) -> np.ndarray:
-    """Clears parts of ``[H, W]`` under 1 % of the largest: dust would move the object's bounds."""
+    """Clear parts of ``[H, W]`` under 1 % of the largest: dust would move the object's bounds."""
     from skimage.measure import label
 
     parts = cast(np.ndarray, label(alpha > 0))
@@ -100,12 +100,12 @@ def without_specks(alpha: np.ndarray) -> np.ndarray:
 
 
 def recenter(rgba: np.ndarray, border_ratio: float | None = BORDER_RATIO) -> np.ndarray:
-    """Puts the object's bounding box in the middle of a square, without resampling.
+    """Put the object's bounding box in the middle of a square, without resampling.
 
     Args:
         rgba: ``[H, W, 4]`` in [0, 1].
         border_ratio: share of the square's side that the box's longer side leaves free, [0, 1);
-            None puts the whole picture there in place of the box.
+            None uses the whole picture instead of the box.
 
     Returns:
         ``[S, S, 4]`` float32; S = longer side / (1 - border_ratio), or the picture's longer side.
@@ -132,7 +132,7 @@ def recenter(rgba: np.ndarray, border_ratio: float | None = BORDER_RATIO) -> np.
 
 
 def shrink(rgba: np.ndarray, longest: int) -> np.ndarray:
-    """Reduces ``[H, W, 4]``, weighted by alpha, until no side is over ``longest`` pixels."""
+    """Reduce ``[H, W, 4]``, weighted by alpha, to at most ``longest`` pixels a side."""
     height, width = rgba.shape[:2]
     if max(height, width) <= longest:
         return rgba
@@ -141,7 +141,7 @@ def shrink(rgba: np.ndarray, longest: int) -> np.ndarray:
 
 
 def resize_rgba(rgba: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resizes ``[H, W, 4]`` in [0, 1], straight alpha, with colours weighted by alpha."""
+    """Resize ``[H, W, 4]`` in [0, 1], straight alpha, with colours weighted by alpha."""
     alpha = rgba[..., 3:]
     small = _resize(np.dstack([rgba[..., :3] * alpha, alpha]), height, width)
     small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
@@ -149,7 +149,7 @@ def resize_rgba(rgba: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def composite(rgba: np.ndarray, size: int, background: float = 1.0) -> Tensor:
-    """Composites ``[S, S, 4]`` on a grey value (1 is white) and resizes it.
+    """Composite ``[S, S, 4]`` on a grey value (1 is white) and resize it.
 
     Returns:
         ``[size, size, 3]`` float32 in [0, 1].
@@ -167,17 +167,17 @@ def _resize(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 class SamSegmenter:
-    """Segment Anything through kornia, with weights from a file, never random or downloaded.
+    """Segment Anything through kornia, with weights from a file.
 
-    The object is expected in the middle, so the prompt is a box that leaves out a tenth of the
-    picture on each side.
+    The object is assumed in the middle: the prompt is a box without a tenth of the picture on each
+    side.
 
     Args:
         checkpoint: the released ``.pth`` or ``.pt`` of ViT-B, ViT-L, ViT-H or MobileSAM.
         device: device of the network.
 
     Raises:
-        UserError: the file is missing or is none of these, or kornia is older than 0.9.
+        UserError: the file is missing or not such a checkpoint, or kornia is older than 0.9.
     """
 
     _WIDTHS = {768: "vit_b", 1024: "vit_l", 1280: "vit_h"}
@@ -192,7 +192,7 @@ class SamSegmenter:
         except ImportError as error:
             raise UserError("--sam needs kornia 0.9, and so Python 3.11 or newer") from error
         try:
-            # Its tensors are as large as it says, before kornia reads it.
+            # Checks the sizes of the tensors before kornia reads the file.
             positions = read_torch(path).get("image_encoder.pos_embed")
             kind = "mobile_sam" if positions is None else self._WIDTHS[positions.shape[-1]]
             config = SamConfig(model_type=kind, checkpoint=str(path))
@@ -204,7 +204,7 @@ class SamSegmenter:
             ) from error
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
-        """Returns alpha ``[H, W]`` float32, 0 or 1, from RGB ``[H, W, 3]`` in [0, 1]."""
+        """Return alpha ``[H, W]`` float32, 0 or 1, from RGB ``[H, W, 3]`` in [0, 1]."""
         height, width = rgb.shape[:2]
         image = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)
         box = torch.tensor([[0.1 * width, 0.1 * height, 0.9 * width, 0.9 * height]])

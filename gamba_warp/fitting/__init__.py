@@ -1,1 +1,1 @@
-"""Gaussians of one object by optimisation, without a model."""
+"""Fitting of Gaussians to one object by optimisation, without a model."""

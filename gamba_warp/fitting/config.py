@@ -1,4 +1,4 @@
-"""How one object is fitted."""
+"""Options of a fit."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _Rate = Annotated[float, Meta(ge=0, le=10)]
 _Weight = Annotated[float, Meta(ge=0, le=1e6)]
 _Share = Annotated[float, Meta(ge=0, le=1)]
 Strategy = Literal["fixed", "mcmc", "default"]
-BETAS = (0.9, 0.99)  # Adam's second moment forgets in 100 steps, because there are only hundreds
+BETAS = (0.9, 0.99)  # Adam's second moment spans 100 steps, as a fit has only hundreds
 MIN_SCALE, MAX_SCALE = 1e-3, 0.1  # object units
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How one object is fitted.
+    """Options of a fit.
 
     Attributes:
-        gaussians: N, fixed throughout; with another strategy the most there may be.
+        gaussians: N, constant with strategy "fixed", else the largest number.
         steps: number of Adam steps; 0 returns the start.
         seconds: time limit, or None; the learning rates then fall with the time, so the result
-            depends on the machine. The schedules of gsplat's strategies count steps all the same.
+            depends on the machine. The schedules of gsplat's strategies still count steps.
         views: number of views rendered in each step.
         lr_means: first learning rate of the means, object units a step.
         lr_scales: first learning rate of the scales' logarithms.
@@ -39,23 +39,23 @@ class FitConfig:
         weight_alpha: weight of the squared error of alpha; that of colour has the weight 1.
         weight_l1: weight of the absolute error of colour.
         relocate_every: steps between relocations; 0 for none.
-        relocate_share: largest share of the Gaussians that is relocated at once.
-        relocate_until: share of the steps after which none is relocated.
-        min_weight: a Gaussian that has less blending weight than so many pixels in all views
-            together is relocated.
+        relocate_share: largest share of the Gaussians relocated at once.
+        relocate_until: share of the steps after which relocation stops.
+        min_weight: Gaussians with less total blending weight in all views, in pixels, are
+            relocated.
         strategy: "fixed", or gsplat's "mcmc" or "default". The fields ``relocate_`` and
-            ``min_weight`` are for "fixed" alone, and those from ``start_share`` to ``grow_grad``
-            for the other two.
+            ``min_weight`` apply to "fixed", those from ``start_share`` to ``grow_grad`` to the
+            other two.
         start_share: N at the start, as a share of ``gaussians``.
         refine_start: share of the steps before gsplat's strategy changes the number.
-        refine_stop: share of the steps after which it stays.
-        refine_times: changes that the whole number of steps would have room for.
-        weight_opacity: weight of the mean opacity in the loss of "mcmc": what nothing needs fades,
-            and is moved to where it is needed.
-        noise: ``noise_lr`` of "mcmc", the noise on the means by their learning rate.
-        grow_grad: "default" splits and copies Gaussians of a larger gradient in the picture.
-        rasterize_mode: mode that renders the Gaussians. Files do not hold it, and most viewers are
-            classic; antialiased Gaussians fit small pictures better.
+        refine_stop: share of the steps after which the number stays.
+        refine_times: number of refinements if they took place over all steps.
+        weight_opacity: weight of the mean opacity in the loss of "mcmc": unneeded Gaussians fade
+            and are relocated.
+        noise: ``noise_lr`` of "mcmc", the noise on the means relative to their learning rate.
+        grow_grad: "default" splits and copies Gaussians with a larger gradient in the picture.
+        rasterize_mode: rendering mode. Files do not store it, and most viewers are classic;
+            antialiased Gaussians fit small pictures better.
         seed: seed of all random numbers.
     """
 

@@ -1,4 +1,4 @@
-"""The strategies of gsplat in a fit: they add, move and remove Gaussians, up to a number."""
+"""Fitting with gsplat's strategies, which add, move and remove Gaussians, up to a limit."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .start import activate
 
 
 def start_count(config: FitConfig) -> int:
-    """The number of Gaussians that a fit with a strategy starts with, at least 2."""
+    """Initial number of Gaussians of a fit with a strategy, at least 2."""
     return max(2, round(config.start_share * config.gaussians))
 
 
 def make_strategy(config: FitConfig) -> Any:
-    """Makes gsplat's strategy, its schedule in the fit's own number of steps.
+    """Make gsplat's strategy, with its schedule scaled to the fit's number of steps.
 
     Args:
-        config: of the fit; its strategy is not "fixed".
+        config: options of the fit, with a strategy other than "fixed".
 
     Raises:
         ModuleNotFoundError: gsplat is not installed.
@@ -37,17 +37,17 @@ def make_strategy(config: FitConfig) -> Any:
     }
     if config.strategy == "mcmc":
         return MCMCStrategy(cap_max=config.gaussians, noise_lr=config.noise, **times)
-    # No Gaussian is pruned for its size: the fit bounds the scales itself.
+    # No pruning by size: the fit bounds the scales itself.
     reset_every = max(1, config.steps // 4)
     return DefaultStrategy(reset_every=reset_every, prune_scale3d=float("inf"), **times)
 
 
 class Densified:
-    """A fit whose number of Gaussians one of gsplat's strategies changes.
+    """Fit with a number of Gaussians controlled by one of gsplat's strategies.
 
     Attributes:
-        parameters: as ``random_start`` returns them; the strategy puts new tensors into the dict.
-        optimizers: one Adam for each, by its name, as the strategies demand.
+        parameters: as from ``random_start``; the strategy replaces the tensors in the dict.
+        optimizers: one Adam per parameter, by name, as the strategies require.
     """
 
     def __init__(
@@ -66,9 +66,9 @@ class Densified:
         self._info: dict[str, Any] = {}
 
     def draw(self, cameras: Cameras, backgrounds: Tensor) -> tuple[Tensor, Tensor]:
-        """Renders ``[V, H, W, 3]`` on ``backgrounds [V, 3]``, and alpha ``[V, H, W, 1]``."""
+        """Render ``[V, H, W, 3]`` on ``backgrounds [V, 3]``, and alpha ``[V, H, W, 1]``."""
         now, mode = activate(self.parameters), self._config.rasterize_mode
-        if self._config.strategy == "mcmc":  # it asks nothing of the pictures
+        if self._config.strategy == "mcmc":  # needs no information from rendering
             picture = render(now, cameras, backgrounds, rasterize_mode=mode)
             return picture.rgb, picture.alpha
         assert now.quats is not None
@@ -83,24 +83,24 @@ class Densified:
         return rgb, alpha
 
     def penalty(self) -> Tensor | float:
-        """What the loss has beside the pictures: the weighted mean opacity of "mcmc"."""
+        """Regularization loss: the weighted mean opacity of "mcmc"."""
         if self._config.strategy == "default":
             return 0.0
         return self._config.weight_opacity * self.parameters["opacities"].sigmoid().mean()
 
     def after(self, step: int, done: float) -> int:
-        """What follows a step of Adam: the strategy's own part.
+        """Run the strategy after a step of Adam.
 
         Args:
             step: its number, from 1.
-            done: share of the fit that was done before it; not used, the strategy counts steps.
+            done: share of the fit done before it; unused, since the strategy counts steps.
 
         Returns:
-            0: what the strategies move is not counted.
+            0: moves of the strategies are not counted.
         """
         device = self.parameters["means"].device
         seed = int(torch.randint(2**62, (), generator=self._rng, device=device))
-        # gsplat draws from torch's global generators: here they are the fit's own for a moment.
+        # gsplat draws from torch's global generators: seed them temporarily from the fit's own.
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(seed)
             if self._config.strategy == "mcmc":
@@ -117,11 +117,11 @@ class Densified:
 
     @torch.no_grad()
     def _grow(self, step: int) -> None:
-        """A step of "default", which knows no largest number: here it is held to one."""
+        """Run a step of "default", with a limit on the number of Gaussians that it lacks itself."""
         from gsplat.strategy.ops import remove
 
-        room = self._config.gaussians - len(self.parameters["means"])
-        self._strategy.grow_grad2d = max(self._config.grow_grad, self._bar(room))
+        free = self._config.gaussians - len(self.parameters["means"])
+        self._strategy.grow_grad2d = max(self._config.grow_grad, self._grow_threshold(free))
         self._run(step, packed=False)
         surplus = len(self.parameters["means"]) - self._config.gaussians
         if surplus > 0:
@@ -129,11 +129,11 @@ class Densified:
             mask[self.parameters["opacities"].argsort()[:surplus]] = True
             remove(self.parameters, self.optimizers, self._state, mask)
 
-    def _bar(self, room: int) -> float:
-        """The gradient in the picture that about ``room`` Gaussians exceed; each grows by one."""
-        if room <= 0:
+    def _grow_threshold(self, free: int) -> float:
+        """Gradient in the picture exceeded by about ``free`` Gaussians; each adds one."""
+        if free <= 0:
             return float("inf")
         if self._state["grad2d"] is None:
             return 0.0
         mean = self._state["grad2d"] / self._state["count"].clamp_min(1)
-        return 0.0 if room >= len(mean) else mean.topk(room + 1).values[-1].item()
+        return 0.0 if free >= len(mean) else mean.topk(free + 1).values[-1].item()

@@ -1,4 +1,4 @@
-"""Objects of a dataset, each fitted on its own and measured on held-out views."""
+"""Fits each object of a dataset and measures it on held-out views."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ _TABLE = (
 
 @dataclass
 class FitJob:
-    """What is the same for every object.
+    """Settings common to all objects.
 
     Attributes:
         dataset: source of the views.
         folder: folder of the results.
-        config: settings of a fit.
-        held_out: one view of so many is held out, the last; 0 for none.
+        config: options of a fit.
+        held_out: the last of every ``held_out`` views is held out; 0 for none.
         size: height of the pictures, pixels; None for the files' own.
-        device: device that computes.
+        device: device of the fit.
     """
 
     dataset: ViewDataset
@@ -68,12 +68,12 @@ class FitJob:
 
 
 def choose_objects(uids: list[str], names: tuple[str, ...], limit: int | None) -> list[str]:
-    """Chooses the named objects, or all; of these ``limit``, evenly spaced.
+    """Choose the named objects, or all; of these ``limit``, evenly spaced.
 
     Args:
-        uids: the objects there are.
-        names: those wanted, or none for all.
-        limit: at most so many, of index ``⌊k · count / limit⌋``; None for no limit.
+        uids: all objects.
+        names: names to choose; empty for all.
+        limit: largest number, of index ``⌊k · count / limit⌋``; None for no limit.
 
     Raises:
         UserError: a name is not among ``uids``.
@@ -86,25 +86,26 @@ def choose_objects(uids: list[str], names: tuple[str, ...], limit: int | None) -
 
 
 def split_views(count: int, held_out: int) -> tuple[list[int], list[int]]:
-    """Splits views in file order: for the fit, and held out from it.
+    """Split views in file order: for the fit, and held out from it.
 
     Args:
         count: number of views.
-        held_out: the last of every so many is held out (5, 11, 17, 23 for 6); 0 for none.
+        held_out: the last of every ``held_out`` views is held out (5, 11, 17, 23 for 6); 0 for
+            none.
 
     Returns:
         Indices of the views for the fit, and of those held out.
     """
-    kept = [v for v in range(count) if held_out and v % held_out == held_out - 1]
-    return [v for v in range(count) if v not in kept], kept
+    test = [v for v in range(count) if held_out and v % held_out == held_out - 1]
+    return [v for v in range(count) if v not in test], test
 
 
 def load_views(job: FitJob, uid: str, fitted: list[int]) -> ObjectViews:
-    """Loads all views of one object, those for the fit and those held out.
+    """Load all views of one object, those for the fit and those held out.
 
     Raises:
-        UserError: a file is bad, or the ``fitted`` views are fewer than two, have no transparent
-            pixel or show nothing.
+        UserError: a file is invalid, or the ``fitted`` views are fewer than two, have no
+            transparent pixel or are empty.
     """
     if len(fitted) < 2:
         raise UserError(f"{uid}: {len(fitted)} views to fit, at least 2 are needed")
@@ -118,16 +119,16 @@ def load_views(job: FitJob, uid: str, fitted: list[int]) -> ObjectViews:
 
 
 def fit_objects(job: FitJob, uids: Sequence[str]) -> tuple[str, list[tuple[str, str]]]:
-    """Fits objects one after the other, and reports on all; one that fails stops no other.
+    """Fit objects one after the other, and report on all; a failure does not stop the others.
 
-    The report is written also when the loop is interrupted, of what was finished.
+    If the loop is interrupted, the report on the finished objects is still written.
 
     Args:
-        job: what is fitted, and how.
+        job: settings of all fits.
         uids: the objects' names.
 
     Returns:
-        The summary as Markdown, and the objects that failed, each with the reason.
+        The summary as Markdown, and the failed objects with the reasons.
     """
     records: list[dict[str, Any]] = []
     failures: list[tuple[str, str]] = []
@@ -143,17 +144,17 @@ def fit_objects(job: FitJob, uids: Sequence[str]) -> tuple[str, list[tuple[str, 
 
 
 def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
-    """Fits one object and writes its files, with a progress bar.
+    """Fit one object and write its files, with a progress bar.
 
     Returns:
-        Its record, as ``objects/NAME.json`` holds it without the settings.
+        Its record, the content of ``objects/NAME.json`` without the settings.
 
     Raises:
         UserError: its views cannot be used, or a file cannot be written.
         ValueError: no silhouette meets the unit cube.
         FloatingPointError: the fit diverged.
     """
-    fitted, kept = split_views(job.dataset.num_views(uid), job.held_out)
+    fitted, test = split_views(job.dataset.num_views(uid), job.held_out)
     views = load_views(job, uid, fitted)
     images, cameras = views.images.to(job.device), views.cameras.to(job.device)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -172,19 +173,19 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
     rgb, truth = out.rgb.clamp(0, 1), over_background(images, WHITE)
     grounds = {}
     for ground, grey in GROUNDS.items():
-        got = over_another(out.rgb, out.alpha, WHITE, grey)[kept].clamp(0, 1)
-        found = psnr(got, over_background(images[kept], grey))
+        got = over_another(out.rgb, out.alpha, WHITE, grey)[test].clamp(0, 1)
+        found = psnr(got, over_background(images[test], grey))
         grounds[f"psnr_{ground}_held_out"] = _mean(found.tolist())
     by_view = psnr(rgb, truth).tolist()
-    large = min(rgb.shape[1:3]) >= SSIM_WINDOW  # in smaller pictures it is not defined
-    similar = ssim(rgb[kept], truth[kept]).tolist() if kept and large else []
+    large = min(rgb.shape[1:3]) >= SSIM_WINDOW  # undefined for smaller pictures
+    similar = ssim(rgb[test], truth[test]).tolist() if test and large else []
     record = {
         "name": uid,
         "views_train": fitted,
-        "views_held_out": kept,
+        "views_held_out": test,
         "size": [cameras.width, cameras.height],
         "psnr_train": _mean([by_view[v] for v in fitted]),
-        "psnr_held_out": _mean([by_view[v] for v in kept]),
+        "psnr_held_out": _mean([by_view[v] for v in test]),
         **grounds,
         "ssim_held_out": _mean(similar),
         "psnr_by_view": by_view,
@@ -197,7 +198,7 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
         "cpu_seconds": cpu,
     }
     _write_object(
-        job, record, result.gaussians, cameras, torch.cat([truth, rgb], 2)[kept or fitted]
+        job, record, result.gaussians, cameras, torch.cat([truth, rgb], 2)[test or fitted]
     )
     return record
 
@@ -207,7 +208,7 @@ def _mean(values: list[float]) -> float | None:
 
 
 def object_paths(folder: Path, uid: str) -> dict[str, Path]:
-    """The files of one object in the folder of the results, by the sub-folder that each is in."""
+    """Result files of one object, by sub-folder."""
     kinds = {"gaussians": ".ply", "strips": ".png", "objects": ".json"}
     return {kind: folder / kind / f"{uid}{suffix}" for kind, suffix in kinds.items()}
 
@@ -219,7 +220,7 @@ def _write_object(
     cameras: Cameras,
     rows: Tensor,
 ) -> None:
-    """Writes the ``.ply``, the strip ``[V, H, 2W, 3]`` (at most 4 views) and, last, the record."""
+    """Write the ``.ply``, the strip ``[V, H, 2W, 3]`` (at most 4 views) and, last, the record."""
     paths = object_paths(job.folder, record["name"])
     for path in paths.values():
         output_folder(path.parent)
@@ -245,7 +246,7 @@ def _settings(job: FitJob) -> dict[str, Any]:
 def _write_report(
     job: FitJob, records: list[dict[str, Any]], failures: list[tuple[str, str]]
 ) -> str:
-    """Writes ``report.json`` and ``report.md``; returns the summary as Markdown."""
+    """Write ``report.json`` and ``report.md``; return the summary as Markdown."""
     summary, rows = {}, []
     for label, key, form in _TABLE:
         values = [record[key] for record in records if record[key] is not None]

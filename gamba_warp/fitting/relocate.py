@@ -1,4 +1,4 @@
-"""Moves Gaussians that hardly show to where the pictures still differ."""
+"""Relocates hardly visible Gaussians to where the pictures still differ."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .start import activate
 
 
 class Fixed:
-    """A fit whose number of Gaussians stays; those that hardly show are moved now and then.
+    """Fit with a constant number of Gaussians; hardly visible ones are relocated at intervals.
 
     Attributes:
-        parameters: as ``random_start`` returns them; the fit changes them in place.
+        parameters: as from ``random_start``; changed in place.
         optimizers: one Adam for all.
     """
 
@@ -33,29 +33,29 @@ class Fixed:
     ) -> None:
         groups = [{"params": [p.requires_grad_()], "name": name} for name, p in parameters.items()]
         self.parameters = parameters
-        # The gradients of single Gaussians are far below Adam's usual eps.
+        # The gradients of single Gaussians are far below Adam's default eps.
         self.optimizers = {"all": torch.optim.Adam(groups, betas=BETAS, eps=1e-15)}
         self._scene, self._config, self._rng = (images, cameras), config, rng
 
     def draw(self, cameras: Cameras, backgrounds: Tensor) -> tuple[Tensor, Tensor]:
-        """Renders ``[V, H, W, 3]`` on ``backgrounds [V, 3]``, and alpha ``[V, H, W, 1]``."""
+        """Render ``[V, H, W, 3]`` on ``backgrounds [V, 3]``, and alpha ``[V, H, W, 1]``."""
         mode = self._config.rasterize_mode
         picture = render(activate(self.parameters), cameras, backgrounds, rasterize_mode=mode)
         return picture.rgb, picture.alpha
 
     def penalty(self) -> float:
-        """What the loss has beside the pictures: nothing."""
+        """Regularization loss: none."""
         return 0.0
 
     def after(self, step: int, done: float) -> int:
-        """What follows a step of Adam.
+        """Relocate Gaussians after a step of Adam, if it is due.
 
         Args:
             step: its number, from 1.
-            done: share of the fit that was done before it.
+            done: share of the fit done before it.
 
         Returns:
-            The number of Gaussians that were moved.
+            The number of moved Gaussians.
         """
         config = self._config
         if not config.relocate_every or step % config.relocate_every:
@@ -70,11 +70,11 @@ class Fixed:
 def shares(
     gaussians: Gaussians, images: Tensor, cameras: Cameras, mode: RasterizeMode = "classic"
 ) -> tuple[Tensor, Tensor]:
-    """What each Gaussian has to do with the pictures, from one backward pass.
+    """Compute each Gaussian's blending weight and share in the error by one backward pass.
 
-    A rendered channel is linear in the colours, so the gradient of ``Σ_p u_p C_p`` to a colour is
-    ``Σ_p u_p w_p``, w being the blending weight: with u = 1 its weight, with u = the squared error
-    of the pixel its share in the error.
+    A rendered channel is linear in the colours, so the gradient of ``Σ_p u_p C_p`` with respect to
+    a colour is ``Σ_p u_p w_p`` with the blending weight w: for u = 1 its weight, for u = the
+    squared error of the pixel its share in the error.
 
     Args:
         gaussians: ``[N]``.
@@ -103,22 +103,22 @@ def relocate(
     config: FitConfig,
     rng: torch.Generator,
 ) -> int:
-    """Moves Gaussians of too little weight onto others, drawn by their share in the error.
+    """Move Gaussians of too little weight onto others, drawn by their share in the error.
 
-    Those that are moved become copies, set off by a random draw from the Gaussian itself. All
-    copies of one together are about as opaque as it was (Kheradmand et al. 2024, with a fixed
-    shrinking of the scales), and their moments in Adam start at 0.
+    Moved Gaussians become copies, offset by a random draw from the Gaussian itself. All copies of
+    one together have about its opacity (Kheradmand et al. 2024, with a fixed shrinking of the
+    scales), and their moments in Adam are reset to 0.
 
     Args:
-        parameters: as ``random_start`` returns them; changed in place.
+        parameters: as from ``random_start``; changed in place.
         optimizer: the parameters' Adam; its state is changed in place.
         weight: ``[N]``, see ``shares``.
         error: ``[N]``, see ``shares``.
-        config: settings of the fit; ``min_weight`` and ``relocate_share`` count here.
+        config: options of the fit, of which ``min_weight`` and ``relocate_share`` are used.
         rng: generator on the parameters' device.
 
     Returns:
-        The number of Gaussians that were moved.
+        The number of moved Gaussians.
     """
     order = weight.argsort()
     least = order[: int(config.relocate_share * len(order))]
@@ -147,7 +147,7 @@ def relocate(
 
 
 def _rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """``vectors [N, 3]`` turned by ``quats [N, 4]`` of any length > 0."""
+    """Rotate ``vectors [N, 3]`` by ``quats [N, 4]`` of any length > 0."""
     unit = torch.nn.functional.normalize(quats, dim=-1)
     inverse = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
     pure = torch.cat([torch.zeros_like(vectors[:, :1]), vectors], -1)

@@ -1,4 +1,4 @@
-"""The start of a fit: random points in the visual hull of the pictures; what parameters mean."""
+"""Initialization of a fit: random points in the visual hull; activation of the parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HULL_GRID = 96  # voxels a side of the unit cube
 
 
 def activate(parameters: dict[str, Tensor]) -> Gaussians:
-    """Makes Gaussians of parameters as ``random_start`` returns them."""
+    """Activate parameters of ``random_start`` to Gaussians."""
     return Gaussians(
         means=parameters["means"],
         quats=parameters["quats"],
@@ -27,7 +27,7 @@ def activate(parameters: dict[str, Tensor]) -> Gaussians:
 
 
 def sample_views(images: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
-    """Reads pictures where points project.
+    """Sample pictures at projected points.
 
     Args:
         images: ``[V, H, W, C]``.
@@ -48,10 +48,10 @@ def sample_views(images: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
 
 
 def visual_hull(alphas: Tensor, cameras: Cameras, grid: int = HULL_GRID) -> Tensor:
-    """The voxels of the unit cube about the origin that project into the object in every view.
+    """Voxels of the unit cube about the origin that project into the object in every view.
 
-    If no voxel does (one picture is empty, or the poses are a little off), the hull has those that
-    do so in the most views.
+    Without any (one picture is empty, or the poses are slightly off), the voxels that do so in the
+    most views.
 
     Args:
         alphas: ``[V, H, W]`` in [0, 1].
@@ -69,7 +69,7 @@ def visual_hull(alphas: Tensor, cameras: Cameras, grid: int = HULL_GRID) -> Tens
     votes = torch.zeros(len(points), device=alphas.device)
     for view in range(len(alphas)):
         part = slice(view, view + 1)
-        # The limit is below one half, so that bars of a pixel's width stay.
+        # Below one half, so that bars one pixel wide remain.
         votes += sample_views(alphas[part, ..., None], cameras[part], points)[0, :, 0] > 0.25
     most = votes.max()
     if most == 0:
@@ -80,10 +80,10 @@ def visual_hull(alphas: Tensor, cameras: Cameras, grid: int = HULL_GRID) -> Tens
 def random_start(
     images: Tensor, cameras: Cameras, num: int, rng: torch.Generator
 ) -> dict[str, Tensor]:
-    """Parameters before activation, of random points in the hull.
+    """Draw random points in the hull, as parameters before activation.
 
     Half of them are in its outer voxels; the others are anywhere in it, because concave parts of an
-    object lie inside the hull. Colours are the views' mean.
+    object lie inside the hull. Colours are the mean of the views.
 
     Args:
         images: ``[V, H, W, 4]`` straight RGBA in [0, 1].
@@ -103,16 +103,15 @@ def random_start(
     empty = torch.nn.functional.pad((~hull).float()[None], (1,) * 6, value=1.0)
     shell = (hull & (max_pool3d(empty, 3, stride=1)[0] > 0)).nonzero()
     cells = []
-    for places, count in ((shell, num // 2), (hull.nonzero(), num - num // 2)):
-        chosen = torch.randint(len(places), (count,), generator=rng, device=device)
-        cells.append(places[chosen])
+    for voxels, count in ((shell, num // 2), (hull.nonzero(), num - num // 2)):
+        chosen = torch.randint(len(voxels), (count,), generator=rng, device=device)
+        cells.append(voxels[chosen])
     offsets = torch.rand(num, 3, generator=rng, device=device)
     means = (torch.cat(cells) + offsets) / HULL_GRID - 0.5
     rgba = sample_views(images, cameras, means)
     weights = rgba[..., 3:].clamp_min(1e-3)
     colors = (rgba[..., :3] * weights).sum(0) / weights.sum(0)
-    # This is half the side of the square that each would have to itself if all were spread over
-    # the surface.
+    # Half the side of the square per Gaussian if all were spread over the surface.
     scale = 0.5 * (len(shell) / num) ** 0.5 / HULL_GRID
     scale = min(max(scale, 2 * MIN_SCALE), 0.5 * MAX_SCALE)
     return {

@@ -1,1 +1,1 @@
-"""The Gamba network: tokens, blocks, decoder, checkpoints, and its posed input."""
+"""Gamba network: tokens, blocks, decoder, checkpoints, and its posed input."""

@@ -1,4 +1,4 @@
-"""The models of files: the shipped one, and any other."""
+"""Loading of models from files, including the shipped one."""
 
 from __future__ import annotations
 
@@ -28,34 +28,33 @@ def load_model(
     device: str | torch.device = "cpu",
     encoder_weights: Weights | None = None,
 ) -> Gamba:
-    """Reads a file of ``save_model``.
+    """Load a model saved by ``save_model``.
 
     Args:
-        path: the file, or a folder with a ``model.safetensors``; without it the shipped
-            model.
+        path: the file, or a folder with a ``model.safetensors``; None loads the shipped model.
         device: the model's device.
-        encoder_weights: as for ``build_encoder``; a frozen timm encoder needs them. Without them
-            the ``encoder.safetensors`` beside the model is taken, if there is one.
+        encoder_weights: as for ``build_encoder``; required by a frozen timm encoder. The default is
+            the ``encoder.safetensors`` beside the model, if there is one.
 
     Returns:
         The model in eval mode.
 
     Raises:
-        UserError: the file is missing, damaged or not of our format, its numbers are not finite, or
-            the encoder is not the one that the model was trained with.
+        UserError: the file is missing, damaged or of another format, its numbers are not finite, or
+            the encoder differs from that of the training.
     """
     return read_model(Gamba, Path(path or DEFAULT_CHECKPOINT), device, encoder_weights)
 
 
 def shipped_model(preset: str, device: str | torch.device = "cpu") -> Gamba | None:
-    """The model of a preset that comes with the package, in eval mode.
+    """Load the model of a preset that is shipped with the package.
 
     Args:
         preset: its name.
         device: the model's device.
 
     Returns:
-        The model; None where none of this preset comes with the package.
+        The model in eval mode; None if no model of this preset is shipped.
 
     Raises:
         UserError: the file cannot be read, as in ``load_model``.

@@ -1,4 +1,4 @@
-"""The model's configuration: one frozen dataclass, its presets and its JSON form."""
+"""Configuration of the model: one frozen dataclass, its presets and its JSON form."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ Back = Literal["learned", "opaque"]
 # Numbers of a ray's Gaussian: depth, offset, opacity, scales, colour.
 RAY_CHANNELS = (1, 3, 1, 3, 3)
 RAY_STEM = 32  # channels after the first convolution of the decoder ``rays``
-# Fields that older files lack: their models are what the defaults say.
-_LATER = {
+# Fields missing in older files; the defaults describe their models.
+_ADDED_LATER = {
     "decoder",
     *(f"ray_{name}" for name in ("cells", "coarse", "layers", "features", "hidden")),
     *(f"ray_{name}" for name in ("depth", "offset", "back")),
@@ -36,86 +36,86 @@ _LATER = {
     *("triplane_size", "triplane_features", "image_tokens", "num_orders"),
 }
 
-# No model that anyone trains comes near these; a file that says more is not believed.
+# Far above any trained model; files with larger values are rejected.
 MAX_GAUSSIANS = 1 << 20
 MAX_INNER_WIDTH = 1 << 15
 MAX_PARAMETERS = 4 * 10**9  # 16 GB
-_IMAGE_CHANNELS = 2048  # of an image token, at most; for the estimate of the size
+_IMAGE_CHANNELS = 2048  # upper bound for an image token, to estimate the size
 
 
 @dataclass(frozen=True, kw_only=True)
 class GambaConfig:
-    """Everything, apart from the weights, that decides what a Gamba network computes.
+    """Architecture of a Gamba network: everything but the weights.
 
     Attributes:
         image_size: side H = W of the input picture, pixels; a multiple of ``patch_size``.
         patch_size: side p of the patches that become 3DGS tokens, pixels; the number of Gaussians
-            is L = 4·(H/p)² (paper §3.2), or as many times as there are ``num_orders``.
+            is L = 4·(H/p)² (paper §3.2), in general ``num_orders``·(H/p)².
         width: channels D of a token.
         depth: number of Gamba blocks.
         state_size: SSM states per channel, 1 to 256.
         conv_size: taps of the causal convolution, 2 to 4.
         expand: inner channels of a block per channel of a token; 32,768 inner channels at most.
         dt_rank: rank of the step size's projection; 0 means ceil(width / 16), as in mamba-ssm.
-        mixer: what a block mixes the tokens with: "mamba", or "attention", a pre-norm transformer
-            block of the same width (paper, question Q2), which the fields ``attention_*`` describe.
-        attention_heads: heads of an attention; they divide ``width``, and 0 means one for each 64
+        mixer: token mixer of a block: "mamba", or "attention", a pre-norm transformer block of the
+            same width (paper, question Q2) with the fields ``attention_*``.
+        attention_heads: number of attention heads, a divisor of ``width``; 0 means one per 64
             channels, at least one.
         attention_mlp: hidden channels of a transformer block's MLP per channel of a token; 32,768
             at most. With 1 the block has about as many parameters as one of Mamba at expand 2.
         norm: normalisation before every block.
-        final_norm: that before the decoder; "same" as before the blocks.
-        discretization: of the selective scan; "mamba" is what mamba-ssm runs, "zoh" and "bilinear"
-            are the exact zero-order hold and the paper's appendix.
+        final_norm: normalisation before the decoder; "same" as before the blocks.
+        discretization: of the selective scan; "mamba" as in mamba-ssm, "zoh" and "bilinear" are the
+            exact zero-order hold and the paper's appendix.
         scan_orders: the four orders of the patches: rows, columns, and "backward" both of them from
             the end (paper §3.2), or "mirrored" each row from its end and each column from its end.
-        num_orders: the first so many of these four; each gives every patch a token.
+        num_orders: number of these orders, from the first; each gives every patch a token.
         embedding_init: standard deviation of the learned embedding E at the start.
         additive_image_tokens: False makes G = E (paper Table 2, "w/o additive 3DGS tokens").
-        mixed_tokens: True makes the first quarter of the tokens of patches of twice the side, and
-            leaves the others E alone (paper, answer A4). It needs an even number of patches a side.
+        mixed_tokens: True adds image tokens of patches of twice the side to the first quarter of
+            the tokens; the others are only E (paper, answer A4). Needs an even number of patches a
+            side.
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
-        image_tokens: where these stand: "prefix" prepends them, "mixed" spreads them evenly among
-            the 3DGS tokens (``model.parts.block.mixed_places``). To attention, which knows no
-            order, it is one.
-        camera_token: whether the camera is prepended; the image tokens may be prepended alone.
+        image_tokens: position of the image tokens: "prefix" prepends them, "mixed" spreads them
+            evenly among the 3DGS tokens (``model.parts.block.mixed_positions``). No difference for
+            attention, which is invariant to the order.
+        camera_token: prepend the camera; the image tokens may be prepended without it.
         encoder: "none", "vgg16" or the name of a timm ViT, e.g. "vit_base_patch14_reg4_dinov2".
-        encoder_size: side of the picture that the encoder sees, pixels.
-        encoder_resize: how pictures are brought to that size: "bicubic", antialiased, or "bilinear"
-            between the four nearest pixels.
-        encoder_normalize: whether pictures are brought to the mean and deviation of the ViT's
-            training.
-        encoder_class_token: whether a ViT's class token is kept (register tokens never are).
-        encoder_frozen: whether the encoder is left untrained, and out of checkpoints.
+        encoder_size: side of the encoder's input, pixels.
+        encoder_resize: resizing to that size: "bicubic", antialiased, or "bilinear" between the
+            four nearest pixels.
+        encoder_normalize: normalise pictures to the mean and deviation of the ViT's training.
+        encoder_class_token: keep a ViT's class token (register tokens are always dropped).
+        encoder_frozen: do not train the encoder, and leave it out of checkpoints.
         decoder_width: channels of the decoder's shared MLP; 0 means ``width``.
         position_bins: points per axis of the position's softmax (paper: 21).
-        position_weights: what the logits of the points become: "softmax" (paper), or "unit",
-            a vector of length 1: a coordinate may then be sqrt(bins / 3) times ``position_range``.
+        position_weights: weights of the points from their logits: "softmax" (paper), or "unit", a
+            vector of length 1: a coordinate may then be sqrt(bins / 3) times ``position_range``.
         position_range: the largest coordinate of the points, ±, object units (paper: 0.5).
         position_init: standard deviation of the position logits at the start.
-        scale_factor: what a softplus is multiplied by to be a standard deviation, object units.
+        scale_factor: factor from a softplus to a standard deviation, object units.
         scale_init: standard deviation of a Gaussian at the start, object units.
         opacity_init: opacity at the start.
-        predict_rotation: whether quaternions are predicted; the paper fixes them.
+        predict_rotation: predict quaternions; the paper fixes them.
         decoder: "bins" is the paper's, one Gaussian a token; "rays" puts Gaussians on the rays of
-            the input's pixels (``model.parts.rays``), and the fields ``ray_*`` are its own;
-            "triplane" takes colours from three planes that as many blocks again make
+            the input's pixels (``model.parts.rays``), with the fields ``ray_*``; "triplane" takes
+            colours from three planes made by a second branch of blocks
             (``model.parts.triplane``; paper, question Q3).
         triplane_size: cells a side of a plane.
         triplane_features: channels of a plane.
-        ray_cells: cells a side of a patch; it divides ``patch_size``.
-        ray_coarse: cells a side of a patch that the tokens have features for; those of the patch's
-            cells are interpolated between them. It divides ``ray_cells``; 0 means ``ray_cells``.
-        ray_layers: Gaussians of a cell: the front one, and those for what is hidden.
+        ray_cells: cells a side of a patch; divides ``patch_size``.
+        ray_coarse: cells a side of a patch with their own features from the tokens; the features of
+            ``ray_cells`` are interpolated from them. Divides ``ray_cells``; 0 means ``ray_cells``.
+        ray_layers: Gaussians of a cell: the front one, and those for hidden parts.
         ray_features: channels of a cell's features.
-        ray_hidden: channels of a layer between these and the Gaussians; 0: no such layer.
-        ray_depth: how far a Gaussian may lie before or behind the object's centre, object units.
-        ray_offset: how far it may lie off its ray, on each axis, object units.
-        ray_back: opacity of the last layer: "learned" for each Gaussian, from almost nothing on, or
-            "opaque" as its cell is. It needs two layers.
+        ray_hidden: channels of a layer between these and the Gaussians; 0 for no such layer.
+        ray_depth: largest depth of a Gaussian before or behind the object's centre, object units.
+        ray_offset: largest offset of a Gaussian from its ray on each axis, object units.
+        ray_back: opacity of the last layer: "learned" per Gaussian, starting almost transparent, or
+            "opaque" like its cell. Needs two layers.
         distance: distance of the reference camera from the object's centre, object units.
         fov: vertical field of view of the reference camera, degrees.
-        background: colour that the input picture is composited on.
+        background: background colour of the input picture.
     """
 
     image_size: Annotated[int, Meta(ge=1, le=4096)] = 512
@@ -189,7 +189,7 @@ class GambaConfig:
                 raise UserError(f"config: {name} is {getattr(self, name):,}, over {limit:,}")
 
     def _check_relations(self) -> None:
-        """Refuses fields that do not go together."""
+        """Raise for inconsistent fields."""
         rays, attention = self.decoder == "rays", self.mixer == "attention"
         multiples = {
             ("image_size", "patch_size"): True,
@@ -233,7 +233,7 @@ class GambaConfig:
 
     @property
     def num_gaussians(self) -> int:
-        """The number of Gaussians: L, or with "rays" that of a picture without any background."""
+        """Number of Gaussians: L, or with "rays" that of a picture without any background."""
         if self.decoder == "rays":
             return self.ray_layers * (self.grid_size * self.ray_cells) ** 2
         return self.num_tokens
@@ -245,7 +245,7 @@ class GambaConfig:
 
     @property
     def pixel_channels(self) -> int:
-        """What a 3DGS token sees of a pixel: that, and its Plücker ray."""
+        """Channels of a pixel in a 3DGS token: those of the picture, and its Plücker ray."""
         return self.input_channels + 6
 
     @property
@@ -270,9 +270,9 @@ class GambaConfig:
 
     @property
     def num_parameters(self) -> int:
-        """The number of parameters, without the image encoder's; with an encoder at most so many.
+        """Number of parameters, without the image encoder's; with an encoder an upper bound.
 
-        It is computed before anything is allocated: a file may claim any size.
+        Computed before anything is allocated: a file may state any size.
         """
         image = _IMAGE_CHANNELS if self.prepend and self.encoder != "none" else 0
         camera = (image or self.width) if self.prepend and self.camera_token else 0
@@ -294,7 +294,7 @@ class GambaConfig:
         return branch + planes + self._decoder_parameters() + patchify + token + embedding
 
     def _mixer_parameters(self, norm: int) -> int:
-        """What a block has behind its norm: a Mamba block, or attention, a norm and an MLP."""
+        """Parameters of a block after its norm: a Mamba block, or attention, a norm and an MLP."""
         if self.mixer == "attention":
             inside = self.mlp_width
             return norm + 4 * (self.width + 1) * self.width + (2 * inside + 1) * self.width + inside
@@ -303,7 +303,7 @@ class GambaConfig:
         return scan + 3 * self.width * inner
 
     def _decoder_parameters(self) -> int:
-        """The decoder's part of ``num_parameters``."""
+        """Parameters of the decoder."""
         if self.decoder != "rays":
             hidden = self.decoder_width or self.width
             heads = 3 * self.position_bins + (11 if self.predict_rotation else 7)
@@ -322,16 +322,16 @@ class GambaConfig:
 
     @property
     def background_color(self) -> float:
-        """The background's grey value: 1 (white) or 0 (black)."""
+        """Grey value of the background: 1 (white) or 0 (black)."""
         return 1.0 if self.background == "white" else 0.0
 
     def to_json(self) -> str:
-        """Returns one line of JSON with every field; ``from_json`` reads it back."""
+        """Return one line of JSON with every field; ``from_json`` reads it back."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str | bytes, source: str = "config") -> GambaConfig:
-        """Reads what ``to_json`` wrote.
+        """Read the JSON of ``to_json``.
 
         Args:
             text: a JSON object with exactly the fields of this class.
@@ -341,15 +341,15 @@ class GambaConfig:
             UserError: the text is not JSON, a key is unknown or missing, or a value has the wrong
                 type or range.
         """
-        from ..untrusted.documents import parse_document  # not where torch and warp are all
+        from ..untrusted.documents import parse_document  # not at the top: msgspec is optional
 
         where = f"{source}: the model's configuration"
         values = parse_document(text, dict[str, Any], where)
         names = {field.name for field in fields(cls)}
-        unknown, missing = sorted(set(values) - names), sorted(names - set(values) - _LATER)
+        unknown, missing = sorted(set(values) - names), sorted(names - set(values) - _ADDED_LATER)
         if unknown or missing:
-            parts = [f"unknown {_few(unknown)}"] if unknown else []
-            parts += [f"missing {_few(missing)}"] if missing else []
+            parts = [f"unknown {_shortened(unknown)}"] if unknown else []
+            parts += [f"missing {_shortened(missing)}"] if missing else []
             raise UserError(f"{where} has keys {'; '.join(parts)}")
         try:
             return cls(**values)
@@ -357,19 +357,19 @@ class GambaConfig:
             raise UserError(f"{source}: {error}") from error
 
 
-def _few(names: list[str]) -> str:
-    """The first names of a list that a file may have made endless."""
+def _shortened(names: list[str]) -> str:
+    """Join the first names of a list of any length from an untrusted file."""
     shown = [name if name.isidentifier() else repr(name[:40]) for name in names[:8]]
     return ", ".join(shown) + (", ..." if len(names) > 8 else "")
 
 
 Preset = Literal["tiny", "rays", "small", "paper", "released"]
 PRESETS: dict[Preset, GambaConfig] = {
-    # This one trains on two CPU cores; it has 4,096 Gaussians and no image encoder.
+    # Trains on two CPU cores; 4,096 Gaussians and no image encoder.
     "tiny": GambaConfig(
         image_size=128, patch_size=4, width=128, depth=6, encoder="none", encoder_size=128
     ),
-    # This one trains on two CPU cores, too: three Gaussians on the ray of each pixel of the object.
+    # Trains on two CPU cores, too: three Gaussians on the ray of each pixel of the object.
     "rays": GambaConfig(
         image_size=128,
         width=192,
@@ -384,13 +384,13 @@ PRESETS: dict[Preset, GambaConfig] = {
         ray_hidden=64,
         ray_back="opaque",
     ),
-    # This one trains on one small GPU; it has 9,216 Gaussians.
+    # Trains on one small GPU; 9,216 Gaussians.
     "small": GambaConfig(
         image_size=192, patch_size=4, width=256, depth=10, encoder="vgg16", encoder_size=192
     ),
-    # This is paper §4.1: 16,384 Gaussians, 576 image tokens from DINOv2 with registers.
+    # Paper §4.1: 16,384 Gaussians, 576 image tokens from DINOv2 with registers.
     "paper": GambaConfig(dt_rank=32),
-    # This is what the authors' public code and weights compute (``gamba import-released``).
+    # The authors' public code and weights (``gamba import-released``).
     "released": GambaConfig(
         final_norm="rms",
         scan_orders="mirrored",

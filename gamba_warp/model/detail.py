@@ -1,25 +1,23 @@
-"""The front of a reconstruction at the resolution of its picture: cells of ``rays`` that split.
+"""Splitting of the front Gaussians of ``rays`` to the resolution of the input picture.
 
-The network sees the picture at ``image_size``; a photograph has more pixels. So after the network
-each front cell may become k x k Gaussians, its children, each on the ray of its own small pixel:
+The network sees the picture at ``image_size``; a photograph has more pixels. After the network,
+each front cell may therefore split into k x k children, each on the ray of its own small pixel:
 
-- depth, what the network added to the opacity that alpha gives, and how far a parent lies off its
-  ray, are interpolated between the cells. A cell counts as much as its alpha, so what is hardly
-  there has no say. The opacity is over a half where alpha is 1: a network that is not sure of
-  the depth makes a faint front, and then the colours of what lies behind it, which has no detail,
-  show through.
-- colour and alpha are those of the picture at k times the cells.
-- the sizes are the parent's, 1/k of them across the view, but so large there that neighbours
-  overlap: at ``image_size`` a rasterizer's own widening covers the gaps between small Gaussians, at
-  k times that it does not. Along the view they stay, so that no crack opens from the side.
-- a parent lies up to a pixel off its ray. Its children go a part of that way: on their rays they
-  would part from cells that do not split, and all the way their pixels would show beside the
-  picture's.
+- Depth, the network's contribution to the logit of the opacity, and the parent's offset from its
+  ray are interpolated between the cells, weighted by alpha. The opacity is over a half where alpha
+  is 1: a network uncertain of the depth makes a faint front, through which the colours of the
+  layers behind it, without detail, would show.
+- Colour and alpha are those of the picture at k times the resolution of the cells.
+- Sizes are the parent's, across the view 1/k of them, but large enough that neighbours overlap: at
+  ``image_size`` a rasterizer's own widening covers the gaps between small Gaussians, at k times
+  that size it does not. Sizes along the view stay, so that no crack opens from the side.
+- A parent lies up to a pixel off its ray. Its children take a part of that offset: without it they
+  would separate from cells that do not split, and with all of it their pixels would be displaced.
 
-What is plain does not split. Cells with background in them or beside them split in 2 x 2 at most:
-a rasterizer widens every Gaussian by a part of its own pixel, so the more of them stand along a
-silhouette, the wider it is in a picture smaller than the one they are made for. For the same reason
-two rounds of correction take colours at k times the cells, but opacities at twice the cells.
+Plain cells do not split. Cells that contain or touch background split in 2 x 2 at most: a
+rasterizer widens every Gaussian by a part of its own pixel, so more of them along a silhouette
+make it wider in pictures smaller than the intended one. For the same reason two rounds of
+correction take colours at k times the cells, but opacities at twice the cells.
 """
 
 from __future__ import annotations
@@ -39,31 +37,31 @@ from ..gaussians import Gaussians
 from ..kernels.rasterize.constants import ALPHA_MIN
 from ..render import render
 from .config import GambaConfig
-from .parts.patches import premultiplied, seen_cells
+from .parts.patches import foreground_cells, premultiplied
 from .parts.rays import EMPTY
 
-PLAIN = 6 / 255  # a cell that differs by less in itself, and from those beside it, is plain
-MOST_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
-SURE = 0.5  # logit of a child's opacity at least, where alpha is 1
-# By detail: the standard deviation of a child across the view at least, in sides of its cell, and
-# the share of its parent's way off the ray (docs/lab/rays.md has what others gave).
-COVER = {2: 0.4, 4: 0.45}
-OFF = {2: 0.5, 4: 0.125}
+PLAIN = 6 / 255  # largest contrast of a plain cell, with its neighbours
+MAX_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
+MIN_OPACITY = 0.5  # logit; least opacity of a child where alpha is 1
+# By detail: the least standard deviation of a child across the view, in sides of its cell, and the
+# share of its parent's offset from the ray (docs/lab/rays.md compares other values).
+MIN_SIZE = {2: 0.4, 4: 0.45}
+OFFSET_SHARE = {2: 0.5, 4: 0.125}
 ROUNDS = 2  # of correction
-SURER = 8.0  # how much the logit of an opacity rises where a whole unit of alpha is missing
-FAINT = 0.05  # alpha of a rendered pixel under which its colour says little
+OPACITY_GAIN = 8.0  # added to the logit of an opacity per missing unit of alpha
+FAINT = 0.05  # alpha of a rendered pixel below which its colour is unreliable
 
 
 def checked_detail(detail: Detail | None, config: GambaConfig, side: int) -> Detail:
-    """How many children a side a cell may have.
+    """Return the number of children a side of a cell.
 
     Args:
-        detail: what was asked for; None: the most for which the picture has the pixels.
+        detail: the requested number; None takes the largest that the picture's pixels allow.
         config: of the model.
-        side: of the square picture that is to be reconstructed, pixels.
+        side: side of the square input picture, pixels.
 
     Raises:
-        UserError: detail is no such number, or more than 1 for a decoder other than ``rays``.
+        UserError: detail is not such a number, or more than 1 for a decoder other than ``rays``.
     """
     if detail not in (None, *DETAILS):
         raise UserError(f"detail is {detail}, it must be 1, 2 or 4")
@@ -87,29 +85,30 @@ def split_front(
     detail: Detail,
     camera: Cameras,
 ) -> Gaussians:
-    """Splits the front of a reconstruction, where the picture shows more than one colour a cell.
+    """Split the front of a reconstruction where the picture shows more than one colour a cell.
 
     Args:
-        gaussians: ``[N]``, what a model with the decoder ``rays`` made of one picture.
-        image: ``[H, W, 4]`` in [0, 1], straight alpha: the picture as this model took it, on the
-            device of ``gaussians``.
+        gaussians: ``[N]``, result of a model with the decoder ``rays`` for one picture.
+        image: ``[H, W, 4]`` in [0, 1], straight alpha: the input of the model, on the device of
+            ``gaussians``.
         rgba: ``[S, S, 4]`` in [0, 1], straight alpha: the same picture at its own size.
         config: of the model.
-        detail: children a side of a cell at most.
-        camera: ``[1]``, that of the picture, in the model's world: see ``posing``.
+        detail: largest number of children a side of a cell.
+        camera: ``[1]``, camera of the picture in the model's world, see ``posing``.
 
     Returns:
-        Gaussians of the same frame: those that did not split, then at most ``MOST_CHILDREN``
-        children (or four for each cell, where that is more). With detail 1, or where all is plain,
+        Gaussians of the same frame: those that did not split, then at most ``MAX_CHILDREN``
+        children (or four for each cell, if that is more). With detail 1, or if all cells are plain,
         ``gaussians`` itself.
     """
     if detail == 1:
         return gaussians
     side, device = _cells(config), gaussians.means.device
     large = torch.from_numpy(resize_rgba(rgba, side * detail, side * detail)).to(device)
-    picture, seen = premultiplied(large[None]), seen_cells(image[None], config.image_size // side)
-    alpha = F.avg_pool2d(image[None, None, ..., 3], config.image_size // side)
-    cells = seen.row * side + seen.column  # of each front Gaussian
+    step = config.image_size // side
+    picture, front_cells = premultiplied(large[None]), foreground_cells(image[None], step)
+    alpha = F.avg_pool2d(image[None, None, ..., 3], step)
+    cells = front_cells.row * side + front_cells.column  # of each front Gaussian
     counts = _children_a_side(picture, alpha, detail).flatten()
     splits = counts[cells] > 1
     if not splits.any():
@@ -124,46 +123,51 @@ def split_front(
         _children(front, parent, fields, counts == count, count, picture, camera)
         for count in sorted({2, detail})
     ]
-    children, pixels = _joined([one for one, _ in made]), torch.cat([at for _, at in made])
+    children, pixels = _concatenate([one for one, _ in made]), torch.cat([at for _, at in made])
     stays = ~is_front
     stays[is_front] = ~splits
-    return _corrected(gaussians.select(stays), children, pixels, picture, camera, detail)
+    return _correct(gaussians.select(stays), children, pixels, picture, camera, detail)
 
 
 def _cells(config: GambaConfig) -> int:
-    """Cells a side of the picture."""
+    """Number of cells a side of the picture."""
     return config.grid_size * config.ray_cells
 
 
 def _children_a_side(picture: Tensor, alpha: Tensor, detail: int) -> Tensor:
-    """1, 2 or ``detail`` for each cell, ``[cells, cells]``: of the picture, and its cells' alpha.
+    """Children a side of each cell, 1, 2 or ``detail``: ``[cells, cells]``.
 
-    Where there would be more than ``MOST_CHILDREN`` children, the cells with the least contrast
-    split in 2 x 2.
+    If there would be more than ``MAX_CHILDREN`` children, the cells with the least contrast split
+    in 2 x 2.
+
+    Args:
+        picture: ``[1, 4, H, W]``, see ``premultiplied``.
+        alpha: ``[1, 1, cells, cells]``.
+        detail: largest number.
     """
-    # The cells beside a cell count, too: at its edge a parent would not be sharp enough for them.
+    # Include the neighbouring cells: an unsplit parent would blur an edge between cells.
     both = F.max_pool2d(torch.cat([picture, -picture], 1), detail)
     most, least = F.max_pool2d(both, 3, stride=1, padding=1).chunk(2, 1)
     contrast = (most + least).amax(1)[0]
     splits = (contrast > PLAIN) & (alpha[0, 0] > 0)
     inner = -F.max_pool2d(-alpha, 3, stride=1, padding=1)[0, 0] > 0.99
     counts = torch.where(splits, 2, 1)
-    room = (MOST_CHILDREN - 4 * int(splits.sum())) // (detail**2 - 4) if detail > 2 else 0
+    count = (MAX_CHILDREN - 4 * int(splits.sum())) // (detail**2 - 4) if detail > 2 else 0
     contrast = torch.where(splits & inner, contrast, 0.0).flatten()
-    best = contrast.topk(min(max(room, 0), len(contrast))).indices
+    best = contrast.topk(min(max(count, 0), len(contrast))).indices
     counts.view(-1)[best[contrast[best] > 0]] = detail
     return counts
 
 
 def _fields(front: Gaussians, cells: Tensor, alpha: Tensor, camera: Cameras) -> Tensor:
-    """What is interpolated, as a map of the cells, ``[1, 5, n, n]``; each is weighted by alpha.
+    """Maps ``[1, 5, n, n]`` of the cells to interpolate, each weighted by alpha.
 
-    Depth along the ray, what the network added to the logit of the opacity, how far a parent lies
-    off its ray, x and y, and the weight.
+    Depth along the ray, the network's contribution to the logit of the opacity, the parent's offset
+    from its ray in x and y, and the weight.
     """
     side = alpha.shape[-1]
     weight = alpha.flatten()[cells]
-    opacity = (torch.logit(front.opacities, 1e-6) - EMPTY * (weight - 1)).clamp_min(SURE)
+    opacity = (torch.logit(front.opacities, 1e-6) - EMPTY * (weight - 1)).clamp_min(MIN_OPACITY)
     points = front.means + camera.viewmats[0, :3, 3]
     depth = points[:, 2]
     K = camera.resized(side, side).Ks[0]
@@ -187,39 +191,39 @@ def _children(
     picture: Tensor,
     camera: Cameras,
 ) -> tuple[Gaussians, Tensor]:
-    """The ``count`` x ``count`` children of the cells of a mask, and their pixels in the picture.
+    """Make the ``count`` x ``count`` children of the cells of a mask.
 
     Args:
         front: the parents.
-        parent: ``[cells²]``, which of them is that of a cell.
+        parent: ``[cells²]``, index of each cell's parent.
         fields: ``[1, 5, cells, cells]``, see ``_fields``.
-        mask: ``[cells²]`` bool, which cells split.
+        mask: ``[cells²]`` bool, the cells to split.
         count: children a side of a cell.
         picture: ``[1, 4, H, W]``, see ``premultiplied``.
         camera: of the picture.
 
     Returns:
-        Those that are drawn at all, and ``[.., 2]`` int64, row and column.
+        The children opaque enough to be drawn, and their pixels ``[.., 2]`` int64, row and column.
     """
     side, size = fields.shape[-1], fields.shape[-1] * count
     grid = mask.view(side, 1, side, 1).expand(side, count, side, count).reshape(size, size)
     row, column = grid.nonzero(as_tuple=True)
     fine = F.interpolate(fields, (size, size), mode="bilinear")[0][:, row, column].T
     depth, opacity, off = (fine[:, :4] / fine[:, 4:]).split([1, 1, 2], -1)
-    seen = F.avg_pool2d(picture, picture.shape[-1] // size)[0][:, row, column].T
-    own = parent[row // count * side + column // count]
+    rgba = F.avg_pool2d(picture, picture.shape[-1] // size)[0][:, row, column].T
+    index = parent[row // count * side + column // count]
     detail, K = picture.shape[-1] // side, camera.resized(size, size).Ks[0]
-    across = depth * _across(row, column, K) + OFF[detail] * off
+    across = depth * _across(row, column, K) + OFFSET_SHARE[detail] * off
     points = torch.cat([across, depth], -1)
-    quats = None if front.quats is None else front.quats[own]
-    least = COVER[detail] * camera.viewmats[0, 2, 3] / K[1, 1]
-    across_view = (front.scales[own] / count).clamp_min(least)
+    quats = None if front.quats is None else front.quats[index]
+    least = MIN_SIZE[detail] * camera.viewmats[0, 2, 3] / K[1, 1]
+    across_view = (front.scales[index] / count).clamp_min(least)
     children = Gaussians(
         means=points - camera.viewmats[0, :3, 3],
         quats=quats,
-        scales=torch.where(_along_the_view(quats, own), front.scales[own], across_view),
-        opacities=torch.sigmoid(opacity + EMPTY * (seen[:, 3:] - 1))[:, 0],
-        colors=(seen[:, :3] / seen[:, 3:].clamp_min(1e-3)).clamp(0, 1),
+        scales=torch.where(_along_the_view(quats, index), front.scales[index], across_view),
+        opacities=torch.sigmoid(opacity + EMPTY * (rgba[:, 3:] - 1))[:, 0],
+        colors=(rgba[:, :3] / rgba[:, 3:].clamp_min(1e-3)).clamp(0, 1),
     )
     step = picture.shape[-1] // size
     pixels = torch.stack([row, column], -1) * step + step // 2
@@ -228,7 +232,7 @@ def _children(
 
 
 def _along_the_view(quats: Tensor | None, like: Tensor) -> Tensor:
-    """Which axis of a Gaussian is nearest to the input camera's z, ``[N, 3]`` bool."""
+    """Mask ``[N, 3]`` of the axis of each Gaussian that is nearest to the input camera's z."""
     if quats is None:
         return torch.tensor([False, False, True], device=like.device).expand(len(like), 3)
     w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
@@ -237,8 +241,8 @@ def _along_the_view(quats: Tensor | None, like: Tensor) -> Tensor:
     return depths >= depths.amax(-1, keepdim=True)
 
 
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    """Several lots of Gaussians as one."""
+def _concatenate(parts: list[Gaussians]) -> Gaussians:
+    """Concatenate Gaussians."""
     quats = [part.quats for part in parts if part.quats is not None]
     return Gaussians(
         means=torch.cat([part.means for part in parts]),
@@ -249,7 +253,7 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
     )
 
 
-def _corrected(
+def _correct(
     others: Gaussians,
     children: Gaussians,
     pixels: Tensor,
@@ -257,12 +261,12 @@ def _corrected(
     camera: Cameras,
     detail: int,
 ) -> Gaussians:
-    """All Gaussians, after each child got what its pixel lacks in a render of them.
+    """Correct each child by the error of its pixel in a rendering; return all Gaussians.
 
-    Colours are compared by themselves, so that no background gets into them.
+    Colours are compared without premultiplication, so that no background bleeds into them.
 
     Args:
-        others: those that did not split.
+        others: the Gaussians that did not split.
         children: ``[M]``.
         pixels: ``[M, 2]``, row and column in the picture.
         picture: ``[1, 4, H, W]``, see ``premultiplied``.
@@ -272,14 +276,15 @@ def _corrected(
     want, alpha = picture[0].permute(1, 2, 0), F.avg_pool2d(picture[:, 3:], step)[0, 0]
     row, column = pixels.unbind(-1)
     for _ in range(ROUNDS):
-        both = _joined([others, children])
-        seen = render(both, camera.resized(size, size))
-        color = want[..., :3] - want[..., 3:] * seen.rgb[0] / seen.alpha[0].clamp_min(FAINT)
-        lacks = alpha - render(both, camera.resized(size // step, size // step)).alpha[0, ..., 0]
-        logits = torch.logit(children.opacities, 1e-4) + SURER * lacks[row // step, column // step]
+        both = _concatenate([others, children])
+        out = render(both, camera.resized(size, size))
+        color = want[..., :3] - want[..., 3:] * out.rgb[0] / out.alpha[0].clamp_min(FAINT)
+        missing = alpha - render(both, camera.resized(size // step, size // step)).alpha[0, ..., 0]
+        change = OPACITY_GAIN * missing[row // step, column // step]
+        logits = torch.logit(children.opacities, 1e-4) + change
         children = replace(
             children,
             colors=(children.colors + color[row, column]).clamp(0, 1),
             opacities=logits.sigmoid(),
         )
-    return _joined([others, children])
+    return _concatenate([others, children])

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 
 class ImageEncoder(nn.Module):
-    """A network from pictures to tokens, at one picture size; ``build_encoder`` makes one.
+    """Network from pictures to tokens, at one picture size; made by ``build_encoder``.
 
     A frozen encoder stays in eval mode and records no graph.
 
     Attributes:
-        channels: C, the size of a token.
+        channels: C, the channels of a token.
     """
 
     def __init__(self, network: nn.Module, channels: int, config: GambaConfig) -> None:
@@ -42,7 +42,7 @@ class ImageEncoder(nn.Module):
         self.train(self.training)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Maps ``images [B, H, W, 3]`` in [0, 1] to ``[B, K, channels]``; it resizes them first."""
+        """Map ``images [B, H, W, 3]`` in [0, 1], resized first, to ``[B, K, channels]``."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
             if images.shape[1:3] != (self.size, self.size):
                 planes = images.permute(0, 3, 1, 2)
@@ -53,21 +53,21 @@ class ImageEncoder(nn.Module):
             return self.network(images)
 
     def train(self, mode: bool = True) -> ImageEncoder:
-        """As ``nn.Module.train``, but a frozen network stays in eval mode."""
+        """Set the mode as ``nn.Module.train``; a frozen network stays in eval mode."""
         super().train(mode)
         self.network.train(mode and not self.frozen)
         return self
 
     def weights(self) -> dict[str, Tensor]:
-        """The network's weights, by the names that ``build_encoder`` reads."""
+        """Return the network's weights, with names for ``build_encoder``."""
         network = self.network.vit if isinstance(self.network, _ViT) else self.network
         return {name: value.contiguous() for name, value in network.state_dict().items()}
 
     @cached_property
     def fingerprint(self) -> str:
-        """The SHA-256 of the network's names and float32 values, as 64 hexadecimal digits.
+        """SHA-256 of the network's names and float32 values, as 64 hexadecimal digits.
 
-        A checkpoint keeps it instead of a frozen network's weights.
+        A checkpoint stores it instead of a frozen network's weights.
         """
         digest = hashlib.sha256()
         for name, value in sorted(self.network.state_dict().items()):
@@ -77,7 +77,7 @@ class ImageEncoder(nn.Module):
 
 
 class _ViT(nn.Module):
-    """A timm ViT that normalises its input and returns its last tokens, registers dropped."""
+    """timm ViT that normalises its input and returns its last tokens, without registers."""
 
     mean: Tensor
     std: Tensor
@@ -103,20 +103,20 @@ Weights = str | Path | Mapping[str, Tensor]
 
 
 def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder | None:
-    """Builds the encoder that ``config`` names, with its weights.
+    """Build the encoder of ``config``, with its weights.
 
     Args:
         config: the model's configuration.
-        weights: for a timm ViT a file (timm's safetensors or .pth, or Meta's DINOv2 .pth), "hub"
-            to fetch timm's own, or "random" for untrained ones, the same on every call; or what
-            such a file holds. For "vgg16" torchvision's file, or None for the one in the cache.
+        weights: for a timm ViT a file (timm's safetensors or .pth, or Meta's DINOv2 .pth), its
+            state dict, "hub" to fetch timm's own, or "random" for untrained ones, the same on every
+            call. For "vgg16" torchvision's file, or None for the one in the cache.
 
     Returns:
         The encoder, or None if ``config.encoder`` is "none".
 
     Raises:
-        UserError: the network or file does not exist, the weights do not fit, or ``weights`` is
-            needed and not given.
+        UserError: the network or file does not exist, the weights do not fit, or required
+            ``weights`` are missing.
     """
     if config.encoder == "none":
         return None
@@ -130,14 +130,14 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
         return ImageEncoder(network, network.dim, config)
     if weights is None:
         raise UserError(
-            f"encoder {config.encoder}: its weights must be named: a file, 'hub' to fetch them, "
+            f"encoder {config.encoder}: its weights must be given: a file, 'hub' to fetch them, "
             "or 'random' for an untrained one"
         )
     if isinstance(weights, Mapping):
         vit = _create_vit(config, pretrained=False)
         _load_vit(vit, dict(weights), f"encoder {config.encoder}")
     elif str(weights) == "random":
-        # Checkpoints do not store this network, so no global seed may decide its weights.
+        # Checkpoints do not store this network, so its weights must not depend on a global seed.
         with torch.random.fork_rng():
             torch.manual_seed(0)
             vit = _create_vit(config, pretrained=False)
@@ -149,13 +149,13 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
 
 
 def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
-    """Builds the encoder that ``config`` names as shapes alone, on the meta device.
+    """Build the encoder of ``config`` on the meta device, without memory for weights.
 
     Returns:
-        An encoder to build a model of meta tensors with, or None if the model has none.
+        An encoder for a model of meta tensors, or None if the model has none.
 
     Raises:
-        UserError: the network does not exist, or is larger than any model may be.
+        UserError: the network does not exist, or is larger than the limit for models.
     """
     if config.encoder == "none" or not config.prepend:
         return None
@@ -195,11 +195,11 @@ def _create_vit(config: GambaConfig, pretrained: bool) -> VisionTransformer:
 
 
 def _load_vit(vit: VisionTransformer, state: dict[str, Any], path: str) -> None:
-    """Loads timm's or Meta's weights; timm resizes the positions if the picture size differs."""
+    """Load timm's or Meta's weights; timm resizes the positions if the picture size differs."""
     from timm.models.vision_transformer import checkpoint_filter_fn
 
     if "register_tokens" in state:
-        state.setdefault("mask_token", None)  # timm knows Meta's layout by this key, then drops it
+        state.setdefault("mask_token", None)  # timm detects Meta's layout by this key
     try:
         state = checkpoint_filter_fn(state, vit)
         state = {k: v for k, v in state.items() if not k.startswith("head.")}
@@ -213,12 +213,12 @@ def _load_vit(vit: VisionTransformer, state: dict[str, Any], path: str) -> None:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """The tensors of a file of weights by name: .safetensors, or what ``torch.save`` wrote.
+    """Read the tensors of a weights file by name: .safetensors, or a file of ``torch.save``.
 
-    A state dict may lie under the key "model" or "state_dict". No code of the file runs.
+    The state dict may be under the key "model" or "state_dict". No code of the file runs.
 
     Raises:
-        UserError: there is no such file, or it holds something else.
+        UserError: the file does not exist, or is not a file of weights.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file of weights")
@@ -234,5 +234,5 @@ def read_state(path: Path) -> dict[str, Any]:
         if isinstance(state, dict) and isinstance(state.get(key), dict):
             state = state[key]
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
-        raise UserError(f"{path}: holds no state dict")
+        raise UserError(f"{path}: does not hold a state dict")
     return state

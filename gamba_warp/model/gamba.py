@@ -1,4 +1,4 @@
-"""The Gamba network: encoder, tokens, blocks and decoder put together (paper §3.2)."""
+"""Gamba network: encoder, tokens, blocks and decoder (paper §3.2)."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from .pretrained import Pretrained
 
 
 def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) -> nn.ModuleList:
-    """Builds the blocks of a branch; zero channels mean that there is no such condition."""
+    """Build the blocks of a branch; zero channels mean no such condition."""
     kind = {"mamba": GambaBlock, "attention": AttentionBlock}[config.mixer]
     return nn.ModuleList(kind(config, camera_channels, image_channels) for _ in range(config.depth))
 
 
 class Gamba(Pretrained, nn.Module):
-    """One posed picture to Gaussians, in one pass (paper §3.2, GambaFormer and decoder).
+    """Network from one posed picture to Gaussians (paper §3.2, GambaFormer and decoder).
 
     Attributes:
-        recompute: keep only each block's input for the gradient, and run the block again in the
-            backward pass; this takes less memory and a third more time.
+        recompute: keep only each block's input for the gradient, and recompute the block in the
+            backward pass; takes less memory and a third more time.
     """
 
     @float32_weights()
@@ -45,12 +45,12 @@ class Gamba(Pretrained, nn.Module):
         encoder_weights: Weights | None = None,
         encoder: ImageEncoder | None = None,
     ) -> None:
-        """Builds the network with fresh weights, the encoder's excepted.
+        """Build the network with fresh weights, except for the encoder's.
 
         Args:
             config: the architecture.
-            encoder_weights: see ``build_encoder``; not used without ``config.prepend``.
-            encoder: used in place of the one that ``config`` names.
+            encoder_weights: see ``build_encoder``; unused without ``config.prepend``.
+            encoder: used instead of the one of ``config``.
 
         Raises:
             UserError: the encoder cannot be built, or its weights are missing.
@@ -80,9 +80,9 @@ class Gamba(Pretrained, nn.Module):
                 vars(parameter)["_no_weight_decay"] = True
 
     def condition(self, images: Tensor, cameras: Cameras) -> list[Any]:
-        """Computes the state that picture and camera leave in each block (``prefix_states``).
+        """Compute the state of each block after picture and camera (``prefix_states``).
 
-        It holds all that the prefix contributes; with the decoder ``triplane`` the states of the
+        It is the whole contribution of the prefix; with the decoder ``triplane`` the states of the
         planes' blocks follow. Arguments and errors are those of ``forward``.
         """
         self._check(images, cameras)
@@ -103,61 +103,61 @@ class Gamba(Pretrained, nn.Module):
         condition: list[Any] | None = None,
         background_margin: int | None = None,
     ) -> Gaussians:
-        """Predicts the Gaussians of each picture's object.
+        """Predict the Gaussians of each picture's object.
 
         Args:
             images: ``[B, H, W, 3]`` RGB in [0, 1] on ``config.background``, H = W =
                 ``config.image_size``; for the decoder ``rays`` ``[B, H, W, 4]`` RGBA with straight
                 alpha.
             cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same picture size.
-            condition: the result of ``condition`` for the same pictures and cameras, if the
-                caller has it already.
+            condition: the result of ``condition`` for the same pictures and cameras, if already
+                computed.
             background_margin: drop the 3DGS tokens of patches that are plain background in every
-                picture, except those within this many patches of one that is not; 0 keeps only
-                the object's own patches. This is faster, but the model was not trained for it:
-                ``make study WHAT=model`` states the error. None drops nothing. On CUDA it reads one
-                number back. The decoder ``rays`` is trained on the object's own patches and always
-                keeps only these, each picture its own; None is 0 there. A margin lets its network
-                see more, and its Gaussians stay as many.
+                picture, except within this many patches of another one; 0 keeps only the object's
+                own patches. This is faster, but the model was not trained for it:
+                ``make study WHAT=model`` measures the error. None drops nothing. On CUDA it reads
+                one number back. The decoder ``rays`` is trained on, and always uses, only the
+                object's own patches, per picture; None is 0 there. A margin adds patches to its
+                network, but no Gaussians.
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or
             the number of kept tokens, in their order. With ``rays`` N is that of the picture with
-            the most cells that see the object; the others are filled up with Gaussians of opacity
-            0.
+            the most foreground cells; the others are padded with Gaussians of opacity 0.
 
         Raises:
-            ValueError: a shape that does not fit, or a negative margin.
+            ValueError: a shape does not match, or the margin is negative.
         """
         self._check(images, cameras)
         with network_products(images.device):
             if condition is None:
                 condition = self.condition(images, cameras)
             if isinstance(self.decoder, RayDecoder):
-                return self._on_rays(images, cameras, condition, background_margin or 0)
+                return self._forward_rays(images, cameras, condition, background_margin or 0)
             tokens = self.tokens(images, cameras)
             if background_margin is not None:
                 background = self.config.background_color
                 tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
-            ours, theirs = condition[: len(self.blocks)], condition[len(self.blocks) :]
-            tokens = self.norm(run_blocks(self.blocks, tokens, ours, self.recompute))
+            count = len(self.blocks)
+            states, plane_states = condition[:count], condition[count:]
+            tokens = self.norm(run_blocks(self.blocks, tokens, states, self.recompute))
             if self.planes is None:
                 return self.decoder(tokens)
-            return self.decoder(tokens, self.planes(len(images), theirs, self.recompute))
+            return self.decoder(tokens, self.planes(len(images), plane_states, self.recompute))
 
-    def _on_rays(
+    def _forward_rays(
         self, rgba: Tensor, cameras: Cameras, condition: list[Any], margin: int
     ) -> Gaussians:
-        """What ``forward`` does for the decoder ``rays``."""
+        """Run ``forward`` for the decoder ``rays``."""
         patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
         pixels = self.tokens.pixels(rgba, cameras)
-        tokens, places = self.tokens.of_patches(pixels, patches)
+        tokens, positions = self.tokens.of_patches(pixels, patches)
         cu_seqlens = None
         if len(rgba) != 1:
             counts = torch.tensor([0, *patches.counts], device=tokens.device)
             cu_seqlens = self.config.num_orders * counts.cumsum(0)
         tokens = run_blocks(self.blocks, tokens[None], condition, self.recompute, cu_seqlens)
-        return self.decoder(self.norm(tokens)[0, places], pixels, patches, rgba, cameras)
+        return self.decoder(self.norm(tokens)[0, positions], pixels, patches, rgba, cameras)
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size
@@ -173,14 +173,14 @@ class Gamba(Pretrained, nn.Module):
                 raise ValueError(f"{name} is {tuple(got)}, expected {want}")
 
     def stored_state(self) -> dict[str, Tensor]:
-        """Returns what a checkpoint holds: the state dict without a frozen encoder."""
+        """Return the content of a checkpoint: the state dict without a frozen encoder."""
         state = self.state_dict()
         if self.encoder and self.encoder.frozen:
             return {name: v for name, v in state.items() if not name.startswith("encoder.")}
         return state
 
     def load_stored_state(self, state: dict[str, Tensor]) -> None:
-        """Loads what ``stored_state`` returned.
+        """Load a result of ``stored_state``.
 
         Raises:
             ValueError: a tensor is missing, unknown or of another shape.
@@ -189,17 +189,19 @@ class Gamba(Pretrained, nn.Module):
         self.load_state_dict(state, strict=False)
 
     def check_stored_state(self, shapes: Mapping[str, Sequence[int]]) -> None:
-        """Compares the names and shapes of tensors with those of ``stored_state``.
+        """Check the names and shapes of tensors against those of ``stored_state``.
 
         Raises:
-            ValueError: a tensor is missing, unknown or of another shape; it names the first.
+            ValueError: a tensor is missing, unknown or of another shape; the message names the
+                first.
         """
-        own = self.stored_state()
-        missing, unknown = sorted(own.keys() - shapes.keys()), sorted(shapes.keys() - own.keys())
+        state = self.stored_state()
+        missing = sorted(state.keys() - shapes.keys())
+        unknown = sorted(shapes.keys() - state.keys())
         if missing or unknown:
             kind, names = ("no", missing) if missing else ("an unknown", unknown)
             raise ValueError(f"{kind} tensor {names[0][:200]!r} ({len(names)} such)")
-        for name, value in own.items():
+        for name, value in state.items():
             if tuple(shapes[name]) != value.shape:
                 got, want = tuple(shapes[name]), tuple(value.shape)
                 raise ValueError(f"tensor '{name}' is {got}, expected {want}")

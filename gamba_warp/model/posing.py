@@ -1,7 +1,7 @@
-"""Posed input: pictures and their cameras, in the world that a model sees them in.
+"""Posed input: pictures and their cameras in the world of the model.
 
-That world has its origin at the object's centre and the axes of the reference camera, which is the
-camera of the input picture and stands at the model's distance (``GambaConfig.distance``).
+This world has its origin at the object's centre and the axes of the reference camera, which is the
+camera of the input picture at the model's distance (``GambaConfig.distance``).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def reference_cameras(config: GambaConfig, count: int) -> Cameras:
-    """The reference camera of a model, ``count`` times: that of pictures without a pose.
+    """Reference camera of a model, repeated ``count`` times, for pictures without a pose.
 
     Args:
         config: of the model; gives the size of the square pictures, the field of view and the
             distance.
-        count: number of pictures, each an input of its own.
+        count: number of input pictures.
 
     Returns:
         Cameras ``[count]``, float32 on the CPU.
@@ -36,11 +36,11 @@ def reference_cameras(config: GambaConfig, count: int) -> Cameras:
 
 
 def relative_cameras(cameras: Cameras, distance: float) -> Cameras:
-    """Cameras of a dataset's world, in the world of the first of them.
+    """Transform cameras of a dataset to the model's world of the first one.
 
     Args:
         cameras: ``[V]`` of one object, V > 0; the first becomes the reference camera.
-        distance: of the reference camera from the object's centre in its world.
+        distance: distance of the reference camera from the object's centre in the new world.
 
     Returns:
         Cameras ``[V]`` with new poses; see ``relative_to_reference``.
@@ -50,14 +50,14 @@ def relative_cameras(cameras: Cameras, distance: float) -> Cameras:
 
 
 def posed_input(views: ObjectViews, config: GambaConfig) -> tuple[Tensor, Cameras]:
-    """The first view of an object as a model takes it.
+    """Convert the first view of an object to a model's input.
 
     Args:
         views: of one object; pictures of the model's ``image_size``.
         config: of the model; gives the background and the distance.
 
     Returns:
-        Images ``[1, S, S, 3]`` RGB in [0, 1], or RGBA where the model takes it, and the reference
+        Images ``[1, S, S, 3]`` RGB in [0, 1], or RGBA if the model takes it, and the reference
         camera ``[1]``, on the device of ``views``.
     """
     images = views.images[:1]

@@ -1,4 +1,4 @@
-"""A model's answer to one picture."""
+"""Prediction of a model for one picture."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ def reconstruct(
     precision: Precision = "float32",
     detail: Detail | None = None,
 ) -> Gaussians:
-    """One forward pass on one picture, seen by the reference camera.
+    """Reconstruct one picture, taken as seen by the reference camera.
 
     Args:
         model: on any device, in evaluation mode.
-        picture: a file, whose object ``photo.cutout.cut_out`` cuts out and centres, with nothing
-            fetched; or the ``rgba`` of what that returns, ``[S, S, 4]`` in [0, 1] with the object
-            in the middle.
+        picture: a file, whose object ``photo.cutout.cut_out`` cuts out and centres without
+            downloads; or the ``rgba`` of its result, ``[S, S, 4]`` in [0, 1] with the object in the
+            middle.
         precision: of the network's products, see ``devices.pick_precision``.
-        detail: into how many Gaussians a side each of the front may split, see
-            ``detail.split_front``; 1 leaves what the network gave. None is the most for which the
-            picture has the pixels, and 1 for a decoder other than ``rays``.
+        detail: largest number of Gaussians a side into which each front one splits, see
+            ``detail.split_front``; 1 for no splitting. None is the largest that the picture's
+            pixels allow, and 1 for a decoder other than ``rays``.
 
     Returns:
         Gaussians ``[N]``, float32, on the model's device, in the reference camera's frame.
 
     Raises:
-        UserError: the file cannot be read, or its object cannot be told from the background; the
-            model cannot split its front.
+        UserError: the file cannot be read, its object cannot be separated from the background, or
+            the model cannot split its front.
         ValueError: the array has another shape.
     """
     rgba = picture
@@ -67,14 +67,14 @@ def reconstruct(
 
 
 def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:
-    """A picture as a model takes it.
+    """Convert a picture to a model's input.
 
     Args:
         rgba: ``[S, S, 4]`` in [0, 1], straight alpha.
         config: of the model.
 
     Returns:
-        ``[1, s, s, 3]`` RGB on the model's background, or RGBA where the model takes alpha, on the
+        ``[1, s, s, 3]`` RGB on the model's background, or RGBA if the model takes alpha, on the
         CPU; s is ``config.image_size``.
     """
     size = config.image_size

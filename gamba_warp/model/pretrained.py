@@ -1,9 +1,9 @@
-"""Models as files and folders, and the part of ``Gamba`` that reads and writes them.
+"""Reading and writing of models as files, folders and repositories of a hub.
 
-One safetensors file holds the weights and, in its header, the configuration. What a file says is
-compared with the model that its configuration means before that model, or any of the file's
-tensors, takes memory. A folder has that file, ``config.json``, a card, and a frozen encoder's
-weights; it is read and written without huggingface_hub and without a network.
+A safetensors file holds the weights and, in its header, the configuration. The header is checked
+against the model of its configuration before that model, or any tensor, takes memory. A folder has
+that file, ``config.json``, a card, and a frozen encoder's weights; reading and writing it needs
+neither huggingface_hub nor a network.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
 ENCODER_NAME = "encoder.safetensors"  # a frozen encoder's weights, in the same folder
 MAX_HEADER = 16 << 20  # bytes; that of a model of 256 blocks takes 1 MB
-_SMALL = 10_000_000  # parameters of a model that is built at once: torch's meta device is slow
-_STORED = ("F32", "BF16", "F16")  # numbers that a file may have; all become float32
+_SMALL = 10_000_000  # parameters of a model built at once, as torch's meta device is slow
+_DTYPES = ("F32", "BF16", "F16")  # allowed in a file; all become float32
 
 CONFIG_NAME, CARD_NAME = "config.json", "README.md"
-WRITTEN = (FILE_NAME, ENCODER_NAME, CONFIG_NAME, CARD_NAME)  # what ``save_pretrained`` writes
+WRITTEN = (FILE_NAME, ENCODER_NAME, CONFIG_NAME, CARD_NAME)  # files of ``save_pretrained``
 _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 1,500
-# These keys of the header are ours; extra_metadata may use any other key.
-_OWN_KEYS = ("format", "config", "encoder_sha256")
+# Reserved keys of the header; extra_metadata may use any other key.
+_RESERVED_KEYS = ("format", "config", "encoder_sha256")
 
 
 class Pretrained:
-    """The methods of ``Gamba`` that read and write folders, and repositories of a hub."""
+    """Methods of ``Gamba`` to read and write folders and repositories of a hub."""
 
     def save_pretrained(self: Gamba, folder: str | Path, card: str = "") -> Path:  # type: ignore[misc]
-        """Writes a model as a folder that ``from_pretrained`` and ``load_model`` read.
+        """Write a model as a folder for ``from_pretrained`` and ``load_model``.
 
         A frozen timm encoder is written too, as ``encoder.safetensors``.
 
         Args:
-            folder: is made; files of the same names are replaced, each when it is whole, but a
-                README.md that is there stays as it is.
-            card: Markdown that follows what the model card says by itself.
+            folder: the folder, created if missing; existing files are replaced atomically, except
+                README.md, which stays.
+            card: Markdown to append to the generated model card.
 
         Returns:
             The folder.
@@ -89,25 +89,25 @@ class Pretrained:
         local_files_only: bool = False,
         token: str | bool | None = None,
     ) -> Gamba:
-        """Reads a model from a folder, a file or a repository of the Hugging Face Hub.
+        """Load a model from a folder, a file or a repository of the Hugging Face Hub.
 
-        A repository that is in the cache is not asked for again; ``force_download`` does that.
+        A cached repository is used without a request; ``force_download`` requests it again.
 
         Args:
             name: a folder of ``save_pretrained``, a model file, or ``owner/repository``.
             device: as for ``load_model``, like ``encoder_weights``.
             revision: of the repository: a branch, tag or commit.
-            cache_dir: of huggingface_hub, like the arguments that follow.
+            cache_dir: of huggingface_hub, like the following arguments.
 
         Returns:
             The model in eval mode.
 
         Raises:
-            UserError: it cannot be had, is no model of ours, or its config.json is of another one.
+            UserError: the model cannot be found, is of another format, or its config.json differs.
         """
         path = Path(name)
         if not path.exists():
-            path = _fetched(
+            path = _download(
                 str(name),
                 force_download,
                 revision=revision,
@@ -115,41 +115,41 @@ class Pretrained:
                 local_files_only=local_files_only,
                 token=token,
             )
-        said, model = path / CONFIG_NAME, path / FILE_NAME  # the model's own file decides
-        if said.is_file() and model.is_file():
-            from ..untrusted.documents import read_bytes  # not where torch and warp are all
+        config, model = path / CONFIG_NAME, path / FILE_NAME  # the model's header is decisive
+        if config.is_file() and model.is_file():
+            from ..untrusted.documents import read_bytes  # not at the top: msgspec is optional
 
-            text = read_bytes(said, _MAX_CONFIG)
-            if GambaConfig.from_json(text, str(said)) != read_config(model)[0]:
-                raise UserError(f"{said}: is not the configuration in {model}")
+            text = read_bytes(config, _MAX_CONFIG)
+            if GambaConfig.from_json(text, str(config)) != read_config(model)[0]:
+                raise UserError(f"{config}: is not the configuration in {model}")
         return read_model(cls, path, device, encoder_weights)
 
     def push_to_hub(self: Gamba, repo_id: str, card: str = "", **options: Any) -> str:  # type: ignore[misc]
-        """Writes a model into a repository of the Hugging Face Hub, as ``save_pretrained`` does.
+        """Write a model into a repository of the Hugging Face Hub, like ``save_pretrained``.
 
         Args:
-            repo_id: ``owner/repository``; it is made if it is not there.
+            repo_id: ``owner/repository``, created if missing.
             card: as for ``save_pretrained``.
             options: of ``huggingface_hub.ModelHubMixin.push_to_hub``: token, private, branch,
                 commit_message and others.
 
         Returns:
-            The address of the commit.
+            URL of the commit.
 
         Raises:
-            UserError: huggingface_hub is missing, or the Hub refuses.
+            UserError: huggingface_hub is missing, or the upload fails.
         """
         model, hub = self, _hub("Gamba.push_to_hub")
 
-        class Pushed(hub.ModelHubMixin):
+        class Upload(hub.ModelHubMixin):
             def _save_pretrained(self, save_directory: Path) -> None:
                 model.save_pretrained(save_directory, card)
 
         try:
-            return str(Pushed().push_to_hub(repo_id, **options))
+            return str(Upload().push_to_hub(repo_id, **options))
         except UserError:
             raise
-        except Exception as error:  # of the library, of its network and of its checks
+        except Exception as error:  # of the library, the network or its checks
             reason = first_line(error)
             raise UserError(f"{repo_id}: cannot be written to the Hub ({reason})") from error
 
@@ -157,18 +157,18 @@ class Pretrained:
 def save_model(
     path: str | Path, model: Gamba, extra_metadata: dict[str, str] | None = None
 ) -> None:
-    """Writes weights and configuration to one safetensors file, atomically.
+    """Write weights and configuration to one safetensors file, atomically.
 
     Args:
         path: the file; if it is named ``model.safetensors``, ``load_model`` finds it by its folder.
         model: the model; of a frozen encoder only the SHA-256 of its weights is stored.
         extra_metadata: further entries of the file's header; the keys "format", "config" and
-            "encoder_sha256" are taken.
+            "encoder_sha256" are reserved.
 
     Raises:
-        TypeError: the path or the model is none, as where one stands in the place of the other.
+        TypeError: path or model has the wrong type, for example if they are swapped.
         UserError: the file cannot be written.
-        ValueError: ``extra_metadata`` has a key that is taken.
+        ValueError: ``extra_metadata`` has a reserved key.
     """
     from safetensors.torch import save_file
 
@@ -177,7 +177,7 @@ def save_model(
         raise TypeError(f"save_model takes the path, then the model, and got {kinds}")
 
     metadata = dict(extra_metadata or {})
-    taken = [key for key in _OWN_KEYS if key in metadata]
+    taken = [key for key in _RESERVED_KEYS if key in metadata]
     if taken:
         raise ValueError(f"extra_metadata has {', '.join(taken)}, which save_model writes itself")
     metadata |= {"format": FORMAT, "config": model.config.to_json()}
@@ -190,9 +190,9 @@ def save_model(
 
 
 def _sort_metadata(path: Path) -> None:
-    """Sorts the header's entries, which the library writes in another order each time.
+    """Sort the header's entries, which the library writes in varying order.
 
-    So equal weights are equal bytes. The header keeps its length, and the tensors their places.
+    Equal weights thus give equal bytes. The length of the header does not change.
     """
     with open(path, "r+b") as file:
         size = int.from_bytes(file.read(8), "little")
@@ -209,7 +209,7 @@ def read_model(
     device: str | torch.device,
     encoder_weights: Weights | None,
 ) -> Gamba:
-    """``load_model``: ``kind`` is ``Gamba``, which this module is a part of."""
+    """Implement ``load_model``; ``kind`` is ``Gamba``, which imports this module."""
     if path.is_dir():
         path = path / FILE_NAME
     if not path.exists():
@@ -238,7 +238,7 @@ def read_model(
 
 
 def _outline(kind: type[Gamba], config: GambaConfig, path: Path) -> Gamba:
-    """The model that a file's configuration means, as shapes without memory."""
+    """Build the model of a file's configuration on the meta device, without memory."""
     try:
         with torch.device("meta"):
             return kind(config, encoder=outline_encoder(config))
@@ -247,7 +247,7 @@ def _outline(kind: type[Gamba], config: GambaConfig, path: Path) -> Gamba:
 
 
 def read_config(path: Path) -> tuple[GambaConfig, str | None]:
-    """Reads what a model file says of itself, and no tensor.
+    """Read the header of a model file, without its tensors.
 
     Args:
         path: a file of ``save_model``.
@@ -256,7 +256,7 @@ def read_config(path: Path) -> tuple[GambaConfig, str | None]:
         The configuration, and the SHA-256 of a frozen encoder's weights or None.
 
     Raises:
-        UserError: the file is missing, damaged or not of our format.
+        UserError: the file is missing, damaged or of another format.
     """
     with _opened(path) as file:
         metadata = file.metadata() or {}
@@ -267,26 +267,27 @@ def read_config(path: Path) -> tuple[GambaConfig, str | None]:
 
 
 def read_weights(path: Path, model: Gamba) -> dict[str, Tensor]:
-    """Reads a model file's tensors, after their names, shapes and kinds are those of a model.
+    """Read a model file's tensors after checking names, shapes and dtypes against a model.
 
     Args:
         path: a file of ``save_model``.
-        model: of the file's configuration; it may be on the meta device.
+        model: of the file's configuration; may be on the meta device.
 
     Returns:
-        What ``Gamba.load_stored_state`` takes: float32, finite, on the CPU.
+        A state for ``Gamba.load_stored_state``: float32, finite, on the CPU.
 
     Raises:
-        UserError: the file is missing or damaged, or a number in it is not finite.
-        ValueError: a tensor is missing, unknown, or of another shape or kind; it names the tensor.
+        UserError: the file is missing or damaged, or has non-finite numbers.
+        ValueError: a tensor is missing, unknown, or of another shape or dtype; the message names
+            it.
     """
     state = {}
     with _opened(path) as file:
         model.check_stored_state({name: file.get_slice(name).get_shape() for name in file.keys()})
         for name in file.keys():
             kind = file.get_slice(name).get_dtype()
-            if kind not in _STORED:
-                raise ValueError(f"tensor '{name}' is of {kind}, not {', '.join(_STORED)}")
+            if kind not in _DTYPES:
+                raise ValueError(f"tensor '{name}' is of {kind}, not {', '.join(_DTYPES)}")
         for name in file.keys():
             state[name] = file.get_tensor(name).float()
             bad = int((~state[name].isfinite()).sum())
@@ -298,7 +299,7 @@ def read_weights(path: Path, model: Gamba) -> dict[str, Tensor]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[safe_open]:
-    """An open safetensors file. Raises UserError for all that is wrong with the file itself."""
+    """Open a safetensors file. Raises UserError if the file itself is invalid."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -306,7 +307,7 @@ def _opened(path: Path) -> Iterator[safe_open]:
             raise UserError(f"{path}: {'not a plain file' if path.exists() else 'no such file'}")
         with open(path, "rb") as raw:
             length = int.from_bytes(raw.read(8), "little")
-        # The library's own limit is 100 MB, which it would parse.
+        # The library would parse a header of up to 100 MB.
         if length > min(MAX_HEADER, path.stat().st_size):
             raise UserError(f"{path}: not a whole safetensors file (its header is too large)")
         with safe_open(path, framework="pt") as file:
@@ -317,7 +318,7 @@ def _opened(path: Path) -> Iterator[safe_open]:
 
 
 def model_card(model: Gamba, name: str, card: str = "") -> str:
-    """The model card of ``save_pretrained``: Markdown that begins with the Hub's fields."""
+    """Model card of ``save_pretrained``: Markdown with the Hub's metadata."""
     config = model.config
     count = sum(value.numel() for value in model.stored_state().values())
     encoder = f", over `{config.encoder}`" if model.encoder else ""
@@ -357,8 +358,8 @@ def _hub(what: str) -> Any:
     return huggingface_hub
 
 
-def _fetched(name: str, force: bool, **options: Any) -> Path:
-    """The folder that a repository's files are cached in."""
+def _download(name: str, force: bool, **options: Any) -> Path:
+    """Return the cache folder of a repository, downloading it if needed."""
     hub = _hub("Gamba.from_pretrained")
     wanted = [CONFIG_NAME, FILE_NAME, ENCODER_NAME]
     options = {"allow_patterns": wanted} | options
@@ -366,11 +367,11 @@ def _fetched(name: str, force: bool, **options: Any) -> Path:
     for change in tries:
         try:
             folder = Path(hub.snapshot_download(name, **{**options, **change}))
-        except Exception as error:  # of the library, of its network and of its checks
+        except Exception as error:  # of the library, the network or its checks
             failure = error
             continue
         if (folder / FILE_NAME).is_file():
             return folder
         failure = FileNotFoundError(f"it has no {FILE_NAME}")
     reason = first_line(failure)[:200]
-    raise UserError(f"{name}: neither a folder here nor to be had from the Hub ({reason})")
+    raise UserError(f"{name}: neither a local folder nor available from the Hub ({reason})")

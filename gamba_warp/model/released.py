@@ -1,9 +1,9 @@
-"""The authors' public weights as a model of ours: the preset ``released``, and names to names.
+"""Import of the authors' public weights: the preset ``released``, and the mapping of names.
 
-Their world has y up and z towards the camera, ours y down and z away from it (OpenCV's). The two
-differ by the signs of y and z, and so do rays and centres. Those signs go into the weights here:
-the channels of the rays change theirs, and the position's points of y and z, which lie even about
-0, their order. Nothing of this is left in the network.
+Their world has y up and z towards the camera, ours y down and z away from it (OpenCV). The two
+differ by the signs of y and z, and so do rays and centres. The import changes the weights
+accordingly: the channels of the rays change their sign, and the position's points of y and z, which
+are symmetric about 0, their order. The network itself needs no change.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .gamba import Gamba
 DEPTH = PRESETS["released"].depth  # blocks of the published network
 _ROOT, _ENCODER = "model.", "model.map_image.model."
 _BLOCK = "transformer.layers.{}."
-# Theirs to ours, of a block and of the rest.
+# Their names to ours, of a block and of the rest.
 _IN_BLOCK = {
     "cond_affine.weight": "project_image.weight",
     "cond_affine.bias": "project_image.bias",
@@ -59,25 +59,25 @@ _VITS = {
     for channels, size in ((384, "small"), (768, "base"), (1024, "large"), (1536, "giant"))
 }
 # Channels of a pixel (RGB, o × d, d) that change their sign between the two worlds.
-_TURNED = [4, 5, 7, 8]
+_FLIPPED = [4, 5, 7, 8]
 
 
 def load_released(
     path: str | Path, encoder_weights: Weights | None = None, depth: int = DEPTH
 ) -> Gamba:
-    """Reads the authors' file of weights as a model with the quirks of their code.
+    """Load the authors' file of weights as a model with the peculiarities of their code.
 
     Args:
-        path: what their training writes, in any float dtype, with DINOv2's weights under
-            ``model.map_image`` or without.
-        encoder_weights: as for ``build_encoder``, in place of those in the file.
-        depth: the number of blocks that the file must hold.
+        path: a file of their training, in any float dtype, with or without DINOv2's weights under
+            ``model.map_image``.
+        encoder_weights: as for ``build_encoder``, instead of those in the file.
+        depth: the expected number of blocks.
 
     Returns:
         The model, float32 on the CPU, in eval mode.
 
     Raises:
-        UserError: no such file, another network's, or one without DINOv2's weights when none are
+        UserError: the file is missing, of another network, or lacks DINOv2's weights and none are
             given.
     """
     path = Path(path)
@@ -90,7 +90,7 @@ def load_released(
     config, weights = convert_released(state, str(path), depth)
     if encoder_weights is None and not encoder:
         raise UserError(
-            f"{path}: has no image encoder (model.map_image); name a file of DINOv2's weights"
+            f"{path}: has no image encoder (model.map_image); give a file of DINOv2's weights"
         )
     model = Gamba(config, encoder if encoder_weights is None else encoder_weights)
     model.load_stored_state(weights)
@@ -100,19 +100,18 @@ def load_released(
 def convert_released(
     state: dict[str, Any], path: str, depth: int = DEPTH
 ) -> tuple[GambaConfig, dict[str, Tensor]]:
-    """The configuration that a state dict of theirs means, and the same weights by our names.
+    """Convert their state dict to a configuration and weights with our names.
 
     Args:
-        state: theirs, by names that begin with ``model.``, or none does; what belongs to the image
-            encoder and to losses is passed over. ``module.`` and ``_orig_mod.``, which training on
-            several GPUs and torch's compiler put into names, are left out.
+        state: their state dict; either some names begin with ``model.``, or none. Tensors of the
+            image encoder and of losses are ignored. ``module.`` and ``_orig_mod.``, added to names
+            by training on several GPUs and by torch's compiler, are removed.
         path: for the error message.
-        depth: the number of blocks that it must hold: nothing else in it tells whether the last
-            ones are missing.
+        depth: the expected number of blocks: missing last blocks cannot be detected otherwise.
 
     Returns:
-        The preset ``released`` at the sizes of the tensors, and what ``load_stored_state`` takes,
-        float32.
+        The preset ``released`` at the sizes of the tensors, and a float32 state for
+        ``load_stored_state``.
 
     Raises:
         UserError: a tensor is missing, unknown, not finite or of an impossible shape.
@@ -123,7 +122,7 @@ def convert_released(
         if not name.startswith(_ROOT) or name.startswith(_ENCODER):
             continue
         if not isinstance(value, Tensor) or not value.is_floating_point():
-            raise UserError(f"{path}: '{name[:100]}' is no tensor of floating-point numbers")
+            raise UserError(f"{path}: '{name[:100]}' is not a tensor of floating-point numbers")
         stored = value.dtype if name == _ROOT + _COORDS else stored
         value = value.float()
         if not value.isfinite().all():
@@ -134,10 +133,10 @@ def convert_released(
         if config.depth != depth:
             raise UserError(
                 f"holds {config.depth} blocks, not {depth}: a part is missing, or it is another "
-                f"network, which --depth {config.depth} takes as it is"
+                f"network, which --depth {config.depth} accepts"
             )
-        weights = _renamed(found, config.depth)
-        with torch.device("meta"):  # before anything takes memory that the file does not hold
+        weights = _rename(found, config.depth)
+        with torch.device("meta"):  # check before allocating memory
             outline = Gamba(config, encoder=outline_encoder(config))
         outline.check_stored_state({name: value.shape for name, value in weights.items()})
     except UserError as error:
@@ -153,7 +152,7 @@ def convert_released(
 
 
 def _plain_names(state: dict[str, Any], path: str) -> dict[str, Any]:
-    """The same by the names of their code: without wrappers' parts, and below ``model.``."""
+    """Restore the names of their code: without the parts of wrappers, and below ``model.``."""
     plain = {_WRAPPERS.sub("", name): value for name, value in state.items()}
     if len(plain) < len(state):
         raise UserError(f"{path}: has a tensor twice, with 'module.' or '_orig_mod.' and without")
@@ -163,7 +162,7 @@ def _plain_names(state: dict[str, Any], path: str) -> dict[str, Any]:
 
 
 def released_names(depth: int) -> dict[str, str]:
-    """Their names of tensors, without ``model.``, and ours, for a network of so many blocks."""
+    """Map their names of tensors, without ``model.``, to ours, for ``depth`` blocks."""
     names = dict(_NAMES)
     for n in range(depth):
         names |= {f"{_BLOCK.format(n)}{k}": f"blocks.{n}.{v}" for k, v in _IN_BLOCK.items()}
@@ -178,7 +177,7 @@ def _shape(found: dict[str, Tensor], name: str, axes: int) -> list[int]:
 
 
 def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
-    """The preset at the sizes of the tensors, with those points, stored in that dtype."""
+    """Preset at the sizes of the tensors, with their points, stored in the given dtype."""
     width, _, patch, _ = _shape(found, "stem_layer.weight", 4)
     tokens, _ = _shape(found, "transformer.pos_embed", 2)
     block = _BLOCK.format(0)
@@ -191,9 +190,9 @@ def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
     points = found.pop(_COORDS)
     limit = _decimal(points[0, -1].to(stored)) if points.numel() else 0.0
     even = torch.linspace(-limit, limit, bins, dtype=torch.float32)
-    # Even points are even no more once each is rounded: by half a unit of the last place of the
-    # largest at most, 0.0016 in bfloat16 at 0.4, where the points are 0.04 apart. 1e-6 is for the
-    # sum by which a float32 point was made.
+    # Rounding moves the evenly spaced points by at most half a unit in the last place of the
+    # largest: 0.0016 in bfloat16 at 0.4, where the points are 0.04 apart. 1e-6 covers the error of
+    # the sum that made a float32 point.
     near = max(1e-6, limit * torch.finfo(stored).eps)
     if points.shape[0] != 3 or bins < 2 or not torch.allclose(points, even, rtol=0, atol=near):
         raise ValueError(f"'{_COORDS}' is not the same even points on three axes")
@@ -222,20 +221,20 @@ def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
 
 
 def _decimal(value: Tensor) -> float:
-    """The shortest decimal number that is stored as this one: 0.4 for bfloat16's 0.400390625."""
+    """Shortest decimal that is stored as this number: 0.4 for bfloat16's 0.400390625."""
     numbers = (float(f"{float(value):.{digits}g}") for digits in range(1, 18))
     return next(x for x in numbers if float(torch.tensor(x).to(value.dtype)) == float(value))
 
 
-def _renamed(found: dict[str, Tensor], depth: int) -> dict[str, Tensor]:
-    """Takes their tensors out of ``found``, by our names and in our world."""
+def _rename(found: dict[str, Tensor], depth: int) -> dict[str, Tensor]:
+    """Move their tensors out of ``found``, with our names and in our world."""
     weights = {ours: found.pop(theirs) for theirs, ours in released_names(depth).items()}
     for n in range(depth):
         weights[f"blocks.{n}.mamba.conv_weight"] = weights[f"blocks.{n}.mamba.conv_weight"][:, 0]
     stem = weights["tokens.patchify.weight"].clone()
     if stem.shape[1] != 9:
         raise ValueError(f"'stem_layer.weight' takes {stem.shape[1]} channels, not 9")
-    stem[:, _TURNED] *= -1
+    stem[:, _FLIPPED] *= -1
     weights["tokens.patchify.weight"] = stem
     for end in ("weight", "bias"):
         x, *others = weights[f"decoder.position.{end}"].tensor_split(3)

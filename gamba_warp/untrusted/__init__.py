@@ -1,1 +1,1 @@
-"""What strangers' files go through before anything of ours believes them; see docs/security.md."""
+"""Validation of untrusted files; see docs/security.md."""

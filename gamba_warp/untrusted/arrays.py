@@ -1,7 +1,6 @@
-"""``.npy`` files of strangers: small arrays of numbers of a known shape, read without numpy.load.
+"""Untrusted ``.npy`` files: small arrays of numbers of a known shape, read without numpy.load.
 
-``numpy.load`` goes by the content: a zip is opened as such, and memory is taken by what a header
-states.
+``numpy.load`` trusts the content: it opens zip files, and allocates the size stated by the header.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 def read_array(path: Path, shape: tuple[int, ...]) -> np.ndarray:
-    """Reads an array of finite numbers.
+    """Read an array of finite numbers.
 
     Args:
         path: file, at most ``MAX_BYTES``; any kind of integers or floats, of any byte order.
-        shape: what it must have.
+        shape: the required shape.
 
     Returns:
         float64 array of that shape.
 
     Raises:
-        UserError: it cannot be read, is no ``.npy`` file, holds other things than numbers, or more
-            or fewer of them, or one that is not finite.
+        UserError: the file cannot be read, is not a ``.npy`` file of numbers, has another shape, or
+            non-finite numbers.
     """
     try:
         array = _parse(read_bytes(path, MAX_BYTES), shape)
@@ -51,7 +50,7 @@ def _parse(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
     try:
         header = _HEADERS[npy.read_magic(file)]
         stated, columns_first, dtype = header(file)
-    except Exception as error:  # numpy asks Python's own parser, which has a dozen kinds
+    except Exception as error:  # numpy uses Python's parser, which raises a dozen types
         raise UserError("its header is not that of an array") from error
     wanted = "x".join(map(str, shape))
     if tuple(stated) != shape:
@@ -63,25 +62,25 @@ def _parse(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def plain_array(data: bytes, dtype: str, shape: tuple[int, ...], columns_first: bool) -> np.ndarray:
-    """An array of numbers over bytes, all of whose parts may be a stranger's.
+    """Make an array of numbers from bytes, with all arguments untrusted.
 
     Args:
-        data: what the array holds.
-        dtype: as numpy writes it: byte order, kind and bytes, ``<f4``.
-        shape: of the array.
-        columns_first: whether the first index runs fastest.
+        data: bytes of the array.
+        dtype: in numpy's notation: byte order, kind and bytes, ``<f4``.
+        shape: shape of the array.
+        columns_first: True if the first index runs fastest.
 
     Returns:
-        Read-only array; it shares the bytes.
+        Read-only array that shares the bytes.
 
     Raises:
-        UserError: the type is not of plain integers or floats, or the shape needs another number of
-            bytes.
+        UserError: the type is not a plain integer or float, or the number of bytes does not match
+            the shape.
     """
     if not isinstance(dtype, str) or not _NUMBERS.fullmatch(dtype):
         raise UserError(f"it holds {str(dtype)[:40]}, not numbers")
     if not isinstance(data, bytes) or not all(type(n) is int and n >= 0 for n in shape):
-        raise UserError("its bytes or its shape are of another kind")
+        raise UserError("its bytes or its shape have the wrong type")
     if len(data) != int(dtype[2:]) * math.prod(shape):
         stated = "x".join(map(str, shape))[:40]
         raise UserError(f"expected {stated} numbers, it holds {len(data)} bytes of them")

@@ -1,11 +1,11 @@
-"""A function run for many items in child processes: what kills a child is one item's failure.
+"""Runs a function for many items in child processes; a crashed child fails only its item.
 
-Native libraries that meet a stranger's bytes may crash, hang or take all memory. Here they do so in
-a process that can be lost: its item gets one line as its reason, a new child takes the next item.
+Native libraries may crash, hang or exhaust the memory on untrusted bytes. In a child process this
+fails one item, with a one-line reason, and a new child takes the next item.
 
 A child is a fresh Python process (spawn: threads of native libraries do not survive a fork), takes
-one item at a time, and is kept for the next call, because its imports take seconds. Children end
-with their parent, however that ends. As with everything that ``multiprocessing`` spawns, a script
+one item at a time, and is reused by the next call, because its imports take seconds. Children end
+with their parent, however it ends. As with all processes spawned by ``multiprocessing``, a script
 must have its calls below ``if __name__ == "__main__":``.
 """
 
@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 
 from ..errors import UserError
 
-_EXIT_SECONDS = 10.0  # in which a process that was killed is gone
+_EXIT_SECONDS = 10.0  # timeout for the end of a killed process
 _READY = "ready"
 
 
 class Failed(NamedTuple):
-    """What stands in place of a value: why there is none, in one line."""
+    """Failure of an item, in place of its value, with a one-line reason."""
 
     reason: str
 
@@ -43,19 +43,19 @@ def run_each(
     seconds: float | None = None,
     memory: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Calls ``function(item)`` for every item in child processes; yields results as they come.
+    """Call ``function(item)`` for every item in child processes; yield results as they complete.
 
     Args:
-        function: what pickle can name: of a module, or a ``functools.partial`` of such.
-        items: what pickle can carry.
+        function: a picklable function: of a module, or a ``functools.partial`` of one.
+        items: picklable items.
         workers: number of children.
         seconds: limit for one item, or None. The first item of a child includes its imports.
-        memory: bytes that a child may allocate, its imports (half a gigabyte with torch) included,
-            or None; on Linux alone (``RLIMIT_DATA``).
+        memory: bytes that a child may allocate, including its imports (half a gigabyte with
+            torch), or None; only on Linux (``RLIMIT_DATA``).
 
     Yields:
-        The item's index, and the function's value or ``Failed``: what it raised, the signal that
-        its process died of, or that it took too long.
+        The item's index, and the function's value or ``Failed`` with its exception, the signal that
+        killed its process, or the time limit.
 
     Raises:
         RuntimeError: child processes cannot be started.
@@ -70,68 +70,68 @@ def run_each(
                 index, child = waiting.pop(), _idle.pop() if _idle else _Child()
                 busy[index] = child
                 child.begin(function, items[index], memory)
-            for index, value in _answers(busy, seconds):
+            for index, value in _wait_for_results(busy, seconds):
                 child = busy.pop(index)
                 if child.is_alive():
                     _idle.append(child)
                 else:
                     child.end()
                 yield index, value
-    finally:  # also where the caller stops early, or is interrupted
+    finally:  # also if the caller stops early or is interrupted
         for child in busy.values():
             child.end()
 
 
 def end_idle() -> None:
-    """Ends the children that are kept for the next call, and frees their memory."""
+    """End the idle children, and free their memory."""
     while _idle:
         _idle.pop().end()
 
 
-def _answers(busy: dict[int, _Child], seconds: float | None) -> list[tuple[int, Any]]:
-    """Waits until something happens; returns the items that are done, and what came of them."""
+def _wait_for_results(busy: dict[int, _Child], seconds: float | None) -> list[tuple[int, Any]]:
+    """Wait for an event; return the finished items with their results."""
     left = None
     if seconds is not None:
         left = max(0.0, min(child.start for child in busy.values()) + seconds - time.monotonic())
-    wait([way for child in busy.values() for way in (child.pipe, child.process.sentinel)], left)
+    wait([w for child in busy.values() for w in (child.pipe, child.process.sentinel)], left)
     done = []
     for index, child in busy.items():
-        answer = child.answer()
-        if answer is None and seconds is not None and time.monotonic() - child.start >= seconds:
+        result = child.result()
+        if result is None and seconds is not None and time.monotonic() - child.start >= seconds:
             child.end()
-            answer = (Failed(f"took more than {seconds:g} seconds"),)
-        if answer is not None:
-            done.append((index, answer[0]))
+            result = (Failed(f"took more than {seconds:g} seconds"),)
+        if result is not None:
+            done.append((index, result[0]))
     return done
 
 
 class _Child:
-    """One process, and the pipe to it."""
+    """Child process, and the pipe to it."""
 
     def __init__(self) -> None:
         context = get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        # Daemons are ended by multiprocessing when this process ends in order.
-        self.process = context.Process(target=_serve, args=(theirs, os.getpid()), daemon=True)
+        self.pipe, remote = context.Pipe()
+        # multiprocessing ends daemons when this process exits normally.
+        self.process = context.Process(target=_serve, args=(remote, os.getpid()), daemon=True)
         self.process.start()
-        theirs.close()
+        remote.close()
         self.owner = os.getpid()
         self.ready = False
         self.start = time.monotonic()
 
     def is_alive(self) -> bool:
-        # After a fork the child is another's.
+        # After a fork the child belongs to another process.
         return self.owner == os.getpid() and not self.pipe.closed and self.process.is_alive()
 
     def begin(self, function: Callable[[Any], Any], item: Any, memory: int | None) -> None:
-        """Sends a task. Raises what pickle raises where it cannot be sent."""
+        """Send a task. Errors of pickle are raised."""
         self.start = time.monotonic()
         message = pickle.dumps((os.getcwd(), memory, pickle.dumps((function, item))))
-        with contextlib.suppress(OSError):  # it has died: ``answer`` says so
+        with contextlib.suppress(OSError):  # it has died: reported by ``result``
             self.pipe.send_bytes(message)
 
-    def answer(self) -> tuple[Any] | None:
-        """The value or ``Failed`` of the task; None where it is still at work."""
+    def result(self) -> tuple[Any] | None:
+        """Return the value or ``Failed`` of the task; None while it is running."""
         try:
             if not self.pipe.poll() and self.process.is_alive():
                 return None
@@ -149,13 +149,13 @@ class _Child:
         self.end()
         if not self.ready:
             raise RuntimeError(
-                f"a child process ended before it began ({_of(code)}); a script must have its "
-                "calls below 'if __name__ == \"__main__\":'"
+                f"a child process ended at its start ({_describe_exit(code)}); a script must have "
+                "its calls below 'if __name__ == \"__main__\":'"
             )
-        return Failed(f"its process {_of(code)}")
+        return Failed(f"its process {_describe_exit(code)}")
 
     def end(self) -> None:
-        """Ends the process at once, and waits until it is gone."""
+        """Kill the process, and wait for its end."""
         if self.owner == os.getpid():
             self.process.kill()
             self.process.join(_EXIT_SECONDS)
@@ -165,19 +165,19 @@ class _Child:
 _idle: list[_Child] = []
 
 
-def _of(code: int | None) -> str:
-    """How a process ended, in words."""
+def _describe_exit(code: int | None) -> str:
+    """Describe the end of a process."""
     if code is None:
         return "stopped answering"
     if code >= 0:
         return f"ended with exit code {code}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else "unknown"
-    memory = ", perhaps for want of memory" if name == "SIGKILL" else ""
+    memory = ", perhaps out of memory" if name == "SIGKILL" else ""
     return f"died of signal {-code} ({name}){memory}"
 
 
 def _serve(pipe: Connection, parent: int) -> None:
-    """The child: does tasks, until its parent is gone."""
+    """Main loop of a child: run tasks until the parent ends."""
     _end_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the parent ends its children
     os.dup2(2, 1)  # stdout belongs to the parent's command
@@ -185,13 +185,13 @@ def _serve(pipe: Connection, parent: int) -> None:
         pipe.send(_READY)
         while True:
             folder, memory, task = pickle.loads(pipe.recv_bytes())
-            pipe.send_bytes(_done(folder, memory, task))
+            pipe.send_bytes(_run_task(folder, memory, task))
     except (EOFError, OSError):
         return
 
 
 def _end_with_parent(parent: int) -> None:
-    """Sees to it that this process does not outlive its parent, even one that is killed."""
+    """Make this process end with its parent, even if the parent is killed."""
 
     def watch() -> None:
         process = parent_process()
@@ -200,7 +200,7 @@ def _end_with_parent(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-    if sys.platform == "linux":  # also where a native call never lets that thread run
+    if sys.platform == "linux":  # also if a native call never lets that thread run
         import ctypes
 
         with contextlib.suppress(OSError, AttributeError):
@@ -209,11 +209,11 @@ def _end_with_parent(parent: int) -> None:
             os._exit(1)
 
 
-def _done(folder: str, memory: int | None, data: bytes) -> bytes:
-    """Does one task; returns the pickled answer, a tuple of one."""
+def _run_task(folder: str, memory: int | None, data: bytes) -> bytes:
+    """Run one task; return the pickled result, a tuple of one."""
     try:
         with contextlib.suppress(OSError):
-            os.chdir(folder)  # relative paths mean what they mean to the parent
+            os.chdir(folder)  # so that relative paths are the parent's
         _limit(memory)
         function, item = pickle.loads(data)
         return pickle.dumps((function(item),))
@@ -227,11 +227,11 @@ def _done(folder: str, memory: int | None, data: bytes) -> bytes:
 
 
 def _limit(memory: int | None) -> None:
-    if sys.platform != "linux":  # macOS has these limits, but heeds none of memory
+    if sys.platform != "linux":  # macOS does not enforce limits of memory
         return
     import resource
 
-    # Not RLIMIT_AS: torch and its friends reserve far more addresses than they ever use.
+    # Not RLIMIT_AS: torch and other libraries reserve far more addresses than they use.
     most = resource.getrlimit(resource.RLIMIT_DATA)[1]
     limits = [limit for limit in (memory, most) if limit not in (None, resource.RLIM_INFINITY)]
     resource.setrlimit(resource.RLIMIT_DATA, (min(limits, default=most), most))

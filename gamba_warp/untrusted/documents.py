@@ -1,4 +1,4 @@
-"""JSON files of strangers: bounded in size and depth, decoded into declared types, or one line."""
+"""Untrusted JSON files: bounded in size and depth, decoded into declared types."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Kind = TypeVar("Kind")
 
 
 def read_bytes(path: str | Path, limit: int = MAX_BYTES) -> bytes:
-    """Reads a whole file that is not larger than ``limit`` bytes.
+    """Read a whole file of at most ``limit`` bytes.
 
     Raises:
-        UserError: it is missing, is no plain file (a folder, a pipe, a device), cannot be read, or
-            is too large.
+        UserError: it is missing, not a plain file (a folder, a pipe, a device), unreadable, or too
+            large.
     """
     path = Path(path)
     try:
@@ -42,11 +42,11 @@ def read_document(path: str | Path, kind: type[Kind], limit: int = MAX_BYTES) ->
 @overload
 def read_document(path: str | Path, kind: Any, limit: int = MAX_BYTES) -> Any: ...
 def read_document(path: str | Path, kind: Any, limit: int = MAX_BYTES) -> Any:
-    """Reads a JSON file as a value of ``kind``.
+    """Read a JSON file as a value of ``kind``.
 
     Args:
         path: file, UTF-8.
-        kind: what it must hold: a ``msgspec.Struct``, a dataclass, or a type such as
+        kind: expected type: a ``msgspec.Struct``, a dataclass, or a type such as
             ``dict[str, Any]``. Ranges and lengths are declared with ``msgspec.Meta``.
         limit: largest size, bytes.
 
@@ -61,16 +61,16 @@ def parse_document(data: bytes | str, kind: type[Kind], source: str) -> Kind: ..
 @overload
 def parse_document(data: bytes | str, kind: Any, source: str) -> Any: ...
 def parse_document(data: bytes | str, kind: Any, source: str) -> Any:
-    """Decodes JSON text as a value of ``kind``; NaN and infinity are no JSON and are refused.
+    """Decode JSON text as a value of ``kind``; NaN and infinity are not JSON and raise.
 
     Args:
         data: the text, UTF-8, with or without a byte order mark.
         kind: as for ``read_document``.
-        source: where the text comes from, for the error's message.
+        source: origin of the text, for the error message.
 
     Raises:
-        UserError: it is not JSON, is nested deeper than ``MAX_DEPTH``, or is not of ``kind``; the
-            message says where in the document.
+        UserError: the text is not JSON, nested deeper than ``MAX_DEPTH``, or not of ``kind``; the
+            message gives the position in the document.
     """
     try:
         text = data.encode() if isinstance(data, str) else data
@@ -89,16 +89,16 @@ def read_lines(path: str | Path, kind: type[Kind]) -> Iterator[Kind]: ...
 @overload
 def read_lines(path: str | Path, kind: Any) -> Iterator[Any]: ...
 def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
-    """The whole lines of a JSON Lines file; what ``parse_document`` refuses is passed over.
+    """Yield the lines of a JSON Lines file, skipping those that ``parse_document`` rejects.
 
-    A process that was killed leaves a line that is cut off.
+    A killed process may leave an incomplete line.
 
     Args:
         path: file, UTF-8.
         kind: of each line, as for ``read_document``.
 
     Raises:
-        UserError: the file is missing, is no plain file, or cannot be read.
+        UserError: the file is missing, not a plain file, or unreadable.
     """
     path = Path(path)
     if not path.is_file():
@@ -116,7 +116,7 @@ def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
 
 
 def value_of(text: str) -> Any:
-    """The value that an option's text means as JSON; the text itself where that is no JSON."""
+    """Parse an option's text as JSON; return the text itself if it is not JSON."""
     try:
         return parse_document(text, Any, "")
     except UserError:
@@ -124,10 +124,10 @@ def value_of(text: str) -> Any:
 
 
 def check_depth(value: Any, source: str) -> None:
-    """Refuses nested lists and dictionaries of more than ``MAX_DEPTH`` levels.
+    """Check that lists and dictionaries are nested at most ``MAX_DEPTH`` levels.
 
     Raises:
-        UserError: it is nested deeper.
+        UserError: the value is nested deeper.
     """
     level, depth = [value], 0
     while level:

@@ -1,4 +1,4 @@
-"""Names that strangers' files give: of a place inside a folder, or nothing."""
+"""Untrusted file names, which must stay inside a folder."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from ..errors import UserError
 
 MAX_NAME = 200  # bytes of one part, below the 255 of most file systems, so that suffixes fit
 MAX_PATH = 1024  # bytes of the whole name
-# What Windows takes for something else than the name of a file: a stream of it, a device.
+# Names with another meaning on Windows: a stream of a file, a device.
 _NOT_ON_WINDOWS = re.compile(r'.*([<>:"|?*]|[. ]$)|(con|prn|aux|nul|com\d|lpt\d) *(\..*)?$', re.I)
 
 
 def inside(folder: str | Path, name: object, source: str) -> Path:
-    """The path of a name that must stay inside a folder.
+    """Return the path of a name that must stay inside a folder.
 
     Args:
-        folder: where the name counts from; it need not exist.
-        name: as an archive, a catalogue or a dataset gives it, parts parted by slashes; what does
-            not exist yet is fine.
-        source: the file, and the field in it, that gives the name, for the error's message.
+        folder: base folder; need not exist.
+        name: name from an archive, a catalogue or a dataset, separated by slashes; need not exist.
+        source: the file and field with the name, for the error message.
 
     Returns:
         ``folder / name``, without ``.`` parts.
 
     Raises:
-        UserError: no text, empty, absolute, with a drive, a ``..`` part, a backslash or a control
-            character, over-long, on Windows also a name that it does not allow, or its way goes
+        UserError: the name is not text, empty, absolute, too long, has a drive, a ``..`` part, a
+            backslash or a control character, is not allowed on Windows (only there), or passes
             through a link that leaves the folder.
     """
     path = Path(folder).joinpath(*parts_of(name, source))
@@ -45,10 +44,10 @@ def inside(folder: str | Path, name: object, source: str) -> Path:
 
 
 def plain_name(name: object, source: str) -> str:
-    """A name that is one part of a path, fit for a new file or folder of ours.
+    """Check a name for a new file or folder: a single part of a path.
 
     Raises:
-        UserError: as for ``inside``; also where it has several parts or begins with a dot.
+        UserError: as for ``inside``; also if it has several parts or begins with a dot.
     """
     parts = parts_of(name, source)
     if len(parts) != 1 or parts[0] != name:
@@ -59,10 +58,10 @@ def plain_name(name: object, source: str) -> str:
 
 
 def parts_of(name: object, source: str) -> tuple[str, ...]:
-    """The parts of a relative name, of which nothing need exist.
+    """Split a relative name, which need not exist, into its parts.
 
     Raises:
-        UserError: as for ``inside``, links excepted.
+        UserError: as for ``inside``, except for links.
     """
     if not isinstance(name, str) or not name.strip():
         raise UserError(f"{source}: the name of a file is {repr(name)[:80]}, not text")

@@ -1,6 +1,6 @@
-"""Ranges of numbers: declared once beside a field or option, checked before anything starts.
+"""Ranges of numbers, declared with a field or option and checked before a command starts.
 
-A range is a ``msgspec.Meta``, so the same declaration also holds for what a JSON file gives.
+A range is a ``msgspec.Meta``, so the same declaration also applies to JSON files.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 else:
     try:
         from msgspec import Meta
-    except ImportError:  # gamba gpu-check needs torch, numpy and warp-lang alone
+    except ImportError:  # gamba gpu-check only needs torch, numpy and warp-lang
 
         @dataclass(frozen=True, kw_only=True)
         class Meta:
-            """What of ``msgspec.Meta`` is used: the bounds of a number, each of which may lack."""
+            """Replacement of ``msgspec.Meta`` with optional bounds of a number."""
 
             ge: float | None = None
             gt: float | None = None
@@ -33,7 +33,7 @@ else:
 
 Function = TypeVar("Function", bound=Callable)
 
-# What many commands have.
+# Types of options of several commands.
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Threads = Annotated[int, Meta(ge=1, le=4096)]
 Minutes = Annotated[float, Meta(gt=0, le=1e6)]
@@ -47,11 +47,11 @@ Rate = Annotated[float, Meta(gt=0, le=1000)]  # pictures a second
 
 
 def wrong(value: float, limits: Meta) -> str | None:
-    """Says what a number must be, or None where it is that; what is not finite never is.
+    """Describe the required range of a number outside it or not finite; None if it is valid.
 
     Args:
         value: any number.
-        limits: its range; a bound that is not given is none.
+        limits: its range; missing bounds are ignored.
 
     Returns:
         For example "must be above 0 and at most 10".
@@ -70,10 +70,10 @@ def wrong(value: float, limits: Meta) -> str | None:
 
 
 def check_range(label: str, value: float, limits: Meta) -> None:
-    """Refuses a number outside its range.
+    """Check that a number is within its range.
 
     Args:
-        label: what begins the message, such as "--lr" or "p.json: seed is".
+        label: start of the message, such as "--lr" or "p.json: seed is".
         value: any number.
         limits: its range.
 
@@ -88,15 +88,15 @@ def check_range(label: str, value: float, limits: Meta) -> None:
 
 
 def check_kind(label: str, value: object, kind: Any) -> None:
-    """Refuses a value that is not of a plain type, or not one of a ``Literal``'s.
+    """Check that a value has a plain type, or is one of a ``Literal``'s.
 
     Args:
-        label: what begins the message, such as "config: width is".
-        value: any; a whole number is let through as a float, True and False only as a bool.
+        label: start of the message, such as "config: width is".
+        value: any; an integer is accepted as a float, True and False only as a bool.
         kind: the type.
 
     Raises:
-        UserError: one line with the value and what it must be.
+        UserError: one line with the value and the expected type.
     """
     shown = repr(value)[:100]
     if typing.get_origin(kind) is typing.Literal:
@@ -111,12 +111,12 @@ def check_kind(label: str, value: object, kind: Any) -> None:
 def check_values(
     values: Mapping[str, Any], hints: Mapping[str, Any], label: Callable[[str], str]
 ) -> None:
-    """Refuses the first value that is outside the range that its type declares.
+    """Check values against the ranges declared by their types.
 
     Args:
-        values: by name; a list or tuple is checked item by item, None is let through.
-        hints: types by name, with their ``Annotated`` parts; those without ranges are let through.
-        label: what begins the message, from a value's name.
+        values: by name; a list or tuple is checked item by item, None is accepted.
+        hints: types by name, with their ``Annotated`` parts; types without ranges accept all.
+        label: start of the message, from a value's name.
 
     Raises:
         UserError: as for ``check_range``.
@@ -129,30 +129,30 @@ def check_values(
 
 
 def _limits(hint: Any) -> list[Meta]:
-    """Every range in a type: its own, and those of its parts."""
+    """All ranges in a type: its own, and those of its parts."""
     found = [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Meta)]
     return found + [limits for part in typing.get_args(hint) for limits in _limits(part)]
 
 
 def option(name: str) -> str:
-    """A field's or argument's name as an option: ``warmup_steps`` is ``--warmup-steps``."""
+    """Convert a name of a field or argument: ``warmup_steps`` to ``--warmup-steps``."""
     return "--" + name.replace("_", "-")
 
 
 def check_options(group: Any) -> None:
-    """Refuses the first field of a dataclass of options that is outside its range.
+    """Check the fields of a dataclass of options against their ranges.
 
     Raises:
-        UserError: as for ``check_range``; it names the option.
+        UserError: as for ``check_range``; the message names the option.
     """
     hints = typing.get_type_hints(type(group), include_extras=True)
     check_values(vars(group), hints, option)
 
 
 def ranged(command: Function) -> Function:
-    """Makes a command check its arguments against their ranges before it starts.
+    """Decorate a command to check its arguments against their ranges before it starts.
 
-    Arguments that are dataclasses are checked by their own fields' ranges.
+    Dataclass arguments are checked by the ranges of their fields.
     """
 
     @functools.wraps(command)

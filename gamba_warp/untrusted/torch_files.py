@@ -1,4 +1,4 @@
-"""Torch's files of strangers: plain values and tensors that the file really holds, or one line."""
+"""Untrusted files of ``torch.save``: plain values and tensors within the size of the file."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from typing import Any
 
 from ..errors import UserError
 
-MAX_VALUES = 1_000_000  # in all lists and dictionaries together; ours have some thousands
+MAX_VALUES = 1_000_000  # in all lists and dictionaries; ours have some thousands
 MAX_DEPTH = 16  # levels of lists and dictionaries; ours have up to 6
-_OLD = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # how files begin that are no zip
+_OLD = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # start of files that are not zip
 
 
 def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any:
-    """Reads a file of ``torch.save`` onto the CPU; nothing in it is run.
+    """Read a file of ``torch.save`` onto the CPU without running any code of it.
 
     Args:
         path: the file.
-        advice: what the error says about a file that cannot be read.
+        advice: text of the error for an unreadable file.
 
     Returns:
-        Dictionaries, lists and tuples of numbers, texts, None and dense tensors. All of the
-        tensors together take at most twice the file's size (two names may share one).
+        Dictionaries, lists and tuples of numbers, texts, None and dense tensors. All tensors take
+        at most twice the file's size (two names may share one).
 
     Raises:
-        UserError: no plain file, damaged (each byte is checked where the file has checksums, as
-            zip files have), or something else is in it.
+        UserError: it is not a plain file, damaged (zip files have checksums, which are verified),
+            or has values of other types.
     """
     import torch
 
@@ -42,20 +42,20 @@ def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any
             _check_zip(path, size)
         else:
             with open(path, "rb") as file:
-                if file.read(len(_OLD)) != _OLD:  # torch would ask for what any bytes say
-                    raise ValueError("it does not begin as torch's files do")
-        # Read as a map, a tensor cannot reach beyond the file; torch's other reader believes what
-        # the file says of the size of a tensor. Only old files, which are no zip, need that one.
+                if file.read(len(_OLD)) != _OLD:  # else torch would allocate arbitrary sizes
+                    raise ValueError("it does not begin like a file of torch")
+        # Memory-mapped, a tensor cannot reach beyond the file; torch's other reader trusts the
+        # stated size of a tensor. Only old files, which are not zip, need that one.
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's are many lines long
+            warnings.simplefilter("ignore")  # torch's warnings have many lines
             value = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
-        return _Copy(size).of(value)
+        return _Copier(size).copy(value)
     except UserError:
         raise
-    except Exception as error:  # pickle, zip and torch raise errors of a dozen classes
+    except Exception as error:  # pickle, zip and torch raise a dozen types
         refused = re.search(r"GLOBAL (\S+)", str(error))
-        if refused:  # torch says it behind lines that advise to let the file run
-            named = f"it holds {refused[1][:100]!r}, of which torch reads none"
+        if refused:  # torch's message advises to run the file
+            named = f"it holds {refused[1][:100]!r}, which torch does not load"
             raise UserError(f"{path}: {advice} ({named})") from error
         lines = str(error).strip().splitlines()
         reason = lines[0][:200] if lines else type(error).__name__
@@ -63,11 +63,11 @@ def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any
 
 
 def _check_zip(path: Path, size: int) -> None:
-    """Refuses packed members, members that overlap, and any whose checksum is wrong."""
+    """Raise for compressed or overlapping members, and for wrong checksums."""
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-            raise ValueError("its members are packed, which torch never does")
+            raise ValueError("its members are packed, unlike those of torch")
         if sum(member.file_size for member in members) > size:
             raise ValueError("its members are larger than the file")
         wrong = archive.testzip()
@@ -75,13 +75,13 @@ def _check_zip(path: Path, size: int) -> None:
         raise ValueError(f"the checksum of {wrong[:80]} is wrong")
 
 
-class _Copy:
-    """Copies values out of a file, up to limits: a value may be shared, or hold itself."""
+class _Copier:
+    """Copy of a file's values within limits: a value may be shared, or contain itself."""
 
     def __init__(self, size: int) -> None:
         self.bytes, self.values = 2 * size, MAX_VALUES
 
-    def of(self, value: Any, depth: int = 0) -> Any:
+    def copy(self, value: Any, depth: int = 0) -> Any:
         import torch
 
         self.values -= 1
@@ -99,9 +99,9 @@ class _Copy:
         if isinstance(value, dict):
             if not all(isinstance(key, (str, int)) for key in value):
                 raise ValueError("a key is neither a text nor a number")
-            return {k: self.of(v, depth + 1) for k, v in value.items()}
+            return {k: self.copy(v, depth + 1) for k, v in value.items()}
         if isinstance(value, (list, tuple)):
-            items = [self.of(item, depth + 1) for item in value]
+            items = [self.copy(item, depth + 1) for item in value]
             return items if isinstance(value, list) else tuple(items)
         if value is None or isinstance(value, (bool, int, float, str)):
             return value

@@ -101,7 +101,7 @@ def test_the_largest_number_holds_for_default():
     start = random_start(images, cameras, 48, rng)
     start["opacities"] = torch.linspace(-1, 1, 48)
     number = Densified(start, config, rng)
-    number._bar = lambda room: 0.0  # all that have a gradient grow
+    number._grow_threshold = lambda free: 0.0  # all that have a gradient grow
     for step in range(1, 4):
         before = number.parameters["opacities"].detach().clone()
         rgb, _ = number.draw(cameras, torch.rand(3, 3))

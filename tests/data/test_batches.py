@@ -42,7 +42,7 @@ def same(a, b):
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_the_queue_gives_the_batches_of_the_source(data, workers):
     def novel(number):
-        return number % 3  # another number at every batch, so that a mix-up would show
+        return number % 3  # differs between batches, so that a mix-up would show
 
     ahead = batches_of(data, workers=workers, novel=novel, last=7)
     for number in range(7):
@@ -96,7 +96,7 @@ def test_no_more_batches_are_begun_than_there_are_threads_ahead(data):
 
 @pytest.mark.parametrize("workers", [1, 4])
 def test_an_error_is_raised_in_its_step(data, workers, monkeypatch):
-    """More than half of the objects go bad one after the other: always in the same batch."""
+    """More than half of the objects fail one after the other: always in the same batch."""
     real = batches.load_sample
     order = [batches_of(data, 1).sample(n, 0).uids[0] for n in range(5)]
 
@@ -130,7 +130,7 @@ def test_a_defect_of_the_program_is_raised_in_its_step(data, monkeypatch):
 
 
 def test_closing_waits_for_one_sample_of_each_thread(data):
-    """Of a batch of 50 slow samples, only those that have begun are finished."""
+    """Of a batch of 50 slow samples, only the started ones are finished."""
     done, began, made = [], threading.Event(), batches_of(data, 50, 2)
 
     def slow(number, novel):
@@ -141,7 +141,7 @@ def test_closing_waits_for_one_sample_of_each_thread(data):
     made.prepare = slow
 
     def take():
-        with suppress(CancelledError, RuntimeError):  # it is closed while this submits
+        with suppress(CancelledError, RuntimeError):  # closed during the submission
             made.take(0)
 
     threading.Thread(target=take).start()
@@ -151,7 +151,7 @@ def test_closing_waits_for_one_sample_of_each_thread(data):
 
 
 def test_a_gpu_gets_pinned_batches(data, monkeypatch):
-    """Without a GPU: what is asked of the tensors, for a device that is none."""
+    """Without a GPU: the calls on the tensors, for a fake device."""
     asked = []
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda t: asked.append(t.shape) or t)
     moved = []
@@ -178,7 +178,7 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
 
 
 def test_pictures_kept_on_the_device_train_as_the_files_do(data, tmp_path):
-    """By another model's size than that of the targets, so that both are kept."""
+    """With a model size other than that of the targets, so that both are kept."""
     views = {"background": "random", "mirror": 0.5, "recolor": 0.5, "size": 12}
     for kept in (False, True):
         changed = {"views": {**views, "cache_device": kept}, "length": {"steps": 3}}

@@ -53,7 +53,7 @@ def write_library(path, properties=PROPERTIES, more=()):
 
 
 def write_deb(path, files):
-    """An ar archive as dpkg makes it; the odd-sized first member is padded."""
+    """Write an ar archive like dpkg; the odd-sized first member is padded."""
     inner = io.BytesIO()
     with tarfile.open(fileobj=inner, mode="w:xz") as tar:
         for name, data in files.items():
@@ -109,13 +109,13 @@ def test_bad_sources(tmp_path, monkeypatch):
     (tmp_path / "cut.deb").write_bytes(good[:-60])
     refused("cannot be unpacked", data_furniture_command, out, deb=tmp_path / "cut.deb")
     refused("a.sh3f: not a furniture library", data_furniture_command, out, deb=tmp_path / "p.deb")
-    refused("holds no .sh3f", data_furniture_command, out, deb=write_deb(tmp_path / "e.deb", {}))
+    refused("contains no .sh3f", data_furniture_command, out, deb=write_deb(tmp_path / "e.deb", {}))
     refused("no such folder", data_furniture_command, out, tree=tmp_path / "nowhere")
     write_library(tmp_path / "b.sh3f", "name=x\nmodel#1=/b/gone/chair.obj\n")
     refused("b.sh3f: not a furniture library", data_furniture_command, out, tree=tmp_path)
     monkeypatch.setattr(furniture, "INSTALLED", tmp_path / "not installed")
     monkeypatch.setattr(furniture.shutil, "which", lambda name: None)
-    refused("no apt-get here.*--deb", data_furniture_command, out)
+    refused("apt-get is missing.*--deb", data_furniture_command, out)
     assert not (out / "catalogue.json").exists()
     assert not list(out.glob(".download-*"))
 
@@ -138,7 +138,7 @@ def test_the_name_of_a_library_removes_nothing(tmp_path, name):
 
 
 def test_what_is_there_stays(tmp_path):
-    """A folder of somebody else's, and libraries of a run that was interrupted."""
+    """A foreign folder, and libraries of an interrupted run."""
     tree, out = tmp_path / "tree", tmp_path / "models"
     tree.mkdir()
     for name in "AB":
@@ -160,7 +160,7 @@ def test_what_is_there_stays(tmp_path):
         (PROPERTIES, ["../x"], "leaves"),
         (PROPERTIES, ["a", "A"], "twice"),
         ("model#1=/../x/chair.obj\nicon#1=/b/cafe.png", [], "leaves"),
-        ("model#1=/b/cafe/gone.obj\nicon#1=/b/cafe.png", [], "holds no"),
+        ("model#1=/b/cafe/gone.obj\nicon#1=/b/cafe.png", [], "is missing"),
         ("model#1=/b/cafe/chair.obj\nicon#1=/../b/cafe.png", [], "holds no"),
         ("model#1=\nicon#1=/b/cafe.png", [], "not text"),
         *[
@@ -179,11 +179,11 @@ def test_hostile_libraries_leave_nothing_behind(tmp_path, properties, more, reas
 
 
 def test_a_package_that_lies(tmp_path):
-    """A size of -60 sent the reader back to the same header for ever."""
+    """A size of -60 sent the reader back to the same header forever."""
     path = write_deb(tmp_path / "p.deb", {"a.sh3f": b""})
     data = path.read_bytes()
     path.write_bytes(data.replace(f"{3:<10}`".encode(), f"{-60:<10}`".encode(), 1))
-    refused("no sound size", data_furniture_command, tmp_path / "out", deb=path)
+    refused("invalid size", data_furniture_command, tmp_path / "out", deb=path)
     for name, reason in (("...sh3f", "begins with a dot"), ("x/../../../y.sh3f", "leaves")):
         write_deb(path, {name: b""})
         refused(reason, data_furniture_command, tmp_path / "out", deb=path)

@@ -27,7 +27,7 @@ from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample
 from gamba_warp.train.data.raycast import Lights, RayCaster
 
 FOV = 49.1
-# even light from everywhere: what is drawn is the surface's own colour
+# even light from all directions: the picture shows the surface's own colour
 FLAT = Lights(np.full(3, 1.0), np.zeros((1, 3)), np.zeros((1, 3)), head=0.0)
 
 
@@ -226,7 +226,7 @@ def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
     before = contents(out)
     times = {name: (out / name / "000.webp").stat().st_mtime_ns for name in ("a", "sub-c")}
     shutil.rmtree(out / "b")
-    part = out / f"{PART}abcd1234"  # as a run leaves it that was killed two days ago
+    part = out / f"{PART}abcd1234"  # left by a run that was killed two days ago
     part.mkdir()
     (part / "000.webp").write_bytes(b"half")
     for path in (part / "000.webp", part):
@@ -306,7 +306,7 @@ def test_where_a_file_says_nothing_its_folder_gives_the_name(tmp_path):
 
 
 def test_a_name_of_an_object_is_its_own_name():
-    """So what is saved by its uid is found again, whatever the uid was made of."""
+    """Files saved by uid are found again, whatever the uid was made of."""
     paths = ["a/b/model", "old chair (2)", "Ä" * 120, "b" * 240, "b" * 239 + "c", "..", "x/x/x"]
     names = object_names([PurePath(path) for path in paths])
     assert len(set(names)) == len(paths)
@@ -396,7 +396,7 @@ def test_limit(meshes, tmp_path, capsys):
     ids=range(15),
 )
 def test_hostile_catalogues_are_one_line(tmp_path, entry, reason):
-    """Names and numbers of a catalogue; nothing is rendered, and nothing written outside."""
+    """Name and numbers of a catalogue; nothing is rendered, and nothing is written outside."""
     folder = tmp_path / "in" / "meshes"
     write_box(folder / "a.ply")
     entries = [{"uid": "box", "model": "a.ply", **entry}]

@@ -1,4 +1,4 @@
-"""The starter set: it is whole, small and attributed, and its views fit its meshes."""
+"""Starter set: complete, small and attributed, and its views match its meshes."""
 
 from pathlib import Path
 
@@ -60,7 +60,7 @@ def test_views_are_neither_empty_nor_cropped():
 
 @pytest.mark.parametrize("uid", HELD_OUT)
 def test_geometry_lies_in_the_views_frame(uid):
-    """Open3D's own pinhole camera sees the stored mesh where the stored pictures show it."""
+    """Open3D's pinhole camera projects the stored mesh onto the stored pictures."""
     o3d = import_open3d()
     mesh = trimesh.load_mesh(STARTER / "meshes" / f"{uid}.ply")
     assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(1, abs=1e-5)

@@ -169,7 +169,7 @@ def test_an_angle_alone_of_a_picture_that_is_not_square(tmp_path):
     path.write_text(json.dumps(angles))
     K = open_dataset(tmp_path).load(0).cameras.Ks[0]
     assert K[1, 1] == pytest.approx(3 / math.tan(FOV))
-    # Numbers in pixels hold for the picture, whose size the file need not repeat.
+    # Numbers in pixels apply to the picture, whose size the file need not repeat.
     path.write_text(json.dumps({"fl_x": 9, "fl_y": 7, "cx": 3, "cy": 2, "frames": [frame]}))
     K = open_dataset(tmp_path).load(0).cameras.Ks[0]
     assert K.tolist() == [[9, 0, 3], [0, 7, 2], [0, 0, 1]]
@@ -213,7 +213,7 @@ def test_masks_are_the_alpha(tmp_path):
 
 
 def test_nerfs_own_layout(tmp_path):
-    """Three files of one object, whose frames have no suffix, but may have dots."""
+    """Three files of one object, with frames without a suffix, possibly with dots."""
     path = write_transforms(tmp_path, count=3, width=8, height=6)
     frames = json.loads(path.read_text())["frames"]
     path.unlink()
@@ -278,7 +278,7 @@ def test_bad_split_file(tmp_path):
     refused("split.json: version 7", open_dataset, tmp_path, "train")
     (tmp_path / "split.json").write_text('{"version": 1, "train": ["a"], "test": ["a"]}')
     refused("in both train and test", open_dataset, tmp_path, "train")
-    for version in (1, 2):  # both are read, and said
+    for version in (1, 2):  # both are read and reported
         (tmp_path / "split.json").write_text(f'{{"version": {version}, "train": ["a"]}}')
         assert open_dataset(tmp_path, "train").split_version == version
 
@@ -323,7 +323,7 @@ def test_bad_requests(tmp_path):
     data = open_dataset(tmp_path)
     assert data.uids == ["a"]
     refused("no object 'z'", data.load, "z")
-    refused("view 3 asked for, it has 3", data.load, 0, views=[3])
+    refused("view 3 requested, it has 3", data.load, 0, views=[3])
     refused("no views", data.load, 0, views=[])
     refused("size 0", data.load, 0, size=0)
     refused("split 'tset'", open_dataset, tmp_path, "tset")

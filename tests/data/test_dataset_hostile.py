@@ -1,4 +1,4 @@
-"""Datasets of strangers: names that leave, numbers without sense, files that are no files."""
+"""Untrusted datasets: names that leave the folder, invalid numbers, special files."""
 
 import json
 import os
@@ -49,7 +49,7 @@ def openlrm(folder, intrinsics=((9, 9), (4, 4), (SIZE, SIZE)), pose=POSE[:3]):
 
 
 def reason(folder):
-    """The one line with which the object cannot be loaded; ``check`` never fails."""
+    """Message of the error on loading the object; ``check`` never fails."""
     data = open_dataset(folder.parent)
     data.check()
     message = refused(None, data.load, folder.name)
@@ -111,9 +111,9 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"frame": {"mask_path": "1.png"}}, "1 of 2 frames have a mask"),
         ({"applied_transform": [[1, 0], [0, 1]]}, "applied_transform has shape (2, 2)"),
         ({"applied_transform": "up"}, "applied_transform is not a matrix"),
-        ({"applied_transform": [[0] * 4] * 3}, "moves no mesh"),
-        ({"applied_transform": [[1e300, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "moves no mesh"),
-        ({"applied_transform": np.eye(3, 4).tolist(), "applied_scale": 0}, "moves no mesh"),
+        ({"applied_transform": [[0] * 4] * 3}, "not invertible"),
+        ({"applied_transform": [[1e300, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "not invertible"),
+        ({"applied_transform": np.eye(3, 4).tolist(), "applied_scale": 0}, "not invertible"),
         ({"applied_transform": np.eye(3, 4).tolist(), "applied_scale": "1"}, "applied_scale is"),
         ({"frames": {"0": {}}}, "no frames"),
         ({"frames": [7]}, "frame 0: no transform_matrix"),

@@ -1,6 +1,6 @@
-"""TF32 is for the network's products: rays, projections and SSIM make none that it would round.
+"""TF32 only affects the network: rays, projections and SSIM make no products that it would round.
 
-Without a GPU: every matrix product that runs is noted, with the precision that it would have there.
+Without a GPU: every matrix product is recorded, with the precision that it would have on one.
 """
 
 from dataclasses import replace
@@ -33,7 +33,7 @@ PRODUCTS = ("mm", "bmm", "addmm", "baddbmm", "matmul", "linear", "addmv", "mv", 
 
 
 class Products(TorchDispatchMode):
-    """Notes the matrix products of float32 that a GPU would round, by name."""
+    """Records the matrix products of float32 that a GPU would round, by name."""
 
     def __init__(self):
         super().__init__()
@@ -49,9 +49,9 @@ class Products(TorchDispatchMode):
 
 @pytest.fixture(autouse=True)
 def high():
-    devices._onednn_is_better()  # its own trial, once a process, is a product
+    devices._onednn_is_better()  # its trial, once per process, is a product
     before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high")  # as a training sets it
+    torch.set_float32_matmul_precision("high")  # as in training
     yield
     torch.set_float32_matmul_precision(before)
 
@@ -67,7 +67,7 @@ def means_of(count=31):
 
 
 def test_products_are_noted():
-    """What would fail the other tests: a layer of a network, forward and backward."""
+    """A layer of a network, forward and backward, would fail the other tests."""
     layer = torch.nn.Linear(3, 4)
     with Products() as seen:
         layer(torch.randn(2, 3)).sum().backward()
@@ -78,7 +78,7 @@ def test_products_are_noted():
 
 
 def test_geometry_and_ssim_make_no_products(cameras):
-    """Rays, poses, projections, rendering, depth and SSIM; forward, and backward where there is."""
+    """Rays, poses, projections, rendering, depth and SSIM; forward, and backward if supported."""
     config = micro.options(".", ".").model_config()
     images = torch.rand(5, cameras.height, cameras.width, 4)
     means, cotangents = means_of(), torch.randn(5, 31, 2)
@@ -105,7 +105,7 @@ def test_geometry_and_ssim_make_no_products(cameras):
 
 
 def test_a_whole_step_rounds_in_the_network_alone(cameras, tmp_path, monkeypatch):
-    """A training step whose model is no network: what is left is geometry, losses and rendering."""
+    """A training step without a network, so only geometry, losses and rendering run."""
     from gamba_warp.train.batches import Batch
     from gamba_warp.train.step import Objective, compute_gradients, health
 
@@ -141,7 +141,7 @@ def test_the_product_is_the_product():
 
 @pytest.mark.parametrize("weights", ["unit", "softmax"])
 def test_the_decoder_places_gaussians_with_all_digits(weights):
-    """Its layers are the network's; the sum over the bins that gives a centre is geometry."""
+    """The layers belong to the network; the sum over the bins for a centre is geometry."""
     config = micro.options(".", ".").model_config()
     decoder = GaussianDecoder(replace(config, position_weights=weights))
     hidden = torch.randn(2, 5, config.decoder_width or config.width, requires_grad=True)

@@ -1,4 +1,4 @@
-"""G-Objaverse as it is published: its folders and tars, its lists, and what is missing in it."""
+"""G-Objaverse as published: its folders and tars, its lists, and its missing files."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from gamba_warp.model.posing import relative_cameras
 
 
 def project(point, views, number):
-    """Where a point of the world lies in a picture, in shares of its side."""
+    """Project a point of the world into a picture, in shares of its side."""
     local = views.cameras.viewmats[number, :3] @ torch.tensor([*point, 1.0])
     pixel = views.cameras.Ks[number] @ local
     return (pixel[:2] / pixel[2] / views.cameras.width).tolist()
@@ -67,14 +67,14 @@ def test_views_that_lack_a_file_are_passed_over(tmp_path, suffix):
     write_object(tmp_path / "0" / "10010", "readme")
     views = tmp_path / "0" / "10010" / "campos_512_v4"
     (views / "00007" / f"00007{suffix}").unlink()
-    (views / "00040").mkdir()  # an empty one, as an interrupted wget leaves it
+    (views / "00040").mkdir()  # an empty one, as left by an interrupted wget
     data = open_dataset(tmp_path)
     assert data.num_views(0) == VIEWS - 1 and not data.check()
     assert "00007" not in {path.stem for path in data.files(0).images}
     for view in views.iterdir():
         for path in view.glob("?????.png"):
             path.unlink()
-    refused("no views that have both picture and camera", open_dataset(tmp_path).load, 0)
+    refused("no views with both picture and camera", open_dataset(tmp_path).load, 0)
 
 
 def test_depth_beside_the_views(tmp_path):
@@ -91,7 +91,7 @@ def test_depth_beside_the_views(tmp_path):
 
 
 def test_the_cameras_file_is_as_published(tmp_path):
-    """The keys of Blender scripts that render Objaverse, which G-Objaverse's files have."""
+    """G-Objaverse's files have the keys of Blender scripts that render Objaverse."""
     write_object(tmp_path / "0" / "10010", "readme")
     text = (tmp_path / "0/10010/campos_512_v4/00000/00000.json").read_text()
     keys = {"bbox", "max_depth", "origin", "x", "x_fov", "y", "y_fov", "z"}

@@ -1,12 +1,12 @@
-"""Objects that a model would know from one another lie on one side of a split."""
+"""Similar objects lie on one side of a split."""
 
-from gamba_warp.train.data.groups import Named, split_groups, textures_of, words_of
+from gamba_warp.train.data.groups import ObjectInfo, split_groups, textures_of, words_of
 
 
 def groups(*items):
     """Groups of objects "library/name/textures", as sets of their numbers."""
     named = [
-        Named(str(i), *item.split("/")[:2], frozenset(item.split("/")[2:]))
+        ObjectInfo(str(i), *item.split("/")[:2], frozenset(item.split("/")[2:]))
         for i, item in enumerate(items)
     ]
     found = split_groups(named)
@@ -41,7 +41,7 @@ def test_shared_textures_meet_and_pass_it_on():
         "A/Oak desk/x", "B/Pine bed/x/y", "C/Small crate/y", "C/Wine crate", "D/Lamp/z"
     )
     assert sides == ["0123", "4"]
-    assert found["0"] == "C-crate"  # the name that most of them have
+    assert found["0"] == "C-crate"  # the most frequent name
 
 
 def test_textures_are_known_by_their_content(tmp_path):

@@ -1,4 +1,4 @@
-"""The benchmark of the loader runs, on views that are made up and on those of a folder."""
+"""Benchmark of the loader, on made-up views and on those of a folder."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Objects that the project makes of seeds: closed, bounded, the same again, all different."""
+"""Procedural objects: closed, bounded, reproducible, all different."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_the_same_seed_gives_the_same_bits(objects):
 
 def test_objects_are_closed_and_have_a_volume(objects):
     for number, mesh in enumerate(objects):
-        # Each edge is passed as often one way as the other.
+        # Each edge is used equally often in both directions.
         edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         here, back = (a * len(mesh.vertices) + b for a, b in (edges.T, edges.T[::-1]))
         assert np.array_equal(np.sort(here), np.sort(back)), number
@@ -57,7 +57,7 @@ def test_objects_are_bounded_and_sound(objects):
         assert 12 <= len(mesh.faces) <= MAX_FACES
         for values in (mesh.vertices, mesh.normals, mesh.uvs):
             assert np.isfinite(values).all()
-        # A face's normals are unit and on its own side, but for slivers, which have none.
+        # A face's normals are unit and on its own side, except for slivers.
         corners = mesh.vertices[mesh.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(across, axis=1)
@@ -117,7 +117,7 @@ def test_files_hold_the_objects(tmp_path, objects):
 def test_another_catalogue_is_not_overwritten(tmp_path):
     (tmp_path / "catalogue.json").write_text('{"objects": []}')
     (tmp_path / "chair.glb").write_bytes(b"")
-    refused("there are other objects", data_made_command, tmp_path, count=1)
+    refused("lists other objects", data_made_command, tmp_path, count=1)
     assert (tmp_path / "catalogue.json").read_text() == '{"objects": []}'
 
 

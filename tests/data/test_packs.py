@@ -1,4 +1,4 @@
-"""Packs of views: the bits of the files, whole or not there; damage of one object is its own."""
+"""Packs of views: bit-identical, atomic; damage of one object does not affect others."""
 
 import json
 import os
@@ -28,7 +28,7 @@ WIDTH, HEIGHT, VIEWS = 14, 10, 3
 
 
 def write_object(folder, seed, depth=None):
-    """Views of noise, with fields of view and poses that no two views share."""
+    """Write views of noise, with different fields of view and poses."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True)
     frames = []
@@ -106,7 +106,7 @@ def test_a_pack_gives_the_bits_of_the_files(data, tmp_path, size, shards):
         for views in (None, [2, 0], [1, 1]):
             assert_same(pack.load(uid, views, size), files.load(uid, views, size))
         assert_same(pack.load(uid, [1, 2], size, 1), files.load(uid, [1, 2], size, 1))
-        if size is None:  # other sizes of a pack are made of its own pictures
+        if size is None:  # other sizes are made from the pack's pictures
             assert_same(pack.load(uid, [1, 2], 7), files.load(uid, [1, 2], 7))
     for name in ("train", "test"):
         assert open_dataset(tmp_path / "pack", name).uids == open_dataset(data, name).uids
@@ -149,13 +149,13 @@ def test_the_command_goes_on_where_it_was_stopped(data, tmp_path, monkeypatch, c
 
     monkeypatch.setattr(writer, "_block", block)
     words = [str(data), str(out), "--size", "6", "--shard-mb", "1", "--workers", "1"]
-    monkeypatch.setattr(writer, "_until", lambda blocks, limit: iter([next(blocks)]))
+    monkeypatch.setattr(writer, "_take_bytes", lambda blocks, limit: iter([next(blocks)]))
     assert cli.run("data pack", words) == 130
     refused("unfinished pack", open_dataset, out)
     first = (out / "shard-00000.bin").stat().st_mtime_ns
     (out / "shard-00007.bin").write_bytes(b"of a killed run")
     assert cli.run("data pack", words) == 0
-    assert "2 objects in" in capsys.readouterr().out
+    assert "2 objects already in" in capsys.readouterr().out
     assert sorted(p.name for p in out.glob("shard*")) == [f"shard-0000{n}.bin" for n in range(3)]
     assert (out / "shard-00000.bin").stat().st_mtime_ns == first
     for uid in UIDS:
@@ -228,7 +228,7 @@ def test_other_folders_are_refused(data, tmp_path):
     assert not (data / packs.INDEX).exists()
 
 
-# Damage. ``b/c`` lies between the others in one shard; each case spoils it alone.
+# Damage. ``b/c`` lies between the others in one shard; each case damages only it.
 
 
 def index_of(out):
@@ -255,7 +255,7 @@ def cut(out):
 
 
 def recounted(out, column, value):
-    """Writes a value into the cameras of the second object, with the checksum that it needs."""
+    """Write a value into the cameras of the second object, with the matching checksum."""
     entry = index_of(out)["objects"][1]
     path, start = out / "shard-00000.bin", entry["cameras"]
     content = bytearray(path.read_bytes())
@@ -322,9 +322,9 @@ def test_a_bad_object_of_a_pack_is_skipped_in_training(tmp_path):
 @pytest.mark.parametrize(
     ("top", "reason"),
     [
-        ({"version": 2}, "version 2 of packs, this one reads 1"),
+        ({"version": 2}, "pack version 2, supported is 1"),
         ({"format": "zip"}, "not the index of a pack"),
-        ({"objects": []}, "holds no objects"),
+        ({"objects": []}, "has no objects"),
         ({"objects": [{"uid": "../a"}]}, "leaves its folder"),
         ({"objects": [{"uid": 3}]}, "not text"),
         ({"objects": 3}, "array"),
@@ -342,7 +342,7 @@ def test_a_name_twice_is_refused(data, tmp_path):
     out = tmp_path / "pack"
     packed(data, out)
     edit(out, uid="a")
-    refused("a is there twice", open_dataset, out)
+    refused("a occurs twice", open_dataset, out)
 
 
 def test_webdataset_reads_its_shards(data, tmp_path):

@@ -60,7 +60,7 @@ def test_plain_backgrounds_are_taken_away(tmp_path, background):
 
 
 def test_on_its_own_background_the_matte_changes_nothing():
-    """White stays white: taking the background out and compositing on it again is the identity."""
+    """White stays white: removing the background and compositing on it again is the identity."""
     rgb = scene(disc(), RED, (1, 1, 1))
     rgba = plain_matte(rgb)
     alpha = rgba[..., 3:]
@@ -72,7 +72,7 @@ def test_on_its_own_background_the_matte_changes_nothing():
 def test_enclosed_background_and_touching_objects():
     alpha = disc(radius=25, centre=(30, 40)) - disc(radius=10, centre=(30, 40))
     rgba = plain_matte(scene(alpha, RED, (1, 1, 1)))
-    assert rgba[30, 40, 3] == 1  # a hole cannot be told from a white spot
+    assert rgba[30, 40, 3] == 1  # a hole cannot be distinguished from a white spot
     rgba = plain_matte(scene(disc(centre=(55, 40), radius=14), RED, (1, 1, 1)))
     assert rgba[59, 40, 3] == 1 and rgba[0, 0, 3] == 0  # it reaches over the lower edge
 
@@ -105,7 +105,7 @@ def test_a_mask_wins_over_all(tmp_path):
     mask[:20, :20] = 1
     out = prepare(rgb, mask=write(tmp_path / "mask.png", mask))
     assert out.shape == (25, 25, 4) and out[..., 3].sum() == 400
-    # A cut-out as a mask: opaque where the object is, whatever its colour is not black
+    # A cut-out as a mask: opaque on the object, in any colour but black
     cutout = np.dstack([np.ones((60, 80, 3)), mask])
     again = prepare(rgb, mask=write(tmp_path / "cut.png", cutout))
     np.testing.assert_array_equal(again, out)
@@ -213,7 +213,7 @@ def test_files_that_are_not_sam_checkpoints(tmp_path):
 
 @needs_sam
 def test_sam_runs_the_weights_of_the_file(tmp_path):
-    """A MobileSAM is recognised, its weights are the file's, and it is not left in training."""
+    """A MobileSAM is recognised, its weights are the file's, and it is in eval mode."""
     from kornia.models.sam import Sam, SamConfig
 
     model = Sam.from_config(SamConfig("mobile_sam")).eval()

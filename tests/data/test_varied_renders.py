@@ -1,4 +1,4 @@
-"""Data that differs more: stretched objects, other fields of view, views from the front."""
+"""Varied data: stretched objects, other fields of view, views from the front."""
 
 import json
 
@@ -39,7 +39,7 @@ def test_stretch_and_field_of_view_are_drawn_for_each_object_and_stated(boxes, t
     angles = [2 * np.degrees(np.arctan(half / one["fl_x"])) for one in found]
     assert all(49.1 / 1.3 <= angle <= 49.1 * 1.3 for angle in angles) and angles[0] != angles[1]
     for values in found:
-        # A box that is stretched along its own axes has the sides that the transform says.
+        # A box stretched along its own axes has the sides of the transform.
         turn = np.array(values["applied_transform"])[:, :3] * values["applied_scale"]
         sides = np.abs(turn @ np.diag([1.0, 0.2, 0.5])).sum(1)
         assert sides.max() == pytest.approx(1)

@@ -1,1 +1,1 @@
-"""Every writing command killed at random moments, and on a disk that fills up."""
+"""Endurance tests: every writing command killed at random moments, and on a full disk."""

@@ -1,4 +1,4 @@
-"""A command in a process of its own, which may be killed, or find a full disk."""
+"""Runs a command in a child process that may be killed or find a full disk."""
 
 import multiprocessing
 import os
@@ -25,13 +25,13 @@ _FORKS.set_forkserver_preload(
 
 
 class End(NamedTuple):
-    """How a child ended.
+    """Result of a child.
 
     Attributes:
         code: exit code; negative: the signal that ended it.
-        said: what it wrote to both outputs.
-        seconds: how long it ran.
-        killed: whether it was killed from here, at the moment that was asked for.
+        said: its text on both outputs.
+        seconds: its run time.
+        killed: True if it was killed here at the requested moment.
     """
 
     code: int
@@ -41,25 +41,25 @@ class End(NamedTuple):
 
     @property
     def is_one_line(self) -> bool:
-        """Whether a failure is told as the command line tells it: no traceback, no native death."""
+        """True if a failure is a message of the command line, without traceback or crash."""
         told = "gamba: " in self.said or "failed: " in self.said
         return self.code in (0, 1, 2) and "Traceback" not in self.said and told
 
 
 def gamba(*words: object) -> None:
-    """What ``python -m gamba_warp WORDS`` does."""
+    """Run ``python -m gamba_warp WORDS``."""
     sys.argv = ["gamba", *map(str, words)]
     runpy.run_module("gamba_warp", run_name="__main__", alter_sys=True)
 
 
 def run_child(function, *arguments, kill_after=None, file_limit=None) -> End:
-    """Calls a function in a child process.
+    """Call a function in a child process.
 
     Args:
-        function: of a module; the exit code is that of ``sys.exit`` in it, 1 of an exception.
+        function: of a module; the exit code is that of its ``sys.exit``, or 1 for an exception.
         arguments: its arguments.
         kill_after: seconds until SIGKILL, or None.
-        file_limit: no file may grow beyond so many bytes, or None.
+        file_limit: largest size of a file in bytes, or None.
     """
     ours, theirs = _FORKS.Pipe(duplex=False)
     process = _FORKS.Process(target=_become, args=(theirs, file_limit, function, arguments))
@@ -72,7 +72,7 @@ def run_child(function, *arguments, kill_after=None, file_limit=None) -> End:
             while part := os.read(ours.fileno(), 1 << 16):
                 parts.append(part)
 
-    # A file would not take what a child says whose files may not grow.
+    # Not a file: the child's files may not grow.
     listener = threading.Thread(target=listen, daemon=True)
     listener.start()
     process.join(LONGEST if kill_after is None else kill_after)

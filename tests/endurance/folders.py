@@ -1,4 +1,4 @@
-"""What is in a folder of results: whole files, and what is left over of killed commands."""
+"""Contents of a folder of results: complete files, and leftovers of killed commands."""
 
 import io
 import json
@@ -11,14 +11,14 @@ from safetensors.torch import load
 
 from gamba_warp.files import PART
 
-_KEPT = (".lock", ".gamba-library.json")  # of a run; of a library that was unpacked
+_ALLOWED = (".lock", ".gamba-library.json")  # of a run; of a library that was unpacked
 _TWO_DAYS = 2 * 24 * 3600
 _ENDS = {".png": b"IEND\xaeB`\x82", ".gif": b";", ".html": b"</html>\n"}
 _ENDS |= dict.fromkeys((".json", ".jsonl", ".md", ".csv"), b"\n")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """The files of a folder by their path in it; what is left over is not among them."""
+    """Files of a folder by their path in it, without leftovers."""
     found = sorted(path for path in folder.rglob("*") if path.is_file())
     named = ((path.relative_to(folder), path) for path in found)
     return {
@@ -29,13 +29,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """What killed commands left behind: all names with a dot, but for ``_KEPT``."""
-    found = (path for path in folder.rglob(".*") if path.name not in _KEPT)
+    """Leftovers of killed commands: all names with a dot, except ``_ALLOWED``."""
+    found = (path for path in folder.rglob(".*") if path.name not in _ALLOWED)
     return [path for path in found if not any(p.startswith(PART) for p in path.parent.parts)]
 
 
 def age(folder: Path) -> None:
-    """Makes the leftovers look two days old, so that the next command may sweep them."""
+    """Make the leftovers look two days old, so that the next command may sweep them."""
     for top in leftovers(folder):
         for path in (*top.rglob("*"), top):
             when = path.lstat().st_mtime - _TWO_DAYS
@@ -43,7 +43,7 @@ def age(folder: Path) -> None:
 
 
 def lost(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
-    """Names of files that were there and are not, or are neither what they were nor whole."""
+    """Names of files that have disappeared, or are neither unchanged nor complete."""
     return [
         name
         for name in sorted(before.keys() | after.keys())
@@ -53,7 +53,7 @@ def lost(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
 
 
 def is_whole(name: str, data: bytes) -> bool:
-    """Whether a new file is one that a command finished, by other readers than ours."""
+    """True if a new file is complete, according to readers of other packages."""
     suffix = Path(name).suffix
     try:
         if suffix in (".png", ".gif", ".webp"):

@@ -1,4 +1,4 @@
-"""The commands that are put to the test, and the small world of files that they work on."""
+"""Commands under test, and the small world of files that they work on."""
 
 import zipfile
 from collections.abc import Callable
@@ -19,13 +19,13 @@ from .child import gamba, run_child
 
 
 class Job(NamedTuple):
-    """One command that writes.
+    """Writing command.
 
     Attributes:
         line: the command and its arguments, with ``{world}`` for the folder of the small world and
             ``{out}`` for that of results.
-        other: further arguments that change what it writes, so that older results can be told.
-        undo: removes a part of the results, where a command does not do again what is done.
+        other: further arguments that change its output, so that older results can be recognised.
+        undo: removes a part of the results, for commands that skip existing results.
     """
 
     line: str
@@ -33,12 +33,12 @@ class Job(NamedTuple):
     undo: Callable[[Path], None] | None = None
 
     def words(self, world: Path, out: Path) -> list[str]:
-        """The command and its arguments."""
+        """Return the command and its arguments."""
         return [word.format(world=world, out=out) for word in self.line.split()]
 
 
 def without_one_object(out: Path) -> None:
-    """Removes one rendered object; there may be none, as several in turn were not made again."""
+    """Remove one rendered object, if any is left after several interrupted runs."""
     for path in sorted(out.glob("*/transforms.json"))[-1:]:
         remove_folder(path.parent)
 
@@ -97,7 +97,7 @@ JOBS = {
 
 
 def training(world: Path, out: Path, steps: int) -> list[str]:
-    """The command that trains a tiny model, or goes on."""
+    """Command that trains a tiny model, or resumes the training."""
     line = (
         f"train {{world}}/data --preset tiny --set {MODEL} --size 16 --lpips off --views-last 2 "
         "--val-every 10 --device cpu --workers 1 --no-tensorboard --batch-size 2 --save-every 3 "
@@ -107,14 +107,14 @@ def training(world: Path, out: Path, steps: int) -> list[str]:
 
 
 def undisturbed(*words: object):
-    """Runs a command, which must end well."""
+    """Run a command, which must succeed."""
     end = run_child(gamba, *words)
     assert end.code == 0, end.said[-2000:]
     return end
 
 
 def make_world(folder: Path, commands: list[str]) -> None:
-    """Makes data, a model, pictures, meshes and what else the commands need."""
+    """Make data, a model, pictures, meshes and all other inputs of the commands."""
     rng = np.random.default_rng(0)
     for name in ("meshes", "pictures", "gaussians"):
         (folder / name).mkdir()
@@ -173,7 +173,7 @@ PLAN = {
 
 
 def make_library(folder: Path, icon: Path) -> None:
-    """A furniture library of 20 models, as ``gamba data furniture`` unpacks it."""
+    """Make a furniture library of 20 models for ``gamba data furniture``."""
     folder.mkdir()
     lines = ["id=Some#Library", "name=Some"]
     with zipfile.ZipFile(folder / "Some.sh3f", "w") as archive:

@@ -1,7 +1,7 @@
-"""Training is killed and goes on to the same bits; other commands never lose older results.
+"""Killed training resumes to the same bits; other commands never lose older results.
 
 ``make endurance`` kills more often, and every command of ``JOBS``; it prints a line for each. A
-full disk is a limit of the size of a file (``RLIMIT_FSIZE``), no full file system.
+full disk is simulated by a limit on the size of a file (``RLIMIT_FSIZE``).
 """
 
 import json
@@ -29,7 +29,7 @@ from .folders import age, contents, is_whole, leftovers, lost
 from .jobs import JOBS, make_world, training, undisturbed
 
 LONG = "GAMBA_ENDURANCE_KILLS" in os.environ
-KILLS = int(os.environ.get("GAMBA_ENDURANCE_KILLS", "2"))  # of each command; of training more
+KILLS = int(os.environ.get("GAMBA_ENDURANCE_KILLS", "2"))  # of each command; more for training
 FULL = int(os.environ.get("GAMBA_ENDURANCE_FULL", "2"))  # full disks, of each command
 SEED = int(os.environ.get("GAMBA_ENDURANCE_SEED", "0"))
 CHOSEN = list(JOBS) if LONG else ["reconstruct"]
@@ -44,12 +44,12 @@ def world(tmp_path_factory):
 
 
 def tell(command, fault, tried, hit, left):
-    """A line of the table in docs/security.md, where nothing was lost."""
+    """Print a line of the table in docs/security.md, if nothing was lost."""
     print(f"\n| {command} | {fault} | {tried} | {hit} | 0 | 0 | 0 | {left} | 0 |")
 
 
 def newest(out):
-    """The step of the newest whole checkpoint; -1 where there is none."""
+    """Step of the newest complete checkpoint; -1 without one."""
     steps = [int(p.name.split("_")[1]) for p in list_checkpoints(out) if not damage(p)]
     return max(steps, default=-1)
 
@@ -104,11 +104,11 @@ def test_training_on_a_full_disk_keeps_its_checkpoint(world, tmp_path):
 @pytest.mark.parametrize("fault", ["SIGKILL", "full disk"])
 @pytest.mark.parametrize("name", CHOSEN)
 def test_a_disturbed_command_loses_nothing(world, tmp_path, name, fault):
-    """It writes over its own older results, which stay or give way to whole ones."""
+    """Older results remain or are replaced by complete ones."""
     job, out, rng, hit = JOBS[name], tmp_path / "out", random.Random(f"{SEED} {name} {fault}"), 0
     words = job.words(world, out)
     first = undisturbed(*words)
-    if job.undo is not None:  # what is done is not done again
+    if job.undo is not None:  # existing results would be skipped
         job.undo(out)
         first = undisturbed(*words)
     whole = contents(out)

@@ -1,4 +1,4 @@
-"""What several test files share; here are threads and comparisons."""
+"""Helpers of several test files; in this module, threads and comparisons."""
 
 import contextlib
 
@@ -7,7 +7,7 @@ import torch
 
 @contextlib.contextmanager
 def on_threads(count):
-    """So many threads of torch inside."""
+    """Run the body with ``count`` threads of torch."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -17,7 +17,7 @@ def on_threads(count):
 
 
 def assert_same_on_threads(function, *counts) -> None:
-    """Fails unless the tensors that ``function`` gives have the same bits on so many threads."""
+    """Fail unless the tensors of ``function`` have the same bits for all numbers of threads."""
     first = None
     for count in counts:
         with on_threads(count):
@@ -27,14 +27,14 @@ def assert_same_on_threads(function, *counts) -> None:
 
 
 def rel_rms(got: torch.Tensor, want: torch.Tensor) -> float:
-    """Returns the root mean square of the difference over that of ``want``, in float64."""
+    """Return the root mean square of the difference over that of ``want``, in float64."""
     got, want = got.detach().double(), want.detach().double()
     scale = want.square().mean().sqrt().item()
     return (got - want).square().mean().sqrt().item() / max(scale, 1e-300)
 
 
 def assert_rel_rms(got, want, limit: float, name: str) -> None:
-    """Fails with the name and both figures if the relative rms error is over ``limit``."""
+    """Fail with the name and both figures if the relative rms error is over ``limit``."""
     assert got.shape == want.shape, f"{name}: shape {tuple(got.shape)}, want {tuple(want.shape)}"
     assert torch.isfinite(got).all(), f"{name}: not finite"
     error = rel_rms(got, want)
@@ -42,7 +42,7 @@ def assert_rel_rms(got, want, limit: float, name: str) -> None:
 
 
 def in_default_float64(function):
-    """What a function returns where torch's default dtype is float64."""
+    """Return the result of a function with torch's default dtype float64."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
@@ -52,7 +52,7 @@ def in_default_float64(function):
 
 
 def assert_default_dtype_changes_nothing(function):
-    """The tensors that a function returns are the same bits of the same dtype, in any default."""
+    """Assert that a function returns the same bits and dtypes with any default dtype."""
     for want, got in zip(function(), in_default_float64(function), strict=True):
         assert got.dtype == want.dtype
         torch.testing.assert_close(got, want, rtol=0, atol=0, equal_nan=True)

@@ -1,7 +1,7 @@
 """Pages in a headless Chromium, driven by Playwright, with WebGL in software.
 
 Tests that open a page take the fixture ``browser_page``; where Chromium or Playwright is missing,
-they are skipped, and the reason names what is.
+they are skipped, with the missing one as the reason.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ FLAGS = (
 
 @dataclass
 class Opened:
-    """A page and what it complained of.
+    """Page with its warnings and errors.
 
     Attributes:
         page: Playwright's page.
-        messages: warnings and errors of its console, and errors that nothing caught.
+        messages: warnings and errors of its console, and uncaught errors.
     """
 
     page: Any
     messages: list[str] = field(default_factory=list)
 
     def promised(self, expression: str, seconds: float = 30.0) -> Any:
-        """What a promise of JavaScript becomes; one that stays open fails the test."""
+        """Return the value of a JavaScript promise; a pending one fails the test."""
         late = f"setTimeout(() => fail(new Error('no answer')), {1000 * seconds})"
         return self.page.evaluate(
             f"() => Promise.race([{expression}, new Promise((_, fail) => {late})])"
         )
 
     def until(self, expression: str, seconds: float = 30.0) -> None:
-        """Waits until an expression of JavaScript is true, whatever the page's policy allows."""
+        """Wait until an expression of JavaScript is true, whatever the page's policy allows."""
         end = time.monotonic() + seconds
         while not self.page.evaluate(expression):
             assert time.monotonic() < end, f"{expression} does not become true"
             self.page.wait_for_timeout(10)
 
     def fingers(self, kind: str, *points: tuple[float, float]) -> None:
-        """Sends one touch event, ``touchStart``, ``touchMove`` or ``touchEnd``, of all fingers."""
+        """Send one touch event, ``touchStart``, ``touchMove`` or ``touchEnd``, of all fingers."""
         if not hasattr(self, "_devtools"):
             self._devtools = self.page.context.new_cdp_session(self.page)
         places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
@@ -66,8 +66,8 @@ class Opened:
 def complains(message: Any) -> bool:
     """Return whether a message of Playwright's console is an error of the page or its requests.
 
-    A graphics driver warns of its own speed, most of all where it draws in software. What a page
-    says has arguments, unlike what the browser says; a driver's errors are the page's.
+    A graphics driver warns about its speed, above all in software rendering. Messages of a page
+    have arguments, unlike those of the browser; a driver's errors count as the page's.
     """
     speed = "GL Driver Message (OpenGL, Performance," in message.text and not message.args
     return message.type == "error" or (message.type == "warning" and not speed)
@@ -89,7 +89,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def browser_page(browser) -> Iterator[Callable[..., Opened]]:
-    """Opens pages: ``browser_page(file or address, width=640, height=480, **options)``.
+    """Open pages: ``browser_page(file or address, width=640, height=480, **options)``.
 
     The options are those of Playwright's ``new_context``, such as ``has_touch`` and
     ``color_scheme``. All pages are closed after the test.

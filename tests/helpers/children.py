@@ -1,11 +1,11 @@
-"""Functions for child processes, which find them by name: some end the process they run in."""
+"""Functions for child processes, importable by name; some kill their process."""
 
 import os
 import signal
 
 
 def murderous_pair(pair, protocol, motion):
-    """Evaluates a pair; one whose name begins with ``bad`` kills the process."""
+    """Evaluate a pair; a name that begins with ``bad`` kills the process."""
     from gamba_warp.eval.shapes.pairs import evaluate_pair
 
     if pair.name.startswith("bad"):
@@ -14,7 +14,7 @@ def murderous_pair(pair, protocol, motion):
 
 
 def talking_pair(pair, protocol, motion):
-    """Evaluates a pair, and prints; one of the name ``bad`` raises what nobody expects."""
+    """Evaluate a pair, and print; one named ``bad`` raises an unexpected error."""
     from gamba_warp.eval.shapes.pairs import evaluate_pair
 
     os.write(1, b"a library talks\n")
@@ -24,7 +24,7 @@ def talking_pair(pair, protocol, motion):
 
 
 def murderous_object(mesh, out, settings, threads):
-    """Renders an object; that with the uid ``b`` kills the process."""
+    """Render an object; that with the uid ``b`` kills the process."""
     from gamba_warp.train.data.render import render_object
 
     if mesh.uid == "b":

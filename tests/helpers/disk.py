@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def full_at(size: int) -> Iterator[None]:
-    """Lets no file of this process grow beyond ``size`` bytes: such a write fails (EFBIG)."""
+    """Limit the files of this process to ``size`` bytes; larger writes fail (EFBIG)."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

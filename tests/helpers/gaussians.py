@@ -1,4 +1,4 @@
-"""Random Gaussians for tests of files and pages, and what a quaternion means."""
+"""Random Gaussians for tests of files and pages, and conversions of quaternions."""
 
 import numpy as np
 import torch

@@ -11,7 +11,7 @@ from gamba_warp.images import save_image
 
 
 def colours(mode="RGB", size=(7, 5)):
-    """Makes a PIL picture of random colours, the same on each call; ``size`` is (width, height)."""
+    """Make a PIL picture of random colours, the same on each call; ``size`` is (width, height)."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
     image = Image.fromarray(pixels, "RGBA")
@@ -19,7 +19,7 @@ def colours(mode="RGB", size=(7, 5)):
 
 
 def encoded(form):
-    """Returns the bytes of a 40 x 30 picture in a format of PIL."""
+    """Return the bytes of a 40 x 30 picture in a format of PIL."""
     content = io.BytesIO()
     colours(size=(40, 30)).save(content, form)
     return content.getvalue()
@@ -81,7 +81,7 @@ def colour_profile(columns=None, gamma=2.2):
 
 
 def bad_files(folder):
-    """Writes files that cannot be read as a picture; yields name, path and the expected reason."""
+    """Write files that cannot be read as a picture; yield name, path and the expected reason."""
     first, second = colours("P"), colours("P", (7, 5)).transpose(Image.Transpose.ROTATE_180)
     yield "missing", folder / "none.png", "no such file"
     yield "folder", folder, "is a folder"
@@ -104,7 +104,7 @@ def bad_files(folder):
 
 
 def cut_out(path, colour=(0.8, 0.3, 0.1)):
-    """Writes a picture of one square, cut out; returns its path."""
+    """Write a picture of one square, cut out; return its path."""
     rgba = np.zeros((20, 30, 4))
     rgba[4:16, 8:24] = (*colour, 1)
     save_image(path, rgba)

@@ -1,4 +1,4 @@
-"""A kernel of no operator, the inputs of the convolution, a watch over torch's operators."""
+"""A plain kernel, inputs of the convolution, and a recorder of torch's operators."""
 
 import torch
 import warp as wp
@@ -33,14 +33,14 @@ INDEXING = {"aten::index.Tensor", "aten::index_put", "aten::index_put_"}
 
 
 class Watch(TorchDispatchMode):
-    """Notes operators that no CUDA graph can hold, inside our own operators too.
+    """Records operators that a CUDA graph cannot capture, also inside our own operators.
 
-    Tensors on the CPU show what reads numbers back; those of a dry run show copies between the
-    devices as well.
+    Tensors on the CPU show operators that read numbers back; those of a dry run also show copies
+    between devices.
 
     Attributes:
-        found: what was noted.
-        names: of all operators.
+        found: the recorded operators.
+        names: names of all operators.
     """
 
     def __init__(self):
@@ -69,5 +69,5 @@ class Watch(TorchDispatchMode):
 
     @staticmethod
     def _later(name, args, kwargs):
-        """Whether it is a copy that the host does not wait for."""
+        """True for an asynchronous copy."""
         return name == "aten::copy_" and (kwargs.get("non_blocking") or args[2:3] == (True,))

@@ -1,4 +1,4 @@
-"""The smallest matting network in ONNX, written by hand: no package that writes ONNX is needed."""
+"""Minimal matting network in ONNX, written without a package for ONNX."""
 
 import numpy as np
 
@@ -45,7 +45,7 @@ def matting_network(
     size: int = 64,
     last: str = "Sigmoid",
 ) -> bytes:
-    """A network that goes by the colour of a pixel alone: ``sigmoid(weights · c + bias)``.
+    """A network that only uses the colour of a pixel: ``sigmoid(weights · c + bias)``.
 
     Args:
         weights: of red, green and blue, each 0.5 below its value in [0, 1].

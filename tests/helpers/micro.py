@@ -31,12 +31,12 @@ MODEL = (
 
 
 def to_opengl(viewmats: torch.Tensor) -> torch.Tensor:
-    """Converts world-to-camera OpenCV matrices to camera-to-world OpenGL ones, ``[.., 4, 4]``."""
+    """Convert world-to-camera OpenCV matrices to camera-to-world OpenGL ones, ``[.., 4, 4]``."""
     return torch.linalg.inv(_FLIP @ viewmats.double()).to(viewmats.dtype)
 
 
 def cloud(seed: int, num: int = 40) -> Gaussians:
-    """Makes Gaussians of one hue in an off-centre ball."""
+    """Make Gaussians of one hue in an off-centre ball."""
     rng = torch.Generator().manual_seed(seed)
     centre = 0.1 * torch.randn(3, generator=rng)
     hue = torch.rand(3, generator=rng)
@@ -50,7 +50,7 @@ def cloud(seed: int, num: int = 40) -> Gaussians:
 
 
 def views_around(count: int, width: int = 32, height: int = 32) -> Cameras:
-    """Makes cameras on a ring of changing height about the origin."""
+    """Make cameras on a ring of changing height about the origin."""
     azimuths = torch.arange(count) * (360.0 / count)
     elevations = 25.0 * torch.cos(torch.arange(count) * 2.0)
     viewmats = torch.cat([orbit(a[None], e.item(), 1.8) for a, e in zip(azimuths, elevations)])
@@ -58,13 +58,13 @@ def views_around(count: int, width: int = 32, height: int = 32) -> Cameras:
 
 
 def photograph(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
-    """Straight RGBA, as files hold it."""
+    """Render straight RGBA, as in files."""
     picture = render(gaussians, cameras)
     return torch.cat([picture.rgb / picture.alpha.clamp_min(1e-3), picture.alpha], -1).clamp(0, 1)
 
 
 def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None:
-    """Writes one object in the transforms.json layout."""
+    """Write one object in the transforms.json layout."""
     azimuths = torch.arange(views) * (360.0 / views)
     viewmats = orbit(azimuths, elevation=15.0, distance=1.8)
     cameras = Cameras(viewmats, intrinsics(SIZE, SIZE).expand(views, 3, 3), SIZE, SIZE)
@@ -82,7 +82,7 @@ def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None
 
 
 def write_dataset(root: Path, objects: int = 3) -> Path:
-    """Writes a dataset of ``objects`` clouds, of which the last is held out."""
+    """Write a dataset of ``objects`` clouds, of which the last is held out."""
     uids = [f"cloud{chr(ord('a') + i)}" for i in range(objects)]
     for i, uid in enumerate(uids):
         write_object(root / uid, cloud(i))
@@ -92,7 +92,7 @@ def write_dataset(root: Path, objects: int = 3) -> Path:
 
 
 def options(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dict) -> TrainConfig:
-    """Makes quick options; ``groups`` changes them, for example ``optim={"lr": 1.0}``."""
+    """Make quick options; ``groups`` changes them, for example ``optim={"lr": 1.0}``."""
     config = TrainConfig(data=data, preset="tiny", set=model)
     quick = {
         "length": {"steps": 6},
@@ -114,12 +114,12 @@ def options(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dic
 
 
 def run(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dict) -> int:
-    """Trains with ``options`` in this process alone; returns the exit code."""
+    """Train with ``options`` in this process; return the exit code."""
     return train(options(data, out, model, **groups), ALONE)
 
 
 def same_weights(a: Path, b: Path) -> bool:
-    """Whether two files of weights hold the same tensors, to the bit."""
+    """True if two files of weights hold bit-identical tensors."""
     one, other = load_file(a), load_file(b)
     return one.keys() == other.keys() and all(torch.equal(one[n], other[n]) for n in one)
 

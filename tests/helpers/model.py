@@ -18,14 +18,14 @@ SMALLEST = GambaConfig(
 
 @timm.models.register_model
 def gamba_test_vit(pretrained=False, **kwargs):
-    """Makes a ViT of one block, which configurations name as "gamba_test_vit"."""
+    """Make a ViT of one block, which configurations name as "gamba_test_vit"."""
     tiny = {"patch_size": 8, "embed_dim": 16, "depth": 1, "num_heads": 2}
-    name = "vit_base_patch16_224"  # for its pretrained_cfg alone
+    name = "vit_base_patch16_224"  # only for its pretrained_cfg
     return _create_vision_transformer(name, pretrained=pretrained, **(tiny | kwargs))
 
 
 def micro(**changes) -> GambaConfig:
-    """Makes a configuration of 36 Gaussians and 4 image tokens, with changes to its fields."""
+    """Make a configuration of 36 Gaussians and 4 image tokens, with changes to its fields."""
     small = {
         "image_size": 12,
         "patch_size": 4,
@@ -39,14 +39,14 @@ def micro(**changes) -> GambaConfig:
 
 
 def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
-    """Draws pictures ``[batch, size, size, 3]`` and makes a camera for each."""
+    """Draw pictures ``[batch, size, size, 3]`` and make a camera for each."""
     viewmats = orbit(torch.linspace(-30, 200, batch), 11.0)
     cameras = Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
     return torch.rand(batch, size, size, 3), cameras
 
 
 def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, cells) -> Gaussians:
-    """A batch on rays gives each picture's Gaussians, whose cells are known; returns them all."""
+    """Assert that a batch gives each picture's own Gaussians, with known cells; return them."""
     together = model(rgba, cameras)
     for index, count in enumerate(cells):
         alone = model(rgba[index : index + 1], cameras[[index]])
@@ -59,7 +59,7 @@ def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, cells)
 
 
 def assert_recomputed_alike(model: Gamba, images: torch.Tensor, cameras: Cameras) -> None:
-    """``recompute`` changes no bit of any gradient."""
+    """Assert that ``recompute`` does not change any gradient."""
     cotangent, grads = torch.randn(len(images), 36, 3), []
     for model.recompute in (False, True):
         model.zero_grad()
@@ -70,10 +70,10 @@ def assert_recomputed_alike(model: Gamba, images: torch.Tensor, cameras: Cameras
 
 
 def run_reconstruct(*arguments) -> int:
-    """Runs ``gamba reconstruct`` in this process; returns the exit code."""
+    """Run ``gamba reconstruct`` in this process; return the exit code."""
     return cli.run("reconstruct", [str(a) for a in arguments])
 
 
 def quick(checkpoint, out):
-    """Options of ``gamba reconstruct`` that make nothing but the Gaussians."""
+    """Options of ``gamba reconstruct`` that only make the Gaussians."""
     return ["--checkpoint", checkpoint, "--out", out, "--turntable", "none", "--no-page"]

@@ -1,6 +1,6 @@
-"""Scenes for the rasterizer's tests: random Gaussians and cameras, and the limits of errors.
+"""Scenes for the rasterizer's tests: random Gaussians and cameras, and error limits.
 
-The last two functions are what gsplat's own torch functions need to blend on the CPU.
+gsplat's own torch functions need the last two functions to blend on the CPU.
 
 A scene is a dict of the arguments of ``rasterization``, so that a test may change one by name.
 """
@@ -58,14 +58,14 @@ def mapped(scene, function):
 
 
 def leaves(scene, dtype):
-    """A copy of another dtype, in which every tensor but Ks asks for a gradient."""
+    """A copy of another dtype, in which every tensor but Ks requires a gradient."""
     scene = mapped(scene, lambda v: v.detach().to(dtype).clone().requires_grad_())
     scene["Ks"].requires_grad_(False)
     return scene
 
 
 def near_a_cut(scene, options):
-    """Pixels whose float64 alpha changes when alpha_min does a little: there rounding decides."""
+    """Pixels whose float64 alpha changes with a small change of alpha_min, so rounding decides."""
     alpha_min = options.get("alpha_min", 1 / 255)
     options = {k: v for k, v in options.items() if k != "alpha_min"}
     scene = mapped(scene, torch.Tensor.double)

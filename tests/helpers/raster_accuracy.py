@@ -1,7 +1,8 @@
 """The rasterizer against its oracle pixel by pixel and Gaussian by Gaussian, at realistic sizes.
 
-``Cuts`` makes the dense oracle fast enough and notes how near each pixel comes to a cut (alpha to
-alpha_min, T to its limit), where rounding decides; ``both`` and ``assert_gradients`` compare.
+``Cuts`` makes the dense oracle fast enough and records the distance of each pixel from a cut (alpha
+from alpha_min, T from its limit), where rounding decides; ``both`` and ``assert_gradients``
+compare.
 """
 
 import pytest
@@ -46,8 +47,8 @@ def alphas_in_reach(mean2d, conic, opacity, pixels, alpha_min):
 class Cuts:
     """The oracle's blending in blocks of 8 x 8 pixels, each with the Gaussians that reach a pixel.
 
-    The others have alpha 0 at each of its pixels, so leaving them out changes no bit. On the way
-    it notes how near each pixel comes to a cut.
+    The others have alpha 0 at each of its pixels, so leaving them out changes no bit. The distance
+    of each pixel from its nearest cut is recorded.
     """
 
     def __init__(self):
@@ -71,13 +72,13 @@ class Cuts:
         return blended, alpha
 
     def distances(self, like):
-        """How far each pixel is from its nearest cut, shaped as a picture without channels."""
+        """Distance of each pixel from its nearest cut, shaped as a picture without channels."""
         return torch.stack(self.views).view(like.shape[:-1])
 
 
 @pytest.fixture
 def cuts(monkeypatch, one_thread):
-    """The oracle blends by blocks and notes the cuts."""
+    """Make the oracle blend by blocks and record the cuts."""
     recorder = Cuts()
     monkeypatch.setattr(reference, "_blend", recorder)
     monkeypatch.setattr(reference, "_CHUNK", 10**9)  # the recorder cuts the picture itself

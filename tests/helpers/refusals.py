@@ -1,4 +1,4 @@
-"""What is refused: a ``UserError`` of one line."""
+"""Assertions of a one-line ``UserError``."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from gamba_warp.errors import UserError
 
 
 def refused(match, function, *arguments, **options):
-    """Calls a function, which must refuse it by a line that matches; returns the line."""
+    """Call a function, which must raise a one-line UserError that matches; return the line."""
     with pytest.raises(UserError, match=match) as caught:
         function(*arguments, **options)
     message = str(caught.value)
@@ -16,13 +16,13 @@ def refused(match, function, *arguments, **options):
 
 
 def refused_at(source, reason, function, *arguments):
-    """Calls a function, which refuses it by a line of under 400 letters: source and reason."""
+    """Call a function, which must raise a line of under 400 letters with source and reason."""
     message = refused(None, function, *arguments)
     assert message.startswith(f"{source}: ") and reason in message and len(message) < 400, message
 
 
 def refused_command(capsys, command, words, *reasons):
-    """Runs a command, which must end with code 2 and one line that holds the reasons."""
+    """Run a command, which must end with code 2 and one line with the reasons."""
     capsys.readouterr()
     assert run(command, [*map(str, words)]) == 2
     said = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Files as the authors of Gamba publish theirs, with random weights, for ``import-released``."""
+"""Files in the form of the authors of Gamba, with random weights, for ``import-released``."""
 
 import io
 from dataclasses import replace
@@ -12,12 +12,12 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.released import released_names
 
 SIZES = {"image_size": 64, "width": 64, "depth": 1, "dt_rank": 4}
-# The smallest of the encoders that a file of theirs can be over; 86 MB of random weights.
+# The smallest encoder supported by their files; 86 MB of random weights.
 ENCODER = "vit_small_patch14_reg4_dinov2"
 
 
 def theirs(model: Gamba) -> bytes:
-    """The file of a model's weights without its image encoder, as the authors would name them."""
+    """File of a model's weights without its image encoder, with the authors' names."""
     config, ours = model.config, model.state_dict()
     state = {f"model.{theirs}": ours[name] for theirs, name in released_names(config.depth).items()}
     for name in [name for name in state if name.endswith("conv1d.weight")]:

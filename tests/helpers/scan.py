@@ -1,4 +1,4 @@
-"""Shared by the tests of the scan: inputs, the oracle, and a comparison that names what differs."""
+"""Helpers of the scan's tests: inputs, the oracle, and a comparison that names differences."""
 
 import pytest
 import torch
@@ -35,7 +35,7 @@ def make(batch, length, channels, states, groups=1, dtype=torch.float32):
 
 
 def leaves(inputs, dtype=None):
-    """Copies that ask for gradients, in another dtype if one is given."""
+    """Copies that require gradients, in another dtype if one is given."""
     return {k: v.detach().clone().to(dtype or v.dtype).requires_grad_() for k, v in inputs.items()}
 
 
@@ -52,16 +52,16 @@ def gradients(leaves, outs, heads):
 
 
 def assert_gradients(ours, exact, limit, half=0.0, heads=None, tiny=0.0, more=None):
-    """Compares all gradients by name.
+    """Compare all gradients by name.
 
     Args:
-        ours: the leaves by name, and what is computed from them.
+        ours: the leaves by name, and the results.
         exact: the same in float64.
         limit: of float32 gradients.
         half: of those in half precision.
-        heads: cotangents of the results; drawn if there are none.
+        heads: cotangents of the results; drawn if missing.
         tiny: below it, a gradient counts as 0.
-        more: by name what the device may add to a limit.
+        more: additions to the limits for the device, by name.
     """
     (mine, outs), (theirs, wants) = ours, exact
     heads = heads or [torch.randn_like(x) for x in outs]
@@ -77,24 +77,23 @@ def assert_gradients(ours, exact, limit, half=0.0, heads=None, tiny=0.0, more=No
             assert_rel_rms(got, want, bound, f"gradient of {name}")
 
 
-# By how much a decay on CUDA may be off, where that is more than float32's limits hold for;
-# ptx.plugin sets it.
+# Error of a decay on CUDA, if larger than covered by the limits of float32; set by ptx.plugin.
 approximate = {"decay": 0.0}
 
 
 def device_errors(exact, inputs, heads=(), decays=0.0, names=("out", "last"), **options):
-    """What CUDA may add to limits that hold for a CPU, where this device's kernels are CUDA's.
+    """Additions to the CPU's limits for CUDA kernels, if this device runs them.
 
     Args:
-        exact: the scan in float64, which takes ``off``.
+        exact: the scan in float64, with an argument ``off``.
         inputs: its tensors by name.
         heads: cotangents of its results, if the gradients count.
-        decays: by how much a decay may be off on CUDA, whatever its exponential.
-        names: of the results.
+        decays: error of a decay on CUDA, for any exponential.
+        names: names of the results.
         options: of the scan.
 
     Returns:
-        By name, 0 or more: of each result, and of each of ``inputs`` for its gradient.
+        Additions >= 0 by name: of each result, and of each of ``inputs`` for its gradient.
     """
     error = max(decays, approximate["decay"])
     if not error or kind_of(torch.device("cpu")) != "cuda":
@@ -110,7 +109,7 @@ def device_errors(exact, inputs, heads=(), decays=0.0, names=("out", "last"), **
 
 
 def assert_gradient_alone(function, inputs, name, **options):
-    """The gradient of one input has the same bits, whichever others are asked for."""
+    """Assert that the gradient of one input does not depend on the other requested ones."""
     results = []
     for asked in (leaves(inputs), {**inputs, name: leaves(inputs)[name]}):
         out = function(**asked, **options)
@@ -119,7 +118,7 @@ def assert_gradient_alone(function, inputs, name, **options):
 
 
 def compare(inputs, forward=FORWARD, gradient=GRADIENT, state=2e-6, **options):
-    """Runs both sides with random cotangents for the output and the last state.
+    """Run both sides with random cotangents for the output and the last state.
 
     Args:
         forward: limit of the output, and of the gradients in half precision.

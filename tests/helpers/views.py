@@ -1,4 +1,4 @@
-"""Datasets of posed views made of Gaussians, and the evaluations run on files."""
+"""Datasets of posed views rendered from Gaussians, and evaluations of files."""
 
 import json
 from pathlib import Path
@@ -35,7 +35,7 @@ def cloud_of(means, scale, opacity, colors) -> Gaussians:
 
 
 def straight(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Straight RGBA ``[V, H, W, 4]``, as files hold it."""
+    """Render straight RGBA ``[V, H, W, 4]``, as in files."""
     with torch.no_grad():
         out = render(gaussians, cameras)  # on black: the colour is premultiplied
     return torch.cat([out.rgb / out.alpha.clamp(min=1e-6), out.alpha], -1)
@@ -51,7 +51,7 @@ def transforms(names, cameras: Cameras) -> str:
 
 
 def write_views(folder: Path, rgba: Tensor, cameras: Cameras) -> None:
-    """Writes an object: pictures ``0.png`` and so on, and their cameras."""
+    """Write an object: pictures ``0.png`` and so on, and their cameras."""
     folder.mkdir(parents=True)
     names = [f"{v}.png" for v in range(len(rgba))]
     for name, picture in zip(names, rgba):
@@ -66,7 +66,7 @@ def write_split(data: Path, **parts: list[str]) -> None:
 
 
 def evaluated(command: str, out: Path, *words: object) -> tuple[int, dict | None]:
-    """Runs ``eval-views`` or ``eval-geometry``; the exit code, and the report if there is one."""
+    """Run ``eval-views`` or ``eval-geometry``; return the exit code and the report, if any."""
     code = run(command, [*map(str, words), "--out", str(out)])
     path = out / "report.json"
     return code, json.loads(path.read_text()) if path.exists() else None

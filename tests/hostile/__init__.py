@@ -1,1 +1,1 @@
-"""Hostile files for every reader: hypothesis breaks sound files and makes small what fails."""
+"""Fuzzing of every reader: hypothesis mutates valid files and shrinks failing ones."""

@@ -1,4 +1,4 @@
-"""A hostile case as plain data: the files that a reader is given, and how they came about."""
+"""Fuzzing case as plain data: the files for a reader, and their mutations."""
 
 import os
 from collections.abc import Mapping
@@ -12,12 +12,12 @@ FORMAT = "gamba_warp.stress_files.1"
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What lies at one name of a case.
+    """File of a case.
 
     Attributes:
-        data: the bytes of a file; of a link, the name that it points to.
-        kind: "file"; "folder" in a file's place; "pipe" that nobody writes to; "link"; "locked", a
-            file that may not be read.
+        data: the bytes of a file; for a link, its target.
+        kind: "file"; "folder" instead of a file; "pipe" without a writer; "link"; "locked", a file
+            without read permission.
     """
 
     data: bytes = b""
@@ -25,14 +25,14 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 class Case(msgspec.Struct, frozen=True):
-    """All that is needed to run a case again.
+    """Reproducible case.
 
     Attributes:
         reader: name of a reader.
-        seed: name of the sound files that it was made of.
-        main: name of the file or folder that the reader is pointed at; "" is the whole folder.
-        files: what lies in the case's folder, by names with slashes.
-        mutations: what was done to the sound files, in order.
+        seed: name of the valid files that it was made of.
+        main: name of the file or folder passed to the reader; "" is the whole folder.
+        files: content of the case's folder, by names with slashes.
+        mutations: descriptions of the mutations, in order.
     """
 
     reader: str
@@ -42,13 +42,13 @@ class Case(msgspec.Struct, frozen=True):
     mutations: tuple[str, ...] = ()
 
 
-def sound_case(reader: str, seed: str, main: str, files: Mapping[str, bytes]) -> Case:
-    """A case of plain files to which nothing was done."""
+def valid_case(reader: str, seed: str, main: str, files: Mapping[str, bytes]) -> Case:
+    """Make a case of plain files without mutations."""
     return Case(reader, seed, main, {name: Entry(data) for name, data in files.items()})
 
 
 def place_case(case: Case, folder: Path) -> Path:
-    """Puts the case's files into an empty folder; returns the path that the reader is pointed at.
+    """Write the case's files into an empty folder; return the path for the reader.
 
     Raises:
         UserError: a name leaves the folder.
@@ -69,7 +69,7 @@ def place_case(case: Case, folder: Path) -> Path:
 
 
 def write_case(case: Case, path: Path, outcome: str = "", text: str = "") -> None:
-    """Writes a case as JSON, with how it ended: what ``corpus/`` keeps."""
+    """Write a case and its outcome as JSON, the format of ``corpus/``."""
     ended = {"outcome": outcome, "text": text.encode("utf-8", "replace").decode()}
     content = {"format": FORMAT, **msgspec.to_builtins(case), **ended}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,5 +77,5 @@ def write_case(case: Case, path: Path, outcome: str = "", text: str = "") -> Non
 
 
 def read_case(path: Path) -> Case:
-    """Reads what ``write_case`` wrote."""
+    """Read a file of ``write_case``."""
     return msgspec.json.decode(path.read_bytes(), type=Case)

@@ -1,7 +1,7 @@
-"""Reads hostile cases in a child process, and judges what comes of each.
+"""Runs fuzzing cases in a child process and judges the outcomes.
 
-The child has limits of memory and of file sizes, sees through Python's audit events what is opened
-and started, and compares the folders around the case before and after. Linux alone has all that.
+The child has limits of memory and of file sizes, monitors opened files and started processes by
+Python's audit events, and compares the folders around the case before and after. Linux only.
 """
 
 import contextlib
@@ -24,54 +24,54 @@ from typing import NamedTuple
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.children import Failed, run_each
 
-from . import sound
+from . import checks
 from .case import Case, place_case
 from .readers import READERS
 
 GOOD = {
-    "sound": "read, and what was read is sound",
+    "sound": "read, with a valid result",
     "refused": "refused with one line that names the file",
 }
 BAD = {
     "exception": "an exception that is no UserError: the user would see a traceback",
     "line": "refused, but with several lines, an over-long one, or one that names no file",
-    "unsound": "accepted, but not finite, out of range, or not what the file holds",
+    "unsound": "accepted, but not finite, out of range, or different from the file",
     "outside": "something outside the case's folder was opened, changed or started",
     "memory": "over 2 GB were taken or asked for",
     "hang": "no end within the time limit",
     "death": "the process died",
 }
 SECONDS = 20.0  # for a case
-_FIRST = 180.0  # for the first case of a kind in a child, which imports what it needs
-_MOST_MEMORY = 2 << 30  # bytes that reading may take
+_FIRST = 180.0  # for the first case of a kind in a child, including its imports
+_MAX_MEMORY = 2 << 30  # bytes for reading a case
 _SLACK = 1 << 30  # bytes above it until allocations fail
 _LARGEST_FILE = 1 << 30
 _FOREIGN = ("/etc/passwd", "/dev/zero", "/dev/stdin", "/etc/hosts")
 _STARTS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "socket.connect")
-# Python itself, for readers that start a child of their own; platform.uname asks the system.
+# Python itself, for readers with their own child; platform.uname runs a program.
 _HARMLESS = (sys.executable, "uname")
 _CHANGES = ("os.remove", "os.rename", "os.rmdir", "os.symlink", "os.link", "shutil.rmtree")
 
 
 class Verdict(NamedTuple):
-    """How a case ended: one of ``GOOD`` or ``BAD``, and a line about it."""
+    """Outcome of a case: one of ``GOOD`` or ``BAD``, and a line about it."""
 
     outcome: str
     text: str = ""
 
     @property
     def bad(self) -> bool:
-        """Whether the case failed."""
+        """True if the case failed."""
         return self.outcome in BAD
 
     def signature(self) -> str:
-        """What makes two failures of a reader the same: the text without numbers and names."""
+        """Key of equal failures of a reader: the text without numbers and names."""
         text = self.text.split(": ")[0] if self.outcome == "exception" else self.text
         return f"{self.outcome}: " + re.sub(r"['\"/].*?(['\"]|$)|\d+", "#", text)[:60]
 
 
 def run_case(case: Case, base: Path, seconds: float = _FIRST) -> Verdict:
-    """Runs one case in a child process, which is kept for the next; ``base`` is a folder for it."""
+    """Run one case in a child process, reused by the next; ``base`` is a folder for it."""
     [(_, verdict)] = run_each(functools.partial(judge, base), [case], seconds=seconds)
     if isinstance(verdict, Failed):
         return Verdict("hang" if "took more than" in verdict.reason else "death", verdict.reason)
@@ -79,10 +79,10 @@ def run_case(case: Case, base: Path, seconds: float = _FIRST) -> Verdict:
 
 
 class Watch:
-    """Notes what Python opens, removes and starts while a case is read.
+    """Records files opened and removed, and processes started, while a case is read.
 
     Args:
-        base: folder of all that a child writes.
+        base: folder for all files of a child.
         box: folder in it of the case; only this may be read and written.
     """
 
@@ -95,7 +95,7 @@ class Watch:
 
     @contextlib.contextmanager
     def over(self, named: list[Path]) -> Iterator[None]:
-        """Watches; ``named`` may be links: the user named them, or the folder they lie in."""
+        """Record during the body; ``named`` may be links, named by the user or in such a folder."""
         self.found, self._named, self._active = [], tuple(map(str, named)), True
         try:
             yield
@@ -108,7 +108,7 @@ class Watch:
         if event == "open" or event in _CHANGES:
             path = arguments[0]
             if isinstance(path, (str, bytes, os.PathLike)):
-                self._active = False  # what follows opens nothing, but may be audited itself
+                self._active = False  # the following may trigger audit events itself
                 try:
                     self._check(event, os.fsdecode(path))
                 finally:
@@ -117,7 +117,7 @@ class Watch:
             self.found.append(f"{event} {str(arguments[0])[:80]}")
 
     def _check(self, event: str, path: str) -> None:
-        if not os.path.isabs(path):  # it may count from an open folder, which the event leaves out
+        if not os.path.isabs(path):  # may be relative to an open folder, unknown to the event
             return
         path = os.path.normpath(path)
         if path.startswith(self._allowed):
@@ -131,10 +131,10 @@ class Watch:
 
 
 class _Place:
-    """Where a child reads cases: canaries around a box, and a folder for its own files.
+    """Folders of a child: canaries around a box for cases, and a folder for its own files.
 
     Attributes:
-        seen: readers with kinds of sound files, whose imports are done.
+        seen: readers with kinds of valid files whose imports are done.
     """
 
     def __init__(self, base: Path) -> None:
@@ -149,9 +149,9 @@ class _Place:
             (folder / "kept.txt").write_text("kept\n", encoding="utf-8")
             (folder / "kept.png").write_bytes(b"kept")
         tempfile.tempdir = str(base / "scratch")
-        for stream in (0, 1, 2):  # what a library prints is no failure
+        for stream in (0, 1, 2):  # output of a library is not a failure
             os.dup2(os.open(os.devnull, os.O_RDWR), stream)
-        # Two readers start children of their own, which a daemon must not.
+        # Two readers start their own children, which a daemon must not.
         multiprocessing.current_process()._config["daemon"] = False
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
@@ -164,7 +164,7 @@ class _Place:
 
     @staticmethod
     def listing(folder: Path, without: Path | None = None) -> dict[str, tuple]:
-        """Size and time of all that is in a folder."""
+        """Size and time of all files in a folder."""
         found = {}
         for place, folders, files in os.walk(folder):
             here = Path(place)
@@ -184,7 +184,7 @@ def _place(base: Path) -> _Place:
 
 
 def judge(base: Path, case: Case) -> Verdict:
-    """Reads a case in this process."""
+    """Read a case in this process."""
     place = _place(base)
     os.chdir(place.base / "here")
     shutil.rmtree(place.box)
@@ -193,11 +193,11 @@ def judge(base: Path, case: Case) -> Verdict:
     out.mkdir()
     path = place_case(case, files)
     before = place.listing(files)
-    # Bounds what is allocated from here on; libraries that came meanwhile are not counted.
+    # Limit allocations from here on; libraries loaded before are not counted.
     most = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    soft = _status("VmData:") + _MOST_MEMORY + _SLACK
+    soft = _status("VmData:") + _MAX_MEMORY + _SLACK
     resource.setrlimit(resource.RLIMIT_DATA, (soft, most))
-    with contextlib.suppress(OSError):  # starts the measurement of the largest memory anew
+    with contextlib.suppress(OSError):  # resets the peak of memory
         Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
     taken, start = _status("VmRSS:"), time.monotonic()
     with place.watch.over([path, *(files / name for name in case.files)]):
@@ -215,21 +215,21 @@ def judge(base: Path, case: Case) -> Verdict:
             place.around = place.listing(place.base, place.box)
         if found:
             outcome, text = "outside", found[0]
-        elif peak > _MOST_MEMORY:
+        elif peak > _MAX_MEMORY:
             outcome, text = "memory", f"{peak >> 20} MB"
         elif late:
             outcome, text = "hang", f"over {SECONDS:g} s"
-    # Verdicts are kept with the code: they name the files and no folder of a machine.
+    # Verdicts are stored in the repository, so they must not contain folders of a machine.
     return Verdict(outcome, text.replace(f"{files}{os.sep}", "").replace(str(place.base), ""))
 
 
 def _attempt(case: Case, path: Path, files: Path, out: Path) -> tuple[str, str]:
-    """The outcome of reading, and a line about it."""
+    """Return the outcome of reading, and a line about it."""
     reader = READERS[case.reader]
     try:
         result = reader.read(path, out)
         try:
-            reader.sound(result, path, out)
+            reader.check(result, path, out)
         except AssertionError as wrong:
             return "unsound", str(wrong)
         return "sound", ""
@@ -237,7 +237,7 @@ def _attempt(case: Case, path: Path, files: Path, out: Path) -> tuple[str, str]:
         if _has_memory_error(error):
             return "memory", str(error)
         try:
-            sound.told(error, files, list(case.files))
+            checks.check_message(error, files, list(case.files))
         except AssertionError as wrong:
             return "line", f"{wrong}: {str(error)[:200]!r}"
         return "refused", str(error)
@@ -254,7 +254,7 @@ def _has_memory_error(error: BaseException | None) -> bool:
 
 
 def _where(error: BaseException) -> str:
-    """The kind of an exception, our line that it came through, and its words."""
+    """Type of an exception, the last line of our code in its traceback, and its message."""
     frames = traceback.extract_tb(error.__traceback__)
     others = (str(Path(__file__).parent), "site-packages", "lib/python")
     ours = [f for f in frames if not any(part in f.filename for part in others)]
@@ -264,7 +264,7 @@ def _where(error: BaseException) -> str:
 
 
 def _status(name: str) -> int:
-    """Bytes that the kernel states of this process under a name."""
+    """Bytes in this process's status by the kernel, by name."""
     with open("/proc/self/status", "rb") as file:
         for line in file:
             if line.startswith(name.encode()):

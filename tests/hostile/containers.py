@@ -1,4 +1,4 @@
-"""Mutations of what is packed: the inside is changed, and what holds it is made whole again."""
+"""Mutations of containers: the content changes, and the container stays valid."""
 
 import ast
 import functools
@@ -33,7 +33,7 @@ from .seeds import ar, npy, tarred, zipped
 
 
 def safetensors_header(draw: Draw, data: bytes) -> bytes:
-    """Changes the JSON header of a safetensors file, or its metadata's JSON."""
+    """Change the JSON header of a safetensors file, or its metadata's JSON."""
     size = struct.unpack("<Q", data[:8])[0]
     header = json.loads(data[8 : 8 + size])
     if "__metadata__" in header and chance(draw, 60):
@@ -46,7 +46,7 @@ def safetensors_header(draw: Draw, data: bytes) -> bytes:
 
 
 def safetensors_values(draw: Draw, data: bytes) -> bytes:
-    """Puts numbers that are not finite, or huge, among the weights; the header stays whole."""
+    """Put non-finite or huge numbers among the weights; the header stays valid."""
     start, out = 8 + struct.unpack("<Q", data[:8])[0], bytearray(data)
     for _ in range(choice(draw, 1, 1, 30)):
         at = start + 4 * draw(st.integers(0, (len(data) - start) // 4 - 1))
@@ -55,7 +55,7 @@ def safetensors_values(draw: Draw, data: bytes) -> bytes:
 
 
 def glb_tree(draw: Draw, data: bytes) -> bytes:
-    """Changes the tree or the binary part of a .glb, whose lengths then fit."""
+    """Change the tree or the binary part of a .glb, whose lengths then fit."""
     size = struct.unpack("<I", data[12:16])[0]
     tree, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
     if chance(draw, 30):
@@ -64,7 +64,7 @@ def glb_tree(draw: Draw, data: bytes) -> bytes:
 
 
 def npy_header(draw: Draw, data: bytes) -> bytes:
-    """Changes shape, type or order in a ``.npy`` header, or makes another kind of array of it."""
+    """Change shape, type or order in a ``.npy`` header, or make another kind of array of it."""
     if chance(draw, 40):
         content = io.BytesIO()
         np.savez(content, a=np.ones((3, 4)))
@@ -90,7 +90,7 @@ def _bomb(size: int) -> bytes:
 
 
 def png_chunks(draw: Draw, data: bytes) -> bytes:
-    """Changes sizes, depth or chunks of a PNG, whose checksums then fit."""
+    """Change sizes, depth or chunks of a PNG, whose checksums then fit."""
     chunks, at = [], 8
     while at + 12 <= len(data):
         size = struct.unpack(">I", data[at : at + 4])[0]
@@ -135,13 +135,13 @@ def _zip_bomb() -> bytes:
 
 
 def zip_members(draw: Draw, data: bytes) -> bytes:
-    """Changes names, contents or the number of members of a zip archive; links, and bombs."""
+    """Change names, contents or the number of members of a zip archive; links, and bombs."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     name = choice(draw, *sorted(members))
     kinds = ("said", "said", "said", "name", "name", "plain", "plain", "delete")
     kind = choice(draw, *kinds, "many", "link", "bomb", "sizes")
-    if kind == "said":  # what the catalogue says
+    if kind == "said":  # the catalogue's text
         name = next((n for n in members if n.endswith(".properties")), name)
         members[name] = _hostile_properties(draw, members[name])
     elif kind == "name":
@@ -183,7 +183,7 @@ def _hostile_properties(draw: Draw, data: bytes) -> bytes:
 
 
 def deb_members(draw: Draw, data: bytes) -> bytes:
-    """Changes the archive in an archive in a Debian package, or what the package says of it."""
+    """Change the archive in an archive in a Debian package, or its header there."""
     members, at = {}, 8
     while at + 60 <= len(data):
         name, size = data[at : at + 16].decode().strip(), int(data[at + 48 : at + 58])
@@ -214,7 +214,7 @@ def deb_members(draw: Draw, data: bytes) -> bytes:
 
 
 def torch_values(draw: Draw, data: bytes) -> bytes:
-    """Changes values, kinds and shapes in a file of ``torch.save``, which is then written again."""
+    """Change values, types and shapes in a file of ``torch.save``, and write it again."""
     tree = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     for _ in range(draw(st.integers(1, 2))):
         holder, key, node = None, None, tree
@@ -239,7 +239,7 @@ def torch_values(draw: Draw, data: bytes) -> bytes:
 
 
 def gzip_inside(draw: Draw, data: bytes) -> bytes:
-    """Changes what a gzip stream holds, or makes it hold far more; its checksum then fits."""
+    """Change the content of a gzip stream, or enlarge it; its checksum then matches."""
     inner = gzip.decompress(data)
     kind = choice(draw, "plain", "plain", "header", "bomb")
     if kind == "bomb":
@@ -258,7 +258,7 @@ def gzip_inside(draw: Draw, data: bytes) -> bytes:
 
 
 def _packed(draw: Draw, data: bytes, *fields: tuple) -> bytes:
-    """One of some fields, each a kind of ``struct``, a place and values, is given a value."""
+    """Change one of the fields, each a ``struct`` format, an offset and values."""
     kind, at, values = choice(draw, *fields)
     out = bytearray(data)
     struct.pack_into(kind, out, at, choice(draw, *values))
@@ -266,7 +266,7 @@ def _packed(draw: Draw, data: bytes, *fields: tuple) -> bytes:
 
 
 def spz_table(draw: Draw, data: bytes) -> bytes:
-    """Changes a number of the plain header or the table of contents of an .spz of version 4."""
+    """Change a number of the plain header or the table of contents of an .spz of version 4."""
     table = struct.unpack_from("<I", data, 16)[0] if data.startswith(b"NGSP") else len(data)
     entry = min(table + 8 * draw(st.integers(0, 11)), len(data) - 8)
     return _packed(
@@ -284,7 +284,7 @@ def spz_table(draw: Draw, data: bytes) -> bytes:
 
 
 def spz_frame(draw: Draw, data: bytes) -> bytes:
-    """Puts another ZSTD frame in place of one of an .spz of version 4: a bomb, or two frames."""
+    """Put another ZSTD frame in place of one of an .spz of version 4: a bomb, or two frames."""
     streams, table = data[15], struct.unpack_from("<I", data, 16)[0]
     sizes = [list(struct.unpack_from("<QQ", data, table + 16 * k)) for k in range(streams)]
     at, frames = table + 16 * streams, []

@@ -1,4 +1,4 @@
-"""Draws hostile cases: sound files, then one to four mutations."""
+"""Draws fuzzing cases: valid files, then one to four mutations."""
 
 import re
 import struct
@@ -15,7 +15,7 @@ from .case import Case, Entry
 from .containers import BY_SUFFIX
 from .mutations import BYTES, JSON, NAMES, TEXT, Draw, choice, encode, position
 
-MOST_BYTES = 4 << 20  # a mutated file is no larger: what is tested is readers, not their patience
+MOST_BYTES = 4 << 20  # largest mutated file; this tests readers, not their speed
 UNFIT = (
     *(ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, struct.error),
     *(OSError, EOFError, zlib.error, zipfile.BadZipFile, tarfile.TarError, NotImplementedError),
@@ -25,7 +25,7 @@ _TEXT_SUFFIXES = (".obj", ".mtl", ".ply", ".off", ".xyz", ".pts", ".pcd", ".stl"
 
 
 def _kinds(name: str, whole: bool) -> list[tuple]:
-    """The mutations for a file, those of its format often."""
+    """Mutations for a file, with those of its format more frequent."""
     suffix = PurePosixPath(name).suffix.lower()
     kinds = [BYTES]
     if whole and suffix in BY_SUFFIX:
@@ -35,7 +35,7 @@ def _kinds(name: str, whole: bool) -> list[tuple]:
 
 
 def _changed(draw: Draw, case: Case, others: list[bytes]) -> Case:
-    """A case with one file changed, of another kind, under another name, or gone."""
+    """A case with one file changed, of another kind, renamed, or missing."""
     names = list(case.files)
     name = choice(draw, names[0], choice(draw, *names))
     entry, what = case.files[name], choice(draw, *["bytes"] * 20, "splice", "kind", "name")
@@ -51,7 +51,7 @@ def _changed(draw: Draw, case: Case, others: list[bytes]) -> Case:
         joined = entry.data[:at] + other[start:]
         data = choice(draw, other, joined, entry.data + other)
     else:
-        # This process unpacks only what is whole: changed bytes may be a trap for it too.
+        # This process only unpacks valid files: changed bytes may harm it, too.
         whole = not any(text.startswith(f"{name}: ") for text in case.mutations)
         mutation = choice(draw, *choice(draw, *_kinds(name, whole)))
         what = mutation.__name__
@@ -80,7 +80,7 @@ def _other_kind(draw: Draw, case: Case, name: str) -> Case:
 
 
 def _renamed(draw: Draw, case: Case, name: str) -> Case:
-    """Another name, or another suffix, for a file; the reader is pointed at the new name."""
+    """Another name or suffix for a file; the reader gets the new name."""
     path = PurePosixPath(name)
     suffixes = (".png", ".ply", ".obj", ".gltf", ".pcd", ".PLY", "", ".json", ".eps", ".npy")
     odd = [n for n in NAMES if 2 < len(n) < 100 and not re.search(r"[/\\\0]", n)]
@@ -98,10 +98,10 @@ def _renamed(draw: Draw, case: Case, name: str) -> Case:
 
 
 @st.composite
-def cases(draw: Draw, sound: Sequence[Case]) -> Case:
-    """A sound case of a reader, preferably the first, and one to four mutations of its files."""
-    case = sound[choice(draw, *range(len(sound)))]
-    others = [entry.data for made in sound for entry in made.files.values()]
+def cases(draw: Draw, valid: Sequence[Case]) -> Case:
+    """A valid case of a reader, preferably the first, with one to four mutations."""
+    case = valid[choice(draw, *range(len(valid)))]
+    others = [entry.data for made in valid for entry in made.files.values()]
     for _ in range(choice(draw, 1, 1, 1, 2, 2, 3, 4)):
         case = _changed(draw, case, others) if case.files else case
     return case

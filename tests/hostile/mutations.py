@@ -1,8 +1,7 @@
-"""What is done to bytes, to text and to JSON.
+"""Mutations of bytes, text and JSON.
 
-A mutation is a function of hypothesis's ``draw`` and of bytes, which gives other bytes. It raises
-where they give it nothing to do. What comes first in a list of choices is what hypothesis makes
-a failing case of in the end.
+A mutation is a function of hypothesis's ``draw`` and of bytes, and returns other bytes. It raises
+if it cannot be applied. Hypothesis shrinks failing cases towards the first of a list of choices.
 """
 
 import json
@@ -53,17 +52,17 @@ def choice(draw: Draw, *values: Any) -> Any:
 
 
 def chance(draw: Draw, percent: int) -> bool:
-    """True in so many of 100 cases."""
+    """True with this probability."""
     return draw(st.integers(0, 99)) >= 100 - percent
 
 
 def position(draw: Draw, most: int) -> int:
-    """A place from 0 to ``most``; often one of the first, where headers are."""
+    """An offset from 0 to ``most``, often small, where headers are."""
     return draw(st.integers(0, min(most, 128)) | st.integers(0, most))
 
 
 def encode(text: str) -> bytes:
-    """UTF-8, with lone surrogates as they are: what a careless writer gives."""
+    """Encode to UTF-8 with lone surrogates, like a careless writer."""
     return text.encode("utf-8", "surrogatepass")
 
 
@@ -73,12 +72,12 @@ def _span(draw: Draw, data: bytes) -> tuple[int, int]:
 
 
 def truncate(draw: Draw, data: bytes) -> bytes:
-    """Cuts the end off: anywhere, or just a few bytes."""
+    """Cut the end off: anywhere, or just a few bytes."""
     return data[: draw(st.integers(0, len(data) - 1) | st.integers(-8, -1))]
 
 
 def flip_bits(draw: Draw, data: bytes) -> bytes:
-    """Turns over 1 to 8 bits."""
+    """Turn over 1 to 8 bits."""
     out = bytearray(data)
     for _ in range(draw(st.integers(1, 8))):
         out[position(draw, len(out) - 1)] ^= 1 << draw(st.integers(0, 7))
@@ -86,7 +85,7 @@ def flip_bits(draw: Draw, data: bytes) -> bytes:
 
 
 def set_bytes(draw: Draw, data: bytes) -> bytes:
-    """Fills a span with 0, 255 or other bytes."""
+    """Fill a span with 0, 255 or other bytes."""
     start, end = _span(draw, data)
     length = min(end, len(data)) - start
     fill = draw(st.sampled_from((b"\0", b"\xff")) | st.binary(min_size=1, max_size=64))
@@ -94,13 +93,13 @@ def set_bytes(draw: Draw, data: bytes) -> bytes:
 
 
 def insert_bytes(draw: Draw, data: bytes) -> bytes:
-    """Puts bytes in; at the end too."""
+    """Insert bytes, possibly at the end."""
     at = choice(draw, position(draw, len(data)), len(data))
     return data[:at] + draw(st.binary(min_size=1, max_size=100)) + data[at:]
 
 
 def move_block(draw: Draw, data: bytes) -> bytes:
-    """Takes a span out, or puts it at another place, over what is there or between it."""
+    """Remove a span, or move it to another offset, overwriting or inserting."""
     start, end = _span(draw, data)
     if chance(draw, 60):
         block, at = data[start:end], position(draw, len(data))
@@ -109,7 +108,7 @@ def move_block(draw: Draw, data: bytes) -> bytes:
 
 
 def extreme_word(draw: Draw, data: bytes) -> bytes:
-    """Replaces 1 to 8 bytes by a number at the end of its range, in either byte order."""
+    """Replace 1 to 8 bytes by a number at the end of its range, in either byte order."""
     word = choice(draw, *_WORDS)[:: choice(draw, 1, -1)]
     at = position(draw, len(data) - len(word))
     at -= at % len(word) if draw(st.booleans()) else 0
@@ -117,7 +116,7 @@ def extreme_word(draw: Draw, data: bytes) -> bytes:
 
 
 def add_to_word(draw: Draw, data: bytes) -> bytes:
-    """Counts a number of 1, 2, 4 or 8 bytes up or down by a little, or doubles it."""
+    """Change a number of 1, 2, 4 or 8 bytes by a little, or double it."""
     size, order = choice(draw, 4, 1, 2, 8), choice(draw, "little", "big")
     at = position(draw, len(data) - size)
     value = int.from_bytes(data[at : at + size], order)
@@ -126,7 +125,7 @@ def add_to_word(draw: Draw, data: bytes) -> bytes:
 
 
 def append(draw: Draw, data: bytes) -> bytes:
-    """The file twice; or no byte of it."""
+    """Repeat the file, or make it empty."""
     return choice(draw, data * 2, b"")
 
 
@@ -143,26 +142,26 @@ def _replaced(draw: Draw, data: bytes, pattern: bytes, by: Callable[[bytes], byt
 
 
 def extreme_number(draw: Draw, data: bytes) -> bytes:
-    """Replaces a number by one at or beyond the end of its range, or by what is no number."""
+    """Replace a number by one at or beyond the end of its range, or by other text."""
     by = encode(choice(draw, *NUMBERS))
     return _replaced(draw, data, rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?", lambda _: by)
 
 
 def near_number(draw: Draw, data: bytes) -> bytes:
-    """Counts a whole number up or down by a little, so that a header lies by a little."""
+    """Change an integer by a little, so that a header is slightly wrong."""
     step = choice(draw, 1, -1, 2, 100)
     return _replaced(draw, data, rb"\d+", lambda old: b"%d" % max(0, int(old[:18]) + step))
 
 
 def hostile_word(draw: Draw, data: bytes) -> bytes:
-    """Replaces a word by a hostile name, by a word of the format's own, or by an over-long one."""
+    """Replace a word by a hostile name, by a word of the format's own, or by an over-long one."""
     own = next((words for head, words in _TOKENS.items() if data.startswith(head)), ())
     word = choice(draw, *map(encode, NAMES), *own * 3, b"\xff\xfe", b"9" * 5000)
     return _replaced(draw, data, rb"[^\s]+", lambda _: word)
 
 
 def change_lines(draw: Draw, data: bytes) -> bytes:
-    """A line less, more often, elsewhere, in part; or all from one on that are no numbers."""
+    """Remove, repeat, move or cut a line; or remove all following lines without numbers."""
     lines = data.split(b"\n")
     last = len(lines) - 1
     at = draw(st.integers(0, min(last, 12)) | st.integers(0, last))
@@ -184,7 +183,7 @@ def change_lines(draw: Draw, data: bytes) -> bytes:
 
 
 def line_ends(draw: Draw, data: bytes) -> bytes:
-    """Other ends of lines, or other bytes in front."""
+    """Change the line ends, or the bytes at the start."""
     end = choice(draw, b"\r\n", b"\r", b"\n\n", b"\0\n", b" \n", b"\x0c", b"\x85")
     front = choice(draw, b"", b"\xef\xbb\xbf", b"\xff\xfe", b"\n", b" ")
     return front + data.replace(b"\n", end, choice(draw, -1, 1, 3))
@@ -197,7 +196,7 @@ TEXT = (
 
 
 def _paths(value: Any, here: tuple = ()) -> list[tuple]:
-    """The way to every value in nested lists and dictionaries, but to the whole."""
+    """Path to every value in nested lists and dictionaries, except the root."""
     found = [here] if here else []
     if isinstance(value, (dict, list)) and len(here) < 30:
         items = value.items() if isinstance(value, dict) else enumerate(value)
@@ -220,7 +219,7 @@ def _hostile_value(draw: Draw, old: Any) -> Any:
 
 
 def dump(tree: Any) -> bytes:
-    """JSON as a careless writer gives it, with NaN and lone surrogates."""
+    """JSON of a careless writer, with NaN and lone surrogates."""
     return encode(json.dumps(tree, ensure_ascii=False))
 
 
@@ -247,12 +246,12 @@ def changed_tree(draw: Draw, tree: Any) -> Any:
 
 
 def change_json(draw: Draw, data: bytes) -> bytes:
-    """Changes values of a JSON document."""
+    """Change values of a JSON document."""
     return dump(changed_tree(draw, json.loads(data)))
 
 
 def deep_json(draw: Draw, data: bytes) -> bytes:
-    """Nests lists or objects by the hundred or the hundred thousand, in place of a value."""
+    """Replace a value by a hundred or a hundred thousand nested lists or objects."""
     deep = choice(draw, 20, 40, 500, 990, 1100, 100_000)
     opened, closed = choice(draw, ("[", "]"), ('{"a":', "}"))
     inner = (opened * deep + "1" + closed * deep).encode()
@@ -268,7 +267,7 @@ def deep_json(draw: Draw, data: bytes) -> bytes:
 
 
 def repeat_key(draw: Draw, data: bytes) -> bytes:
-    """Gives a key twice, with another value."""
+    """Give a key twice, with another value."""
     value = choice(draw, b"null", b"0", b"-1", b'"x"', b"[]", b"1e999", b"NaN")
     return _replaced(draw, data, rb'"(\w+)":', lambda key: key + value + b"," + key)
 

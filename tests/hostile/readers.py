@@ -1,4 +1,4 @@
-"""Every reader of files: how a command calls it, what its sound files are, what a sound result is.
+"""All readers of files: their call by a command, their valid files, and checks of their results.
 
 A reader of a new format is one more line in ``READERS``.
 """
@@ -55,34 +55,34 @@ from gamba_warp.untrusted.documents import read_bytes
 from gamba_warp.viewer.page import write_viewer
 from gamba_warp.vision.weights import store_weights
 
-from . import seeds, sound
+from . import checks, seeds
 
 
 class Reader(NamedTuple):
-    """A reader of files.
+    """Reader of files.
 
     Attributes:
-        read: reads what lies at a path; it may write into a folder, its second argument.
-        sound: asserts that a result is sound, from the result, the path and the folder.
-        seeds: gives the sound files.
-        share: how often it is tried; a quick reader has 8.
-        whole: whether it is pointed at the folder of the files, and not at the first of them.
+        read: reads a path; may write into a folder, its second argument.
+        check: asserts that a result is valid, from the result, the path and the folder.
+        seeds: returns the valid files.
+        share: relative number of cases; 8 for a quick reader.
+        whole: True if it reads the folder of the files instead of the first file.
     """
 
     read: Callable[[Path, Path], Any]
-    sound: Callable[[Any, Path, Path], None]
+    check: Callable[[Any, Path, Path], None]
     seeds: Callable[[], seeds.Kinds]
     share: int = 8
     whole: bool = False
 
 
 def alone(read: Callable[[Path], Any]) -> Callable[[Path, Path], Any]:
-    """A reader of a path, which writes nothing."""
+    """Wrap a reader of a path that writes nothing."""
     return lambda path, out: read(path)
 
 
 def attempt(read: Callable, *arguments: Any) -> Any:
-    """What is read, or the error: one bad file of many is told, and the others are read."""
+    """Return the result or the error, for readers of many files."""
     try:
         return read(*arguments)
     except UserError as error:
@@ -108,7 +108,7 @@ def _view(path: Path, out: Path) -> Any:
 
 
 def _thinned(path: Path, out: Path) -> Any:
-    """Gaussians without those that cannot be drawn, and what is said of these."""
+    """Gaussians without those that cannot be drawn, and the message about these."""
     left_out: list[str] = []
     return read_gaussians(path, left_out), left_out
 
@@ -120,7 +120,7 @@ def _predictions(path: Path, out: Path) -> Any:
 
 
 def _cameras(path: Path, out: Path) -> Any:
-    """The cameras as ``gamba render`` reads them, in the file's size and in another."""
+    """Read cameras like ``gamba render``, in the file's size and in another."""
     load_path(path, (32, 24))
     return load_path(path)
 
@@ -148,7 +148,7 @@ def _split(path: Path, out: Path) -> Any:
 
 
 def _shown(path: Path, out: Path) -> Any:
-    """Pictures that take the place of predictions, of each object of a dataset."""
+    """Pictures in place of predictions, of each object of a dataset."""
     dataset, given = open_dataset(path / "data"), PicturePredictions(path / "seen", 1.5, "cpu")
     protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
     truths = [attempt(load_truth, dataset, uid, protocol, "cpu") for uid in dataset.uids]
@@ -169,7 +169,7 @@ def _furniture(path: Path, out: Path) -> Any:
 
 
 def _gobjaverse(path: Path, out: Path) -> Any:
-    """Makes a dataset of a copy of G-Objaverse, as its lists choose; loads its objects."""
+    """Make a dataset of a copy of G-Objaverse, chosen by its lists; load its objects."""
     files = {name: path / name for name in ("index.json", "quality.json")}
     index, quality = (file if file.exists() else None for file in files.values())
     lists = Lists(index, tuple(sorted(path.glob("list*"))), (), quality)
@@ -182,7 +182,7 @@ def _gobjaverse(path: Path, out: Path) -> Any:
 
 
 def _gso(path: Path, out: Path) -> Any:
-    """Takes models of a copy of GSO, and reads their meshes."""
+    """Take models of a copy of GSO, and read their meshes."""
     names = gso.NAMES[:2]
     failures = take_models(path, out / "gso", names)
     results: list[Any] = [UserError(reason) for reason in failures.values()]
@@ -190,7 +190,7 @@ def _gso(path: Path, out: Path) -> Any:
         try:
             results.append(load_mesh(mesh.path).normalized(gso.UP)[0])
         except UserError as error:
-            # The file is a copy: it has the name of that in the set, but not its place.
+            # The file is a copy: it has the name of that in the set, but another folder.
             results.append(UserError(str(error).replace(str(out), str(path))))
     return results
 
@@ -202,12 +202,12 @@ def _trainer() -> Any:
 
 def _training(path: Path, out: Path) -> Any:
     trainer = _trainer()
-    before = sound.fingerprint(trainer)
+    before = checks.fingerprint(trainer)
     found = find_checkpoint(trainer.config.run.out, str(path))
     try:
         trainer.restore(found)
     except Exception:
-        if sound.fingerprint(trainer) != before:
+        if checks.fingerprint(trainer) != before:
             _trainer.cache_clear()
             raise AssertionError("refused, but a part of it is loaded already") from None
         raise
@@ -248,7 +248,7 @@ def _plan(path: Path, out: Path) -> Any:
 
 
 def _compare(path: Path, out: Path) -> Any:
-    """The table of a report beside itself, as ``gamba compare`` writes it."""
+    """Table of ``gamba compare`` for a report and itself."""
     joined = join(read_reports((f"a={path}", f"b={path}"), ()), None)
     json.dumps(joined, allow_nan=False)
     return [markdown_page(joined, True), html_page(joined, True)]
@@ -281,7 +281,7 @@ def _archive(path: Path, out: Path) -> Any:
 
 
 def _faulty(path: Path, out: Path) -> Any:
-    """Does what the file says, so that there is something to find."""
+    """Fail as the file says, to test the detection of failures."""
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     what = path.read_text("latin1")
@@ -309,47 +309,49 @@ def _faulty(path: Path, out: Path) -> Any:
 
 
 READERS = {
-    "picture": Reader(alone(load_rgba), sound.picture, seeds.pictures),
-    "picture-folder": Reader(_pictures, sound.each(sound.picture), seeds.picture_folders, 3, True),
-    "cut-out": Reader(_prepare, sound.cut_out, seeds.masked_pictures, 4),
-    "gaussians": Reader(alone(read_gaussians), sound.gaussians, seeds.splats),
-    "gaussians-thinned": Reader(_thinned, sound.thinned, seeds.thinned_splats, 4),
-    "gaussians-folder": Reader(
-        _predictions, sound.each(sound.gaussians), seeds.splat_folders, 3, True
+    "picture": Reader(alone(load_rgba), checks.picture, seeds.pictures),
+    "picture-folder": Reader(
+        _pictures, checks.each(checks.picture), seeds.picture_folders, 3, True
     ),
-    "view": Reader(_view, sound.page, seeds.splats, 2),
-    "cameras": Reader(_cameras, sound.cameras, seeds.cameras),
-    "mesh": Reader(_mesh, sound.mesh, seeds.meshes),
-    "shape": Reader(alone(load_shape), sound.shape, seeds.shapes, 12),
-    "evaluation": Reader(_evaluation, sound.report, seeds.compared, 1),
-    "dataset": Reader(_dataset, sound.views, seeds.datasets, 8, True),
-    "pack": Reader(_dataset, sound.views, seeds.packs, 6, True),
-    "shown": Reader(_shown, sound.each(sound.shown), seeds.shown, 3, True),
-    "split": Reader(_split, sound.nothing, seeds.split, 2, True),
-    "catalogue": Reader(alone(find_meshes), sound.catalogue, seeds.catalogues, 4, True),
-    "render": Reader(_render, sound.rendered, seeds.catalogues, 1, True),
-    "furniture": Reader(_furniture, sound.furniture, seeds.libraries, 6, True),
-    "package": Reader(_furniture, sound.furniture, seeds.packages, 6),
-    "gobjaverse-copy": Reader(_gobjaverse, sound.views, seeds.gobjaverse, 3, True),
-    "gso-copy": Reader(_gso, sound.scans, seeds.scans, 3, True),
-    "model": Reader(alone(load_model), sound.model, seeds.models, 6),
-    "training": Reader(_training, sound.training, seeds.checkpoints, 5, True),
-    "start-weights": Reader(_start_weights, sound.model, seeds.models, 3),
-    "config": Reader(_config, sound.config, seeds.configurations),
-    "set": Reader(_set, sound.config, seeds.changes, 4),
-    "protocol": Reader(_protocol, sound.protocol, seeds.protocols),
-    "plan": Reader(_plan, sound.plan, seeds.plans, 2),
-    "compare": Reader(_compare, sound.pages, seeds.reports, 4),
-    "bench": Reader(_bench, sound.pages, seeds.benches, 4),
-    "stress": Reader(_numeric, sound.nothing, seeds.numeric, 2),
-    "released": Reader(_released, sound.released, seeds.released, 2),
-    "encoder": Reader(_encoder, sound.nothing, seeds.weights, 1),
-    "sam": Reader(alone(SamSegmenter), sound.nothing, seeds.weights, 1),
-    "matte": Reader(_matte, sound.alpha, seeds.networks, 3),
-    "archive": Reader(_archive, sound.nothing, seeds.archives, 2),
-    "faulty": Reader(_faulty, sound.faulty, lambda: {"text": {"a.txt": b"sound text"}}, 0),
+    "cut-out": Reader(_prepare, checks.cut_out, seeds.masked_pictures, 4),
+    "gaussians": Reader(alone(read_gaussians), checks.gaussians, seeds.splats),
+    "gaussians-thinned": Reader(_thinned, checks.thinned, seeds.thinned_splats, 4),
+    "gaussians-folder": Reader(
+        _predictions, checks.each(checks.gaussians), seeds.splat_folders, 3, True
+    ),
+    "view": Reader(_view, checks.page, seeds.splats, 2),
+    "cameras": Reader(_cameras, checks.cameras, seeds.cameras),
+    "mesh": Reader(_mesh, checks.mesh, seeds.meshes),
+    "shape": Reader(alone(load_shape), checks.shape, seeds.shapes, 12),
+    "evaluation": Reader(_evaluation, checks.report, seeds.compared, 1),
+    "dataset": Reader(_dataset, checks.views, seeds.datasets, 8, True),
+    "pack": Reader(_dataset, checks.views, seeds.packs, 6, True),
+    "shown": Reader(_shown, checks.each(checks.shown), seeds.shown, 3, True),
+    "split": Reader(_split, checks.nothing, seeds.split, 2, True),
+    "catalogue": Reader(alone(find_meshes), checks.catalogue, seeds.catalogues, 4, True),
+    "render": Reader(_render, checks.rendered, seeds.catalogues, 1, True),
+    "furniture": Reader(_furniture, checks.furniture, seeds.libraries, 6, True),
+    "package": Reader(_furniture, checks.furniture, seeds.packages, 6),
+    "gobjaverse-copy": Reader(_gobjaverse, checks.views, seeds.gobjaverse, 3, True),
+    "gso-copy": Reader(_gso, checks.scans, seeds.scans, 3, True),
+    "model": Reader(alone(load_model), checks.model, seeds.models, 6),
+    "training": Reader(_training, checks.training, seeds.checkpoints, 5, True),
+    "start-weights": Reader(_start_weights, checks.model, seeds.models, 3),
+    "config": Reader(_config, checks.config, seeds.configurations),
+    "set": Reader(_set, checks.config, seeds.changes, 4),
+    "protocol": Reader(_protocol, checks.protocol, seeds.protocols),
+    "plan": Reader(_plan, checks.plan, seeds.plans, 2),
+    "compare": Reader(_compare, checks.pages, seeds.reports, 4),
+    "bench": Reader(_bench, checks.pages, seeds.benches, 4),
+    "stress": Reader(_numeric, checks.nothing, seeds.numeric, 2),
+    "released": Reader(_released, checks.released, seeds.released, 2),
+    "encoder": Reader(_encoder, checks.nothing, seeds.weights, 1),
+    "sam": Reader(alone(SamSegmenter), checks.nothing, seeds.weights, 1),
+    "matte": Reader(_matte, checks.alpha, seeds.networks, 3),
+    "archive": Reader(_archive, checks.nothing, seeds.archives, 2),
+    "faulty": Reader(_faulty, checks.faulty, lambda: {"text": {"a.txt": b"valid text"}}, 0),
 }
-# Sound files that a reader refuses for a reason: EPS under another name, and stand-ins of weights.
+# Valid files that a reader rejects on purpose: EPS under another name, and stand-ins of weights.
 REFUSED = {
     ("picture", "eps-as-png"),
     ("encoder", "torch"),

@@ -1,4 +1,4 @@
-"""A second reader of point clouds, which shares nothing with the first: what a file holds."""
+"""Independent second reader of point clouds."""
 
 import math
 import re
@@ -16,8 +16,8 @@ def points_in(data: bytes, suffix: str) -> np.ndarray | str | None:
         suffix: ".xyz", ".pts", ".pcd" or ".ply".
 
     Returns:
-        ``[N, 3]`` float64 of a text; a line about what makes it no cloud; or None where this
-        reader cannot tell, as of packed bytes.
+        ``[N, 3]`` float64 of a text; the reason why it is not a cloud; or None if unknown, as for
+        compressed data.
     """
     if suffix == ".pcd":
         return _pcd(data)
@@ -32,7 +32,7 @@ def points_in(data: bytes, suffix: str) -> np.ndarray | str | None:
 
 
 def vertices_stated(data: bytes, suffix: str) -> int | None:
-    """The number of vertices that the header of a mesh states, or None where it states none."""
+    """Number of vertices in the header of a mesh, or None if it has none."""
     if suffix == ".ply":
         found = re.findall(rb"^element[ \t]+vertex[ \t]+(\d+)\s*$", data[:4096], re.MULTILINE)
         return int(found[0]) if len(found) == 1 else None

@@ -1,4 +1,4 @@
-"""Sound files of every kind that is read: for each reader, files by name of the kind."""
+"""Valid files of all formats: for each reader, files by name of the kind."""
 
 import base64
 import functools
@@ -54,7 +54,7 @@ EPS = (
 )
 _POSE = [[1.0, 0, 0, 0], [0, 0, -1.0, -1.5], [0, 1.0, 0, 0]]
 _SIZE = 8
-_OWN = [  # what a Gaussian of a .ply has beside its colours
+_OWN = [  # fields of a Gaussian of a .ply beside its colours
     *((name, "<f4") for name in ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2")),
     *((f"rot_{i}", "<f4") for i in range(4)),
 ]
@@ -158,7 +158,7 @@ def gaussians(count: int = 12, kind: Any = "ply", degree: int = 0) -> bytes:
 
 
 def splats() -> Kinds:
-    """Gaussians in every format that is read, some with harmonics."""
+    """Gaussians in every supported format, some with harmonics."""
     harmonics = gaussians(degree=1)
     text = PlyData.read(io.BytesIO(harmonics))
     text.text = True
@@ -186,7 +186,7 @@ def splats() -> Kinds:
 def spz_4(data: bytes) -> bytes:
     """An ``.spz`` of version 3 in the container of version 4, with an extension.
 
-    Each ZSTD frame holds its bytes as they are, so a mutation reaches the numbers too.
+    Each ZSTD frame is uncompressed, so mutations reach the numbers, too.
     """
     inner = gzip.decompress(data)
     magic, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", inner)
@@ -233,7 +233,7 @@ def ply(points: np.ndarray, more: dict, faces: Sequence = (), form: str = "ascii
 
 
 def ply_bytes(data: PlyData) -> bytes:
-    """What ``plyfile`` writes."""
+    """Encode with ``plyfile``."""
     content = io.BytesIO()
     data.write(content)
     return content.getvalue()
@@ -277,7 +277,7 @@ def meshes() -> Kinds:
 
 
 def pcd(points: np.ndarray, normals: bool = False, **form: bool) -> bytes:
-    """A ``.pcd`` of points ``[N, 3]``, as Open3D writes it."""
+    """A ``.pcd`` of points ``[N, 3]``, written by Open3D."""
     o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(points if normals else [])
@@ -308,20 +308,20 @@ def clouds() -> Kinds:
 
 
 def shapes() -> Kinds:
-    """All that is a shape; triangles need no side files, but for a .gltf's numbers."""
+    """All kinds of shapes, without side files except a .gltf's numbers."""
     made = {**clouds(), **meshes(), **splats()}
     made.pop("gltf-side")
     return {name: dict([next(iter(files.items()))]) for name, files in made.items()}
 
 
 def compared() -> Kinds:
-    """A mesh, a cloud and Gaussians: what an evaluation does with each takes seconds."""
+    """A mesh, a cloud and Gaussians: few, because an evaluation takes seconds."""
     made = shapes()
     return {name: made[name] for name in ("ply-binary", "ply-cloud", "gaussians")}
 
 
 def cameras() -> Kinds:
-    """Two cameras as a file of each form holds them."""
+    """Two cameras as a file of each format."""
     poses = [np.eye(4), np.eye(4)]
     poses[1][:3, 3] = 0.5, -1.5, 2.0
     head = {"format": "gamba-cameras", "version": 1, "width": 8, "height": 6, "fps": 24, "fov": 50}
@@ -366,7 +366,7 @@ def transforms(uid: str, depth: bool = False) -> Files:
 
 
 def shown() -> Kinds:
-    """True views of an object beside what a method shows: by name, and with cameras of its own."""
+    """True views of an object beside a method's pictures: by name, and with their own cameras."""
     true = transforms("chair")
     named = {name: content for name, content in true.items() if name.endswith(".png")}
     posed = {name: content for name, content in true.items() if "000" not in name}
@@ -432,7 +432,7 @@ def packs() -> Kinds:
 
 
 def put(files: Files, folder: Path) -> None:
-    """Writes files into a folder."""
+    """Write files into a folder."""
     for name, content in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -450,7 +450,7 @@ def catalogues() -> Kinds:
 
 
 def gobjaverse() -> Kinds:
-    """Copies of G-Objaverse: a folder and a tar, with lists; and what the set's script leaves."""
+    """Copies of G-Objaverse: a folder and a tar, with lists; and a copy of the set's script."""
     view = published_views.files_of(0)
     view = {f"00000/00000{end}": view[end] for end in (".json", ".png")}
     tar = tarred({f"10011/campos_512_v4/{name}": data for name, data in view.items()}, "")
@@ -484,7 +484,7 @@ def zipped(members: Files) -> bytes:
 
 
 def tarred(members: Files, form: str = "xz", odd: tarfile.TarInfo | None = None) -> bytes:
-    """A tar archive, packed by "xz" or "gz", or not at all; with an odd member at its end."""
+    """A tar archive, compressed by "xz", "gz" or not; with an optional odd member at its end."""
     content = io.BytesIO()
     with tarfile.open(fileobj=content, mode=f"w:{form}") as tar:
         for name, data in members.items():
@@ -497,7 +497,7 @@ def tarred(members: Files, form: str = "xz", odd: tarfile.TarInfo | None = None)
 
 
 def ar(members: Files) -> bytes:
-    """An ar archive, as dpkg makes it."""
+    """An ar archive in the form of dpkg."""
     parts = [b"!<arch>\n"]
     for name, data in members.items():
         parts.append(f"{name:<16}{0:<12}{0:<6}{0:<6}{100644:<8}{len(data):<10}`\n".encode())
@@ -556,7 +556,7 @@ def released() -> Kinds:
 
 
 def trainer(folder: Path) -> Trainer:
-    """A trainer on a dataset of one object, which is written into a folder."""
+    """A trainer on a dataset of one object, written into a folder."""
     parts = {"version": 1, "train": ["chair"], "val": [], "test": []}
     put({**transforms("chair"), "split.json": as_json(parts)}, folder / "data")
     views = {"batch_size": 1, "size": 8, "views_first": 1, "views_last": 1}
@@ -662,7 +662,7 @@ def networks() -> Kinds:
 
 
 def weights() -> Kinds:
-    """A torch file of weights that fit nothing."""
+    """A torch file of weights of no model."""
     content = io.BytesIO()
     torch.save({"cls_token": torch.zeros(1, 1, 8), "blocks.0.bias": torch.ones(8)}, content)
     return {"torch": {"weights.pth": content.getvalue()}}

@@ -1,7 +1,7 @@
-"""Hostile files for every reader, as hypothesis draws them; and that what is bad is seen.
+"""Fuzzing of every reader with hypothesis, and tests of the detection of failures.
 
-``make hostile MINUTES=30 SEED=2`` looks for longer. A failing case, made small, is written to
-``out/hostile/``; as a file in ``corpus/`` it is run again by every ``make test``.
+``make hostile MINUTES=30 SEED=2`` runs longer. A failing case, after shrinking, is written to
+``out/hostile/``; as a file in ``corpus/`` it is run by every ``make test``.
 """
 
 import functools
@@ -21,8 +21,8 @@ from msgspec.structs import replace
 from gamba_warp.errors import MOST_LETTERS, UserError, one_line
 from gamba_warp.untrusted.children import end_idle
 
-from . import sound
-from .case import Case, Entry, place_case, read_case, sound_case, write_case
+from . import checks
+from .case import Case, Entry, place_case, read_case, valid_case, write_case
 from .child import BAD, GOOD, run_case
 from .drawing import cases
 from .readers import READERS, REFUSED
@@ -32,8 +32,8 @@ from .seeds import clouds
 ROOT = Path(__file__).resolve().parents[2]
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
 SEED = int(os.environ.get("GAMBA_HOSTILE_SEED", "1"))
-MINUTES = float(os.environ.get("GAMBA_HOSTILE_MINUTES", "0"))  # of all readers together
-EXAMPLES = 12  # cases of a reader for each of its shares, where no minutes are asked for
+MINUTES = float(os.environ.get("GAMBA_HOSTILE_MINUTES", "0"))  # for all readers
+EXAMPLES = 12  # cases of a reader per share, without a given time
 SHARES = sum(reader.share for reader in READERS.values())
 TRIED = [name for name, reader in READERS.items() if reader.share]
 WANTED = {
@@ -45,7 +45,7 @@ WANTED = {
 
 @pytest.fixture(scope="module")
 def base():
-    """A folder for child processes: in memory, where a case's files cost no disk."""
+    """A folder for child processes, in memory to spare the disk."""
     memory = Path("/dev/shm")
     end_idle()
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
@@ -54,21 +54,21 @@ def base():
 
 
 @functools.cache
-def sound_cases(reader):
-    """A case of each of a reader's sound files."""
+def valid_cases(reader):
+    """A case of each of a reader's valid files."""
     made = READERS[reader].seeds().items()
     mains = ("" if READERS[reader].whole else next(iter(files)) for _, files in made)
-    return [sound_case(reader, seed, main, files) for (seed, files), main in zip(made, mains)]
+    return [valid_case(reader, seed, main, files) for (seed, files), main in zip(made, mains)]
 
 
 @functools.cache
 def failure(signature):
-    """An exception of its own for each kind of failure: hypothesis makes that one small."""
+    """An exception type for each kind of failure, so that hypothesis shrinks each separately."""
     return type("Failure", (AssertionError,), {"__doc__": signature})
 
 
 def fuzz(reader, base, seed, examples, out, counts):
-    """Draws cases of a reader; the smallest that fails is written to a folder, and raised."""
+    """Draw cases of a reader; write the smallest failing one to a folder, and raise it."""
 
     @hypothesis.seed(seed)
     @settings(
@@ -79,7 +79,7 @@ def fuzz(reader, base, seed, examples, out, counts):
         report_multiple_bugs=False,
         suppress_health_check=list(HealthCheck),
     )
-    @given(cases(sound_cases(reader)))
+    @given(cases(valid_cases(reader)))
     def holds(case):
         verdict = run_case(case, base)
         counts[verdict.outcome] += 1
@@ -95,10 +95,10 @@ def fuzz(reader, base, seed, examples, out, counts):
 
 @pytest.mark.parametrize("reader", TRIED)
 def test_hostile_files(reader, base):
-    """Every case is read and sound, or refused with one line that names the file."""
+    """Every case gives a valid result, or an error with one line that names the file."""
     share, counts, start = READERS[reader].share, Counter(), time.monotonic()
-    # A seed that is refused would test nothing behind the first check.
-    told = {case.seed: run_case(case, base) for case in sound_cases(reader)}
+    # A rejected seed would test nothing after the first check.
+    told = {case.seed: run_case(case, base) for case in valid_cases(reader)}
     for seed, verdict in told.items():
         wanted = "refused" if (reader, seed) in REFUSED else "sound"
         assert verdict.outcome == wanted, f"{reader}, {seed}: {verdict}"
@@ -116,7 +116,7 @@ def test_hostile_files(reader, base):
 
 
 def faulty_case(what):
-    return sound_case("faulty", "text", "a.txt", {"a.txt": what.encode(), "b.txt": b"unused"})
+    return valid_case("faulty", "text", "a.txt", {"a.txt": what.encode(), "b.txt": b"unused"})
 
 
 def test_each_fault_is_seen(base):
@@ -136,20 +136,20 @@ def test_a_hang_is_seen(base):
 
 
 def test_a_failure_is_found_and_made_small(base, tmp_path):
-    """The reader fails where the third byte is no ASCII letter."""
+    """The reader fails if the third byte is not ASCII."""
     with pytest.raises(AssertionError, match="exception, KeyError at"):
         fuzz("faulty", base, 0, 400, tmp_path, Counter())
     small = read_case(tmp_path / "faulty.json")
     assert len(small.mutations) <= 2 and list(small.files) == ["a.txt"]
-    assert len(small.files["a.txt"].data) <= len("sound text")
+    assert len(small.files["a.txt"].data) <= len("valid text")
 
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "link", "missing"])
 def test_what_is_no_file_is_refused(base, kind):
-    """In each file's place, of every reader: a pipe has no end, nor has /dev/zero."""
+    """In place of each file of every reader: a pipe and /dev/zero never end."""
     told = {}
     for reader in TRIED:
-        case = sound_cases(reader)[0]
+        case = valid_cases(reader)[0]
         for name in list(case.files)[:3]:
             changed = {name: Entry(b"/dev/zero", kind)} if kind != "missing" else {}
             files = {other: entry for other, entry in case.files.items() if other != name}
@@ -161,7 +161,7 @@ def test_what_is_no_file_is_refused(base, kind):
 
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.stem)
 def test_what_was_found_once_stays_mended(base, path):
-    """``corpus/`` holds cases that failed, as they were written; each is judged again."""
+    """``corpus/`` holds cases that once failed; each is judged again."""
     verdict = run_case(read_case(path), base)
     assert verdict.outcome in GOOD, verdict
 
@@ -172,7 +172,7 @@ def test_the_same_seed_gives_the_same_cases():
 
         @hypothesis.seed(seed)
         @settings(max_examples=40, phases=(Phase.generate,), database=None, deadline=None)
-        @given(cases(sound_cases("shape")))
+        @given(cases(valid_cases("shape")))
         def collect(case):
             found.append(case)
 
@@ -215,16 +215,16 @@ def test_the_second_reader_takes_no_garbage(name, garbage):
     [(file, data)] = clouds()[name].items()
     lines = data.splitlines(keepends=True)
     assert isinstance(points_in(b"".join([*lines[:-1], garbage]), Path(file).suffix), str)
-    if name != "xyz":  # which states no count
+    if name != "xyz":  # which has no count
         assert isinstance(points_in(b"".join(lines[:-1]), Path(file).suffix), str)
 
 
 def test_the_check_of_pictures_can_fail():
     good = np.zeros((2, 3, 4), np.float32)
-    sound.picture(good, Path(), Path())
+    checks.picture(good, Path(), Path())
     for bad in (good[..., :3], good.astype(np.float64), good + 2, good * np.nan):
         with pytest.raises(AssertionError):
-            sound.picture(bad, Path(), Path())
+            checks.picture(bad, Path(), Path())
 
 
 @pytest.mark.parametrize("text", ["a\nb", "a\x1b[31mb", "\ud800", "x" * 10**6, "\r\n", "a\u2028b"])
@@ -235,7 +235,7 @@ def test_an_error_is_one_line(text):
     assert len(line) <= MOST_LETTERS
 
 
-def test_an_error_keeps_what_is_sound():
+def test_an_error_keeps_what_is_valid():
     assert one_line("café.png: ungültig") == "café.png: ungültig"
 
 

@@ -46,7 +46,7 @@ def _mamba_reference(mamba: Mamba, tokens: torch.Tensor) -> torch.Tensor:
 
 
 def _block_reference(block: GambaBlock, tokens, camera, image) -> torch.Tensor:
-    """Prepends the projected condition, runs the reference, drops the prefix again."""
+    """Prepend the projected condition, runs the reference, drops the prefix again."""
     p = {name: value.double() for name, value in block.state_dict().items()}
     prefix = []
     for name, condition in (("project_camera", camera), ("project_image", image)):
@@ -65,12 +65,12 @@ def _block_reference(block: GambaBlock, tokens, camera, image) -> torch.Tensor:
 
 
 def _run(block: GambaBlock, tokens, camera, image) -> torch.Tensor:
-    """The block behind its own prefix."""
+    """Run the block after its own prefix."""
     return block(tokens, *prefix_states([block], camera, image))[0]
 
 
 def _perturbed(block: GambaBlock) -> GambaBlock:
-    """Every parameter away from its starting value, so that none is 0 or 1 by chance."""
+    """Move every parameter from its initial value, so that none is 0 or 1 by chance."""
     with torch.no_grad():
         for parameter in block.parameters():
             parameter += 0.1 * torch.randn_like(parameter)

@@ -102,7 +102,7 @@ def test_relative_to_reference():
     assert_close(scale, torch.tensor([0.75, 0.5]).double())
     same, _ = C.relative_to_reference(reference[:, None], reference, 1.5)
     assert_close(same[:, 0], C.reference_viewmat(1.5).double().expand(2, 4, 4))
-    # A point of the world lands at the same place of each camera, scale aside.
+    # A point of the world projects to the same position in each camera, up to scale.
     point = torch.randn(2, 1, 3, 1).double()
     moved = scale[:, None, None, None] * (reference[:, None, :3, :3] @ point)
     before = viewmats[..., :3, :3] @ point + viewmats[..., :3, 3:]

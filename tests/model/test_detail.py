@@ -1,4 +1,4 @@
-"""The front at the picture's own resolution: which cells split, into what, and what is refused."""
+"""Splitting of the front to the picture's resolution: cells, children, and errors."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from gamba_warp.images import save_image
 from gamba_warp.model import detail as subject
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.detail import COVER, OFF, checked_detail, split_front
+from gamba_warp.model.detail import MIN_SIZE, OFFSET_SHARE, checked_detail, split_front
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.model.predict import model_input, reconstruct
@@ -36,7 +36,7 @@ def rays(**changes) -> GambaConfig:
 
 
 def fresh(**changes) -> Gamba:
-    """Untrained, so its front is an opaque plane with the colours of the picture."""
+    """Untrained model, whose front is an opaque plane with the colours of the picture."""
     torch.manual_seed(4)
     return Gamba(rays(**changes)).eval()
 
@@ -91,7 +91,7 @@ def test_what_is_plain_does_not_split():
         full = box(24 * detail, 0, 24 * detail)
         before = reconstruct(model, full, detail=1)
         assert same(reconstruct(model, full, detail=detail), before)
-        # A mark on one cell splits this one and those beside it.
+        # A mark on one cell splits this one and its neighbours.
         full[12 * detail, 12 * detail, :3] = 0
         assert reconstruct(model, full, detail=detail).num == before.num + 9 * (detail**2 - 1)
         # A square of 8 x 8 cells has 28 with background beside them, of which each becomes four.
@@ -107,7 +107,7 @@ def test_what_is_plain_does_not_split():
     ids=["patch 8", "patch 24", "cells of 2 x 2 pixels"],
 )
 def test_the_input_view_becomes_sharp(changes):
-    """A fresh front has no depth to get wrong, so what is left is that of the splitting."""
+    """An untrained front has no error of depth, so only that of the splitting remains."""
     model = fresh(**changes)
     side = 24 // (model.config.patch_size // model.config.ray_cells)
     rgba = board(4 * side, 3)
@@ -170,8 +170,8 @@ def test_children_go_half_of_the_way_that_parents_lie_off_their_rays():
 
 
 def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
-    """But for the share of their parent's way off its ray."""
-    monkeypatch.setitem(OFF, 2, 0.0)
+    """Except for the share of their parent's offset from its ray."""
+    monkeypatch.setitem(OFFSET_SHARE, 2, 0.0)
     model, rgba = fresh(), board(48, 2)
     model.decoder.scale_bias.data[0] = math.log(0.9)  # sides of a cell
     found = reconstruct(model, rgba, detail=2)
@@ -181,17 +181,17 @@ def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
     points = children.means + camera.viewmats[0, :3, 3]
     pixels = points[:, :2] / points[:, 2:] * camera.Ks[0, 0, 0] + 24
     torch.testing.assert_close(pixels % 1, torch.full_like(pixels, 0.5), atol=1e-3, rtol=0)
-    assert len(pixels.round(decimals=2).unique(dim=0)) == 200  # and each has a pixel of its own
+    assert len(pixels.round(decimals=2).unique(dim=0)) == 200  # and each has its own pixel
     # Half as wide across the view as their parents, and as long along it.
     parents = whole.scales[::3].mean(0)
     torch.testing.assert_close(
         children.scales.mean(0) / parents, torch.tensor([0.5, 0.5, 1.0]), rtol=0.02, atol=0
     )
-    # Where parents are small, the children are wide enough to cover the picture all the same.
+    # Children of small parents are still wide enough to cover the picture.
     model.decoder.scale_bias.data[0] = math.log(0.1)
     small = reconstruct(model, rgba, detail=2).scales[-200:]
     side = 0.5 * parents[:2].max() / 0.9
-    torch.testing.assert_close(small[:, :2], (COVER[2] * side).expand(200, 2), rtol=0.02, atol=0)
+    torch.testing.assert_close(small[:, :2], (MIN_SIZE[2] * side).expand(200, 2), rtol=0.02, atol=0)
 
 
 def test_two_rounds_correct_colours_at_all_pixels_and_opacities_at_twice_the_cells(monkeypatch):
@@ -247,7 +247,7 @@ def test_the_count_is_bounded(monkeypatch):
     noise[:, :48, :3] *= 0.3
     before = reconstruct(model, noise, detail=1).num
     assert reconstruct(model, noise, detail=4).num == before + 24 * 24 * 15
-    monkeypatch.setattr(subject, "MOST_CHILDREN", 4000)
+    monkeypatch.setattr(subject, "MAX_CHILDREN", 4000)
     found = reconstruct(model, noise, detail=4)
     others = before - 24 * 24
     assert 3900 < found.num - others <= 4000
@@ -271,7 +271,7 @@ def test_alpha_that_is_soft_everywhere(detail):
 
 
 def test_children_of_what_is_not_finite_are_not_left_out():
-    """So that what writes them can refuse them."""
+    """Writers of files can then reject them."""
     model, rgba = fresh(), board(96, 4)
     image = model_input(rgba, model.config)[0]
     made = reconstruct(model, rgba, detail=1)
@@ -294,7 +294,7 @@ def test_three_pixels_and_none():
 
 
 def test_a_picture_of_8000_pixels_a_side(tmp_path, capsys):
-    """It is reduced when it is read, so the floats of a small one are all that there are."""
+    """The picture is reduced when it is read, so only a small one takes memory."""
     save_model(tmp_path / "model.safetensors", fresh())
     large = Image.new("L", (8000, 8000), 255)
     large.paste(Image.linear_gradient("L").resize((5000, 5000)), (1500, 1500))
@@ -330,7 +330,7 @@ def test_other_decoders_and_other_numbers_are_refused(tmp_path, capsys):
 
 
 def test_no_background_gets_into_the_colours():
-    """A plain object has its colour at its rim, too: the correction does not mend it with white."""
+    """A plain object keeps its colour at its rim: the correction adds no white."""
     model, color = fresh(), torch.tensor([0.5, 0.3, 0.1])
     found = reconstruct(model, box(96, 29, 67, color.tolist()), detail=4)
     front = found.colors[found.opacities > 0.05]

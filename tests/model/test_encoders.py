@@ -18,7 +18,7 @@ _TINY = {"patch_size": 14, "embed_dim": 24, "depth": 2, "num_heads": 2}
 def gamba_test_reg_vit(pretrained=False, **kwargs):
     """The shape of DINOv2 with registers: no class position, layer scale, 4 registers."""
     tiny = {**_TINY, "init_values": 0.1, "reg_tokens": 4, "no_embed_class": True}
-    name = "vit_small_patch14_reg4_dinov2"  # for its pretrained_cfg alone
+    name = "vit_small_patch14_reg4_dinov2"  # only for its pretrained_cfg
     return _create_vision_transformer(name, pretrained=pretrained, **(tiny | kwargs))
 
 
@@ -130,7 +130,7 @@ def test_fingerprint_tells_weights_apart(tmp_path):
 @pytest.mark.parametrize(
     "changes, weights, words",
     [
-        ({}, None, "must be named"),
+        ({}, None, "must be given"),
         ({}, "missing.pth", "missing.pth: no such file"),
         ({"encoder": "vit_of_nobody"}, "random", "vit_of_nobody: neither"),
         ({"encoder": "resnet18"}, "random", "resnet18"),

@@ -1,4 +1,4 @@
-"""The container of Gaussians: its checks, its conversions, and rigid motions."""
+"""Container of Gaussians: checks, conversions, and rigid motions."""
 
 import math
 
@@ -108,7 +108,7 @@ def test_rigid_motion_of_a_batch_with_gradients():
 
 @pytest.mark.parametrize("count", [3, 8, 15])
 def test_an_object_that_turns_with_the_camera_keeps_its_picture(count):
-    """The harmonics turn with the object; without that, the colours would be another side's."""
+    """The harmonics rotate with the object; otherwise the colours would be of another side."""
     torch.manual_seed(3)
     gaussians = some(7)
     gaussians.harmonics = 0.3 * torch.randn(7, count, 3)

@@ -51,7 +51,7 @@ def test_condition_can_be_kept(changes):
         condition = model.condition(images, cameras)
         assert len(condition) == 2 and (condition[0] is None) == bool(changes)
         want = model(images, cameras)
-        for _ in range(2):  # a use changes nothing
+        for _ in range(2):  # reuse gives the same result
             assert torch.equal(model(images, cameras, condition).means, want.means)
         if not changes:
             with torch.autocast("cpu", torch.bfloat16):  # the condition is float32
@@ -195,7 +195,7 @@ def test_config_refuses(changes, words):
     ids=str,
 )
 def test_a_default_of_float64_changes_nothing(changes):
-    """Weights are drawn, and Gaussians predicted, as where the default dtype is float32."""
+    """Weights are drawn, and Gaussians predicted, as with the default dtype float32."""
 
     def run():
         torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""Checkpoints: bit-equal round trips, what is stored, and refusals that name the file."""
+"""Checkpoints: bit-equal round trips, their content, and errors that name the file."""
 
 import json
 import os
@@ -83,7 +83,7 @@ def test_frozen_encoder_must_be_the_same(tmp_path):
     save_model(tmp_path / "m.safetensors", model)
     with pytest.raises(UserError, match="m.safetensors: was trained with other weights"):
         load_model(tmp_path / "m.safetensors", encoder_weights="random")
-    refused("must be named", load_model, tmp_path / "m.safetensors")
+    refused("must be given", load_model, tmp_path / "m.safetensors")
 
 
 def _damage(path, kind):

@@ -1,4 +1,4 @@
-"""The one way from a dataset's view to a model's posed input."""
+"""Conversion of a dataset's view to a model's posed input."""
 
 import pytest
 import torch
@@ -65,7 +65,7 @@ def test_the_input_lies_on_the_model_s_background(dataset):
 
 
 def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypatch):
-    """To the bit, whatever the other views and the size of the pictures to match."""
+    """Bit-identical, for any other views and any size of the target pictures."""
     uid = dataset.uids[0]
     want = posed_input(dataset.load(uid, views=[4], size=16), CONFIG)
     for size in (16, 24):

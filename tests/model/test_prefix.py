@@ -1,4 +1,4 @@
-"""States instead of a prefix: as prepending and dropping, which is the plain form kept here."""
+"""States instead of a prefix, compared with the plain form of prepending and dropping."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from gamba_warp.model.parts.block import GambaBlock, prefix_states
 
 
 def prepend_and_drop(blocks, tokens, camera, image):
-    """Paper eq. 2 as it is written."""
+    """Plain form of paper eq. 2."""
     for block in blocks:
         pairs = ((block.project_camera, camera), (block.project_image, image))
         prefix = [project(condition) for project, condition in pairs if condition is not None]
@@ -36,7 +36,7 @@ def make_blocks(depth: int, camera: int, image: int, **changes) -> torch.nn.Modu
 
 
 def run(form, blocks, leaves: dict, cotangent) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The output, and by name all gradients that are there."""
+    """Return the output, and all gradients by name."""
     out = form(blocks, leaves["tokens"], leaves.get("camera"), leaves.get("image"))
     named = {**leaves, **dict(blocks.named_parameters())}
     grads = torch.autograd.grad(out, list(named.values()), cotangent, allow_unused=True)
@@ -73,7 +73,7 @@ def test_equals_prepend_and_drop(camera, image, length, changes):
 
 
 def test_full_depth_model_equals_prepend_and_drop():
-    """14 blocks with the paper's states, taps and expansion; camera and image tokens in front."""
+    """14 blocks with the paper's states, taps and expansion; camera and image tokens first."""
     config = micro(image_size=32, patch_size=4, width=48, depth=14, state_size=16)
     model = Gamba(config, "random")
     images, cameras = inputs(2, 32)
@@ -114,7 +114,7 @@ def test_autocast_equals_prepend_and_drop():
 
 
 def test_states_do_what_they_say():
-    """Each block's own, independent of the others; float32 and in the order of the blocks."""
+    """One state per block, independent of the others; float32 and in the order of the blocks."""
     blocks = make_blocks(3, 7, 11)
     camera, image = torch.randn(2, 1, 7), torch.randn(2, 5, 11)
     together = prefix_states(blocks, camera, image)

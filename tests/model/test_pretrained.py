@@ -64,7 +64,7 @@ def test_needs_no_hub_for_a_folder(tmp_path, monkeypatch):
 
 
 def _cached(tmp_path, model):
-    """A repository in a cache of huggingface_hub."""
+    """Make a repository in a cache of huggingface_hub."""
     repository = tmp_path / "models--owner--name"
     commit = "a" * 40
     (repository / "refs").mkdir(parents=True)
@@ -77,7 +77,7 @@ def test_a_cached_repository_needs_no_network(tmp_path, monkeypatch):
     _cached(tmp_path, model)
     monkeypatch.setattr("socket.socket.connect", _no_network)
     assert _same(model, Gamba.from_pretrained("owner/name", cache_dir=tmp_path))
-    with pytest.raises(UserError, match="owner/other: neither a folder here nor to be had"):
+    with pytest.raises(UserError, match="owner/other: neither a local folder nor available"):
         Gamba.from_pretrained("owner/other", cache_dir=tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""The decoder ``rays``: which tokens it computes, where its Gaussians lie, and how it starts."""
+"""Decoder ``rays``: computed tokens, positions of Gaussians, and initialization."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from gamba_warp.eval.views.compare import Truth
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.parts.patches import foreground_patches, seen_cells
+from gamba_warp.model.parts.patches import foreground_cells, foreground_patches
 from gamba_warp.model.parts.rays import RayDecoder
 from gamba_warp.model.predict import model_input, reconstruct
 from gamba_warp.render import render
@@ -32,7 +32,7 @@ def rays(**changes) -> GambaConfig:
 
 
 def trained(config: GambaConfig) -> Gamba:
-    """A model whose head says something, as the head of a fresh one hardly does."""
+    """Model with a head that has an effect, unlike that of an untrained one."""
     torch.manual_seed(4)
     model = Gamba(config, "random" if config.encoder != "none" else None)
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
@@ -57,7 +57,7 @@ def one(cameras: Cameras, index: int) -> Cameras:
 
 @pytest.mark.parametrize("segment", [4096, 7])
 def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
-    """Also where the batch's row of tokens is cut in the midst of pictures."""
+    """Also if the batch's row of tokens is cut inside pictures."""
     monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", segment)
     model, (rgba, cameras) = trained(rays()), cut_outs([*BOXES, (slice(0, 0), slice(0, 0))])
     with torch.set_grad_enabled(segment > 7):
@@ -125,7 +125,7 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
         picture[..., 3] = alpha
     patches = foreground_patches(rgba[..., 3], 4)
     pixels = torch.rand(3, model.config.pixel_channels, 40, 40)
-    seen = seen_cells(rgba, 4 // cells)
+    seen = foreground_cells(rgba, 4 // cells)
     got = decoder._stem(pixels, patches, seen)
     want = decoder.stem(pixels).permute(0, 2, 3, 1)[seen.picture, seen.row, seen.column]
     assert seen.counts[1] == 0 and sum(seen.counts) == len(got)
@@ -146,13 +146,13 @@ def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive, order
     whole = tokens(rgba, cameras)
     patches = foreground_patches(rgba[..., 3], 4)
     got, places = tokens.of_patches(tokens.pixels(rgba, cameras), patches)
-    own = [patches.place[patches.picture == index].tolist() for index in range(len(rgba))]
+    own = [patches.position[patches.picture == index].tolist() for index in range(len(rgba))]
     inside = torch.zeros(len(rgba), 9, dtype=torch.bool)
     for index, places_of in enumerate(own):
         inside[index, places_of] = True
     assert patches.counts == [len(places_of) for places_of in own]
     torch.testing.assert_close(got, whole[inside[:, tokens.orders]])
-    for place, picture, patch in zip(places, patches.picture, patches.place):
+    for place, picture, patch in zip(places, patches.picture, patches.position):
         for order in range(orders):
             number = 9 * order + tokens.orders.view(orders, 9)[order].tolist().index(patch)
             torch.testing.assert_close(got[place[order]], whole[picture, number])
@@ -167,7 +167,7 @@ def test_a_picture_without_background_keeps_every_token():
 
 @pytest.mark.parametrize("rotation", [False, True])
 def test_gaussians_follow_the_formulas(rotation):
-    """Known answer: every number of the head is set by hand, and one Gaussian computed apart."""
+    """Known answer: every output of the head is set by hand; one Gaussian is recomputed."""
     config = rays(predict_rotation=rotation)
     model, (rgba, cameras) = Gamba(config), cut_outs()
     numbers = [0.3, -0.2, 0.5, 0.1, 0.7, 0.2, -0.4, 0.6, 0.3, -0.1, 0.25]
@@ -221,7 +221,7 @@ def test_wild_sizes_and_almost_empty_cells_have_limits():
 
 
 def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
-    """A coloured disc with a soft rim as five cameras around it see a flat picture of it."""
+    """Coloured disc with a soft rim, as a flat picture seen by five cameras around it."""
     x = torch.linspace(-1, 1, size)
     radius = (x[:, None] ** 2 + x**2).sqrt()
     alpha = ((0.7 - radius) * size / 2 + 0.5).clamp(0, 1)
@@ -232,7 +232,7 @@ def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
 
 
 def test_at_the_start_the_picture_is_the_billboard():
-    """The flat picture itself is the truth: what differs is one Gaussian's blur at the edges."""
+    """The flat picture is the truth: only the blur of one Gaussian at the edges differs."""
     rgba, cameras = disc()
     truth = Truth("disc", rgba.expand(5, -1, -1, -1), cameras, [*range(5)])
     flat, alpha = billboard(truth)
@@ -251,7 +251,7 @@ def test_at_the_start_the_picture_is_the_billboard():
 
 
 def test_the_hidden_layers_are_seen_by_the_rasterizer_from_the_start():
-    """Under an opacity of 1/255 a Gaussian is culled and would never learn."""
+    """Below an opacity of 1/255 a Gaussian is culled and would never learn."""
     model, (rgba, cameras) = Gamba(rays()), cut_outs()
     rgba[..., 3] = (rgba[..., 3] > 0).float()
     made = model(rgba, cameras)
@@ -334,7 +334,7 @@ def test_reconstruct_gives_the_alpha_to_the_model():
     rgba = disc(40)[0].numpy()
     small = model_input(rgba, rays())
     assert small.shape == (1, 12, 12, 4) and small[0, 0, 0, 3] == 0 and small[0, 6, 6, 3] == 1
-    # What is transparent has no colour that could bleed in: inside, a grey disc stays grey.
+    # No colour of transparent pixels bleeds in: inside, a grey disc stays grey.
     grey = np.where(rgba[..., 3:] > 0, [0.4, 0.4, 0.4, 1.0], [0.9, 0.0, 0.0, 0.0]).astype("f4")
     small = model_input(grey, rays())[0]
     torch.testing.assert_close(small[small[..., 3] > 0.01][:, :3].mean(0), torch.full((3,), 0.4))
@@ -342,7 +342,7 @@ def test_reconstruct_gives_the_alpha_to_the_model():
 
 
 def test_features_between_coarse_cells_are_interpolated():
-    weights = RayDecoder(rays(ray_cells=4, ray_coarse=2)).between
+    weights = RayDecoder(rays(ray_cells=4, ray_coarse=2)).upsampling
     assert weights.shape == (16, 4)
     torch.testing.assert_close(weights.sum(1), torch.ones(16))
     # The corner of a patch has its own coarse cell alone, the middle a share of all four.

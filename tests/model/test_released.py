@@ -1,4 +1,4 @@
-"""The authors' public network: what it computes at a small size, each of its quirks, their file."""
+"""The authors' public network at a small size: results, peculiarities, and their file."""
 
 import inspect
 import os
@@ -57,7 +57,7 @@ def _state(golden) -> dict[str, torch.Tensor]:
 
 
 class _Given(torch.nn.Module):
-    """In place of an encoder: its tokens are given."""
+    """Stand-in for an encoder, with given tokens."""
 
     channels, frozen, name = 768, True, "given"
 
@@ -70,7 +70,7 @@ class _Given(torch.nn.Module):
 
 
 def _gaussians(golden, monkeypatch):
-    """Ours from the golden inputs, which are turned into our world."""
+    """Our Gaussians from the golden inputs, transformed to our world."""
     config, weights = convert_released(_state(golden), "golden", 2)
     model = Gamba(config, encoder=_Given(golden["condition_tokens"]))
     model.load_stored_state(weights)
@@ -115,7 +115,7 @@ def test_the_ply_file_equals_theirs(golden, monkeypatch, tmp_path):
         if name.startswith("scale"):  # our scales are 1e-6 larger, which a logarithm shows
             got = np.log(np.exp(got) - 1e-6)
         assert np.abs(got - want).max() < 2e-5, name
-    # Half a turn about x, which brings our world to theirs, leaves the axes of a Gaussian alone.
+    # The half turn about x between the worlds does not change the axes of a Gaussian.
     turns = np.stack([vertex[f"rot_{i}"] for i in range(4)], -1)
     assert np.abs(turns - [0, 1, 0, 0]).max() < 1e-6
     back = load_ply(tmp_path / "ours.ply")
@@ -129,7 +129,7 @@ def test_config_is_the_preset_at_their_sizes(golden):
 
 
 def _file(golden, tmp_path, encoder=True, **changes) -> Path:
-    """A file as their training writes it, with an image encoder in Meta's layout."""
+    """Write a file like their training, with an image encoder in Meta's layout."""
     state = _state(golden) | {"lpips_loss.lin0.weight": torch.ones(2)} | changes
     if encoder:
         vit = timm.create_model("gamba_test_wide_vit", img_size=518, num_classes=0).state_dict()
@@ -178,7 +178,7 @@ def test_encoder_from_a_file_of_its_own(golden, tmp_path, wide):
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
 def test_any_float_dtype(golden, tmp_path, wide, dtype):
-    """The points of the position are even no more once they are rounded."""
+    """Rounded points of the position are no longer evenly spaced."""
     path = _file(golden, tmp_path)
     content = torch.load(path)["model"]
     rounded = {name: value.to(dtype) for name, value in content.items()}
@@ -203,7 +203,7 @@ def test_a_file_without_its_last_blocks_is_refused(golden, tmp_path, depth, foun
     part = {
         k: v for k, v in state.items() if "layers.1.mamba" not in k and "layers.1.cond" not in k
     }
-    words = f"a: holds {found} blocks?, not {depth}: a part .* --depth {found} takes"
+    words = f"a: holds {found} blocks?, not {depth}: a part .* --depth {found} accepts"
     refused(words, convert_released, part if found == 1 else state, "a", depth)
     assert DEPTH == PRESETS["released"].depth == 14
     assert inspect.signature(import_released_command).parameters["depth"].default == DEPTH
@@ -237,7 +237,7 @@ def test_wrappers_names_are_left_out(golden, tmp_path, wide, change):
 def test_an_object_in_the_file_is_named(golden, tmp_path, thing, name):
     path = tmp_path / "theirs.pth"
     torch.save({"model": _state(golden), "args": thing}, path)
-    refused(rf"it holds '{name}', of which torch reads none", load_released, path, depth=2)
+    refused(rf"it holds '{name}', which torch does not load", load_released, path, depth=2)
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_an_object_in_the_file_is_named(golden, tmp_path, thing, name):
         ("model.decoder.coords", torch.rand(3, 21), "not the same even points"),
         ("model.decoder.coords", torch.ones(3, 0), "not the same even points"),
         ("model.decoder.gs_layer.rgb.bias", torch.full((3,), torch.nan), "not finite"),
-        ("model.decoder.gs_layer.rgb.bias", torch.ones(3).int(), "no tensor of floating"),
+        ("model.decoder.gs_layer.rgb.bias", torch.ones(3).int(), "not a tensor of floating"),
         ("model.stem_layer.weight", torch.ones(64, 8, 8, 8), "takes 8 channels, not 9"),
         ("model.transformer.layers.0.cond_affine.weight", torch.ones(64, 7), "not DINOv2's"),
         ("model.transformer.layers.9999.norm.weight", torch.ones(3), "config: depth is 10,?000"),
@@ -271,7 +271,7 @@ def test_the_file_itself_is_never_replaced(golden, tmp_path, wide, capsys):
     assert "would be overwritten" in capsys.readouterr().err and path.read_bytes() == before
 
 
-# Every quirk by itself.
+# Every peculiarity separately.
 
 
 def test_final_norm():

@@ -1,4 +1,4 @@
-"""TensorBoard and Weights & Biases beside the log: what they get, and that they stop nothing."""
+"""TensorBoard and Weights & Biases beside the log: their data; failures never stop a run."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ from gamba_warp import cli
 from gamba_warp.train import boards
 from gamba_warp.train.config import RunConfig, config_differences
 
-# The calls of wandb 0.31 that are used, kept in a list.
+# Stand-in for the used calls of wandb 0.31, recorded in a list.
 FAKE = """
 calls = []
 fails = ""
@@ -110,7 +110,7 @@ def test_wandb_that_is_not_installed_is_said_before_anything(data, tmp_path, mon
     arguments = [str(data), "--out", str(out), "--log", "wandb", "--device", "cpu", "--steps", "1"]
     assert cli.run("train", arguments) == 2
     assert capsys.readouterr().err == (
-        "gamba: --log wandb: it is not installed: pip install '.[wandb]' in the checkout, or "
+        "gamba: --log wandb: not installed: pip install '.[wandb]' in the checkout, or "
         "'FILE.whl[wandb]'\n"
     )
     assert not out.exists()

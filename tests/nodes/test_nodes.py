@@ -1,4 +1,4 @@
-"""Several processes train as one does: the same sums, averaged logs, the same end."""
+"""Several processes train like one: the same sums, averaged logs, the same end."""
 
 import json
 
@@ -26,10 +26,10 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def runs(data, tmp_path_factory):
-    """1 x 4 objects, 2 x 2 one after the other, and 2 x 2 in two processes."""
+    """Runs of 1 x 4 objects, 2 x 2 in turn, and 2 x 2 in two processes."""
     folder = tmp_path_factory.mktemp("runs")
     alone = {"length": {"steps": STEPS}, "run": {"save_every": 1, "keep": 9, "threads": 1}}
-    with on_threads(1):  # as in the processes: sums are split by threads
+    with on_threads(1):  # as in the processes, since threads split sums
         assert run(data, folder / "whole", views={**VIEWS, "batch_size": 4}, **alone) == 0
         halves = {**VIEWS, "batch_size": 2, "accumulate": 2}
         assert run(data, folder / "halves", views=halves, **alone) == 0
@@ -37,7 +37,7 @@ def runs(data, tmp_path_factory):
     assert [end.code for end in ends] == [0, 0], ends
     assert not (folder / "not-there").exists()  # only the first process writes
     assert ends[1].out == ""
-    # Warp itself says in every process that there is no driver.
+    # Warp itself reports in every process that no driver was found.
     assert all(line.startswith("Warp CUDA warning") for line in ends[1].err.splitlines())
     return folder
 
@@ -47,7 +47,7 @@ def weights(run, step, kind="model"):
 
 
 def test_two_processes_have_the_bits_of_two_halves_in_turn(runs):
-    """Halves of a sum are exact, and of two numbers there is but one sum."""
+    """Halving a sum is exact, and the sum of two numbers has no order."""
     for kind in ("model", "ema"):
         for step in range(1, STEPS + 1):
             alone, both = weights(runs / "halves", step, kind), weights(runs / "two", step, kind)

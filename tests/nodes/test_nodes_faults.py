@@ -1,4 +1,4 @@
-"""Several processes that are not alike, have no disk in common, or find it full: no one waits."""
+"""Several processes that differ, share no disk, or find it full: none of them hangs."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from gamba_warp import versions
 from gamba_warp.files import PART
 from gamba_warp.train.checkpoint import damage, list_checkpoints
 
-FULL = 20_000  # bytes: the log has room, a checkpoint has not
+FULL = 20_000  # bytes: enough for the log, not for a checkpoint
 FIVE = ("--views-first", 5, "--views-last", 5)  # all of them, at every step
 pytestmark = pytest.mark.slow  # a process takes seconds to import torch
 
@@ -28,7 +28,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def ends(data, tmp_path_factory):
-    """What two processes did one after the other, by name: exit codes and lines by rank."""
+    """Results of two processes for a series of runs, by name: exit codes and lines by rank."""
     root = tmp_path_factory.mktemp("nodes")
     (root / "empty").mkdir()
     later = root / "later" / "checkpoints" / "step_000009"
@@ -118,7 +118,7 @@ def test_pictures_that_only_another_process_cannot_read_are_named(ends):
 
 
 def test_processes_that_differ_are_refused_with_the_difference(data, tmp_path):
-    """Options, data, the package's and a library's version, in one line on each."""
+    """Options, data, versions of the package and of a library, in one line on each."""
     other = tmp_path / "clouds"
     shutil.copytree(data, other)
     shutil.copy(other / "cloudb" / "001.png", other / "cloudb" / "000.png")

@@ -1,4 +1,4 @@
-"""What docs/sixteen-gpus.md hands out: the Slurm script, and the count of operations."""
+"""Slurm script and count of operations of docs/sixteen-gpus.md."""
 
 import os
 import re
@@ -16,7 +16,7 @@ PAGE = (ROOT / "docs" / "sixteen-gpus.md").read_text(encoding="utf-8")
 
 
 def slurm(folder, *arguments):
-    """Runs the script where scontrol and srun only say what they were asked."""
+    """Run the script with stand-ins for scontrol and srun that print their arguments."""
     for name, text in (("scontrol", "printf 'node7\\nnode8\\n'"), ("srun", 'printf "%s\\n" "$@"')):
         (folder / name).write_text(f"#!/bin/bash\n{text}\n")
         (folder / name).chmod(0o755)

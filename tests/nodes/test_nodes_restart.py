@@ -1,4 +1,4 @@
-"""Two torchruns, as on two machines: a killed process is started anew, to the same end."""
+"""Two torchruns, as on two machines: a killed process is restarted, with the same result."""
 
 import os
 import random
@@ -16,7 +16,7 @@ KILLS = int(os.environ.get("GAMBA_ENDURANCE_NODES", "2"))  # `make endurance` as
 
 
 def test_killed_processes_start_anew_and_end_as_if_nothing_was(tmp_path):
-    """Once the one that writes, once the other: one while it trains, one as it comes."""
+    """Kill the writing process and the other one: one during training, one at its start."""
     data = micro.write_dataset(tmp_path / "clouds", 4)
     rng = random.Random(23)  # those moments
     options = words(data, tmp_path / "none")

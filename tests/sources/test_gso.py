@@ -88,7 +88,7 @@ def test_views_and_meshes_of_a_copy_of_the_set(tmp_path, capsys):
     entries = json.loads((tmp_path / "out/meshes/catalogue.json").read_text())["objects"]
     assert [entry["uid"] for entry in entries] == [FIRST, SECOND]
     assert find_meshes(tmp_path / "out" / "meshes")[0].attribution["creator"] == "Google"
-    # The same command goes on: what is there is neither read nor rendered again.
+    # The same command continues: existing objects are neither read nor rendered again.
     shutil.rmtree(tmp_path / "set" / FIRST)
     write_model(tmp_path / "set", THIRD)
     assert run("data gso", words[2:]) == 0
@@ -103,7 +103,7 @@ def test_shards_part_the_list(tmp_path, capsys):
     words = [str(tmp_path / "out"), "--source", str(tmp_path / "set"), "--size", "16"]
     assert run("data gso", [*words, "--shard", "1/60", "--workers", "1"]) == 0
     assert open_dataset(tmp_path / "out" / "views", "test").uids == [SECOND]
-    assert run("data gso", [*words, "--shard", "0/60"]) == 2  # none of this shard is there
+    assert run("data gso", [*words, "--shard", "0/60"]) == 2  # this shard has no objects
     assert "holds none of the 1 models" in capsys.readouterr().err
 
 
@@ -111,7 +111,7 @@ def test_shards_part_the_list(tmp_path, capsys):
     "change, reason",
     [
         (lambda path: path.write_bytes(b"no zip"), "cannot be unpacked"),
-        (lambda path: zipfile.ZipFile(path, "w").writestr("meshes/model.mtl", ""), "holds no"),
+        (lambda path: zipfile.ZipFile(path, "w").writestr("meshes/model.mtl", ""), "is missing"),
         (lambda path: zipfile.ZipFile(path, "a").writestr("meshes/../../x.obj", "v"), "leaves"),
         (lambda path: zipfile.ZipFile(path, "a").writestr("meshes/texture.png", "v"), "two files"),
     ],
@@ -140,7 +140,7 @@ def test_all_names_hold_the_evaluation_and_are_told_by_the_last_part():
 
 
 def write_glb(folder, name, up):
-    """A box of 2 x 1 x 4, whose longest side points up."""
+    """Write a box of 2 x 1 x 4, whose longest side points up."""
     folder.mkdir(parents=True, exist_ok=True)
     box = trimesh.creation.box((2, 1, 4) if up == "z" else (2, 4, 1))
     box.export(folder / name)
@@ -164,9 +164,9 @@ def test_a_folder_of_meshes_that_is_there(tmp_path, capsys, file, up, told):
     words = [str(tmp_path / "out"), "--source", str(source), "--size", "16", "--workers", "1"]
     assert run("data gso", [*words, "--limit", "2", *told]) == 1
     said = capsys.readouterr()
-    assert f"1 of 2 are there: {FIRST}\n" in said.out
+    assert f"1 of 2 found: {FIRST}\n" in said.out
     assert f"missing: {SECOND}: not in {source}" in said.err and "1 of 2 missing" in said.out
-    assert "1 other object of the set, not of the evaluation" in said.out
+    assert "1 other object of the set outside the evaluation" in said.out
     assert f"eval-geometry EVAL/gaussians {source} --protocol gso --up {up} --data" in said.out
     data = open_dataset(tmp_path / "out" / "views", "test")
     assert data.uids == [FIRST] and data.num_views(0) == 24
@@ -180,7 +180,7 @@ def test_axes_that_a_file_does_not_tell_are_asked_for(tmp_path, capsys):
     write_glb(tmp_path / "there" / FIRST, "model.obj", "z")
     words = [str(tmp_path / "out"), "--source", str(tmp_path / "there"), "--size", "16"]
     assert run("data gso", words) == 2
-    assert "model.obj: may have y or z up; say which, with --up" in capsys.readouterr().err
+    assert "model.obj: may have y or z up; choose with --up" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     write_model(tmp_path / "set", FIRST)
     words[2] = str(tmp_path / "set")

@@ -21,7 +21,7 @@ UIDS = {f"0/1001{i}": f"{i}4c6e2b3a1f84f0c9f6d3b2a1c0d9e8f" for i in range(4)}
 
 
 def write_lists(folder):
-    """The published lists, of four objects; the files have the published forms."""
+    """Write the published lists, of four objects, in their published forms."""
     index = {name: f"000-14{i}/{uid}.glb" for i, (name, uid) in enumerate(UIDS.items())}
     uids = list(UIDS.values())
     lvis = {"Band_Aid": [uids[0]], "Bible": [uids[1], uids[3]], "airplane": ["f" * 32]}
@@ -43,7 +43,7 @@ def write_lists(folder):
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory):
-    """A copy in which the objects are a folder, a tar, a script's folder, and too few views."""
+    """Copy with objects as a folder, a tar, a script's folder, and with too few views."""
     root = tmp_path_factory.mktemp("gobjaverse")
     write_object(root / "set" / "0" / "10010", "readme")
     write_object(root / "set" / "0" / "10011", "tar")
@@ -75,7 +75,7 @@ def test_a_local_copy_in_all_its_forms(published, tmp_path, capsys, copy):
         assert other.cameras.viewmats.equal(first.cameras.viewmats)
     linked = (out / "0" / "10010" / "campos_512_v4").is_symlink()
     assert linked is not copy
-    # What is not read of a tar is not unpacked.
+    # Only the files of a tar that are read are unpacked.
     names = {path.name for path in (out / "0" / "10011" / "campos_512_v4" / "00003").iterdir()}
     assert names == {"00003.png", "00003.json"}
     assert not [path for path in out.rglob(f"{PART}*")]
@@ -85,7 +85,7 @@ def test_a_local_copy_in_all_its_forms(published, tmp_path, capsys, copy):
 
 
 def test_the_papers_training_set(published, tmp_path, capsys):
-    """LVIS, as far as G-Objaverse has rendered it, without what it calls poor (paper §4.1)."""
+    """Objects of LVIS rendered by G-Objaverse, without those of poor quality (paper §4.1)."""
     words = [tmp_path, "--source", published / "set", "--min-views", 3]
     words += ["--index", published / "gobjaverse_280k_index_to_objaverse.json"]
     words += ["--uids", published / "lvis-annotations.json.gz"]
@@ -113,7 +113,7 @@ def test_shards_and_a_run_that_goes_on(published, tmp_path, capsys):
     assert "1 object put into" in put and "val and test splits are empty" in empty
     assert following.startswith("next: ")
     assert open_dataset(tmp_path / "out").uids == ["0/10010", "0/10011", "0/10013"]
-    # A link whose goal has moved is made again; what is somebody's own stays.
+    # A broken link is made again; foreign files stay.
     link = tmp_path / "out" / "0" / "10010" / "campos_512_v4"
     link.unlink()
     link.symlink_to(tmp_path / "nowhere")
@@ -193,7 +193,7 @@ def test_damaged_objects_leave_nothing(tmp_path, capsys):
     told = capsys.readouterr().err.splitlines()
     reasons = {line.split(": ")[1]: line for line in told if line.startswith("left out: ")}
     assert sorted(reasons) == ["0/6", "0/7", "0/8", "0/9"]
-    assert "is there twice" in reasons["0/7"] and "leaves its folder" in reasons["0/8"]
+    assert "occurs twice" in reasons["0/7"] and "leaves its folder" in reasons["0/8"]
     assert (
         "00001.json: Object missing required field `y`" in reasons["0/6"]
         and PART not in reasons["0/6"]
@@ -236,7 +236,7 @@ def test_meshes_by_the_package(published, package, tmp_path, capsys):
     said = capsys.readouterr()
     assert f"left out: {'f' * 32}: Objaverse has no such object" in said.err
     assert "next: gamba data render" in said.out
-    # Nothing is asked for twice, but for what is not there.
+    # Nothing is requested twice, except missing objects.
     asked = [uid for batch in package.asked for uid in batch]
     assert sorted(asked) == sorted({*asked}) and len(asked) == 4
     meshes = {mesh.uid: mesh for mesh in find_meshes(out)}
@@ -249,7 +249,7 @@ def test_meshes_by_the_package(published, package, tmp_path, capsys):
         "source": "https://sketchfab.com/3d-models/x",
     }
     assert named[0].name.startswith("Thing ")
-    shutil.rmtree(tmp_path / "cache")  # the files have a second name, or are copies
+    shutil.rmtree(tmp_path / "cache")  # the files are hard links or copies
     assert all(mesh.path.read_bytes().startswith(b"glTF") for mesh in meshes.values())
 
 

@@ -1,4 +1,4 @@
-"""``gamba data objaverse --depth``: depth of normal-and-depth files; what is no surface is 0."""
+"""``gamba data objaverse --depth``: depth of normal-and-depth files; 0 without a surface."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_published_files_of_a_folder_and_of_a_tar(tmp_path, capsys):
     words = [str(tmp_path / "out"), "--source", str(tmp_path / "set"), "--min-views", "1"]
     assert run("data objaverse", words) == 0
     assert open_dataset(tmp_path / "out").load("0/5").depths is None
-    assert run("data objaverse", [*words, "--depth"]) == 0  # to what is there already
+    assert run("data objaverse", [*words, "--depth"]) == 0  # added to existing objects
     assert "2 objects put into" in capsys.readouterr().out
     for uid in ("0/5", "0/6"):
         views = open_dataset(tmp_path / "out").load(uid)

@@ -1,4 +1,4 @@
-"""``gamba train --recipe``: every number of the paper, batches over processes, and what wins."""
+"""``gamba train --recipe``: every number of the paper, batches over processes, and priority."""
 
 import json
 import shlex
@@ -15,7 +15,7 @@ from gamba_warp.train.command import expand
 from gamba_warp.train.config import TrainConfig, command_line
 from gamba_warp.train.recipes import RECIPES, recipe_words, table_of
 
-# Each number of the paper's training, as its text has it.
+# Each number of the paper's training, quoted from its text.
 PAPER = [
     ("views.size", 512, "not stated; the side of the input, §4.1, and of G-Objaverse"),
     ("length.epochs", 400, "§4.1: for totally 400 epochs"),
@@ -101,7 +101,7 @@ def test_a_given_option_wins_wherever_it_stands():
         assert (config.optim.lr, config.views.size, config.views.batch_size) == (1, 128, 3)
         assert not config.loss.radial_mask and config.optim.weight_decay == 0.05
         assert config.data.name == "data" and config.run.recipe == "paper"
-        # The record's command means the same without the recipe, also where a default was given.
+        # The recorded command is equivalent without the recipe, even if a default was given.
         text = command_line(config.to_dict())
         again = tyro.cli(tyro.conf.OmitArgPrefixes[TrainConfig], args=shlex.split(text)[2:])
         first, second = config.to_dict(), again.to_dict()

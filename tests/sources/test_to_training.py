@@ -1,4 +1,4 @@
-"""From files as they are published to a step of ``gamba train --recipe paper``."""
+"""From published files to a step of ``gamba train --recipe paper``."""
 
 import json
 
@@ -18,7 +18,7 @@ def test_a_copy_of_gobjaverse_trains(tmp_path):
     words = [tmp_path / "data", "--source", tmp_path / "set"]
     assert run("data objaverse", [str(word) for word in words]) == 0
     words = [tmp_path / "data", "--recipe", "paper", "--accumulate", 128]
-    # A small model in place of the paper's, without the weights that are fetched.
+    # A small model instead of the paper's, without downloaded weights.
     words += ["--preset", "tiny", "--set", *MODEL, "--size", 16, "--lpips", "off", "--steps", 1]
     words += ["--precision", "float32", "--device", "cpu", "--no-tensorboard", "--log-every", 1]
     assert run("train", [str(word) for word in [*words, "--out", tmp_path / "run"]]) == 0

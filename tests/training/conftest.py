@@ -1,4 +1,4 @@
-"""What the tests of training share."""
+"""Fixtures of the training tests."""
 
 import pytest
 from helpers import micro
@@ -6,5 +6,5 @@ from helpers import micro
 
 @pytest.fixture(scope="session")
 def data(tmp_path_factory):
-    """Two clouds to train on and one that is held out; no test changes them."""
+    """Two clouds to train on and a held-out one; read-only."""
     return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds")

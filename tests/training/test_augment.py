@@ -1,4 +1,4 @@
-"""Changes of a sample keep its views true: another object, seen by its own cameras."""
+"""Augmented views stay consistent: those of another object, seen by its own cameras."""
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ def gaussians(seed: int):
 def test_a_mirrored_object_seen_by_mirrored_cameras_is_the_mirrored_picture():
     made, object_ = mirrored(views()), gaussians(0)
     object_.means = object_.means * torch.tensor([-1.0, 1.0, 1.0])
-    # M R(q) M: a rotation about an axis whose x stays and whose y and z turn round.
+    # M R(q) M: a rotation about an axis with the same x and negated y and z.
     object_.quats = object_.quats * torch.tensor([1.0, 1.0, -1.0, -1.0])
     shown = render(object_, made.cameras, depth=True)
     # The same sums in another order of pixels and depths.

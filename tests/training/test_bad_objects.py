@@ -1,4 +1,4 @@
-"""Objects that cannot be read: counted, named, passed over, and too many of them end the run."""
+"""Unreadable objects are counted, named and skipped; too many of them end the run."""
 
 import pytest
 from helpers import micro

@@ -167,7 +167,7 @@ def two(tmp_path, model):
 
 
 def flip(path, share):
-    """Changes one bit of a file."""
+    """Change one bit of a file."""
     data = bytearray(path.read_bytes())
     data[int(share * (len(data) - 1))] ^= 4
     path.write_bytes(data)
@@ -201,15 +201,15 @@ def test_a_file_that_is_gone_is_damage(tmp_path, two):
     for name in ("model.safetensors", "state.pt"):
         (two[1] / name).unlink()
         assert find_checkpoint(tmp_path, "auto", [].append) == two[0], name
-    save_checkpoint(tmp_path, 2, {}, {"a": 2}, keep=3)  # a list that does not name the model
+    save_checkpoint(tmp_path, 2, {}, {"a": 2}, keep=3)  # its checksums do not include the model
     assert find_checkpoint(tmp_path, "auto", [].append) == two[0]
 
 
 def test_older_checkpoints_without_checksums(tmp_path, two):
     (two[1] / "checksums.json").unlink()
     assert find_checkpoint(tmp_path, "auto") == two[1]
-    # In the pickle: between the files of the archive are bytes that no one reads, and that no sum
-    # of theirs covers. Where they lie depends on the version of torch.
+    # In the pickle: between the files of the archive are unused bytes without a checksum. Their
+    # position depends on the version of torch.
     data = bytearray((two[1] / "state.pt").read_bytes())
     data[data.index(b"\x80\x02") + 4] ^= 1
     (two[1] / "state.pt").write_bytes(data)
@@ -260,8 +260,8 @@ def test_fields_of_a_state_are_checked(field, value):
         (lambda s: s["state"][0].pop("step"), "parameter 0 has other fields"),
         (lambda s: s["state"].update({0: 5}), "parameter 0 has other fields"),
         (lambda s: s["state"][0].update(exp_avg=torch.ones(3)), r"exp_avg of parameter 0 is \(3,"),
-        (lambda s: s["state"][0].update(exp_avg=1.0), "exp_avg of parameter 0 is no float32"),
-        (lambda s: s["state"][0].update(step=torch.ones((), dtype=torch.int64)), "no float32"),
+        (lambda s: s["state"][0].update(exp_avg=1.0), "exp_avg of parameter 0 is not a float32"),
+        (lambda s: s["state"][0].update(step=torch.ones((), dtype=torch.int64)), "not a float32"),
         (lambda s: s["state"][0]["exp_avg"].fill_(math.nan), "exp_avg .* not finite"),
         (lambda s: s["state"][0]["exp_avg_sq"].fill_(-1.0), "exp_avg_sq .* negative"),
         (lambda s: s["state"][0]["step"].fill_(math.inf), "step .* not finite"),
@@ -282,7 +282,7 @@ def test_moments_of_a_state_are_checked(model, change, words):
 
 
 def repacked(path, change, packing=zipfile.ZIP_STORED):
-    """Writes a torch file again with its pickle changed, or its members packed."""
+    """Rewrite a torch file with a changed pickle, or with compressed members."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, "w", packing) as archive:
@@ -299,7 +299,7 @@ def test_a_state_that_claims_more_than_it_holds(tmp_path):
     torch.save({"a": torch.arange(10.0)}, path)
     repacked(path, lambda data: data, zipfile.ZIP_DEFLATED)
     refused("state.pt: damaged.*packed", read_state, tmp_path)
-    torch.save({"a": torch.ones(1).expand(10**6, 10**6)}, path)  # one number, 4 TB as it is copied
+    torch.save({"a": torch.ones(1).expand(10**6, 10**6)}, path)  # one number, 4 TB after a copy
     refused("state.pt: damaged.*larger than the file", read_state, tmp_path)
     endless = []
     endless.append(endless)
@@ -311,6 +311,6 @@ def test_a_state_that_claims_more_than_it_holds(tmp_path):
     torch.save({"a": wide}, path)
     refused("state.pt: damaged.*over 1,000,000 values", read_state, tmp_path)
     torch.save([1], path)
-    refused("state.pt: damaged.*holds no state", read_state, tmp_path)
+    refused("state.pt: damaged.*not hold the state", read_state, tmp_path)
     torch.save({"a": torch.ones(3).to_sparse()}, path)
     refused("state.pt: damaged.*not dense", read_state, tmp_path)

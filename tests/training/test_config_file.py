@@ -1,4 +1,4 @@
-"""``gamba train --config``: the options of another run, changed by those beside it."""
+"""``gamba train --config``: the options of another run, overridden by further options."""
 
 import json
 
@@ -26,7 +26,7 @@ def test_a_second_run_has_the_options_of_the_first(data, tmp_path, capsys):
     for group, values in changed.items():
         first[group] |= values
     assert first == second and len(lines(two, "train")) == 3
-    # Without --out the same run goes on, here to another length.
+    # Without --out the same run is resumed, here with another length.
     assert _train(f"--config={one / 'config.json'}", "--steps", 4) == 0
     assert [record["step"] for record in lines(one, "train")] == [1, 2, 3, 4]
 
@@ -45,14 +45,14 @@ def test_data_may_be_another(tmp_path):
 @pytest.mark.parametrize(
     "content, words",
     [
-        (None, "no run's config.json"),
-        (b"\xff", "no run's config.json"),
-        (b"[1]", "a run's options"),
+        (None, "not the config.json of a run"),
+        (b"\xff", "not the config.json of a run"),
+        (b"[1]", "not the config.json of a run"),
         (b"{}", "missing required field `data`"),
         (b'{"data": "x", "preset": "tiny", "speed": 1}', "unknown speed"),
         (b'{"data": "x", "preset": "tiny", "optim": {"speed": 1}}', "unknown optim.speed"),
         (b'{"data": "x", "preset": "tiny", "optim": 3}', "optim: Expected `object`"),
-        (b'{"data": "--out=/", "preset": "tiny"}', "'--out=/' is no value"),
+        (b'{"data": "--out=/", "preset": "tiny"}', "'--out=/' is not a valid value"),
         (b'{"data": "x", "preset": "tiny", "optim": {"lr": "fast"}}', "lr: Expected `float`, got"),
         (
             b'{"data": "x", "preset": "tiny", "optim": {"lr": {}}}',

@@ -1,4 +1,4 @@
-"""Depth as a target: what the renderer writes of it, the loss, and a training with it."""
+"""Depth as a target: the renderer's depth files, the loss, and training."""
 
 import json
 
@@ -17,7 +17,7 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.train.batches import load_sample
 from gamba_warp.train.data.samples import Change
 from gamba_warp.train.objective.losses import (
-    DEPTH_BEND,
+    DEPTH_BETA,
     SLOPE_STEPS,
     SLOPE_WEIGHT,
     depth_loss,
@@ -94,11 +94,11 @@ def some(seed, layers=3, count=40):
 
 def bent(gap):
     size = gap.abs()
-    return torch.where(size < DEPTH_BEND, size**2 / (2 * DEPTH_BEND), size - DEPTH_BEND / 2)
+    return torch.where(size < DEPTH_BETA, size**2 / (2 * DEPTH_BETA), size - DEPTH_BETA / 2)
 
 
 def slow_depth_loss(gaussians, layers, cameras, surfaces):
-    """The same, one Gaussian after the other."""
+    """Plain form of the loss, one Gaussian after the other."""
     totals = []
     for b in range(len(surfaces)):
         total = 0.0
@@ -149,7 +149,7 @@ def test_nothing_known_is_no_loss():
 
 
 def test_surfaces_of_a_sample_are_in_the_models_world(boxes):
-    """Where the camera stands at the model's distance, and for the mirrored object, too."""
+    """With the camera at the model's distance, also for the mirrored object."""
     config = micro.options(boxes, boxes, loss={"lpips": "off"}).model_config()
     data, background = open_dataset(boxes), torch.ones(3)
     stored = data.load(0, [2]).cameras
@@ -179,7 +179,7 @@ def test_a_training_brings_the_layers_to_the_surfaces(boxes, tmp_path):
 
 def test_bad_use_is_said_in_one_line(tmp_path):
     clouds = micro.write_dataset(tmp_path / "clouds")
-    with pytest.raises(UserError, match='only layers of the decoder "rays"'):
+    with pytest.raises(UserError, match='needs the decoder "rays"'):
         run(clouds, tmp_path / "out", loss={"lpips": "off", "depth_weight": 1.0})
     with pytest.raises(UserError, match="has no depth pictures"):
         run(clouds, tmp_path / "out", RAYS, loss={"lpips": "off", "depth_weight": 1.0})

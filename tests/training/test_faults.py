@@ -1,4 +1,4 @@
-"""Training on a full disk, beside another trainer, and below a terminal that is closed."""
+"""Training on a full disk, beside another trainer, and under a closed terminal."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import PART, only_process
 from gamba_warp.processes import stop_requests
 from gamba_warp.train.checkpoint import list_checkpoints
-from gamba_warp.train.log import Quiet, RunLog, say
+from gamba_warp.train.log import RunLog, SafeStream, say
 
 
 def leftovers(folder):
@@ -86,8 +86,8 @@ def test_sample_pictures_never_stop_a_run(tmp_path, capsys):
 def test_a_closed_terminal_stops_nothing():
     with open("/dev/full", "w", buffering=1) as full:
         say("a line", full)
-        Quiet(full).write("a bar\n")
-        Quiet(full).flush()
+        SafeStream(full).write("a bar\n")
+        SafeStream(full).flush()
         with pytest.raises(OSError):
             full.flush()
         os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())  # so that it closes

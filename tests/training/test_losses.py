@@ -9,7 +9,7 @@ from gamba_warp.conventions import over_background
 from gamba_warp.image_metrics import ssim
 from gamba_warp.kernels.ssim import products
 from gamba_warp.train.objective.losses import (
-    Seen,
+    LossInputs,
     loss_terms,
     mse,
     random_crops,
@@ -42,8 +42,8 @@ def test_mse_and_psnr():
 def test_loss_terms_and_weights():
     rgb, target = torch.zeros(2, 3, 8, 8, 3), torch.full((2, 3, 8, 8, 3), 0.5)
     alpha, target_alpha = torch.ones(2, 3, 8, 8, 1), torch.zeros(2, 3, 8, 8, 1)
-    seen = Seen(rgb, alpha, target, target_alpha, lambda a, b: (b - a).mean((-3, -2, -1)))
-    terms = loss_terms(seen, {"lpips": 0.5})
+    inputs = LossInputs(rgb, alpha, target, target_alpha, lambda a, b: (b - a).mean((-3, -2, -1)))
+    terms = loss_terms(inputs, {"lpips": 0.5})
     assert {name: tuple(term.shape) for name, term in terms.items()} == {
         "rgb": (2, 3),
         "mask": (2, 3),
@@ -51,7 +51,7 @@ def test_loss_terms_and_weights():
     }
     loss = total_loss(terms, {"rgb": 1.0, "mask": 2.0, "lpips": 0.5})
     assert loss.item() == pytest.approx(0.25 + 2.0 + 0.25)
-    assert set(loss_terms(seen, {})) == {"rgb", "mask"}
+    assert set(loss_terms(inputs, {})) == {"rgb", "mask"}
     with pytest.raises(KeyError, match="lpips"):
         total_loss(terms, {"rgb": 1.0, "mask": 1.0})
 
@@ -82,7 +82,7 @@ def test_structure_is_one_minus_ssim_and_its_gradient_kornias(shape):
 
 @pytest.mark.parametrize("place", [(0, 0), (24, 30), (0, 30), (12, 15)])
 def test_windows_without_a_difference_are_left_out_exactly(place):
-    """A square of the least size, in a corner, at a side and in the middle, on noise."""
+    """A square of the smallest size, in a corner, at a side and in the middle, on noise."""
     torch.manual_seed(1)
     want = torch.rand(2, 25, 31, 3, dtype=torch.float64)
     got = want.clone()
@@ -145,8 +145,9 @@ def test_loss_terms_have_the_terms_that_are_asked_for():
         shapes.append(got.shape)
         return (got - want).square().mean((-3, -2, -1))
 
-    seen, weights = Seen(rgb, alpha, rgb, alpha, lpips, lpips_crop=8), {"lpips": 1.0, "ssim": 1.0}
-    terms = loss_terms(seen, weights)
+    inputs = LossInputs(rgb, alpha, rgb, alpha, lpips, lpips_crop=8)
+    weights = {"lpips": 1.0, "ssim": 1.0}
+    terms = loss_terms(inputs, weights)
     assert {name: tuple(term.shape) for name, term in terms.items()} == {
         "rgb": (2, 3),
         "mask": (2, 3),
@@ -155,4 +156,4 @@ def test_loss_terms_have_the_terms_that_are_asked_for():
     }
     assert shapes == [(2, 8, 8, 3)]
     assert all(term.abs().max() < 1e-6 for term in terms.values())
-    assert set(loss_terms(seen._replace(lpips=None), {"lpips": 1.0})) == {"rgb", "mask"}
+    assert set(loss_terms(inputs._replace(lpips=None), {"lpips": 1.0})) == {"rgb", "mask"}

@@ -31,9 +31,9 @@ def slots(monkeypatch):
 
 @pytest.fixture
 def in_process(monkeypatch):
-    """Objects that this process makes: another takes seconds to start."""
+    """Make objects in this process, as another takes seconds to start."""
     monkeypatch.setattr(pools, "run_each", lambda made, items, workers: enumerate(map(made, items)))
-    monkeypatch.setattr(pools, "_made", views_of)
+    monkeypatch.setattr(pools, "_make_views", views_of)
 
 
 def views_of(number, seed, settings):
@@ -77,7 +77,7 @@ def test_a_pool_that_begins_later_goes_on_with_the_same_pictures(slots, opened, 
             after = late.take(sample)
             assert before.uids == after.uids
             assert_same(before.load(0), after.load(0))
-    assert len(whole._ready) <= 5 + 2 * 2 + pools.AHEAD  # those of older rounds are forgotten
+    assert len(whole._ready) <= 5 + 2 * 2 + pools.AHEAD  # those of older rounds are dropped
 
 
 def test_other_processes_make_the_same_pictures(slots, opened):
@@ -96,7 +96,7 @@ def assert_same(one, two):
 
 
 class Deadly:
-    """Kills the process that unpickles it, which has imported nothing by then."""
+    """Kills the process that unpickles it, before it imports anything."""
 
     def __reduce__(self):
         return signal.raise_signal, (signal.SIGKILL,)
@@ -106,7 +106,7 @@ class Deadly:
 
 
 def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeypatch):
-    monkeypatch.setattr(pools, "_made", Deadly())
+    monkeypatch.setattr(pools, "_make_views", Deadly())
     with pytest.raises(UserError, match=r"made object \d+: its process died of signal 9"):
         opened(views=None).take(0)
 
@@ -150,7 +150,7 @@ def test_a_resumed_run_has_the_same_bits_and_another_share_is_refused(data, tmp_
     "views, reason",
     [
         ({"made": 1.5}, "--made"),
-        ({"made": 0.5, "overfit": "0"}, "--made: --overfit trains on one object alone"),
+        ({"made": 0.5, "overfit": "0"}, "--made: --overfit trains on one object"),
         ({"made": 0.5, "made_uses": 0}, "--made-uses"),
     ],
 )

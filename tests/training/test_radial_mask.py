@@ -13,7 +13,7 @@ from gamba_warp.train.objective.radial_mask import (
 )
 
 SIZE = 96
-CONTOUR = 0.5 / (SIZE / 2)  # half a pixel: how well a 0/1 pixel mask states a curve
+CONTOUR = 0.5 / (SIZE / 2)  # half a pixel: accuracy of a curve in a 0/1 pixel mask
 
 
 def disc(radius: float, width=SIZE, height=SIZE, centre=(0.0, 0.0)) -> torch.Tensor:

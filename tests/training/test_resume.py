@@ -1,4 +1,4 @@
-"""Runs that go on: with another length, from other weights, or refused with the way named."""
+"""Resumed runs: with another length, from other weights, or rejected with advice."""
 
 import json
 import shlex
@@ -38,7 +38,7 @@ def done(data, tmp_path_factory):
 
 @pytest.mark.parametrize("total", [6, 12])
 def test_another_length_goes_on_at_the_rate_of_the_checkpoint(data, done, tmp_path, total):
-    """A cosine over 8 steps, at step 4: the rest is made shorter or longer, and said so."""
+    """A cosine over 8 steps, at step 4: the rest is shortened or lengthened, with a note."""
     source = str(list_checkpoints(done)[0])
     groups = {"length": {"steps": total}, "optim": {"ema": 0.5}}
     resumed = {"resume": source, "save_every": 1, "keep": 9}
@@ -48,7 +48,7 @@ def test_another_length_goes_on_at_the_rate_of_the_checkpoint(data, done, tmp_pa
     rates = [line["lr"] for line in lines(tmp_path, "train")]
     assert rates[0] == pytest.approx(lines(done, "train")[4]["lr"], rel=1e-4)
     assert rates == sorted(rates, reverse=True) and len(rates) == total - 4
-    # What is resumed once more keeps to the same fall.
+    # A second resumption continues the same fall.
     again = tmp_path / "again"
     resumed["resume"] = str(list_checkpoints(tmp_path)[0])
     assert run(data, again, run=resumed, **groups) == 0
@@ -97,7 +97,7 @@ def test_init_takes_a_checkpoint_a_run_or_a_model(data, done, tmp_path, capsys):
         out = tmp_path / str(number)
         assert run(data, out, run={"init": source}, **STILL) == 0
         assert same_weights(out / "model.safetensors", wanted)
-    assert "of what run they are is not known" in capsys.readouterr().out
+    assert "their run is not known" in capsys.readouterr().out
     for file in ("ema.safetensors", "model.safetensors"):
         assert not same_weights(newest / file, list_checkpoints(done)[0] / file)
     refused("holds neither a model nor a checkpoint", run, data, tmp_path / "x", run={"init": data})
@@ -168,5 +168,5 @@ def test_the_weight_of_novel_views_reaches_the_training(data, tmp_path):
         loss = {"novel_weight": weight}
         assert run(data, out, length={"steps": 1}, loss=loss, views={"views_per_object": 2}) == 0
         losses.append(lines(out, "train")[0])
-    assert losses[0]["loss_rgb"] == losses[1]["loss_rgb"]  # terms are logged as they are
+    assert losses[0]["loss_rgb"] == losses[1]["loss_rgb"]  # terms are logged unweighted
     assert losses[0]["loss"] != losses[1]["loss"]

@@ -1,4 +1,4 @@
-"""The run's page and its curves: made of what the log holds, whatever state that is in."""
+"""Page of a run and its curves, from a log in any state."""
 
 import html
 import json
@@ -17,7 +17,7 @@ from gamba_warp.pages.run_log import read_run_log
 
 
 def write(path, *lines):
-    """A log of dictionaries, or of bytes as they are."""
+    """Write a log of dictionaries or of raw bytes."""
     made = [line if isinstance(line, bytes) else json.dumps(line).encode() for line in lines]
     path.write_bytes(b"\n".join(made) + b"\n")
     return path
@@ -127,7 +127,7 @@ def test_lines_that_are_no_lines_of_a_log_are_passed_over(tmp_path):
 
 
 def test_steps_that_were_made_again_count_once(tmp_path):
-    """A run is killed at step 30 and goes on an hour later from its checkpoint at step 10."""
+    """A run is killed at step 30 and resumed an hour later from its checkpoint at step 10."""
     log = [line("start", 0)]
     log += [line("train", step, 6 * step, loss=step) for step in (10, 20, 30)]
     log += [line("start", 10, 4000)]
@@ -141,7 +141,7 @@ def test_steps_that_were_made_again_count_once(tmp_path):
 
 
 def long_log(path, every=25, total=40_000):
-    """As of forty thousand steps at 1.2 seconds each."""
+    """Write a log of forty thousand steps at 1.2 seconds each."""
     log = [line("start", 0, config={"length": {"steps": total}})]
     for step in range(every, total + 1, every):
         noise = 1 + 0.3 * math.sin(step * 1.7)

@@ -1,4 +1,4 @@
-"""Google Scanned Objects are not trained on, unless it is asked for; then the card says so."""
+"""Training rejects Google Scanned Objects unless requested; then the card states it."""
 
 import json
 
@@ -12,7 +12,7 @@ from gamba_warp.train.batches import open_data
 
 @pytest.fixture
 def sets(tmp_path):
-    """Two datasets; of the second one to train on and the one to validate on are scanned."""
+    """Two datasets; the second has a scanned object for training and one for validation."""
     first = micro.write_dataset(tmp_path / "first", 3)
     things = micro.write_dataset(tmp_path / "things", 3)
     for old, new in (("clouda", "Dino_4"), ("cloudc", "Elephant")):
@@ -22,7 +22,7 @@ def sets(tmp_path):
     return first, things
 
 
-SAID = "names of Google Scanned Objects.*\\({}\\): leave them out, or give --train-on-gso"
+SAID = "the data has Google Scanned Objects.*\\({}\\): leave them out, or give --train-on-gso"
 
 
 @pytest.mark.parametrize(

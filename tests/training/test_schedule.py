@@ -1,4 +1,4 @@
-"""Schedules at the steps where their values are known, and where a run's length changes."""
+"""Schedules at steps with known values, and after a change of the run's length."""
 
 import itertools
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from gamba_warp.train.config import LossConfig, OptimConfig
-from gamba_warp.train.objective.losses import Moment, radial_weight
+from gamba_warp.train.objective.losses import Progress, radial_weight
 from gamba_warp.train.optim import Schedule, ema_decay, novel_views
 
 SHAPES = ("cosine", "trapezoid")
@@ -55,12 +55,12 @@ def test_no_jump_where_the_length_changes(shape, step, total):
     assert values[-1] == pytest.approx(0.0, abs=1e-9)
     if not made.since.rises:
         assert all(b <= a + 1e-12 for a, b in itertools.pairwise(values)), "it never rises"
-    else:  # it was almost 0, and says what it goes to
-        assert before < 0.1 * new.share(step, 0.0) and "in a tenth of what is left" in text
+    else:  # it was almost 0, and the text gives its target
+        assert before < 0.1 * new.share(step, 0.0) and "in a tenth of the rest" in text
 
 
 def test_a_run_cut_short_falls_over_what_is_left():
-    """A cosine over 40,000 steps is to end at 32,000; half of what is left is half of its fall."""
+    """A cosine over 40,000 steps is to end at 32,000; half of the rest is half of its fall."""
     old = steps(40_000, warmup=0)
     made, _, values = extended(old, steps(32_000, warmup=0), 17_000)
     assert values[0] == pytest.approx(old.share(17_000, 0.0), abs=1e-12)
@@ -90,7 +90,7 @@ def test_the_same_length_and_a_second_resumption_change_nothing():
     assert again == first and text is None
     twice, _ = steps(1500).after(first, 400, 12.0)
     assert twice.share(400, 12.0) == pytest.approx(first.share(400, 12.0))
-    over, text = steps(50).after(old, 300, 9.0)  # nothing is left, so nothing is said
+    over, text = steps(50).after(old, 300, 9.0)  # the run is over: no text
     assert text is None
     assert steps(1000).after(over, 300, 9.0)[0].share(300, 9.0) == pytest.approx(
         old.share(300, 9.0)
@@ -132,21 +132,22 @@ def test_novel_views_grow_from_first_to_last_in_equal_shares():
 
 def test_radial_weight_falls_to_zero_in_steps():
     loss = LossConfig(rdist_weight=0.1, rdist_steps=40)
-    assert radial_weight(loss, Moment(0, 0, 0)) == 0.1
+    assert radial_weight(loss, Progress(0, 0, 0)) == 0.1
     # Epochs and share do not count.
-    assert radial_weight(loss, Moment(20, 9, 0.9)) == pytest.approx(0.05)
-    assert radial_weight(loss, Moment(40, 0, 0)) == radial_weight(loss, Moment(400, 0, 0)) == 0
-    assert radial_weight(replace(loss, rdist_steps=0), Moment(0, 0, 0)) == 0
-    assert radial_weight(replace(loss, radial_mask=False), Moment(0, 0, 0)) == 0
+    assert radial_weight(loss, Progress(20, 9, 0.9)) == pytest.approx(0.05)
+    assert radial_weight(loss, Progress(40, 0, 0)) == radial_weight(loss, Progress(400, 0, 0)) == 0
+    assert radial_weight(replace(loss, rdist_steps=0), Progress(0, 0, 0)) == 0
+    assert radial_weight(replace(loss, radial_mask=False), Progress(0, 0, 0)) == 0
 
 
 def test_radial_weight_falls_in_epochs_or_a_share_of_the_run():
-    """The paper's 10 of 400 epochs stay as they are; of 20 epochs a quarter is 5."""
+    """The paper's 10 of 400 epochs stay; of 20 epochs a quarter is 5."""
     loss = LossConfig(rdist_weight=0.1)
     for epochs, run, want in ((0, 400, 0.1), (5, 400, 0.05), (10, 400, 0), (2.5, 20, 0.05)):
-        got = radial_weight(loss, Moment(7, epochs, epochs / run))
+        got = radial_weight(loss, Progress(7, epochs, epochs / run))
         assert got == pytest.approx(want, abs=1e-12)
-    assert radial_weight(loss, Moment(7, 5, 0.25)) == radial_weight(loss, Moment(7, 19, 0.95)) == 0
+    ends = Progress(7, 5, 0.25), Progress(7, 19, 0.95)
+    assert [radial_weight(loss, at) for at in ends] == [0, 0]
 
 
 def test_ema_decay_is_short_at_first():

@@ -1,4 +1,4 @@
-"""The training loop: resumes to the bit, skips what is not finite, refuses what does not fit."""
+"""Training loop: bit-identical resumption, skipping of non-finite steps, invalid checkpoints."""
 
 import io
 import itertools
@@ -41,7 +41,7 @@ def assert_same_files(a, b):
 
 
 def on_forward(monkeypatch, change):
-    """Calls ``change(number, result)`` after each forward pass, the first of which has number 1."""
+    """Call ``change(number, result)`` after each forward pass, numbered from 1."""
     real, numbers = step.forward, itertools.count(1)
 
     def changed(*arguments):
@@ -53,7 +53,7 @@ def on_forward(monkeypatch, change):
 
 
 def stop_after(monkeypatch, count):
-    """Sends SIGTERM to this process in the middle of step ``count``."""
+    """Send SIGTERM to this process in the middle of step ``count``."""
     on_forward(monkeypatch, lambda n, _: n == count and os.kill(os.getpid(), signal.SIGTERM))
 
 
@@ -95,9 +95,9 @@ def test_resume_is_bit_identical(data, tmp_path, monkeypatch, accumulate):
             return (got - want).abs().mean((-3, -2, -1))
 
     monkeypatch.setattr(losses, "load_lpips", Difference)
-    # Another number of views at almost every step, so that one prepared too early would show.
+    # The number of views changes at almost every step, so that one prepared too early would show.
     views = {"accumulate": accumulate, "background": "random", "views_last": 5, "size": 20}
-    # Where the crops lie comes from torch's random numbers.
+    # The positions of the crops come from torch's random numbers.
     views = {"views": views, "loss": {"lpips": "on", "lpips_crop": 16}}
     assert run(data, tmp_path / "whole", **views) == 0
     with monkeypatch.context() as patch:
@@ -258,7 +258,7 @@ def test_other_options_and_another_model_are_refused(data, tmp_path):
 
 def test_never_resume_and_resume_from_a_path(data, tmp_path):
     assert run(data, tmp_path / "a", length={"steps": 2}) == 0
-    refused("holds a run already", run, data, tmp_path / "a", run={"resume": "never"})
+    refused("already holds a run", run, data, tmp_path / "a", run={"resume": "never"})
     assert run(data, tmp_path / "b", run={"resume": str(tmp_path / "a")}) == 0
     assert [record["step"] for record in lines(tmp_path / "b", "train")] == [3, 4, 5, 6]
     with pytest.raises(UserError, match="no checkpoint there"):
@@ -299,7 +299,7 @@ def test_broken_object_is_left_out_and_listed(tmp_path, capsys):
 
 
 def test_minutes_alone_limit_the_run(data, tmp_path, monkeypatch):
-    """By a clock that moves on one second at each look, two minutes are 120 looks or so."""
+    """With a clock that advances one second per reading, two minutes are about 120 readings."""
     ticks = itertools.count()
     clock = SimpleNamespace(monotonic=lambda: float(next(ticks)), perf_counter=time.perf_counter)
     monkeypatch.setattr(loop, "time", clock)
@@ -327,7 +327,7 @@ def test_views_are_distinct_while_they_last():
 
 
 def test_input_view_is_the_model_s_reference(data):
-    """Whatever view is the input, its camera is the reference camera in the model's world."""
+    """The camera of any input view is the reference camera in the model's world."""
     from gamba_warp.data.dataset import open_dataset
     from gamba_warp.train.batches import load_sample
 
@@ -370,14 +370,14 @@ def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
     assert ["loss_lpips" in record for record in records] == [False, False, True]
     third = records[2]
     assert third["loss"] == pytest.approx(third["loss_rgb"] + third["loss_mask"] + 1.5, abs=1e-4)
-    # A validation's loss has LPIPS from the start, or it would jump where training begins it.
+    # A validation's loss has LPIPS from the start; otherwise it would jump when training adds it.
     late = {"loss": loss | {"lpips_after": 9}, "run": {"val_every": 1}}
     assert run(data, tmp_path / "late", **late, **short) == 0
     assert all(record["loss"] > 1.5 for record in lines(tmp_path / "late", "val"))
 
 
 def test_bfloat16_keeps_float32_weights(data, tmp_path, monkeypatch):
-    """It is the precision of the network and of LPIPS in a step; a validation has float32."""
+    """bfloat16 is used by the network and LPIPS in a step; a validation uses float32."""
     network, lpips, real = set(), set(), Gamba.forward
 
     def spy(model, *arguments):

@@ -1,4 +1,4 @@
-"""Validation on further datasets, and the best of a run by all of them."""
+"""Validation on further datasets, and the best checkpoint by all of them."""
 
 import itertools
 import json
@@ -55,7 +55,7 @@ def test_figures_of_a_further_set_are_those_of_eval_views(sets, tmp_path, capsys
 
 
 def scripted(monkeypatch, figures):
-    """Validations whose novel PSNR is what is told: in turn that of DATA and that of the other."""
+    """Replace the novel PSNR of validations by given values: in turn of DATA and of the other."""
     rows = [torch.zeros(1, 4, 4, 3)]
     told = iter(
         ({"loss": 1.0, "psnr_input": 50.0, "psnr_novel": psnr}, rows if psnr else [])
@@ -66,7 +66,7 @@ def scripted(monkeypatch, figures):
 
 def test_the_best_is_by_the_mean_over_the_sets(sets, tmp_path, monkeypatch, capsys):
     # By the mean step 2 is the best; by DATA it would be step 3, by the other or by objects step 4.
-    # Of step 5 the other has no figure, and of step 6 there is none that is a number.
+    # At step 5 the other has no figure, and at step 6 none is a number.
     figures = [(20, 10), (19, 12), (25, 5), (10, 20), (40, 0), (float("nan"), 30)]
     scripted(monkeypatch, figures)
     changes = {"val_every": 1, "save_every": 1, "keep": 9, "val_extra": (sets[1],)}

@@ -1,4 +1,4 @@
-"""Zip, tar and ar archives that bite: names, links, lies about sizes, bombs, damage."""
+"""Hostile zip, tar and ar archives: names, links, false sizes, bombs, damage."""
 
 import bz2
 import gzip
@@ -21,7 +21,7 @@ from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
 
 
 def make_zip(path, members, method=zipfile.ZIP_DEFLATED):
-    """Writes members, whose names may be ZipInfo objects."""
+    """Write members, whose names may be ZipInfo objects."""
     with zipfile.ZipFile(path, "w", method) as archive:
         for name, data in members:
             archive.writestr(name, data)
@@ -81,7 +81,7 @@ def test_bombs_and_odd_zips(tmp_path, monkeypatch):
     path = make_zip(tmp_path / "bomb.zip", [("a", b"0" * 1_000_000)])
     refused_at(path, "100 times its size", unpack, path, tmp_path / "out")
     path = make_zip(tmp_path / "b.zip", [("a", b"0" * 99)], zipfile.ZIP_LZMA)
-    refused_at(path, "in a way", unpack, path, tmp_path / "out")
+    refused_at(path, "unsupported compression", unpack, path, tmp_path / "out")
     path = make_zip(tmp_path / "c.zip", [("a", b"0" * 99)])
     data = bytearray(path.read_bytes())
     data[data.rindex(b"PK\1\2") + 8] |= 1  # the flag of a password
@@ -97,7 +97,7 @@ def test_bombs_and_odd_zips(tmp_path, monkeypatch):
 def test_a_zip_that_lies_about_a_size_fills_no_memory(tmp_path):
     path = make_zip(tmp_path / "a.zip", [("a", b"0" * 50_000_000)])
     data = bytearray(path.read_bytes())
-    place = data.rindex(b"PK\1\2") + 24  # the size in the table of contents
+    place = data.rindex(b"PK\1\2") + 24  # size in the table of contents
     data[place : place + 4] = (10).to_bytes(4, "little")
     path.write_bytes(data)
     tracemalloc.start()
@@ -130,11 +130,11 @@ def test_ar_sizes(tmp_path):
     assert read_data(path) == ("data.tar.xz", b"12345")
     for size in ("-60", "-1", "1e3", "", "0x10", "9999999999"):
         make_ar(path, [("data.tar.xz", b"12345", size)])
-        refused_at(path, "no sound size", read_data, path)
+        refused_at(path, "invalid size", read_data, path)
         make_ar(path, [("first", b"2.0", size), ("data.tar.xz", b"12345", 5)])
         started = time.monotonic()
         refused_at(path, "", read_data, path)
-        assert time.monotonic() - started < 1  # -60 went round for ever
+        assert time.monotonic() - started < 1  # -60 looped forever
     whole = make_ar(path, [("data.tar.xz", b"12345" * 9, 45)]).read_bytes()
     for length in (0, 7, 8, 30, 67, 68, 90):
         path.write_bytes(whole[:length])

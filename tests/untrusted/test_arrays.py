@@ -1,4 +1,4 @@
-"""Small ``.npy`` files that lie: about their size, their kind, or what they are."""
+"""Small ``.npy`` files with a false size, type or format."""
 
 import io
 import zipfile

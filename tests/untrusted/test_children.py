@@ -1,6 +1,6 @@
-"""Functions in child processes: deaths, limits, and no process left behind.
+"""Functions in child processes: crashes, limits, and no process left behind.
 
-The function is ``eval`` here, which a child has without the seconds that importing takes.
+The function is ``eval``, which needs no import that would take seconds.
 """
 
 import os
@@ -93,7 +93,7 @@ def test_children_end_with_their_parent(tmp_path, number):
 
 
 def _runs(pid):
-    """Whether a process is there and is no zombie: in a container nobody may collect those."""
+    """True if a process runs and is not a zombie, which a container may never reap."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:

@@ -1,4 +1,4 @@
-"""JSON of strangers, ranges of numbers, torch's files: sound values, or one line."""
+"""Untrusted JSON, ranges of numbers, files of torch: valid values, or a one-line error."""
 
 import os
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Strangers' files have one door each: what opens them elsewhere would be open to all."""
+"""Untrusted files are only opened by the modules that validate them."""
 
 import ast
 from pathlib import Path
@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Who may call what; ``vision.weights`` opens a wheel whose digest pip has compared, ``pack`` a tar
-# that it has just written.
+# Allowed callers; ``vision.weights`` opens a wheel whose digest pip has checked, ``pack`` its own
+# new tar.
 DOORS = {
     "Image.open": {"gamba_warp/images.py"},
     "tarfile.open": {"gamba_warp/untrusted/archives.py", "train/sources/pack.py"},
@@ -20,7 +20,7 @@ DOORS = {
     "pickle.load": set(),
     "pickle.loads": {"gamba_warp/untrusted/children.py"},
     "json.load": set(),
-    # what the same process, or its parent, has just written; and what Warp's compiler writes
+    # files just written by the same process or its parent, or by Warp's compiler
     "json.loads": {
         "gamba_warp/gpu_check/check.py",
         "gamba_warp/model/pretrained.py",
@@ -39,7 +39,7 @@ def calls(path):
 
 @pytest.fixture(scope="module")
 def found():
-    """The lines of each call, by what is called."""
+    """Lines of each call, by the called function."""
     lines = {name: set() for name in DOORS}
     for folder in ("gamba_warp", "train", "eval", "kernels"):
         for path in (ROOT / folder).rglob("*.py"):

@@ -1,4 +1,4 @@
-"""Names from archives, catalogues and datasets: they stay inside their folder, or are refused."""
+"""Names from archives, catalogues and datasets stay inside their folder, or raise."""
 
 import pytest
 from helpers.refusals import refused
@@ -59,6 +59,6 @@ def test_links_may_not_leave_the_folder(tmp_path):
     for name in ("out/secret.png", "out/none.png", "out"):
         refused("leaves", inside, folder, name, "x")
     assert inside(folder, "in/a.png", "x") == folder / "in" / "a.png"
-    inside(folder, "round/a.png", "x")  # opening it fails, and says so
+    inside(folder, "round/a.png", "x")  # opening it fails with an error
     (tmp_path / "link").symlink_to(folder)
     assert inside(tmp_path / "link", "images/a.png", "x")  # the folder itself may be one

@@ -1,9 +1,9 @@
-"""820 textured furniture models that are free to use, ready for ``gamba data render``.
+"""820 free textured furniture models, ready for ``gamba data render``.
 
-They are Sweet Home 3D's furniture libraries as Debian's package ``sweethome3d-furniture`` carries
-them: five ``.sh3f`` zip files of OBJ models, each with a 128x128 RGBA icon, a name and a creator.
-All are CC BY 3.0 or CC0; the attribution goes into ``catalogue.json`` and from there into every
-rendered object.
+These are Sweet Home 3D's furniture libraries of Debian's package ``sweethome3d-furniture``: five
+``.sh3f`` zip files of OBJ models, each with a 128x128 RGBA icon, a name and a creator. All are
+CC BY 3.0 or CC0; the attribution goes into ``catalogue.json`` and from there into every rendered
+object.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from gamba_warp.formats.catalogue import CATALOGUE, check_rotation
 from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
 from gamba_warp.untrusted.names import parts_of, plain_name
 
-from .groups import Named, split_groups, textures_of
+from .groups import ObjectInfo, split_groups, textures_of
 
 PACKAGE = "sweethome3d-furniture"
 INSTALLED = Path("/usr/share/sweethome3d/furniture")
 _PROPERTIES = "PluginFurnitureCatalog.properties"
-_MAX_TEXT = _MAX_ICON = 16 << 20  # bytes; they take a few kB
+_MAX_TEXT = _MAX_ICON = 16 << 20  # bytes; published ones have a few kB
 _TEXT = {"capture_output": True, "encoding": "utf-8", "errors": "replace"}
 _BY = "https://creativecommons.org/licenses/by/3.0/"
 
-# By library: whom to name, if not each model's creator; the licence; where its text is.
+# By library: the creator to credit, if not each model's; the licence; the URL of its text.
 LIBRARIES: dict[str, tuple[str, str, str]] = {
     "BlendSwap-CC-0": ("", "CC0 1.0", "https://creativecommons.org/publicdomain/zero/1.0/"),
     "BlendSwap-CC-BY": ("", "CC BY 3.0", _BY),
@@ -47,29 +47,29 @@ LIBRARIES: dict[str, tuple[str, str, str]] = {
 
 
 def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) -> int:
-    """Unpacks the libraries, and writes the catalogue of all models.
+    """Unpack the libraries, and write the catalogue of all models.
 
     Args:
         out: folder for the models, their icons and catalogue.json.
         deb: the package file, or None.
-        tree: a folder that holds the .sh3f files, or None; without either an installed package is
-            used, or apt-get downloads it.
+        tree: folder with the .sh3f files, or None. Without both, the installed package is used, or
+            apt-get downloads it.
 
     Returns:
         The number of models.
 
     Raises:
-        UserError: there are no libraries, one is damaged, or two models have one name.
+        UserError: no library is found, one is damaged, or two models have the same name.
     """
     out, objects = output_folder(out), []
     with tempfile.TemporaryDirectory(dir=out, prefix=PART) as scratch:
         paths = sorted(_find_libraries(deb, tree, Path(scratch)).glob("*.sh3f"))
         if not paths:
-            raise UserError(f"{deb or tree or INSTALLED}: holds no .sh3f libraries")
+            raise UserError(f"{deb or tree or INSTALLED}: contains no .sh3f libraries")
         for path in paths:
             try:
                 objects += unpack_library(path, out)
-            except UserError as error:  # a package's library lies in a folder that goes
+            except UserError as error:  # name the package, not the temporary folder
                 reason = str(error).replace(f"{scratch}/", f"{deb or PACKAGE}: ")
                 raise UserError(reason) from error
     counts = Counter(entry["uid"] for entry in objects)
@@ -77,7 +77,7 @@ def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) 
         raise UserError(f"two models are called {repeated}")
     groups = split_groups(
         [
-            Named(e["uid"], e["model"].split("/")[0], e["name"], textures_of(out / e["model"]))
+            ObjectInfo(e["uid"], e["model"].split("/")[0], e["name"], textures_of(out / e["model"]))
             for e in objects
         ]
     )
@@ -87,7 +87,7 @@ def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) 
 
 
 def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
-    """The folder of the .sh3f files."""
+    """Return the folder of the .sh3f files."""
     if tree is not None:
         if not tree.is_dir():
             raise UserError(f"{tree}: no such folder")
@@ -97,7 +97,7 @@ def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
         if INSTALLED.is_dir():
             return INSTALLED
         deb = _download(scratch)
-    # A .deb is an ar archive that holds a tar.
+    # A .deb is an ar archive with a tar inside.
     with tempfile.TemporaryFile(dir=scratch) as data:
         name = read_ar(deb, "data.tar", data)
         with open_tar(data, f"{deb}: {name}", scratch) as members:
@@ -105,17 +105,17 @@ def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
                 if member.name.endswith(".sh3f"):
                     file = scratch / plain_name(PurePosixPath(member.name).name, str(deb))
                     if file.exists():
-                        raise UserError(f"{deb}: {file.name} is there twice")
+                        raise UserError(f"{deb}: {file.name} occurs twice")
                     with file.open("wb") as target:
                         shutil.copyfileobj(member.file, target)
     return scratch
 
 
 def _download(folder: Path) -> Path:
-    """Debian's package by apt-get, which needs no root for this."""
+    """Download Debian's package with apt-get, which does not need root for this."""
     if shutil.which("apt-get") is None:
         raise UserError(
-            f"no apt-get here: get {PACKAGE}_*_all.deb from a Debian mirror and give it by --deb"
+            f"apt-get is missing: get {PACKAGE}_*_all.deb from a Debian mirror and pass it as --deb"
         )
     print(f"downloading {PACKAGE} (125 MB) with apt-get")
     command = ["apt-get", "download", PACKAGE]
@@ -125,13 +125,13 @@ def _download(folder: Path) -> Path:
         result = subprocess.run(command, cwd=folder, **_TEXT)
     files = sorted(folder.glob("*.deb"))
     if result.returncode or not files:
-        reason = (result.stderr.strip().splitlines() or ["no file came"])[-1]
-        raise UserError(f"apt-get download {PACKAGE}: {reason}; or give the file by --deb")
+        reason = (result.stderr.strip().splitlines() or ["no file was downloaded"])[-1]
+        raise UserError(f"apt-get download {PACKAGE}: {reason}; or pass the file as --deb")
     return files[0]
 
 
 def read_properties(data: bytes) -> dict[str, str]:
-    """A Java ``.properties`` file: ``key=value`` lines in Latin-1, other letters escaped."""
+    """Parse a Java ``.properties`` file: ``key=value`` lines in Latin-1, other letters escaped."""
     text = re.sub(r"\\\r?\n[ \t]*", "", data.decode("latin-1"))
     text = re.sub(r"\\u([0-9a-fA-F]{4})", lambda match: chr(int(match[1], 16)), text)
     pairs = (line.partition("=") for line in text.splitlines() if not line.lstrip().startswith("#"))
@@ -139,20 +139,20 @@ def read_properties(data: bytes) -> dict[str, str]:
 
 
 def unpack_library(path: Path, out: Path) -> list[dict]:
-    """Unpacks one .sh3f into a folder of its name, unless that is there, and its icons.
+    """Unpack one .sh3f into a folder of its name, unless it exists, and its icons.
 
     Returns:
         The library's catalogue entries.
 
     Raises:
-        UserError: not a zip, no furniture catalogue in it, a member that is not allowed, or the
-            folder is there and lacks a model.
+        UserError: the file is not a zip, lacks a furniture catalogue or has a forbidden member, or
+            the folder exists and lacks a model.
     """
     library = plain_name(path.stem, str(path))
     if library.lower() in ("icons", CATALOGUE):
         raise UserError(f"{path}: a library cannot be called {library}")
-    if not path.is_file() or not zipfile.is_zipfile(path):  # to read a pipe would not end
-        raise UserError(f"{path}: not a furniture library (no zip file)")
+    if not path.is_file() or not zipfile.is_zipfile(path):  # reading a pipe would never end
+        raise UserError(f"{path}: not a furniture library (not a zip file)")
     with open_zip(path) as archive:
         catalogue = read_properties(archive.read(_PROPERTIES, _MAX_TEXT))
         members = [name for name in archive.names if not name.endswith(".properties")]
@@ -164,7 +164,7 @@ def unpack_library(path: Path, out: Path) -> list[dict]:
             raise UserError(f"{path}: not a furniture library (no {error})") from error
         missing = {e["model"].removeprefix(f"{library}/") for e in entries} - {*members}
         if missing:
-            raise UserError(f"{path}: not a furniture library (it holds no {min(missing)!r})")
+            raise UserError(f"{path}: not a furniture library ({min(missing)!r} is missing)")
         icons = [archive.read(picture, _MAX_ICON) for picture in pictures]
         if not (out / library).exists():
             with atomic_folder(out / library) as part:
@@ -178,7 +178,7 @@ def unpack_library(path: Path, out: Path) -> list[dict]:
 
 
 def _entry(library: str, catalogue: dict[str, str], number: str, path: Path) -> dict:
-    """One model's entry in catalogue.json; raises KeyError where a line of it is missing."""
+    """Entry of one model in catalogue.json; raises KeyError if a line of it is missing."""
     source = f"{path}: model {number}"
     model = PurePosixPath(*parts_of(catalogue[f"model#{number}"].lstrip("/"), source))
     uid = re.sub(r"[^\w.-]+", "_", f"{library}-{model.parent.name}".lower())

@@ -1,15 +1,15 @@
-"""Which objects belong on one side of a split: those that a model would know from one another.
+"""Groups of similar objects, which must lie on one side of a split.
 
-Two objects are of one group if
+Two objects belong to one group if
 
 - they are of one library and one kind, the last word of the name before any number ("Concept Sedan
-  02" is a sedan), because libraries have variants of one model under such names;
-- both are called by their kind alone, in whatever library ("Chair");
+  02" is a sedan), because libraries name variants of one model so;
+- both names are only the kind, in any library ("Chair");
 - they are of one library and one name begins with all words of the other, at least two ("Arrow turn
   right", "Arrow turn right and ahead");
-- they show a picture file with the same content,
+- they use a picture file with the same content.
 
-and so on from one to the next.
+The relation is transitive.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from gamba_warp.files import sha256
 from gamba_warp.untrusted.names import inside
 
 
-class Named(NamedTuple):
-    """What is known of an object.
+class ObjectInfo(NamedTuple):
+    """Names and textures of an object.
 
     Attributes:
         uid: its name in the dataset.
-        library: where it comes from.
-        name: what people call it.
-        textures: SHA-256 of each picture file that its material shows.
+        library: its library.
+        name: its readable name.
+        textures: SHA-256 of each picture file of its material.
     """
 
     uid: str
@@ -41,21 +41,21 @@ class Named(NamedTuple):
     textures: frozenset[str]
 
 
-def split_groups(objects: Sequence[Named]) -> dict[str, str]:
-    """The group of each object, by uid.
+def split_groups(objects: Sequence[ObjectInfo]) -> dict[str, str]:
+    """Return the group of each object, by uid.
 
-    A group has the name ``<library>-<kind>`` that most of its objects have, so that it lies where
-    these would lie by themselves.
+    A group is named by the most frequent ``<library>-<kind>`` of its objects, so it falls into the
+    part of the split where most of them would be on their own.
     """
-    above = {item.uid: item.uid for item in objects}
+    parent = {item.uid: item.uid for item in objects}
 
-    def top(uid: str) -> str:
-        while above[uid] != uid:
-            above[uid] = above[above[uid]]
-            uid = above[uid]
+    def root(uid: str) -> str:
+        while parent[uid] != uid:
+            parent[uid] = parent[parent[uid]]
+            uid = parent[uid]
         return uid
 
-    # What belongs together by one of the rules.
+    # Objects to join, by the rule and its key.
     found: dict[tuple[str, ...], list[str]] = defaultdict(list)
     named: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for item in objects:
@@ -72,20 +72,20 @@ def split_groups(objects: Sequence[Named]) -> dict[str, str]:
                 found[("begins", *whole[:count])] += named[whole[:count]] + named[whole]
     for uids in found.values():
         for uid in uids:
-            above[top(uid)] = top(uids[0])
+            parent[root(uid)] = root(uids[0])
     kinds: dict[str, Counter[str]] = defaultdict(Counter)
     for item in objects:
-        kinds[top(item.uid)][f"{item.library}-{words_of(item.name)[-1]}"] += 1
+        kinds[root(item.uid)][f"{item.library}-{words_of(item.name)[-1]}"] += 1
     names = {
         first: min(found, key=lambda kind: (-found[kind], kind)) for first, found in kinds.items()
     }
-    return {item.uid: names[top(item.uid)] for item in objects}
+    return {item.uid: names[root(item.uid)] for item in objects}
 
 
 def textures_of(model: Path) -> frozenset[str]:
-    """SHA-256 of each picture file that the materials of an unpacked ``.obj`` model name.
+    """SHA-256 of each picture file named by the materials of an unpacked ``.obj`` model.
 
-    What is missing, or has a name that leaves the model's folder, is passed over.
+    Missing files, and names that leave the model's folder, are skipped.
     """
     found = set()
     for library in _named_files(model, rb"(?m)^mtllib\s+(.+?)\s*$"):
@@ -95,7 +95,7 @@ def textures_of(model: Path) -> frozenset[str]:
 
 
 def _named_files(path: Path, line: bytes) -> Iterator[Path]:
-    """The files beside ``path`` that its lines name."""
+    """Yield the files beside ``path`` that its lines name."""
     if path.suffix.lower() not in (".obj", ".mtl"):
         return
     for match in re.finditer(line, path.read_bytes()):
@@ -108,5 +108,5 @@ def _named_files(path: Path, line: bytes) -> Iterator[Path]:
 
 
 def words_of(name: str) -> list[str]:
-    """The words of a name before any number, in small letters; the name itself if it has none."""
+    """Words of a name before any number, in lower case; the name itself if it has none."""
     return [word.lower() for word in re.findall(r"[^\W\d_]+", re.split(r"\d", name)[0]) or [name]]

@@ -1,9 +1,9 @@
-"""Made objects for a training: other processes make and render them while the model trains.
+"""Made objects for training: other processes make and render them while the model trains.
 
-The pool has ``SLOTS`` slots. A round takes one sample from each slot, in an order of its own, and
-an object stays in its slot for ``uses`` rounds; the slots change their objects in turn, so that
-every round needs as many new ones. Which object a sample shows is a function of its number alone,
-so a resumed run goes on with the same ones.
+The pool has ``SLOTS`` slots. A round takes one sample from each slot, in its own order, and an
+object stays in its slot for ``uses`` rounds. The slots change their objects at staggered rounds, so
+every round needs the same number of new ones. The object of a sample is a function of the sample's
+number, so a resumed run continues with the same objects.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from gamba_warp.data.dataset import ViewDataset
-from gamba_warp.data.layouts import ObjectFiles, Stored
+from gamba_warp.data.layouts import DecodedPicture, ObjectFiles
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.children import Failed, end_idle, run_each
@@ -27,8 +27,8 @@ from gamba_warp.versions import NEEDS, require
 from .render import DEPTH_UNIT, Views, draw_views
 from .settings import Settings
 
-SLOTS = 64  # objects that are in use at a time; one has 2 MB at 12 views of 128² with depth
-AHEAD = 8  # objects that are ready before they are needed
+SLOTS = 64  # objects in use at a time; one has 2 MB at 12 views of 128² with depth
+AHEAD = 8  # objects prepared ahead
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class PoolOptions:
     """Options of a pool.
 
     Attributes:
-        seed: of all objects, their cameras and lights.
-        rank: of this process among those that train together; each has objects of its own.
-        world: number of these processes.
+        seed: seed of all objects, their cameras and lights.
+        rank: rank of this training process; each has its own objects.
+        world: number of training processes.
         uses: samples of an object.
         workers: number of processes that make and render.
         views: options of the pictures.
@@ -53,31 +53,31 @@ class PoolOptions:
 
 
 class Pool:
-    """Made objects by the number of their sample; threads may take them in about that order."""
+    """Made objects by sample number; threads may take them in roughly that order."""
 
     def __init__(self, options: PoolOptions, first: int) -> None:
-        """Starts to make the objects of the samples from ``first`` on.
+        """Start making the objects of the samples from ``first`` on.
 
         Args:
             options: the pool's options.
-            first: number of the first sample that is taken.
+            first: number of the first sample.
 
         Raises:
-            ModuleNotFoundError: what makes objects needs a library that is not installed.
+            ModuleNotFoundError: a library for making objects is not installed.
         """
         require(*NEEDS["data made"])
         self.options = options
         self._first = first
         self._ready: dict[int, ViewDataset] = {}
         self._untaken: set[int] = set()  # objects that are ready and were never taken
-        self._failure: str | None = None  # the reason why no more objects come
+        self._failure: str | None = None  # reason why the pool has stopped
         self._closed = False
         self._changed = threading.Condition()
         self._maker = threading.Thread(target=self._make, name="made objects", daemon=True)
         self._maker.start()
 
     def take(self, sample: int) -> ViewDataset:
-        """Waits for the object of a sample; returns it as a dataset of one object.
+        """Wait for the object of a sample; return it as a dataset of one object.
 
         Raises:
             UserError: the object cannot be made, or its process died twice.
@@ -97,7 +97,7 @@ class Pool:
             return self._ready[number]
 
     def close(self) -> None:
-        """Ends the processes; the object that each makes is lost."""
+        """End the processes and discard the objects in progress."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -105,20 +105,20 @@ class Pool:
         end_idle()
 
     def _object(self, sample: int) -> int:
-        """Number of the object that a sample shows."""
-        turn, position = divmod(sample, SLOTS)
-        slot = int(_order(self.options.seed, turn)[position])
-        generation = (turn + slot % self.options.uses) // self.options.uses
+        """Number of the object of a sample."""
+        round_number, position = divmod(sample, SLOTS)
+        slot = int(_order(self.options.seed, round_number)[position])
+        generation = (round_number + slot % self.options.uses) // self.options.uses
         return (generation * SLOTS + slot) * self.options.world + self.options.rank
 
     def _last_round(self, number: int) -> int:
-        """Last round in which samples show an object."""
+        """Last round that uses an object."""
         generation, slot = divmod(number // self.options.world, SLOTS)
         uses = self.options.uses
         return (generation + 1) * uses - slot % uses - 1
 
     def _needed(self) -> Iterator[int]:
-        """Numbers of all objects, each once, in the order in which samples first show them."""
+        """Yield the numbers of all objects, each once, in the order of first use."""
         latest: dict[int, int] = {}
         for sample in count(self._first):
             number = self._object(sample)
@@ -128,13 +128,13 @@ class Pool:
                 yield number
 
     def _make(self) -> None:
-        """Makes objects until the pool is closed or one fails; runs in a thread of its own."""
+        """Make objects until the pool is closed or one fails; runs in its own thread."""
         needed = self._needed()
         try:
             while not self._closed:
                 numbers = [*islice(needed, self.options.workers)]
                 if failed := self._make_all(numbers):
-                    failed = self._make_all([*failed])  # a process may die of other work's memory
+                    failed = self._make_all([*failed])  # memory may have been short for a moment
                 if failed and not self._closed:
                     number, reason = failed.popitem()
                     raise UserError(f"made object {number}: {reason}")
@@ -144,9 +144,9 @@ class Pool:
                 self._changed.notify_all()
 
     def _make_all(self, numbers: Sequence[int]) -> dict[int, str]:
-        """Makes these objects; returns reasons by number, of those that failed."""
+        """Make these objects; return the failures, reasons by number."""
         failed = {}
-        made = partial(_made, seed=self.options.seed, settings=self.options.views)
+        made = partial(_make_views, seed=self.options.seed, settings=self.options.views)
         for index, result in run_each(made, numbers, workers=self.options.workers):
             if isinstance(result, Failed):
                 failed[numbers[index]] = result.reason
@@ -164,22 +164,22 @@ class Pool:
 
 
 @lru_cache(maxsize=8)
-def _order(seed: int, turn: int) -> np.ndarray:
-    """The slots in the order of a round."""
-    return np.random.default_rng([seed, 5, turn]).permutation(SLOTS)
+def _order(seed: int, round_number: int) -> np.ndarray:
+    """Slots in the order of a round."""
+    return np.random.default_rng([seed, 5, round_number]).permutation(SLOTS)
 
 
-def _made(number: int, seed: int, settings: Settings) -> Views:
-    """In a child process: an object's views."""
-    from .made import make_object  # needs libraries that a training without made objects does not
+def _make_views(number: int, seed: int, settings: Settings) -> Views:
+    """Make and render an object, in a child process."""
+    from .made import make_object  # needs libraries that training without made objects does not
 
     quiet_warp()
     torch.set_num_threads(1)
     return draw_views(make_object(np.random.default_rng([seed, number])), str(number), settings)
 
 
-class _Picture(Stored):
-    """A picture in memory."""
+class _Picture(DecodedPicture):
+    """Picture in memory."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.values = values

@@ -1,7 +1,4 @@
-"""How the views of an object are made: the cameras.
-
-Those stand around it, and each has all of it in the picture.
-"""
+"""Cameras of rendered views: around an object, each with all of it in the picture."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ FRONT = (35.0, 0.0, 20.0)  # degrees: largest azimuth, least and largest elevati
 
 
 def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndarray:
-    """Returns ``[4, 4]`` camera-to-world, OpenGL frame, of a camera that looks at the origin, z up.
+    """Return ``[4, 4]`` camera-to-world, OpenGL frame, of a camera that looks at the origin, z up.
 
     A camera of azimuth 0 stands at -y (the front, as in Blender); azimuth grows towards +x.
 
@@ -37,11 +34,11 @@ def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndar
 
 
 def nearest_distance(points: np.ndarray, pose: np.ndarray, fov: float) -> float:
-    """Returns the least distance along the pose's axis at which this camera may stand.
+    """Return the least camera distance along the pose's axis.
 
-    All points are then in a square picture, with a margin. If this view becomes the reference, its
-    camera is put at distance 1.5, and the object then lies within [-0.5, 0.5] on each camera axis,
-    where the model can place Gaussians.
+    At this distance all points are in a square picture, with a margin. A reference view is rescaled
+    to distance 1.5; the object then lies within [-0.5, 0.5] on each camera axis, where the model
+    can place Gaussians.
 
     Args:
         points: ``[P, 3]`` in the object's frame.
@@ -62,7 +59,7 @@ def sample_poses(
     fronts: int = 1,
     spread: float = SPREAD,
 ) -> np.ndarray:
-    """Draws ``[views, 4, 4]`` camera-to-world matrices, OpenGL frame.
+    """Draw ``[views, 4, 4]`` camera-to-world matrices, OpenGL frame.
 
     The first views see the object roughly from the front, see ``FRONT``. The others are spread in
     azimuth by the golden ratio with a random start; nine in ten have an elevation of -10 to 50°,
@@ -72,9 +69,9 @@ def sample_poses(
         points: ``[P, 3]`` vertices of the object, which is centred at the origin.
         views: number of views.
         fov: degrees, of the picture's side.
-        rng: source of chance.
+        rng: random generator.
         fronts: number of views from the front.
-        spread: largest share by which a camera stands further than it must.
+        spread: largest share by which a camera stands further away than necessary.
     """
     golden = (math.sqrt(5) - 1) / 2
     start = rng.uniform()
@@ -94,9 +91,9 @@ def sample_poses(
 def ring_poses(
     points: np.ndarray, fov: float, elevations: Sequence[float], azimuths: Sequence[float]
 ) -> np.ndarray:
-    """Returns ``[V, 4, 4]`` camera-to-world matrices, OpenGL frame, on rings about the object.
+    """Return ``[V, 4, 4]`` camera-to-world matrices, OpenGL frame, on rings about the object.
 
-    All views of an object have one distance: the least at which it is in each picture.
+    All views of an object have one distance: the least that keeps it inside each picture.
 
     Args:
         points: ``[P, 3]`` vertices of the object, which is centred at the origin.
@@ -104,14 +101,14 @@ def ring_poses(
         elevations: of the rings, degrees; the first ring's views come first.
         azimuths: of each ring's views, degrees.
     """
-    places = [(azimuth, elevation) for elevation in elevations for azimuth in azimuths]
-    around = [look_at_origin(azimuth, elevation, 1.0) for azimuth, elevation in places]
+    angles = [(azimuth, elevation) for elevation in elevations for azimuth in azimuths]
+    around = [look_at_origin(azimuth, elevation, 1.0) for azimuth, elevation in angles]
     distance = max(nearest_distance(points, pose, fov) for pose in around)
-    return np.stack([look_at_origin(*place, distance) for place in places])
+    return np.stack([look_at_origin(*pair, distance) for pair in angles])
 
 
 def front_views(poses: np.ndarray) -> list[int]:
-    """The views that see their object roughly from the front, see ``FRONT``; the first always.
+    """Indices of the views roughly from the front, see ``FRONT``; always includes the first.
 
     Args:
         poses: ``[V, 4, 4]`` camera to world, OpenGL frame; the object's centre is the origin.

@@ -1,6 +1,6 @@
-"""A small ray caster for textured meshes: Open3D finds the hits, a Warp kernel shades them."""
+"""Small ray caster for textured meshes: Open3D finds the hits, a Warp kernel shades them."""
 
-# Annotations of kernels are values that Warp reads, no types.
+# Annotations of kernels are values for Warp, not types.
 # pyright: reportInvalidTypeForm=false
 
 import math
@@ -18,18 +18,18 @@ from gamba_warp.versions import import_open3d
 
 SAMPLES = 3  # rays along each side of a pixel; odd, so that one goes through the pixel's centre
 LAYERS = 8  # number of surfaces that a ray may pass through
-STEP = 1e-4  # object units behind a transparent surface at which its ray goes on
-GLOSS = 0.02  # share that even a black surface reflects, so that its shape shows
+STEP = 1e-4  # object units behind a transparent surface at which its ray continues
+GLOSS = 0.02  # share reflected even by a black surface, so that its shape shows
 OPAQUE = 0.02  # transmittance below which a ray ends
-# What the lights of an object are drawn from: height of the key light in degrees, its strength,
-# that of the ambient light, and the tint of both lights.
+# Ranges of the lights of an object: height of the key light in degrees, its strength, that of the
+# ambient light, and the tint of both lights.
 USUAL = {"height": (25, 70), "key": (0.5, 0.85), "ambient": (0.4, 0.6), "tint": (0.92, 1.0)}
 VARIED = {"height": (0, 90), "key": (0.3, 1.1), "ambient": (0.2, 0.7), "tint": (0.75, 1.0)}
 
 
 @dataclass
 class Lights:
-    """The light of one object, the same for all its views, in its own frame.
+    """Lights of one object, the same for all its views, in its own frame.
 
     Attributes:
         ambient: light from above, ``[3]``; half of it comes from below.
@@ -45,11 +45,11 @@ class Lights:
 
     @classmethod
     def sample(cls, rng: np.random.Generator, varied: bool = False) -> "Lights":
-        """Draws a key light and a fill light from above, ambient light and a lamp at the camera.
+        """Draw a key light and a fill light from above, ambient light and a lamp at the camera.
 
         Args:
-            rng: source of chance.
-            varied: whether strength, height and tint of the lights differ more than usual.
+            rng: random generator.
+            varied: draw strength, height and tint of the lights from wider ranges.
         """
         ranges = VARIED if varied else USUAL
         azimuth = rng.uniform(0, 2 * math.pi) + np.array([0, rng.uniform(0.5, 1.5) * math.pi])
@@ -66,19 +66,19 @@ class Lights:
 
 @struct
 class _Surface:
-    """A mesh with its materials and lights, as ``_shade`` reads them.
+    """Mesh with its materials and lights, for ``_shade``.
 
     Attributes:
         normals: ``[3 F]`` unit normals of the faces' corners.
         uvs: ``[3 F]`` of the corners.
-        colors: ``[3 F]`` display RGBA of the corners; empty where all are white.
+        colors: ``[3 F]`` display RGBA of the corners; empty if all are white.
         face_normals: ``[F]`` unit.
         density: ``[F]`` widths of a texture per object unit.
-        materials: ``[F]`` into those of the next.
+        materials: ``[F]`` indices into the materials.
         plain: ``[M]`` linear RGBA of the materials, the colour premultiplied.
-        levels: number of halvings of a texture; 0 of a material without one.
+        levels: number of halvings of a texture; 0 for a material without one.
         texels: ``[T]`` display RGBA of all textures at every halved size.
-        starts: ``[M, L]`` first texel of a material's texture, halved so many times.
+        starts: ``[M, L]`` first texel of a material's texture, by number of halvings.
         widths: ``[M, L]`` texels.
         heights: ``[M, L]`` texels.
         linear: ``[256]`` linear light of display values.
@@ -117,7 +117,7 @@ def _to_linear(display: wp.float32):
 @wp.func
 @no_type_check
 def _texel(s: _Surface, start: wp.int64, width: wp.int32, height: wp.int32, x: int, y: int):
-    """One texel as linear RGBA, colour premultiplied; textures repeat."""
+    """Read one texel as linear RGBA, colour premultiplied; textures repeat."""
     column, row = x % width, y % height
     if column < 0:
         column += width
@@ -165,19 +165,19 @@ def _shade(
     colors_out: wp.array(dtype=wp.vec4),
     depths_out: wp.array(dtype=wp.float32),
 ):
-    """Puts the surface that each ray has hit behind what it has seen so far.
+    """Composite the hit of each ray behind the surfaces before it.
 
     Args:
         s: the mesh and its lights.
         spacing: distance between neighbouring rays at depth 1.
-        rays_in: numbers of the rays that have hit, as are their hits in the next arguments.
+        rays_in: numbers of the rays; the hit arguments are in the same order.
         directions_in: of all rays, at depth 1.
-        distances_in: from where the ray went on to the hit, infinite for a miss.
+        distances_in: from the last start of the ray to the hit, infinite for a miss.
         faces_in: faces that were hit.
         corners_in: barycentric weights of their second and third corner.
-        travelled_out: of all rays, depth that was reached; read, too.
-        colors_out: linear RGBA, colour premultiplied; read, too.
-        depths_out: depth where half of the light is blocked; read, too.
+        travelled_out: depth reached by all rays; also read.
+        colors_out: linear RGBA, colour premultiplied; also read.
+        depths_out: depth at which half of the light is blocked; also read.
     """
     hit = wp.tid()
     if not wp.isfinite(distances_in[hit]):
@@ -191,7 +191,7 @@ def _shade(
     first = 3 * face
     to_camera = -wp.normalize(directions_in[ray])
     normal = a * s.normals[first] + b * s.normals[first + 1] + c * s.normals[first + 2]
-    # Faces have two sides, and the normal is that of the side that the camera sees.
+    # Faces are two-sided; the normal is that of the side facing the camera.
     side = wp.dot(s.face_normals[face], to_camera)
     normal = wp.normalize(normal) * wp.where(side > 0.0, 1.0, wp.where(side < 0.0, -1.0, 0.0))
     material = s.materials[face]
@@ -225,7 +225,7 @@ def _shade(
 
 
 def _halvings(texture: np.ndarray | None) -> list[np.ndarray]:
-    """The texture at every halved size down to one texel; none without a texture."""
+    """Mipmaps of a texture down to one texel; empty without a texture."""
     if texture is None:
         return []
     chain = [np.ascontiguousarray(texture)]
@@ -237,14 +237,14 @@ def _halvings(texture: np.ndarray | None) -> list[np.ndarray]:
 
 
 def _directions(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """World directions ``[H W, 3]`` of unit depth, through columns ``x [W]`` and rows ``y [H]``."""
+    """World directions ``[H W, 3]`` of unit depth, for columns ``x [W]`` and rows ``y [H]``."""
     right, up, back = pose[:3, :3].T
     across = x[:, None] * right - back
     return (y[:, None, None] * up + across).astype(np.float32).reshape(-1, 3)
 
 
 class RayCaster:
-    """Pictures of one mesh under one light.
+    """Renderer of one mesh with fixed lights.
 
     Args:
         mesh: in object units, z-up, centred.
@@ -301,7 +301,7 @@ class RayCaster:
         self._surface = s
 
     def render(self, pose: np.ndarray, size: int, fov: float) -> tuple[np.ndarray, np.ndarray]:
-        """Renders one view.
+        """Render one view.
 
         Args:
             pose: ``[4, 4]`` camera to world, OpenGL frame.
@@ -310,8 +310,8 @@ class RayCaster:
 
         Returns:
             ``[size, size, 4]`` float32 display RGBA in [0, 1], colour not premultiplied; and
-            ``[size, size]`` float32 depth along the optical axis at the pixels' centres: of the
-            point where half the light is blocked, or 0 if there is none.
+            ``[size, size]`` float32 depth along the optical axis at the pixels' centres, of the
+            point where half the light is blocked; 0 without one.
         """
         n = size * SAMPLES
         half = math.tan(math.radians(fov) / 2)
@@ -334,7 +334,7 @@ class RayCaster:
         return picture, full_depth[SAMPLES // 2 :: SAMPLES, SAMPLES // 2 :: SAMPLES]
 
     def last_depth(self, pose: np.ndarray, size: int, fov: float) -> np.ndarray:
-        """Depth of the last surface that a ray meets, however transparent what it meets is.
+        """Depth of the last surface along each ray, ignoring transparency.
 
         Args:
             pose: as for ``render``, like ``size`` and ``fov``.
@@ -351,11 +351,11 @@ class RayCaster:
         far = max(0.0, float(-corners.min())) + 1.0  # behind all of the mesh
         rays = np.concatenate([origin + far * directions, -directions], 1).astype(np.float32)
         hits = self._scene.cast_rays(self._o3d.core.Tensor(rays), nthreads=self.threads)
-        depth = far - hits["t_hit"].numpy()  # what is behind the camera, or no hit, is below 0
+        depth = far - hits["t_hit"].numpy()  # negative behind the camera or without a hit
         return np.maximum(depth, 0).reshape(size, size).astype(np.float32)
 
     def _window(self, pose: np.ndarray, n: int, half: float) -> tuple[tuple, tuple]:
-        """Finds the ranges of sample rows and columns that the object can cover."""
+        """Find the ranges of sample rows and columns that the object can cover."""
         local = (self.mesh.vertices - pose[:3, 3]) @ pose[:3, :3]
         if (local[:, 2] > -1e-3).any():  # the camera is beside or inside the object
             return (0, n), (0, n)
@@ -369,7 +369,7 @@ class RayCaster:
     def _trace(
         self, origin: np.ndarray, directions: np.ndarray, spacing: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Traces rays to linear RGBA ``[P, 4]``, colour premultiplied, and depth ``[P]``.
+        """Trace rays to linear RGBA ``[P, 4]``, colour premultiplied, and depth ``[P]``.
 
         The directions must have unit depth.
         """
@@ -378,19 +378,19 @@ class RayCaster:
         depth = np.zeros(count, np.float32)
         travelled = np.zeros(count, np.float32)
         alive = np.arange(count, dtype=np.int32)
-        found = [_array(travelled, wp.float32), _array(color, wp.vec4), _array(depth, wp.float32)]
+        outputs = [_array(travelled, wp.float32), _array(color, wp.vec4), _array(depth, wp.float32)]
         rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], 1)
         for _ in range(LAYERS):
             hits = self._scene.cast_rays(self._o3d.core.Tensor(rays), nthreads=self.threads)
             parts = hits["t_hit"], hits["primitive_ids"], hits["primitive_uvs"]
             distances, faces, corners = (part.numpy() for part in parts)
-            seen = [
+            operands = [
                 *(_array(alive, wp.int32), _array(directions, wp.vec3)),
                 *(_array(distances, wp.float32), _array(faces, wp.uint32)),
                 _array(corners, wp.vec2),
             ]
-            inputs = [self._surface, spacing, *seen]
-            wp.launch(_shade, len(alive), inputs=inputs, outputs=found, device="cpu")
+            inputs = [self._surface, spacing, *operands]
+            wp.launch(_shade, len(alive), inputs=inputs, outputs=outputs, device="cpu")
             alive = alive[(color[alive, 3] < 1 - OPAQUE) & np.isfinite(travelled[alive])]
             if not len(alive):
                 break
@@ -401,6 +401,6 @@ class RayCaster:
 
 
 def _array(values: np.ndarray, dtype: Any) -> Any:
-    """Values as a Warp array, which shares their memory where they are of its type already."""
+    """Convert to a Warp array, which shares the memory if the type already matches."""
     kind = wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype))
     return wp.array(np.ascontiguousarray(values, kind), dtype=dtype, device="cpu", copy=False)

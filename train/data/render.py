@@ -1,8 +1,8 @@
-"""Mesh files to posed RGBA views, as ``gamba_warp.data.dataset`` reads them.
+"""Renders mesh files to posed RGBA views for ``gamba_warp.data.dataset``.
 
-The world of the views is z-up, the object's bounding box is centred in it, its longest side is 1.
-``applied_transform`` and ``applied_scale`` in ``transforms.json`` say how the file's points got
-there: ``x_world = applied_scale · (applied_transform · [x_file, 1])``.
+The world of the views is z-up; the object's bounding box is centred and its longest side is 1.
+``applied_transform`` and ``applied_scale`` in ``transforms.json`` map the file's points to it:
+``x_world = applied_scale · (applied_transform · [x_file, 1])``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Views:
         poses: ``[V, 4, 4]`` float64 camera to world, OpenGL frame, object units.
         K: ``[3, 3]`` float64, pixels, of all views.
         depths: ``[V, S, S]`` uint16 depth of the first surface, in steps of ``DEPTH_UNIT``, 0
-            where there is none; None where the settings ask for no depth.
+            without one; None unless the settings ask for depth.
         backs: as ``depths``, of the last surface.
         transform: ``[3, 4]``, from the file's points to the world before scaling.
         scale: object units per unit of the file.
@@ -70,17 +70,17 @@ class Views:
 def draw_views(
     model: TexturedMesh, uid: str, settings: Settings, rotation: ArrayLike | None = None
 ) -> Views:
-    """Renders the views of one object, a function of the arguments alone.
+    """Render the views of one object; deterministic in the arguments.
 
     Args:
         model: the object in the file's frame; ``settings.up`` is "y" or "z".
-        uid: name of the object, from which, with the settings' seed, cameras and lights are drawn.
+        uid: name of the object; with the settings' seed it seeds cameras and lights.
         settings: options of the pictures.
-        rotation: ``[3, 3]``, applied to the file's points first; None: none.
+        rotation: ``[3, 3]``, applied to the file's points first; None for none.
     """
     digest = hashlib.sha256(f"{settings.seed} {uid}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-    # From a source of its own, so that views without these changes stay what they were.
+    # A separate generator, so that views without these options stay the same.
     stretch, fov = settings.drawn(np.random.default_rng(int.from_bytes(digest[8:16], "big")))
     turn = np.diag(stretch) @ (np.eye(3) if rotation is None else np.asarray(rotation))
     model, transform, scale = model.normalized(settings.up, turn)
@@ -103,17 +103,17 @@ def draw_views(
 
 
 def _steps(depth: np.ndarray) -> np.ndarray:
-    """Depth in object units as the 16-bit steps of depth pictures."""
+    """Convert depth in object units to the 16-bit steps of depth pictures."""
     return np.clip(np.rint(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
 
 
 def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
-    """Renders one object into ``out/<uid>``, which appears only when complete.
+    """Render one object into ``out/<uid>``, which appears only when complete.
 
-    The same mesh, uid and settings give the same files, whatever else is rendered beside it.
+    The same mesh, uid and settings give the same files, independently of other objects.
 
     Returns:
-        What was missing in the mesh's files and replaced.
+        Warnings about missing parts of the mesh's files that were replaced.
 
     Raises:
         UserError: the mesh cannot be read, or the folder cannot be written.
@@ -162,7 +162,7 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
 def still_missing(
     meshes: Sequence[Mesh], out: Path, settings: Settings
 ) -> tuple[list[Mesh], dict[str, str]]:
-    """The objects that are not in the dataset ``out`` yet; and, by uid, those damaged there.
+    """Objects that the dataset ``out`` lacks, and by uid those that are damaged in it.
 
     Raises:
         UserError: an object in it was rendered with other settings.
@@ -179,19 +179,19 @@ def still_missing(
         except UserError as error:
             damaged[mesh.uid] = f"{error}; remove {path.parent} to render it again"
             continue
-        if stored is None or _UNNAMED | stored != vars(settings):
+        if stored is None or _DEFAULTS | stored != vars(settings):
             raise UserError(
                 f"{path}: was rendered with other settings ({stored}); choose another --out"
             )
     return missing, damaged
 
 
-# Sets that were made before these settings existed do not name them.
-_UNNAMED = {f.name: f.default for f in fields(Settings) if f.default is not MISSING}
+# Defaults of settings that older datasets do not name.
+_DEFAULTS = {f.name: f.default for f in fields(Settings) if f.default is not MISSING}
 
 
 class _Stored(msgspec.Struct):
-    """What a rendered object's ``transforms.json`` says of how it was made."""
+    """Settings and group in a rendered object's ``transforms.json``."""
 
     settings: dict[str, Any] | None = None
     group: str | None = None
@@ -204,19 +204,18 @@ def render_meshes(
     workers: int,
     groups: Mapping[str, str] | None = None,
 ) -> tuple[dict[str, list[str]], dict[str, str]]:
-    """Renders objects into a dataset, with a progress bar, and writes its split anew.
+    """Render objects into a dataset, with a progress bar, and rewrite its split.
 
     Args:
         meshes: the objects.
-        out: the dataset's folder, which is there.
-        settings: what decides the pixels.
+        out: the dataset's existing folder.
+        settings: options of the pictures.
         workers: processes; 0 means one per core.
-        groups: the groups of objects that are there already, by uid, where they are other ones
-            than when these were rendered; None: they are not.
+        groups: new groups of objects rendered earlier, by uid; None to keep the stored ones.
 
     Returns:
-        By uid, what was missing in the files of a mesh and replaced; and by uid, why an object
-        could not be rendered.
+        Warnings by uid, about missing parts of a mesh's files that were replaced; and failures by
+        uid.
     """
     warnings: dict[str, list[str]] = {}
     failures: dict[str, str] = {}
@@ -234,7 +233,7 @@ def render_meshes(
             warnings[mesh.uid] = result
     stored = {}
     for path in sorted(out.glob("[!.]*/transforms.json")):
-        with suppress(UserError):  # readers of the dataset say so, each time
+        with suppress(UserError):  # readers of the dataset report it
             stored[path.parent.name] = read_document(path, _Stored).group or path.parent.name
     changed = {uid: group for uid, group in (groups or {}).items() if uid in stored}
     write_split(out, stored | changed)
@@ -242,7 +241,7 @@ def render_meshes(
 
 
 def _attempt(mesh: Mesh, out: Path, settings: Settings, threads: int) -> list[str] | str:
-    """In a child process: the mesh's warnings, or the reason why it failed."""
+    """Render in a child process; return the mesh's warnings, or the reason of the failure."""
     quiet_warp()
     torch.set_num_threads(threads)
     try:

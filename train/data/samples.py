@@ -1,4 +1,4 @@
-"""One sample of the training: an input picture, and the pictures to match, with their cameras."""
+"""Training samples: an input picture, and the pictures to match, with their cameras."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MAX_GAMMA = 1.5  # colours become value^gamma, gamma between 1 / MAX_GAMMA and t
 
 @dataclass(frozen=True)
 class Change:
-    """What is done with the views of one sample.
+    """Augmentation of the views of one sample.
 
     Attributes:
-        mirror: whether left and right are exchanged.
-        channels: the order of the colour channels.
+        mirror: exchange left and right.
+        channels: order of the colour channels.
         gamma: exponent of the colours, > 0.
     """
 
@@ -34,24 +34,24 @@ class Change:
     gamma: float = 1.0
 
     def __call__(self, views: ObjectViews) -> ObjectViews:
-        """Returns the changed views."""
+        """Return the changed views."""
         if self.mirror:
             views = mirrored(views)
         if self.channels == (0, 1, 2) and self.gamma == 1.0:
-            return views  # most samples of most trainings
+            return views  # the most frequent case
         color = views.images[..., list(self.channels)] ** self.gamma
         return replace(views, images=torch.cat([color, views.images[..., 3:]], -1))
 
 
 def draw_change(rng: np.random.Generator, mirror: float, recolor: float) -> Change:
-    """Draws a change.
+    """Draw a change.
 
     Args:
-        rng: source of chance.
-        mirror: chance that the object is mirrored.
-        recolor: chance that its colours change.
+        rng: random generator.
+        mirror: probability that the object is mirrored.
+        recolor: probability that its colours change.
     """
-    # As many numbers whatever the chances, so that one does not change what the other draws.
+    # Always the same number of draws, so that one option does not affect the other.
     first, second, power = rng.random(3)
     order = rng.permutation(3)
     if second >= recolor:
@@ -61,7 +61,7 @@ def draw_change(rng: np.random.Generator, mirror: float, recolor: float) -> Chan
 
 
 def mirrored(views: ObjectViews) -> ObjectViews:
-    """The views of the object's mirror image: x of the world and of every picture turned round.
+    """Views of the object's mirror image: x of the world and of every picture is flipped.
 
     A point p at the pixel (x, y) becomes M p at (W - x, y), M = diag(-1, 1, 1): with the viewmat
     M R M, M t and the principal point W - cx. Both R and M R M are rotations.
@@ -88,7 +88,7 @@ class Batch:
         cameras: ``[B, V+1]``.
         background: ``[B, 1, 3]`` RGB that pictures are rendered and composited on.
         surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface behind each pixel of
-            the inputs, in the model's world, 0 where none is known; None: nobody asked for them.
+            the inputs, in the model's world, 0 where unknown; None unless requested.
     """
 
     uids: list[str]
@@ -100,26 +100,26 @@ class Batch:
     surfaces: Tensor | None = None
 
     def to(self, device: torch.device) -> Batch:
-        """Returns the same batch on a device; a GPU gets it beside other work if it is pinned."""
+        """Return the batch on a device; the copy to a GPU is asynchronous if it is pinned."""
         if device.type == "cpu":
             return self
         return _combined([self], lambda values: values[0].to(device, non_blocking=True))
 
     def pinned(self) -> Batch:
-        """Returns the same batch, its tensors on the CPU in page-locked memory.
+        """Return the batch with its CPU tensors in page-locked memory.
 
-        Only from there does a GPU copy while the host goes on.
+        Only such memory is copied to a GPU asynchronously.
         """
         return _combined([self], lambda v: v[0].pin_memory() if v[0].device.type == "cpu" else v[0])
 
 
 def join(samples: list[Batch]) -> Batch:
-    """Joins samples to one batch; all must have the same number of views."""
+    """Join samples to one batch; all must have the same number of views."""
     return _combined(samples, torch.cat)
 
 
 def _combined(parts: list[Any], make: Callable[[list[Tensor]], Tensor]) -> Any:
-    """What the parts are, each tensor in it made of those of all of them; lists are joined."""
+    """Combine parts of one type: tensors by ``make``, lists by concatenation."""
     first = parts[0]
     if isinstance(first, Tensor):
         return make(parts)
@@ -127,8 +127,8 @@ def _combined(parts: list[Any], make: Callable[[list[Tensor]], Tensor]) -> Any:
         return [item for part in parts for item in part]
     if not is_dataclass(first):
         return first
-    of = {f.name: [getattr(part, f.name) for part in parts] for f in fields(first)}
-    return type(first)(**{name: _combined(values, make) for name, values in of.items()})
+    by_name = {f.name: [getattr(part, f.name) for part in parts] for f in fields(first)}
+    return type(first)(**{name: _combined(values, make) for name, values in by_name.items()})
 
 
 def load_sample(
@@ -141,7 +141,7 @@ def load_sample(
     change: Change | None = None,
     surfaces: bool = False,
 ) -> Batch:
-    """Loads one object as a batch of one; ``views[0]`` is the input view.
+    """Load one object as a batch of one; ``views[0]`` is the input view.
 
     Poses are relative to the input view, at the model's distance (``model.posing``).
 
@@ -152,13 +152,13 @@ def load_sample(
         size: side of the pictures to match, pixels.
         config: the model's configuration.
         background: RGB ``[3]``.
-        change: what is done with the views first; None: nothing.
-        surfaces: whether those are loaded too, where the object has depth pictures.
+        change: augmentation of the views; None for none.
+        surfaces: also load them, if the object has depth pictures.
 
     Raises:
         UserError: the object cannot be read or its pictures are not square.
     """
-    depths = int(surfaces)  # of the input view alone
+    depths = int(surfaces)  # only of the input view
     target = dataset.load(index, views, size, depths)
     source = None
     if size != config.image_size:
@@ -190,13 +190,13 @@ def load_sample(
 def choose_views(
     count: int, novel: int, reference: int | None, rng: np.random.Generator
 ) -> list[int]:
-    """Chooses an input view and ``novel`` others, which repeat only if there are too few.
+    """Choose an input view and ``novel`` others, which repeat only if there are too few.
 
     Args:
         count: number of the object's views.
         novel: number of novel views, V.
         reference: the input view, or None for any.
-        rng: source of chance.
+        rng: random generator.
     """
     order = rng.permutation(count)
     first = int(order[0]) if reference is None else reference

@@ -1,4 +1,4 @@
-"""The settings of rendered views, which the commands show without loading anything else."""
+"""Settings of rendered views, importable by the commands without slow modules."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     import numpy as np
 
 Up = Literal["auto", "y", "z"]
-SPREAD = 0.2  # largest share by which a distance exceeds the least one, unless told
-# Fields of view of 20° to 70°, one for each object, evenly drawn by their logarithm.
+SPREAD = 0.2  # default of the largest share by which a distance exceeds the least one
+# Fields of view of 20° to 70°, one per object, log-uniform.
 VARIED_CAMERAS: dict[str, Any] = {"fov": 37.4, "fov_spread": 1.87, "spread": 0.3}
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the pixels; every ``transforms.json`` keeps it.
+    """Settings that determine the pixels; stored in every ``transforms.json``.
 
     Attributes:
         views: number of views of an object.
@@ -32,7 +32,7 @@ class Settings:
         format: format of the pictures; both are lossless.
         up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
         fronts: number of views from the front, the first ones.
-        spread: largest share by which a camera stands further away than it must.
+        spread: largest share by which a camera stands further away than necessary.
         stretch: stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
         fov_spread: draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
         light: varied makes the lights of the objects differ more.
@@ -54,7 +54,7 @@ class Settings:
     poses: tyro.conf.Suppress[Literal["drawn", "gso"]] = "drawn"
 
     def drawn(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-        """Draws the stretch along the file's axes ``[3]`` and the field of view of an object."""
+        """Draw the stretch along the file's axes ``[3]`` and the field of view of an object."""
         import numpy as np  # not at the top: `--help` of a command shows these fields
 
         stretch = np.exp(rng.uniform(-1, 1, 3) * np.log(self.stretch))

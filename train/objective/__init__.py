@@ -1,1 +1,1 @@
-"""What the training makes small: the paper's losses, and ours."""
+"""Training objective: the paper's losses, and ours."""

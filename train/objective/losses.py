@@ -1,6 +1,6 @@
-"""The training loss of the paper (eq. loss_train).
+"""Training loss of the paper (eq. loss_train).
 
-Every term has one value per view, ``[.., V]``; ``total_loss`` weighs and averages them.
+Every term has one value per view, ``[.., V]``; ``total_loss`` weights and averages them.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from gamba_warp.vision.weights import lpips_available
 from ..config import LossConfig, TrainConfig
 from .radial_mask import contour_distances, project_means, radial_mask_loss
 
-DEPTH_BEND = 0.02  # object units; see ``depth_loss``
+DEPTH_BETA = 0.02  # object units; see ``depth_loss``
 SLOPE_STEPS, SLOPE_WEIGHT = (1, 2, 4, 8), 1.0  # pixels; beside the distances
 
 
 def mse(got: Tensor, want: Tensor) -> Tensor:
-    """Averages the squared error over height, width, channels: ``[.., H, W, C]`` to ``[..]``."""
+    """Average the squared error over height, width, channels: ``[.., H, W, C]`` to ``[..]``."""
     return (got - want).square().mean((-3, -2, -1))
 
 
 def structure(got: Tensor, want: Tensor) -> Tensor:
-    """Computes 1 - SSIM, as ``image_metrics.ssim`` defines it, by ``kernels/ssim``.
+    """Compute 1 - SSIM, as defined by ``image_metrics.ssim``, with ``kernels/ssim``.
 
-    The gradient reaches ``got`` only, and has no gradient of its own.
+    Differentiable once, with respect to ``got`` only.
 
     Args:
         got: ``[.., H, W, C]``, H and W at least 11.
@@ -50,7 +50,7 @@ def structure(got: Tensor, want: Tensor) -> Tensor:
 
 
 class _Structure(torch.autograd.Function):
-    """``structure``, whose gradient is computed with its value.
+    """Autograd function of ``structure``; the forward pass also computes the slope.
 
     A picture's value depends on no other picture, so its gradient is a factor times its slope.
     """
@@ -58,7 +58,7 @@ class _Structure(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, got: Tensor, want: Tensor) -> Tensor:
         a, b = (x.reshape(-1, *got.shape[-3:]) for x in (got, want))
-        with float32_products():  # a variance is the small difference of two means of products
+        with float32_products():  # a variance is a small difference of two means of products
             values, slope = dissimilarity(a, b, ctx.needs_input_grad[0])
         if slope is not None:
             ctx.save_for_backward(slope.reshape(got.shape))
@@ -71,7 +71,7 @@ class _Structure(torch.autograd.Function):
 
 
 def rendered_psnr(got: Tensor, want: Tensor) -> Tensor:
-    """``psnr`` of rendered pictures, whose values are clamped to [0, 1] first.
+    """PSNR of rendered pictures, clamped to [0, 1] first.
 
     Args:
         got: ``[.., H, W, C]``, rendered.
@@ -84,61 +84,63 @@ def rendered_psnr(got: Tensor, want: Tensor) -> Tensor:
 
 
 def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Tensor) -> Tensor:
-    """How far the first layer of ``rays`` is from the first surface, and the last from the last.
+    """Depth error of the first layer of ``rays`` at the first surface, and of the last at the last.
 
-    A Gaussian is compared at the pixel that its centre falls on, by the distance along the optical
-    axis: quadratically up to ``DEPTH_BEND`` object units, and linearly beyond. So are the
-    differences between two pixels of a row or a column that lie ``SLOPE_STEPS`` apart: they tell
-    the form of a surface apart from its distance (after the gradient term of Ranftl et al. 2020,
+    A Gaussian is compared at the pixel of its projected centre, by the smooth L1 distance along the
+    optical axis: quadratic up to ``DEPTH_BETA`` object units, linear beyond. The same applies to
+    the differences between two pixels of a row or a column ``SLOPE_STEPS`` apart, which measure the
+    shape of a surface independently of its distance (after the gradient term of Ranftl et al. 2020,
     "Towards Robust Monocular Depth Estimation").
 
     Args:
-        gaussians: ``[B, N]``, as the decoder ``rays`` makes them: its layers lie side by side.
-        layers: number of these.
+        gaussians: ``[B, N]`` of the decoder ``rays``, with adjacent layers.
+        layers: number of layers.
         cameras: ``[B]`` of the inputs.
-        surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface, 0 where none is
-            known; pictures of the size that the cameras have.
+        surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface, 0 where unknown, at
+            the size of the cameras' pictures.
 
     Returns:
-        ``[B]``, over both layers the mean of the distances and ``SLOPE_WEIGHT`` times that of the
-        differences; 0 where no depth is known.
+        ``[B]``, the sum over both layers of the mean distance and ``SLOPE_WEIGHT`` times the mean
+        difference; 0 where no depth is known.
     """
     height, width = surfaces.shape[-2:]
-    places, depths = project_means(gaussians.means, cameras[:, None])
-    column, row = places[:, 0].detach().floor().long().unbind(-1)
+    positions, depths = project_means(gaussians.means, cameras[:, None])
+    column, row = positions[:, 0].detach().floor().long().unbind(-1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
     total = surfaces.new_zeros(len(surfaces))
     for layer, surface in zip((0, layers - 1), surfaces.flatten(2).unbind(1)):
-        of = (slice(None), slice(layer, None, layers))
-        true = surface.gather(1, pixel[of])
-        known = inside[of] & (gaussians.opacities[of] > 0) & (true > 0)
-        gaps = (depths[:, 0][of] - true) * known
-        total = total + _bent_mean(gaps, known)
+        members = (slice(None), slice(layer, None, layers))
+        true = surface.gather(1, pixel[members])
+        known = inside[members] & (gaussians.opacities[members] > 0) & (true > 0)
+        errors = (depths[:, 0][members] - true) * known
+        total = total + _smooth_l1_mean(errors, known)
         empty = torch.zeros_like(surface)
-        count = empty.scatter_add(1, pixel[of], known.to(gaps.dtype)).view(-1, height, width)
-        gap = empty.scatter_add(1, pixel[of], gaps).view(-1, height, width) / count.clamp_min(1)
-        seen = count > 0
+        count = empty.scatter_add(1, pixel[members], known.to(errors.dtype))
+        count = count.view(-1, height, width)
+        error = empty.scatter_add(1, pixel[members], errors).view(-1, height, width)
+        error = error / count.clamp_min(1)
+        valid = count > 0
         for step in SLOPE_STEPS:
             for axis in (1, 2):
-                rest = gap.shape[axis] - step
-                rises = gap.narrow(axis, step, rest) - gap.narrow(axis, 0, rest)
-                both = seen.narrow(axis, step, rest) & seen.narrow(axis, 0, rest)
+                rest = error.shape[axis] - step
+                slopes = error.narrow(axis, step, rest) - error.narrow(axis, 0, rest)
+                both = valid.narrow(axis, step, rest) & valid.narrow(axis, 0, rest)
                 share = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
-                total = total + share * _bent_mean(rises, both)
+                total = total + share * _smooth_l1_mean(slopes, both)
     return total
 
 
-def _bent_mean(gaps: Tensor, known: Tensor) -> Tensor:
-    """The mean of the known errors, quadratic up to ``DEPTH_BEND``: ``[B, ..]`` to ``[B]``."""
-    bent = smooth_l1_loss(gaps, torch.zeros_like(gaps), beta=DEPTH_BEND, reduction="none")
-    return (bent * known).flatten(1).sum(1) / known.flatten(1).sum(1).clamp_min(1)
+def _smooth_l1_mean(errors: Tensor, known: Tensor) -> Tensor:
+    """Mean smooth L1 of the known errors, with beta ``DEPTH_BETA``: ``[B, ..]`` to ``[B]``."""
+    losses = smooth_l1_loss(errors, torch.zeros_like(errors), beta=DEPTH_BETA, reduction="none")
+    return (losses * known).flatten(1).sum(1) / known.flatten(1).sum(1).clamp_min(1)
 
 
 def random_crops(got: Tensor, want: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """The same random square of the same random view of each object, from both.
+    """Crop the same random square of the same random view of each object from both.
 
-    Chance is torch's own, whose state a checkpoint holds.
+    Uses torch's global generator, whose state is in the checkpoints.
 
     Args:
         got: ``[B, V, H, W, C]``.
@@ -150,29 +152,29 @@ def random_crops(got: Tensor, want: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """
     batch, views, height, width = got.shape[:4]
     limits = torch.tensor([views, height - size + 1, width - size + 1])
-    places = (torch.rand(batch, 3) * limits).long().tolist()
+    origins = (torch.rand(batch, 3) * limits).long().tolist()
     crops = [
-        torch.stack([p[i, v, y : y + size, x : x + size] for i, (v, y, x) in enumerate(places)])
+        torch.stack([p[i, v, y : y + size, x : x + size] for i, (v, y, x) in enumerate(origins)])
         for p in (got, want)
     ]
     return crops[0], crops[1]
 
 
-class Seen(NamedTuple):
-    """What the terms of a batch are computed from.
+class LossInputs(NamedTuple):
+    """Inputs of the loss terms of a batch.
 
     Attributes:
         rgb: ``[B, V+1, H, W, 3]``, rendered on the background of ``target``; the input view first.
         alpha: ``[B, V+1, H, W, 1]``, rendered.
         target: as ``rgb``, true.
         target_alpha: as ``alpha``, true.
-        lpips: ``(got, want) -> [..]``; None leaves this term out.
-        lpips_crop: if not 0, side of the square that it sees, of one view of each object; see
+        lpips: ``(got, want) -> [..]``; None omits this term.
+        lpips_crop: if not 0, side of the square that LPIPS compares in one view of each object; see
             ``random_crops``.
         gaussians: predicted, ``[B]``.
         cameras: ``[B, V+1]``.
         input_cameras: ``[B]``.
-        surfaces: as for ``depth_loss``; None leaves this term out.
+        surfaces: as for ``depth_loss``; None omits this term.
         config: of the model.
     """
 
@@ -189,20 +191,20 @@ class Seen(NamedTuple):
     config: Any = None
 
     def compared(self) -> tuple[Tensor, Tensor]:
-        """The pictures that LPIPS compares, rendered and true; each call draws other crops."""
+        """Return the rendered and true pictures for LPIPS; each call draws new crops."""
         pair = self.rgb, self.target
         return random_crops(*pair, self.lpips_crop) if self.lpips_crop else pair
 
 
-class Moment(NamedTuple):
-    """Where a run stands.
+class Progress(NamedTuple):
+    """Progress of a run.
 
     Attributes:
         step: optimizer steps done.
         epochs: the same in passes over the objects.
         done: share of the run that is done, 0 to 1.
-        validates: whether it is asked for a validation, whose weights are the same all along:
-            LPIPS from the start, neither the radial mask constraint nor depth.
+        validates: True for a validation, whose weights are constant: LPIPS from the start, neither
+            the radial mask constraint nor depth.
     """
 
     step: int
@@ -212,26 +214,26 @@ class Moment(NamedTuple):
 
 
 class Term(NamedTuple):
-    """A term of the loss.
+    """Term of the loss.
 
     Attributes:
-        weight: by the options, at a moment.
-        value: ``[B, V+1]``, or ``[B]`` where it is not of views; None where it cannot be computed.
-        mark: its name in a profile.
-        always: whether it is computed at weight 0, too, for the log.
+        weight: by the options and the progress.
+        value: ``[B, V+1]``, or ``[B]`` if not per view; None if it cannot be computed.
+        label: its name in a profile.
+        always: also compute it at weight 0, for the log.
     """
 
-    weight: Callable[[LossConfig, Moment], float]
-    value: Callable[[Seen], Tensor | None]
-    mark: str
+    weight: Callable[[LossConfig, Progress], float]
+    value: Callable[[LossInputs], Tensor | None]
+    label: str
     always: bool = False
 
 
-def radial_weight(loss: LossConfig, at: Moment) -> float:
-    """Returns the radial mask constraint's weight, which falls linearly to 0.
+def radial_weight(loss: LossConfig, at: Progress) -> float:
+    """Return the radial mask constraint's weight, which falls linearly to 0.
 
-    It falls over ``rdist_steps``, or else over ``rdist_epochs``, but in ``rdist_share`` of the run
-    at most; 0 without the constraint, and in a validation.
+    It falls over ``rdist_steps``, or else over ``rdist_epochs``, but over ``rdist_share`` of the
+    run at most; 0 without the constraint, and in a validation.
     """
     spans = [(at.epochs, loss.rdist_epochs), (at.done, loss.rdist_share)]
     if loss.rdist_steps is not None:
@@ -240,7 +242,7 @@ def radial_weight(loss: LossConfig, at: Moment) -> float:
     return loss.rdist_weight * max(0.0, left) if loss.radial_mask and not at.validates else 0.0
 
 
-# In the order in which they are added up. A new term is one entry here, and its weight an option.
+# In the order of summation. A new term is one entry here, and its weight an option.
 TERMS: dict[str, Term] = {
     "rgb": Term(lambda loss, at: 1.0, lambda s: mse(s.rgb, s.target), "MSE and mask", True),
     "mask": Term(
@@ -274,26 +276,26 @@ TERMS: dict[str, Term] = {
 }
 
 
-def term_weights(loss: LossConfig, at: Moment) -> dict[str, float]:
-    """Returns the weight of each of ``TERMS``, and as ``novel`` that of the novel views."""
+def term_weights(loss: LossConfig, at: Progress) -> dict[str, float]:
+    """Return the weight of each of ``TERMS``, and as ``novel`` that of the novel views."""
     weights = {name: term.weight(loss, at) for name, term in TERMS.items()}
     return weights | {"novel": loss.novel_weight}
 
 
-def loss_terms(seen: Seen, weights: Mapping[str, float]) -> dict[str, Tensor]:
-    """Computes the terms whose weight is not 0, and those that are always computed."""
+def loss_terms(inputs: LossInputs, weights: Mapping[str, float]) -> dict[str, Tensor]:
+    """Compute the terms with a nonzero weight, and those that are always computed."""
     found = {}
     for name, term in TERMS.items():
         if term.always or weights.get(name):
-            with record_function(term.mark):
-                value = term.value(seen)
+            with record_function(term.label):
+                value = term.value(inputs)
             if value is not None:
                 found[name] = value
     return found
 
 
 def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Sums the weighted terms, averaged over all views and objects, to a scalar.
+    """Sum the weighted terms, averaged over all views and objects, to a scalar.
 
     Raises:
         KeyError: a term has no weight.
@@ -301,7 +303,7 @@ def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Ten
     return torch.stack([weights[name] * term.mean() for name, term in terms.items()]).sum()
 
 
-# From docs/train-your-own.md, which has the command.
+# Measured in docs/train-your-own.md, with the command.
 COST = (
     "LPIPS of whole pictures makes a step on a CPU 5 to 15 times as long: --lpips off leaves "
     "it out, --lpips-crop 64 compares a part"
@@ -309,11 +311,11 @@ COST = (
 
 
 def open_lpips(config: TrainConfig, device: str) -> tuple[LPIPS | None, str | None]:
-    """Loads LPIPS as ``--lpips`` says; the second value tells the user what "auto" came to.
+    """Load LPIPS according to ``--lpips``; also return a note about "auto" for the user.
 
     Args:
         config: of the run.
-        device: type of the device that trains, ``cpu`` or ``cuda``.
+        device: type of the training device, ``cpu`` or ``cuda``.
 
     Raises:
         UserError: ``--lpips on`` was given and the weights are missing.

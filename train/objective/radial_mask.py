@@ -1,9 +1,9 @@
-"""The radial mask constraint (paper eq. radial_mask): Gaussians stay inside the silhouettes.
+"""Radial mask constraint (paper eq. radial_mask): Gaussians stay inside the silhouettes.
 
 A mask becomes U distances, one per ray, from the image centre to the outermost contour. A Gaussian
 whose projected centre lies farther out than the contour at its angle is pulled back.
 
-Distances are in units of half the image's height, so the loss is the same at every picture size.
+Distances are in units of half the image height, so the loss is independent of the picture size.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _STEP = 0.5  # pixels between two samples along a ray
 
 
 def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -> Tensor:
-    """Finds the distance from the image centre to the outermost contour along each ray.
+    """Find the distance from the image centre to the outermost contour along each ray.
 
-    Ray k has the angle 2πk/U, from +x (right) towards +y (down). The contour is where the
-    bilinearly interpolated mask passes ``threshold``; outside the picture the mask is 0.
+    Ray k has the angle 2πk/U, from +x (right) towards +y (down). At the contour the bilinearly
+    interpolated mask crosses ``threshold``; outside the picture the mask is 0.
 
     Args:
         masks: ``[.., H, W]`` in [0, 1].
@@ -54,12 +54,12 @@ def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -
 
 
 def _pair(x: float, y: float, like: Tensor) -> Tensor:
-    """Two numbers as a tensor; a GPU fills it in, where a copy of a list would be waited for."""
+    """Two numbers as a tensor, without the synchronizing copy of a list to a GPU."""
     return torch.stack([like.new_full((), x), like.new_full((), y)])
 
 
 def project_means(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Projects every centre into every view, as a pinhole camera does.
+    """Project every centre into every view with a pinhole camera.
 
     Args:
         means: ``[.., N, 3]``.
@@ -80,12 +80,12 @@ def project_means(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def radial_mask_loss(means: Tensor, cameras: Cameras, contours: Tensor) -> Tensor:
-    """Averages (d_j - contour)² over all N Gaussians; those inside the contour count 0.
+    """Average (d_j - contour)² over all N Gaussians; those inside the contour count 0.
 
     d_j is the distance of the projected centre from the image centre. The contour's distance is
     interpolated linearly in angle between the two nearest rays (paper eq. radial_mask). A centre
     behind the camera counts 0, and so does every centre in a view with an empty mask. The mean is
-    over all Gaussians, so the pull on one does not depend on how many others are outside.
+    over all Gaussians, so the pull on one does not depend on the number of others outside.
 
     Args:
         means: ``[.., N, 3]``, object units.
@@ -98,18 +98,18 @@ def radial_mask_loss(means: Tensor, cameras: Cameras, contours: Tensor) -> Tenso
     positions, depths = project_means(means, cameras)
     centre = _pair(cameras.width / 2, cameras.height / 2, positions)
     offsets = (positions - centre) / (cameras.height / 2)
-    # Square root and angle have no gradient at 0, where the loss is 0 in any case.
+    # Square root and angle have no gradient at 0, where the loss is 0 anyway.
     usable = (depths > NEAR) & (offsets.square().sum(-1) > 1e-12)
     offsets = torch.where(usable[..., None], offsets, _pair(1.0, 0.0, offsets))
     x, y = offsets.unbind(-1)
     distances = (x * x + y * y).sqrt()
 
     rays = contours.shape[-1]
-    turns = torch.atan2(y, x) / (2 * math.pi) * rays
-    below = turns.detach().floor()
+    angles = torch.atan2(y, x) / (2 * math.pi) * rays  # in units of rays
+    below = angles.detach().floor()
     index = below.long()
     contour = torch.lerp(
-        contours.gather(-1, index % rays), contours.gather(-1, (index + 1) % rays), turns - below
+        contours.gather(-1, index % rays), contours.gather(-1, (index + 1) % rays), angles - below
     )
-    wrong = usable & (distances > contour) & (contours.amax(-1, keepdim=True) > 0)
-    return torch.where(wrong, distances - contour, 0.0).square().mean(-1)
+    outside = usable & (distances > contour) & (contours.amax(-1, keepdim=True) > 0)
+    return torch.where(outside, distances - contour, 0.0).square().mean(-1)

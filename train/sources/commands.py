@@ -1,7 +1,7 @@
-"""The commands that make data: ``gamba data furniture``, ``made``, ``render`` and the others.
+"""Commands ``gamba data furniture``, ``made``, ``render`` and the others.
 
-They parse, call and print. What is there already is skipped, so a command that was stopped goes on;
-what fails is told on stderr, and the exit code is then 1.
+They parse, call and print. Existing results are skipped, so a stopped command can be continued.
+Failures are printed to stderr, and the exit code is then 1.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from .objaverse_lists import Lists
 
 Item = TypeVar("Item")
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-# What an empty part of a set's split means.
+# Consequence of an empty part of a split.
 _WITHOUT = {
     "train": "there is nothing to train on",
     "val": "training does not validate",
     "test": "eval-views needs --split",
 }
-_SHOWN = 20  # objects of Objaverse that are told one by one; the record has all
+_MAX_SHOWN = 20  # failures of Objaverse that are printed; the record has all
 
 
 @dataclass(frozen=True)
 class Share:
-    """Which of the objects a command works on.
+    """Selection of objects for a command.
 
     Attributes:
         shard: i/n takes every n-th object from the i-th, for n machines.
@@ -50,10 +50,10 @@ class Share:
 
     @property
     def numbers(self) -> tuple[int, int]:
-        """I and n.
+        """Numbers i and n of the shard.
 
         Raises:
-            UserError: the shard is not of the form i/n, or not 0 <= i < n.
+            UserError: the shard is not of the form i/n with 0 <= i < n.
         """
         match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", self.shard)
         if not match or not int(match[1]) < int(match[2]):
@@ -61,13 +61,13 @@ class Share:
         return int(match[1]), int(match[2])
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Those of the items."""
+        """Select from the items."""
         first, count = self.numbers
         return items[first::count][: self.limit]
 
 
-def _told(failures: Mapping[str, str], what: str, warnings: Mapping[str, list[str]]) -> int:
-    """Says what failed and what was missing; returns the exit code."""
+def _report(failures: Mapping[str, str], what: str, warnings: Mapping[str, list[str]]) -> int:
+    """Print failures and warnings; return the exit code."""
     for name, lines in sorted(warnings.items()):
         print(f"warning: {name}: {'; '.join(lines)}")
     for name, reason in sorted(failures.items()):
@@ -75,11 +75,11 @@ def _told(failures: Mapping[str, str], what: str, warnings: Mapping[str, list[st
     return 1 if failures else 0
 
 
-def _tell_empty(data: Path) -> None:
-    """Says in one line which parts of the split of a set, of some objects, hold none of them."""
+def _report_empty_splits(data: Path) -> None:
+    """Print one line about the empty parts of a dataset's split, if any."""
     from gamba_warp.data.dataset import open_dataset, splits_of
 
-    with suppress(UserError):  # no object is there, or what is wrong is said where it is read
+    with suppress(UserError):  # an empty or damaged dataset is reported by its readers
         there = {*splits_of(data, open_dataset(data).uids).values()}
         empty = [name for name in _WITHOUT if name not in there]
         if empty:
@@ -90,12 +90,12 @@ def _tell_empty(data: Path) -> None:
 def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None = None) -> int:
     """Get 820 free textured models with icons: Sweet Home 3D's libraries, from Debian's package.
 
-    Without --deb or --tree: an installed package is used, else apt-get downloads it (125 MB).
+    Without --deb or --tree the installed package is used, else apt-get downloads it (125 MB).
 
     Args:
         out: folder for the models, their icons and catalogue.json; 400 MB.
-        deb: the package file sweethome3d-furniture_*.deb, if you have it.
-        tree: a folder that holds the .sh3f files, if you have them.
+        deb: package file sweethome3d-furniture_*.deb, if you have it.
+        tree: folder with the .sh3f files, if you have them.
     """
     from ..data.furniture import get_furniture
 
@@ -108,9 +108,9 @@ def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None 
 def data_made_command(
     out: Out, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
 ) -> int:
-    """Make toys, animals, shoes, tools, packages, furniture, free of anybody's rights (.glb).
+    """Make toys, animals, shoes, tools, packages, furniture, free of copyright (.glb).
 
-    An object depends on the seed and its number alone; those that are there already are kept.
+    An object depends only on the seed and its number; existing ones are kept.
 
     Args:
         out: folder for the models and catalogue.json.
@@ -135,14 +135,14 @@ def data_render_command(
 ) -> int:
     """Render posed RGBA views of every mesh in a folder (.obj .glb .gltf .ply .stl .off).
 
-    Objects that are already there are skipped, so a run that was stopped goes on where it was.
+    Existing objects are skipped, so a stopped command can be continued.
 
     Args:
-        folder: meshes, at any depth; a catalogue.json in it may give names and attribution.
-        out: the dataset to make or to go on with.
-        settings: how they are rendered.
-        share: which of them.
-        split: render only the objects that lie in this part of the set.
+        folder: folder of meshes, at any depth; its catalogue.json may give names and attribution.
+        out: the dataset to make or to continue.
+        settings: options of the pictures.
+        share: selection of objects.
+        split: render only the objects of this part of the set.
         workers: number of processes; 0 means one per core.
     """
     from gamba_warp.data.dataset import split_of
@@ -162,10 +162,10 @@ def data_render_command(
         print(f"{done} of {counted(len(meshes), 'object')} already in {out}")
     warnings, failures = render_meshes(todo, out, settings, workers, groups)
     rendered, failures = len(todo) - len(failures), failures | damaged
-    code = _told(failures, "failed", warnings)
+    code = _report(failures, "failed", warnings)
     print(f"rendered {counted(rendered, 'object')} into {out}, {len(failures)} failed")
     if split == "all":
-        _tell_empty(out)
+        _report_empty_splits(out)
     return code
 
 
@@ -182,16 +182,16 @@ def data_pack_command(
 ) -> int:
     """Decode the views of a dataset once, and write them into a few large files.
 
-    Every command that takes a dataset takes the pack. Its views at SIZE are those of the files, to
-    the bit; larger ones are enlarged. A command that was stopped goes on with the next shard.
+    Every command that takes a dataset also takes the pack. Its views at SIZE are bit-identical to
+    those of the files; larger ones are enlarged. A stopped command continues with the next shard.
 
     Args:
         data: the dataset.
-        out: folder of the pack to make or to go on with.
+        out: folder of the pack to make or to continue.
         size: height of the pictures, pixels; None keeps that of the files.
         split: pack only the objects of this part of the set.
-        format: arrays that are mapped into memory, or WebDataset's .tar files of the same arrays.
-        shard_mb: a file ends with the object that passes this size, megabytes.
+        format: memory-mapped arrays, or WebDataset's .tar files of the same arrays.
+        shard_mb: a file ends with the object that exceeds this size, megabytes.
         limit: stop after this many objects.
         workers: number of threads that decode; 0 means one per core.
     """
@@ -203,14 +203,14 @@ def data_pack_command(
     settings = PackSettings(size, split, format, shard_mb << 20)
     done = write_pack(data, out, settings, workers or cores(), limit)
     if done.there:
-        print(f"{counted(done.there, 'object')} in {out} already")
+        print(f"{counted(done.there, 'object')} already in {out}")
     made = f"packed {counted(done.written, 'object')} into {out}, {counted(done.shards, 'shard')}"
     print(f"{made}, {len(done.failures)} failed")
     if split == "all":
-        _tell_empty(out)
+        _report_empty_splits(out)
     if note := background_note(open_dataset(out)):
         print(f"warning: {data}: {note}", file=sys.stderr)
-    return _told(done.failures, "failed", {})
+    return _report(done.failures, "failed", {})
 
 
 @ranged
@@ -226,19 +226,19 @@ def data_objaverse_command(
 ) -> int:
     """Make a dataset of a local copy of G-Objaverse, or download Objaverse's meshes.
 
-    Folders are linked, tars unpacked as far as training needs them. What is there is skipped, so a
-    run that was stopped goes on. OUT/objaverse.json records the choice. docs/datasets.md has the
-    commands for the paper's training set.
+    Folders are linked; of tars only the files for training are unpacked. Existing objects are
+    skipped, so a stopped command can be continued. OUT/objaverse.json records the choice.
+    docs/datasets.md has the commands for the paper's training set.
 
     Args:
-        out: folder to make or to go on with.
+        out: folder to make or to continue.
         source: folder of G-Objaverse (folders or tars); or "objaverse": meshes by that package.
-        lists: which objects.
-        share: which of them.
+        lists: lists of objects.
+        share: selection of these objects.
         min_views: complete views that an object of G-Objaverse must have; published are 40.
-        copy: copy the files of folders in place of linking them.
-        depth: also make depth pictures of the _nd.exr files; needs the package OpenEXR.
-        workers: downloads at once.
+        copy: copy the files of folders instead of linking them.
+        depth: also make depth pictures from the _nd.exr files; needs the package OpenEXR.
+        workers: number of parallel downloads.
     """
     from .objaverse_meshes import PACKAGE, load_package, take_meshes
     from .objaverse_views import check_package, find_rendered, take_views
@@ -265,14 +265,14 @@ def data_objaverse_command(
     about = {"source": source, "counts": chosen.counts, "shard": share.shard, "objects": len(names)}
     write_json(record, about | {"objaverse": known, "left_out": failures})
     there = len(names) - taken - len(failures)
-    found = f"{there:,} were there, {len(failures):,} left out"
+    found = f"{there:,} existed, {len(failures):,} left out"
     print(f"{counted(taken, 'object')} put into {out}, {found}")
-    for name, reason in list(failures.items())[:_SHOWN]:
+    for name, reason in list(failures.items())[:_MAX_SHOWN]:
         print(f"left out: {name}: {reason}", file=sys.stderr)
-    if (rest := len(failures) - _SHOWN) > 0:
+    if (rest := len(failures) - _MAX_SHOWN) > 0:
         print(f"left out: {rest:,} more, see {record}", file=sys.stderr)
     if not meshes:
-        _tell_empty(out)
+        _report_empty_splits(out)
     following = "gamba data render {} --size 512 --out DATA" if meshes else "gamba train {} ..."
     print(f"next: {following.format(out)}")
     return 1 if failures else 0
@@ -287,19 +287,19 @@ def data_gso_command(
     size: Annotated[int, Meta(ge=8, le=4096)] = 512,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
 ) -> int:
-    """Make the evaluation "gso" of a copy of Google Scanned Objects: 60 objects, 24 views of each.
+    """Make the evaluation "gso" from a copy of Google Scanned Objects: 60 objects, 24 views each.
 
-    Writes OUT/views (a dataset, all of it the test split; view 0 is the input) and, of the set's
-    own layout, OUT/meshes. What is there is skipped, so a run that was stopped goes on. Objects
-    that SOURCE has and those that it lacks are named; where it lacks some the exit code is 1.
+    Writes OUT/views (a dataset, all of it the test split; view 0 is the input) and, for the set's
+    own layout, OUT/meshes. Existing objects are skipped, so a stopped command can be continued.
+    Found and missing objects are listed; if any are missing, the exit code is 1.
 
     Args:
-        out: folder to make or to go on with.
-        source: folder of the set: a folder or a zip of each model, as the Fuel server gives them;
+        out: folder to make or to continue.
+        source: folder of the set, with a folder or a zip of each model as the Fuel server has them;
             or meshes with the set's names in any other layout, such as NAME.glb.
-        up: the axis that points up in files of another layout; auto: y for .glb and .gltf, and
-            others have to be told. Those of the Fuel server have z.
-        share: which of them.
+        up: the axis that points up in files of another layout; auto: y for .glb and .gltf, required
+            for other formats. Those of the Fuel server have z.
+        share: selection of objects.
         size: pixels a side; the evaluation's are 512.
         workers: number of processes that render; 0 means one per core.
     """
@@ -321,13 +321,13 @@ def data_gso_command(
         failures = take_models(source, out, names)
         meshes = taken(out, names)
     failures = {name: why for name, why in failures.items() if name not in {m.uid for m in meshes}}
-    print(f"{len(meshes)} of {len(names)} are there: {', '.join(mesh.uid for mesh in meshes)}")
+    print(f"{len(meshes)} of {len(names)} found: {', '.join(mesh.uid for mesh in meshes)}")
     if others := others_of(source):
-        left = f"{counted(others, 'other object')} of the set, not of the evaluation"
+        left = f"{counted(others, 'other object')} of the set outside the evaluation"
         print(f"{left}: gamba data render {source} --out DATA")
     made, warnings, failed = make_views(out, meshes, size, workers, up)
     failures |= failed
-    code = _told(failures, "missing", warnings)
+    code = _report(failures, "missing", warnings)
     views, missing = out / "views", f"{len(failures)} of {len(names)} missing"
     print(f"rendered {counted(made, 'object')} into {views}, {missing}")
     print(f"next: gamba eval-views --protocol gso --checkpoint MODEL --data {views} --out EVAL")

@@ -1,9 +1,9 @@
-"""The evaluation ``gso``: models taken from a copy of Google Scanned Objects, then rendered.
+"""Evaluation ``gso``: models from a copy of Google Scanned Objects, and their renderings.
 
-A model is a folder ``<Name>/``, or its zip as the Fuel server gives it, with ``meshes/model.obj``
-and ``model.mtl``, ``materials/textures/texture.png``, ``metadata.pbtxt`` and ``thumbnails/``. The
-``.mtl`` names its texture as if it lay beside it. So mesh, materials and textures are put into one
-folder, where every reader finds them.
+A model is a folder ``<Name>/``, or its zip from the Fuel server, with ``meshes/model.obj`` and
+``model.mtl``, ``materials/textures/texture.png``, ``metadata.pbtxt`` and ``thumbnails/``. The
+``.mtl`` refers to the texture as if it lay beside it, so mesh, materials and textures are put into
+one folder, where every reader finds them.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from ..data.settings import Settings, Up
 
 MESH = "meshes/model.obj"
 METADATA = "metadata.pbtxt"
-_FOLDERS = ("meshes", "materials/textures")  # what is taken of a model
+_FOLDERS = ("meshes", "materials/textures")  # folders of a model that are read
 _SUFFIXES = (".obj", ".mtl", ".png", ".jpg", ".jpeg")
-_TEXT = 1 << 20  # bytes of the metadata, which have 1 kB
+_MAX_METADATA = 1 << 20  # bytes; published ones have 1 kB
 _ATTRIBUTION = {
     "creator": "Google",
     "licence": "Creative Commons Attribution 4.0 International",
@@ -40,25 +40,25 @@ _ATTRIBUTION = {
 
 
 def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Path]:
-    """The models of these names in a local copy of the set, as folders or as zips.
+    """Find models in a local copy of the set, as folders or as zips.
 
     Args:
-        source: folder of the set; the models lie right in it or in ``models/``.
-        names: which are looked for.
+        source: folder of the set; the models lie in it or in ``models/``.
+        names: names of the models.
 
     Returns:
-        A folder or zip by name; a name that is not there is left out.
+        A folder or zip by name; missing names are left out.
 
     Raises:
-        UserError: no such folder, or none of the models is in it.
+        UserError: the folder does not exist, or contains none of the models.
     """
     if not source.is_dir():
         raise UserError(f"--source {source}: no such folder")
     found = {}
     for name in names:
-        places = [folder / f"{name}{end}" for folder in (source, source / "models")
-                  for end in ("", ".zip")]  # fmt: skip
-        path = next((p for p in places if (p / MESH).is_file() or p.suffix and p.is_file()), None)
+        paths = [folder / f"{name}{end}" for folder in (source, source / "models")
+                 for end in ("", ".zip")]  # fmt: skip
+        path = next((p for p in paths if (p / MESH).is_file() or p.suffix and p.is_file()), None)
         if path is not None:
             found[name] = path
     if not found:
@@ -70,14 +70,14 @@ def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Pat
 
 
 def find_meshes_of(source: Path, names: Sequence[str]) -> list[Mesh]:
-    """The meshes of these names in a folder that has not the set's own layout.
+    """Find meshes by name in a folder of another layout than the set's own.
 
     Args:
-        source: the folder; ``find_meshes`` names what is in it.
-        names: which are looked for.
+        source: the folder, read by ``find_meshes``.
+        names: names of the meshes.
 
     Returns:
-        Empty where the folder has the set's own layout, or none of them.
+        The meshes; empty if the folder has the set's own layout, or none of them.
     """
     with suppress(UserError):
         find_models(source, names)
@@ -88,7 +88,7 @@ def find_meshes_of(source: Path, names: Sequence[str]) -> list[Mesh]:
 
 
 def others_of(source: Path) -> int:
-    """Number of the set's models in a folder that are not of the evaluation."""
+    """Number of the set's models in a folder that are outside the evaluation."""
     others = sorted(gso.all_names() - {*gso.NAMES})
     with suppress(UserError):
         return len(find_models(source, others))
@@ -96,27 +96,27 @@ def others_of(source: Path) -> int:
 
 
 def up_of(meshes: Sequence[Mesh], up: Up) -> Up:
-    """The axis that points up in meshes that have not the set's own layout.
+    """Return the axis that points up in meshes of another layout than the set's own.
 
     Args:
         meshes: their files.
-        up: what was asked for; auto where the format has to tell.
+        up: the requested axis; auto takes it from the format.
 
     Raises:
-        UserError: it does not, because only glTF has an axis of its own; .obj files of the set have
-            z up where others have y.
+        UserError: the format does not define it; only glTF does. .obj files of the set have z up,
+            others y.
     """
     for mesh in meshes:
         if up == "auto" and mesh.path.suffix.lower() not in (".glb", ".gltf"):
-            raise UserError(f"{mesh.path}: may have y or z up; say which, with --up y or --up z")
+            raise UserError(f"{mesh.path}: may have y or z up; choose with --up y or --up z")
     return "y" if up == "auto" else up
 
 
 def take_model(name: str, path: Path, out: Path) -> None:
-    """Puts mesh, materials and textures of a model into ``out/<name>``, whole or not at all.
+    """Copy mesh, materials and textures of a model into ``out/<name>``, atomically.
 
     Args:
-        name: of the model.
+        name: name of the model.
         path: its folder, or its zip.
         out: folder of the models.
 
@@ -124,47 +124,47 @@ def take_model(name: str, path: Path, out: Path) -> None:
         UserError: it is damaged, lacks its mesh, or two different files would have one name.
     """
     with atomic_folder(out / name) as part:
-        for place, data in _files(path):
-            target = inside(part, PurePosixPath(place).name, str(path))
+        for member, data in _files(path):
+            target = inside(part, PurePosixPath(member).name, str(path))
             if target.exists() and target.read_bytes() != data:
                 raise UserError(f"{path}: two files are called {target.name!r}")
             target.write_bytes(data)
         if not (part / "model.obj").is_file():
-            raise UserError(f"{path}: holds no {MESH}")
+            raise UserError(f"{path}: {MESH} is missing")
 
 
 def _files(path: Path) -> Iterator[tuple[str, bytes]]:
-    """What is taken of a model: the place of each file in it, and its bytes."""
+    """Yield the files of a model that are copied: relative path and bytes."""
     if path.is_dir():
         found = [p for f in _FOLDERS if (path / f).is_dir() for p in sorted((path / f).iterdir())]
-        places = [p.relative_to(path).as_posix() for p in found]
-        places += [METADATA] if (path / METADATA).is_file() else []
-        for place in filter(_most, places):
-            yield place, read_bytes(inside(path, place, str(path)), _most(place))
+        members = [p.relative_to(path).as_posix() for p in found]
+        members += [METADATA] if (path / METADATA).is_file() else []
+        for member in filter(_max_size, members):
+            yield member, read_bytes(inside(path, member, str(path)), _max_size(member))
         return
     with open_zip(path) as archive:
-        # It holds the model's folder, or what is in it.
+        # The zip has the model's folder, or its content, at the top.
         mesh = next((name for name in archive.names if f"/{name}".endswith(f"/{MESH}")), MESH)
         top = mesh.removesuffix(MESH)
         for name in archive.names:
-            place = name.removeprefix(top)
-            if name.startswith(top) and _most(place):
-                yield place, archive.read(name, _most(place))
+            member = name.removeprefix(top)
+            if name.startswith(top) and _max_size(member):
+                yield member, archive.read(name, _max_size(member))
 
 
-def _most(place: str) -> int:
-    """Largest size of a file that is taken, bytes; 0 of one that is not."""
-    path = PurePosixPath(place)
+def _max_size(member: str) -> int:
+    """Largest size of a file that is copied, bytes; 0 if it is not copied."""
+    path = PurePosixPath(member)
     if str(path.parent) in _FOLDERS and path.suffix.lower() in _SUFFIXES:
         return 256 << 20  # meshes have 2 to 30 MB
-    return _TEXT if place == METADATA else 0
+    return _MAX_METADATA if member == METADATA else 0
 
 
 def attribution_of(folder: Path) -> dict[str, str]:
-    """Creator, licence and source of a model, as its metadata state them, else as the set does."""
+    """Creator, licence and source of a model by its metadata, else those of the set."""
     known = dict(_ATTRIBUTION)
     if (folder / METADATA).is_file():
-        text = read_bytes(folder / METADATA, _TEXT).decode("utf-8", "replace")
+        text = read_bytes(folder / METADATA, _MAX_METADATA).decode("utf-8", "replace")
         for key, pattern in (
             ("creator", r'authors\s*\{[^{}]*?\bname:\s*"([^"\\]{1,200})"'),
             ("licence", r'legal\s*\{[^{}]*?\blicense:\s*"([^"\\]{1,200})"'),
@@ -175,18 +175,18 @@ def attribution_of(folder: Path) -> dict[str, str]:
 
 
 def take_models(source: Path, out: Path, names: Sequence[str]) -> dict[str, str]:
-    """Puts models that are not there yet into ``out/meshes``, and writes their catalogue.
+    """Copy missing models into ``out/meshes``, and write their catalogue.
 
     Args:
         source: a copy of the set.
         out: folder of the evaluation.
-        names: of the models.
+        names: names of the models.
 
     Returns:
-        By name, why a model could not be had.
+        Failures by name.
 
     Raises:
-        UserError: nothing can be read of ``source``, or nothing written.
+        UserError: ``source`` cannot be read, or the catalogue cannot be written.
     """
     meshes = output_folder(out / "meshes")
     wanted = [name for name in names if not (meshes / name / "model.obj").is_file()]
@@ -213,7 +213,7 @@ def take_models(source: Path, out: Path, names: Sequence[str]) -> dict[str, str]
 
 
 def taken(out: Path, names: Sequence[str]) -> list[Mesh]:
-    """Those of the models that ``take_models`` has put into ``out/meshes``."""
+    """Models that ``take_models`` has copied into ``out/meshes``."""
     meshes = out / "meshes"
     if not any((meshes / name / "model.obj").is_file() for name in names):
         return []
@@ -223,28 +223,26 @@ def taken(out: Path, names: Sequence[str]) -> list[Mesh]:
 def make_views(
     out: Path, meshes: Sequence[Mesh], size: int, workers: int, up: Up = gso.UP
 ) -> tuple[int, dict[str, list[str]], dict[str, str]]:
-    """Renders models into ``out/views``.
-
-    All objects that are there are its test split.
+    """Render models into ``out/views``; all objects are its test split.
 
     Args:
         out: folder of the evaluation.
-        meshes: of the models.
+        meshes: meshes of the models.
         size: pixels a side.
         workers: processes; 0 means one per core.
         up: the axis that points up in the files.
 
     Returns:
-        The number of objects rendered now; by name, what was missing in a model's files; and by
-        name, why an object could not be rendered.
+        The number of newly rendered objects, warnings by name about missing parts of a model's
+        files, and failures by name.
 
     Raises:
-        UserError: objects are there that were rendered otherwise.
+        UserError: existing objects were rendered with other settings.
     """
     views = output_folder(out / "views")
     if not meshes:
         return 0, {}, {}
-    # The same light for an object at each run.
+    # The same lights for an object in every run.
     settings = Settings(gso.VIEWS, size, gso.FOV, format="png", up=up, spread=0.0, poses="gso")
     todo, damaged = still_missing(meshes, views, settings)
     warnings, failures = render_meshes(todo, views, settings, workers)

@@ -1,8 +1,8 @@
-"""Lists of Objaverse's and G-Objaverse's objects, in the forms in which they are published.
+"""Published lists of the objects of Objaverse and G-Objaverse.
 
 An object has two names: Objaverse's uid, of 32 letters and digits, and in G-Objaverse
-``dictionary_id/instance_id``, two numbers. ``gobjaverse_280k_index_to_objaverse.json`` has the one
-by the other: ``{"0/10010": "000-142/d4c6….glb", …}``.
+``dictionary_id/instance_id``, two numbers. ``gobjaverse_280k_index_to_objaverse.json`` maps the
+latter to the former: ``{"0/10010": "000-142/d4c6….glb", …}``.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class _Annotation(msgspec.Struct):
 
 
 def read_list(path: Path) -> set[str]:
-    """Reads names of objects.
+    """Read names of objects.
 
     Args:
-        path: JSON, also packed by gzip: a list of names (``gobjaverse_280k.json``, the lists of its
+        path: JSON, possibly gzipped: a list of names (``gobjaverse_280k.json``, the lists of its
             ten categories), or lists by category (``lvis-annotations.json.gz``); or text, ``.txt``
             or ``.csv``, with a name in the last field of each line.
 
@@ -43,7 +43,7 @@ def read_list(path: Path) -> set[str]:
         The names: uids of Objaverse, ``dictionary_id/instance_id`` of G-Objaverse.
 
     Raises:
-        UserError: the file cannot be read, is none of these, or names nothing.
+        UserError: the file cannot be read, has another format, or names no objects.
     """
     if path.suffix.lower() in (".txt", ".csv"):
         rows = _bytes_of(path).decode("utf-8", "replace").splitlines()
@@ -58,10 +58,10 @@ def read_list(path: Path) -> set[str]:
 
 
 def read_index(path: Path) -> dict[str, str]:
-    """Reads the uid of Objaverse by the name in G-Objaverse.
+    """Read the uid of Objaverse by the name in G-Objaverse.
 
     Raises:
-        UserError: the file cannot be read, or is no such index.
+        UserError: the file cannot be read, or is not such an index.
     """
     index = {}
     for name, entry in parse_document(_bytes_of(path), dict[str, str], str(path)).items():
@@ -72,17 +72,17 @@ def read_index(path: Path) -> dict[str, str]:
 
 
 def read_quality(path: Path) -> dict[str, str]:
-    """Reads ``category_annotation.json``: the category of each object by its uid of Objaverse.
+    """Read ``category_annotation.json``: the category of each object by its uid of Objaverse.
 
     Raises:
-        UserError: the file cannot be read, or holds something else.
+        UserError: the file cannot be read, or has another format.
     """
     rows = parse_document(_bytes_of(path), list[_Annotation], str(path))
     return {_name(row.object_index, str(path)): row.label for row in rows}
 
 
 def _bytes_of(path: Path) -> bytes:
-    """A file's bytes, unpacked where it is packed by gzip, and not more of them than are read."""
+    """Read a file, with a limited size, and unpack it if it is gzipped."""
     data = read_bytes(path)
     if not data.startswith(b"\x1f\x8b"):
         return data
@@ -97,7 +97,7 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _name(entry: str, source: str) -> str:
-    """The name that an entry means; ``000-142/d4c6….glb`` means ``d4c6…``."""
+    """Parse the name in an entry; ``000-142/d4c6….glb`` gives ``d4c6…``."""
     text = entry.strip()
     for suffix in (".glb", ".tar"):
         text = text.removesuffix(suffix)
@@ -111,12 +111,12 @@ def _name(entry: str, source: str) -> str:
 
 @dataclass
 class Choice:
-    """Which objects are taken.
+    """Selected objects.
 
     Attributes:
-        names: in G-Objaverse, or of Objaverse where views are not looked for; sorted.
-        counts: how many objects each list has, keeps or leaves out; for people and the record.
-        uids: uid of Objaverse by the name in G-Objaverse, as far as an index says it.
+        names: in G-Objaverse, or of Objaverse for meshes; sorted.
+        counts: number of objects in each list, and left after it; for the user and the record.
+        uids: uid of Objaverse by the name in G-Objaverse, if known from an index.
     """
 
     names: list[str]
@@ -126,13 +126,13 @@ class Choice:
 
 @dataclass(frozen=True)
 class Lists:
-    """The files that choose objects.
+    """Files that select objects.
 
     Attributes:
-        index: gobjaverse_280k_index_to_objaverse.json; lists by Objaverse's names need it.
-        uids: take only what each of these lists names (lvis-annotations.json.gz, ...).
-        without: take nothing that one of these lists names (gobjaverse_280k_Poor-quality.json).
-        quality: category_annotation.json: leave out what it calls Poor-quality.
+        index: gobjaverse_280k_index_to_objaverse.json; lists of Objaverse's names need it.
+        uids: take only objects named by all of these lists (lvis-annotations.json.gz, ...).
+        without: leave out objects named by one of these lists (gobjaverse_280k_Poor-quality.json).
+        quality: category_annotation.json: leave out the objects of its category Poor-quality.
     """
 
     index: Path | None = None
@@ -141,15 +141,15 @@ class Lists:
     quality: Path | None = None
 
     def choose(self, there: Iterable[str] | None) -> Choice:
-        """Chooses objects.
+        """Choose objects.
 
         Args:
-            there: names in G-Objaverse of the objects of a local copy; or None: objects of
-                Objaverse, by their uids, of which ``uids`` must have a list.
+            there: names in G-Objaverse of the objects of a local copy; None chooses objects of
+                Objaverse by uid, which needs a list in ``uids``.
 
         Raises:
-            UserError: a list cannot be read; names of the other kind need an index that is not
-                given; or no object is left.
+            UserError: a list cannot be read, names of the other kind need a missing index, or no
+                object is left.
         """
         index = {} if self.index is None else read_index(self.index)
         if there is None and not self.uids:
@@ -159,12 +159,12 @@ class Lists:
         if not meshes:
             counts["in the source"] = len(found.names)
         for path in self.uids:
-            names = self._translated(read_list(path), index, meshes, path)
+            names = self._convert_names(read_list(path), index, meshes, path)
             what = f"of them also in {path.name}" if counts else f"in {path.name}"
             found.names = sorted(names & {*found.names} if counts else names)
             counts[what] = len(found.names)
         for path in self.without:
-            names = self._translated(read_list(path), index, meshes, path)
+            names = self._convert_names(read_list(path), index, meshes, path)
             found.names = [name for name in found.names if name not in names]
             counts[f"left without {path.name}"] = len(found.names)
         if self.quality is not None:
@@ -177,14 +177,14 @@ class Lists:
             found.names = [name for name in found.names if label_of[name] != POOR]
             counts[f"left without {POOR}"] = len(found.names)
         if not found.names:
-            told = ", ".join(f"{count} {what}" for what, count in counts.items())
-            raise UserError(f"no object is left ({told})")
+            listed = ", ".join(f"{count} {what}" for what, count in counts.items())
+            raise UserError(f"no object is left ({listed})")
         return found
 
-    def _translated(
+    def _convert_names(
         self, names: set[str], index: Mapping[str, str], meshes: bool, path: Path
     ) -> set[str]:
-        """The names in the kind that is asked for; those that the index does not know are left."""
+        """Convert names to the requested kind; names missing from the index are dropped."""
         rendered = {name for name in names if RENDERED.fullmatch(name)}
         others = names - rendered
         if not (rendered if meshes else others):

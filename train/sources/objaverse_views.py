@@ -1,10 +1,10 @@
-"""A local copy of G-Objaverse as a dataset: chosen objects, linked, copied or unpacked.
+"""Makes a dataset of a local copy of G-Objaverse: chosen objects, linked, copied or unpacked.
 
 The set is published as ``dictionary_id/instance_id/campos_512_v4/NNNNN/NNNNN.png`` and seven more
-files a view; as a tar of each object, ``dictionary_id/instance_id.tar``; and by a script that
-leaves out the folder ``campos_512_v4``. Training needs a view's picture and camera alone, and for
-depth its ``_nd.exr`` (normal and depth); the package OpenEXR reads that, a native library, so in a
-child process that may be lost.
+files a view; as a tar of each object, ``dictionary_id/instance_id.tar``; and by a script without
+the folder ``campos_512_v4``. Training needs only a view's picture and camera, and for depth its
+``_nd.exr`` (normal and depth). The package OpenEXR, a native library, reads the latter in a child
+process, which may crash.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from gamba_warp.untrusted.names import inside
 VIEWS = 40  # of an object: two orbits, top and bottom
 _NUMBER = re.compile(r"[0-9]{1,12}")
 _MEMBER = re.compile(r"(?:[^/]+/){0,3}?([0-9]{5})/\1(\.png|\.json|_nd\.exr)")
-_MOST = {".png": 64 << 20, ".json": 1 << 20}  # bytes; pictures have 0.2 MB
+_MAX_SIZES = {".png": 64 << 20, ".json": 1 << 20}  # bytes; pictures have 0.2 MB
 
 
 SUFFIX = "_nd.exr"
-MOST = 64 << 20  # bytes of a file; they have 2 to 4 MB
-# Half the diagonal of the unit cube that holds the object: what is nearer or further is no surface,
-# as the set's own example says.
-_REACH = 3**0.5 / 2
-_SECONDS, _MEMORY = 600.0, 4 << 30  # of an object's 40 files, which take 2 s and 0.7 GB
+MAX_DEPTH_SIZE = 64 << 20  # bytes of a file; published ones have 2 to 4 MB
+# Half the diagonal of the unit cube around the object: nearer or farther depths are not surfaces,
+# according to the set's own example.
+_RADIUS = 3**0.5 / 2
+_SECONDS, _MEMORY = 600.0, 4 << 30  # limits for an object's 40 files, which take 2 s and 0.7 GB
 
 
 def find_rendered(source: Path) -> dict[str, Path]:
-    """The objects of a local copy, by name; a folder is preferred to a tar.
+    """Find the objects of a local copy, by name; a folder is preferred to a tar.
 
     Args:
-        source: folder of the set, or one that holds it as ``savedata/``.
+        source: folder of the set, or its parent if the set is in ``savedata/``.
 
     Raises:
-        UserError: no such folder, or no objects in it.
+        UserError: the folder does not exist or has no objects.
     """
     if not source.is_dir():
         raise UserError(f"--source {source}: no such folder")
@@ -65,10 +65,10 @@ def find_rendered(source: Path) -> dict[str, Path]:
         if _NUMBER.fullmatch(path.name.removesuffix(".tar"))
         and path.is_dir() is not path.name.endswith(".tar")
     ]
-    found = dict(sorted(entries, key=lambda entry: entry[1].is_dir()))  # folders last, so they stay
+    found = dict(sorted(entries, key=lambda entry: entry[1].is_dir()))  # folders last, so they win
     if not found:
         raise UserError(
-            f"--source {source}: holds no objects of G-Objaverse (0/10010, 0/10010.tar)"
+            f"--source {source}: contains no objects of G-Objaverse (0/10010, 0/10010.tar)"
         )
     return found
 
@@ -81,25 +81,25 @@ def take_views(
     copy: bool,
     depth: bool = False,
 ) -> tuple[int, dict[str, str]]:
-    """Puts objects into a dataset that are not in it yet.
+    """Add missing objects to a dataset.
 
     Args:
         objects: the local copy, by name.
-        names: which of it.
+        names: names of the objects to add.
         out: the dataset.
         least: complete views that an object must have.
-        copy: whether the files of folders are copied; else their folder is linked.
-        depth: whether depth pictures are made, too; also for objects that are there without.
+        copy: copy the files of folders instead of linking the folder.
+        depth: also make depth pictures, even for existing objects that lack them.
 
     Returns:
-        How many were put there now; and by name, why one could not be.
+        The number of new objects, and failures by name.
 
     Raises:
-        UserError: the system makes no links.
+        UserError: the system cannot create links.
     """
     failures: dict[str, str] = {}
-    marks = (GOBJAVERSE, GOBJAVERSE_DEPTH) if depth else (GOBJAVERSE,)
-    wanted = [name for name in names if not all((out / name / mark).exists() for mark in marks)]
+    parts = (GOBJAVERSE, GOBJAVERSE_DEPTH) if depth else (GOBJAVERSE,)
+    wanted = [name for name in names if not all((out / name / part).exists() for part in parts)]
     for name in progress_bar(wanted, unit="object"):
         try:
             _take(objects[name], out / name, least, copy, depth)
@@ -111,21 +111,21 @@ def take_views(
 def _take(path: Path, target: Path, least: int, copy: bool, depth: bool) -> None:
     if not (path.is_dir() or path.is_file()):
         raise UserError(f"{path}: is neither a folder nor a file")
-    if (target / GOBJAVERSE).exists():  # without depth, which is then all that is added
+    if (target / GOBJAVERSE).exists():  # only depth is missing
         files = _checked(target, path, least)
         with atomic_folder(target / GOBJAVERSE_DEPTH) as part:
             _add_depth(files, part, path)
         return
-    # A link that leads nowhere any more gives way; anything else that is there stays.
+    # A broken link is replaced; anything else stays.
     names = {p.name for p in target.iterdir()} if target.is_dir() else set()
     broken = (target / GOBJAVERSE).is_symlink() and names <= {GOBJAVERSE, GOBJAVERSE_DEPTH}
     with atomic_folder(target, replace=broken) as part:
         made, views = part / GOBJAVERSE, _views_of(path)
         if path.is_file():
-            _unpack(path, made, _MOST)
+            _unpack(path, made, _MAX_SIZES)
         elif copy:
             for view in sorted(p for p in views.iterdir() if re.fullmatch("[0-9]{5}", p.name)):
-                for suffix, most in _MOST.items():
+                for suffix, most in _MAX_SIZES.items():
                     file = inside(views, f"{view.name}/{view.name}{suffix}", str(views))
                     if file.is_file():
                         (made / view.name).mkdir(parents=True, exist_ok=True)
@@ -143,12 +143,12 @@ def _take(path: Path, target: Path, least: int, copy: bool, depth: bool) -> None
 
 
 def _views_of(path: Path) -> Path:
-    """The folder of an object's views."""
+    """Return the folder of an object's views."""
     return path / GOBJAVERSE if (path / GOBJAVERSE).is_dir() else path
 
 
 def _unpack(path: Path, target: Path, most: Mapping[str, int]) -> None:
-    """Writes the views' files of a tar whose ends ``most`` has, with their largest sizes, bytes."""
+    """Unpack the view files of a tar whose suffixes are in ``most``, up to these sizes, bytes."""
     target.mkdir()
     with path.open("rb") as file, open_tar(file, path, target.parent) as members:
         for member in members:
@@ -157,16 +157,16 @@ def _unpack(path: Path, target: Path, most: Mapping[str, int]) -> None:
                 continue
             if member.size > most[match[2]]:
                 raise UserError(f"{path}: {member.name!r} is over {most[match[2]] >> 20} MB")
-            place = target / match[1] / f"{match[1]}{match[2]}"
-            if place.exists():
-                raise UserError(f"{path}: {member.name!r} is there twice")
-            place.parent.mkdir(exist_ok=True)
-            with place.open("xb") as out:
+            unpacked = target / match[1] / f"{match[1]}{match[2]}"
+            if unpacked.exists():
+                raise UserError(f"{path}: {member.name!r} occurs twice")
+            unpacked.parent.mkdir(exist_ok=True)
+            with unpacked.open("xb") as out:
                 shutil.copyfileobj(member.file, out)
 
 
 def _checked(folder: Path, path: Path, least: int) -> ObjectFiles:
-    """Refuses an object whose cameras cannot be read, or that has too few complete views."""
+    """Read an object's cameras; raise if they are unreadable or too few views are complete."""
     try:
         files = open_dataset(folder, layout="gobjaverse").files(0)
     except UserError as error:
@@ -179,20 +179,20 @@ def _checked(folder: Path, path: Path, least: int) -> ObjectFiles:
 
 
 def _add_depth(files: ObjectFiles, target: Path, path: Path) -> None:
-    """Makes the depth pictures of an object's views in ``target``, of its depth files."""
+    """Convert an object's depth files to depth pictures in ``target``."""
     with tempfile.TemporaryDirectory(dir=target, prefix=PART) as scratch:
         raw = _views_of(path)
         if path.is_file():
             raw = Path(scratch) / "views"
-            _unpack(path, raw, {SUFFIX: MOST})
+            _unpack(path, raw, {SUFFIX: MAX_DEPTH_SIZE})
         distances = np.linalg.norm(files.camera_to_world[:, :3, 3], axis=1).tolist()
         wanted = []
         for image, distance in zip(files.images, distances):
             source = inside(raw, f"{image.stem}/{image.stem}{SUFFIX}", str(path))
             if not source.is_file():
                 raise UserError(f"{path}: {source.name}: no such file")
-            if source.stat().st_size > MOST:
-                raise UserError(f"{path}: {source.name}: over {MOST >> 20} MB")
+            if source.stat().st_size > MAX_DEPTH_SIZE:
+                raise UserError(f"{path}: {source.name}: over {MAX_DEPTH_SIZE >> 20} MB")
             wanted.append((source, target / f"{image.stem}.png", distance))
         for _, result in run_each(_convert, [wanted], seconds=_SECONDS, memory=_MEMORY):
             if isinstance(result, Failed):
@@ -200,13 +200,13 @@ def _add_depth(files: ObjectFiles, target: Path, path: Path) -> None:
 
 
 def check_package() -> None:
-    """Raises UserError where the package OpenEXR is not installed."""
+    """Raise UserError if the package OpenEXR is not installed."""
     if find_spec("OpenEXR") is None:
         raise UserError("--depth: needs the package OpenEXR: pip install OpenEXR")
 
 
 def _convert(files: Sequence[tuple[Path, Path, float]]) -> None:
-    """In a child process: files of depth to pictures, each by its camera's distance."""
+    """Convert depth files to pictures in a child process, with the cameras' distances."""
     import OpenEXR  # pyright: ignore[reportMissingImports]: optional
 
     for source, target, distance in files:
@@ -222,23 +222,23 @@ def _convert(files: Sequence[tuple[Path, Path, float]]) -> None:
             raise
         except KeyError as error:
             raise UserError(f"{source.name}: has no fourth channel, the depth") from error
-        except Exception as error:  # the library's own kinds
+        except Exception as error:  # the library's own types
             raise UserError(f"{source.name}: cannot be read ({error})") from error
         Image.fromarray(depth_steps(depth, distance)).save(target)
 
 
 def depth_steps(depth: np.ndarray, distance: float) -> np.ndarray:
-    """Depth along the optical axis as a 16-bit picture of steps of ``GOBJAVERSE_DEPTH_UNIT``.
+    """Convert depth along the optical axis to 16-bit steps of ``GOBJAVERSE_DEPTH_UNIT``.
 
     Args:
-        depth: ``[H, W]`` float32, object units; not finite or out of the object's reach where
-            there is no surface.
+        depth: ``[H, W]`` float32, object units; non-finite or outside the unit cube's radius
+            without a surface.
         distance: of the camera from the object's centre, object units.
 
     Returns:
-        ``[H, W]`` uint16; 0 where there is no surface.
+        ``[H, W]`` uint16; 0 without a surface.
     """
     with np.errstate(invalid="ignore"):
-        there = np.isfinite(depth) & (np.abs(depth - distance) <= _REACH)
+        there = np.isfinite(depth) & (np.abs(depth - distance) <= _RADIUS)
     steps = np.rint(np.where(there, depth, 0) / GOBJAVERSE_DEPTH_UNIT)
     return np.clip(steps, 0, 65535).astype(np.uint16)

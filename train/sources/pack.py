@@ -1,4 +1,4 @@
-"""Writes packs (``gamba_warp/data/packs.py``): the views of a dataset, decoded and resized once."""
+"""Writer of packs (``gamba_warp/data/packs.py``): views of a dataset, decoded and resized once."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from gamba_warp.files import atomic_path, only_process, output_folder, write_tex
 from gamba_warp.untrusted.documents import MAX_BYTES
 from gamba_warp.untrusted.names import parts_of
 
-_ALIGNED = 64  # bytes; an object begins at a multiple
-_AHEAD = 2  # objects decoded ahead, by thread
-_ABOUT = ("uid", "name", "split", "attribution", "depth_unit")  # what a tar says of an object
+_ALIGNMENT = 64  # bytes; an object begins at a multiple
+_AHEAD = 2  # objects decoded ahead, per thread
+_METADATA = ("uid", "name", "split", "attribution", "depth_unit")  # of an object in a tar
 SUFFIXES = {"arrays": "bin", "webdataset": "tar"}
 
-# One object as it is written: its entry, and its arrays by their names in the index.
+# Object to write: its entry, and its arrays by their names in the index.
 Block = tuple[packs.Entry, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class PackSettings:
-    """What a pack is to hold.
+    """Settings of a pack.
 
     Attributes:
         size: height of the pictures, pixels; None keeps that of the files.
         split: "all", "train", "val" or "test".
         shards: "arrays" or "webdataset".
-        shard_bytes: a shard ends with the object that passes this size.
+        shard_bytes: a shard ends with the object that exceeds this size.
     """
 
     size: int | None = 128
@@ -52,13 +52,13 @@ class PackSettings:
 
 @dataclass
 class Packed:
-    """What ``write_pack`` did.
+    """Result of ``write_pack``.
 
     Attributes:
-        written: number of the objects that were packed now.
-        there: number of those that were in the pack already.
+        written: number of newly packed objects.
+        there: number of objects that were already in the pack.
         shards: number of all shards.
-        failures: reasons by uid, of the objects that could not be read.
+        failures: reasons by uid, of unreadable objects.
     """
 
     written: int
@@ -70,30 +70,30 @@ class Packed:
 def write_pack(
     data: Path, out: Path, settings: PackSettings, workers: int, limit: int | None = None
 ) -> Packed:
-    """Packs a dataset, or goes on with a pack of it that was begun.
+    """Pack a dataset, or continue a pack of it.
 
-    Whole shards stay where the command is killed or the disk is full; nothing else does.
+    If the command is killed or the disk is full, only complete shards remain.
 
     Args:
         data: the dataset.
-        out: folder of the pack, which is made where it is not there.
-        settings: see there.
-        workers: number of threads that decode.
-        limit: number of the objects that are packed, the first ones; None: all.
+        out: folder of the pack, created if missing.
+        settings: settings of the pack.
+        workers: number of decoding threads.
+        limit: number of objects to pack, the first ones; None means all.
 
     Raises:
-        UserError: the data cannot be opened, the folder holds something else or a pack of other
+        UserError: the data cannot be opened, the folder holds something else or a pack with other
             settings, cannot be written, or its disk is full.
     """
     dataset = open_dataset(data, settings.split)
     splits = splits_of(data, dataset.uids)
-    index = _begun(out, settings)  # before the folder is made
+    index = _open_index(out, settings)  # before the folder is made
     out = output_folder(out)
     with only_process(out, "packs"):
         index.size, index.split, index.shards = settings.size, settings.split, settings.shards
         index.split_version = dataset.split_version
         stored, index.objects = index.objects, []
-        for values in stored:  # those whose shard is there and long enough, with sound cameras
+        for values in stored:  # keep entries with a complete shard and valid cameras
             with suppress(UserError):
                 packs.read_packed(out, values)
                 index.objects.append(values)
@@ -101,7 +101,7 @@ def write_pack(
         wanted = dataset.uids[:limit]
         todo = [uid for uid in wanted if uid not in known]
         named = {values["shard"] for values in index.objects}
-        for suffix in SUFFIXES.values():  # of a run that was killed, or all damaged
+        for suffix in SUFFIXES.values():  # of a killed run, or damaged
             for path in out.glob(f"shard-*.{suffix}"):
                 if path.name not in named:
                     path.unlink(missing_ok=True)
@@ -122,8 +122,8 @@ def write_pack(
     return Packed(len(todo) - len(failures), there, len(shards), failures)
 
 
-def _begun(out: Path, settings: PackSettings) -> packs.Index:
-    """The index of a pack that is there, or a new one; a folder of anything else is refused."""
+def _open_index(out: Path, settings: PackSettings) -> packs.Index:
+    """Read the index of an existing pack, or make a new one; raise for any other folder."""
     if (out / packs.INDEX).exists():
         index = packs.read_index(out)
         old = {"--size": index.size, "--split": index.split, "--format": index.shards}
@@ -147,7 +147,7 @@ def _blocks(
     workers: int,
     failures: dict[str, str],
 ) -> Generator[Block, None, None]:
-    """Yields the objects that can be read, in their order, decoded ahead on threads."""
+    """Yield the readable objects in order, decoded ahead on threads."""
     pool, waiting = ThreadPoolExecutor(workers), dict[str, Future[Block]]()
     try:
         for number, uid in enumerate(progress_bar(uids, desc="packing", unit="object")):
@@ -163,7 +163,7 @@ def _blocks(
 
 
 def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> Block:
-    """Decodes one object."""
+    """Decode one object."""
     parts_of(uid, f"the object {uid!r}")
     files = dataset.files(uid)
     images, Ks = dataset.pictures(uid, None, size)
@@ -202,12 +202,12 @@ def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> Bloc
 def _write_shards(
     out: Path, index: packs.Index, blocks: Iterator[Block], settings: PackSettings
 ) -> None:
-    """Writes all objects; the index names a shard as soon as it is whole."""
+    """Write all objects; the index names a shard as soon as it is complete."""
     names = (f"shard-{n:05d}.{SUFFIXES[settings.shards]}" for n in itertools.count())
     free = (out / name for name in names if not (out / name).exists())
     for first in blocks:
         path = next(free)
-        taken = _until(itertools.chain([first], blocks), settings.shard_bytes)
+        taken = _take_bytes(itertools.chain([first], blocks), settings.shard_bytes)
         entries = _write_shard(path, taken, len(index.objects))
         index.objects += [msgspec.to_builtins(entry) for entry in entries]
         try:
@@ -217,8 +217,8 @@ def _write_shards(
             raise
 
 
-def _until(blocks: Iterator[Block], limit: int) -> Iterator[Block]:
-    """The next blocks, up to the one with which they pass ``limit`` bytes."""
+def _take_bytes(blocks: Iterator[Block], limit: int) -> Iterator[Block]:
+    """Yield the next blocks, up to the one that exceeds ``limit`` bytes."""
     size = 0
     for block in blocks:
         yield block
@@ -231,16 +231,16 @@ def _write_index(out: Path, index: packs.Index) -> None:
     text = msgspec.json.encode(index).decode()
     if len(text) > MAX_BYTES:
         raise UserError(
-            f"{out}: the index would be over {MAX_BYTES >> 20} MB, which is not read; make several "
-            "packs of parts of the dataset, and train on them with --extra"
+            f"{out}: the index would exceed {MAX_BYTES >> 20} MB, the limit of readers; make "
+            "several packs of parts of the dataset, and train on them with --extra"
         )
     write_text(out / packs.INDEX, text + "\n")
 
 
 def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[packs.Entry]:
-    """Writes a shard: bare arrays one after the other, or a WebDataset.
+    """Write a shard: raw arrays one after the other, or a WebDataset.
 
-    That has ``NUMBER.json`` and a ``.npy`` an array of each object, from ``number`` on.
+    A WebDataset has ``NUMBER.json`` and a ``.npy`` per array of each object, from ``number`` on.
     """
     entries = []
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -256,7 +256,7 @@ def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[packs
         for key, (entry, arrays) in enumerate(blocks, number):
             starts = {}
             if tar is None:
-                file.write(bytes(-file.tell() % _ALIGNED))
+                file.write(bytes(-file.tell() % _ALIGNMENT))
                 for kind, array in arrays.items():
                     starts[kind] = file.tell()
                     file.write(np.ascontiguousarray(array).data)
@@ -264,10 +264,10 @@ def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[packs
                 for kind, array in sorted(arrays.items()):
                     npy = io.BytesIO()
                     np.save(npy, np.ascontiguousarray(array))
-                    # The array is the last part of what follows the header.
+                    # The array comes last, after the headers of tar and npy.
                     starts[kind] = file.tell() + tarfile.BLOCKSIZE + npy.tell() - array.nbytes
                     add(tar, f"{key:08d}.{kind}.npy", npy.getvalue())
-                about = {name: getattr(entry, name) for name in _ABOUT}
+                about = {name: getattr(entry, name) for name in _METADATA}
                 add(tar, f"{key:08d}.json", json.dumps(about).encode())
             entries.append(msgspec.structs.replace(entry, shard=path.name, **starts))
         if tar is not None:

@@ -1,1 +1,1 @@
-"""The tables and pictures of the pages, written from results that are kept: ``make figures``."""
+"""Tables and pictures of the pages, written from stored results: ``make figures``."""

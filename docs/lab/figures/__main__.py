@@ -15,12 +15,12 @@ from . import growth, model_card, step, times
 def figures(
     views: Path | None = None, geometry: Path | None = None, retrieval: Path | None = None
 ) -> None:
-    """Writes the tables and pictures of the pages again, from the results that are kept.
+    """Rewrite the tables and pictures of the pages from the stored results.
 
     Args:
-        views: report of eval-views, whose figures go into the card of the shipped model first.
+        views: report of eval-views, whose figures are first written into the shipped model's card.
         geometry: likewise, report of eval-geometry of the model.
-        retrieval: likewise, report of eval-geometry of what the retrieval finds.
+        retrieval: likewise, report of eval-geometry of the retrieval.
     """
     model_card.main(views, geometry, retrieval)
     growth.main()

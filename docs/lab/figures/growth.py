@@ -33,7 +33,7 @@ PICTURES = {
 
 
 def main() -> None:
-    """Writes the page and both pictures again."""
+    """Write the page and both pictures again."""
     document = read_document(RESULTS)
     write_text(PAGE, page_of(PAGE.read_text(encoding="utf-8"), document))
     for name, path in PICTURES.items():
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def split(document: dict) -> dict[str, dict]:
-    """The document's records of growing costs, and those of growing errors."""
+    """Split the document into records of growing costs and of growing errors."""
     found: dict[str, list[dict]] = {"costs": [], "errors": []}
     for record in document["records"]:
         found["errors" if record["axis"] == ERRORS else "costs"].append(record)
@@ -53,11 +53,11 @@ def split(document: dict) -> dict[str, dict]:
 
 
 def page_of(text: str, document: dict) -> str:
-    """The page with the parts between its marks written from the results.
+    """Update the parts of the page between its marks from the results.
 
     Args:
         text: of the page.
-        document: as ``read_document`` returns it.
+        document: result of ``read_document``.
 
     Raises:
         ValueError: the page lacks a mark.
@@ -73,7 +73,7 @@ def page_of(text: str, document: dict) -> str:
 
 
 def _missing(document: dict) -> list[str]:
-    """A sentence on the cases that the results lack, if there are any."""
+    """Sentence on the cases missing in the results, if any."""
     settings = make_settings(torch.device("cpu"), False, False, False, 1)
     known = [(c.op, c.name) for c in (*growth.cases(settings), *growth_errors.cases(settings))]
     measured = {(r["op"], r["case"]) for r in document["records"]}
@@ -84,13 +84,13 @@ def _missing(document: dict) -> list[str]:
 
 
 def _picture(name: str, parts: dict[str, dict]) -> str:
-    """The link to a picture, where there is anything to draw."""
+    """Link to a picture, unless it is empty."""
     drawn = growth_picture([parts[name]])
     return f"![Growth of {name}](../pictures/{PICTURES[name].name})\n\n" if drawn else ""
 
 
 def _costs(document: dict) -> str:
-    """What grows faster than its work, then one table of all slopes."""
+    """Figures that grow faster than their work, then one table of all slopes."""
     said, rows, header = [], [], []
     for op, cases in groups(document).items():
         name = op.removeprefix("growth-")

@@ -5,8 +5,8 @@ After ``gamba eval-views`` and ``gamba eval-geometry`` of the model that ships:
     make figures REPORTS="--views out/eval/report.json --geometry out/shapes/report.json \
         --retrieval out/shapes-retrieval/report.json"
 
-Without an option it only writes the tables again. Everything else in the card, ``NAME.json``
-beside the weights, is written by hand.
+Without an option it only updates the tables. Everything else in the card, ``NAME.json`` beside the
+weights, is written by hand.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ TITLES = {"novel": "New views", "input": "The input view", "shape": "Shape"}
 def main(
     views: Path | None = None, geometry: Path | None = None, retrieval: Path | None = None
 ) -> None:
-    """Puts reports' figures into the card, and writes the tables.
+    """Put figures of reports into the card, and write the tables.
 
     Args:
         views: report of eval-views.
         geometry: report of eval-geometry of the model.
-        retrieval: report of eval-geometry of what the retrieval finds.
+        retrieval: report of eval-geometry of the retrieval.
     """
     card = read_card(DEFAULT_CHECKPOINT)
     if card is None:
@@ -66,7 +66,7 @@ def main(
 
 
 def page_of(text: str, card: ModelCard) -> str:
-    """The page with the parts between its marks written from the card.
+    """Update the parts of the page between its marks from the card.
 
     Args:
         text: of the page.
@@ -93,7 +93,7 @@ def page_of(text: str, card: ModelCard) -> str:
 
 
 def readme_of(text: str, card: ModelCard) -> str:
-    """The README with its table of results written from the card: new views beside shapes.
+    """Update the README's table of results from the card: new views beside shapes.
 
     Args:
         text: of the README.

@@ -1,4 +1,4 @@
-"""The parts of a page that a program writes, each between two marks."""
+"""Generated parts of a page, each between two marks."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ _MARK = "<!-- {name}: written by {writer} -->"
 
 
 def marks(writer: str, name: str) -> tuple[str, str]:
-    """The lines before and behind a part.
+    """Lines before and after a part.
 
     Args:
-        writer: what writes the part, as a reader would call it.
-        name: of the part.
+        writer: the command that writes the part.
+        name: name of the part.
     """
     begin, end = (_MARK.format(name=text, writer=writer) for text in (name, f"end of {name}"))
     return begin, end
 
 
 def with_parts(text: str, writer: str, parts: Mapping[str, str]) -> str:
-    """A page with its parts written anew; everything else stays as it is.
+    """Replace the parts of a page; everything else is unchanged.
 
     Args:
         text: of the page, with the marks of every part.
-        writer: what writes the parts, as in ``marks``.
+        writer: as for ``marks``.
         parts: text of each part by its name.
 
     Raises:

@@ -1,13 +1,12 @@
-"""Cuts the object out of ordinary photographs in each way, and shows what comes of it.
+"""Cuts the object out of ordinary photographs with each method, and shows the results.
 
-The pictures are those that other packages bring as samples; they are read from where the packages
-lie (or from a folder of unpacked archives), and none of them is kept here:
+The pictures are samples of other packages, read from the installed packages (or from a folder of
+unpacked archives); none of them is stored here:
 
     python docs/lab/figures/photo_ways.py --model isnet.onnx --folder unpacked --out ways.png
 
-prints the table of docs/photo.md, without the verdicts of eyes, and writes a sheet to look at: a
-row a picture; the picture, and what is left of it after a plain background, the matte of the
-network and GrabCut.
+prints the table of docs/photo.md, without the visual judgements, and writes a sheet: a row a
+picture; the picture, and the results of plain background, matting network and GrabCut.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from gamba_warp.photo.cutout import fault_of
 from gamba_warp.photo.grabcut import grabcut
 from gamba_warp.photo.matte import Matte
 
-# Package (as it is imported, or a folder), and the picture in it.
+# Package (by its import name, or a folder), and the picture in it.
 PICTURES = (
     ("skimage/data", "astronaut.png"),
     ("skimage/data", "camera.png"),
@@ -54,10 +53,10 @@ _CELL = 192  # side of a picture on the sheet, pixels
 
 
 def find(folder: Path | None) -> Iterator[tuple[str, Path | None]]:
-    """Each picture's name, and its file or None.
+    """Yield each picture's name, and its file or None.
 
     Args:
-        folder: where archives of packages that are not installed were unpacked.
+        folder: folder with unpacked archives of packages that are not installed.
     """
     for package, name in PICTURES:
         root, _, inner = package.partition("/")
@@ -69,7 +68,7 @@ def find(folder: Path | None) -> Iterator[tuple[str, Path | None]]:
 
 
 def plain(rgb: np.ndarray) -> np.ndarray | None:
-    """Alpha of what is left without a plain background, or None if there is none."""
+    """Alpha after removal of a plain background, or None without one."""
     rgba = plain_matte(rgb)
     return None if rgba is None else rgba[..., 3]
 
@@ -83,11 +82,11 @@ def cell(picture: np.ndarray) -> np.ndarray:
 
 
 def compare(model: Path, folder: Path | None, out: Path) -> list[list[str]]:
-    """Tries every way on every picture that is there, and writes the sheet.
+    """Try every method on every available picture, and write the sheet.
 
     Returns:
-        A row for each picture: its name, and for each way the share of the picture that the object
-        takes, or why it is none, with the seconds.
+        A row for each picture: its name, and for each method the object's share of the picture, or
+        the reason of the failure, with the seconds.
     """
     ways: list[Callable[[np.ndarray], np.ndarray | None]] = [plain, Matte(model), grabcut]
     rows, sheet = [], []
@@ -117,7 +116,7 @@ def compare(model: Path, folder: Path | None, out: Path) -> list[list[str]]:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description="Each way on ordinary photographs.")
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--folder", type=Path)

@@ -32,17 +32,17 @@ _BOTH = " / ".join(_PRECISIONS)
 
 
 def main() -> None:
-    """Writes the page again."""
+    """Update the page."""
     text = PAGE.read_text(encoding="utf-8")
     write_text(PAGE, page_of(text, read_document(STEP), read_document(PRECISION)))
 
 
 def page_of(text: str, step: dict, precision: dict) -> str:
-    """The page with the parts between its marks written from the results.
+    """Update the parts of the page between its marks from the results.
 
     Args:
         text: of the page.
-        step: results of the suite step, as ``read_document`` returns them.
+        step: results of the suite step, from ``read_document``.
         precision: those of the case precision of the suite model.
 
     Raises:
@@ -71,7 +71,7 @@ class _Case:
         self._records = {r["variant"]: r for r in records if (r["op"], r["case"]) == (op, case)}
 
     def __getitem__(self, variant: str) -> dict[str, Any]:
-        """The record of a variant; ValueError if there is none that was timed."""
+        """Return the record of a variant; raise ValueError without a timed one."""
         found = self._records.get(variant)
         if found is None or found["ms_p50"] is None:
             raise ValueError(f"no time of {self._name}, {variant}")
@@ -84,7 +84,7 @@ class _Case:
 
 
 def _shares(case: _Case) -> str:
-    """Where the time of a step goes, as shares of the whole."""
+    """Shares of the parts in the time of a step."""
     names = ("tiny", "tiny, bfloat16", "rays", "rays, bfloat16")
     columns = [(case[name]["work"][WHOLE], parts_of(case[name])) for name in names]
     rows = [["whole, ms", *(f"{whole:,.0f}" for whole, _ in columns)]]
@@ -95,7 +95,7 @@ def _shares(case: _Case) -> str:
 
 
 def _products(case: _Case) -> str:
-    """A picture at the paper's size, and how fast its products are."""
+    """Time of a picture at the paper's size, and speed of its products."""
     kinds = ("paper, float32", "paper, bfloat16")
     alone = [*(f"{kind}, products alone" for kind in kinds), "paper, MKL's products alone"]
     rates = [f"{case[x]['work']['flops'] / case[x]['ms_p50'] / 1e6:,.0f}" for x in alone]
@@ -108,7 +108,7 @@ def _products(case: _Case) -> str:
 
 
 def _compared(case: _Case, presets: tuple[str, ...], what: str, angle: bool = False) -> str:
-    """How far ``what`` of each preset is from that of float32, in both precisions."""
+    """Difference of ``what`` of each preset from that of float32, in both precisions."""
     shown: dict[str, Callable[[dict], str]] = {
         "ms": lambda r: case.ms(r["variant"]),
         f"{what}, relative rms": lambda r: f"{r['rel_rms_error']:.1e}",
@@ -142,7 +142,7 @@ def _ssim(case: _Case) -> str:
 
 
 def _optimizer(case: _Case) -> str:
-    """What follows the gradient, in each way."""
+    """Times after the gradient, with each optimizer."""
     ways = ("fused", "foreach", "single")
     rows = [["AdamW", *(case.ms(f"AdamW, {way}") for way in ways)]]
     for name, text in (("norm", "norm of the gradient"), ("average", "running average")):

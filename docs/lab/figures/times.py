@@ -25,17 +25,17 @@ _HEADER += ("with gradients, ms", "worst error", "bare loop, ms", "torch loop, m
 
 
 def main() -> None:
-    """Writes the page again."""
+    """Update the page."""
     text = PAGE.read_text(encoding="utf-8")
     write_text(PAGE, page_of(text, read_document(TIMES)))
 
 
 def page_of(text: str, document: dict) -> str:
-    """The page with its table written from the results.
+    """Update the page's table from the results.
 
     Args:
         text: of the page.
-        document: results of the study, as ``read_document`` returns them.
+        document: results of the study, from ``read_document``.
 
     Raises:
         ValueError: the page lacks a mark.

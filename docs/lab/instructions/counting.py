@@ -1,9 +1,9 @@
-"""What the CUDA kernels execute, counted while their PTX runs without a GPU (``tests/ptx``).
+"""Instruction counts of the CUDA kernels, from running their PTX without a GPU (``tests/ptx``).
 
-PTX is not yet the machine's code. What ptxas does for certain is done here before counting:
-products join the sums that alone read them, and what nobody reads is not counted; nor are moves of
-registers and reads of parameters, of which it makes operands. What is left differs from the
-disassembly by addresses that it computes once and keeps.
+PTX is not yet machine code. The certain optimizations of ptxas are applied before counting:
+products are fused with the sums that are their only readers; unused results, moves of registers and
+reads of parameters, which become operands, are not counted. The remaining difference from the
+disassembly are addresses that ptxas computes once and reuses.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _DROPPED = ("move", "parameter")
 
 @dataclass(frozen=True)
 class Executed:
-    """What all launches of a kernel executed.
+    """Instructions executed by all launches of a kernel.
 
     Attributes:
         name: of the kernel.
@@ -38,10 +38,10 @@ class Executed:
             its "sectors" of 32 bytes, "first" of them that the launch had not touched, the sectors
             of threads' "own" memory, and of shared memory "passes", "conflicts" among them, and
             "together", the passes if a warp's lanes could be served at once.
-        lanes: of 32, at an instruction on average.
-        splits: branches that part a warp, of all.
+        lanes: mean number of active lanes of 32 per instruction.
+        splits: share of branches that diverge in a warp.
         code: the PTX.
-        times: by instruction of the PTX, how many warps executed it.
+        times: number of warps that executed each instruction of the PTX.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Executed:
 
 
 def executed(machine: Interpreter) -> dict[str, Executed]:
-    """By entry, what an interpreter that counts has executed."""
+    """Return the counts of an interpreter, by entry."""
     return {
         entry: _sum(program, times, machine.counts[entry])
         for entry, (program, times) in machine.executed.items()
@@ -102,7 +102,7 @@ def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
 def count(
     run: Callable[[], Sequence[Tensor]], wanted: Iterable[Tensor], multiprocessors: int
 ) -> dict[str, dict[str, Executed]]:
-    """What a call executes on an imagined device: "forward", and "gradient" of what it returns."""
+    """Count the instructions of a call on a fake device: "forward", and "gradient"."""
     options = {"counting": True, "contract": ".*"}
     with interpreted(multiprocessors, **options) as machine:
         outputs = [x for x in run() if x.requires_grad]

@@ -1,8 +1,8 @@
-"""What kernels would take at the least on a GPU, from counts of what they execute.
+"""Lower bounds for the time of kernels on a GPU, from counts of their instructions.
 
-An estimate, never a measurement: each unit of a multiprocessor is taken to work in every cycle, and
-the busiest one sets the time. Stalls, barriers and misses of the caches are not in it, so a real
-time is longer.
+An estimate, not a measurement: each unit of a multiprocessor is assumed to work in every cycle, and
+the busiest one determines the time. Stalls, barriers and cache misses are ignored, so real times
+are longer.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Device:
     Attributes:
         name: of the product.
         multiprocessors: their number; each starts 4 instructions of a warp per cycle.
-        clock: cycles per second, the highest: from the float32 operations that the sheet tells.
+        clock: highest cycles per second, from the float32 operations in the data sheet.
         bandwidth: of device memory, bytes per second.
         float_lanes: float32 additions or products of a multiprocessor per cycle.
     """
@@ -41,22 +41,22 @@ DEVICES = {
 LANES, SPECIAL, INTEGER = 32, 16, 64  # of a warp; of a multiprocessor's units
 SCHEDULERS, SECTOR = 4, 32
 LINE = 128  # bytes of the L1 cache or of shared memory, which is a part of it, per cycle
-# What the counts hold beside instructions: what these ask of memory.
+# Counts beside instructions: their memory accesses.
 ASKED = ("bytes", "sectors", "first", "own", "passes", "conflicts", "together")
 
 
 def every(counts: Mapping[str, float]) -> float:
-    """All instructions of the counts."""
+    """Total number of instructions."""
     return sum(number for kind, number in counts.items() if kind not in ASKED)
 
 
 def cycles(device: Device, counts: Mapping[str, float]) -> dict[str, float]:
-    """Cycles of one multiprocessor that each of its units needs at the least.
+    """Least number of cycles of one multiprocessor for each of its units.
 
     Args:
-        device: whose.
-        counts: instructions of warps by kind ("float", "special", …) and ``ASKED``, as
-            ``counting.Executed`` has them. A "routine" counts as one instruction.
+        device: the GPU.
+        counts: instructions of warps by kind ("float", "special", …) and ``ASKED``, as in
+            ``counting.Executed``. A "routine" counts as one instruction.
 
     Returns:
         ``issue``: 4 instructions start per cycle. ``special``: exponentials, roots and reciprocals.
@@ -78,13 +78,13 @@ def cycles(device: Device, counts: Mapping[str, float]) -> dict[str, float]:
 
 
 def limit(found: Mapping[str, float]) -> str:
-    """The name of the largest."""
+    """Name of the largest."""
     return max(found, key=lambda name: found[name])
 
 
 @dataclass(frozen=True)
 class Work:
-    """What one launch of a kernel does.
+    """Work of one launch of a kernel.
 
     Attributes:
         blocks: of threads.
@@ -110,10 +110,10 @@ class Shape:
 
 
 def scan_work(kernel: str, shape: Shape, tuning: Tuning) -> Work | None:
-    """The work of one of the scan's kernels; None for one whose time does not matter.
+    """Work of one of the scan's kernels; None for a negligible one.
 
-    In segments ``scan_forward`` is the walk that gives a segment's last state, as
-    ``summarise_backward`` is of the gradient; the last segment needs none.
+    With segments, ``scan_forward`` is the pass for a segment's last state, like
+    ``summarise_backward`` for the gradient; the last segment needs neither.
     """
     if kernel not in ("scan_forward", "summarise_backward", "scan_backward"):
         return None
@@ -147,21 +147,22 @@ def _traffic(shape: Shape, back: bool, summary: bool, parts: int) -> float:
 
 
 def per_element(counts: Mapping[str, float], work: Work) -> dict[str, float]:
-    """Counts of a launch, of warps, as those of a thread for one (batch, token, channel, state)."""
+    """Convert warp counts of a launch to those of a thread per (batch, token, channel, state)."""
     scale = LANES / (work.blocks * work.elements)
     found = {kind: number * scale for kind, number in sorted(counts.items())}
     return {"all": every(found)} | found
 
 
 def estimate(device: Device, work: Work, each: Mapping[str, float]) -> dict[str, float | str]:
-    """The least time of a launch, milliseconds, by what sets it; "ms" and "limit" are the largest.
+    """Least time of a launch, milliseconds, per unit; "ms" and "limit" are the largest.
 
-    The multiprocessor with the most blocks sets it, but for "dram", which is the whole device's.
+    The multiprocessor with the most blocks determines it, except for "dram", which is of the whole
+    device.
 
     Args:
-        device: that it runs on.
+        device: the GPU.
         work: of the launch.
-        each: of ``per_element``.
+        each: result of ``per_element``.
     """
     warps = -(-work.blocks // device.multiprocessors) * work.elements / LANES
     counts = {kind: number * warps for kind, number in each.items() if kind != "all"}

@@ -1,4 +1,4 @@
-"""What the kernels execute in the cases that the benchmarks begin with: counts.json, counts.md."""
+"""Instruction counts of kernels in the first cases of the benchmarks: counts.json, counts.md."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from .report import TOKENS, WIDTH, count_scan
 
 FORMAT = "gamba_warp.counts.1"
 GAUSSIANS, SIDE = 16384, 512
-# What a case gives: what was executed, and of a kernel, or of all ("") what its counts are for: a
-# text, and how many warps' worth of it there is.
+# Result of a case: the executed kernels, and by kernel, or for all (""), the unit of the counts: a
+# text, and the number of units in warps.
 Counts = dict[str, dict[str, Executed]]
 Units = dict[str, list[tuple[str, float]]]
 # One ends at once where the lists have room, the other is a single thread.
@@ -83,7 +83,7 @@ CASES: dict[tuple[str, str], Callable[[], tuple[Counts, Units]]] = {
 
 
 def rows_of(op: str, case: str, seen: set[str]) -> Iterator[dict]:
-    """Of a case, the kernels that no case before it launched."""
+    """Yield the rows of the kernels that no earlier case launched."""
     torch.manual_seed(0)
     counted, found = CASES[op, case]()
     for direction, kernels in counted.items():
@@ -105,7 +105,7 @@ def rows_of(op: str, case: str, seen: set[str]) -> Iterator[dict]:
 
 
 def headline(say: Callable[[str], None] = lambda case: None) -> dict:
-    """Executes all cases; ``{format, versions, kernels}``, ready for JSON.
+    """Execute all cases; ``{format, versions, kernels}``, ready for JSON.
 
     A kernel has ``op, kernel, case, direction, per`` (what its figures are for), ``number`` (warps'
     worth of that), ``each`` (counts for one), ``lanes``, ``splits`` (as ``counting.Executed``), and
@@ -120,7 +120,7 @@ def headline(say: Callable[[str], None] = lambda case: None) -> dict:
 
 
 def versions() -> dict[str, str]:
-    """Of what makes the PTX."""
+    """Versions of the software that makes the PTX."""
     toolkit = wp.get_cuda_toolkit_version() or ()
     return {"nvrtc": ".".join(map(str, toolkit)), "warp": wp.__version__}
 
@@ -176,7 +176,7 @@ def _binds(cycles: dict[str, float], each: dict[str, float]) -> str:
 
 
 def markdown(document: dict) -> str:
-    """The page of the document of ``headline``."""
+    """Page of the document of ``headline``."""
     counts, memory = [], []
     for row in document["kernels"]:
         each = row["each"]

@@ -1,4 +1,4 @@
-"""The report of ``make instructions`` as a page: that of ``gamba bench --static``, and more."""
+"""Page of the report of ``make instructions``: that of ``gamba bench --static``, extended."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _table(header: list[str], rows: list[list[object]]) -> str:
 
 
 def loops(document: dict) -> list[str]:
-    """What the hottest loop of each kernel holds."""
+    """Content of the hottest loop of each kernel."""
     arch = list(document["machines"])[-1]
     rows = [r for r in document["kernels"] if r["arch"] == arch and "loop" in r]
     if not rows:
@@ -57,7 +57,7 @@ _LIMITS = ("issue", "special", "float32", "integer", "L1", "dram")
 
 
 def estimates(document: dict) -> list[str]:
-    """The least times of the scan's kernels; nothing without a disassembler."""
+    """Least times of the scan's kernels; empty without a disassembler."""
     rows = [row for row in document["kernels"] if "estimate" in row]
     if not rows:
         return []
@@ -86,6 +86,6 @@ def estimates(document: dict) -> list[str]:
 
 
 def markdown(document: dict) -> str:
-    """The page of the documents of ``report``."""
+    """Page of the documents of ``report``."""
     text = static_markdown(document, "make instructions")
     return "\n".join([text, *loops(document), *estimates(document)])

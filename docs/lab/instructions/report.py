@@ -1,4 +1,4 @@
-"""What the CUDA kernels take, with their instructions counted, and least times of the scan."""
+"""Resources and instruction counts of the CUDA kernels, and least times of the scan."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ SHAPES = {
     for name, o in SCANS.items()
     for batch, text in ((16, ""), (1, ", in segments"))
 }
-# What is executed of them: whole chunks, two blocks of channels; one segment, or two for several.
+# Executed part of them: whole chunks, two blocks of channels; one segment, or two for several.
 TOKENS, WIDTH, SEGMENTS = 1024, 128, 2
 
 
 def tuning_of(shape: Shape) -> Tuning:
-    """The kernels that a shape runs on."""
+    """Tuning of the kernels for a shape."""
     return choose(shape.batch, shape.length, shape.channels, shape.states, 1, MULTIPROCESSORS)
 
 
 def count_scan(case: str) -> tuple[dict[str, dict[str, Executed]], Shape, Tuning]:
-    """What a scan of ``SHAPES`` executes, cut to ``TOKENS`` and ``WIDTH``, and on which kernels."""
+    """Count the instructions of a scan of ``SHAPES``, cut to ``TOKENS`` and ``WIDTH``."""
     options = SCANS[case.removesuffix(", in segments")]
     shape = replace(SHAPES[case], batch=1, length=TOKENS, channels=WIDTH)
     tuning = tuning_of(SHAPES[case])
@@ -79,7 +79,7 @@ def count_scan(case: str) -> tuple[dict[str, dict[str, Executed]], Shape, Tuning
 
 
 def count_instructions(entry: Entry, tool: Path, scans: dict) -> dict[int, dict]:
-    """By architecture ``loop``, what the largest innermost loop holds, and the scan's estimate."""
+    """Count the largest innermost loop, and estimate the scan, by architecture."""
     found = {}
     for arch, path in binaries(entry.launch).items():
         symbol = symbol_of(entry.launch, read_cubin(path.read_bytes()))
@@ -102,10 +102,10 @@ def count_instructions(entry: Entry, tool: Path, scans: dict) -> dict[int, dict]
 
 
 def report(say: Callable[[str], None] = lambda kernel: None) -> dict:
-    """The document of ``static_report`` with more, where there is a disassembler.
+    """Extend the document of ``static_report``, if a disassembler is installed.
 
     Returns:
-        It with ``devices`` and ``scan``, and in its kernels ``loop``, ``per_element`` and
+        The document with ``devices`` and ``scan``, and in its kernels ``loop``, ``per_element`` and
         ``estimate``.
     """
     document = static_report(say)

@@ -1,7 +1,7 @@
-"""A kernel's instructions as a disassembler lists them: their kinds, and the loops they are in.
+"""Instructions of a kernel from a disassembler, with their kinds and loops.
 
-``nvdisasm`` comes with CUDA's toolkit and inside Triton. Loops are the natural loops of the jumps:
-a jump back to a place that every way to the jump has passed.
+``nvdisasm`` is part of CUDA's toolkit and of Triton. Loops are natural loops: those of a jump back
+to a dominator of the jump.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-# Kind: the operations that it holds, by the part of their name before the first dot. What is not
-# listed is "integer" (with comparisons, selections and bits), or "uniform" if it begins with U.
+# Operations of each kind, by their name before the first dot. Others are "integer" (with
+# comparisons, selections and bits), or "uniform" if they begin with U.
 KINDS = {
     "float": ("FADD", "FMUL", "FFMA", "FADD32I", "FMUL32I", "FFMA32I"),
     "special": ("MUFU",),
@@ -37,7 +37,7 @@ KINDS = {
 _KIND = {operation: kind for kind, operations in KINDS.items() for operation in operations}
 _MEMORY = ("global", "shared", "local", "shuffle")
 _LINE = re.compile(r"\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\w+\s+)?([A-Z][\w.]*)\s*([^;]*);")
-_JUMPS = ("BRA", "BRA.", "CALL")  # sm_80 jumps far with a call from which nothing returns
+_JUMPS = ("BRA", "BRA.", "CALL")  # sm_80 jumps far with a call that never returns
 _LABEL = re.compile(r"(\.L_\w+):")
 _TARGET = re.compile(r"`\((\.L_\w+)\)")
 
@@ -49,7 +49,7 @@ class Instruction:
     Attributes:
         operation: with its modifiers, e.g. "LDS.128".
         always: it has no condition.
-        target: index of the instruction that it may jump to, else None.
+        target: index of its jump target, or None.
     """
 
     operation: str
@@ -76,9 +76,9 @@ class Loop:
     """A natural loop.
 
     Attributes:
-        first: index of its first instruction, where every turn begins.
-        body: indices of its instructions, those of the loops inside it included.
-        inside: the loops in it, by their place.
+        first: index of its first instruction, where every iteration begins.
+        body: indices of its instructions, including those of inner loops.
+        inside: inner loops, in order.
     """
 
     first: int
@@ -87,7 +87,7 @@ class Loop:
 
 
 def find_nvdisasm() -> Path | None:
-    """NVIDIA's disassembler: on PATH, in CUDA_HOME or CUDA_PATH, or inside Triton."""
+    """Find NVIDIA's disassembler: on PATH, in CUDA_HOME or CUDA_PATH, or inside Triton."""
     folders = [
         Path(os.environ[name]) / "bin"
         for name in ("CUDA_HOME", "CUDA_PATH")
@@ -103,10 +103,10 @@ def find_nvdisasm() -> Path | None:
 
 
 def disassemble(tool: Path, cubin: Path) -> str:
-    """The text that ``nvdisasm -c`` gives of a binary.
+    """Return the output of ``nvdisasm -c`` for a binary.
 
     Raises:
-        ValueError: the tool fails, as one that is older than the binary does.
+        ValueError: the tool fails, for example if it is older than the binary.
     """
     done = subprocess.run([tool, "-c", cubin], capture_output=True, encoding="utf-8")
     if done.returncode:
@@ -115,10 +115,10 @@ def disassemble(tool: Path, cubin: Path) -> str:
 
 
 def parse(text: str, kernel: str) -> list[Instruction]:
-    """The instructions of a kernel, those of functions that it calls included.
+    """Parse the instructions of a kernel, including the functions that it calls.
 
     Args:
-        text: of ``disassemble``.
+        text: result of ``disassemble``.
         kernel: its symbol.
 
     Raises:
@@ -144,7 +144,7 @@ def parse(text: str, kernel: str) -> list[Instruction]:
 
 
 def _next(code: Sequence[Instruction], i: int) -> Iterator[int]:
-    """Where execution goes from instruction i."""
+    """Yield the successors of instruction i."""
     target = code[i].target
     if target is not None:
         yield target
@@ -157,7 +157,7 @@ def _next(code: Sequence[Instruction], i: int) -> Iterator[int]:
 
 
 def find_loops(code: Sequence[Instruction]) -> tuple[Loop, ...]:
-    """The outermost loops of a kernel, with those inside them."""
+    """Find the outermost loops of a kernel, with their inner loops."""
     before: list[list[int]] = [[] for _ in code]
     for i in range(len(code)):
         for j in _next(code, i):
@@ -167,13 +167,13 @@ def find_loops(code: Sequence[Instruction]) -> tuple[Loop, ...]:
         start = instruction.target
         if start is None or start >= i:
             continue
-        body, pending = {start}, [i]  # what reaches the jump without passing its target
+        body, pending = {start}, [i]  # instructions that reach the jump without passing its target
         while pending:
             at = pending.pop()
             if at not in body:
                 body.add(at)
                 pending += before[at]
-        if 0 not in body or start == 0:  # else a way from the entry avoids the target: no loop
+        if 0 not in body or start == 0:  # else a path from the entry avoids the target: not a loop
             bodies[start] = bodies.get(start, set()) | body
     return _nest([(start, frozenset(body)) for start, body in sorted(bodies.items())])
 
@@ -191,7 +191,7 @@ def _nest(bodies: list[tuple[int, frozenset[int]]]) -> tuple[Loop, ...]:
 
 
 def counts(code: Sequence[Instruction], body: frozenset[int] | None = None) -> Counter[str]:
-    """How often each kind occurs, and "passes"; of all the code or of a part."""
+    """Count instructions of each kind, and "passes"; of all the code or of a part."""
     chosen = code if body is None else [code[i] for i in sorted(body)]
     total = Counter(instruction.kind for instruction in chosen)
     total["passes"] = sum(instruction.passes for instruction in chosen)
@@ -199,7 +199,7 @@ def counts(code: Sequence[Instruction], body: frozenset[int] | None = None) -> C
 
 
 def innermost(code: Sequence[Instruction]) -> frozenset[int]:
-    """The body of the largest loop that holds no other; of a kernel without loops, all of it."""
+    """Body of the largest innermost loop; of a kernel without loops, all of it."""
 
     def leaves(loops: Sequence[Loop]) -> Iterator[frozenset[int]]:
         for loop in loops:
@@ -211,16 +211,16 @@ def innermost(code: Sequence[Instruction]) -> frozenset[int]:
 def executed(
     code: Sequence[Instruction], ptx: Sequence[Instruction], times: Sequence[int]
 ) -> dict[str, float]:
-    """How many instructions of each kind the warps execute.
+    """Estimate the instructions of each kind executed by the warps.
 
-    ptxas keeps the loops of PTX. Each instruction of a loop is taken to be executed as often as
-    those of the same loop in PTX are on average, so branches that some warps skip count in part.
+    ptxas keeps the loops of PTX. Each instruction of a loop is assumed to be executed as often as
+    those of the same loop in PTX on average, so branches skipped by some warps count in part.
 
     Args:
         code: of the kernel.
-        ptx: its PTX. At each level the largest loops of both, in the order of their places, are
-            the same; the code of a loop that one of the two has more is that of what is around it.
-        times: by instruction of the PTX, how many warps executed it.
+        ptx: its PTX. At each level the largest loops of both are matched in order; the code of an
+            unmatched loop belongs to the enclosing one.
+        times: number of warps that executed each instruction of the PTX.
     """
     total: dict[str, float] = defaultdict(float)
 

@@ -10,15 +10,15 @@ from gamba_warp.kernels.bench.core.case import Settings
 
 @dataclass(frozen=True)
 class StudySettings(Settings):
-    """What a run of studies was asked for.
+    """Settings of a run of studies.
 
     Attributes:
-        data: folder of posed views for the cases of training; None: made-up views.
+        data: folder of posed views for the cases of training; None for made-up views.
     """
 
     data: Path | None = None
 
 
 def data_of(settings: Settings) -> Path | None:
-    """The folder of posed views; None of a run that has no such choice."""
+    """Return the folder of posed views; None for a run without this setting."""
     return getattr(settings, "data", None)

@@ -18,7 +18,7 @@ from gamba_warp.untrusted.ranges import Threads, ranged
 
 from . import StudySettings, drift, show, targets
 
-# What is studied -> the module with ``cases(settings)`` and perhaps ``targets(settings)``.
+# Name of a study -> the module with ``cases(settings)`` and optionally ``targets(settings)``.
 STUDIES = {
     "scan": ".scan",
     "times": ".times",
@@ -53,9 +53,9 @@ def study(
     data: Path | None = None,
     only: tuple[str, ...] = (),
 ) -> int:
-    """Measures what the project wants to know of itself, by the clock of gamba bench.
+    """Measure the studies of the project, with the timing of gamba bench.
 
-    Writes bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
+    Writes bench.json, bench.md and bench.html. Ctrl-C keeps the results so far.
 
     Args:
         what: scan and raster (choices inside the kernels), times (of a layer's scan, by length,

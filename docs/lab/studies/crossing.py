@@ -1,4 +1,4 @@
-"""Where two lines of a chart cross: from which length on one thing costs more than another."""
+"""Crossings of two lines of a chart: the length from which one series costs more than another."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FIGURES = {
 
 
 class Crossing(NamedTuple):
-    """Where the second series begins to cost more than the first, for good.
+    """Point from which the second series costs more than the first.
 
     Attributes:
         op: of the case.
@@ -25,8 +25,8 @@ class Crossing(NamedTuple):
         first: name of the series that costs less beyond the crossing.
         second: name of the other one.
         lengths: lengths that both have, the least and the greatest.
-        at: the length L*, interpolated between two lengths on logarithmic axes; None where the
-            series do not cross.
+        at: the length L*, interpolated between two lengths on logarithmic axes; None if the series
+            do not cross.
         value: the figure there, in the unit of ``FIGURES``; None likewise.
         cheaper: name of the series that costs less at the greatest length.
     """
@@ -44,7 +44,7 @@ class Crossing(NamedTuple):
     cheaper: str
 
     def text(self) -> str:
-        """Says it in one sentence."""
+        """Describe the crossing in one sentence."""
         where = f"{self.direction}, {self.dtype}, {self.figure}"
         low, high = (f"{length:,.0f}" for length in self.lengths)
         if self.at is None:
@@ -57,9 +57,9 @@ class Crossing(NamedTuple):
 
 
 def crossings(records: Iterable[dict]) -> list[Crossing]:
-    """The crossings of every case with the axis "lengths": of its first series with the second.
+    """Find the crossings of every case with the axis "lengths": of its first and second series.
 
-    Where lines cross more than once, the one at the greatest length counts.
+    If lines cross more than once, the crossing at the greatest length counts.
     """
     found: dict[tuple[str, ...], list[dict]] = {}
     for r in records:
@@ -71,7 +71,7 @@ def crossings(records: Iterable[dict]) -> list[Crossing]:
 
 
 def series_of(records: Sequence[dict], figure: str) -> dict[str, dict[float, float]]:
-    """A figure by length, by series, of the records of one direction and dtype."""
+    """Figures by series and length, of the records of one direction and dtype."""
     factor, result = FIGURES[figure][2], {}
     for r in records:
         value, length = r.get(figure) or r["work"].get(figure), r["parameters"].get("L")
@@ -105,5 +105,5 @@ def _crossing(key: tuple[str, ...], records: Sequence[dict], figure: str) -> Cro
 
 
 def _between(low: float, high: float, share: float) -> float:
-    """The number that lies between two others, at a share of the way on a logarithmic axis."""
+    """Interpolate between two numbers on a logarithmic axis."""
     return math.exp(math.log(low) + share * (math.log(high) - math.log(low)))

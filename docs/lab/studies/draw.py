@@ -13,10 +13,10 @@ from .slopes import error_charts, growth_charts
 
 
 def growth_picture(documents: Sequence[dict]) -> str:
-    """All growths of results as one SVG: a chart of a case beside the next, with its title.
+    """Draw all growths of results as one SVG, with a titled chart per case.
 
     Args:
-        documents: as ``measure`` returns them.
+        documents: results of ``measure``.
 
     Returns:
         The text of the file; empty if nothing grows in the documents.
@@ -37,11 +37,11 @@ _BAR, _BETWEEN = 11, 7  # height of a bar, and between two names, pixels
 
 
 def bars(series: Mapping[str, Mapping[str, float]], label: str) -> str:
-    """Returns the ``<svg>`` element, or an empty text if there is nothing to show.
+    """Return the ``<svg>`` element, or an empty text without any figures.
 
     Args:
-        series: by series, figures by name, >= 0; a name that one lacks is 0 there.
-        label: what the figures are, with their unit.
+        series: by series, figures by name, >= 0; missing names are 0.
+        label: quantity and unit of the figures.
     """
     names = list(dict.fromkeys(name for figures in series.values() for name in figures))
     largest = max((value for figures in series.values() for value in figures.values()), default=0)

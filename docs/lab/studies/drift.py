@@ -1,6 +1,6 @@
-"""How far the rules of occupancy drift on known shapes that are damaged.
+"""Drift of the rules of occupancy on damaged known shapes.
 
-``make study WHAT=drift`` prints the table that stands in ``eval/README.md``.
+``make study WHAT=drift`` prints the table of ``eval/README.md``.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def known_shapes() -> dict[str, Mesh]:
 
 
 def with_hole(mesh: Mesh, share: float, seed: int) -> Mesh:
-    """Cuts out the faces nearest to a random place of the surface, up to ``share`` of the area."""
+    """Cut out the faces nearest to a random point of the surface, up to ``share`` of the area."""
     area = np.linalg.norm(mesh.normals(), axis=1)
     middle = mesh.corners().mean(1)
     at = np.random.default_rng(seed).choice(len(middle), p=area / area.sum())
@@ -58,7 +58,7 @@ def with_hole(mesh: Mesh, share: float, seed: int) -> Mesh:
 
 
 def with_flips(mesh: Mesh, share: float, seed: int) -> Mesh:
-    """Turns over about ``share`` of the faces, drawn at random."""
+    """Turn over about ``share`` of the faces, drawn at random."""
     faces = mesh.faces.copy()
     chosen = np.random.default_rng(seed).random(len(faces)) < share
     faces[chosen] = faces[chosen][:, ::-1]
@@ -66,7 +66,7 @@ def with_flips(mesh: Mesh, share: float, seed: int) -> Mesh:
 
 
 def doubled(mesh: Mesh) -> Mesh:
-    """Gives every face again from its other side, as files for renderers that cull have it."""
+    """Add every face again with the other orientation, as in files for culling renderers."""
     return Mesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces[:, ::-1]]))
 
 
@@ -105,7 +105,7 @@ def drift(mesh: Mesh, damage: Callable[[Mesh, int], Mesh], voxels: int, seeds: i
 
 
 def main(voxels: int = 32, seeds: int = 3) -> None:
-    """Prints the table as Markdown.
+    """Print the table as Markdown.
 
     Args:
         voxels: Number of voxels in a unit of length.

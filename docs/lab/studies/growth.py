@@ -25,7 +25,7 @@ SCAN, RASTER = "growth-scan", "growth-raster"
 _TOKENS = 512  # first tokens that the scan's oracle sees
 _DENSE = 16384  # of more Gaussians the oracle sees those near its crop
 
-# The sizes of a case by level; those that do not grow are in ``_SCAN_BASE`` and ``_RASTER_BASE``.
+# Growing sizes of a case by level; constant ones are in ``_SCAN_BASE`` and ``_RASTER_BASE``.
 _SCAN_SIZES = {
     "quick": {"L": (256, 1024), "D": (16, 64), "N": (4, 16), "B": (1, 2)},
     "normal": {
@@ -63,7 +63,7 @@ _RASTER_BASE = {"quick": (1024, 64, 64), "normal": (16384, 512, 256)}  # count, 
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the cases: scan over L, D, N and B, rasterizer over Gaussians, pixels and views."""
+    """Return the cases: scan over L, D, N and B, rasterizer over Gaussians, pixels and views."""
     scan = {
         "L": f"Time and memory over the number of tokens L, {_WIDTH_OF_LENGTHS} channels.",
         "D": "Time and memory over the number of channels D.",
@@ -84,7 +84,7 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def _weighed(variant: Variant, size: str, value: int, unit: str, device: torch.device) -> Variant:
-    """A variant whose work has its memory, and whose parameters say what grows."""
+    """Add the memory to a variant's work, and the growing size to its parameters."""
     count, run = variant.work, variant.run
 
     def work() -> dict[str, int | float]:
@@ -152,12 +152,11 @@ def _pairs(scene: Scene, count: Callable[[], Mapping[str, int | float]]) -> dict
 
 
 def near_crop(scene: Scene, backward: bool) -> Tensor:
-    """Which Gaussians may reach the crop that the oracle draws: their box of six standard
-    deviations does.
+    """Mask of the Gaussians that may reach the oracle's crop: by a box of six standard deviations.
 
     Args:
-        scene: one object, ``[N, ·]``; its first view counts.
-        backward: whether it is the smaller crop of the gradients.
+        scene: one object, ``[N, ·]``; its first view is used.
+        backward: True for the smaller crop of the gradients.
 
     Returns:
         ``[N]`` bool on the CPU.
@@ -175,10 +174,10 @@ def near_crop(scene: Scene, backward: bool) -> Tensor:
 
 
 def check_near(scene: Scene, backward: bool) -> Error:
-    """The error on the crop, with the oracle's Gaussians those that may reach it.
+    """Error on the crop, with the oracle limited to the Gaussians that may reach it.
 
-    The picture is that of all Gaussians. Gradients are those of the Gaussians near the crop, drawn
-    alone: the dense oracle of all of them would take gigabytes.
+    The picture is that of all Gaussians. Gradients are those of a rendering of only the Gaussians
+    near the crop: the dense oracle of all would take gigabytes.
     """
     near = near_crop(scene, backward)
     few = {k: x[near.to(x.device)] for k, x in scene.gaussians.items()}

@@ -1,4 +1,4 @@
-"""Benchmark cases of the scan's error over the number of tokens, beside what theory lets it be.
+"""Benchmark cases of the scan's error over the number of tokens, with theoretical bounds.
 
 Named inputs at 1,024 to 1,048,576 tokens, with gradients up to 131,072 and forward alone above,
 against float64 from the same rounded inputs. The lines are those of the scan's README, "Accuracy":
@@ -42,7 +42,7 @@ class Sizes:
 
 
 def sizes_of(settings: Settings) -> Sizes:
-    """The lengths of a level."""
+    """Return the lengths of a level."""
     if settings.level == "quick":
         return Sizes((256, 1024, 4096), 1024)
     powers = range(10, 21) if settings.level == "full" else (10, 12, 14, 16, 17, 18, 20)
@@ -79,7 +79,7 @@ def make_kind(kind: str, length: int) -> dict[str, Tensor]:
 
 
 class _Recurrence(torch.autograd.Function):
-    """h_t = f_t h_{t-1} + w_t in float64, pieces of tokens side by side, and its gradient."""
+    """h_t = f_t h_{t-1} + w_t in float64, in parallel pieces of tokens, and its gradient."""
 
     @staticmethod
     def forward(ctx: Any, f: Tensor, w: Tensor, first: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ def truth(inputs: dict[str, Tensor], first: Tensor) -> tuple[Tensor, Tensor]:
         ``out`` ``[1, L, D]`` and the states after each token ``[L, D, N]``.
     """
     u, z, B, C = (inputs[k][0] for k in ("u", "z", "B", "C"))
-    # torch's softplus goes over to its argument at 20, where float64 still sees a difference.
+    # torch's softplus returns its argument above 20, where float64 still shows a difference.
     step = F.softplus(inputs["delta"][0] + inputs["delta_bias"], threshold=700.0)
     f = torch.exp(step[..., None] * inputs["A"])
     h = _Recurrence.apply(f, (step * u)[..., None] * B[:, None], first)
@@ -175,7 +175,7 @@ class Problem:
             return selective_scan(**own, delta_softplus=True, return_last_state=True)
 
     def cotangent(self, length: int) -> Tensor:
-        """Of the output, ``[1, L, D]``: 1 where all is constant, otherwise drawn."""
+        """Cotangent of the output, ``[1, L, D]``: 1 for constant inputs, otherwise random."""
         shape = (1, length, _CHANNELS)
         if self.kind == "constant":
             return torch.ones(shape, dtype=self.dtype)
@@ -217,7 +217,7 @@ class Problem:
         return dict(zip(leaves, grads))
 
     def lines(self, length: int) -> dict[str, float]:
-        """What one rounding of f, random ones and equal ones leave of h at most."""
+        """Bounds of the error of h for one rounding of f, random ones and equal ones."""
         memory = memory_of(self.inputs, length)
         return {"ε/2": EPS / 2, "ε√T/2": EPS / 2 * math.sqrt(memory), "εT/2": EPS / 2 * memory}
 
@@ -239,7 +239,7 @@ def errors(problem: Problem, length: int, device: torch.device, backward: bool) 
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the cases: every kind of inputs in float32 and bfloat16."""
+    """Return the cases: every kind of inputs in float32 and bfloat16."""
     made = []
     for kind, text in KINDS.items():
         for dtype in (torch.float32, torch.bfloat16):
@@ -262,7 +262,7 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def variants(settings: Settings, kind: str, dtype: torch.dtype) -> list[Variant]:
-    """Returns a variant for every length, with gradients where the level has them."""
+    """Return a variant for every length, with gradients where the level has them."""
     problem = Problem(kind, dtype, sizes_of(settings))
     return [_variant(problem, length, settings.device) for length in problem.sizes.lengths]
 

@@ -1,8 +1,8 @@
 """Benchmark cases over the number of tokens: a Mamba block against a transformer block.
 
-The paper's question 2 asks what the linear cost of Mamba is worth. Both blocks have the same width
-and see the same tokens, one sequence; the condition of a Gamba block is left out (its cost does not
-grow with L). The transformer block attends to all tokens, as those of reconstruction models do.
+The paper's question 2 concerns the benefit of Mamba's linear cost. Both blocks have the same width
+and the same tokens, one sequence; the condition of a Gamba block is left out (its cost does not
+grow with L). The transformer block attends to all tokens, as in other reconstruction models.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ _FUSED = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
 
 
 class Stopped(NotMeasured):
-    """Raised in place of a run that would go beyond a limit; ``str(error)`` says which."""
+    """Raised instead of a run that would exceed a limit, named by ``str(error)``."""
 
     word = "stopped"
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a run measures.
+    """Sizes of a run.
 
     Attributes:
         lengths: numbers of tokens, ascending.
@@ -67,8 +67,8 @@ class Sizes:
 
 
 def sizes_of(settings: Settings) -> Sizes:
-    """The sizes of a level; the paper's width where the device is CUDA, or the level "full"."""
-    # The question is asked of 1k to 64k; the shorter ones show a crossing below.
+    """Return the sizes of a level; the paper's width on CUDA or at the level "full"."""
+    # The question concerns 1k to 64k; the shorter ones show a crossing below.
     powers = tuple(2**k for k in range(8, 17))
     if settings.level == "quick":
         return Sizes((128, 256, 512), 64, 2.0)
@@ -83,7 +83,7 @@ def reference_transformer(block: AttentionBlock, tokens: Tensor, count: int) -> 
     Args:
         block: the block whose weights are used; it has no prefix.
         tokens: ``[B, L, width]`` float64; every one of them is seen.
-        count: how many tokens of the result are wanted.
+        count: number of tokens of the result.
 
     Returns:
         ``[B, count, width]`` float64.
@@ -129,23 +129,23 @@ class Bench:
         }
 
     def autocast(self) -> AbstractContextManager:
-        """The dtype of the products, as in training."""
+        """Autocast of the products, as in training."""
         if self.dtype == torch.float32:
             return nullcontext()
         return torch.autocast(self.device.type, self.dtype)
 
     def apply(self, name: str, tokens: Tensor) -> Tensor:
-        """One block as the model runs it: Mamba's on a CPU without gradients in segments."""
+        """Apply one block like the model: Mamba's on a CPU without gradients in segments."""
         with self.autocast(), sdpa_kernel(_FUSED):
             return run_blocks([self.blocks[name]], tokens, [None])
 
     @torch.no_grad()
     def forward(self, name: str, length: int) -> Tensor:
-        """The block without gradients; this is what is timed."""
+        """Run the block without gradients; timed."""
         return self.apply(name, self.tokens[:, :length])
 
     def step(self, name: str, length: int) -> None:
-        """Forward, backward to the tokens and all weights, AdamW; this is timed too."""
+        """Forward, backward to the tokens and all weights, AdamW; timed."""
         tokens = self.tokens[:, :length].detach().requires_grad_()
         self.apply(name, tokens).float().square().mean().backward()
         self.optimizers[name].step()
@@ -160,7 +160,7 @@ class Bench:
         return reference_block(block, tokens[:, :count], None, None)
 
     def check(self, name: str, length: int) -> Error:
-        """The error of what is added to the first tokens, of which Mamba's see no later one."""
+        """Error of the block's contribution to the first tokens, which is causal for Mamba."""
         count = min(_TOKENS, length)
         tokens = self.tokens[:, :length].double().cpu()
         with torch.no_grad():
@@ -170,7 +170,7 @@ class Bench:
         return compare({"update": got - first}, {"update": want - first})
 
     def check_step(self, name: str, length: int) -> Error:
-        """The error of the gradient of all tokens, of the first tokens after the block."""
+        """Error of the gradient of the first tokens after the block with respect to all tokens."""
         count = min(_TOKENS, length)
         tokens = self.tokens[:, :length].detach().requires_grad_()
         cotangent = torch.zeros_like(tokens)
@@ -189,7 +189,7 @@ class Line:
     Attributes:
         name: of the block.
         direction: "forward" or "forward+backward".
-        bench: what is run.
+        bench: the benchmarked blocks.
         seconds: of the fastest call so far, by length.
         peaks: bytes by length, where they are known.
     """
@@ -206,7 +206,7 @@ class Line:
         return (self.bench.step if training else self.bench.forward)(self.name, length)
 
     def run(self, length: int) -> object:
-        """One call. Raises Stopped where a shorter length was over a limit, or memory lacks."""
+        """Run one call. Raises Stopped if a shorter length exceeded a limit, or memory is short."""
         self._check_limits(length)
         try:
             return self._timed(length)
@@ -225,7 +225,7 @@ class Line:
         return result
 
     def expected(self, length: int) -> float:
-        """Seconds that a call may take: the power law through the two shorter lengths."""
+        """Expected seconds of a call, by the power law through the two shorter lengths."""
         shorter = sorted(done for done in self.seconds if done < length)
         if not shorter:
             return 0.0
@@ -234,7 +234,7 @@ class Line:
             return self.seconds[last]
         before = shorter[-2]
         slope = math.log(self.seconds[last] / self.seconds[before]) / math.log(last / before)
-        # A call's cost hides the growth of short lengths, and no call takes over O(L squared).
+        # A call's overhead hides the growth of short lengths, and no call exceeds O(L squared).
         return self.seconds[last] * (length / last) ** min(max(slope, 0.0), 2.0)
 
     def _check_limits(self, length: int) -> None:
@@ -253,17 +253,17 @@ class Line:
             raise Stopped(self.ended)
 
     def check(self, length: int) -> Error:
-        """The error; and the memory of a call, which the next length is judged by."""
+        """Return the error; record the memory of a call to predict that of the next length."""
         error = self.bench.check_step if self.direction == BOTH else self.bench.check
         found = error(self.name, length)
-        # This is the second call: in the first one's time there may be a compilation.
+        # This is the second call: the first one may include a compilation.
         peak = peak_bytes(partial(self._timed, length), self.bench.device)
         if peak is not None:
             self.peaks[length] = peak
         return found
 
     def work(self, length: int) -> dict[str, int]:
-        """The memory of a call: how much it grows, results included, what is kept before not."""
+        """Memory of a call: its growth, including results, excluding earlier allocations."""
         return {"peak_bytes": self.peaks[length]} if length in self.peaks else {}
 
 
@@ -273,7 +273,7 @@ def _is_memory(error: BaseException) -> bool:
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """Memory that a run may take: of the GPU, or of a Linux machine; None elsewhere."""
+    """Free memory of the GPU, or of a Linux machine; None elsewhere."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
@@ -284,7 +284,7 @@ def free_bytes(device: torch.device) -> int | None:
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the cases: forward and a step of training; on CUDA each in two dtypes."""
+    """Return the cases: forward and a step of training; on CUDA each in two dtypes."""
     sizes = sizes_of(settings)
     dtypes = [torch.float32, torch.bfloat16][: 2 if settings.device.type == "cuda" else 1]
     names = {"forward": "forward", BOTH: "training step"}
@@ -323,7 +323,7 @@ def _name(dtype: torch.dtype) -> str:
 
 
 def lines(settings: Settings, sizes: Sizes, direction: str, dtype: torch.dtype) -> list[Variant]:
-    """Returns the variants of one direction: both blocks at every length, short ones first."""
+    """Return the variants of one direction: both blocks at every length, short ones first."""
     bench = Bench(settings, sizes, dtype)
     both = [Line(name, direction, bench) for name in bench.blocks]
     full = dtype == torch.float32
@@ -353,7 +353,7 @@ def _variant(line: Line, length: int, limit: float, oracle: str) -> Variant:
 
     def run() -> object:
         result = line.run(length)
-        # Of what takes seconds three rounds are enough, of what takes many, one.
+        # Three rounds suffice for calls of seconds, one for longer calls.
         share = line.seconds[length] / line.bench.sizes.seconds
         made.rounds = None if share < 0.01 else 3 if share < 0.1 else 1
         return result

@@ -37,7 +37,7 @@ ALONE = "matrix products alone"
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the cases, which count to those of ``gamba bench block model``."""
+    """Return the cases, in addition to those of ``gamba bench block model``."""
     models = [
         ("background tokens", background_tokens, "error,skipped"),
         ("precision", precision.precisions, "error"),
@@ -49,7 +49,7 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def targets(settings: Settings) -> list[Target]:
-    """Returns those of both precisions, and of blocks beside their products."""
+    """Return the targets of both precisions, and of blocks beside their products."""
     made = precision.targets(settings)
     if settings.level != "quick":
         for name in _DEPTHS:
@@ -77,7 +77,7 @@ def alone(settings: Settings) -> list[Variant]:
 
 
 class _Lazy:
-    """Makes a function at its first call, so that a failure there spoils no other variant."""
+    """Function made at its first call, so that a failure does not affect other variants."""
 
     def __init__(self, make: Callable[[], Callable[[], Tensor]]) -> None:
         self._make = make
@@ -155,21 +155,21 @@ class _Pictures:
 
     @torch.no_grad()
     def run(self, margin: int | None) -> list[Gaussians]:
-        """Runs the model on one picture after the other; this is what is timed."""
+        """Run the model on one picture after the other; timed."""
         return [self.model(x, self.camera, background_margin=margin)[0] for x in self.images]
 
     @torch.no_grad()
     def pictures(self, margin: int | None) -> Tensor:
-        """Renders the results of ``run`` from three sides: ``[pictures, 3, H, W, 3]``."""
+        """Render the results of ``run`` from three sides: ``[pictures, 3, H, W, 3]``."""
         made = self.run(margin)
         return torch.stack([render(g, self.views, self.background).rgb for g in made])
 
     def check(self, margin: int | None) -> Error:
-        """Measures the error of the rendered pictures to those of the full model."""
+        """Measure the error of the rendered pictures to those of the full model."""
         return compare({"pictures": self.pictures(margin)}, {"pictures": self.full})
 
     def work(self, margin: int | None) -> dict[str, float]:
-        """Counts kept tokens and their share, and the PSNR to the full model's pictures, dB."""
+        """Count kept tokens and their share, and the PSNR to the full model's pictures, dB."""
         kept = sum(g.means.shape[-2] for g in self.run(margin))
         total = len(self.images) * self.model.config.num_gaussians
         difference = (self.pictures(margin) - self.full).square().mean().clamp_min(1e-12)

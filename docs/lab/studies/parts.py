@@ -1,8 +1,8 @@
-"""Where the time of a run goes: the events of torch's profiler, summed by part.
+"""Time of a run by parts, from the events of torch's profiler.
 
-A part is a region that the code names with ``record_function``, or operators of one kind inside a
-region. An operator's gradient belongs to the region of the operator: the profiler gives both the
-same sequence number. Times are self times on the calling thread, so every moment is counted once.
+A part is a region named with ``record_function``, or operators of one kind inside a region. An
+operator's gradient belongs to the region of the operator: the profiler gives both the same sequence
+number. Times are self times on the calling thread, so every moment is counted once.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ def measure_parts(
     kinds: Mapping[str, Mapping[str, str]],
     rounds: int,
 ) -> dict[str, float]:
-    """Profiles a run on the CPU, a few times.
+    """Profile a run on the CPU, a few times.
 
     Args:
-        run: what is measured; it names its regions with ``torch.profiler.record_function``.
-        regions: these names; of two that enclose an operator the inner one counts.
-        kinds: by region, what is a part of its own: text in an operator's name -> part. Operators
-            inside such an operator belong to it too.
+        run: the function to measure, with regions by ``torch.profiler.record_function``.
+        regions: names of the regions; of two that enclose an operator the inner one counts.
+        kinds: separate parts by region: text in an operator's name -> part. Operators inside such
+            an operator belong to it, too.
         rounds: number of runs, >= 1.
 
     Returns:
         Milliseconds, medians over the rounds: "forward: PART" and "backward: PART" for each part
-        that took any time; "not attributed", what lies in no region; and "under the profiler", the
-        time of the whole run while it is profiled.
+        that took any time; "not attributed", outside all regions; and "under the profiler", the
+        time of the whole profiled run.
     """
-    # Read at the first use; below this level the profiler writes lines of its own to stderr.
+    # Read at the first use; below this level the profiler writes to stderr.
     os.environ.setdefault("KINETO_LOG_LEVEL", "6")
     found: list[dict[str, float]] = []
     for _ in range(rounds):
@@ -77,7 +77,7 @@ def _sums(
 
 
 def _place(event: Any, regions: set[str]) -> Any | None:
-    """The innermost region, or function of the gradient, that encloses an event."""
+    """Find the innermost region, or function of the gradient, around an event."""
     while event is not None:
         if event.name in regions or event.name.startswith(_BACKWARD):
             return event

@@ -29,7 +29,7 @@ _LIMITS = {torch.float32: 1e-3, torch.bfloat16: 0.1}
 
 
 def targets(settings: Settings) -> list[Target]:
-    """Returns the targets; there are none at a quick run's sizes or on a GPU."""
+    """Return the targets; none at a quick run's sizes or on a GPU."""
     if settings.level == "quick" or settings.device.type != "cpu":
         return []
     wanted = ((f"paper, {PLAIN}", 1.08), (f"paper, float32, {ALONE}", 1.3))
@@ -45,7 +45,7 @@ def targets(settings: Settings) -> list[Target]:
 
 
 class _Precise:
-    """A model with one picture, and what it gives in float32 by torch's own choice of library."""
+    """Model with one picture, and its result in float32 by torch's default library."""
 
     def __init__(self, settings: Settings, preset: Preset) -> None:
         torch.manual_seed(0)
@@ -75,7 +75,7 @@ class _Precise:
 
     @torch.no_grad()
     def run(self, precision: torch.dtype) -> Gaussians:
-        """Runs the model; this is what is timed."""
+        """Run the model; timed."""
         with network_products(self.picture.device, precision):
             return self.model(self.picture, self.camera)
 
@@ -84,13 +84,13 @@ class _Precise:
         return render(gaussians[0], self.views).rgb
 
     def check(self, precision: torch.dtype) -> Error:
-        """Measures the error of the Gaussians."""
+        """Measure the error of the Gaussians."""
         made, truth = ({k: x for k, x in vars(g).items() if x is not None} for g in
                        (self.run(precision), self.truth))  # fmt: skip
         return compare(made, truth)
 
     def work(self, precision: torch.dtype) -> dict[str, float]:
-        """Measures how far the pictures from three sides are, as a PSNR."""
+        """Measure the PSNR of pictures from three sides."""
         error = (self._render(self.run(precision)) - self.seen).square().mean().clamp_min(1e-12)
         return {"psnr_to_float32": round(-10 * error.log10().item(), 1)}
 

@@ -1,4 +1,4 @@
-"""A bare scan for a CPU, which shows how fast the sum itself can go without an operator around it.
+"""Bare scan for a CPU, to show the speed of the sum without an operator around it.
 
 It is one native loop over a block of 16 adjacent channels, with their 16 states unrolled and exp2
 by a polynomial. It has no gate, skip connection, softplus or bias, no gradient, one dtype and 16
@@ -92,7 +92,7 @@ def _kernel():
 
 
 def probe_scan(u: Tensor, delta: Tensor, rate: Tensor, B: Tensor, C: Tensor, out: Tensor) -> Tensor:
-    """Computes h_t = exp(δA) h_{t-1} + δ B_t u_t, out_t = Σ_n C_t h_t on torch's threads.
+    """Compute h_t = exp(δA) h_{t-1} + δ B_t u_t, out_t = Σ_n C_t h_t on torch's threads.
 
     Args:
         u: ``[L, D]``, D a multiple of 16; like all arguments float32 on the CPU, dense.
@@ -112,5 +112,5 @@ def probe_scan(u: Tensor, delta: Tensor, rate: Tensor, B: Tensor, C: Tensor, out
 
 
 def probe_rate(A: Tensor) -> Tensor:
-    """Maps A ``[D, 16]``, negative numbers, to the A·log2(e) ``[16, D]`` of ``probe_scan``."""
+    """Map A ``[D, 16]``, negative numbers, to the A·log2(e) ``[16, D]`` of ``probe_scan``."""
     return (A.T * _LOG2E).contiguous()

@@ -1,4 +1,4 @@
-"""The matrix products of a run, alone: what a run of blocks would take if all else were free."""
+"""Matrix products of a run, repeated alone: the time of blocks if everything else were free."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Products:
             self._calls.append(partial(getattr(torch, name), *tensors, out=out))
 
     def _buffer(self, shape, stride, dtype, use: int) -> Tensor:
-        """Returns a tensor of this shape; operands of the same shape and position share one."""
+        """Return a tensor of this shape; operands of the same shape and position share one."""
         key = (tuple(shape), tuple(stride), dtype, use)
         if key not in self._buffers:
             x = torch.empty_strided(shape, stride, dtype=dtype, device=self._device)
@@ -68,7 +68,7 @@ class Products:
 
     @torch.no_grad()
     def run(self) -> None:
-        """Repeats all products, by the library that the model takes; this is what is timed."""
+        """Repeat all products, with the library of the model; timed."""
         with network_products(self._device):
             for call in self._calls:
                 call()

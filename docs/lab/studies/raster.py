@@ -63,7 +63,7 @@ def switches(settings: Settings) -> list[Variant]:
 
 
 def _share(name: str, scene: Scene) -> dict[str, float]:
-    """What the named switch leaves out of its own count, where all are on."""
+    """Share skipped by the named switch of its own count, with all switches on."""
     counts = scene.work(True)
     blocks = 16 * counts["pairs_walked"]
     none, half = counts["tiles_empty"], counts["tiles"] - counts["tiles_empty"]
@@ -87,22 +87,22 @@ class LargeScene(Scene):
     """A shell whose oracle sees only the Gaussians around the crop: it is dense.
 
     Attributes:
-        wide: whether pictures are 16:9; ``size`` is their height.
+        wide: True for pictures of 16:9; ``size`` is their height.
     """
 
     wide: bool = False
 
     @property
     def width(self) -> int:
-        """Of the picture, pixels."""
+        """Width of the picture, pixels."""
         return _width(self.size, self.wide)
 
     def arguments(self) -> dict:
-        """As of any scene, with the width of the picture."""
+        """Arguments of any scene, with the width of the picture."""
         return super().arguments() | {"width": self.width}
 
     def crop(self, backward: bool) -> tuple[int, int, int, int]:
-        """As of any scene; the object is in the middle of a wide picture too."""
+        """Crop of any scene; the object is also in the middle of a wide picture."""
         left, top, width, height = super().crop(True)
         return left + (self.width - self.size) // 2, top, width, height
 
@@ -151,7 +151,7 @@ def large_scenes(settings: Settings) -> list[Variant]:
 
 
 def targets(settings: Settings) -> list[Target]:
-    """Time grows no faster than pairs and Gaussians together; projection and lists are half."""
+    """Targets: time grows no faster than pairs plus Gaussians; projection and lists are half."""
     if settings.level == "quick" or settings.device.type != "cpu":
         return []
     made = []

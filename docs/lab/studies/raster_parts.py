@@ -1,4 +1,4 @@
-"""Parts of the rasterizer alone, and those of gsplat's torch code that a CPU can run."""
+"""Parts of the rasterizer, and those of gsplat's torch code that run on a CPU."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Parts:
         return Projected(*project(*each, self.viewmats[None], self.Ks[None], lens.numbers()))
 
     def gsplat_project(self) -> Tensor:
-        """The centres that gsplat finds in the picture, ``[V, N, 2]``."""
+        """Centres projected by gsplat, ``[V, N, 2]``."""
         code = peers.load("gsplat.cuda._torch_impl", "gsplat")
         means, quats, scales = (self.x[k] for k in ("means", "quats", "scales"))
         covariances, _ = code._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
@@ -68,7 +68,7 @@ class Parts:
         return bin_op(*(part.flatten(0, 1) for part in parts), *options)
 
     def gsplat_bin(self) -> object:
-        """The lists that gsplat makes of the same boxes."""
+        """Tile lists of gsplat for the same boxes."""
         code = peers.load("gsplat.cuda._torch_impl", "gsplat")
         x, tiles = self.projected, -(-self.size // TILE)
         radii = x.extents[0].ceil().int()
@@ -88,7 +88,7 @@ def gsplat_parts(settings: Settings) -> list[Variant]:
         runs: dict[str, tuple[Callable, Callable]] = {
             "projection": (parts.project, parts.gsplat_project)
         }
-        if count != 1048576:  # gsplat's lists of so many take long: a loop in Python
+        if count != 1048576:  # gsplat's lists take too long: a loop in Python
             runs["tile lists"] = (parts.bin, parts.gsplat_bin)
         for part, (ours, theirs) in runs.items():
             end = f", {count} Gaussians" if count else ""

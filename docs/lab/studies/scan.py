@@ -1,4 +1,4 @@
-"""Studies of the scan: its inner choices, which no caller makes, and a bare loop beside it."""
+"""Studies of the scan: its internal choices, and a bare loop for comparison."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def targets(settings: Settings) -> list[Target]:
-    """What should be reached; nothing at a quick run's sizes."""
+    """Return the targets; none at a quick run's sizes."""
     if settings.level == "quick" or settings.device.type != "cpu":
         return []
     ours, probe = (Key("scan", "bare loop", name) for name in ("default", "probe, 2 threads"))
@@ -55,7 +55,7 @@ def targets(settings: Settings) -> list[Target]:
 
 
 def bare(problem: Operator) -> Operator:
-    """The same with the steps given, and no gate, skip or bias."""
+    """The same problem with given steps, and without gate, skip or bias."""
     x = problem.inputs
     step = F.softplus(x["delta"] + x["delta_bias"])
     inputs = {"u": x["u"], "delta": step, "A": x["A"], "B": x["B"], "C": x["C"]}
@@ -64,7 +64,7 @@ def bare(problem: Operator) -> Operator:
 
 
 def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Variant]:
-    """Makes variants run, check and count inside ``use(choice)``, which chooses kernels."""
+    """Make variants run, check and count inside ``use(choice)``, which selects kernels."""
 
     def inside(function: Callable) -> Callable:
         def run():

@@ -1,4 +1,4 @@
-"""What the studies show of their cases beside the table that every case has."""
+"""Presentation of the studies' cases, in addition to the table of every case."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from .slopes import ERRORS, GROWTH, error_charts, growth_charts, growth_lines, g
 
 
 def more(document: dict, records: Sequence[dict]) -> tuple[list[str], list[report.Table]]:
-    """Crossings and what grows too fast, in sentences; slopes and parts, in tables.
+    """Crossings and excessive growth, in sentences; slopes and parts, in tables.
 
-    Of a whole document (no records): its targets.
+    For a whole document (without records), its targets.
     """
     if not records:
         return [], targets.rows(document)
@@ -32,7 +32,7 @@ def more(document: dict, records: Sequence[dict]) -> tuple[list[str], list[repor
 
 
 def charts_of(case: str, records: Sequence[dict]) -> list[str]:
-    """The charts of a study's axis; of any other, those of ``gamba bench``."""
+    """Charts of a study's axis; for any other, those of ``gamba bench``."""
     axis: str = records[0]["axis"] or ""
     if "," in axis:
         each = ([r | {"axis": one} for r in records] for one in axis.split(","))
@@ -69,7 +69,7 @@ def page(documents: Sequence[dict]) -> str:
 
 
 def summary(document: dict) -> str:
-    """Lines on targets, crossings, what grows too fast, and failures."""
+    """Lines on targets, crossings, excessive growth, and failures."""
     lines = [f"{c.op}: {c.text()}" for c in crossings(document["records"])]
     for op, cases in report.groups(document).items():
         lines += [f"{op}: {line}" for records in cases.values() for line in growth_lines(records)]
@@ -79,7 +79,7 @@ def summary(document: dict) -> str:
 
 
 def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
-    """As ``suites.write_pages``; a .svg file gets the charts of growth, a .json file all records.
+    """Write pages like ``suites.write_pages``; charts of growth for .svg, all records for .json.
 
     Raises:
         UserError: nothing grows in the documents, or they are not of one machine and level.
@@ -97,7 +97,7 @@ def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
 
 
 def join(documents: Sequence[dict]) -> dict:
-    """One document of the records of several runs; of the same case the last run counts.
+    """Join the records of several runs in one document; for the same case the last run counts.
 
     Raises:
         UserError: they are not of one machine, level and set of versions.
@@ -121,12 +121,12 @@ def join(documents: Sequence[dict]) -> dict:
 
 
 def with_crossings(document: dict) -> dict:
-    """The document with where its lines cross."""
+    """Add the crossings to the document."""
     return document | {"crossings": [c._asdict() for c in crossings(document["records"])]}
 
 
 def _memory_chart(records: Sequence[dict]) -> str:
-    """Draws time against the memory that is kept for the gradient."""
+    """Draw time against the memory that is kept for the gradient."""
     kept = [r for r in records if "saved_bytes" in r["work"]]
     points = [pages.marked(r, r["work"]["saved_bytes"] / 2**20) for r in kept]
     front = Series("Pareto front", pareto(points), "steps")
@@ -135,7 +135,7 @@ def _memory_chart(records: Sequence[dict]) -> str:
 
 
 def _switch_chart(records: Sequence[dict]) -> str:
-    """Draws what a switch of the default skips against the time that it saves.
+    """Draw the share skipped by a switch of the default against the time that it saves.
 
     Both are shares; the time is that of the variant without the switch.
     """
@@ -154,7 +154,7 @@ def _switch_chart(records: Sequence[dict]) -> str:
 
 
 def _share_charts(case: str, records: Sequence[dict]) -> list[str]:
-    """Draws time and memory of each direction, and tokens, against the share of the picture."""
+    """Draw time and memory of each direction, and tokens, against the share of the picture."""
     made = []
     for direction in dict.fromkeys(r["direction"] for r in records):
         found = [r for r in records if r["direction"] == direction]
@@ -169,7 +169,7 @@ def _share_charts(case: str, records: Sequence[dict]) -> list[str]:
 
 
 def _length_charts(records: Sequence[dict]) -> list[str]:
-    """Draws time and memory of each direction and dtype against L, and where two lines cross."""
+    """Draw time and memory of each direction and dtype against L, and where two lines cross."""
     made = []
     for direction, dtype in dict.fromkeys((r["direction"], r["dtype"]) for r in records):
         found = [r for r in records if (r["direction"], r["dtype"]) == (direction, dtype)]

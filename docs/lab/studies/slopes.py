@@ -1,8 +1,8 @@
-"""How time, memory and errors grow with a size: slopes on logarithmic axes, beside the work's.
+"""Growth of time, memory and errors with a size: slopes on logarithmic axes, beside the work's.
 
-A case with the axis "growth L" (or N, D, any parameter) has variants that differ in this size
-alone; their ``work`` counts ``units``, and their parameter ``unit`` says in words what these are. A
-case with the axis ``ERRORS`` has variants over L whose ``work`` holds errors and bounds by name.
+A case with the axis "growth L" (or N, D, any parameter) has variants that only differ in this size;
+their ``work`` counts ``units``, and their parameter ``unit`` describes these. A case with the axis
+``ERRORS`` has variants over L whose ``work`` holds errors and bounds by name.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .crossing import FIGURES
 
 GROWTH, ERRORS = "growth ", "growth of error"
 BOUND = "ε"  # names of bounds begin with it
-_DEARER = 1.1  # a unit that costs this much more at the greatest size is told
+_DEARER = 1.1  # units that cost this much more at the greatest size are reported
 _LEAST_BYTES = 2**23  # of less memory, the pages and slack of the heap are a part
 _HEADER = ("direction", "dtype", "figure", "over", "slope", "of its work", "a unit's cost")
 
@@ -25,7 +25,7 @@ Line = Mapping[float, float]
 
 
 class Growth(NamedTuple):
-    """How a figure of one direction grows with a size.
+    """Growth of a figure of one direction with a size.
 
     Attributes:
         direction: of the records.
@@ -35,12 +35,12 @@ class Growth(NamedTuple):
         least: the smallest size measured.
         most: the greatest one.
         slope: exponent of the figure, least squares of its logarithms.
-        unit: what its work counts, in words.
+        unit: description of the units of its work.
         work_slope: exponent of the work, likewise.
         cheapest: size below ``most`` at which a unit of work costs least.
         dearer: cost of a unit at ``most`` over that at ``cheapest``.
         end_slopes: exponents of figure and work from ``cheapest`` to ``most``.
-        faster: whether the figure grows faster than its work, noise allowed for.
+        faster: True if the figure grows faster than its work, beyond noise.
     """
 
     direction: str
@@ -58,7 +58,7 @@ class Growth(NamedTuple):
     faster: bool
 
     def text(self) -> str:
-        """Says in a sentence that the figure grows faster than its work, or that it does not."""
+        """Describe in a sentence if the figure grows faster than its work."""
         where = f"{self.direction}, {self.dtype}, {self.figure} over {self.size}"
         if not self.faster:
             return f"{where} grows no faster than its work ({self.unit})."
@@ -71,7 +71,7 @@ class Growth(NamedTuple):
 
 
 def slope(line: Line) -> float | None:
-    """The exponent of the power law that fits figures by size best; None of fewer than two sizes.
+    """Fit the exponent of a power law to figures by size; None for fewer than two sizes.
 
     Args:
         line: figures > 0 by size > 0.
@@ -142,12 +142,12 @@ def _growth(key: tuple[str, str, str], records: list[dict], figure: str) -> Grow
 
 
 def _exp(x: float) -> float:
-    """e^x, held where a stranger's figures would leave the range of numbers."""
+    """e^x, clamped for untrusted figures out of range."""
     return math.exp(max(-300.0, min(x, 300.0)))
 
 
 def _apart(records: Sequence[dict], size: str, low: float, high: float, dearer: float) -> bool:
-    """Whether a unit costs more in the fast runs of one size than in the slow ones of another."""
+    """True if a unit costs more in the fast runs of one size than in the slow ones of another."""
     by_size = {r["parameters"].get(size): r for r in records}
     slow, fast = by_size[low], by_size[high]
     return dearer * (fast["ms_p20"] / fast["ms_p50"]) > slow["ms_p80"] / slow["ms_p50"]
@@ -180,7 +180,7 @@ def growth_table(records: Sequence[dict]) -> tuple[list[str], list[list[str]]] |
 
 
 def growth_charts(records: Sequence[dict]) -> list[str]:
-    """Draws time and memory of all directions against the size, and the work as a dashed line."""
+    """Draw time and memory of all directions against the size, and the work as a dashed line."""
     made = []
     parts = _groups(records)
     for dtype, size in dict.fromkeys(key[1:] for key in parts):
@@ -228,7 +228,7 @@ def _error_lines(records: Sequence[dict]) -> dict[str, dict[float, float]]:
 
 
 def error_charts(records: Sequence[dict]) -> list[str]:
-    """Draws the errors of a case against the number of tokens, and their bounds as dashed lines."""
+    """Draw the errors of a case against the number of tokens, and their bounds as dashed lines."""
     lines = _error_lines(records)
     drawn = [
         Series(

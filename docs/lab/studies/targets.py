@@ -1,6 +1,6 @@
-"""What should be reached: figures, and quotients of figures, of ``gamba bench`` and the studies.
+"""Targets for figures, and quotients of figures, of ``gamba bench`` and the studies.
 
-``make study`` judges what it measures, and with --render the results of ``gamba bench`` too.
+``make study`` checks its results, and with --render also those of ``gamba bench``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gamba_warp.kernels.bench.core.report import Table, number
 
 @dataclass(frozen=True)
 class Key:
-    """The key of a figure; ``field`` is ``ms_p50`` or a key of the record's ``work``."""
+    """Key of a figure; ``field`` is ``ms_p50`` or a key of the record's ``work``."""
 
     op: str
     case: str
@@ -27,7 +27,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Target:
-    """A figure, or a quotient of figures, that should be reached.
+    """Target for a figure or a quotient of figures.
 
     Attributes:
         text: meaning of the figure, in words.
@@ -47,7 +47,7 @@ class Target:
 
 
 def judge(targets: Iterable[Target], records: Sequence[dict]) -> list[dict]:
-    """Holds records against targets.
+    """Compare records with targets.
 
     Returns:
         ``{op, text, wanted, value, reached}`` for each target whose cases were measured; ``value``

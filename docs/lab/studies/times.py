@@ -1,4 +1,4 @@
-"""What a layer's scan costs, by its length, width and dtype: the table of docs/scan-times.md.
+"""Cost of a layer's scan by length, width and dtype: the table of docs/scan-times.md.
 
 Widths are the inner ones of published models: 512 of this project's ``rays``, 1,536 of mamba-130m,
 5,120 of mamba-2.8b.
@@ -19,7 +19,7 @@ from .scan import bare, probe
 
 LENGTHS, WIDTHS = (512, 2048, 8192), (512, 1536, 5120)
 _SLOW = 2048 * 1536  # tokens times channels up to which others' code in torch is timed
-_SEEN = 512  # tokens that the oracle looks at
+_COMPARED = 512  # tokens compared with the oracle
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -35,7 +35,7 @@ def cases(settings: Settings) -> list[Case]:
 
 def layer(settings: Settings, length: int, width: int) -> list[Variant]:
     """One sequence, 16 states: both dtypes, and beside them a bare loop and others' code."""
-    problem = scan_problem(make_inputs(1, length, width), settings.device, min(length, _SEEN))
+    problem = scan_problem(make_inputs(1, length, width), settings.device, min(length, _COMPARED))
     made = problem.pair("float32", default=True)
     made += problem.pair("bfloat16", {"dtype": torch.bfloat16})
     if settings.device.type == "cpu":

@@ -1,1 +1,1 @@
-"""The parts of the network: tokens, patches, blocks, decoders."""
+"""Parts of the network: tokens, patches, blocks, decoders."""

@@ -1,9 +1,9 @@
-"""A transformer block in place of the Mamba block, for the paper's question Q2.
+"""Transformer block in place of the Mamba block, for the paper's question Q2.
 
-The prefix P_c T, P_x X is seen by the 3DGS tokens, and its own outputs are dropped. So it has keys
-and values only, and these depend on no 3DGS token: ``prefix_states`` computes them once for all
-blocks, as it computes the states of Mamba blocks. Attention here is not causal, and knows of the
-tokens' order only what the embedding E says.
+The 3DGS tokens attend to the prefix P_c T, P_x X, whose own outputs are dropped. The prefix
+therefore only has keys and values, independent of the 3DGS tokens: ``prefix_states`` computes them
+once for all blocks, like the states of Mamba blocks. Attention is not causal; only the embedding E
+encodes the order of the tokens.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .block import Block, Blocks, make_norm, product, stacked
 
 
 class Memory(NamedTuple):
-    """What an attention sees of the prefix.
+    """Keys and values of the prefix.
 
     Attributes:
         keys: ``[B, heads, K, width / heads]``.
@@ -37,7 +37,7 @@ class AttentionBlock(Block):
     in_segments = False
 
     def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
-        """Builds the block; zero channels mean that there is no such condition."""
+        """Build the block; zero channels mean no such condition."""
         super().__init__(config, camera_channels, image_channels)
         width, inner = config.width, config.mlp_width
         self.heads = config.num_heads
@@ -48,7 +48,7 @@ class AttentionBlock(Block):
         self.mlp = nn.Sequential(first, nn.GELU(), second)
         for layer in (self.kvq_proj, self.out_proj, first, second):
             nn.init.zeros_(layer.bias)
-        # Two residual branches a block, whose sum over all blocks keeps the variance of one.
+        # Two residual branches per block; their sum over all blocks keeps the variance of one.
         for layer in (self.out_proj, second):
             with torch.no_grad():
                 layer.weight.div_(math.sqrt(2 * config.depth))
@@ -56,12 +56,12 @@ class AttentionBlock(Block):
     def forward(
         self, tokens: Tensor, state: Memory | None, cu_seqlens: Tensor | None = None
     ) -> tuple[Tensor, Memory | None]:
-        """Refines the 3DGS tokens, all of them: ``Block.forward``."""
+        """Refine all 3DGS tokens: ``Block.forward``."""
         parts = self.kvq_proj(self.norm(tokens)).chunk(3, dim=-1)
         keys, values, queries = (_by_head(part, self.heads) for part in parts)
         if cu_seqlens is None:
             hidden = _attention(keys, values, queries, state)
-        else:  # a picture after the other, each over its own tokens
+        else:  # one picture after the other, each over its own tokens
             counts = cu_seqlens.diff().tolist()
             pictures = zip(*(part.split(counts, 2) for part in (keys, values, queries)))
             hidden = torch.cat([
@@ -72,8 +72,8 @@ class AttentionBlock(Block):
         return tokens + self.mlp(self.mlp_norm(tokens)), state
 
     @staticmethod
-    def after(blocks: Blocks, prefix: Tensor) -> list[Memory]:
-        """Keys and values of each block's prefix: ``Block.after``."""
+    def states_after(blocks: Blocks, prefix: Tensor) -> list[Memory]:
+        """Compute keys and values of each block's prefix: ``Block.states_after``."""
         first = blocks[0]
         assert isinstance(first, AttentionBlock)
         rows = 2 * prefix.shape[-1]
@@ -86,12 +86,12 @@ class AttentionBlock(Block):
 
 
 def _by_head(tokens: Tensor, heads: int) -> Tensor:
-    """``[B, L, width]`` to ``[B, heads, L, width / heads]``."""
+    """Reshape ``[B, L, width]`` to ``[B, heads, L, width / heads]``."""
     return tokens.unflatten(2, (heads, -1)).transpose(1, 2)
 
 
 def _attention(keys: Tensor, values: Tensor, queries: Tensor, memory: Memory | None) -> Tensor:
-    """Each token looks at the prefix and at all tokens of its picture."""
+    """Attend from each token to the prefix and to all tokens of its picture."""
     if memory is not None:
         keys = torch.cat([memory.keys.to(keys.dtype), keys], dim=2)
         values = torch.cat([memory.values.to(values.dtype), values], dim=2)

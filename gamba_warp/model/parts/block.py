@@ -1,11 +1,10 @@
-"""The Gamba block: prepend the condition, run a Mamba block, drop the condition (paper eq. 2).
+"""Gamba block: prepend the condition, run a Mamba block, drop the condition (paper eq. 2).
 
 In a Mamba block a token depends on the tokens before it only through two small states. A block
-prepends the condition, drops its outputs, and the next block prepends it anew. All that the
-condition contributes to a block is therefore the pair of states after it, and this pair does not
-depend on the 3DGS tokens. ``prefix_states`` computes the states of all blocks at once, and
-``run_blocks`` then runs the blocks over the 3DGS tokens alone. The result is that of prepending and
-dropping.
+prepends the condition, drops its outputs, and the next block prepends it again. The condition thus
+contributes only the pair of states after it, which does not depend on the 3DGS tokens.
+``prefix_states`` computes the states of all blocks at once, and ``run_blocks`` then runs the blocks
+over the 3DGS tokens only. The result equals that of prepending and dropping.
 """
 
 from __future__ import annotations
@@ -27,14 +26,14 @@ from ...kernels.selective_scan import selective_scan, selective_scan_state
 from ..config import GambaConfig
 
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
-# Number of tokens that pass through all blocks together on a CPU that keeps nothing for a gradient.
-# The temporaries of so few are reused at once, instead of being mapped anew each time.
+# Tokens that pass through all blocks at a time on a CPU without gradients. Temporaries of this size
+# are reused instead of being mapped anew each time.
 SEGMENT = 4096
 Blocks = Sequence["Block"] | nn.ModuleList
 
 
 def make_norm(config: GambaConfig, final: bool = False) -> nn.LayerNorm | nn.RMSNorm:
-    """LayerNorm or RMSNorm over a token's channels, with eps 1e-5; the ``final_norm`` if asked."""
+    """Make a LayerNorm or RMSNorm over a token's channels, eps 1e-5; optionally ``final_norm``."""
     kinds = {"layer": nn.LayerNorm, "rms": nn.RMSNorm}
     other = final and config.final_norm != "same"
     kind = kinds[config.final_norm if other else config.norm]
@@ -45,7 +44,7 @@ def make_norm(config: GambaConfig, final: bool = False) -> nn.LayerNorm | nn.RMS
 
 
 class State(NamedTuple):
-    """What a Mamba block remembers of the tokens that it has seen.
+    """State of a Mamba block after some tokens.
 
     Attributes:
         conv: ``[B, conv_size - 1, inner_width]``, the convolution's last inputs.
@@ -57,11 +56,11 @@ class State(NamedTuple):
 
 
 class Mamba(nn.Module):
-    """The vanilla Mamba block (Gu & Dao 2023), channels last.
+    """Vanilla Mamba block (Gu & Dao 2023), channels last.
 
     Parameters have mamba-ssm's names, shapes and row order (``x_proj``: step rank, B, C), so
-    weights of mamba-ssm load unchanged. The one exception is the convolution's weight, which lacks
-    mamba-ssm's middle axis of length 1.
+    weights of mamba-ssm load unchanged, except the convolution's weight, which lacks mamba-ssm's
+    middle axis of length 1.
     """
 
     def __init__(self, config: GambaConfig) -> None:
@@ -81,7 +80,7 @@ class Mamba(nn.Module):
 
     @torch.no_grad()
     def _init_weights(self, config: GambaConfig) -> None:
-        """Draws the weights as mamba-ssm does by default (version 2.2)."""
+        """Draw the weights like mamba-ssm by default (version 2.2)."""
         bound = config.conv_size**-0.5
         nn.init.uniform_(self.conv_weight, -bound, bound)
         nn.init.uniform_(self.conv_bias, -bound, bound)
@@ -92,7 +91,7 @@ class Mamba(nn.Module):
         self.dt_proj.bias.copy_(step + torch.log(-torch.expm1(-step)))  # softplus's inverse
         states = torch.arange(1, config.state_size + 1, dtype=torch.float32)
         self.A_log.copy_(states.log().expand_as(self.A_log))
-        # There is one residual branch per block, and their sum keeps the variance of one branch.
+        # One residual branch per block; their sum keeps the variance of one branch.
         self.out_proj.weight.div_(math.sqrt(config.depth))
         for parameter in (self.A_log, self.D, self.conv_bias, self.dt_proj.bias):
             vars(parameter)["_no_weight_decay"] = True
@@ -100,11 +99,11 @@ class Mamba(nn.Module):
     def forward(
         self, tokens: Tensor, state: State | None = None, cu_seqlens: Tensor | None = None
     ) -> tuple[Tensor, State]:
-        """Maps ``[B, L, width]`` to ``[B, L, width]``; a token sees itself and those before it.
+        """Map ``[B, L, width]`` to ``[B, L, width]``; a token sees itself and earlier ones.
 
-        ``state`` is what earlier tokens left, or None if there are none. The state after the last
-        token is returned beside the tokens. ``cu_seqlens [S + 1]`` are the borders of S sequences
-        packed in one row; B of the states is S then.
+        ``state`` is that of earlier tokens, or None without any. The state after the last token is
+        returned beside the tokens. ``cu_seqlens [S + 1]`` are the borders of S sequences packed in
+        one row; B of the states is then S.
         """
         conv_state, scan_state = state or (None, None)
         x, z = self.in_proj(tokens).chunk(2, dim=-1)
@@ -141,16 +140,16 @@ class Mamba(nn.Module):
 
 
 class Block(nn.Module):
-    """What a block of any mixer has: the projections of the condition, and the norm.
+    """Base of blocks with any mixer: the projections of the condition, and the norm.
 
     Attributes:
-        in_segments: whether one part of the tokens may pass through all blocks before the next.
+        in_segments: True if one part of the tokens may pass through all blocks before the next.
     """
 
     in_segments = True
 
     def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
-        """Builds these; zero channels mean that there is no such condition."""
+        """Build the layers; zero channels mean no such condition."""
         super().__init__()
         width = config.width
         self.project_camera = nn.Linear(camera_channels, width) if camera_channels else None
@@ -160,12 +159,12 @@ class Block(nn.Module):
     def forward(
         self, tokens: Tensor, state: Any, cu_seqlens: Tensor | None = None
     ) -> tuple[Tensor, Any]:
-        """Refines the 3DGS tokens, all of them or the next segment.
+        """Refine the 3DGS tokens, all of them or the next segment.
 
         Args:
             tokens: ``[B, L, width]``, or the tokens of all pictures in one row.
-            state: this block's entry of ``prefix_states``, or its state after the segment before.
-            cu_seqlens: ``[B + 1]``, where each picture's tokens begin and end in such a row.
+            state: this block's entry of ``prefix_states``, or its state after the previous segment.
+            cu_seqlens: ``[B + 1]``, borders of each picture's tokens in such a row.
 
         Returns:
             ``[B, L, width]``, and the state after the last token.
@@ -173,8 +172,8 @@ class Block(nn.Module):
         raise NotImplementedError
 
     @staticmethod
-    def after(blocks: Blocks, prefix: Tensor) -> list[Any]:
-        """The state of each block after its prefix.
+    def states_after(blocks: Blocks, prefix: Tensor) -> list[Any]:
+        """Compute the state of each block after its prefix.
 
         Args:
             blocks: all of one configuration.
@@ -184,15 +183,15 @@ class Block(nn.Module):
 
 
 class GambaBlock(Block):
-    """One Gamba block: G_n = G_{n-1} + Drop(Mamba(Norm(Prepend(P_c T, P_x X, G_{n-1})))).
+    """Gamba block: G_n = G_{n-1} + Drop(Mamba(Norm(Prepend(P_c T, P_x X, G_{n-1})))).
 
-    The prefix has no residual branch of its own, since each block drops it and the next one makes
-    it anew. It enters as the state that it leaves behind, which ``prefix_states`` computes. With
-    ``image_tokens`` "mixed" these tokens stand among the 3DGS tokens, and the whole sequence runs.
+    The prefix has no residual branch, since each block drops it and the next one makes it again. It
+    enters as the state after it, computed by ``prefix_states``. With ``image_tokens`` "mixed" these
+    tokens are among the 3DGS tokens, and the block runs over the whole sequence.
     """
 
     def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
-        """Builds the block; zero channels mean that there is no such condition."""
+        """Build the block; zero channels mean no such condition."""
         super().__init__(config, camera_channels, image_channels)
         self.mixed = config.image_tokens == "mixed"
         self.in_segments = not self.mixed
@@ -201,31 +200,31 @@ class GambaBlock(Block):
     def forward(
         self, tokens: Tensor, state: State | Mixed | None, cu_seqlens: Tensor | None = None
     ) -> tuple[Tensor, State | Mixed]:
-        """Refines the 3DGS tokens: ``Block.forward``."""
+        """Refine the 3DGS tokens: ``Block.forward``."""
         if isinstance(state, Mixed):
             return tokens + self._mixing(self.norm(tokens), state.tokens, cu_seqlens), state
         hidden, after = self.mamba(self.norm(tokens), state, cu_seqlens)
         return tokens + hidden, after
 
     def _mixing(self, tokens: Tensor, mixed: Tensor, cu_seqlens: Tensor | None) -> Tensor:
-        """The Mamba block over ``mixed [B, K, width]`` and 3DGS tokens, whose outputs remain."""
+        """Run the Mamba block over ``mixed [B, K, width]`` and 3DGS tokens; keep the latter."""
         count, length = mixed.shape[1], tokens.shape[1]
         if cu_seqlens is None:
             cu_seqlens = length * torch.arange(len(tokens) + 1, device=tokens.device)
-        places = mixed_places(count, cu_seqlens)
+        positions = mixed_positions(count, cu_seqlens)
         both = torch.cat([mixed.to(tokens.dtype).flatten(0, 1), tokens.flatten(0, 1)])
-        row = torch.empty_like(both).index_copy(0, places, both)[None]
+        row = torch.empty_like(both).index_copy(0, positions, both)[None]
         borders = cu_seqlens + count * torch.arange(len(cu_seqlens), device=tokens.device)
         hidden, _ = self.mamba(row, cu_seqlens=borders)
-        return hidden[0, places[mixed.shape[:2].numel() :]].view_as(tokens)
+        return hidden[0, positions[mixed.shape[:2].numel() :]].view_as(tokens)
 
     @staticmethod
-    def after(blocks: Blocks, prefix: Tensor) -> list[State] | list[Mixed]:
-        """The states after the prefix, or what is to be mixed: ``Block.after``.
+    def states_after(blocks: Blocks, prefix: Tensor) -> list[State] | list[Mixed]:
+        """Compute the states after the prefix, or the tokens to mix: ``Block.states_after``.
 
-        All blocks are computed together: one batched product for each kind of matrix, one
-        convolution and one scan in which each block is a group of channels. What only the dropped
-        outputs would need is left out: the gate z, C, D and the output projection.
+        All blocks are computed together: one batched product per kind of matrix, one convolution
+        and one scan in which each block is a group of channels. The gate z, C, D and the output
+        projection, needed only for the dropped outputs, are left out.
         """
         first = blocks[0]
         assert isinstance(first, GambaBlock)
@@ -263,19 +262,19 @@ def run_blocks(
     recompute: bool = False,
     cu_seqlens: Tensor | None = None,
 ) -> Tensor:
-    """Runs all blocks over the 3DGS tokens.
+    """Run all blocks over the 3DGS tokens.
 
     On a CPU without gradients, one segment of ``SEGMENT`` tokens after the other passes through all
-    blocks, and each block hands its state from one segment to the next. Blocks that see tokens in
+    blocks, and each block passes its state from one segment to the next. Blocks that see tokens in
     both directions take all tokens at once.
 
     Args:
         blocks: the network's blocks, all of one kind, in their order.
         tokens: ``[B, L, width]``; with ``cu_seqlens`` ``[1, T, width]``, those of all pictures.
         states: the result of ``prefix_states``, one entry per block.
-        recompute: with gradients, keep only each block's input and run the block again in the
+        recompute: with gradients, keep only each block's input and recompute the block in the
             backward pass.
-        cu_seqlens: ``[B + 1]`` int64, where each picture's tokens begin and end in one row.
+        cu_seqlens: ``[B + 1]`` int64, borders of each picture's tokens in one row.
 
     Returns:
         The shape of ``tokens``.
@@ -286,20 +285,20 @@ def run_blocks(
     if tokens.device.type == "cpu" and not gradients and first.in_segments:
         segments = list(tokens.split(SEGMENT, dim=1))
     for s, segment in enumerate(segments):
-        # Of a picture with no token in this segment the state passes as it is.
-        own = None if cu_seqlens is None else (cu_seqlens - start).clamp(0, segment.shape[1])
+        # The state of a picture without tokens in this segment is unchanged.
+        borders = None if cu_seqlens is None else (cu_seqlens - start).clamp(0, segment.shape[1])
         start += segment.shape[1]
         for i, block in enumerate(blocks):
             run = block
             if recompute and gradients:
-                run = partial(checkpoint, _Repeated(block), use_reentrant=False)
-            segment, states[i] = run(segment, states[i], own)
+                run = partial(checkpoint, _RecomputedBlock(block), use_reentrant=False)
+            segment, states[i] = run(segment, states[i], borders)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
 
-class _Repeated:
-    """A block that a backward pass runs again, by the library of the first time."""
+class _RecomputedBlock:
+    """Block under activation checkpointing, recomputed with the same matmul precision."""
 
     def __init__(self, block: nn.Module) -> None:
         self._block = block
@@ -310,7 +309,7 @@ class _Repeated:
 
 
 def prefix_states(blocks: Blocks, camera: Tensor | None, image: Tensor | None) -> list[Any]:
-    """Computes the state of each block after its prefix P_c T, P_x X, camera first.
+    """Compute the state of each block after its prefix P_c T, P_x X, camera first.
 
     Args:
         blocks: blocks of one configuration.
@@ -319,8 +318,7 @@ def prefix_states(blocks: Blocks, camera: Tensor | None, image: Tensor | None) -
 
     Returns:
         One state per block, a named tuple of tensors ``[B, ..]``: ``State`` of Mamba blocks,
-        ``Mixed`` where the tokens are to be mixed, ``Memory`` of attention. None for each if there
-        is neither condition.
+        ``Mixed`` of tokens to mix, ``Memory`` of attention. None for each without any condition.
     """
     projections = {"project_camera": camera, "project_image": image}
     prefix = [
@@ -332,27 +330,27 @@ def prefix_states(blocks: Blocks, camera: Tensor | None, image: Tensor | None) -
         return [None] * len(blocks)
     first = blocks[0]
     assert isinstance(first, Block)
-    return first.after(blocks, _normalized(blocks, first.norm, torch.cat(prefix, dim=1)))
+    return first.states_after(blocks, _normalized(blocks, first.norm, torch.cat(prefix, dim=1)))
 
 
 def joined(blocks: Blocks, name: str) -> Tensor:
-    """Joins one parameter of all blocks along its first dimension."""
+    """Concatenate one parameter of all blocks along its first dimension."""
     return torch.cat([attrgetter(name)(block) for block in blocks])
 
 
 def stacked(blocks: Blocks, name: str, rows: int | None = None) -> Tensor:
-    """Stacks the first ``rows`` of one parameter of all blocks: ``[depth, rows, ..]``."""
+    """Stack the first ``rows`` of one parameter of all blocks: ``[depth, rows, ..]``."""
     return torch.stack([attrgetter(name)(block)[:rows] for block in blocks])
 
 
 def product(tokens: Tensor, matrices: Tensor) -> Tensor:
-    """Multiplies each block's tokens by its matrix: ``[B, K, depth, in]`` to ``[.., out]``."""
+    """Multiply each block's tokens by its matrix: ``[B, K, depth, in]`` to ``[.., out]``."""
     rows = tokens.flatten(0, 1).transpose(0, 1)
     return torch.bmm(rows, matrices.mT).transpose(0, 1).unflatten(0, tokens.shape[:2])
 
 
 def _normalized(blocks: Blocks, norm: nn.LayerNorm | nn.RMSNorm, tokens: Tensor) -> Tensor:
-    """Applies each block's own norm: ``[B, K, depth·width]`` to ``[B, K, depth, width]``."""
+    """Apply each block's own norm: ``[B, K, depth·width]`` to ``[B, K, depth, width]``."""
     tokens = tokens.unflatten(2, (len(blocks), -1)).float()
     if isinstance(norm, nn.RMSNorm):
         return F.rms_norm(tokens, norm.normalized_shape, None, norm.eps) * stacked(
@@ -363,7 +361,7 @@ def _normalized(blocks: Blocks, norm: nn.LayerNorm | nn.RMSNorm, tokens: Tensor)
 
 
 class Mixed(NamedTuple):
-    """What a block mixes into the 3DGS tokens.
+    """Condition tokens that a block mixes into the 3DGS tokens.
 
     Attributes:
         tokens: ``[B, K, width]``, projected and normalised, camera first.
@@ -372,25 +370,25 @@ class Mixed(NamedTuple):
     tokens: Tensor
 
 
-def mixed_places(count: int, cu_seqlens: Tensor) -> Tensor:
-    """Where each token stands in the common row, when tokens are no prefix but mixed in.
+def mixed_positions(count: int, cu_seqlens: Tensor) -> Tensor:
+    """Position of each token in the common row, if condition tokens are mixed in.
 
-    Of K such tokens and a picture's L 3DGS tokens, token k = 0 .. K-1 stands before the 3DGS token
-    of the number floor((k + 1) L / (K + 1)), so that they cut the 3DGS tokens into K + 1 pieces of
-    nearly one length. A Mamba block then runs over all K + L tokens, and the outputs of the K are
+    Of K such tokens and a picture's L 3DGS tokens, token k = 0 .. K-1 comes before the 3DGS token
+    number floor((k + 1) L / (K + 1)), so that they cut the 3DGS tokens into K + 1 pieces of nearly
+    equal length. A Mamba block then runs over all K + L tokens, and the outputs of the K are
     dropped.
 
     Args:
         count: K.
-        cu_seqlens: ``[B + 1]`` int64, where each picture's 3DGS tokens begin and end.
+        cu_seqlens: ``[B + 1]`` int64, borders of each picture's 3DGS tokens.
 
     Returns:
-        ``[B K + T]`` int64, a permutation: the places of each picture's K tokens, then those of
+        ``[B K + T]`` int64, a permutation: the positions of each picture's K tokens, then those of
         all 3DGS tokens.
     """
     steps = torch.arange(1, count + 1, device=cu_seqlens.device)
     before = cu_seqlens[:-1, None] + steps * cu_seqlens.diff()[:, None] // (count + 1)
     before = before.flatten()
-    own = torch.arange(int(cu_seqlens[-1]), device=cu_seqlens.device)
-    passed = torch.searchsorted(before, own, right=True)
-    return torch.cat([before + torch.arange(len(before), device=own.device), own + passed])
+    tokens = torch.arange(int(cu_seqlens[-1]), device=cu_seqlens.device)
+    passed = torch.searchsorted(before, tokens, right=True)
+    return torch.cat([before + torch.arange(len(before), device=tokens.device), tokens + passed])

@@ -1,4 +1,4 @@
-"""From tokens to Gaussians: the only place with activations (paper §3.2, Gaussian Decoder)."""
+"""Decoder from tokens to Gaussians, with all activations (paper §3.2, Gaussian Decoder)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch.nn import functional as F
 from ...gaussians import Gaussians
 from ..config import GambaConfig
 
-MIN_SCALE = 1e-6  # object units; keeps finite the logarithm that files store
+MIN_SCALE = 1e-6  # object units; keeps the logarithm stored in files finite
 
 
 class GaussianDecoder(nn.Module):
-    """A shared MLP with one hidden layer, then one linear head for each attribute.
+    """Shared MLP with one hidden layer, then one linear head for each attribute.
 
     Attributes:
-        colored: whether there is a head for colours.
+        colored: True if it has a head for colours.
     """
 
     colored = True
@@ -48,10 +48,10 @@ class GaussianDecoder(nn.Module):
         for head in (self.opacity, self.scale, self.color, self.rotation):
             if head is not None:
                 self.init_head(head)
-        # A softmax over near-zero logits puts every Gaussian at the centre, and a heap of opaque
-        # Gaussians at one point is the collapse that the radial mask loss shall prevent. Logits of
-        # deviation 1.5 spread the centres by about 0.1 per axis: this is inside any object, and far
-        # from a saturated softmax, whose gradient would vanish.
+        # A softmax over near-zero logits puts every Gaussian at the centre; opaque Gaussians at one
+        # point are the collapse that the radial mask loss is to prevent. Logits of deviation 1.5
+        # spread the centres by about 0.1 per axis: inside any object, and far from a saturated
+        # softmax, whose gradient would vanish.
         fan_in = 0.356 * self.position.in_features
         nn.init.normal_(self.position.weight, std=config.position_init * fan_in**-0.5)
         nn.init.zeros_(self.position.bias)
@@ -66,7 +66,7 @@ class GaussianDecoder(nn.Module):
 
     @staticmethod
     def init_mlp(first: nn.Linear, second: nn.Linear) -> None:
-        """Gives unit variance before each SiLU, whose mean square on a unit normal is 0.356."""
+        """Give unit variance before each SiLU, whose mean square on a unit normal is 0.356."""
         for layer in (first, second):
             nn.init.zeros_(layer.bias)
         nn.init.normal_(first.weight, std=first.in_features**-0.5)
@@ -74,12 +74,12 @@ class GaussianDecoder(nn.Module):
 
     @staticmethod
     def init_head(head: nn.Linear) -> None:
-        """Makes what a head says almost 0 at the start."""
+        """Make the output of a head almost 0 at the start."""
         nn.init.normal_(head.weight, std=0.02)
         nn.init.zeros_(head.bias)
 
     def forward(self, tokens: Tensor) -> Gaussians:
-        """Decodes ``tokens [B, L, width]`` to ``[B, L]`` Gaussians in float32.
+        """Decode ``tokens [B, L, width]`` to ``[B, L]`` Gaussians in float32.
 
         Positions lie within ±``position_range`` (with unit weights beyond), opacities and colours
         in [0, 1], scales above 0.
@@ -90,7 +90,7 @@ class GaussianDecoder(nn.Module):
             return Gaussians(**self.shapes(hidden), colors=self.color(hidden.float()).sigmoid())
 
     def shapes(self, hidden: Tensor) -> dict[str, Any]:
-        """All of the Gaussians but their colours, float32, from the MLP's ``[B, L, channels]``."""
+        """Decode all but the colours, float32, from the MLP's ``[B, L, channels]``."""
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
         with torch.autocast(hidden.device.type, enabled=False):
             hidden = hidden.float()
@@ -98,7 +98,7 @@ class GaussianDecoder(nn.Module):
             unit = self.config.position_weights == "unit"
             weights = F.normalize(logits, dim=-1) if unit else logits.softmax(-1)
             return {
-                "means": (weights * self.points).sum(-1),  # as a product, a GPU might round it
+                "means": (weights * self.points).sum(-1),  # no matrix product: GPUs may round it
                 "quats": None if self.rotation is None else self.rotation(hidden),
                 "scales": self.config.scale_factor * F.softplus(self.scale(hidden)) + MIN_SCALE,
                 "opacities": self.opacity(hidden)[..., 0].sigmoid(),

@@ -1,22 +1,22 @@
 """Gaussians on the rays of the input picture's pixels: the decoder ``rays``.
 
 A patch of p x p pixels has k x k cells, and each cell has one Gaussian in each of several layers.
-The first layer is what the picture shows: it starts opaque, in the plane through the object's
-centre, with the colour of its cell, so that the input view is sharp before the first step. The
-other layers are for what is hidden: they start almost transparent, behind one another. The network
-predicts, for a Gaussian of layer i on a ray of direction d = (x, y, 1) in the camera's frame,
+The first layer is the visible surface: it starts opaque, in the plane through the object's centre,
+with the colour of its cell, so that the input view is sharp before the first step. The other layers
+are for hidden parts: they start almost transparent, one behind the other. The network predicts, for
+a Gaussian of layer i on a ray of direction d = (x, y, 1) in the camera's frame,
 
     point    = d · (distance + ray_depth · tanh(depth_i + ·)) + ray_offset · tanh(·)
     scales   = footprint · exp(size_i + ·), where footprint is the side of a cell at the distance
     opacity  = sigmoid(opacity_i + 10 · (alpha - 1) + ·)
     colour   = sigmoid(logit(colour of the cell) + 2 · (·))
 
-where each · is a number of the head, near 0 at the start, and alpha is the cell's mean alpha. The
+where each · is an output of the head, near 0 at the start, and alpha is the cell's mean alpha. The
 terms with the index i are learned for each layer.
 
 With ``ray_back`` "opaque" the last layer is a surface, too: it starts opaque, and the · of its
-opacity is 0. Else the squared error of a back whose place is not known yet is least for a fog of
-faint Gaussians, and training ends in one.
+opacity is 0. Otherwise a fog of faint Gaussians minimizes the squared error of a back of unknown
+depth, and training ends in one.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from torch.nn import functional as F
 from ...cameras import Cameras, exact_product
 from ...gaussians import Gaussians
 from ..config import RAY_CHANNELS, RAY_STEM, GambaConfig
-from .patches import Cells, Patches, seen_cells
+from .patches import Cells, Patches, foreground_cells
 
-FRONT_OPACITY = 3.0  # logit; neighbours overlap, so together they are opaque
-HIDDEN_OPACITY = -5.4  # logit; just over the 1/255 under which a Gaussian has no gradient
+FRONT_OPACITY = 3.0  # logit; overlapping neighbours are opaque together
+HIDDEN_OPACITY = -5.4  # logit; just over 1/255, below which a Gaussian has no gradient
 BACK_OPACITY = 2.0  # logit of an opaque back
 FRONT_SIZE, HIDDEN_SIZE, BACK_SIZE = 0.25, 0.6, 0.4  # standard deviations, in sides of a cell
-LAST_DEPTH = 0.7  # where the last hidden layer starts, in ``ray_depth`` behind the middle
+LAST_DEPTH = 0.7  # initial depth of the last hidden layer behind the middle, in ``ray_depth``
 COLOR_MARGIN = 0.01  # keeps the logit of a cell's colour finite
-EMPTY = 10.0  # how much lower the opacity's logit is in an empty cell than in a full one
-STEM_REACH = 3  # how many cells beside a cell the stem sees, one for each of its convolutions
+EMPTY = 10.0  # difference of the opacity's logit between a full and an empty cell
+STEM_REACH = 3  # receptive field of the stem in neighbouring cells, one per convolution
 SIZE_LIMITS = (-4.0, 3.0)  # of the logarithm of a size, in sides of a cell
 
 
 class RayDecoder(nn.Module):
-    """From the tokens of the patches and their pixels to the Gaussians of the cells."""
+    """Decoder from the tokens and pixels of patches to the Gaussians of their cells."""
 
-    between: Tensor  # [cells², coarse²]
+    upsampling: Tensor  # [cells², coarse²]
 
     def __init__(self, config: GambaConfig) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class RayDecoder(nn.Module):
         step = config.patch_size // cells  # pixels a side of a cell
         coarse = config.ray_coarse or cells
         self.up = nn.Linear(config.num_orders * config.width, coarse**2 * features)
-        self.register_buffer("between", _interpolation(coarse, cells), persistent=False)
+        self.register_buffer("upsampling", _interpolation(coarse, cells), persistent=False)
         self.stem = nn.Sequential(
             nn.Conv2d(config.pixel_channels, RAY_STEM, step + 2, step, padding=1),
             nn.SiLU(),
@@ -65,7 +65,7 @@ class RayDecoder(nn.Module):
         last = config.ray_hidden or features
         self.mix = nn.Linear(features, last) if config.ray_hidden else None
         self.head = nn.Linear(last, layers * sum(self._parts()))
-        # Almost 0, so that the first picture is that of the formulas with 0 for every ·.
+        # Almost 0, so that every · of the formulas starts near 0.
         nn.init.normal_(self.head.weight, std=0.002)
         nn.init.zeros_(self.head.bias)
         hidden = layers - 1
@@ -79,32 +79,32 @@ class RayDecoder(nn.Module):
         self.opacity_bias = nn.Parameter(torch.tensor(opacities))
 
     def _parts(self) -> list[int]:
-        """How many numbers depth, offset, opacity, scales, colour and rotation take."""
+        """Channels of depth, offset, opacity, scales, colour and rotation."""
         return [*RAY_CHANNELS, 4] if self.rotates else [*RAY_CHANNELS]
 
     def forward(
         self, tokens: Tensor, pixels: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
     ) -> Gaussians:
-        """Decodes the cells that see something of the object, ``ray_layers`` Gaussians each.
+        """Decode the foreground cells, ``ray_layers`` Gaussians each.
 
         Args:
             tokens: ``[P, O, width]``, the token of each patch in each of the O orders.
-            pixels: ``[B, pixel_channels, H, W]``, what the network sees of the pictures.
-            patches: which patches these are.
+            pixels: ``[B, pixel_channels, H, W]``, the network's input channels of the pictures.
+            patches: the P patches.
             rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha.
             cameras: ``[B]`` of the pictures.
 
         Returns:
             ``[B, N]``, float32, in the world of ``cameras``: the cells row by row, the layers of a
-            cell side by side. N is that of the picture with the most cells; the others are filled
-            up with Gaussians of opacity 0.
+            cell adjacent. N is that of the picture with the most cells; the others are padded with
+            Gaussians of opacity 0.
         """
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
         with torch.autocast(tokens.device.type, enabled=False):
-            cells = seen_cells(rgba.float(), self.config.patch_size // self.config.ray_cells)
-        hidden = self.up(tokens.flatten(1)).unflatten(1, (self.between.shape[1], -1))
+            cells = foreground_cells(rgba.float(), self.config.patch_size // self.config.ray_cells)
+        hidden = self.up(tokens.flatten(1)).unflatten(1, (self.upsampling.shape[1], -1))
         if self.config.ray_coarse:
-            hidden = self.between.to(hidden.dtype) @ hidden
+            hidden = self.upsampling.to(hidden.dtype) @ hidden
         hidden = hidden.flatten(0, 1).index_select(0, patches.number(cells, self.config.ray_cells))
         hidden = hidden + self._stem(pixels, patches, cells)
         if self.mix is not None:
@@ -114,16 +114,17 @@ class RayDecoder(nn.Module):
             return _padded(self._activated(out, cells, cameras), cells)
 
     def _stem(self, pixels: Tensor, patches: Patches, cells: Cells) -> Tensor:
-        """What ``stem`` makes of ``pixels`` in the cells: ``[T, C]``.
+        """Apply ``stem`` to ``pixels``, at the cells: ``[T, C]``.
 
-        A CPU computes each picture's own rows and columns; a GPU would wait for their numbers.
+        A CPU only computes each picture's rows and columns with cells; a GPU would have to wait for
+        their numbers.
         """
         if pixels.device.type != "cpu":
             return self.stem(pixels).permute(0, 2, 3, 1)[cells.picture, cells.row, cells.column]
         count, found = self.config.ray_cells, []
         step, side = self.config.patch_size // count, patches.grid * count
-        places = (each.split(cells.counts) for each in (cells.row, cells.column))
-        for picture, box, row, column in zip(pixels.split(1), patches.boxes(), *places):
+        positions = (each.split(cells.counts) for each in (cells.row, cells.column))
+        for picture, box, row, column in zip(pixels.split(1), patches.boxes(), *positions):
             (top, bottom), (left, right) = (
                 (max(0, first * count - STEM_REACH), min(side, last * count + STEM_REACH))
                 for first, last in box
@@ -134,17 +135,17 @@ class RayDecoder(nn.Module):
         return torch.cat(found)
 
     def _activated(self, out: Tensor, cells: Cells, cameras: Cameras) -> Gaussians:
-        """The formulas above: ``out [T, layers, ·]`` of the cells to Gaussians ``[T, layers]``."""
+        """Apply the formulas above to ``out [T, layers, ·]``; return Gaussians ``[T, layers]``."""
         depth, offset, opacity, scale, color, *rotation = out.split(self._parts(), -1)
-        own = opacity[..., 0]
+        opacity = opacity[..., 0]
         if self.config.ray_back == "opaque":
-            own = F.pad(own[..., :-1], (0, 1))
+            opacity = F.pad(opacity[..., :-1], (0, 1))
         base = torch.logit(cells.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
         Ks, viewmats = cameras.Ks[cells.picture], cameras.viewmats[cells.picture]
         side = self.config.patch_size // self.config.ray_cells
         x = (side * (cells.column.to(Ks) + 0.5) - Ks[:, 0, 2]) / Ks[:, 0, 0]
         y = (side * (cells.row.to(Ks) + 0.5) - Ks[:, 1, 2]) / Ks[:, 1, 1]
-        turn, shift = viewmats[:, :3, :3], viewmats[:, None, :3, 3]
+        rotations, shift = viewmats[:, :3, :3], viewmats[:, None, :3, 3]
         distance = shift.norm(dim=-1, keepdim=True)
         footprint = side * distance / Ks[:, 1, 1, None, None]
         z = distance + self.config.ray_depth * torch.tanh(self.depth_bias[:, None] + depth)
@@ -154,36 +155,36 @@ class RayDecoder(nn.Module):
         if rotation:
             quats = rotation[0] + rotation[0].new_tensor([1.0, 0.0, 0.0, 0.0])
         return Gaussians(
-            means=exact_product(points - shift, turn),
+            means=exact_product(points - shift, rotations),
             quats=quats,
             scales=footprint * torch.exp((self.scale_bias[:, None] + scale).clamp(*SIZE_LIMITS)),
-            opacities=torch.sigmoid(self.opacity_bias + EMPTY * (cells.alpha - 1) + own),
+            opacities=torch.sigmoid(self.opacity_bias + EMPTY * (cells.alpha - 1) + opacity),
             colors=torch.sigmoid(base[:, None] + 2 * color),
         )
 
 
 def _padded(made: Gaussians, cells: Cells) -> Gaussians:
-    """Gaussians ``[T, layers]`` of all cells as ``[B, N]``, those of each picture first."""
+    """Pad Gaussians ``[T, layers]`` of all cells to ``[B, N]``; the padding comes last."""
     counts = torch.tensor(cells.counts, device=cells.picture.device)
     shape = len(counts), max(cells.counts, default=0)
     first = shape[1] * torch.arange(len(counts), device=counts.device) - counts.cumsum(0) + counts
-    places = torch.arange(len(cells.picture), device=counts.device) + first[cells.picture]
+    rows = torch.arange(len(cells.picture), device=counts.device) + first[cells.picture]
 
-    def filled(values: Tensor, filling: float = 0.0) -> Tensor:
-        rows = values.new_full((shape[0] * shape[1], *values.shape[1:]), filling)
-        return rows.index_copy_(0, places, values).unflatten(0, shape).flatten(1, 2)
+    def padded(values: Tensor, value: float = 0.0) -> Tensor:
+        out = values.new_full((shape[0] * shape[1], *values.shape[1:]), value)
+        return out.index_copy_(0, rows, values).unflatten(0, shape).flatten(1, 2)
 
     return Gaussians(
-        means=filled(made.means),
-        quats=None if made.quats is None else filled(made.quats, 1.0),
-        scales=filled(made.scales, 1.0),
-        opacities=filled(made.opacities),
-        colors=filled(made.colors),
+        means=padded(made.means),
+        quats=None if made.quats is None else padded(made.quats, 1.0),
+        scales=padded(made.scales, 1.0),
+        opacities=padded(made.opacities),
+        colors=padded(made.colors),
     )
 
 
 def _interpolation(coarse: int, fine: int) -> Tensor:
-    """Weights ``[fine², coarse²]`` that make a fine grid of a coarse one, bilinearly."""
+    """Weights ``[fine², coarse²]`` of bilinear interpolation from a coarse to a fine grid."""
     each = torch.eye(coarse**2).view(1, coarse**2, coarse, coarse)
     finer = F.interpolate(each, (fine, fine), mode="bilinear", align_corners=False)
     return finer.view(coarse**2, fine**2).T.contiguous()

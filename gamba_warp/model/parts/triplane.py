@@ -1,10 +1,9 @@
 """Colours from three planes of features: the decoder ``triplane`` (paper, question Q3, answer A3).
 
-The blocks and tokens that the other decoders have say where the Gaussians are, how large and how
-opaque. A second branch of blocks of the same depth and width, behind the same prefix, turns learned
-tokens into three square planes of features, which lie in x and y, x and z, y and z and span
-±``position_range``. Each Gaussian's centre is looked up in all three, and an MLP makes its colour
-of what it finds there.
+The blocks and tokens of the other decoders give positions, sizes and opacities of the Gaussians. A
+second branch of blocks of the same depth and width, after the same prefix, turns learned tokens
+into three square planes of features in x and y, x and z, y and z, which span ±``position_range``.
+All three are sampled at each Gaussian's centre, and an MLP turns the features into its colour.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ AXES = ((0, 1), (0, 2), (1, 2))  # of the planes: the first along a row, the sec
 
 
 class PlaneBranch(nn.Module):
-    """The branch that makes the planes: 3n² learned tokens, its own blocks, norm and projection."""
+    """Branch that makes the planes: 3n² learned tokens, its own blocks, norm and projection."""
 
     def __init__(self, config: GambaConfig, blocks: nn.ModuleList) -> None:
-        """Builds the branch around blocks, whose states ``prefix_states`` computes apart."""
+        """Build the branch around blocks, whose states ``prefix_states`` computes separately."""
         super().__init__()
         side, features = config.triplane_size, config.triplane_features
         self.sides = 3, side, side
@@ -42,7 +41,7 @@ class PlaneBranch(nn.Module):
         nn.init.zeros_(self.features.bias)
 
     def forward(self, batch: int, states: Sequence[Any], recompute: bool = False) -> Tensor:
-        """Makes the planes of ``batch`` pictures: ``[B, 3, features, n, n]``.
+        """Make the planes of ``batch`` pictures: ``[B, 3, features, n, n]``.
 
         Args:
             batch: B.
@@ -55,20 +54,20 @@ class PlaneBranch(nn.Module):
 
 
 def query_planes(planes: Tensor, points: Tensor) -> Tensor:
-    """Looks points up in three planes, bilinearly between the four nearest cells' centres.
+    """Sample three planes at points, bilinearly between the four nearest cells' centres.
 
     Args:
         planes: ``[B, 3, C, n, n]``, in the order of ``AXES``.
         points: ``[B, N, 3]``, where -1 and 1 are the outer edges of the planes. Beyond the centres
-            of the outermost cells a plane goes on as it is there.
+            of the outermost cells a plane is constant.
 
     Returns:
         ``[B, N, 3C]``, the planes one after the other.
     """
-    places = torch.stack([points[..., list(axes)] for axes in AXES], 1)
+    coordinates = torch.stack([points[..., list(axes)] for axes in AXES], 1)
     found = F.grid_sample(
         planes.flatten(0, 1),
-        places.flatten(0, 1)[:, None],
+        coordinates.flatten(0, 1)[:, None],
         mode="bilinear",
         padding_mode="border",
         align_corners=False,
@@ -77,7 +76,7 @@ def query_planes(planes: Tensor, points: Tensor) -> Tensor:
 
 
 class TriplaneDecoder(GaussianDecoder):
-    """``GaussianDecoder`` with an MLP of the planes' features in place of its head for colours."""
+    """``GaussianDecoder`` with an MLP of the planes' features instead of a head for colours."""
 
     colored = False
 
@@ -91,18 +90,18 @@ class TriplaneDecoder(GaussianDecoder):
         self.init_head(self.plane_color)
 
     def forward(self, tokens: Tensor, planes: Tensor) -> Gaussians:
-        """Decodes tokens and planes to Gaussians in float32.
+        """Decode tokens and planes to Gaussians in float32.
 
         Args:
             tokens: ``[B, L, width]``.
             planes: the result of ``PlaneBranch``.
 
         Returns:
-            ``[B, L]``; the ranges are those of ``GaussianDecoder``. No gradient comes to the
-            positions by the places in the planes (the authors' public code stops it, too).
+            ``[B, L]``; the ranges are those of ``GaussianDecoder``. Positions get no gradient
+            through the sampling of the planes (nor do they in the authors' public code).
         """
         parts = self.shapes(self.mlp(tokens))
-        places = parts["means"].detach() / self.config.position_range
-        hidden = self.plane_mlp(query_planes(planes.float(), places))
+        points = parts["means"].detach() / self.config.position_range
+        hidden = self.plane_mlp(query_planes(planes.float(), points))
         with torch.autocast(tokens.device.type, enabled=False):
             return Gaussians(**parts, colors=self.plane_color(hidden.float()).sigmoid())

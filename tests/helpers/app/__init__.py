@@ -45,7 +45,7 @@ def command(*options) -> list[str]:
 
 @contextmanager
 def serving(temporary: Path) -> Iterator[Served]:
-    """The command as users start it, in a folder for temporary files of its own."""
+    """Start the command like a user, with its own folder for temporary files."""
     environment = {**os.environ, "TMPDIR": str(temporary), "HTTP_PROXY": "http://127.0.0.1:9"}
     process = subprocess.Popen(
         command("--port", 0, "--max-upload-mb", MEGABYTES, "--device", "cpu"),
@@ -64,7 +64,7 @@ def serving(temporary: Path) -> Iterator[Served]:
 
 @dataclass
 class Answer:
-    """What came back."""
+    """Response of the server."""
 
     status: int
     headers: dict[str, str]
@@ -86,14 +86,14 @@ def form(content: bytes, name: str = "a.png") -> bytes:
 
 @dataclass
 class Program:
-    """A program on the same machine that asks as it likes; it keeps its cookie."""
+    """Program on the same machine that sends any requests, with a cookie."""
 
     host: str
     headers: dict[str, str] = field(default_factory=dict)
     session: str = field(default_factory=lambda: secrets.token_hex(5))
 
     def ask(self, place: str, body: bytes | None = None, method: str = "", **headers) -> Answer:
-        """One request; names of headers have ``_`` for ``-``."""
+        """Send one request; names of headers have ``_`` for ``-``."""
         link = http.client.HTTPConnection(self.host, timeout=30)
         named = {name.replace("_", "-"): value for name, value in headers.items()}
         sent = {name: value for name, value in {**self.headers, **named}.items() if value}
@@ -104,24 +104,24 @@ class Program:
         return answer
 
     def opened(self) -> Program:
-        """Asks for the page first, as a browser does."""
+        """Request the page first, like a browser."""
         self.headers["Cookie"] = self.ask("/").headers["set-cookie"].partition(";")[0]
         return self
 
     def upload(self, content: bytes, name: str = "a.png") -> str:
-        """The path that the page is told."""
+        """Upload a file; return its path for the page."""
         answer = self.ask("/gradio_api/upload", form(content, name), **FORM)
         assert answer.status == 200, answer
         return json.loads(answer.body)[0]
 
     def join(self, number: Any, data: list, **more) -> Answer:
-        """Asks for a call of a function; what it gives comes by ``result``."""
+        """Request a call of a function; ``result`` returns its output."""
         call = {"fn_index": number, "data": data, "session_hash": self.session, **more}
         kind = {"Content-Type": "application/json"}
         return self.ask("/gradio_api/queue/join", json.dumps(call).encode(), **kind)
 
     def result(self, number: int, data: list, **more) -> dict:
-        """The output of a call: ``data``, or an ``error``."""
+        """Return the output of a call: ``data``, or an ``error``."""
         answer = self.join(number, data, **more)
         assert answer.status == 200, answer
         events = self.ask(f"/gradio_api/queue/data?session_hash={self.session}").body.decode()

@@ -59,7 +59,7 @@ def npm_package(name: str, version: str) -> Path:
 
 
 def run_node(*arguments, cwd: Path) -> str:
-    """What a program prints to its output; an AssertionError with its words where it fails."""
+    """Run a program and return its output; raise an AssertionError with it on failure."""
     done = subprocess.run(
         [node()[0], *map(str, arguments)], capture_output=True, text=True, timeout=SECONDS, cwd=cwd
     )

@@ -1,6 +1,6 @@
-"""How near one set of Gaussians is to another, in whatever order a file has them.
+"""Differences between two sets of Gaussians, in any order.
 
-``published`` reads files by other people's code and by the published layouts, with none of ours.
+``published`` reads files with other packages and by the published layouts, without our code.
 """
 
 import json
@@ -15,10 +15,10 @@ from helpers.gaussians import covariances, rotations
 
 
 def differences(want, got):
-    """The largest difference of each attribute, the Gaussians paired by their centres.
+    """Return the largest difference of each attribute, with Gaussians paired by their centres.
 
     ``angle`` is that between the axes of an ellipsoid, radians: a half turn about one of its own
-    axes leaves it what it is, so readers may return another rotation of the same ellipsoid.
+    axes does not change it, so readers may return another rotation of the same ellipsoid.
     """
     distance = torch.cdist(want.means.double(), got.means.double())
     order = distance.argmin(1)
@@ -39,8 +39,8 @@ def differences(want, got):
     return {name: float(value) for name, value in found.items()}
 
 
-# What the layout of each format allows: half a step of its numbers, for the Gaussians of
-# ``helpers.gaussians.some``, which lie in a unit cube. Angles: three numbers, each half a step off.
+# Tolerances of the formats: half a step of their numbers, for the Gaussians of
+# ``helpers.gaussians.some`` in a unit cube. Angles: three numbers, each half a step off.
 ALLOWED = {
     "ply": {
         **{"means": 0, "angle": 1e-3, "logs": 1e-6, "opacities": 1e-6},
@@ -72,7 +72,7 @@ ALLOWED = {
 
 
 def check(kind, want, got):
-    """Asserts that what was read is as near as the format allows."""
+    """Assert that the read Gaussians are within the tolerance of the format."""
     for name, value in differences(want, got).items():
         assert value <= ALLOWED[kind][name], (kind, name, value, ALLOWED[kind][name])
 

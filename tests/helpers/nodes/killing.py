@@ -1,4 +1,4 @@
-"""One of two training processes is killed again and again, as torchrun starts them anew."""
+"""Repeated kills of one of two training processes, which torchrun restarts."""
 
 import json
 import os
@@ -15,21 +15,21 @@ from typing import Any
 
 from helpers.nodes.processes import environment, free_port
 
-_LONGEST = 900.0  # seconds of one run with all its kills
+_TIMEOUT = 900.0  # seconds of one run with all its kills
 _STEPS_PER_KILL = 8
 _WAIT = 0.02  # seconds between two looks
 
 
 @dataclass(frozen=True)
 class Killed:
-    """What came of it.
+    """Result of a run with kills.
 
     Attributes:
-        main: how often it was the process that writes.
-        resumed: how often the training went on from a checkpoint.
+        main: number of kills of the writing process.
+        resumed: number of resumptions from a checkpoint.
         steps: the last step.
-        seconds: of all of it.
-        said: what the processes wrote.
+        seconds: total time.
+        said: output of the processes.
     """
 
     main: int
@@ -40,27 +40,27 @@ class Killed:
 
 
 def steps_for(kills: int) -> int:
-    """Steps of a run in which so many kills find room."""
+    """Steps of a run that is long enough for ``kills`` kills."""
     return _STEPS_PER_KILL * kills + 4
 
 
 def kill_one_of_two(words: list[str], out: Path, kills: int, rng: random.Random) -> Killed:
-    """Trains in two processes, each under a torchrun of its own, as on two machines.
+    """Train in two processes, each under its own torchrun, as on two machines.
 
     Args:
-        words: options of ``gamba train`` but for the run folder, ``--steps`` and what is saved;
-            with ``--log-every 1``, by which the moments are chosen.
-        out: the run folder; what the processes say goes into a file beside it.
-        kills: how often one of the two is killed.
-        rng: of the moments, and of which of the two it is.
+        words: options of ``gamba train`` except the run folder, ``--steps`` and those of saving;
+            with ``--log-every 1``, which determines the moments.
+        out: the run folder; the output of the processes goes into a file beside it.
+        kills: number of kills of one of the two.
+        rng: generator of the moments and of the choice between the two.
 
     Raises:
-        RuntimeError: the run does not end well, or not in time.
+        RuntimeError: the run fails or exceeds its time limit.
     """
     started = time.monotonic()
     own = ["--out", out, "--steps", steps_for(kills), "--save-every", 3]
     reaper = _Reaper(out / "log.jsonl", kills, rng)
-    # A kill fails both workers: the other has lost it.
+    # A kill fails both workers: the other loses its peer.
     said = _nodes([*words, *map(str, own)], out.with_name(f"{out.name}.txt"), 2 * kills, reaper)
     return Killed(
         main=reaper.main,
@@ -81,13 +81,13 @@ class _Reaper:
         self._aim()
 
     def _aim(self) -> None:
-        """Chooses the moment: so many more logged steps, 0 for at once, and then some seconds."""
+        """Choose the moment: a number of further logged steps, 0 for at once, then some seconds."""
         wanted = self.rng.choice((0, *range(1, _STEPS_PER_KILL)))
         self._steps = len(_lines(self.log, "train")) + wanted
         self._wait = self.rng.uniform(0, 1.5 if wanted == 0 else 0.1)
 
     def __call__(self, agents: list[subprocess.Popen]) -> None:
-        """Looks whether the moment has come; ``agents`` are the two torchruns."""
+        """Kill a worker if the moment has come; ``agents`` are the two torchruns."""
         if not self.left or len(_lines(self.log, "train")) < self._steps:
             return
         workers = [_child(agent.pid) for agent in agents]
@@ -109,23 +109,23 @@ class _Reaper:
 def _nodes(
     words: list[str], notes: Path, restarts: int, look: Callable[[list[subprocess.Popen]], None]
 ) -> str:
-    """Runs two torchruns with one worker each to their end; returns what they said."""
+    """Run two torchruns with one worker each to their end; return their output."""
     command = [sys.executable, "-m", "torch.distributed.run", "--nnodes", "2"]
     command += ["--nproc-per-node", "1", "--max-restarts", str(restarts), "--rdzv-id", "gamba"]
     command += ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{free_port()}"]
     command += ["--local-addr", "127.0.0.1", "-m", "gamba_warp.train", *words]
     agents: list[subprocess.Popen[Any]] = []
-    limit = time.monotonic() + _LONGEST
+    limit = time.monotonic() + _TIMEOUT
     with open(notes, "w+", encoding="utf-8", errors="replace") as file:
         try:
             for _ in range(2):
                 agents.append(
                     subprocess.Popen(command, env=environment(), stdout=file, stderr=file)
                 )
-                time.sleep(1.0)  # so that the first is the host, and has the lower rank
+                time.sleep(1.0)  # makes the first one the host, with the lower rank
             while any(agent.poll() is None for agent in agents):
                 if time.monotonic() > limit:
-                    raise RuntimeError(f"no end after {_LONGEST:.0f} s: {_tail(notes)}")
+                    raise RuntimeError(f"no end after {_TIMEOUT:.0f} s: {_tail(notes)}")
                 look(agents)
                 time.sleep(_WAIT)
         finally:
@@ -137,7 +137,7 @@ def _nodes(
 
 
 def _end(agent: subprocess.Popen) -> None:
-    """Ends a torchrun, and its worker by it."""
+    """End a torchrun, and thereby its worker."""
     if agent.poll() is not None:
         return
     worker = _child(agent.pid)
@@ -148,7 +148,7 @@ def _end(agent: subprocess.Popen) -> None:
 
 
 def _child(parent: int) -> int | None:
-    """The number of a process's worker, which runs the training; None where it has none now."""
+    """Process id of the worker of a torchrun; None without one."""
     for entry in os.scandir("/proc"):
         if not entry.name.isdigit():
             continue
@@ -164,7 +164,7 @@ def _child(parent: int) -> int | None:
 
 
 def _lines(log: Path, event: str) -> list[dict]:
-    """The whole lines of one kind in a run's log; none where there is no log yet."""
+    """Complete lines of one kind in a run's log; empty without a log."""
     try:
         text = log.read_text(encoding="utf-8")
     except OSError:

@@ -1,4 +1,4 @@
-"""Training in several processes, as torchrun starts them, each with its own options."""
+"""Training in several processes like those of torchrun, each with its own options."""
 
 import os
 import socket
@@ -12,12 +12,12 @@ from typing import Any
 from helpers import micro
 
 ROOT = Path(micro.__file__).resolve().parents[2]
-LONGEST = 300  # seconds, after which processes that wait for one another are killed
+LONGEST = 300  # seconds until processes that wait for one another are killed
 
 
 @dataclass(frozen=True)
 class End:
-    """How a process ended: its exit code and what it wrote."""
+    """Result of a process: its exit code and its output."""
 
     code: int
     out: str
@@ -25,7 +25,7 @@ class End:
 
 
 def free_port() -> int:
-    """A TCP port that nobody listens on now."""
+    """Find an unused TCP port."""
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
         return held.getsockname()[1]
@@ -48,7 +48,7 @@ def words(data: Path, out: Path, *more: object) -> list[str]:
 
 
 def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -> list[End]:
-    """Runs ``gamba train`` in processes that know of one another.
+    """Run ``gamba train`` in processes of one group.
 
     Args:
         arguments: of each process, by its rank.
@@ -66,10 +66,10 @@ def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -
 
 
 def run_all(commands: list[list[str]]) -> list[End]:
-    """Runs commands that know of one another as torchrun's workers do; all of them end in time.
+    """Run commands as one group, like torchrun's workers, with a time limit.
 
     Returns:
-        How each ended, by rank; who was still there after ``LONGEST`` has the code -9.
+        The results by rank; processes killed after ``LONGEST`` have the code -9.
     """
     known = {"WORLD_SIZE": len(commands), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port()}
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

@@ -1,8 +1,8 @@
-"""One process of several: trains again and again, as a plan says, and notes how it ends.
+"""Process of a group that trains repeatedly according to a plan, and records the results.
 
 Run as ``python -m helpers.nodes.worker PLAN RESULT``. The plan is a JSON list of ``["copy", from,
-to]``, which the first process does, and of ``[name, arguments by rank, most bytes of a file by rank
-or null]``; the result, RESULT with the rank behind it, is an object of ``[code, line]`` by name.
+to]``, done by the first process, and of ``[name, arguments by rank, largest size of a file by rank
+or null]``. The result, RESULT with the rank appended, is an object of ``[code, line]`` by name.
 """
 
 import contextlib

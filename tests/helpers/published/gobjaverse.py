@@ -15,7 +15,7 @@ ELEVATION = {number: 20.0 for number in range(25)} | {25: 89.9, 26: -89.9}
 ELEVATION |= {number: 2.0 for number in range(27, 40)}
 SIZE = 32  # those of the set have 512
 FOV = 2 * math.atan(0.5 * 1024 / 1422.222)
-# What lies beside a view's picture and camera, and is not read.
+# Unused files beside a view's picture and camera.
 OTHERS = ("_albedo.png", "_hdr.exr", "_mr.png", "_nd.exr", "_ng.exr")
 
 
@@ -66,12 +66,12 @@ def members(name: str, views: int = VIEWS) -> dict[str, bytes]:
 
 
 def write_object(folder: Path, layout: str, views: int = VIEWS) -> None:
-    """Writes an object.
+    """Write an object.
 
     Args:
         folder: ``ROOT/dictionary_id/instance_id``.
-        layout: "readme", as the set's README and its tars have it; "script", as its script of
-            single files leaves it; "tar".
+        layout: "readme", that of the set's README and its tars; "script", that of its script for
+            single files; "tar".
         views: number of views.
     """
     made = members(folder.name, views)
@@ -87,7 +87,7 @@ def write_object(folder: Path, layout: str, views: int = VIEWS) -> None:
 
 
 def write_tar(path: Path, content: dict[str, bytes]) -> None:
-    """Writes a plain tar of these files."""
+    """Write a plain tar of these files."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tarfile.open(path, "w") as tar:
         for name, data in content.items():

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-# A model's own text, with another name.
+# Metadata of a model, with another name.
 PBTXT = """model {
   file: "model.sdf"
 }
@@ -70,7 +70,7 @@ def texture() -> bytes:
 
 
 def files() -> dict[str, bytes]:
-    """What is in a model's folder."""
+    """Content of a model's folder."""
     return {
         "model.config": b"<model></model>",
         "model.sdf": b"<sdf></sdf>",
@@ -83,7 +83,7 @@ def files() -> dict[str, bytes]:
 
 
 def write_model(root: Path, name: str) -> Path:
-    """Writes a model's folder."""
+    """Write a model's folder."""
     for place, data in files().items():
         path = root / name / place
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def write_model(root: Path, name: str) -> Path:
 
 
 def write_zip(root: Path, name: str, top: str = "") -> Path:
-    """Writes a model's zip, as the Fuel server gives it, or with a folder around everything."""
+    """Write a model's zip like the Fuel server, or with a folder around everything."""
     root.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(root / f"{name}.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for place, data in files().items():

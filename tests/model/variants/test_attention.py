@@ -35,7 +35,7 @@ def _linear(layer: torch.nn.Linear, x: torch.Tensor) -> torch.Tensor:
 
 
 def _plain_block(block, tokens, prefix):
-    """One transformer block as it is written, head by head and picture by picture."""
+    """Plain form of a transformer block, head by head and picture by picture."""
     found = []
     for sequence, before in zip(tokens, prefix):
         whole = _norm(block.norm, torch.cat([before, sequence]))
@@ -106,7 +106,7 @@ def test_every_token_sees_every_other_and_is_not_cut_into_segments(monkeypatch):
     monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", 2)
     with torch.no_grad():
         base = run_blocks(blocks, tokens, [None])
-        tokens[:, 8, :5] += 1  # of all channels the norm would take it away
+        tokens[:, 8, :5] += 1  # the norm would remove it from all channels
         moved = (run_blocks(blocks, tokens, [None]) - base).abs().amax(-1)
     assert (moved > 1e-5).all()
 

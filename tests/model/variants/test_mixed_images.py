@@ -1,4 +1,4 @@
-"""Image tokens among the 3DGS tokens: where they stand, and that a plain Mamba block runs."""
+"""Image tokens among the 3DGS tokens: their positions, against a plain Mamba block."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from helpers.model import assert_each_alone, assert_recomputed_alike, inputs, mi
 from helpers.refusals import refused
 
 from gamba_warp.model.gamba import Gamba, make_blocks
-from gamba_warp.model.parts.block import mixed_places, prefix_states, run_blocks
+from gamba_warp.model.parts.block import mixed_positions, prefix_states, run_blocks
 
 
 def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
@@ -19,7 +19,7 @@ def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
 
 
 def plain(blocks, tokens, camera, image):
-    """Picture by picture, each token put into a list where it belongs."""
+    """Plain form: picture by picture, with each token inserted into a list."""
     for block in blocks:
         pairs = ((block.project_camera, camera), (block.project_image, image))
         extra = torch.cat([project(x) for project, x in pairs if x is not None], 1)
@@ -64,15 +64,15 @@ def test_equals_the_plain_form(camera, count, length):
 
 def test_places_known_answer():
     # Of 10 own tokens and 2 others, these stand before tokens 3 and 6; then 12 tokens, then none.
-    got = mixed_places(2, torch.tensor([0, 10, 22, 22])).tolist()
+    got = mixed_positions(2, torch.tensor([0, 10, 22, 22])).tolist()
     assert got[:6] == [3, 7, 12 + 4, 12 + 9, 26, 27]
     assert got[6:16] == [0, 1, 2, 4, 5, 6, 8, 9, 10, 11] and sorted(got) == [*range(28)]
     assert got[16:] == [12 + t for t in (0, 1, 2, 3, 5, 6, 7, 8, 10, 11, 12, 13)]
-    assert sorted(mixed_places(5, torch.tensor([0, 3, 4])).tolist()) == [*range(14)]
+    assert sorted(mixed_positions(5, torch.tensor([0, 3, 4])).tolist()) == [*range(14)]
 
 
 def test_a_token_is_seen_by_those_behind_it_alone(monkeypatch):
-    monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", 2)  # is not to cut the sequence
+    monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", 2)  # must not cut the sequence
     blocks, tokens, image = blocks_of(0, 11), torch.randn(1, 9, 16), torch.randn(1, 2, 11)
     with torch.no_grad():
         base = run_blocks(blocks, tokens, prefix_states(blocks, None, image))

@@ -1,4 +1,4 @@
-"""Mixed tokens (paper, answer A4): which tokens see a patch, and which."""
+"""Mixed tokens (paper, answer A4): the tokens that see a patch, and their patches."""
 
 import pytest
 import torch

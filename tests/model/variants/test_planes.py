@@ -1,4 +1,4 @@
-"""The decoder ``triplane`` (paper, answer A3): looking up, decoding, the branch of the planes."""
+"""Decoder ``triplane`` (paper, answer A3): sampling, decoding, the branch of the planes."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ PLANES = {"decoder": "triplane", "triplane_size": 3, "triplane_features": 5}
 
 
 def looked_up(planes: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """One picture, point by point: ``planes [3, C, n, n]`` and ``points [N, 3]`` to ``[N, 3C]``."""
+    """Sample point by point: ``planes [3, C, n, n]`` and ``points [N, 3]`` to ``[N, 3C]``."""
     side, found = planes.shape[-1], []
     for point in points.tolist():
         x, y, z = (min(max((p + 1) * side / 2 - 0.5, 0.0), side - 1.0) for p in point)
@@ -38,7 +38,7 @@ def test_points_are_looked_up_between_four_cells():
     got = query_planes(planes, points)
     for picture in range(2):
         torch.testing.assert_close(got[picture], looked_up(planes[picture], points[picture]))
-    # The corner itself has the outermost cell's features, and what is beyond has the same.
+    # The corner itself has the outermost cell's features, and so have points beyond it.
     torch.testing.assert_close(got[0, 40, :4], planes[0, 0, :, 0, 0])
     far = query_planes(planes, torch.full((2, 1, 3), 7.0, dtype=torch.float64))
     torch.testing.assert_close(far[1, 0, 8:], planes[1, 2, :, 4, 4])

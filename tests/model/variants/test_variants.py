@@ -1,4 +1,4 @@
-"""The variants of the network: that the presets stay what they are, and that files hold each."""
+"""Variants of the network: unchanged presets, and files of each variant."""
 
 import hashlib
 import json
@@ -13,7 +13,7 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.predict import reconstruct
 from gamba_warp.vision.vgg import VGG16Features, VGG16Trunk
 
-# Names and shapes of the tensors that files of the presets hold; older files have the same.
+# Names and shapes of the tensors in files of the presets; the same as in older files.
 STORED = {
     "tiny": "3f61a702eabbc5c7",
     "rays": "8c65916990cee708",
@@ -44,7 +44,7 @@ VARIANTS = [
 
 LENGTHS = {"tiny": (4096, 0), "rays": (49152, 0), "small": (9216, 144), "paper": (16384, 576)}
 LENGTHS["released"] = (16384, 577)
-# The paper's ablations, and what else a configuration may say of the plain network.
+# The paper's ablations, and other options of the plain network.
 ABLATIONS = [
     {},
     {"encoder": "none"},
@@ -61,7 +61,7 @@ ABLATIONS = [
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_store_what_they_stored(preset, monkeypatch):
-    """And have its sizes; the number of parameters is known before a model is built."""
+    """The sizes are the same; the number of parameters is known before a model is built."""
     trunk = VGG16Trunk
     monkeypatch.setattr(
         "gamba_warp.vision.vgg.vgg16_features", lambda path: VGG16Features(trunk().state_dict())

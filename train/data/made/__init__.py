@@ -1,8 +1,7 @@
-"""Objects without end, made of a seed: toys, animals, shoes, bags, tools, packages, furniture.
+"""Procedural objects from a seed: toys, animals, shoes, bags, tools, packages, furniture.
 
-Each is a union of solids, so that it is closed and has a volume; what it is made of comes from
-plans, which build things as things are built, and from free compositions. y is up, the front looks
-along +z. Nobody has rights in them.
+Each is a union of solids, so it is closed and has a volume. Objects come from plans, which assemble
+typical parts, and from free compositions. y is up, the front looks along +z. All are CC0.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def composition(m: Maker) -> list[Manifold]:
 
 
 def largest(solid: Manifold) -> Manifold:
-    """A solid without the pieces that hang in the air beside its largest one."""
+    """Largest connected piece of a solid."""
     return max(solid.decompose(), key=lambda piece: piece.volume(), default=solid)
 
 
@@ -77,8 +77,8 @@ def shape(m: Maker, mirrored: bool = True, fine: int = 32) -> Manifold:
     """A random solid about the origin, with sides of .3 to 2.
 
     Args:
-        m: source of chance.
-        mirrored: whether it is the same on both sides of x = 0 where its kind allows it.
+        m: random source.
+        mirrored: make it symmetric about x = 0 if its kind allows it.
         fine: number of points around a round one.
     """
     kind = m.n(0, 11)
@@ -126,7 +126,7 @@ def turned(m: Maker, radius: float, height: float, fine: int) -> Manifold:
 
 
 def loafed(m: Maker, a: float, b: float, c: float, fine: int) -> Manifold:
-    """A solid through superellipses whose sizes, places and forms change along z."""
+    """A solid through superellipses whose sizes, positions and forms change along z."""
     count, sides = fine // 2, fine * 7 // 8
     t = np.linspace(-1, 1, count)
     ends = m.u(0.3, 0.95)
@@ -185,7 +185,7 @@ def whole_warped(m: Maker, parts: list[Manifold], mirrored: bool) -> Manifold:
 
 
 def surface_point(m: Maker, solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
-    """A point ``[3]`` of a solid's surface, and the direction in which this looks."""
+    """A point ``[3]`` of a solid's surface, and its normal."""
     mesh = solid.to_mesh()
     faces = np.asarray(mesh.tri_verts)
     corners = np.asarray(mesh.vert_properties)[:, :3].astype(float)[faces]
@@ -198,7 +198,7 @@ def surface_point(m: Maker, solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turned_to(solid: Manifold, normal: np.ndarray, place: np.ndarray) -> Manifold:
-    """A solid whose y axis is turned to a direction, and whose origin is moved to a place."""
+    """Rotate a solid's y axis to a direction, and move its origin to a position."""
     y = normal / max(float(np.linalg.norm(normal)), 1e-9)
     side = np.array([1.0, 0, 0]) if abs(y[0]) < 0.9 else np.array([0, 0, 1.0])
     z = np.cross(side, y)
@@ -253,7 +253,7 @@ def grown(m: Maker, host: Manifold, mirrored: bool, look: int) -> Manifold:
 
 
 def hollowed(m: Maker, solid: Manifold, look: int) -> Manifold:
-    """A solid that is open at its top: a scaled copy of it is cut out."""
+    """A solid open at its top: a scaled copy of it is cut out."""
     low, high = extent(solid)
     size = high - low
     wall = m.u(0.03, 0.12) * float(size.min())

@@ -83,7 +83,7 @@ def _ears(m: Maker, blend: Blend, center: Vec, radii: Vec, look: int) -> None:
 
 
 def _turned(m: Maker, parts: list[Manifold]) -> list[Manifold]:
-    """Animals are shown from the front, from the side and between."""
+    """Turn an animal to the front, to the side or between."""
     angle = m.pick(0.0, m.u(-60, 60), 90.0, -90.0, m.u(40, 110), m.u(-110, -40))
     return [part.rotate([0, angle, 0]) for part in parts]
 

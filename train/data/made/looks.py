@@ -1,8 +1,7 @@
-"""Looks of surfaces, and meshes with textures made of solids.
+"""Looks of surfaces, and textured meshes made of solids.
 
-A solid that is *stamped* remembers, at each point, where this lay when it was stamped (its *skin*),
-and the number of its look. Both stay through booleans, turns and bends, so that textures are laid
-on the parts as these were made.
+A *stamped* solid stores the rest position of each vertex (its *skin*) and the number of its look.
+Both survive booleans, turns and bends, so textures follow the parts as they were made.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from gamba_warp.formats.meshes import CREASE, TexturedMesh
 from . import textures
 from .solids import both, extent, joined, solid_of
 
-SHARP = 40.0  # degrees; a sharper edge is not shaded smoothly
+SHARP = 40.0  # degrees; sharper edges are not shaded smoothly
 MAX_FACES = 60_000
 THINNEST = 2e-4  # least volume, as a share of a cube of the longest side
 # Of a skin, for faces that look along x, y and z: the axes of u and v, and the signs of u and v
@@ -35,12 +34,12 @@ class Look:
     """Look of some of an object's parts.
 
     Attributes:
-        materials: one for all sides; or six, of the sides that look to +x, -x, +y, -y, +z and -z.
-        mapping: how the texture lies on the skin: "box", from the side that a face looks to,
-            repeated; "fit", the same, once over the skin's extent; "round", once about y.
+        materials: one for all sides; or six, for the sides facing +x, -x, +y, -y, +z and -z.
+        mapping: texture mapping on the skin: "box", repeated, projected from the side that a face
+            looks to; "fit", the same, once over the skin's extent; "round", once about y.
         repeats: of the texture over a unit, for "box"; about y, for "round".
-        low: least coordinates ``[3]`` of the skin of what is stamped with it.
-        high: greatest ones.
+        low: least coordinates ``[3]`` of the skins stamped with it.
+        high: greatest coordinates ``[3]``.
     """
 
     materials: list[Material]
@@ -51,7 +50,7 @@ class Look:
 
 
 def material(pixels: np.ndarray) -> Material:
-    """A material of a picture ``[h, w, 3]`` uint8."""
+    """A material with a picture ``[h, w, 3]`` uint8."""
     full = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     full[..., :3] = pixels
     return Material(np.ones(4, np.float32), full)
@@ -66,11 +65,11 @@ class Maker:
     """Source of random numbers and of looks for plans.
 
     Args:
-        rng: source of chance.
+        rng: random generator.
 
     Attributes:
         rng: the same.
-        looks: those that were made.
+        looks: all looks made so far.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -78,27 +77,27 @@ class Maker:
         self.looks: list[Look] = []
 
     def u(self, low: float, high: float) -> float:
-        """A number between two."""
+        """Draw a number between two."""
         return float(self.rng.uniform(low, high))
 
     def chance(self, share: float) -> bool:
-        """True in a share of all cases."""
+        """True with this probability."""
         return bool(self.rng.random() < share)
 
     def n(self, low: int, high: int) -> int:
-        """A whole number, the last included."""
+        """Draw an integer, bounds included."""
         return int(self.rng.integers(low, high + 1))
 
     def pick(self, *options):
-        """One of some things."""
+        """Choose one of the options."""
         return options[self.rng.integers(len(options))]
 
     def color(self, kinds: str = "any") -> np.ndarray:
-        """A colour of one of some kinds, see ``textures.color``, separated by spaces."""
+        """Draw a colour of one of the kinds, separated by spaces; see ``textures.color``."""
         return textures.color(self.rng, self.pick(*kinds.split()))
 
     def add(self, look: Look) -> int:
-        """The number of a new look."""
+        """Add a look; return its number."""
         self.looks.append(look)
         return len(self.looks) - 1
 
@@ -124,7 +123,7 @@ class Maker:
         Args:
             patterns: names in ``textures.PATTERNS`` to choose from, separated by spaces.
             kinds: of the first colour.
-            contrast: share of cases in which the second is another colour, not a shade.
+            contrast: probability that the second is another colour, not a shade.
             mapping: see ``Look``.
             repeats: the same; 0: drawn.
         """
@@ -179,9 +178,9 @@ class Maker:
             ground: colour of the paper.
             mapping: see ``Look``.
             inks: colours; None: drawn.
-            sides: whether what does not look to +z is of the ground's colour.
+            sides: give all faces that do not look to +z the ground's colour.
         """
-        # What goes once around is four times as wide as high.
+        # A wrap-around print is four times as wide as high.
         height = textures.PRINT * 3 // 8 if mapping == "round" else textures.PRINT
         pixels = textures.package(
             self.rng, ground, inks or self.inks(), kind, textures.PRINT, height
@@ -189,12 +188,12 @@ class Maker:
         return self.faced(pixels, ground) if sides else self.add(Look([material(pixels)], mapping))
 
     def faced(self, pixels: np.ndarray, ground: np.ndarray) -> int:
-        """A look with a picture on what looks to +z, once over it, and one colour elsewhere."""
+        """A look with one picture across the faces that look to +z, and one colour elsewhere."""
         bare = plain_material(ground)
         return self.add(Look([bare, bare, bare, bare, material(pixels), bare], "fit"))
 
     def stamp(self, solid: Manifold, look: int) -> Manifold:
-        """The solid with its skin where it is now, all of it of one look."""
+        """Stamp a solid at its current position with one look."""
         mesh = solid.to_mesh()
         vertices = np.asarray(mesh.vert_properties)[:, :3]
         return self.stamped(vertices, np.asarray(mesh.tri_verts), np.zeros(1), (look,))
@@ -202,12 +201,12 @@ class Maker:
     def stamped(
         self, vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray, looks: Sequence[int]
     ) -> Manifold:
-        """A solid of arrays, with its skin where it is.
+        """Make a stamped solid of arrays.
 
         Args:
             vertices: ``[V, 3]``.
             faces: ``[F, 3]``.
-            of_face: ``[F]`` indices into looks; ignored where there is one look.
+            of_face: ``[F]`` indices into looks; ignored with a single look.
             looks: their numbers.
         """
         if not len(faces):
@@ -236,9 +235,9 @@ class Maker:
         """The stamped solid of a ``solids.Blend``, whose looks are indices into these."""
 
         def stamp(vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> Manifold:
-            sound = solid_of(vertices, faces)
-            if sound.is_empty():
-                return sound
+            solid = solid_of(vertices, faces)
+            if solid.is_empty():
+                return solid
             swapped = faces[:, ::-1]
             probe = np.einsum(
                 "fk,fk->",
@@ -264,20 +263,20 @@ class Parts(list[Manifold]):
     def add(
         self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
     ) -> None:
-        """Adds a solid of one look.
+        """Add a solid of one look.
 
         Args:
             solid: about the origin.
             look: its number.
             turn: degrees about x, then y, then z.
-            at: place of its origin.
+            at: position of its origin.
         """
         self.append(self._stamped(solid, look, turn, at))
 
     def pair(
         self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
     ) -> None:
-        """Adds a solid and its mirror image on the other side of x = 0, see ``add``."""
+        """Add a solid and its mirror image on the other side of x = 0, see ``add``."""
         self.append(both(self._stamped(solid, look, turn, at)))
 
     def _stamped(self, solid: Manifold, look: int, turn: ArrayLike, at: ArrayLike) -> Manifold:
@@ -285,12 +284,12 @@ class Parts(list[Manifold]):
         return self.m.stamp(turned.translate(np.asarray(at, float).tolist()), look)
 
     def turned(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> list[Manifold]:
-        """All of them as one, turned about x, then y, then z by degrees."""
+        """All parts as one, turned about x, then y, then z by degrees."""
         return [joined(self).rotate([x, y, z])]
 
 
 def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh | None:
-    """The union of stamped solids as a mesh with textures; None where it is empty or a sheet."""
+    """Union of stamped solids as a textured mesh; None if it is empty or a sheet."""
     whole = joined([s for s in solids if not s.is_empty()])
     if whole.is_empty():
         return None
@@ -329,15 +328,15 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
 def _normals(
     rough: np.ndarray, same: np.ndarray, corners: np.ndarray, places: np.ndarray
 ) -> np.ndarray:
-    """Unit normals ``[F, 3, 3]`` of corners: means over the faces of a smooth patch, by their area.
+    """Unit normals ``[F, 3, 3]`` of corners: area-weighted means over the faces of a smooth patch.
 
-    So a flat face beside a rounded edge stays flat, and slivers that a cut left have no say.
+    A flat face beside a rounded edge thus stays flat, and slivers left by a cut have little effect.
 
     Args:
-        rough: ``[V, 3]`` normals which are equal where a vertex's faces belong to one patch.
-        same: ``[V]`` the first of the vertices at one place.
+        rough: ``[V, 3]`` normals, equal if a vertex's faces belong to one patch.
+        same: ``[V]`` the first of the vertices at one position.
         corners: ``[F, 3]`` vertices of faces.
-        places: ``[F, 3, 3]`` where these are.
+        places: ``[F, 3, 3]`` positions of the corners.
     """
     steps = np.rint(500 * rough).astype(np.int64) + 512
     key = ((same * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
@@ -358,7 +357,7 @@ def _normals(
 def _mapped(
     skin: np.ndarray, number: np.ndarray, looks: Sequence[Look]
 ) -> tuple[np.ndarray, np.ndarray, list[Material]]:
-    """UVs ``[F, 3, 2]``, materials' numbers ``[F]`` and materials of faces.
+    """UVs ``[F, 3, 2]``, material numbers ``[F]`` and materials of faces.
 
     Args:
         skin: ``[F, 3, 3]``.

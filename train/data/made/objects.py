@@ -1,4 +1,4 @@
-"""One object of its source of chance, and files of many."""
+"""Random objects, and files of many."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from .vehicles import plane, train_of, vehicle
 from .vessels import bottle, bowl, food, mug, plant, teapot
 from .wear import bag, hat, shoe, wearable
 
-GROUP = "made"  # all are of one group, so that all lie in one part of a split: train
+GROUP = "made"  # one group, so that all objects lie in one part of the split: train
 ATTRIBUTION = {"creator": "made by gamba data made", "licence": "CC0 1.0", "source": ""}
 FREE = 0.37  # share of free compositions
 TURNED = 0.12  # share of objects that are turned about y by any angle
 
 Plan = Callable[[Maker], list[Manifold]]
-# How often each is drawn, beside the others.
+# Relative frequency of each plan.
 PLANS: tuple[tuple[Plan, float], ...] = (
     *((quadruped, 4.0), (plush, 4.0), (biped, 2.0), (bird, 1.5), (swimmer, 1.2), (crawler, 1.2)),
     *((snake, 0.5), (figure, 3.5), (block_figure, 1.5)),
@@ -48,13 +48,14 @@ _WEIGHTS = np.cumsum([weight for _, weight in PLANS]) / sum(weight for _, weight
 
 
 def make_object(rng: np.random.Generator) -> TexturedMesh:
-    """Draws one object, which is closed and has a volume.
+    """Draw one object, closed and with a volume.
 
     Args:
-        rng: source of chance; object n of seed s has ``np.random.default_rng([s, n])``.
+        rng: random generator; object n of seed s uses ``np.random.default_rng([s, n])``.
 
     Returns:
-        The object, y up, its front along +z, of any size and place; at most ``MAX_FACES`` faces.
+        The object, y up, its front along +z, at any size and position, with at most ``MAX_FACES``
+        faces.
     """
     while True:
         plan = (
@@ -68,7 +69,7 @@ def make_object(rng: np.random.Generator) -> TexturedMesh:
 
 
 def made_by(plan: Plan, rng: np.random.Generator) -> TexturedMesh | None:
-    """The object of one plan; None where nothing, or hardly more than a sheet, came of it."""
+    """Make the object of one plan; None if it is empty or hardly more than a sheet."""
     maker = Maker(rng)
     parts = plan(maker)
     if rng.random() < TURNED:
@@ -78,10 +79,10 @@ def made_by(plan: Plan, rng: np.random.Generator) -> TexturedMesh | None:
 
 
 def make_files(out: Path, count: int, seed: int) -> None:
-    """Writes objects as ``.glb`` files, with their ``catalogue.json``.
+    """Write objects as ``.glb`` files, with their ``catalogue.json``.
 
     Args:
-        out: folder for the files; one with another catalogue is refused.
+        out: folder for the files; must not have another catalogue.
         count: number of objects.
         seed: seed of all of them.
 
@@ -91,7 +92,7 @@ def make_files(out: Path, count: int, seed: int) -> None:
     out = output_folder(out)
     ours = all(path.name.startswith("made-") for path in out.glob("*.glb"))
     if (out / CATALOGUE).exists() and not ours:
-        raise UserError(f"{out / CATALOGUE}: there are other objects; choose another --out")
+        raise UserError(f"{out / CATALOGUE}: lists other objects; choose another --out")
     entries = []
     for number in progress_bar(range(count), unit="object"):
         uid = f"made-{seed}-{number:05d}"
@@ -106,7 +107,7 @@ def make_files(out: Path, count: int, seed: int) -> None:
 
 
 def _glb(mesh: TexturedMesh) -> bytes:
-    """A mesh as a binary glTF file, a part for each material."""
+    """Encode a mesh as binary glTF, one part per material."""
     import trimesh
     from trimesh.exchange.gltf import export_glb
     from trimesh.visual import TextureVisuals

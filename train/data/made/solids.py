@@ -1,7 +1,7 @@
 """Closed solids by ``manifold3d``: lofts, lathes, tubes, slabs, superquadrics, blended limbs.
 
-A function here makes a solid of numbers alone, about the origin unless it says otherwise, y up.
-Rings and profiles are arrays of points; lengths have no unit.
+The functions are deterministic. Solids are about the origin unless stated otherwise, y up. Rings
+and profiles are arrays of points; lengths have no unit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CELLS = 36_000  # of its bounding box, at most
 
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
-    """The solid of ``vertices [V, 3]`` and ``faces [F, 3]``, turned so that its volume is positive.
+    """Solid of ``vertices [V, 3]`` and ``faces [F, 3]``, oriented to a positive volume.
 
     A mesh that is not closed gives an empty solid.
     """
@@ -89,7 +89,7 @@ def loft(rings: np.ndarray, tips: np.ndarray | None = None, closed: bool = False
     Args:
         rings: ``[R, N, 3]``.
         tips: ``[2, 3]`` middle points of the ends; None: the means of the first and last ring.
-        closed: whether the last ring is joined to the first, and there are no ends.
+        closed: join the last ring to the first instead of closing the ends.
     """
     count, sides = rings.shape[:2]
     points = rings.reshape(-1, 3)
@@ -116,7 +116,7 @@ def lathe(profile: ArrayLike, sides: int = 32) -> Manifold:
 
 
 def ring_of(exponent: float, sides: int = 24) -> np.ndarray:
-    """A superellipse ``[sides, 2]`` of half sizes 1: 2 is a circle, more tends to a square."""
+    """A superellipse ``[sides, 2]`` of half sizes 1: exponent 2 is a circle, more is squarer."""
     angle = np.arange(sides) * (2 * math.pi / sides)
     c, s = np.cos(angle), np.sin(angle)
     r = (np.abs(c) ** exponent + np.abs(s) ** exponent) ** (-1 / exponent)
@@ -148,7 +148,7 @@ def slab(outline: ArrayLike, thickness: float, bevel: float = 0.0, steps: int = 
     """An outline in x and y, thick along z, with rounded edges.
 
     Args:
-        outline: ``[N, 2]`` counterclockwise; its mean must see all of it.
+        outline: ``[N, 2]`` counterclockwise; star-shaped about its mean.
         thickness: along z, about 0.
         bevel: radius of the edges.
         steps: rings of a rounded edge.
@@ -169,7 +169,7 @@ def slab(outline: ArrayLike, thickness: float, bevel: float = 0.0, steps: int = 
 
 
 def box(width: float, height: float, deep: float, radius: float = 0.0) -> Manifold:
-    """A box about the origin, with rounded edges where there is a radius."""
+    """A box about the origin, with rounded edges if the radius is not 0."""
     if radius <= 0:
         return Manifold.cube([width, height, deep], True)
     radius = min(radius, 0.49 * min(width, height, deep))
@@ -230,7 +230,7 @@ def ring(
 
 
 def frames(path: np.ndarray, closed: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tangents and two normals ``[R, 3]`` each along a curve, which turn as little as they can."""
+    """Tangents and two normals ``[R, 3]`` each along a curve, with minimal rotation."""
     if closed:
         t = np.roll(path, -1, 0) - np.roll(path, 1, 0)
     else:
@@ -259,11 +259,11 @@ def tube(
 
     Args:
         path: ``[K, 3]`` points that the curve goes through.
-        radii: one, or some that are spread along the curve.
+        radii: one, or several spread along the curve.
         sides: points around a circle, or a profile ``[N, 2]`` of radius 1.
         count: rings along the curve.
-        closed: whether the curve is a loop.
-        round_ends: whether the ends are half balls.
+        closed: True if the curve is a loop.
+        round_ends: close the ends with half balls.
         flat: scales of the profile along its two axes.
     """
     line = spline(path, count, closed)
@@ -301,7 +301,7 @@ class Blend:
 
     Args:
         soft: length over which two of them flow together.
-        symmetric: whether each is there on both sides of x = 0.
+        symmetric: add each on both sides of x = 0.
     """
 
     def __init__(self, soft: float = 0.08, symmetric: bool = True) -> None:
@@ -318,7 +318,7 @@ class Blend:
                 self._items.append((*mirrored, look, lambda x, y, z: distance(-x, y, z)))
 
     def limb(self, path: ArrayLike, radii: ArrayLike, look: int = 0) -> None:
-        """Adds round cones through points ``[K, 3]`` with a radius at each."""
+        """Add round cones through points ``[K, 3]`` with a radius at each."""
         p = np.asarray(path, np.float32)
         r = np.broadcast_to(np.asarray(radii, np.float32), len(p))
         for a, b, ra, rb in zip(p, p[1:], r, r[1:]):
@@ -327,7 +327,7 @@ class Blend:
             )
 
     def egg(self, center: ArrayLike, radii: ArrayLike, look: int = 0, tilt: float = 0.0) -> None:
-        """Adds an ellipsoid, turned about x by ``tilt`` radians."""
+        """Add an ellipsoid, turned about x by ``tilt`` radians."""
         c, r = np.asarray(center, np.float32), np.asarray(radii, np.float32)
         s, k = math.sin(tilt), math.cos(tilt)
         reach = np.array(
@@ -340,7 +340,7 @@ class Blend:
         stamp: Callable[[np.ndarray, np.ndarray, np.ndarray], Manifold],
         cells: int = RESOLUTION,
     ) -> Manifold:
-        """The solid.
+        """Make the solid.
 
         Args:
             stamp: makes a solid of vertices, faces and the look of each face.
@@ -389,7 +389,7 @@ class Blend:
 def _split(
     vertices: np.ndarray, faces: np.ndarray, looks: np.ndarray, border: np.ndarray, look: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh cut along a line; what lies where ``border [V]`` is below 0 gets another look."""
+    """Cut a mesh along a line; the part with ``border [V]`` below 0 gets another look."""
     border = np.where(np.abs(border) < 1e-4, 1e-4, border)
     below = border[faces] < 0
     count = below.sum(1)
@@ -397,7 +397,7 @@ def _split(
     kept_looks = np.where(count[whole] == 3, look, looks[whole])
     if not crossed.any():
         return vertices, faces, kept_looks
-    # Turned so that the corner that is alone on its side comes first.
+    # Rotated so that the corner alone on its side comes first.
     alone = np.where(count[crossed] == 1, below[crossed].argmax(1), (~below[crossed]).argmax(1))
     order = (alone[:, None] + np.arange(3)) % 3
     a, b, c = np.take_along_axis(faces[crossed], order, 1).T
@@ -446,7 +446,7 @@ def _egg(c: np.ndarray, r: np.ndarray, s: float, k: float) -> Callable:
 
 
 def bend(solid: Manifold, angle: float) -> Manifold:
-    """A solid bent in the plane of y and z: what stands upright leans towards +z at its top."""
+    """Bend a solid in the plane of y and z, its top towards +z."""
     (low, high) = extent(solid)
     length = max(float(high[1] - low[1]), 1e-6)
     if abs(angle) < 1e-3:
@@ -493,10 +493,10 @@ def ripple(
 
     Args:
         solid: with faces that are small beside ``length``.
-        rng: source of chance.
+        rng: random generator.
         height: typical displacement.
-        length: of the field's waves.
-        mirrored: whether the field is the same on both sides of x = 0.
+        length: wavelength of the field.
+        mirrored: make the field symmetric about x = 0.
     """
     waves = rng.normal(size=(3, 7, 3)) * (2 * math.pi / length / 1.7)
     phases = rng.uniform(0, 2 * math.pi, (3, 7))

@@ -1,7 +1,7 @@
-"""Made-up textures: patterns of materials, and printed matter with marks like letters.
+"""Procedural textures: patterns of materials, and printed matter with letter-like marks.
 
 A pattern is a mix ``[SIDE, SIDE]`` in [0, 1] of two colours, and repeats without a seam. Printed
-matter is a picture ``[h, w, 3]`` of its own. Colours are display values in [0, 1].
+matter is a whole picture ``[h, w, 3]``. Colours are display values in [0, 1].
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _COLORS = {
 
 
 def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
-    """Draws a colour ``[3]`` of a kind: one of ``_COLORS``, any, toy, dark or wide."""
+    """Draw a colour ``[3]`` of a kind: one of ``_COLORS``, any, toy, dark or wide."""
     if kind == "any":
         kinds = ("toy", "toy", "pastel", "dark", "dark", "white", "white", "earth", "metal", "wide")
         kind = kinds[rng.integers(len(kinds))]
@@ -59,7 +59,7 @@ def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
 
 
 def mixed(mix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """A picture ``[h, w, 3]`` uint8 of two colours."""
+    """Mix two colours to a picture ``[h, w, 3]`` uint8."""
     m = mix[..., None]
     return np.rint(255 * np.clip(first * (1 - m) + second * m, 0, 1)).astype(np.uint8)
 
@@ -70,9 +70,9 @@ def noise(
     """Smooth noise ``[side, side]`` from 0 to 1 without a seam.
 
     Args:
-        rng: source of chance.
-        levels: its waves are 2 to these powers, the first to the one before the last.
-        stretch: how much longer the waves are across than up.
+        rng: random generator.
+        levels: range of the powers of 2 of its wave numbers, the last excluded.
+        stretch: ratio of the horizontal to the vertical wavelength.
         side: pixels.
     """
     total = np.zeros((side, side), np.float32)
@@ -86,7 +86,7 @@ def noise(
 
 
 def plain(rng: np.random.Generator) -> np.ndarray:
-    """One colour, hardly soiled."""
+    """One colour, slightly soiled."""
     return rng.uniform(0, 0.25) * noise(rng, (1, 4))
 
 
@@ -231,10 +231,10 @@ def _word(rng: np.random.Generator, low: int = 2, high: int = 9) -> str:
 
 
 class Print:
-    """A sheet that is printed on.
+    """A printed sheet.
 
     Args:
-        rng: source of chance.
+        rng: random generator.
         ground: its colour.
         width: pixels.
         height: pixels.
@@ -369,7 +369,7 @@ def package(
     """A printed side of a package.
 
     Args:
-        rng: source of chance.
+        rng: random generator.
         ground: colour of the paper.
         inks: two or more colours.
         kind: front, back, side or label.

@@ -1,4 +1,4 @@
-"""Blocks, games, robots, and several things beside one another."""
+"""Blocks, games, robots, and groups of objects."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def vehicle(m: Maker) -> list[Manifold]:
         rings = []
         for x, s in ((-0.5, 0.75), (-0.42, 0.95), (-0.2, 1), (0.2, 1), (0.42, 0.95), (0.5, 0.75)):
             y = np.where(side > hood, hood + (side - hood) * s, side)
-            # The cabin is narrower than what is below it.
+            # The cabin is narrower than the body below it.
             wide = x * w * (1 - 0.5 * np.clip(y - hood, 0, 1))
             rings.append(np.stack([wide, y, np.array(z) * long * (0.97 + 0.03 * s)], -1))
         body = loft(np.stack(rings))

@@ -26,7 +26,7 @@ _ALONE_LIMIT = 1e-4  # the same sums in products of other shapes
 
 
 class _Covered:
-    """The model of preset rays and a batch whose objects cover a share of the picture."""
+    """Model of preset rays, and a batch whose objects cover a share of the picture."""
 
     def __init__(self, settings: Settings, model: Gamba, share: float) -> None:
         torch.manual_seed(1)
@@ -41,11 +41,11 @@ class _Covered:
 
     @torch.no_grad()
     def forward(self, margin: int) -> Gaussians:
-        """Runs the network; this is what is timed."""
+        """Run the network; timed."""
         return self._run(margin, self.batch.inputs, self.batch.input_cameras)
 
     def gradients(self, margin: int, batch: Batch | None = None) -> dict[str, Tensor]:
-        """Makes the gradients of the weights; this is timed too."""
+        """Make the gradients of the weights; timed."""
         run = partial(self._run, margin)
         compute_gradients(
             run, self.optimizer, [batch or self.batch], Objective(WEIGHTS), clip=math.inf
@@ -60,7 +60,7 @@ class _Covered:
         return [Batch(**{k: v[i] for k, v in fields.items()}) for i in one]
 
     def check(self, margin: int) -> Error:
-        """Measures the error of the batch's Gaussians to those of each object alone."""
+        """Measure the error of the batch's Gaussians to those of each object alone."""
         together, got, want = self.forward(margin), {}, {}
         for i, one in enumerate(self._alone()):
             with torch.no_grad():
@@ -72,7 +72,7 @@ class _Covered:
         return compare(got, want)
 
     def check_gradients(self, margin: int) -> Error:
-        """Measures the error of all weights' gradient to the mean of those of each object alone."""
+        """Measure the error of all weights' gradient to the mean of those of each object alone."""
         got = {name: value.clone() for name, value in self.gradients(margin).items()}
         sums: dict[str, Tensor] = {}
         alone = self._alone()
@@ -87,10 +87,10 @@ class _Covered:
         return render(self.forward(margin), self.batch.cameras, self.batch.background).rgb
 
     def work(self, margin: int, whole: int, run: Callable[[], object]) -> dict[str, float]:
-        """Counts tokens and memory, and the PSNR to the pictures of all patches, in dB."""
+        """Count tokens and memory, and the PSNR to the pictures of all patches, in dB."""
         alpha = self.batch.inputs[..., 3]
         patches = foreground_patches(alpha, self.model.config.patch_size, margin)
-        counts: dict[str, float] = {"tokens": 4 * len(patches.place)}
+        counts: dict[str, float] = {"tokens": 4 * len(patches.position)}
         if margin != whole:
             error = (self._pictures(margin) - self._pictures(whole)).square().mean()
             counts["psnr_to_full"] = round(-10 * error.clamp_min(1e-12).log10().item(), 1)

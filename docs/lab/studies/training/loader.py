@@ -26,13 +26,13 @@ from ..targets import Key, Target
 
 OP = "loader"
 _BATCH, _NOVEL, _SIZE = 4, 3, 128  # as in the cases of a step
-_VIEWS, _OBJECTS = 24, 24  # of a folder that is made up, and of what is used of another
+_VIEWS, _OBJECTS = 24, 24  # of a made-up folder, and used of another
 _BATCHES = {"quick": 2, "normal": 24, "full": 96}
 _PACK, _WORKERS = "pack", 2
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the case of the loader."""
+    """Return the case of the loader."""
     text = (
         f"Batches of {_BATCH} objects in {_NOVEL + 1} views of {_SIZE}², half of them mirrored and "
         f"three in ten recoloured, prepared by {_WORKERS} threads and taken at once, from the "
@@ -45,7 +45,7 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def targets(settings: Settings) -> list[Target]:
-    """Returns the target; there is none at a quick run's sizes."""
+    """Return the target; none at a quick run's sizes."""
     if settings.level == "quick":
         return []
     return [
@@ -61,7 +61,7 @@ def targets(settings: Settings) -> list[Target]:
 
 @dataclass
 class _Loader:
-    """Batches of a dataset; ``folder`` is kept for as long as they are."""
+    """Batches of a dataset; keeps ``folder`` alive."""
 
     dataset: ViewDataset
     objects: list[int]
@@ -70,7 +70,7 @@ class _Loader:
     folder: tempfile.TemporaryDirectory
 
     def run(self) -> None:
-        """Takes all batches; this is what is timed."""
+        """Take all batches; timed."""
         views = DataConfig(size=_SIZE, mirror=0.5, recolor=0.3, workers=_WORKERS)
         config = TrainConfig(data=Path(self.folder.name), preset="rays", views=views)
         data = TrainingData(self.dataset, self.objects, batch_size=_BATCH)
@@ -84,7 +84,7 @@ class _Loader:
             torch.cuda.synchronize(self.world.device)
 
     def work(self) -> dict[str, float]:
-        """Counts the samples and what each takes of the process's own time, beside other work."""
+        """Count the samples and the process time of each, beside other work."""
         began = time.process_time()
         self.run()
         used, count = time.process_time() - began, _BATCH * self.batches
@@ -105,7 +105,7 @@ def _build(settings: Settings) -> list[Variant]:
         cached.pictures(index, None, _SIZE)
     write_pack(data, root / "pack", PackSettings(_SIZE), _WORKERS, len(objects))
     pack, resident = open_dataset(root / "pack"), open_dataset(root / "pack")
-    resident.keep(objects, [_SIZE], settings.device, _WORKERS)
+    resident.preload(objects, [_SIZE], settings.device, _WORKERS)
     made: dict[str, ViewDataset] = {"files": files, "files, --cache": cached}
     made |= {_PACK: pack, "pack, --cache-device": resident}
     world, batches = World(0, 1, settings.device), _BATCHES[settings.level]

@@ -38,12 +38,12 @@ LPIPS_TEXT = (
     "bfloat16 there, through the ReLUs of float32. All in bfloat16 moves the ReLUs."
 )
 _CROP = 64
-_SSIM_LIMIT, _LPIPS_LIMIT = 1e-5, 3e-2  # the second is what bfloat16 may do to single values
+_SSIM_LIMIT, _LPIPS_LIMIT = 1e-5, 3e-2  # the second allows for bfloat16 in single values
 OURS, THEIRS = "ours", "kornia"
 
 
 def ssim_targets(settings: Settings) -> list[Target]:
-    """Returns the targets of SSIM; there are none at a quick run's sizes."""
+    """Return the targets of SSIM; none at a quick run's sizes."""
     if settings.level == "quick":
         return []
     return [
@@ -66,7 +66,7 @@ class _Pair:
     loss: Callable[[Tensor, Tensor], Tensor]
 
     def run(self, double: bool = False) -> dict[str, Tensor]:
-        """Makes value and gradient; this is what is timed."""
+        """Make value and gradient; timed."""
         kind = torch.float64 if double else torch.float32
         got = self.got.to(kind, copy=True).requires_grad_()
         value = self.loss(got, self.want.to(kind))
@@ -87,7 +87,7 @@ def _pictures(settings: Settings, everywhere: bool) -> tuple[Tensor, Tensor]:
 
 
 def _kornia(got: Tensor, want: Tensor) -> Tensor:
-    """What kornia makes, in the dtype of the pictures."""
+    """Result of kornia, in the dtype of the pictures."""
     try:
         from kornia.metrics import ssim as ssim_map
     except ModuleNotFoundError as error:
@@ -190,7 +190,7 @@ def _check_value(pair: _Pair, truth: dict[str, Tensor]) -> Error:
 
 
 def _gradient(pair: _Pair, truth: dict[str, Tensor]) -> dict[str, float]:
-    """How far the gradient is from the truth."""
+    """Error of the gradient."""
     got, want = (v["gradient"].detach().double().flatten() for v in (pair.run(), truth))
     error = (got - want).norm() / want.norm()
     cosine = 1 - cosine_similarity(got, want, 0)

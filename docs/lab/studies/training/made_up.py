@@ -1,4 +1,4 @@
-"""What the cases of a training step share: models, weights of the losses, and views."""
+"""Shared parts of the cases of a training step: models, weights of the losses, and views."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _MadeUp(ViewDataset):
     """Objects of smooth noise whose silhouette is an ellipse, in views from all around."""
 
     def __init__(self, shares: Sequence[float], size: int) -> None:
-        """``shares`` are those of a view that each object covers."""
+        """Make objects that cover the given ``shares`` of a view."""
         super().__init__({}, "made up", cache=False)
         self.uids = [f"object{number}" for number in range(len(shares))]
         self.views = NOVEL + 3
@@ -53,7 +53,7 @@ class _MadeUp(ViewDataset):
         self, index: int | str, views: Sequence[int] | None = None, size: int | None = None,
         depths: int | None = None,
     ) -> ObjectViews:  # fmt: skip
-        """Views of one object, as ``ViewDataset.load`` gives them; ``size`` is that of all."""
+        """Views of one object, as from ``ViewDataset.load``; ``size`` is that of all."""
         chosen = list(range(self.views) if views is None else views)
         images = self.drawn[int(index), chosen].clone()
         side = images.shape[1]
@@ -85,7 +85,7 @@ def step_config(name: str, settings: Settings) -> GambaConfig:
 
 
 def step_model(name: str, settings: Settings) -> tuple[Gamba, bool]:
-    """A model to train, with seed 0, and whether its weights are those that come with the package.
+    """Make a model to train, with seed 0; also return True if it has the shipped weights.
 
     Args:
         name: of a variant; those of the presets may have such weights, but not in a quick run.
@@ -101,7 +101,7 @@ def step_model(name: str, settings: Settings) -> tuple[Gamba, bool]:
 def step_source(
     config: GambaConfig, settings: Settings, batch: int, covered: float = _COVERED
 ) -> Batches:
-    """Batches of the folder that was given, or of made-up views with the same silhouettes."""
+    """Batches of the given folder, or of made-up views with the same silhouettes."""
     spread = (SPREAD[i % len(SPREAD)] if covered < 1 else 1.0 for i in range(batch))
     shares = [min(1.0, covered * factor) for factor in spread]
     size = min(SIZE, config.image_size)

@@ -1,4 +1,4 @@
-"""Benchmark case of what follows the gradient in a step: clipping, AdamW, zeroing, the average."""
+"""Benchmark case of a step after the gradient: clipping, AdamW, zeroing, the average."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LIMIT = 1e-5
 
 
 class _Weights:
-    """Weights with gradients, their optimizer in one of its ways, and what each part needs."""
+    """Weights with gradients, and one implementation of their optimizer."""
 
     def __init__(self, settings: Settings, way: str, kind: torch.dtype = torch.float32) -> None:
         torch.manual_seed(0)
@@ -48,26 +48,26 @@ class _Weights:
         self.put()
 
     def put(self) -> None:
-        """Puts the gradients in place."""
+        """Put the gradients in place."""
         for p, gradient in zip(self.weights, self.gradients):
             p.grad = gradient
 
     def step(self) -> None:
-        """Makes a step of AdamW."""
+        """Make a step of AdamW."""
         self.optimizer.step()
 
     def norm(self) -> Tensor:
-        """Computes the norm of the whole gradient."""
+        """Compute the norm of the whole gradient."""
         return nn.utils.get_total_norm(self.gradients, foreach=self.foreach)
 
     def zero(self, to_none: bool) -> None:
-        """Ends the gradients, after it has put them in place."""
+        """Set the gradients, then zero them."""
         self.put()
         self.optimizer.zero_grad(set_to_none=to_none)
 
     @torch.no_grad()
     def average(self) -> None:
-        """Moves the running average."""
+        """Move the running average."""
         if self.foreach:
             self.ema.update()
             return

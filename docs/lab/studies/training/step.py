@@ -45,7 +45,7 @@ _BATCHES = {"quick": (1,), "normal": (1, 2, 4), "full": (1, 2, 4, 8)}
 _WITH_LPIPS = "LPIPS of crops"
 # Allowed errors of the whole gradient; a bfloat16 has 8 binary digits, and errors add up.
 _ROUNDED = {torch.float32: 1e-3, torch.bfloat16: 0.3}
-# What is a part of its own, by a region of the step: text in an operator's name -> part.
+# Separate parts by region of the step: text in an operator's name -> part.
 _PRODUCTS = dict.fromkeys(("aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm"), "products")
 _KINDS = {
     "rest of the network": {
@@ -67,7 +67,7 @@ _REGIONS = (
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the cases of a training step."""
+    """Return the cases of a training step."""
     parts = (
         f"One optimizer step on {BATCH} objects in {NOVEL + 1} views of {SIZE}²: data, network, "
         f"rendering, MSE + mask + 0.2 (1 - SSIM), with and without LPIPS of crops of {_CROP}², "
@@ -109,7 +109,7 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def targets(settings: Settings) -> list[Target]:
-    """Returns the targets; there are none at a quick run's sizes."""
+    """Return the targets; none at a quick run's sizes."""
     if settings.level == "quick":
         return []
     ends = ["", *([f", {_WITH_LPIPS}"] if lpips_available() else [])]
@@ -127,7 +127,7 @@ def targets(settings: Settings) -> list[Target]:
 
 
 class _Step:
-    """A model with its optimizer and its data, as a run of training has them."""
+    """Model with its optimizer and its data, as in a training run."""
 
     def __init__(
         self, settings: Settings, name: str, batch: int = BATCH, lpips: bool = False
@@ -152,7 +152,7 @@ class _Step:
             return self.model(images, cameras)
 
     def step(self) -> Tensor:
-        """Makes the whole step and returns the gradient's norm; this is what is timed."""
+        """Make the whole step and return the gradient's norm; timed."""
         with record_function("data"):
             batch = self.source.batch(self.number, NOVEL).to(self.device)
         self.number += 1
@@ -169,13 +169,13 @@ class _Step:
         return made.norm
 
     def check(self) -> None:
-        """Checks that the gradient is finite and not 0; there is no oracle."""
+        """Check that the gradient is finite and not 0, without an oracle."""
         value = self.step().item()
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"gradient is {value}")
 
     def work(self, rounds: int) -> dict[str, float]:
-        """Counts samples and Gaussians, and on a CPU the milliseconds of each part."""
+        """Count samples and Gaussians, and on a CPU the milliseconds of each part."""
         batch = self.source.batch(0, NOVEL).to(self.device)
         with torch.no_grad():
             opacities = self.model(batch.inputs, batch.input_cameras).opacities
@@ -227,7 +227,7 @@ def _batches(settings: Settings) -> list[Variant]:
 
 
 class _Precise:
-    """A model and a batch, whose gradient is made in a precision of the products."""
+    """Model and batch, for gradients in a precision of the products."""
 
     def __init__(self, settings: Settings, name: str) -> None:
         self.model, self.trained = step_model(name, settings)
@@ -238,18 +238,18 @@ class _Precise:
             self.truth = self.gradient(torch.float32)
 
     def gradient(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Makes the gradient of all weights, and the pictures; this is what is timed."""
+        """Make the gradient of all weights, and the pictures; timed."""
         objective = Objective(WEIGHTS, precision=precision)
         made = compute_gradients(self.model, self.optimizer, [self.batch], objective, clip=math.inf)
         grads = [p.grad.flatten() for p in self.model.parameters() if p.grad is not None]
         return torch.cat(grads), made.result.rendering.rgb.detach()
 
     def check(self, precision: torch.dtype) -> Error:
-        """Measures the error of the gradient to the truth."""
+        """Measure the error of the gradient to the truth."""
         return compare({"gradient": self.gradient(precision)[0]}, {"gradient": self.truth[0]})
 
     def work(self, precision: torch.dtype) -> dict[str, float]:
-        """Measures how far the gradient and the pictures are from the truth's."""
+        """Measure the errors of the gradient and of the pictures."""
         gradient, pictures = self.gradient(precision)
         cosine = 1 - cosine_similarity(gradient.double(), self.truth[0].double(), 0)
         error = (pictures - self.truth[1]).square().mean().clamp_min(1e-12)

@@ -1,4 +1,4 @@
-"""What a sound result of each reader is: every function asserts it, and says what is wrong."""
+"""Checks of the results of readers: every function asserts that a result is valid."""
 
 import dataclasses
 import hashlib
@@ -14,19 +14,19 @@ from gamba_warp.errors import MOST_LETTERS
 from .second_reader import points_in, vertices_stated
 
 _PIXELS = 64 << 20
-_UNPACKED = 256 << 20  # bytes that the small archives of the seeds may become
+_UNPACKED = 256 << 20  # largest unpacked size of the small archives of the seeds, bytes
 _PARAMETERS = 1 << 30
 _CODE = re.compile(r"<script>alert|onerror='alert")
 _FOLDER = re.compile(r"[a-z0-9][a-z0-9_-]*")
 
 
-def told(problem, folder, names):
-    """The words of a ``UserError``, or of a reason: one line that names a file, or an option.
+def check_message(problem, folder, names):
+    """Check the message of a ``UserError``, or a reason: one line that names a file or an option.
 
     Args:
-        problem: the error, or its words.
+        problem: the error, or its message.
         folder: of the case.
-        names: of the files in it; the message names one of them, the folder or an option.
+        names: files in it; the message must name one of them, the folder or an option.
     """
     text = str(problem)
     assert text.strip(), "the message is empty"
@@ -39,16 +39,16 @@ def told(problem, folder, names):
 
 
 def nothing(result, path, out):
-    """Any result is sound."""
+    """Accept any result."""
 
 
 def each(check):
-    """A check of a list, in which errors stand for what could not be read."""
+    """Make a check of a list with errors in place of unreadable items."""
 
     def checked(result, path, out):
         for item in result:
             if isinstance(item, Exception):
-                told(item, path, [path.name])
+                check_message(item, path, [path.name])
             else:
                 check(item, path, out)
 
@@ -106,7 +106,7 @@ def gaussians(result, path, out, lost=0):
     data, stated = path.read_bytes() if path.is_file() else b"", None
     if data.startswith(b"NGSP") and len(data) >= 12:  # an .spz of version 4
         stated = int.from_bytes(data[8:12], "little")
-    # Another kind of file may have a .ply behind its own end.
+    # Another kind of file may have a .ply after its own end.
     elif data.startswith(b"ply") and (f := re.search(rb"element\s+vertex\s+(\d+)", data)):
         stated = int(f[1])
     there = result.num + lost
@@ -114,7 +114,7 @@ def gaussians(result, path, out, lost=0):
 
 
 def thinned(result, path, out):
-    """Sound Gaussians, which are as many as the file has together with those left out."""
+    """Valid Gaussians, with those left out as many as in the file."""
     kept, lines = result
     said = [re.fullmatch(r"(\d+) of \d+ Gaussians have .*: left out", line) for line in lines]
     assert all(said), f"what is left out is not said: {lines}"
@@ -122,7 +122,7 @@ def thinned(result, path, out):
 
 
 def mesh(result, path, out):
-    """Finite vertices, faces and materials that are there."""
+    """Finite vertices, and existing faces and materials."""
     arrays = {n: getattr(result, n) for n in ("vertices", "normals", "uvs", "colors")}
     _finite(**arrays)
     _faces(result.faces, len(result.vertices))
@@ -147,14 +147,14 @@ def _faces(faces, vertices):
 
 
 def shape(result, path, out):
-    """A sound shape; of a cloud every number of the file, read by another reader."""
+    """A valid shape; for a cloud all numbers of the file, according to another reader."""
     if hasattr(result, "opacities"):
         return gaussians(result, path, out)
     data, suffix = path.read_bytes(), path.suffix.lower()
     if hasattr(result, "faces"):
         _finite(vertices=result.vertices)
         count, stated = len(result.vertices), vertices_stated(data, suffix)
-        # Those of no face are left out.
+        # Vertices without a face are left out.
         assert stated is None or count <= stated, f"{count} vertices, the file states {stated}"
         return _faces(result.faces, count)
     positions = result.positions
@@ -171,21 +171,21 @@ def shape(result, path, out):
 
 
 def report(result, path, out):
-    """Records that JSON can hold; failures with one line."""
+    """Records valid in JSON; failures with one line."""
     for record in result:
         _as_json("a record", record)
         if record["status"] != "ok":
             reason = record.get("reason", "")
             raw = re.match(r"[A-Z]\w+(Error|Exception|Warning)\b", reason)
             assert not raw, f"a raw exception: {reason[:100]}"
-            told(reason, path, [path.name])
+            check_message(reason, path, [path.name])
 
 
 def views(result, path, out):
-    """Finite, fitting views of objects; errors of one line for others."""
+    """Finite, consistent views of objects; errors of one line for others."""
     loaded, reasons = result
     for line in reasons:
-        told(line, path, [path.name])
+        check_message(line, path, [path.name])
     each(_object)(loaded, path, out)
 
 
@@ -206,7 +206,7 @@ def _object(item, path, out):
 
 
 def catalogue(result, path, out):
-    """Meshes whose uids are names of one folder, and whose values JSON can hold."""
+    """Meshes whose uids are names of one folder, with values valid in JSON."""
     for item in result:
         inside = item.uid not in ("", ".", "..") and "/" not in item.uid and "\0" not in item.uid
         assert inside, f"the uid {item.uid[:40]!r} leaves its folder"
@@ -220,7 +220,7 @@ def catalogue(result, path, out):
 
 
 def rendered(result, path, out):
-    """Objects that were rendered, or one line."""
+    """Rendered objects, or one line."""
     each(nothing)(result, path, out)
     for folder in out.iterdir():
         assert not folder.name.startswith("."), f"{folder.name} is left behind"
@@ -235,7 +235,7 @@ def _our_json(path):
 
 
 def furniture(result, path, out):
-    """Models that are there, inside the folder; nothing beside it is touched."""
+    """Existing models inside the folder, with nothing beside it changed."""
     target = out / "inner" / "furniture"
     beside = sorted(p.name for p in (out / "inner").iterdir())
     assert beside == ["furniture", "neighbour.txt"], "something beside the target was changed"
@@ -271,7 +271,7 @@ def released(result, path, out):
 
 
 def fingerprint(trainer):
-    """A hash of all that a trainer restores."""
+    """A hash of the state that a trainer restores."""
     digest = hashlib.sha256(repr([trainer.step, trainer.skipped, trainer.elapsed]).encode())
     state = [trainer.model.state_dict(), trainer.optimizer.state_dict()["state"]]
     state.append(trainer.ema.model.state_dict() if trainer.ema else {})
@@ -282,7 +282,7 @@ def fingerprint(trainer):
 
 
 def _flat(value, name=""):
-    """The leaves of nested lists and dictionaries, by the way to each."""
+    """Leaves of nested lists and dictionaries, by their paths."""
     if isinstance(value, (dict, list)):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         return {k: v for key, inner in items for k, v in _flat(inner, f"{name}.{key}").items()}
@@ -290,7 +290,7 @@ def _flat(value, name=""):
 
 
 def training(result, path, out):
-    """Finite weights, averages and moments, and counts that are whole and not negative."""
+    """Finite weights, averages and moments, and nonnegative integer counts."""
     for network in (result.model, result.ema.model):
         model(network, path, out)
     moments = _flat(result.optimizer.state_dict()["state"])
@@ -318,7 +318,7 @@ def config(result, path, out):
 
 
 def protocol(result, path, out):
-    """A protocol that a report can hold."""
+    """A protocol valid in a report."""
     _as_json("a protocol", result.to_json())
 
 
@@ -333,7 +333,7 @@ def pages(result, path, out):
 
 
 def cameras(result, path, out):
-    """Finite cameras that turn rigidly, with focal lengths above 0 and pictures of bounded size."""
+    """Finite cameras with rotations, focal lengths above 0 and pictures of bounded size."""
     cameras, rate = result.cameras, result.fps
     _finite(poses=cameras.viewmats, Ks=cameras.Ks)
     rotations = cameras.viewmats[:, :3, :3]
@@ -347,7 +347,7 @@ def cameras(result, path, out):
 
 
 def plan(result, path, out):
-    """A plan whose folders stay inside the ablation's, and whose words are no other options."""
+    """A plan whose folders stay inside the ablation's, and whose words are not other options."""
     found, commands = result
     for row, stages in zip(found.rows, commands):
         assert _FOLDER.fullmatch(row.name), f"the name {row.name[:40]!r} is no folder's"
@@ -367,7 +367,7 @@ def shown(result, path, out):
 
 
 def scans(result, path, out):
-    """Sound meshes, and nothing of a model in the folder but its own files."""
+    """Valid meshes, and only the model's own files in its folder."""
     for folder in (out / "gso" / "meshes").iterdir():
         assert not folder.name.startswith("."), f"{folder.name} is left behind"
         _no_links(folder)
@@ -375,5 +375,5 @@ def scans(result, path, out):
 
 
 def faulty(result, path, out):
-    """Sound unless the file says that it is not."""
+    """Valid unless the file says otherwise."""
     assert result != "wrong", "it says so"
