@@ -44,6 +44,13 @@ _UPRIGHT = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
+# Pillow keeps the high bytes of PNGs of 16 bits a channel; these raw modes give the low ones.
+_LOW_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L", "LA;16B": "RGBA"}
+# Chunks of PNG, by Pillow's names, and their values in sRGB.
+_CHUNKS = {
+    "gAMA": ("gamma", [1 / 2.2]),
+    "cHRM": ("chromaticity", [0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06]),
+}
 _QUIET = threading.Lock()  # the filters of warnings belong to the process
 
 
@@ -254,6 +261,8 @@ def to_rgba(
 def _with_alpha(image: Image.Image) -> Image.Image:
     """The picture in a mode of ``_PLAIN``, I or F, where a transparent value became alpha."""
     key, raw = image.info.get("transparency"), _raw_mode(image)
+    if raw in _LOW_BYTES and image.format == "PNG":
+        return _rounded(image, raw, key)
     if key is None or image.mode in ("P", "PA"):
         grey = image.mode.startswith(("I", "F"))
         if image.mode == "1":
@@ -264,12 +273,41 @@ def _with_alpha(image: Image.Image) -> Image.Image:
         alpha = np.where(values == key, 0, 255).astype(np.uint8)
         grey = ((values + 128) // 257).astype(np.uint8)
         return Image.merge("LA", [Image.fromarray(x) for x in (grey, alpha)])
-    # Pillow scales the pixels to 8 bits, but not the value. Of 16 bits it keeps the high byte.
-    if raw == "RGB;16B":
-        image.info["transparency"] = tuple(value >> 8 for value in key)
-    elif raw in ("L;2", "L;4"):
+    if raw in ("L;2", "L;4"):  # Pillow scales the pixels to 8 bits, but not the value
         image.info["transparency"] = key * {"L;2": 85, "L;4": 17}[raw]
     return image.convert("RGBA")
+
+
+def _rounded(image: Image.Image, raw: str, key: Sequence[int] | None) -> Image.Image:
+    """Round a PNG of 16 bits a channel to 8 bits, with alpha 0 where it has the colour ``key``.
+
+    Its pixels are decoded twice, for the high and for the low bytes.
+    """
+    file = cast(Any, image).fp
+    start = file.tell()
+    file.seek(0)
+    with _without_warnings():
+        other = cast(Any, Image.open(io.BytesIO(file.read()), formats=("PNG",)))
+    file.seek(start)
+    other.tile = [other.tile[0]._replace(args=_LOW_BYTES[raw])]
+    low = np.asarray(other)
+    high = np.array(image)
+    if raw == "LA;16B":  # bytes of grey and of alpha, which ``high`` has as RGBA
+        low = low[..., [1, 1, 1, 3]]
+    alpha = None
+    if key is not None:
+        other_color = [
+            (high[..., i] != k >> 8) | (low[..., i] != k & 255) for i, k in enumerate(key)
+        ]
+        alpha = Image.fromarray(np.where(np.any(other_color, 0), 255, 0).astype(np.uint8))
+    # (256 high + low) / 257 = high + (low - high) / 257, to the nearest.
+    up, down = (low > high) & (low - high > 128), (high > low) & (high - low > 128)
+    high += up
+    high -= down
+    image = Image.fromarray(high)
+    if alpha is not None:
+        image.putalpha(alpha)
+    return image
 
 
 def _raw_mode(image: Image.Image) -> str | None:
@@ -316,6 +354,10 @@ def _conversion(
 ) -> Callable[[Image.Image], Image.Image] | None:
     """What brings 8-bit pixels of this picture to sRGB; None where they are, or nobody can."""
     if "icc_profile" not in image.info:
+        for chunk, (key, srgb) in _CHUNKS.items() if "srgb" not in image.info else ():
+            values = np.ravel(image.info.get(key, srgb))
+            if len(values) != len(srgb) or np.abs(values - srgb).max() > 0.01:
+                warn(f"{name}: its {chunk} chunk is not read; colours are taken for sRGB")
         return None
     profile = image.info["icc_profile"]
     try:

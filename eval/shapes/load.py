@@ -19,7 +19,7 @@ from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind
 from gamba_warp.formats.headers import open_shape
 from gamba_warp.formats.meshes import Y_TO_Z_UP, default_up, load_mesh
 from gamba_warp.formats.names import SPLAT_SUFFIXES
-from gamba_warp.formats.ply_header import read_ply_header
+from gamba_warp.formats.ply_data import read_ply_header
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import extract_surface
 from gamba_warp.surfaces.options import SurfaceOptions

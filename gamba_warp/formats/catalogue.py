@@ -1,4 +1,4 @@
-"""The meshes of a folder, with what its ``catalogue.json`` says of them."""
+"""Meshes of a folder, with their entries in its ``catalogue.json``."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ..untrusted.names import MAX_NAME, parts_of, plain_name
 from .meshes import SUFFIXES
 
 CATALOGUE = "catalogue.json"  # beside the meshes: names and attribution, see ``find_meshes``
-# Names of files, and of the folders that they lie in, that say nothing of the object.
+# Names of files and folders that do not identify an object.
 NO_NAMES = frozenset(
     "mesh meshes model model_normalized models normalized_model object raw_model scene source "
     "textured untitled".split()
 )
 
-_LONG = MAX_NAME // 2  # bytes of a name; there is room for a suffix
-_DIGITS = 12  # of the hash that ends one that was longer
+_LONG = MAX_NAME // 2  # bytes of a name, which leave room for a suffix
+_DIGITS = 12  # of the hash at the end of a shortened name
 _SHORTENED = re.compile(rf"[0-9a-f]{{{_DIGITS}}}$")
 
 
@@ -34,11 +34,11 @@ class Mesh:
     """One object to render.
 
     Attributes:
-        path: its file.
-        uid: its folder in the dataset.
-        name: what it is called.
-        group: name of the objects that belong on one side of a split.
-        attribution: who made it, and under which licence.
+        path: the file.
+        uid: folder in the dataset.
+        name: a name for people.
+        group: name shared by objects that belong on one side of a split.
+        attribution: author and licence.
         rotation: ``[3, 3]``, turns the file's points upright first, or None.
     """
 
@@ -51,14 +51,14 @@ class Mesh:
 
 
 def find_meshes(folder: Path) -> list[Mesh]:
-    """All mesh files under a folder, sorted by uid.
+    """Return all mesh files under a folder, sorted by uid.
 
-    ``catalogue.json`` in the folder, if there, has ``objects``: a list of ``model`` (path in the
-    folder), ``uid``, ``name``, ``group`` (of variants that belong on one side of a split) and
-    ``attribution``. Other meshes are named by their path (``object_names``).
+    An optional ``catalogue.json`` in the folder has ``objects``: a list of ``model`` (path in the
+    folder) and the other fields of ``Mesh``. Other meshes are named by their path
+    (``object_names``).
 
     Raises:
-        UserError: no such folder, no meshes, a bad catalogue, or two objects with one uid.
+        UserError: no such folder, no meshes, a malformed catalogue, or two objects with one uid.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder")
@@ -66,17 +66,15 @@ def find_meshes(folder: Path) -> list[Mesh]:
     meshes: dict[str, Mesh] = {}
     files = (path for path in visible(folder, "*") if path.suffix.lower() in SUFFIXES)
     paths = sorted(path for path in files if path.is_file())
-    told = _told([path.relative_to(folder).with_suffix("") for path in paths])
-    for path, parts in zip(paths, told):
-        entry = known.get(path.relative_to(folder).as_posix())
-        uid = entry.uid if entry else _uid(parts)
-        if uid in meshes and not entry:
+    named = _name_parts([path.relative_to(folder).with_suffix("") for path in paths])
+    for path, parts in zip(paths, named):
+        model = path.relative_to(folder).as_posix()
+        entry = known.get(model) or _Entry(model, _uid(parts))
+        uid = entry.uid
+        if uid in meshes and model not in known:
             uid = f"{uid}-{path.suffix[1:].lower()}"
         if uid in meshes:
             raise UserError(f"{path} and {meshes[uid].path} would both be '{uid}'")
-        if entry is None:
-            meshes[uid] = Mesh(path, uid, parts[-1], uid, {})
-            continue
         name, group = entry.name or parts[-1], entry.group or uid
         meshes[uid] = Mesh(path, uid, name, group, entry.attribution or {}, entry.rotation)
     if not meshes:
@@ -85,7 +83,7 @@ def find_meshes(folder: Path) -> list[Mesh]:
 
 
 class _Entry(msgspec.Struct):
-    """One object of a catalogue; fields that are not named here may be there."""
+    """One object of a catalogue; further fields are ignored."""
 
     model: str
     uid: str
@@ -100,7 +98,7 @@ class _Catalogue(msgspec.Struct):
 
 
 def _read_catalogue(path: Path) -> dict[str, _Entry]:
-    """The entries by model; none without the file. Raises UserError where one is not sound."""
+    """Return the entries by model; none without the file. Raises UserError if one is invalid."""
     if not path.exists():
         return {}
     known: dict[str, _Entry] = {}
@@ -117,7 +115,7 @@ def _read_catalogue(path: Path) -> dict[str, _Entry]:
 
 
 def check_rotation(value: object, source: str) -> np.ndarray:
-    """Makes a turn of a mesh's points, ``[3, 3]`` float64, of nine numbers or their texts.
+    """Convert nine numbers or their texts to a rotation of a mesh's points, ``[3, 3]`` float64.
 
     Raises:
         UserError: not nine finite numbers, or a matrix that flattens the mesh.
@@ -134,21 +132,21 @@ def check_rotation(value: object, source: str) -> np.ndarray:
 
 
 def object_names(paths: Sequence[PurePath]) -> list[str]:
-    """The names of the objects that files in one folder hold, each fit for one file's name.
+    """Return names of the objects in the files of one folder, each valid as a file name.
 
-    ``a/b`` is ``a-b``. Where the last parts say nothing (``NO_NAMES``) or repeat the folder, the
-    folder gives the name: ``a/b/model`` and ``a/b/b`` are ``a-b`` too. A file whose folder's name
-    another one has as well keeps all parts. A name that this returned is left as it is.
+    ``a/b`` is ``a-b``. Last parts that identify nothing (``NO_NAMES``) or repeat the folder are
+    dropped: ``a/b/model`` and ``a/b/b`` are ``a-b`` too. Files that would share a name keep all
+    parts. Returned names are unchanged when passed again.
 
     Args:
         paths: of the files in the folder, without suffix; files of one path are of one object.
     """
-    return [_uid(parts) for parts in _told(paths)]
+    return [_uid(parts) for parts in _name_parts(paths)]
 
 
-def _told(paths: Sequence[PurePath]) -> list[tuple[str, ...]]:
-    """The parts of each path that name its object."""
-    short = [_telling(path.parts) for path in paths]
+def _name_parts(paths: Sequence[PurePath]) -> list[tuple[str, ...]]:
+    """Return the parts of each path that name its object."""
+    short = [_identifying(path.parts) for path in paths]
     owners: dict[str, set[PurePath]] = {}
     for path, parts in zip(paths, short):
         owners.setdefault(_uid(parts), set()).add(path)
@@ -158,7 +156,7 @@ def _told(paths: Sequence[PurePath]) -> list[tuple[str, ...]]:
     ]
 
 
-def _telling(parts: tuple[str, ...]) -> tuple[str, ...]:
+def _identifying(parts: tuple[str, ...]) -> tuple[str, ...]:
     while len(parts) > 1 and parts[-1].lower() in NO_NAMES:
         parts = parts[:-1]
     return _once(parts)
@@ -170,7 +168,7 @@ def _once(parts: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _uid(parts: tuple[str, ...]) -> str:
-    """One name of parts, for a folder."""
+    """Join parts to one name for a folder."""
     uid = re.sub(r"[^\w.-]+", "_", "-".join(parts)).lstrip(".") or "_"
     size = len(uid.encode())
     if size > _LONG and not (size <= _LONG + _DIGITS and _SHORTENED.search(uid)):

@@ -1,21 +1,17 @@
-"""Point clouds read to the last number: ``.xyz``, ``.pts``, ``.pcd`` and ``.ply``.
+"""Point clouds: ``.xyz``, ``.pts``, ``.pcd`` and ``.ply``, read completely or refused.
 
-What a header promises is there, every word is a number, every row has the same columns; else the
-file is refused. (Open3D's readers keep what they have when a line is bad, even memory that was
-never written.)
+Open3D's readers keep a part of a malformed file, even memory that was never written.
 
-- ``.xyz``: at least three columns; further ones (normals, colours: the format does not say which)
-  are checked and not used.
-- ``.pts``: a line with the number of points, or none; then ``x y z``, ``x y z intensity``,
+- ``.xyz``: at least three columns; further ones (normals or colours, the format does not say) are
+  checked and not used.
+- ``.pts``: optionally a line with the number of points; then ``x y z``, ``x y z intensity``,
   ``x y z r g b`` or ``x y z intensity r g b``.
-- ``.pcd``: text, binary or compressed; ``x y z`` and, where they are there, ``normal_x normal_y
-  normal_z``.
+- ``.pcd``: text, binary or compressed; ``x y z``, and ``normal_x normal_y normal_z`` if present.
 - ``.ply``: text or binary; ``x y z`` and ``nx ny nz``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -23,7 +19,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from ..errors import UserError
-from .headers import MAX_VALUES, compare_sizes, lines_of, open_shape, read_table
+from .headers import MAX_VALUES, check_lines, compare_sizes, lines_of, open_shape, read_table
 from .ply_data import read_ply
 
 SUFFIXES = (".xyz", ".pts", ".pcd", ".ply")
@@ -36,25 +32,20 @@ _AXES, _PCD_NORMALS = ("x", "y", "z"), ("normal_x", "normal_y", "normal_z")
 
 
 class Cloud(NamedTuple):
-    """What a file holds.
+    """Points of a file."""
 
-    Attributes:
-        positions: ``[N, 3]`` float64, finite, N > 0.
-        normals: ``[N, 3]`` float64 of any length, perhaps not finite; or None.
-    """
-
-    positions: np.ndarray
-    normals: np.ndarray | None = None
+    positions: np.ndarray  # [N, 3] float64, finite, N > 0
+    normals: np.ndarray | None = None  # [N, 3] float64 of any length, not checked
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Reads a cloud by its suffix, one of ``SUFFIXES``.
+    """Read a cloud by its suffix, one of ``SUFFIXES``.
 
     Raises:
-        UserError: missing, empty, over ``MAX_POINTS`` points, not what its header says, a word
-            that is no number, or a point that is not finite. (A ``.pcd`` of a depth camera marks
-            pixels without a point by NaN: such a file is refused, with their number, because a
-            cloud with holes is not the cloud that somebody meant to compare.)
+        UserError: the file is missing, empty, over ``MAX_POINTS`` points or malformed, a word is
+            not a number, or a point is not finite. (A ``.pcd`` of a depth camera marks pixels
+            without a point by NaN: it is refused with their number, because a cloud with holes is
+            not the cloud that somebody meant to compare.)
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -86,16 +77,12 @@ def _read_pts(path: Path) -> Cloud:
     with open_shape(path) as (file, _):
         lines = lines_of(file, str(path), comments="#")
         first = next(lines, "")
-        count = None
-        if len(first.split()) == 1:
+        if len(first.split()) != 1:
+            table = read_table(chain([first] if first else [], lines), str(path), _PTS_COLUMNS)
+        else:
             count = _whole(path, "the number of points", first.strip())
-        elif first:
-            lines = chain([first], lines)
-        table = read_table(lines, str(path), _PTS_COLUMNS)
-    if count is not None and len(table) != count:
-        raise UserError(
-            f"{path}: truncated or false header, {count} points but {len(table)} lines follow"
-        )
+            table = read_table(lines, str(path), _PTS_COLUMNS)
+            check_lines(path, f"{count} points", count, len(table))
     return Cloud(np.ascontiguousarray(table[:, :3]))
 
 
@@ -107,47 +94,49 @@ def _read_ply(path: Path) -> Cloud:
     return Cloud(positions, data.numbers("vertex", ("nx", "ny", "nz")))
 
 
-class _PcdHeader(NamedTuple):
-    """The fields of a ``.pcd`` as a type for numpy, the number of points, and the kind of data."""
-
-    kind: np.dtype
-    count: int
-    data: str
-
-
 def _read_pcd(path: Path) -> Cloud:
     with open_shape(path) as (file, size):
-        header = _pcd_header(path, file)
-        kind, count = header.kind, header.count
-        says, left = f"{count} points", size - file.tell()
-        if header.data == "ascii":
-            return _pcd_text(path, lines_of(file, str(path)), header)
-        wanted = count * kind.itemsize
-        if header.data == "binary":
+        fields, count, data = _pcd_header(path, file)
+        kind = np.dtype(fields)
+        says, left, wanted = f"{count} points", size - file.tell(), count * kind.itemsize
+        columns = {}
+        if data == "ascii":
+            ends = np.cumsum([repeat for _, _, (repeat,) in fields])
+            table = read_table(lines_of(file, str(path)), str(path), (int(ends[-1]),))
+            check_lines(path, says, count, len(table))
+            columns = {name: table[:, end - 1] for (name, *_), end in zip(fields, ends)}
+        elif data == "binary":
             compare_sizes(path, says, wanted, left)
             rows = np.frombuffer(file.read(wanted), kind, count)
-            return _pcd_cloud(lambda name: rows[name][:, 0], kind)
-        sizes = np.frombuffer(file.read(8), "<u4")
-        packed, unpacked = (int(number) for number in sizes) if len(sizes) == 2 else (0, 0)
-        compare_sizes(path, says, packed, left - 8, exact=False)
-        if unpacked != wanted or wanted > MAX_UNPACKED:
-            raise UserError(
-                f"{path}: truncated or false header, {says} take {wanted} bytes but it holds "
-                f"{unpacked}, of {MAX_UNPACKED} at most"
-            )
-        compare_sizes(path, says, wanted, packed * 264, exact=False)  # LZF's longest repetition
-        plain = lzf_decompressed(file.read(packed), wanted, str(path))
+            columns = {name: rows[name][:, 0] for name, *_ in fields}
+        else:  # compressed points are stored field by field, not point by point
+            sizes = np.frombuffer(file.read(8), "<u4")
+            packed, unpacked = map(int, sizes) if len(sizes) == 2 else (0, 0)
+            compare_sizes(path, says, packed, left - 8, exact=False)
+            if unpacked != wanted or wanted > MAX_UNPACKED:
+                raise UserError(
+                    f"{path}: truncated or false header, {says} take {wanted} bytes but it holds "
+                    f"{unpacked}, of {MAX_UNPACKED} at most"
+                )
+            compare_sizes(path, says, wanted, packed * 264, exact=False)  # LZF's best ratio
+            plain = lzf_decompressed(file.read(packed), wanted, str(path))
+            at = 0
+            for name, code, (repeat,) in fields:
+                columns[name] = np.frombuffer(plain, code, count * repeat, at)
+                at += columns[name].nbytes
 
-    # Compressed points are stored field by field, not point by point.
-    def field(name: str) -> np.ndarray:
-        inner, offset = kind.fields[name][:2]  # pyright: ignore[reportOptionalSubscript]
-        return np.frombuffer(plain, inner.base, count * inner.shape[0], offset * count)
+    def stacked(names: tuple[str, ...]) -> np.ndarray:
+        return np.stack([np.asarray(columns[name], np.float64) for name in names], 1)
 
-    return _pcd_cloud(field, kind)
+    has_normals = columns.keys() >= {*_PCD_NORMALS}
+    return Cloud(stacked(_AXES), stacked(_PCD_NORMALS) if has_normals else None)
 
 
-def _pcd_header(path: Path, file: BinaryIO) -> _PcdHeader:
-    """Reads the header; the file then stands at the data. Raises UserError."""
+def _pcd_header(path: Path, file: BinaryIO) -> tuple[list[tuple[str, str, tuple[int]]], int, str]:
+    """Read the header: each field's name, type and shape, the number of points, kind of data.
+
+    Fields without use, with several values or with a repeated name are called ``unused N``.
+    """
     lines: dict[str, list[str]] = {}
     for _ in range(_HEADER_LINES):
         words = file.readline(1 << 14).decode("ascii", "replace").split()
@@ -161,7 +150,7 @@ def _pcd_header(path: Path, file: BinaryIO) -> _PcdHeader:
     for key in ("FIELDS", "SIZE", "TYPE", "DATA"):
         if not lines.get(key):
             raise UserError(f"{path}: broken header, no {key}")
-    names, kinds = lines["FIELDS"], lines["TYPE"]
+    names, kinds, data = lines["FIELDS"], lines["TYPE"], lines["DATA"][0]
     sizes = [_whole(path, "SIZE", word) for word in lines["SIZE"]]
     repeats = [_whole(path, "COUNT", word) for word in lines.get("COUNT", ["1"] * len(names))]
     if not len(names) == len(sizes) == len(kinds) == len(repeats):
@@ -176,39 +165,14 @@ def _pcd_header(path: Path, file: BinaryIO) -> _PcdHeader:
     for i, (name, letter, size, repeat) in enumerate(zip(names, kinds, sizes, repeats)):
         if (letter, size) not in _PCD_KINDS:
             raise UserError(f"{path}: field {name[:40]} has type {letter[:9]} of {size} bytes")
-        used = name in (*_AXES, *_PCD_NORMALS) and repeat == 1
-        known = name if used and names.count(name) == 1 else f"unused {i}"  # "_" may repeat
-        fields.append((known, _PCD_KINDS[letter, size], (repeat,)))
-    kind = np.dtype(fields)
-    missing = [axis for axis in _AXES if axis not in (kind.names or ())]
+        used = name in (*_AXES, *_PCD_NORMALS) and repeat == names.count(name) == 1
+        fields.append((name if used else f"unused {i}", _PCD_KINDS[letter, size], (repeat,)))
+    missing = [axis for axis in _AXES if axis not in [name for name, _, _ in fields]]
     if missing:
         raise UserError(f"{path}: broken header, not one field {' '.join(missing)}")
-    data = lines["DATA"][0]
     if data not in ("ascii", "binary", "binary_compressed"):
         raise UserError(f"{path}: broken header, DATA {data[:20]}")
-    return _PcdHeader(kind, count, data)
-
-
-def _pcd_text(path: Path, lines: Iterator[str], header: _PcdHeader) -> Cloud:
-    widths = {name: field[0].shape[0] for name, field in (header.kind.fields or {}).items()}
-    table = read_table(lines, str(path), (sum(widths.values()),))
-    if len(table) != header.count:
-        raise UserError(
-            f"{path}: truncated or false header, {header.count} points "
-            f"but {len(table)} lines follow"
-        )
-    ends = dict(zip(widths, np.cumsum(list(widths.values()))))
-    return _pcd_cloud(lambda name: table[:, ends[name] - 1], header.kind)
-
-
-def _pcd_cloud(field, kind: np.dtype) -> Cloud:
-    """The cloud of the columns ``[N]`` that ``field`` gives by name."""
-
-    def stacked(names: tuple[str, ...]) -> np.ndarray:
-        return np.stack([np.asarray(field(name), np.float64) for name in names], 1)
-
-    has_normals = set(_PCD_NORMALS) <= set(kind.names or ())
-    return Cloud(stacked(_AXES), stacked(_PCD_NORMALS) if has_normals else None)
+    return fields, count, data
 
 
 def _whole(path: Path, what: str, word: str) -> int:
@@ -218,24 +182,18 @@ def _whole(path: Path, what: str, word: str) -> int:
 
 
 def lzf_decompressed(data: bytes, size: int, source: str) -> bytearray:
-    """Unpacks a block of LZF, the compression of ``.pcd`` files (Marc Lehmann's liblzf).
+    """Unpack a block of LZF, the compression of ``.pcd`` files (Marc Lehmann's liblzf).
 
-    A control byte below 32 is followed by that many bytes and one more, as they are. A greater one
-    repeats what lies before: its upper 3 bits are the length less 2 (7: the next byte adds to it),
-    its lower 5 bits and the next byte the distance less 1.
-
-    Args:
-        data: the block.
-        size: of its content, bytes.
-        source: named in errors.
+    A control byte below 32 is followed by that many literal bytes and one more. A greater one
+    copies bytes of the output: its upper 3 bits are the length less 2 (7: the next byte adds to
+    it), its lower 5 bits and the next byte the distance less 1.
 
     Raises:
-        UserError: the block is broken, or its content is not of that size.
+        UserError: the block is malformed, or its content is not of ``size`` bytes.
     """
-    out = bytearray()
-    at, end = 0, len(data)
+    out, at = bytearray(), 0
     try:
-        while at < end:
+        while at < len(data) and len(out) <= size:
             control = data[at]
             at += 1
             if control < 32:
@@ -250,16 +208,12 @@ def lzf_decompressed(data: bytes, size: int, source: str) -> bytearray:
             start = len(out) - ((control & 31) << 8) - data[at] - 1
             at += 1
             if start < 0:
-                raise UserError(f"{source}: its compressed data are broken")
+                raise IndexError
             part = out[start : start + length]
-            if len(part) < length:  # it repeats itself
-                part = (part * (length // len(part) + 1))[:length]
-            out += part
-            if len(out) > size:
-                break
+            out += (part * -(-length // len(part)))[:length]  # it may reach into its own copy
     except IndexError:
-        at = end + 1
-    if at > end or len(out) != size:
+        at = len(data) + 1
+    if at > len(data) or len(out) != size:
         raise UserError(f"{source}: its compressed data are broken, or are not {size} bytes")
     return out
 

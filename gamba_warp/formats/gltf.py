@@ -1,12 +1,12 @@
-"""Meshes of glTF: each primitive of the default scene where its nodes, skins and targets put it.
+"""Meshes of glTF: primitives of the default scene, placed by nodes, skins and morph targets.
 
-What changes shape or colours and is not read is a warning that names it.
+Unsupported content that changes shape or colours is a warning that names it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from .gltf_file import PACKED, Entry, GltfFile, Index, Vec2, Vec3, Vec4, normalised, open_gltf
+from .gltf_file import INSTANCING, PACKED, Entry, GltfFile, Index, normalised, open_gltf
 from .headers import open_shape
 from .materials import Material, SideFiles, plain, to_display
 from .parts import Part, to_rgba8
@@ -26,37 +26,21 @@ _Weights = tuple[float, ...]
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 _GLOSS = "KHR_materials_pbrSpecularGlossiness"
 _PICTURES = ("EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds")
-# Extensions that are read, change neither shape nor colours, or are spoken of where they are used.
+# Extensions that are read, change neither shape nor colours, or are warned of where they are used.
 _KNOWN = {
     *("EXT_lights_image_based", "EXT_texture_webp", "FB_ngon_encoding", "KHR_lights_punctual"),
     *("KHR_animation_pointer", "KHR_materials_emissive_strength", "KHR_materials_ior"),
-    *(_GLOSS, "KHR_materials_unlit", "KHR_materials_variants"),
+    *(_GLOSS, INSTANCING, "KHR_materials_unlit", "KHR_materials_variants"),
     *("KHR_mesh_quantization", "KHR_texture_transform", "KHR_xmp", "KHR_xmp_json_ld"),
     *(*_PICTURES, *PACKED),
 }
 
 
-@dataclass
-class _Triangles:
-    """A primitive in its own frame; all arrays but ``faces`` have a row for each vertex."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    material: Material | None
-    normals: np.ndarray | None
-    uvs: np.ndarray | None
-    colors: np.ndarray | None
-
-
 def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
-    """Yields the triangles of the default scene.
-
-    Args:
-        path: a ``.glb`` or ``.gltf`` file.
-        sides: reads what lies beside it, and takes the warnings.
+    """Yield the triangles of the default scene of a ``.glb`` or ``.gltf`` file.
 
     Raises:
-        UserError: it is not what it says.
+        UserError: the file is malformed.
     """
     with open_shape(path) as (stream, size):
         file = open_gltf(path, stream, size, lambda uri: sides.read(unquote(uri), uri))
@@ -74,17 +58,20 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
         index, skin = node.get("mesh", Index), node.get("skin", Index)
         if index is None:
             continue
-        mesh = file.item("meshes", index)
+        mesh, poses = file.item("meshes", index), matrix @ file.instances(node)
         weights = node.get("weights", _Weights, mesh.get("weights", _Weights, ()))
         for number, primitive in enumerate(mesh.entries("primitives")):
             key = index, number, weights
             if key not in known:
                 known[key] = reader.triangles(primitive, weights)
-            if known[key] is not None:
-                pose = matrix
-                if skin is not None and "JOINTS_0" in primitive.entry("attributes").values:
-                    pose = reader.pose(skin, primitive, matrices)
-                yield _moved(known[key], pose)
+            if known[key] is None:
+                continue
+            if skin is None or "JOINTS_0" not in primitive.entry("attributes").values:
+                yield from (_moved(known[key], pose) for pose in poses)
+                continue
+            if len(poses) > 1:
+                sides.omit(f"instances of a skinned mesh ({INSTANCING}) are not read")
+            yield _moved(known[key], reader.pose(skin, primitive, matrices))
 
 
 class _Reader:
@@ -92,8 +79,11 @@ class _Reader:
         self.file, self.sides, self.warn = file, sides, sides.warnings.append
         self._looks: dict[int, tuple[Material, Entry]] = {}
 
-    def triangles(self, primitive: Entry, weights: _Weights) -> _Triangles | None:
-        """A primitive with its morph targets; None, and a warning, without triangles."""
+    def triangles(self, primitive: Entry, weights: _Weights) -> Part | None:
+        """Return a primitive with its morph targets in its own frame, attributes by vertex.
+
+        None, and a warning, without triangles.
+        """
         mode, given = primitive.get("mode", int, _TRIANGLES), primitive.entry("attributes")
         if mode in _OTHERS:
             self.sides.omit(f"{_OTHERS[mode]} beside the triangles are left out")
@@ -140,10 +130,10 @@ class _Reader:
             alpha = colors[:, :0] if opaque else colors[:, 3:]
             colors = to_rgba8(np.hstack([to_display(colors[:, :3]), alpha]))
         faces, normals = _faces(self.file.path, indices, mode), attribute("NORMAL", 3)
-        return _Triangles(vertices.astype(np.float64), faces, material, normals, uvs, colors)
+        return Part(vertices.astype(np.float64), faces, material, normals, uvs, colors)
 
     def uvs(self, attribute, info: Entry) -> np.ndarray | None:
-        """The coordinates ``[V, 2]`` of a texture, v upwards; None without any."""
+        """Return the coordinates ``[V, 2]`` of a texture, v upwards; None without any."""
         change = info.entry("extensions").entry("KHR_texture_transform")
         number = change.get("texCoord", Index, info.get("texCoord", Index, 0))
         uvs = attribute(f"TEXCOORD_{number}", 2)
@@ -152,8 +142,8 @@ class _Reader:
         rotation = change.get("rotation", float, 0.0)
         cos, sin = np.cos(rotation), np.sin(rotation)
         turn = np.array([[cos, -sin], [sin, cos]])  # of rows
-        uvs = (uvs.astype(np.float64) * change.get("scale", Vec2, (1.0, 1.0))) @ turn
-        uvs += change.get("offset", Vec2, (0.0, 0.0))
+        uvs = (uvs.astype(np.float64) * change.vector("scale", (1, 1))) @ turn
+        uvs += change.vector("offset", (0, 0))
         sampler = self.file.item("textures", info.need("index", Index)).get("sampler", Index)
         if sampler is not None:
             sampler = self.file.item("samplers", sampler)
@@ -164,20 +154,17 @@ class _Reader:
         return uvs * [1, -1] + [0, 1]
 
     def material(self, look: Entry) -> tuple[Material, Entry]:
-        """Colour and texture of a material, and the entry that names its texture."""
+        """Return a material, and the entry that names its texture."""
         base, more = look.entry("pbrMetallicRoughness"), look.entry("extensions")
-        for source, name in (
-            *((look, "normalTexture"), (look, "occlusionTexture")),
-            (base, "metallicRoughnessTexture"),
-        ):
-            if name in source.values:
+        for name in ("normalTexture", "occlusionTexture", "metallicRoughnessTexture"):
+            if name in look.values or name in base.values:
                 self.warn(f"{name} is not drawn")
         if _GLOSS in more.values:
             color, texture, info = self.glossy(more.entry(_GLOSS))
         else:
-            color, info = base.get("baseColorFactor", Vec4, _WHITE), base.entry("baseColorTexture")
-            color, texture = np.array(color), self.texture(info)
-        light = np.array(look.get("emissiveFactor", Vec3, (0.0, 0.0, 0.0)))
+            color, info = base.vector("baseColorFactor", _WHITE), base.entry("baseColorTexture")
+            texture = self.texture(info)
+        light = look.vector("emissiveFactor", (0, 0, 0))
         if light.any():
             if color[:3].any() and (texture is None or texture[..., :3].any()):
                 self.warn("light of a surface beside its base colour is not drawn")
@@ -197,14 +184,14 @@ class _Reader:
         return Material(plain(color), texture), info
 
     def glossy(self, gloss: Entry) -> tuple[np.ndarray, np.ndarray | None, Entry]:
-        """Colour and texture of a material of the older kind, diffuse and specular."""
+        """Return colour, texture and its entry of an older material, diffuse and specular."""
         from trimesh.visual.gloss import specular_to_pbr
 
         names = ("diffuseTexture", "specularGlossinessTexture")
         pictures = [(name, self.texture(gloss.entry(name))) for name in names]
         found = specular_to_pbr(
-            diffuseFactor=gloss.get("diffuseFactor", Vec4, _WHITE),
-            specularFactor=gloss.get("specularFactor", Vec3, _WHITE[:3]),
+            diffuseFactor=gloss.vector("diffuseFactor", _WHITE),
+            specularFactor=gloss.vector("specularFactor", _WHITE[:3]),
             glossinessFactor=gloss.get("glossinessFactor", float, 1.0),
             **{name: x if x is None else Image.fromarray(x) for name, x in pictures},
         )
@@ -214,7 +201,7 @@ class _Reader:
         return np.array(found.get("baseColorFactor", _WHITE)), texture, info
 
     def texture(self, info: Entry) -> np.ndarray | None:
-        """The picture of a texture; None, and a warning, where it cannot be had."""
+        """Return the picture of a texture; None, and a warning, if it cannot be read."""
         if not info.values:
             return None
         try:
@@ -235,7 +222,7 @@ class _Reader:
             return None
 
     def pose(self, index: int, primitive: Entry, matrices: dict[int, np.ndarray]) -> np.ndarray:
-        """``[V, 4, 4]`` the matrices of a skinned primitive's vertices in the scene."""
+        """Return ``[V, 4, 4]``, matrices of a skinned primitive's vertices in the scene."""
         skin, path = self.file.item("skins", index), self.file.path
         chain, given = skin.need("joints", list[Index]), primitive.entry("attributes")
         if not chain or not matrices.keys() >= {*chain}:
@@ -266,7 +253,7 @@ class _Reader:
 
 
 def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
-    """``[F, 3]`` triangles of a list, a strip or a fan, all turned alike."""
+    """Return ``[F, 3]`` triangles of a list, a strip or a fan, with one orientation."""
     if mode == _TRIANGLES:
         if len(indices) % 3:
             raise UserError(f"{path}: {len(indices)} corners, which are no whole triangles")
@@ -280,16 +267,17 @@ def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
     return faces[(faces != np.roll(faces, 1, 1)).all(1)]  # strips are joined by faces without area
 
 
-def _moved(found: _Triangles, matrix: np.ndarray) -> Part:
-    """The part where a matrix ``[4, 4]``, or one for each vertex, puts it."""
-    turn, faces = matrix[..., :3, :3], found.faces
-    vertices = (turn @ found.vertices[..., None])[..., 0] + matrix[..., :3, 3]
-    normals = found.normals
+def _moved(part: Part, matrix: np.ndarray) -> Part:
+    """Move a part by a matrix ``[4, 4]``, or one of each vertex; attributes become corners'."""
+    turn, faces, normals = matrix[..., :3, :3], part.faces, part.normals
+    vertices = (turn @ part.vertices[..., None])[..., 0] + matrix[..., :3, 3]
     if normals is not None and matrix.ndim == 2:
         normals = normals @ np.linalg.pinv(turn if np.isfinite(turn).all() else np.eye(3))
     elif normals is not None:
         normals = (turn @ normals[..., None])[..., 0]
-    if np.nansum(np.linalg.det(turn)) < 0:  # mirrored: what was in front is behind
+    if np.nansum(np.linalg.det(turn)) < 0:  # a mirrored face has its front behind
         faces = faces[:, ::-1]
-    of_corners = (None if x is None else x[faces] for x in (normals, found.uvs, found.colors))
-    return Part(vertices, faces, found.material, *of_corners)
+    normals, uvs, colors = (
+        None if x is None else x[faces] for x in (normals, part.uvs, part.colors)
+    )
+    return replace(part, vertices=vertices, faces=faces, normals=normals, uvs=uvs, colors=colors)

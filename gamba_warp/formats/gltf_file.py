@@ -1,6 +1,6 @@
-"""The document of a glTF file, the numbers that its accessors name, and its nodes.
+"""Document, accessors and nodes of a glTF file.
 
-An index, an offset or a length is checked where it is used: what nothing uses may be false.
+Indices, offsets and lengths are checked where they are used: unused ones may be invalid.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
@@ -21,30 +21,25 @@ from ..errors import UserError
 from ..untrusted.documents import parse_document
 from .headers import MAX_FILE, compare_sizes
 
-MAX_ZEROS = 1 << 24  # bytes of an accessor that no bytes of the file stand behind
-MAX_NODES = 200_000  # of a scene
+MAX_ZEROS = 1 << 24  # bytes of an accessor without bytes in the file
+MAX_NODES = 200_000  # of a scene, and instances of its meshes
 # Extensions that pack triangles; a reader without them sees zeros.
 PACKED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+INSTANCING = "EXT_mesh_gpu_instancing"
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _EXTENSION = re.compile(rb'"([A-Z]{2,10}_[a-z]\w{1,60})"\s*:')  # some files do not list them
 
 Index = Annotated[int, msgspec.Meta(ge=0, le=MAX_FILE)]
-Vec2, Vec3 = tuple[float, float], tuple[float, float, float]
-Vec4 = tuple[float, float, float, float]
 _Kind = Literal[5120, 5121, 5122, 5123, 5125, 5126]
 _Width = Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
 _Stride = Annotated[int, msgspec.Meta(ge=1, le=252)]
-_Matrix = Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)]
+# Translation, rotation (a quaternion xyzw) and scale without effect.
+_IDENTITY = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
 
 
 class Entry:
-    """An object of the document; its values are checked when they are asked for.
-
-    Attributes:
-        where: place in the document, for errors.
-        values: by their names, not checked.
-    """
+    """An object at ``where`` in the document; its values are checked when they are asked for."""
 
     def __init__(self, where: str, values: Any) -> None:
         if not isinstance(values, dict):
@@ -52,23 +47,29 @@ class Entry:
         self.where, self.values = where, values
 
     def get(self, name: str, kind: Any, default: Any = None) -> Any:
-        """A value as a declared type; the default without one. Raises UserError."""
-        value = self.values.get(name)
-        return default if value is None else self.need(name, kind)
+        """Return a value of a declared type, or the default. Raises UserError."""
+        return default if self.values.get(name) is None else self.need(name, kind)
 
     def need(self, name: str, kind: Any) -> Any:
-        """A value as a declared type. Raises UserError where it is missing or not of it."""
+        """Return a value of a declared type. Raises UserError if it is missing or of another."""
         try:
             return msgspec.convert(self.values.get(name), kind)
         except msgspec.ValidationError as error:
             raise UserError(f"{self.where}.{name}: {error}") from error
 
+    def vector(self, name: str, default: Sequence[float]) -> np.ndarray:
+        """Return as many numbers as the default has, float64. Raises UserError."""
+        kind = Annotated[
+            list[float], msgspec.Meta(min_length=len(default), max_length=len(default))
+        ]
+        return np.array(self.get(name, kind, default), np.float64)
+
     def entry(self, name: str) -> Entry:
-        """An object in the object, empty without one. Raises UserError."""
+        """Return an object in the object, empty if missing. Raises UserError."""
         return Entry(f"{self.where}.{name}", self.values.get(name) or {})
 
     def entries(self, name: str) -> list[Entry]:
-        """The objects of a list, empty without one. Raises UserError."""
+        """Return the objects of a list, empty if missing. Raises UserError."""
         items = self.get(name, list, [])
         return [Entry(f"{self.where}.{name}[{i}]", item) for i, item in enumerate(items)]
 
@@ -79,26 +80,19 @@ def _no_side_file(uri: str) -> bytes:
 
 @dataclass
 class GltfFile:
-    """A document, and the bytes that it speaks of.
+    """A document and its buffers. All methods raise UserError if the file is malformed."""
 
-    Attributes:
-        path: named in errors.
-        document: what the file says.
-        extensions: the names of all that the document has anywhere.
-        binary: the binary chunk of a ``.glb``, or None.
-        side_file: reads what an URI names. Raises UserError.
-    """
-
-    path: Path
-    document: Entry
-    extensions: list[str]
-    binary: bytes | None
-    side_file: Callable[[str], bytes]
+    path: Path  # named in errors
+    document: Entry  # the root object
+    extensions: list[str]  # names of all extensions anywhere in the document
+    binary: bytes | None  # the binary chunk of a .glb
+    side_file: Callable[[str], bytes]  # reads the file of a URI
     _buffers: dict[int, bytes] = field(default_factory=dict)
     _lists: dict[str, list[Entry]] = field(default_factory=dict)
+    _instances: int = 0
 
     def item(self, what: str, index: int) -> Entry:
-        """One of the document's lists' entries. Raises UserError where there is none."""
+        """Return an entry of one of the document's lists."""
         if what not in self._lists:
             self._lists[what] = self.document.entries(what)
         items = self._lists[what]
@@ -107,7 +101,7 @@ class GltfFile:
         return items[index]
 
     def content(self, uri: str) -> bytes:
-        """The bytes that an URI holds itself, or names. Raises UserError."""
+        """Return the bytes of a data URI, or of the file of another one."""
         if not uri.startswith("data:"):
             return self.side_file(uri)
         head, _, data = uri.partition(",")
@@ -117,17 +111,15 @@ class GltfFile:
             raise UserError(f"data that are not base64 ({error})") from error
 
     def view(self, index: int) -> memoryview:
-        """The bytes of a view. Raises UserError where its buffer has less."""
+        """Return the bytes of a view."""
         view = self.item("bufferViews", index)
         buffer, length = view.need("buffer", Index), view.need("byteLength", Index)
         start = view.get("byteOffset", Index, 0)
         if buffer not in self._buffers:
             self._buffers[buffer] = self._buffer_bytes(buffer)
-        data = memoryview(self._buffers[buffer])
-        compare_sizes(
-            self.path, f"the bytes of view {index}", length, len(data) - start, exact=False
-        )
-        return data[start : start + length]
+        data = memoryview(self._buffers[buffer])[start:]
+        compare_sizes(self.path, f"the bytes of view {index}", length, len(data), exact=False)
+        return data[:length]
 
     def _buffer_bytes(self, index: int) -> bytes:
         buffer, data = self.item("buffers", index), self.binary
@@ -144,19 +136,14 @@ class GltfFile:
         return data[:length]
 
     def refuse_packed(self) -> None:
-        """Raises UserError where the document has an extension that packs triangles."""
+        """Raise UserError if the document has an extension that packs triangles."""
         for name in self.extensions:
             if name in PACKED:
-                raise UserError(
-                    f"{self.path}: packed by {name}, which is not read; unpack it first"
-                )
+                reason = f"packed by {name}, which is not read; unpack it first"
+                raise UserError(f"{self.path}: {reason}")
 
     def values(self, index: int) -> np.ndarray:
-        """``[N, C]`` the numbers of an accessor, as they are stored; float64 if normalised.
-
-        Raises:
-            UserError: they are not in the file.
-        """
+        """Return the numbers of an accessor, ``[N, C]``, as stored; float64 if normalised."""
         accessor = self.item("accessors", index)
         kind, says = np.dtype(_KINDS[accessor.need("componentType", _Kind)]), f"accessor {index}"
         shape = accessor.need("count", Index), _WIDTHS[accessor.need("type", _Width)]
@@ -189,16 +176,12 @@ class GltfFile:
         return np.ndarray(shape, kind, data, start, (step, size))
 
     def placed_nodes(self) -> list[tuple[Entry, int, np.ndarray]]:
-        """Each node of the scene, its index, and its matrix ``[4, 4]`` in the scene.
-
-        Raises:
-            UserError: there are over ``MAX_NODES``, or a node is its own ancestor.
-        """
+        """Return each node of the scene, its index, and its matrix ``[4, 4]`` in the scene."""
         kind = list[Index]
         if self.document.values.get("scenes"):
             scene = self.item("scenes", self.document.get("scene", Index, 0))
             roots = scene.get("nodes", kind, [])
-        else:  # glTF without a scene: all nodes that are no children
+        else:  # glTF without a scene: all nodes that are not children
             nodes = self.document.entries("nodes")
             inner = {child for node in nodes for child in node.get("children", kind, [])}
             roots = [index for index in range(len(nodes)) if index not in inner]
@@ -209,49 +192,78 @@ class GltfFile:
                 raise UserError(f"{self.path}: over {MAX_NODES} nodes, or nodes in a circle")
             index, above = left.pop()
             node = self.item("nodes", index)
-            matrix = node.get("matrix", _Matrix)
-            matrix = above @ (_pose(node) if matrix is None else np.reshape(matrix, (4, 4)).T)
+            if node.values.get("matrix") is None:
+                matrix = _matrices(*(node.vector(*item)[None] for item in _IDENTITY.items()))[0]
+            else:
+                matrix = node.vector("matrix", range(16)).reshape(4, 4).T
+            matrix = above @ matrix
             found.append((node, index, matrix))
             left += [(child, matrix) for child in reversed(node.get("children", kind, []))]
         return found
 
+    def instances(self, node: Entry) -> np.ndarray:
+        """Return the matrices ``[N, 4, 4]`` of the instances of a node's mesh in the node's frame.
+
+        They are those of ``EXT_mesh_gpu_instancing``, or one unit matrix.
+        """
+        given = node.entry("extensions").entry(INSTANCING).entry("attributes")
+        if not given.values:
+            return np.eye(4)[None]
+        pose, counts = [], set()
+        for name, default in _IDENTITY.items():
+            rows = np.array([default])
+            if name.upper() in given.values:
+                rows = normalised(self.values(given.need(name.upper(), Index)))
+                counts.add(len(rows))
+            if len(counts) > 1 or rows.shape[1] != len(default):
+                raise UserError(f"{given.where}: {len(rows)} x {rows.shape[1]} numbers {name}")
+            pose.append(rows.astype(np.float64))
+        count = counts.pop() if counts else 1
+        self._instances += count
+        if self._instances > MAX_NODES:
+            raise UserError(f"{self.path}: over {MAX_NODES} instances of meshes")
+        return _matrices(*(np.broadcast_to(rows, (count, rows.shape[1])) for rows in pose))
+
 
 def normalised(values: np.ndarray) -> np.ndarray:
-    """Integers as the fractions that they stand for in glTF; floats stay as they are."""
+    """Return the fractions that integers stand for in glTF; floats are unchanged."""
     if values.dtype.kind == "f":
         return values
     return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
 
 
-def _pose(node: Entry) -> np.ndarray:
-    """``[4, 4]`` that scales, then turns by a quaternion xyzw of any length, then moves."""
-    matrix, rotation = np.eye(4), node.get("rotation", Vec4, (0.0, 0.0, 0.0, 1.0))
-    length = sum(part**2 for part in rotation) ** 0.5
-    x, y, z, w = (part / (length or 1.0) for part in rotation)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, :3] *= node.get("scale", Vec3, (1.0, 1.0, 1.0))
-    matrix[:3, 3] = node.get("translation", Vec3, (0.0, 0.0, 0.0))
-    return matrix
+@np.errstate(all="ignore")  # untrusted numbers; the vertices are checked
+def _matrices(moves: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Return ``[N, 4, 4]`` that scale, then rotate by quaternions of any length, then move."""
+    lengths = np.linalg.norm(quats, axis=1)
+    x, y, z, w = quats.T / np.where(lengths == 0, 1.0, lengths)
+    rotations = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrices = np.zeros((len(moves), 4, 4))
+    matrices[:, :3, :3] = rotations.transpose(2, 0, 1) * scales[:, None]
+    matrices[:, :3, 3], matrices[:, 3, 3] = moves, 1.0
+    return matrices
 
 
 def open_gltf(
     path: Path, file: BinaryIO, size: int, side_file: Callable[[str], bytes] = _no_side_file
 ) -> GltfFile:
-    """Reads the document of a glTF file, and its first binary chunk.
+    """Read the document of a glTF file of ``size`` bytes, and its first binary chunk.
 
     Args:
         path: if its suffix is ``.gltf``, the file is a document; else a container of one.
         file: at its start.
         size: of the file, bytes.
-        side_file: reads what an URI names.
+        side_file: reads the file of a URI.
 
     Raises:
-        UserError: the container holds less or more than it says, the document is not one, or needs
-            an extension that packs triangles.
+        UserError: the container or the document is malformed, or it requires an extension that
+            packs triangles.
     """
     text, binary = file.read(), None
     if path.suffix.lower() != ".gltf":
@@ -267,6 +279,7 @@ def open_gltf(
 
 
 def _chunks(path: Path, data: bytes, size: int) -> tuple[bytes, bytes]:
+    """Return the JSON chunk and the first binary one of a container."""
     if data[:4] != b"glTF":
         raise UserError(f"{path}: not a .glb file")
     if size < 12:

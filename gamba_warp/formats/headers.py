@@ -1,8 +1,4 @@
-"""What readers of shapes share: counts that a file states against its size, and rows of numbers.
-
-A file that lies is refused unread. In a text every row has the same columns, and
-every word is a number.
-"""
+"""Checks shared by the readers of shapes: stated counts against the size, tables of numbers."""
 
 from __future__ import annotations
 
@@ -23,17 +19,17 @@ SLACK = 2  # bytes after the end: a line end
 MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
 _BOM = b"\xef\xbb\xbf"
-# str takes four control signs for blanks, which are none in a file: they become no ASCII.
+# str.split treats four control characters as blanks; here they become other than ASCII.
 _STRICT = bytes(0xFF if 0x1C <= number <= 0x1F else number for number in range(256))
 
 
 @contextmanager
 def open_shape(path: Path, limit: int = MAX_FILE) -> Iterator[tuple[BinaryIO, int]]:
-    """Opens a shape file for reading; gives it and its size in bytes.
+    """Open a shape file of at most ``limit`` bytes; yield it and its size in bytes.
 
     Raises:
-        UserError: it is missing, no plain file, empty or over ``limit`` bytes, cannot be read, or
-            what is read of it does not fit the memory.
+        UserError: it is missing, not a plain file, empty or too large, cannot be read, or the body
+            runs out of memory.
     """
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
@@ -52,14 +48,14 @@ def open_shape(path: Path, limit: int = MAX_FILE) -> Iterator[tuple[BinaryIO, in
 
 
 def compare_sizes(path: Path, says: str, wanted: int, there: int, exact: bool = True) -> None:
-    """Compares the bytes that a header promises with those that follow it.
+    """Compare the bytes that a header states with those that follow it.
 
     Args:
         path: named in errors.
-        says: what the header states.
-        wanted: bytes of that.
+        says: content of the header, in words.
+        wanted: bytes that it takes.
         there: bytes that follow.
-        exact: whether more than ``SLACK`` bytes beyond ``wanted`` are refused, too.
+        exact: also refuse more than ``SLACK`` bytes beyond ``wanted``.
 
     Raises:
         UserError: there are too few bytes, or too many.
@@ -72,13 +68,14 @@ def compare_sizes(path: Path, says: str, wanted: int, there: int, exact: bool = 
         raise UserError(f"{path}: false header, {says} take {wanted} bytes but {there} follow")
 
 
-def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
-    """Yields the lines of a text file that are not blank, of bounded length.
+def check_lines(path: Path, says: str, wanted: int, there: int) -> None:
+    """Raise UserError if not as many lines are there as a header states by the words ``says``."""
+    if there != wanted:
+        raise UserError(f"{path}: truncated or false header, {says} but {there} lines follow")
 
-    Args:
-        file: where the text begins.
-        source: named in errors.
-        comments: a line that begins with it is passed over; empty: there are no comments.
+
+def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
+    """Yield the lines of a text file that are neither blank nor, with ``comments``, begin with it.
 
     Raises:
         UserError: a line is longer than ``MAX_LINE``.
@@ -87,7 +84,7 @@ def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
     while line := file.readline(MAX_LINE):
         if len(line) == MAX_LINE:
             raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
-        # What is not ASCII becomes a sign that no number has.
+        # Other characters than ASCII become one that no number has.
         line = (line.removeprefix(_BOM) if first else line).translate(_STRICT)
         text = line.decode("ascii", "replace")
         first = False
@@ -96,15 +93,15 @@ def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
 
 
 def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ()) -> np.ndarray:
-    """Reads lines of numbers as ``[N, C]`` float64; NaN and infinity are numbers here.
+    """Read lines of numbers as ``[N, C]`` float64; NaN and infinity are numbers here.
 
     Args:
         lines: one row each.
         source: named in errors.
-        columns: the numbers of columns that are allowed; empty: any.
+        columns: allowed numbers of columns; empty: any.
 
     Raises:
-        UserError: a word is no number, the rows differ in their number of columns, or there are
+        UserError: a word is not a number, the rows differ in their number of columns, or there are
             more than ``MAX_VALUES`` numbers.
     """
     lines = iter(lines)
@@ -125,3 +122,21 @@ def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ())
     if len(table) > most:
         raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
     return table
+
+
+def read_rows(lines: Iterable[str], source: str) -> tuple[np.ndarray, np.ndarray]:
+    """Read rows of different lengths: ``[M]`` float64 of all rows, ``[N]`` int64 their lengths.
+
+    Raises:
+        UserError: as for ``read_table``.
+    """
+    sizes = []
+
+    def words() -> Iterator[str]:
+        for line in lines:
+            row = line.split()
+            sizes.append(len(row))
+            yield from row
+
+    numbers = read_table(words(), source, (1,))[:, 0]
+    return numbers, np.array(sizes, np.int64)

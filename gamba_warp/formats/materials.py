@@ -1,7 +1,7 @@
-"""What a mesh's file refers to: materials and textures, of files beside it and of nowhere else.
+"""Materials and textures of meshes, read only from the mesh's own folder.
 
-Each lies in the mesh's own folder, is plain and of bounded size, and is a picture of a known format
-where it is to be one. What cannot be had is replaced and named; it never stops the mesh.
+The files are plain, of bounded size, and pictures of a known format. Missing or unreadable ones are
+replaced and named; they never stop the mesh.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from ..untrusted.names import inside
 GREY = 0.6  # display value of a surface whose colour is not known
 MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
 MAX_SIDE_FILE = 256 << 20  # bytes of a file beside the mesh
-MAX_SIDE_FILES = 1 << 30  # bytes of all of them, and of all textures as they are kept
-_UNSEEN = 8  # of 255: a texture with no more alpha anywhere has an alpha channel that is not used
+MAX_SIDE_FILES = 1 << 30  # bytes of all of them, and of all textures in memory
+_UNSEEN = 8  # of 255: the alpha channel of a texture without a larger alpha is ignored
 # Options of MTL stand before the name: "-s 1 1 1 -clamp on wood.jpg".
 _OPTIONS = re.compile(r"^(-\w+\s+(([-+.\d]+|on|off|[rgbmlz])\s+)+)+")
 _MOVING = re.compile(r"-([sot])((?:\s+[-+.\d]+)+)\s")
@@ -32,7 +32,7 @@ _AS_IT_IS = {"s": r"(\s+1(\.0*)?)+", "o": r"(\s+0(\.0*)?)+", "t": r"(\s+0(\.0*)?
 
 @dataclass
 class Material:
-    """How a surface looks.
+    """Colour of a surface.
 
     Attributes:
         color: ``[4]`` float32 RGBA, linear light, multiplies the texture.
@@ -44,69 +44,56 @@ class Material:
 
 
 def to_linear(display: np.ndarray | float) -> np.ndarray:
-    """SRGB display values in [0, 1] to linear light (IEC 61966-2-1), any shape, float32."""
+    """Convert sRGB display values in [0, 1] to linear light (IEC 61966-2-1), float32."""
     x = np.asarray(display, dtype=np.float32)
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def to_display(linear: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1] to sRGB display values, any shape, float32."""
+    """Convert linear light in [0, 1] to sRGB display values, float32."""
     x = np.asarray(linear, dtype=np.float32)
     curve = 1.055 * np.maximum(x, 1e-8) ** (1 / 2.4) - 0.055
     return np.where(x <= 0.0031308, 12.92 * x, curve).astype(np.float32)
 
 
 def plain(color: np.ndarray) -> np.ndarray:
-    """A file's linear colour as float32 in [0, 1]; what is no number there is grey."""
+    """Return a file's linear colour as float32 in [0, 1]; NaN becomes grey."""
     values = np.where(np.isnan(color), to_linear(GREY), color)
     return np.clip(values, 0.0, 1.0).astype(np.float32)
 
 
 @dataclass
 class SideFiles:
-    """The files beside a mesh, found whatever their case, slashes or options.
+    """Files beside a mesh, found in any case, with any slashes or options; warnings of a mesh."""
 
-    Attributes:
-        path: the mesh's file.
-        warnings: what was missing, not fit to be read or not understood, one line each.
-        omitted: those of the warnings that speak of the shape.
-        left: bytes that side files may still have.
-        texels: bytes that textures may still take.
-    """
-
-    path: Path
-    warnings: list[str] = field(default_factory=list)
-    omitted: list[str] = field(default_factory=list)
-    left: int = MAX_SIDE_FILES
-    texels: int = MAX_SIDE_FILES
+    path: Path  # the mesh's file
+    warnings: list[str] = field(default_factory=list)  # missing or unread content, one line each
+    omitted: list[str] = field(default_factory=list)  # the warnings that concern the shape
+    left: int = MAX_SIDE_FILES  # bytes that side files may still have
+    texels: int = MAX_SIDE_FILES  # bytes that textures may still take
 
     def omit(self, what: str) -> None:
-        """Warns of what is not read and changes the shape."""
+        """Warn of unread content that changes the shape."""
         self.warnings.append(what)
         self.omitted.append(what)
 
     def read(self, *names: str) -> bytes:
-        """Read the first of these files that exists.
-
-        Raises:
-            UserError: none is there, it is no plain file, or too large.
-        """
-        shown = " ".join(names[0][:100].split())
+        """Read the first of these files that exists. Raises UserError."""
         file = _find_file(self.path.parent, *names)
         if file is None:
-            raise UserError(f"{shown}: not found")
+            raise UserError(f"{_shown(names[0])}: not found")
         data = read_bytes(file, min(MAX_SIDE_FILE, max(self.left, 0)))
         self.left -= len(data)
         return data
 
-    def picture(self, name: str) -> np.ndarray | None:
-        """The texture of a file that an MTL file names; None without one."""
-        shown = " ".join(name[:100].split())
+    def picture(self, name: str, profiled: bool = True) -> np.ndarray | None:
+        """Return the picture that an MTL file names, as ``texture`` does."""
+        shown = _shown(name)
         for option, numbers in _MOVING.findall(name[:2000]):
             if not re.fullmatch(_AS_IT_IS[option], numbers):
                 self.warnings.append(f"{shown}: the option -{option} is not read")
         try:
-            return self.texture(self.read(name), shown, profiled=True)
+            return self.texture(self.read(name), shown, profiled)
         except UserError as error:
             self.warnings.append(str(error))
             return None
@@ -114,9 +101,9 @@ class SideFiles:
     def texture(
         self, data: bytes | memoryview, name: str, profiled: bool = False
     ) -> np.ndarray | None:
-        """A picture as ``[h, w, 4]`` uint8 RGBA; None where it cannot be decoded.
+        """Decode a picture to ``[h, w, 4]`` uint8 RGBA; None, and a warning, if that fails.
 
-        Colour profiles count if ``profiled``; glTF 2.0 wants them ignored (3.8.3, images).
+        Colour profiles are used if ``profiled``; glTF 2.0 ignores them (3.8.3, images).
         """
         try:
             with open_picture(io.BytesIO(data), name) as image:
@@ -137,8 +124,12 @@ class SideFiles:
         return texture
 
 
+def _shown(name: str) -> str:
+    return " ".join(name[:100].split())
+
+
 def _find_file(folder: Path, *names: str) -> Path | None:
-    """The file of a name in a folder or below it; None without one, or where it is elsewhere."""
+    """Return the file of the first name found in a folder or below it; None without one."""
     for name in names:
         bare = _OPTIONS.sub("", name[:2000].strip())
         for candidate in (name, bare, Path(bare.replace("\\", "/")).name):

@@ -1,8 +1,8 @@
-"""Mesh files to flat arrays: one list of triangles with their corners' normals, UVs and materials.
+"""Mesh files as flat arrays: one list of triangles with their corners' normals, UVs and materials.
 
-A reader for each format gives parts; this module joins them, makes normals where there are none,
-and leaves out vertices of no face. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are
-y-up by convention and are turned by ``normalized`` (front +z becomes front -y, as in Blender).
+The readers of the formats yield parts, which are joined without unused vertices; missing normals
+are computed. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up by convention and
+are turned by ``normalized`` (front +z becomes front -y, as in Blender).
 """
 
 from __future__ import annotations
@@ -23,7 +23,15 @@ from .parts import Part
 from .ply_mesh import read_ply_mesh
 from .stl import read_stl
 
-SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
+_READERS: dict[str, Callable[[Path, SideFiles], Iterator[Part]]] = {
+    ".obj": read_obj,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".ply": read_ply_mesh,
+    ".stl": read_stl,
+    ".off": read_off,
+}
+SUFFIXES = tuple(_READERS)
 Y_UP = (".obj", ".glb", ".gltf")
 MAX_REACH = 1e18  # the squares of larger coordinates overflow float32
 MAX_PARTS = 40_000_000  # vertices and faces; their arrays take 4 GB
@@ -40,12 +48,12 @@ class TexturedMesh:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64.
         normals: ``[F, 3, 3]`` float32, unit, on the side of the face's own normal.
-        uvs: ``[F, 3, 2]`` float32, v upwards; 0 where a face has none.
-        colors: ``[F, 3, 4]`` uint8 display RGBA; white where a face has none.
+        uvs: ``[F, 3, 2]`` float32, v upwards; 0 if missing.
+        colors: ``[F, 3, 4]`` uint8 display RGBA; white if missing.
         material_ids: ``[F]`` int64 into ``materials``.
         materials: at least one.
-        warnings: what was missing and replaced, or is not read, one line each.
-        omitted: those of the warnings that speak of the shape.
+        warnings: missing content that was replaced, or unread content, one line each.
+        omitted: the warnings that concern the shape.
     """
 
     vertices: np.ndarray
@@ -61,12 +69,11 @@ class TexturedMesh:
     def normalized(
         self, up: str = "z", rotation: ArrayLike | None = None
     ) -> tuple[TexturedMesh, np.ndarray, float]:
-        """The mesh turned to z-up, with its bounding box centred and its longest side 1.
+        """Return the mesh turned to z-up, with its bounding box centred and its longest side 1.
 
         Args:
-            up: the axis that points up in the file, "y" or "z".
-            rotation: ``[3, 3]``, applied first, for files whose object lies on its side, or
-                to stretch it; or None.
+            up: upward axis of the file, "y" or "z".
+            rotation: ``[3, 3]``, applied first, to turn an object upright or to stretch it.
 
         Returns:
             The mesh, ``transform [3, 4]`` and ``scale``: x_new = scale · (transform · [x, 1]).
@@ -87,22 +94,22 @@ class TexturedMesh:
 
 
 def default_up(path: str | Path) -> str:
-    """The axis that points up in a file of this suffix, by convention: "y" or "z"."""
+    """Return the upward axis of a file of this suffix by convention, "y" or "z"."""
     return "y" if Path(path).suffix.lower() in Y_UP else "z"
 
 
 def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
-    """Reads a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
+    """Read a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
     texture without UV coordinates by its mean colour; ``warnings`` names each.
 
     Args:
         path: the file.
-        normals: whether they are made; without them, which are much of the time, they are 0.
+        normals: compute normals, which takes much of the time; else they are 0.
 
     Raises:
-        UserError: missing, unreadable, no faces, vertices not finite, or no extent.
+        UserError: missing, malformed, no faces, vertices not finite, or no extent.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -115,9 +122,8 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
         for part in _READERS[path.suffix.lower()](path, sides):
             count += len(part.faces) + len(part.vertices)  # a scene may hold one part many times
             if count > MAX_PARTS:
-                raise UserError(
-                    f"{path}: over {MAX_PARTS} vertices and faces, the limit for a mesh"
-                )
+                limit = f"over {MAX_PARTS} vertices and faces, the limit for a mesh"
+                raise UserError(f"{path}: {limit}")
             if not len(part.faces):
                 continue
             arrays, material = _flatten(part, sides, normals)
@@ -142,12 +148,12 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
         raise UserError(f"{path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
     if extent <= 0:
         raise UserError(f"{path}: all vertices are one point")
-    told = (list(dict.fromkeys(lines)) for lines in (sides.warnings, sides.omitted))
-    return TexturedMesh(**joined, materials=materials, warnings=next(told), omitted=next(told))
+    warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
+    return TexturedMesh(**joined, materials=materials, warnings=warnings, omitted=omitted)
 
 
 def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Material]:
-    """The arrays of one part, without vertices of no face, and its material."""
+    """Return the arrays of one part, without unused vertices, and its material."""
     used = np.zeros(len(part.vertices), bool)
     used[part.faces] = True
     faces, vertices = part.faces, part.vertices
@@ -166,26 +172,21 @@ def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Materia
         sides.warnings.append("a textured part has no UV coordinates")
         mean = material.texture.mean((0, 1), keepdims=True).astype(np.uint8)
         material = replace(material, texture=mean)
-    arrays = {
-        "vertices": vertices,
-        "faces": faces,
-        "normals": _corner_normals(vertices, faces, part.normals)
-        if normals
-        else np.zeros((len(faces), 3, 3), np.float32),
-        "uvs": np.zeros((len(faces), 3, 2), np.float32)
-        if uvs is None
-        else np.nan_to_num(uvs.astype(np.float32)),
-        "colors": np.full((len(faces), 3, 4), 255, np.uint8)
-        if part.colors is None
-        else part.colors,
-    }
+    corners, colors = faces.shape, part.colors
+    arrays = {"vertices": vertices, "faces": faces}
+    arrays["normals"] = np.zeros((*corners, 3), np.float32)
+    if normals:
+        arrays["normals"] = _corner_normals(vertices, faces, part.normals)
+    uvs = np.zeros((*corners, 2)) if uvs is None else uvs
+    arrays["uvs"] = np.nan_to_num(uvs.astype(np.float32))
+    arrays["colors"] = np.full((*corners, 4), 255, np.uint8) if colors is None else colors
     return arrays, material
 
 
 def _corner_normals(
     vertices: np.ndarray, faces: np.ndarray, given: np.ndarray | None
 ) -> np.ndarray:
-    """Normals ``[F, 3, 3]``: the corner's where it agrees with the face, else the face's."""
+    """Return normals ``[F, 3, 3]``: the corner's if it agrees with the face, else the face's."""
     if given is None:
         import trimesh
 
@@ -200,13 +201,3 @@ def _corner_normals(
     agree = (smooth * flat).sum(2, keepdims=True)
     smooth *= np.sign(agree)
     return np.where(np.abs(agree) > CREASE, smooth, flat).astype(np.float32)
-
-
-_READERS: dict[str, Callable[[Path, SideFiles], Iterator[Part]]] = {
-    ".obj": read_obj,
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".ply": read_ply_mesh,
-    ".stl": read_stl,
-    ".off": read_off,
-}

@@ -1,4 +1,4 @@
-"""Names of the formats that are written, and the suffixes of their files."""
+"""Names of the written formats, and the suffixes of their files."""
 
 from collections.abc import Sequence
 from typing import Literal, cast, get_args
@@ -10,17 +10,17 @@ MeshFormat = Literal["obj", "glb", "ply", "stl"]
 MeshChoice = Literal[MeshFormat, "none"]
 SPLAT_FORMATS: tuple[str, ...] = get_args(SplatFormat)
 MESH_FORMATS: tuple[str, ...] = get_args(MeshFormat)
-# What may hold Gaussians; .ply and .glb may hold a mesh as well.
+# Suffixes of files of Gaussians; .ply and .glb may hold a mesh as well.
 SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".glb")
 
 
 def splat_suffix(kind: str) -> str:
-    """What follows the name of a file of Gaussians: ``.ply``, or ``.compressed.ply``."""
+    """Return the suffix of a format of Gaussians: ``.ply``, or ``.compressed.ply``."""
     return "." + kind.replace("-", ".")
 
 
 def mesh_formats(chosen: Sequence[MeshChoice]) -> tuple[MeshFormat, ...]:
-    """The formats of ``--mesh``, of which ``none`` is no format.
+    """Return the formats of ``--mesh``, empty for ``none``.
 
     Raises:
         UserError: ``none`` beside a format.

@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
-from .headers import MAX_VALUES, lines_of, open_shape, read_table
+from .headers import MAX_VALUES, check_lines, lines_of, open_shape, read_rows, read_table
 from .materials import SideFiles
 from .parts import Part, cut_polygons, to_rgba8
 from .ply_data import spread
 
-# What vertices have besides a place: texture coordinates, colours, normals. Some files of
-# ModelNet40 have the counts behind the word, without a blank.
+# Attributes of vertices: texture coordinates, colours, normals. Some files of ModelNet40 have the
+# counts behind the word, without a blank.
 _HEADER = re.compile(r"(ST)?(C)?(N)?OFF(?![A-Z])\s*(.*)")
 
 
 def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
-    """Yields the one part of a file.
+    """Yield the one part of a file.
 
     Raises:
-        UserError: it holds less or more than its header says, or a word is no number.
+        UserError: it holds less or more than its header states, or a word is not a number.
     """
     with open_shape(path) as (file, _):
         lines = (line.split("#")[0] for line in lines_of(file, str(path), comments="#"))
@@ -34,28 +34,23 @@ def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
             raise UserError(f"{path}: broken header, not OFF and numbers of vertices and faces")
         count, faces = (int(word[:18]) for word in counts[:2])
         rows = list(islice(lines, MAX_VALUES))
-    if len(rows) != count + faces:
-        says = f"{count} vertices and {faces} faces"
-        raise UserError(f"{path}: truncated or false header, {says}, but {len(rows)} lines follow")
+    check_lines(path, f"{count} vertices and {faces} faces,", count + faces, len(rows))
     table = read_table(rows[:count], f"{path}: vertices")
     if count and table.shape[1] < 3:
         raise UserError(f"{path}: row 1 is not whole: {rows[0][:40].strip()}")
-    words = [row.split() for row in rows[count:]]
-    numbers = read_table((word for row in words for word in row), f"{path}: faces", (1,))[:, 0]
-    sizes = np.array([len(row) for row in words], np.int64)
+    numbers, sizes = read_rows(rows[count:], f"{path}: faces")
     starts = np.cumsum(sizes) - sizes
     lengths = numbers[starts]
     bad = ~((lengths >= 0) & (lengths < sizes) & (lengths == np.rint(lengths)))
     if bad.any():
         row = count + bad.argmax()
         raise UserError(f"{path}: row {row + 1} is not whole: {rows[row][:40].strip()}")
-    lengths = lengths.astype(np.int64)
+    points, lengths = table[:, :3], lengths.astype(np.int64)
     corners = numbers[spread(starts + 1, lengths)]
-    points = table[:, :3]
     places = cut_polygons(sides, points, corners, lengths)
     corners = corners.astype(np.int64)
     of_vertices = table[:, 6 if found[3] else 3 : -2 if found[1] else None]
-    rest = sizes - 1 - lengths  # what follows a face's corners: a colour, or its number in a list
+    rest = sizes - 1 - lengths  # numbers behind a face's corners: a colour, or its index in a list
     colors = None
     if of_vertices.shape[1] in (3, 4):
         colors = to_rgba8(of_vertices)[corners[places]]

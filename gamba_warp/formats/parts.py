@@ -1,4 +1,4 @@
-"""Parts of a mesh, as its readers yield them: triangles of one material, with corner attributes."""
+"""Parts of a mesh that the readers yield, triangles of one material, and their common code."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from ..errors import UserError
 from .materials import Material, SideFiles
 from .ply_data import spread
 
-STRAIGHT = 1e-6  # sine of the angle from which a corner turns inwards
-MAX_WORK = 200_000_000  # squares of the corners of polygons with inward ones; some ten seconds
+STRAIGHT = 1e-6  # sine of the angle from which a corner is concave
+MAX_WORK = 200_000_000  # sum of squared numbers of corners of concave polygons; some ten seconds
 
 
 @dataclass
@@ -19,9 +19,9 @@ class Part:
     """F triangles of one material in the frame of the file.
 
     Attributes:
-        vertices: ``[V, 3]`` float; some may be of no face.
+        vertices: ``[V, 3]`` float; some may be unused.
         faces: ``[F, 3]`` int64.
-        material: that of all faces; None: the file has none, like the others.
+        material: of all faces; this and the following are None if the file has none.
         normals: ``[F, 3, 3]`` of any length.
         uvs: ``[F, 3, 2]``, v upwards.
         colors: ``[F, 3, 4]`` uint8 display RGBA.
@@ -36,10 +36,9 @@ class Part:
 
 
 def color_range(values: np.ndarray) -> int:
-    """The number that is full light in colours of any type.
+    """Return the number of full light in colours: 255, of 16 bits 65535.
 
-    Integers reach to 255, those of 16 bits to 65535; floats to 1, or to the smallest of these three
-    that they fit.
+    Of floats it is the smallest of 1, 255 and 65535 that they fit.
     """
     if values.dtype == np.uint8:
         return 255
@@ -50,7 +49,7 @@ def color_range(values: np.ndarray) -> int:
 
 
 def to_rgba8(values: np.ndarray) -> np.ndarray:
-    """Makes uint8 RGBA ``[N, 4]`` of display colours ``[N, 3 or more]`` of any ``color_range``."""
+    """Convert display colours ``[N, 3 or more]`` of any ``color_range`` to uint8 ``[N, 4]``."""
     out = np.full((len(values), 4), 255, np.uint8)
     values = np.asarray(values)[:, :4]
     if values.dtype != np.uint8:
@@ -63,22 +62,22 @@ def to_rgba8(values: np.ndarray) -> np.ndarray:
 def cut_polygons(
     sides: SideFiles, points: np.ndarray, corners: np.ndarray, lengths: np.ndarray
 ) -> np.ndarray:
-    """Cuts polygons into triangles, in their order: convex ones as fans, others by their ears.
+    """Triangulate polygons, in their order: convex ones as fans, others by ear clipping.
 
-    A polygon that is not flat is cut as it looks along its normal; one of fewer than three corners
-    gives nothing.
+    A polygon that is not flat is projected along its normal; one of fewer than three corners gives
+    nothing.
 
     Args:
-        sides: whose path errors name; a warning says where ears would take too long.
+        sides: its path is named in errors; it is warned if ear clipping would take too long.
         points: ``[V, 3]``.
-        corners: ``[M]`` indices of points, those of all polygons one after the other.
-        lengths: ``[P]``, the number of corners of each polygon.
+        corners: ``[M]`` indices of points, of all polygons one after the other.
+        lengths: ``[P]``, number of corners of each polygon.
 
     Returns:
-        ``[F, 3]`` int64, places in ``corners``.
+        ``[F, 3]`` int64 indices into ``corners``.
 
     Raises:
-        UserError: a corner is not the number of a point.
+        UserError: a corner is not the index of a point.
     """
     bad = ~((corners >= 0) & (corners < len(points)) & (corners == np.rint(corners)))
     if bad.any():
@@ -91,7 +90,7 @@ def cut_polygons(
     found[:, 0] -= step[:, 0]
     if not len(lengths) or lengths.max() == 3:
         return found
-    # Every corner beside those before and after it in its polygon.
+    # Of every corner the next one in its polygon, and the turn between their edges.
     at, begins = spread(first, lengths), np.cumsum(lengths) - lengths
     owner = np.repeat(np.arange(len(lengths)), lengths)
     after = np.arange(1, len(at) + 1)
@@ -107,17 +106,17 @@ def cut_polygons(
     for index in np.flatnonzero(np.logical_or.reduceat(turns < -STRAIGHT, begins)):
         work -= (lengths[index] + 30) ** 2
         if work < 0:
-            sides.omit("polygons that are not convex are too many: some are false")
+            sides.omit("too many concave polygons: some are triangulated as if they were convex")
             break
         start, count = begins[index], lengths[index]
         ears = _ears(places[start : start + count], normals[index])
-        if len(ears) == counts[index]:  # else the polygon cuts itself
+        if len(ears) == counts[index]:  # else the polygon intersects itself
             found[ends[index] - counts[index] : ends[index]] = first[index] + ears
     return found
 
 
 def _ears(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """``[F, 3]`` places in a polygon ``[n, 3]``, as it looks against a unit normal."""
+    """Return ``[F, 3]`` indices into a polygon ``[n, 3]``, projected along a unit normal."""
     from manifold3d import triangulate
 
     right = np.cross(np.eye(3)[np.abs(normal).argmin()], normal)
@@ -127,7 +126,7 @@ def _ears(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def merged(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct rows of ``[V, C]``, in order, and ``[V]`` the index of each row among them."""
+    """Return the distinct rows of ``[V, C]``, sorted, and each row's index ``[V]`` among them."""
     rows = np.asarray(vertices, np.float64) + 0.0  # -0.0 becomes 0.0
     order = np.lexsort(rows.T[::-1])  # four times as fast as np.unique of rows
     ordered = rows[order]

@@ -1,73 +1,142 @@
-"""All elements of a ``.ply`` file as arrays: what the header states is there, every number."""
+"""Headers and elements of ``.ply`` files, checked against the file's size before they are read."""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from ..errors import UserError
-from .headers import MAX_FILE, MAX_VALUES, compare_sizes, lines_of, open_shape, read_table
-from .ply_header import ORDERS, PlyElement, PlyHeader, PlyProperty, read_ply_header
+from .headers import (
+    MAX_FILE,
+    MAX_VALUES,
+    check_lines,
+    compare_sizes,
+    lines_of,
+    open_shape,
+    read_rows,
+    read_table,
+)
+
+MAX_HEADER = 1 << 16  # bytes
+MAX_DIGITS = 18  # of a count, so that it fits 64 bits
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}  # format to numpy's byte order
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_END = re.compile(rb"[\r\n]end_header[ \t]*\r?\n")  # a line of its own; a comment may contain it
 
 
-def spread(starts: np.ndarray, lengths: np.ndarray, step: int = 1) -> np.ndarray:
-    """``[M]`` the places of all items of lists that start at ``starts``, ``step`` apart."""
-    ends = np.cumsum(lengths)
-    within = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)
-    return np.repeat(starts, lengths) + within * step
+class PlyProperty(NamedTuple):
+    """One property of an element, a number or a list of numbers."""
+
+    name: str
+    kind: str  # numpy's type of the number, or of each number in the list, without byte order
+    length: str = ""  # numpy's type of the list's length; empty for a number
+
+
+class PlyElement(NamedTuple):
+    """One element: ``count`` rows of the same properties."""
+
+    name: str
+    count: int
+    properties: list[PlyProperty]
+
+    def least_bytes(self) -> int:
+        """Return the bytes of all rows if their lists are empty."""
+        return self.count * sum(np.dtype(x.length or x.kind).itemsize for x in self.properties)
+
+
+class PlyHeader(NamedTuple):
+    """Content of a header."""
+
+    format: str  # "ascii", a key of ``ORDERS``, or an unknown word; "none" without a format
+    comments: list[str]
+    elements: list[PlyElement]  # in the order of their data
+    start: int  # position of the first byte of the data
 
 
 class PlyList(NamedTuple):
-    """A property whose values are lists.
+    """A property whose values are lists."""
 
-    Attributes:
-        values: ``[M]``, all lists one after the other.
-        lengths: ``[N]`` int64, of each row's list.
-    """
-
-    values: np.ndarray
-    lengths: np.ndarray
+    values: np.ndarray  # [M], all lists one after the other
+    lengths: np.ndarray  # [N] int64, of each row's list
 
 
 Columns = dict[str, np.ndarray | PlyList]  # an element's, by the names of its properties
 
 
 class PlyData(NamedTuple):
-    """What a file holds.
-
-    Attributes:
-        header: what it states.
-        elements: by name, each property's ``[N]`` numbers, or lists.
-    """
+    """Content of a file: its header, and by element and property ``[N]`` numbers or lists."""
 
     header: PlyHeader
     elements: dict[str, Columns]
 
     def numbers(self, element: str, names: tuple[str, ...]) -> np.ndarray | None:
-        """``[N, C]`` float64, properties of an element; None where one of them is not there."""
+        """Return properties of an element, ``[N, C]`` float64; None if one is missing."""
         found = [self.elements.get(element, {}).get(name) for name in names]
         if not all(isinstance(column, np.ndarray) for column in found):
             return None
         return np.stack([np.asarray(column, np.float64) for column in found], 1)
 
 
-def read_ply(path: Path, limit: int = MAX_FILE) -> PlyData:
-    """Reads every element of a ``.ply`` file, text or binary.
-
-    Nothing is allocated by what the header says before the file's size is known to fit it.
-
-    Args:
-        path: the file.
-        limit: largest size, bytes.
+def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
+    """Read the header at the start of a file, and leave the file's position undefined.
 
     Raises:
-        UserError: it is no ``.ply`` file, holds less or more than its header states, a word is no
-            number, or a name is given twice.
+        UserError: not a ``.ply`` file, the header has no end, or a line is malformed.
+        OSError: the file cannot be read.
+    """
+    head = file.read(MAX_HEADER)
+    if not head.startswith(b"ply"):
+        raise UserError(f"{path}: not a .ply file")
+    end = _END.search(head)
+    if end is None:
+        raise UserError(f"{path}: the .ply header has no end")
+    layout, comments = "none", []
+    elements: list[PlyElement] = []
+    for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
+        words = line.split()
+        match words[:1]:
+            case ["format"] if layout == "none" and len(words) > 1:
+                layout = words[1]
+            case ["comment"]:
+                comments.append(line.partition(" ")[2].strip())
+            case ["element"]:
+                if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MAX_DIGITS:
+                    raise UserError(
+                        f"{path}: the .ply header says '{' '.join(words)[:80]}', "
+                        f"expected 'element {words[1] if len(words) > 1 else 'NAME'} COUNT'"
+                    )
+                elements.append(PlyElement(words[1], int(words[2]), []))
+            case ["property"]:
+                if not elements:
+                    raise UserError(f"{path}: the .ply header has a property before any element")
+                elements[-1].properties.append(_property(path, words))
+    return PlyHeader(layout, comments, elements, end.end())
+
+
+def _property(path: Path, words: list[str]) -> PlyProperty:
+    is_list = words[1:2] == ["list"]
+    kinds = [TYPES.get(word, "") for word in words[1 + is_list : -1]]
+    if len(kinds) != 1 + is_list or not all(kinds):
+        text = " ".join(words[1:])[:80]
+        raise UserError(f"{path}: property '{text}' is not a plain number or a list of such")
+    return PlyProperty(words[-1], kinds[-1], kinds[0] if is_list else "")
+
+
+def read_ply(path: Path, limit: int = MAX_FILE) -> PlyData:
+    """Read every element of a ``.ply`` file, text or binary, of at most ``limit`` bytes.
+
+    Raises:
+        UserError: not a ``.ply`` file, it holds less or more than its header states, a word is not
+            a number, or a name is given twice.
     """
     with open_shape(path, limit) as (file, size):
         header = read_ply_header(path, file)
@@ -80,7 +149,7 @@ def read_ply(path: Path, limit: int = MAX_FILE) -> PlyData:
             if next(lines, None) is not None:
                 raise UserError(f"{path}: false header, more lines follow than {says}")
             return PlyData(header, found)
-        least = sum(element.count * element.least_bytes() for element in header.elements)
+        least = sum(element.least_bytes() for element in header.elements)
         compare_sizes(path, says, least, size - header.start, exact=False)
         data, at = file.read(), 0
     elements: dict[str, Columns] = {}
@@ -96,57 +165,53 @@ def _check_header(path: Path, header: PlyHeader) -> None:
         raise UserError(f"{path}: .ply format is {header.format}, neither binary nor ascii")
     for element in header.elements:
         names = [item.name for item in element.properties]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise UserError(f"{path}: {element.name} property {twice} is given twice")
+        for name in names:
+            if names.count(name) > 1:
+                raise UserError(f"{path}: {element.name} property {name} is given twice")
         if any(item.length.startswith("f") for item in element.properties):
             raise UserError(f"{path}: the length of a list in {element.name} is a fraction")
     names = [element.name for element in header.elements]
-    if len(set(names)) < len(names):
+    if len({*names}) < len(names):
         raise UserError(f"{path}: the .ply header has an element twice")
 
 
+def spread(starts: np.ndarray, lengths: np.ndarray, step: int = 1) -> np.ndarray:
+    """Return ``[M]`` places of all items of lists that start at ``starts``, ``step`` apart."""
+    ends = np.cumsum(lengths)
+    within = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)
+    return np.repeat(starts, lengths) + within * step
+
+
 def _from_text(path: Path, lines: Iterator[str], element: PlyElement) -> Columns:
-    """The element's columns, from as many lines as it has rows."""
-    items, count, source = element.properties, element.count, f"{path}: {element.name}"
-    ends = [0]  # of the rows, among all numbers
-
-    def words() -> Iterator[str]:
-        for line in islice(lines, count if items else 0):
-            row = line.split()
-            ends.append(ends[-1] + len(row))
-            yield from row
-
-    with_lists = any(item.length for item in items)
-    if with_lists:  # whose rows may differ in length
-        table = read_table(words(), source, (1,))
-    else:
-        table = read_table(islice(lines, count if items else 0), source, (len(items),))
-    there = len(ends) - 1 if with_lists else len(table)
-    if items and there < count:
-        raise UserError(
-            f"{path}: truncated or false header, {count} {element.name}, but {there} lines follow"
-        )
-    if not with_lists:
+    """Return the element's columns, from as many lines as it has rows."""
+    items, source = element.properties, f"{path}: {element.name}"
+    count = element.count if items else 0
+    rows, says = islice(lines, count), f"{count} {element.name},"
+    if not any(item.length for item in items):
+        table = read_table(rows, source, (len(items),))
+        check_lines(path, says, count, len(table))
         return {item.name: _typed(path, table[:, i], item) for i, item in enumerate(items)}
-    flat = table[:, 0]
-    numbers: Any = flat.data  # quicker than numpy's scalars
-
-    def length_at(at: int) -> int:
-        length = numbers[at] if at < len(flat) else -1.0
-        if not 0 <= length <= len(flat) or not length.is_integer():
-            raise UserError(f"{source} has a list of length {length:g}")
-        return int(length)
-
-    steps = [(1, 1, length_at) if item.length else (0, 1, None) for item in items]
-    starts, lengths, _ = _walk(ends[:-1], 0, steps)
-    wanted, got = starts[-1] + lengths[-1] - ends[:-1], np.diff(ends)
-    if (wanted != got).any():
-        row = (wanted != got).argmax()
-        raise UserError(f"{source} has a row of {got[row]} numbers, not {wanted[row]}")
+    numbers, sizes = read_rows(rows, source)
+    check_lines(path, says, count, len(sizes))
+    spans, ends = [], np.cumsum(sizes)
+    at = ends - sizes
+    for item in items:
+        lengths = np.ones(count, np.int64)
+        if item.length:
+            stated = np.where(at < ends, numbers.take(at, mode="clip"), 0)
+            bad = ~((stated >= 0) & (stated <= len(numbers)) & (stated == np.rint(stated)))
+            if bad.any():
+                raise UserError(f"{source} has a list of length {stated[bad][0]:g}")
+            lengths, at = stated.astype(np.int64), at + 1
+        spans.append((at, lengths))
+        at = at + lengths
+    if (at != ends).any():
+        row = (at != ends).argmax()
+        wanted = sizes[row] + at[row] - ends[row]
+        raise UserError(f"{source} has a row of {sizes[row]} numbers, not {wanted}")
     return {
-        item.name: _column(item, _typed(path, flat[spread(start, length, 1)], item), length)
-        for item, start, length in zip(items, starts, lengths)
+        item.name: _column(item, _typed(path, numbers[spread(start, lengths)], item), lengths)
+        for item, (start, lengths) in zip(items, spans)
     }
 
 
@@ -155,13 +220,13 @@ def _column(item: PlyProperty, values: np.ndarray, lengths: np.ndarray) -> np.nd
 
 
 def _typed(path: Path, values: np.ndarray, item: PlyProperty) -> np.ndarray:
-    """Numbers of a text as the property's type. Raises UserError where they do not fit it."""
+    """Convert numbers of a text to the property's type. Raises UserError if they do not fit it."""
     kind = np.dtype(item.kind)
     if kind.kind == "f":
         with np.errstate(over="ignore"):
             return values.astype(kind)
     limits = np.iinfo(kind)
-    fits = (values >= limits.min) & (values <= limits.max)  # which NaN does not
+    fits = (values >= limits.min) & (values <= limits.max)  # False for NaN
     if item.length:  # an index; a colour may be 0.7
         fits &= values == np.rint(values)
     if not fits.all():
@@ -169,86 +234,69 @@ def _typed(path: Path, values: np.ndarray, item: PlyProperty) -> np.ndarray:
     return values.astype(kind)
 
 
-def _walk(
-    rows: Sequence[int | None],
-    at: int,
-    steps: Sequence[tuple[int, int, Callable[[int], int] | None]],
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Goes through rows with lists one by one: only a row says where the next one begins.
-
-    Args:
-        rows: where each begins, or None: where the one before it ends.
-        at: where the first begins.
-        steps: of each property, what the length of its list takes (0: it is no list), what a
-            number takes, and what reads the length that stands at a place.
-
-    Returns:
-        ``[properties, rows]`` where the numbers begin and how many there are, and the end.
-    """
-    starts, lengths = [array("q") for _ in steps], [array("q") for _ in steps]
-    parts = [
-        (*step, start.append, length.append) for step, start, length in zip(steps, starts, lengths)
-    ]
-    for begin in rows:
-        at = at if begin is None else begin
-        for head, step, length_at, add_start, add_length in parts:
-            length = length_at(at) if length_at else 1
-            at += head
-            add_start(at)
-            add_length(length)
-            at += length * step
-    return np.array(starts), np.array(lengths), at
-
-
 def _from_bytes(
     path: Path, data: bytes, at: int, element: PlyElement, order: str
 ) -> tuple[Columns, int]:
-    """The element's columns and where the next element begins."""
+    """Return the element's columns, and the position of the next element."""
     items, count = element.properties, element.count
-    says, kinds = f"{count} {element.name}", [np.dtype(order + item.kind) for item in items]
     if not items or not count:
         none = np.zeros(0, np.int64)
         return {item.name: _column(item, np.zeros(0, item.kind), none) for item in items}, at
-    compare_sizes(path, says, count * element.least_bytes(), len(data) - at, exact=False)
-
+    says, left = f"{count} {element.name}", len(data) - at
+    compare_sizes(path, says, element.least_bytes(), left, exact=False)
+    kinds = [np.dtype(order + item.kind) for item in items]
+    layout = [
+        (int(item.length[1:] or 0), item.length.startswith("i"), kind.itemsize)
+        for item, kind in zip(items, kinds)
+    ]
     byteorder = "little" if order == "<" else "big"
 
-    def step(item: PlyProperty) -> tuple[int, int, Callable[[int], int] | None]:
-        head, size = int(item.length[1:] or 0), np.dtype(item.kind).itemsize
-        signed = item.length.startswith("i")
-
-        def length_at(at: int) -> int:
-            length = int.from_bytes(data[at : at + head], byteorder, signed=signed)
+    def lengths_of_row(at: int) -> tuple[list[int], int]:
+        """Return the length of each property's list (1 for a number), and the row's end."""
+        lengths = []
+        for head, signed, size in layout:
+            length = 1
+            if head:
+                length = int.from_bytes(data[at : at + head], byteorder, signed=signed)
             if length < 0:
                 raise UserError(f"{path}: false header, a list of {length} in {element.name}")
-            return length
+            lengths.append(length)
+            at += head + length * size
+        return lengths, at
 
-        return head, size, length_at if head else None
-
-    steps = [step(item) for item in items]
+    columns: Columns = {}
     # As a rule all lists of a property are as long as the first.
-    _, lengths, end = _walk([None], at, steps)
-    compare_sizes(path, says, end, len(data), exact=False)
-    if count * (end - at) <= len(data) - at:
+    lengths, end = lengths_of_row(at)
+    if count * (end - at) <= left:
         fields = []
-        for i, item in enumerate(items):
+        for i, (item, kind, length) in enumerate(zip(items, kinds, lengths)):
             fields += [(f"n{i}", order + item.length)] if item.length else []
-            fields += [(f"v{i}", kinds[i], (int(lengths[i, 0]),))]
+            fields += [(f"v{i}", kind, (length,))]
         rows = np.frombuffer(data, np.dtype(fields), count, at)
         if all((rows[f"n{i}"] == lengths[i]).all() for i, x in enumerate(items) if x.length):
-            columns: Columns = {}
             for i, item in enumerate(items):
-                values, each = rows[f"v{i}"], np.repeat(lengths[i], count)
-                values = values.reshape(-1) if item.length else values[:, 0]
-                columns[item.name] = _column(item, values, each)
+                values = rows[f"v{i}"].reshape(-1) if item.length else rows[f"v{i}"][:, 0]
+                columns[item.name] = _column(item, values, np.full(count, lengths[i], np.int64))
             return columns, at + count * (end - at)
-    starts, lengths, end = _walk([None] * count, at, steps)
-    compare_sizes(path, says, end, len(data), exact=False)
-    if lengths.sum() > MAX_VALUES:
-        raise UserError(f"{path}: over {MAX_VALUES} numbers, the limit for one file")
-    raw, columns = np.frombuffer(data, np.uint8), {}
-    for i, item in enumerate(items):
-        places, size = spread(starts[i], lengths[i], steps[i][1]), steps[i][1]
-        values = np.stack([raw[places + byte] for byte in range(size)], 1).view(kinds[i])[:, 0]
-        columns[item.name] = _column(item, values, lengths[i])
-    return columns, end
+    # Else only a row says where the next one begins.
+    starts = np.empty(count, np.int64)
+    for row in range(count):
+        starts[row] = at
+        at = lengths_of_row(at)[1]
+    compare_sizes(path, says, at, len(data), exact=False)
+    raw, total = np.frombuffer(data, np.uint8), 0
+
+    def take(places: np.ndarray, kind: np.dtype) -> np.ndarray:
+        return np.stack([raw[places + i] for i in range(kind.itemsize)], 1).view(kind)[:, 0]
+
+    for item, kind in zip(items, kinds):
+        each = np.ones(count, np.int64)
+        if item.length:
+            length = np.dtype(order + item.length)
+            each, starts = take(starts, length).astype(np.int64), starts + length.itemsize
+        total += each.sum()
+        if total > MAX_VALUES:
+            raise UserError(f"{path}: over {MAX_VALUES} numbers, the limit for one file")
+        columns[item.name] = _column(item, take(spread(starts, each, kind.itemsize), kind), each)
+        starts = starts + each * kind.itemsize
+    return columns, at

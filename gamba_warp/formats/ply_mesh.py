@@ -14,17 +14,17 @@ from .parts import Part, cut_polygons, to_rgba8
 from .ply_data import Columns, PlyList, read_ply
 
 _CORNERS = ("vertex_indices", "vertex_index")
-# What programs call the channels of a colour, and texture coordinates.
+# Names of the channels of a colour, and of texture coordinates.
 _CHANNELS = ("{}", "diffuse_{}")
 _UVS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _TEXTURE = re.compile(r"TextureFile\s+(.*)", re.I)
 
 
 def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
-    """Yields the one part of a file.
+    """Yield the one part of a file.
 
     Raises:
-        UserError: as ``read_ply``, or its vertices have no place, or its faces no corners.
+        UserError: as for ``read_ply``, or vertices without a position, or faces without corners.
     """
     data = read_ply(path)
     vertices, faces = data.elements.get("vertex", {}), data.elements.get("face", {})
@@ -66,7 +66,7 @@ def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
 
 
 def _colors(columns: Columns) -> np.ndarray | None:
-    """``[N, 4]`` uint8 RGBA of an element; None where it has no colours."""
+    """Return ``[N, 4]`` uint8 RGBA of an element; None without colours."""
     for name in _CHANNELS:
         rgba = [columns.get(name.format(key)) for key in ("red", "green", "blue", "alpha")]
         rgba = rgba[: 3 if rgba[3] is None else 4]

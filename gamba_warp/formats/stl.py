@@ -14,18 +14,18 @@ from .headers import compare_sizes, open_shape, read_table
 from .materials import SideFiles
 from .parts import Part
 
-_HEAD = 84  # bytes of a binary file before its faces: a text and their number
+_HEAD = 84  # bytes of a binary file before its faces: a text and their count
 _FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
-    """Yields the one part of a file; its faces have corners of their own.
+    """Yield the one part of a file; its faces share no vertices.
 
-    A file is text if it begins with "solid", has no zero bytes there, and is not as long as the
-    binary file that it would be.
+    A file is text if it begins with "solid", without zero bytes, and does not have the length of
+    the binary file that it would be.
 
     Raises:
-        UserError: it holds less than it says, or a word is no number.
+        UserError: it holds less than it states, or a word is not a number.
     """
     with open_shape(path) as (file, size):
         data = file.read()
@@ -48,8 +48,7 @@ def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
 
 
 def _text_corners(path: Path, data: bytes) -> np.ndarray:
-    """``[3 F, 3]``; of a name, which may be any words, nothing is taken."""
-    # Keywords of STL stand at the begin of a line, in either case.
+    """Return ``[3 F, 3]``; keywords begin a line, in either case, as a name may be any words."""
     text = data.replace(b"\r", b"\n").lower()
     begun, ends, last = (
         len(re.findall(rb"(?m)^[ \t]*" + word + rb"\b", text))

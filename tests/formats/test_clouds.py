@@ -1,4 +1,4 @@
-"""Point clouds are read to the last number, or not at all."""
+"""Point clouds, read completely or refused."""
 
 import struct
 
@@ -102,7 +102,7 @@ def test_damaged_clouds_are_refused(tmp_path, name):
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("name, options", KINDS)
 def test_the_same_as_open3d(tmp_path, name, options, normals):
-    """On files that it writes itself, and therefore reads rightly."""
+    """Compare on files that Open3D writes itself."""
     o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(POINTS[:500].astype(float)))
     cloud.points.extend(np.full((200, 3), 0.25))  # which LZF finds

@@ -1,4 +1,4 @@
-"""Digests of files; writing them: whole or not at all, and what is left over goes."""
+"""Digests of files; atomic writes, and removal of their leftovers."""
 
 import errno
 import hashlib
@@ -104,7 +104,7 @@ def test_a_full_disk_is_one_line_and_the_older_file_stays(tmp_path, kind):
 
 
 def test_what_has_its_name_is_on_the_disk(tmp_path, monkeypatch):
-    """So a power cut leaves an older file or a whole one: files first, then names in folders."""
+    """A power cut leaves the older file or the complete new one: sync files first, then folders."""
     done, real = [], os.replace
     monkeypatch.setattr(os, "fsync", lambda handle: done.append(os.fstat(handle).st_ino))
 
@@ -191,7 +191,7 @@ def test_what_begins_with_a_dot_is_no_input(tmp_path):
 
 
 def test_who_reads_the_older_file_reads_it_to_its_end(tmp_path):
-    """The name changes to the new file at once; the older one is not written over."""
+    """The name moves to the new file at once; the older one is not overwritten."""
     path = tmp_path / "a.txt"
     path.write_text("old" * 100_000)
     with open(path) as reader:

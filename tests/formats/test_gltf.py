@@ -1,4 +1,4 @@
-"""Meshes of glTF by their right values; whatever is not read is a warning that names it."""
+"""Meshes of glTF, compared with known values; unread content is a warning that names it."""
 
 import base64
 import io
@@ -23,7 +23,7 @@ _KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126
 
 
 class Document:
-    """A glTF document that grows by arrays; its first mesh is a square of one primitive."""
+    """A glTF document to which arrays are added; its first mesh is a square of one primitive."""
 
     def __init__(self, **more):
         self.binary = b""
@@ -50,7 +50,7 @@ class Document:
         return len(self.tree["accessors"]) - 1
 
     def paint(self, info=(), texture=(), **material):
-        """Gives the square a texture, whose picture is ``PAINT``."""
+        """Give the square the texture ``PAINT``."""
         pixels = io.BytesIO()
         Image.fromarray(PAINT).save(pixels, "PNG")
         self.tree["images"] = [{"bufferView": self.view(pixels.getvalue())}]
@@ -69,12 +69,12 @@ class Document:
 
 
 def places(mesh):
-    """The corners ``[F, 3, 3]``."""
+    """Return the corners ``[F, 3, 3]``."""
     return mesh.vertices[mesh.faces]
 
 
 def seen(mesh, at):
-    """The texel, display RGB, at a place ``[x, y]`` of the square."""
+    """Return the texel, display RGB, at a point ``[x, y]`` of the square."""
     (face,) = (i for i in range(len(mesh.faces)) if _inside(places(mesh)[i], at))
     corners = np.column_stack([places(mesh)[face][:, :2], np.ones(3)])
     u, v = np.linalg.solve(corners.T, [*at, 1]) @ mesh.uvs[face]
@@ -110,7 +110,7 @@ def test_normalised_integers_are_fractions(tmp_path, kind):
 
 
 def test_rows_with_a_stride(tmp_path):
-    """Three numbers of 16 bits take eight bytes, as the format asks."""
+    """Three numbers of 16 bits take eight bytes, as the format requires."""
     document, rows = Document(), np.zeros((4, 4), "<i2")
     rows[:, :3] = SQUARE * 7
     document.attributes["POSITION"] = document.array(rows, type="VEC3")
@@ -176,7 +176,7 @@ def test_webp_by_its_extension(tmp_path):
     assert mesh.materials[0].texture is not None and not mesh.warnings
 
 
-def test_surfaces_that_only_shine(tmp_path):
+def test_surfaces_that_only_emit_light(tmp_path):
     document = Document().paint(emissiveTexture={"index": 0}, emissiveFactor=[1, 1, 1])
     document.tree["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [0, 0, 0, 1]}
     mesh = document.load(tmp_path)
@@ -205,7 +205,7 @@ def test_alpha(tmp_path, mode, alphas):
 
 
 def test_diffuse_and_specular(tmp_path):
-    """The older kind of material: what is not metal has its diffuse colour."""
+    """A nonmetal of the older kind of material has its diffuse colour."""
     gloss = {"diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.04, 0.04, 0.04]}
     extension = {"KHR_materials_pbrSpecularGlossiness": gloss}
     document = Document(materials=[{"extensions": extension}])
@@ -220,7 +220,7 @@ def test_diffuse_and_specular(tmp_path):
 
 
 def test_strips_and_fans(tmp_path):
-    """All faces turn alike, whatever their number in the strip."""
+    """All faces have one orientation, odd ones of a strip too."""
     rows = {5: [0, 1, 3, 2], 6: [0, 1, 2, 3]}
     document = Document()
     parts = [document.primitive]
@@ -249,6 +249,52 @@ def test_nodes(tmp_path):
     np.testing.assert_allclose(places(mesh)[2:], square[..., [1, 0, 2]] * [-2, 2, 2] + [6, 8, 10])
 
 
+def instanced(**attributes):
+    """Return the square, repeated by a node that moves all instances by (0, 0, 3)."""
+    document = Document()
+    given = {name: document.array(np.asarray(rows)) for name, rows in attributes.items()}
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": given}}
+    document.tree["nodes"] = [{"mesh": 0, "translation": [0, 0, 3], "extensions": extension}]
+    document.tree["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
+    return document
+
+
+def test_instances(tmp_path):
+    square = SQUARE[CORNERS.reshape(2, 3)]
+    moves = np.array([[1, 2, 0], [-5, 0, 1]], "<f4")
+    mesh = instanced(TRANSLATION=moves).load(tmp_path)
+    np.testing.assert_array_equal(places(mesh)[:2], square + [1, 2, 3])
+    np.testing.assert_array_equal(places(mesh)[2:], square + [-5, 0, 4])
+    assert mesh.warnings == ["a part has no material: grey"]
+    # A quarter turn about z as bytes, then a mirror, with other sizes.
+    quats = np.rint(np.array([[0, 0, 0.5**0.5, 0.5**0.5], [0, 0, 0, 1]]) * 127).astype("i1")
+    scales = np.array([[2, 3, 1], [-1, 1, 1]], "<f4")
+    mesh = instanced(TRANSLATION=moves, ROTATION=quats, SCALE=scales, _ID=moves).load(tmp_path)
+    turned = square[..., [1, 0, 2]] * [-3, 2, 1] + [1, 2, 3]
+    np.testing.assert_allclose(places(mesh)[:2], turned, atol=1e-6)
+    corners = places(mesh)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(across[:, 2], [6, 6, 1, 1])
+    assert corners[2:, :, 0].max() == -5 and corners[2:, :, 0].min() == -6
+    assert len(instanced().load(tmp_path).faces) == 2
+
+
+def test_invalid_instances(tmp_path, monkeypatch):
+    rows = np.ones((2, 3), "<f4")
+    refused("2 x 3 numbers scale", instanced(TRANSLATION=rows[:1], SCALE=rows).load, tmp_path)
+    refused("2 x 3 numbers rotation", instanced(ROTATION=rows).load, tmp_path)
+    monkeypatch.setattr("gamba_warp.formats.gltf_file.MAX_NODES", 1)
+    refused("over 1 instances of meshes", instanced(TRANSLATION=rows).load, tmp_path)
+
+
+def test_instances_of_a_skin_are_named(tmp_path):
+    document = skinned()
+    given = {"TRANSLATION": document.array(np.ones((2, 3), "<f4"))}
+    document.tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": given}}
+    warning = "instances of a skinned mesh (EXT_mesh_gpu_instancing) are not read"
+    assert warning in document.load(tmp_path).warnings
+
+
 def test_a_mirroring_node_keeps_the_outside(tmp_path):
     nodes = [{"mesh": 0}, {"mesh": 0, "scale": [-1, 1, 1]}]
     document = Document(nodes=nodes, scenes=[{"nodes": [0, 1]}])
@@ -261,7 +307,7 @@ def test_a_mirroring_node_keeps_the_outside(tmp_path):
 
 
 def skinned(**more):
-    """The square, whose right side hangs on a joint that is 10 to the right."""
+    """Return the square with its right side bound to a joint that is 10 to the right."""
     nodes = [{"mesh": 0, "skin": 0, "scale": [100, 100, 100]}, {}, {"translation": [10, 0, 0]}]
     document = Document(nodes=nodes, scenes=[{"nodes": [0, 1, 2]}])
     joints = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]], "u1")
@@ -274,7 +320,7 @@ def skinned(**more):
     return document
 
 
-def test_skins_stand_where_their_joints_are(tmp_path):
+def test_skins_follow_their_joints(tmp_path):
     mesh = skinned().load(tmp_path)
     want = np.array([[0, 0, 0], [3, 0, 0], [3, 1, 0], [0, 1, 0]])[CORNERS.reshape(2, 3)]
     np.testing.assert_allclose(places(mesh), want)
@@ -336,7 +382,7 @@ def without_position(document):
 
 
 def changed(path, value):
-    """Changes a place of the document."""
+    """Return a function that changes a value of the document."""
 
     def change(document):
         place = document.tree
@@ -408,16 +454,12 @@ UNREAD = {
         name: (changed((*MATERIAL, "extensions"), {name: {}}), f"the extension {name} is not read")
         for name in ("KHR_materials_clearcoat", "KHR_materials_transmission", "MSFT_lod")
     },
-    "instances": (
-        changed(("nodes", 0, "extensions"), {"EXT_mesh_gpu_instancing": {"attributes": {}}}),
-        "the extension EXT_mesh_gpu_instancing is not read",
-    ),
     "listed": (changed(("extensionsUsed",), ["ADOBE_x"]), "the extension ADOBE_x is not read"),
 }
 
 
 @pytest.mark.parametrize("name", UNREAD)
-def test_what_is_not_read_is_named(tmp_path, name):
+def test_unread_content_is_named(tmp_path, name):
     change, warning = UNREAD[name]
     document = Document().paint()
     assert not document.load(tmp_path).warnings
@@ -426,7 +468,7 @@ def test_what_is_not_read_is_named(tmp_path, name):
     assert warning in mesh.warnings and len(mesh.faces) == 2
 
 
-def test_names_that_look_like_extensions_are_none(tmp_path):
+def test_names_that_look_like_extensions(tmp_path):
     document = Document(nodes=[{"mesh": 0, "name": "LP_body"}]).paint()
     document.attributes["_BATCHID"] = 0
     assert not document.load(tmp_path).warnings
@@ -436,7 +478,7 @@ def test_names_that_look_like_extensions_are_none(tmp_path):
     "name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"]
 )
 def test_packed_triangles_are_refused_by_name(tmp_path, name):
-    """Read the plain copy beside them."""
+    """A plain copy beside them is read."""
     document = Document(extensionsUsed=[name])
     assert len(document.load(tmp_path).faces) == 2
     del document.tree["accessors"][0]["bufferView"]

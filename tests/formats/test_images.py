@@ -1,4 +1,4 @@
-"""Pictures in files: all common kinds, damaged ones, and writing that leaves all or nothing."""
+"""Pictures in files: all common kinds, damaged ones, and atomic writes."""
 
 import io
 import os
@@ -73,9 +73,9 @@ def test_16_bit_grey_keeps_its_range(tmp_path, suffix):
 
 
 def png16(values, key=None, bits=16):
-    """A PNG of few or many bits and a transparent value, which Pillow reads but cannot write."""
+    """Return a PNG of any bit depth, which Pillow cannot write, with a transparent value."""
     height, width, channels = values.shape
-    kind = {1: 0, 3: 2, 4: 6}[channels]
+    kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
     high = values.astype(">u2").reshape(height, -1)
     of_bits = np.unpackbits(high.view(np.uint8), axis=1).reshape(height, -1, 16)[..., -bits:]
     rows = b"".join(b"\0" + row.tobytes() for row in np.packbits(of_bits.reshape(height, -1), 1))
@@ -91,7 +91,7 @@ def png16(values, key=None, bits=16):
 
 @pytest.mark.parametrize("channels, bits", [(1, 2), (1, 4), (1, 8), (1, 16), (3, 8), (3, 16)])
 def test_a_transparent_value_becomes_alpha(tmp_path, channels, bits):
-    """Whatever the bits: Pillow compares 8-bit pixels with the value as the file has it."""
+    """Pillow compares 8-bit pixels with the file's value of another bit depth."""
     most = 2**bits - 1
     values = np.random.default_rng(0).integers(0, most, (5, 7, channels))
     values[1, 2] = values[4, 0] = most  # what no other pixel is
@@ -101,24 +101,59 @@ def test_a_transparent_value_becomes_alpha(tmp_path, channels, bits):
         for got in (load_rgba(tmp_path / "a.png"), load_rgba8(tmp_path / "a.png") / 255):
             np.testing.assert_array_equal(got[..., 3], (values != key).any(-1))
             want = np.broadcast_to(values / most, (5, 7, 3))
-            # Of 16 bits of colour Pillow keeps the high byte.
-            np.testing.assert_allclose(got[..., :3], want, atol=1.01 / 255 if bits == 16 else 1e-6)
+            # Colour of 16 bits is rounded to 8.
+            np.testing.assert_allclose(got[..., :3], want, atol=0.501 / 255 if bits == 16 else 1e-6)
     large = np.kron(values, np.ones((16, 16, 1), int))
     (tmp_path / "a.png").write_bytes(png16(large, [most] * channels, bits))
     alpha = load_rgba(tmp_path / "a.png", 14)[..., 3]  # by blocks of four
     np.testing.assert_array_equal(alpha[::4, ::4], (values != most).any(-1))
 
 
-@pytest.mark.parametrize("channels", [3, 4])
-def test_16_bit_colour_is_read_to_8_bits(tmp_path, channels):
-    values = np.random.default_rng(0).integers(0, 65536, (5, 7, channels))
+@pytest.mark.parametrize("channels", [2, 3, 4])
+def test_16_bit_colour_is_rounded_to_8_bits(tmp_path, channels):
+    """Pillow keeps the high byte alone, up to a whole step below."""
+    values = np.random.default_rng(0).integers(0, 65536, (64, 1024, channels))
+    values[..., 0] = np.arange(65536).reshape(64, 1024)
     (tmp_path / "a.png").write_bytes(png16(values))
-    got = load_rgba(tmp_path / "a.png")[..., :channels]
-    np.testing.assert_allclose(got, values / 65535, atol=1.01 / 255)  # Pillow keeps the high byte
+    want = np.rint(values / 257)
+    want = want[..., [0, 0, 0, 1]] if channels == 2 else want
+    np.testing.assert_array_equal(load_rgba8(tmp_path / "a.png")[..., : want.shape[2]], want)
+    got = load_rgba(tmp_path / "a.png")[..., : want.shape[2]]
+    np.testing.assert_array_equal(got, (want / 255).astype(np.float32))
+
+
+def test_a_colour_near_the_transparent_one_stays(tmp_path):
+    """Both have one high byte."""
+    values = np.array([[[770, 770, 770], [771, 770, 770]]])
+    (tmp_path / "a.png").write_bytes(png16(values, [770] * 3))
+    assert load_rgba8(tmp_path / "a.png")[0, :, 3].tolist() == [0, 255]
+
+
+def chunked(name, data):
+    """Return a PNG with one more chunk."""
+    content = png16(np.full((2, 2, 3), 99), bits=8)
+    chunk = struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    return content[:33] + chunk + content[33:]
+
+
+def test_chunks_of_colour_that_are_not_read_are_named(tmp_path):
+    path = tmp_path / "a.png"
+    primaries = [31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000]
+    wide = [31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000]
+    for name, good, bad in ((b"gAMA", [45455], [100000]), (b"cHRM", primaries, wide)):
+        for values in (good, bad):
+            lines = []
+            path.write_bytes(chunked(name, struct.pack(f">{len(values)}I", *values)))
+            load_rgba(path, warn=lines.append)
+            text = f"{path}: its {name.decode()} chunk is not read; colours are taken for sRGB"
+            assert lines == ([text] if values is bad else [])
+    path.write_bytes(chunked(b"sRGB", b"\0"))
+    load_rgba(path, warn=lines.append)
+    assert len(lines) == 1  # of the last before
 
 
 def in_srgb(pixels, columns, gamma):
-    """Values of 0 to 255 of a space with a gamma, in sRGB."""
+    """Convert values of 0 to 255 of a space with a gamma to sRGB."""
     linear = (pixels / 255.0) ** gamma @ np.array(columns).T
     linear = np.clip(linear @ np.linalg.inv(SRGB).T, 0, 1)
     return 255 * np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -154,7 +189,7 @@ def test_a_profile_of_srgb_leaves_every_bit(tmp_path):
 @pytest.mark.parametrize("columns", [None, ADOBE_RGB], ids=["grey", "rgb"])
 @pytest.mark.parametrize("mode", ["L", "LA", "I;16"])
 def test_grey_has_profiles_too(tmp_path, mode, columns):
-    """And stays grey, as masks have to."""
+    """It stays grey, as masks must."""
     values = np.arange(256, dtype=np.uint8).reshape(16, 16)
     grey = Image.fromarray(257 * values.astype(np.uint16)) if mode == "I;16" else None
     if mode != "I;16":
@@ -252,7 +287,7 @@ def test_saved_pictures_come_back(tmp_path):
 
 
 def bare_png(width, height):
-    """A PNG whose header states a size, and that holds next to nothing."""
+    """Return a PNG whose header states a size, without the pixels."""
     return png16(np.zeros((1, 1, 3), int)).replace(
         *(
             b"IHDR" + data + zlib.crc32(b"IHDR" + data).to_bytes(4, "big")
@@ -286,7 +321,7 @@ def test_sizes_are_refused_by_the_header_without_a_warning(
 
 
 def test_only_a_few_formats_are_ever_opened(tmp_path, monkeypatch):
-    """Of PostScript, whatever its name, Pillow would have another program draw a picture."""
+    """Pillow would have another program draw a PostScript file of any name."""
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_: pytest.fail("Ghostscript"))
     postscript = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n"
     for suffix in ("png", "eps", "jpg"):
@@ -348,7 +383,7 @@ def test_every_exif_orientation(tmp_path, orientation):
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P", "1", "I;16", "F"])
 def test_large_pictures_are_reduced_by_whole_factors(tmp_path, mode):
-    """To no less than twice the length asked for, and as the mean of the whole picture."""
+    """The result has at least twice the requested length, and the mean of the whole picture."""
     pixels = np.zeros((120, 160), np.uint16 if mode == "I;16" else np.float32)
     pixels[:, :80] = 65535 if mode == "I;16" else 1
     if mode in ("I;16", "F"):

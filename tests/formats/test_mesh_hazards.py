@@ -1,4 +1,4 @@
-"""Mesh files that lie, name what is not theirs, or are large without need."""
+"""Mesh files with false headers, with names outside their folder, or far too large."""
 
 import base64
 import io
@@ -36,7 +36,10 @@ def ascii_ply(vertices, faces):
 
 CORNERS = ["0 0 0", "1 0 0", "0 1 0", "0 0 1"]
 BAD = {
-    "word_in_face.obj": (V + "f 1 2 3\nf 1 x 3\n", "line 6, 'f 1 x 3', is no vertex or face"),
+    "word_in_face.obj": (
+        V + "f 1 2 3\nf 1 x 3\n",
+        "line 6, 'f 1 x 3', is not a valid vertex or face",
+    ),
     "word_in_vertex.obj": (V + "v 1 0 zero\nf 1 2 3\n", "line 5, 'v 1 0 zero'"),
     "two_numbers.obj": (V + "v 1 0\nf 1 2 3\n", "line 5"),
     "corner_zero.obj": (V + "f 0 1 2\n", "line 5"),
@@ -95,7 +98,7 @@ def mixed(indices):
 
 
 def test_polygons_of_different_lengths(tmp_path):
-    """Such a file went to a native reader, which indices out of range killed."""
+    """Indices out of range crashed the native reader that once read such files."""
     path = tmp_path / "a.ply"
     path.write_bytes(mixed([[0, 1, 2], [0, 1, 2, 3]]))
     mesh = load_mesh(path)
@@ -201,7 +204,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("name", LIES)
-def test_gltf_that_lies(tmp_path, name):
+def test_invalid_gltf(tmp_path, name):
     folder = tmp_path / "inner"
     folder.mkdir()
     (tmp_path / "secret.bin").write_bytes(np.eye(3, dtype="<f4").tobytes())
@@ -240,8 +243,8 @@ def test_embedded_pictures_are_of_few_formats(tmp_path):
     assert load_mesh(path).materials[0].texture is None
 
 
-def test_faces_without_area_are_passed_over(tmp_path):
-    """Of one or two corners, as modellers leave them behind."""
+def test_faces_of_one_or_two_corners_are_ignored(tmp_path):
+    """They have one or two corners, as modellers leave them behind."""
     path = tmp_path / "a.obj"
     path.write_text(V + "f 1 2\nf 1 2 3\n  f 3/1/1 4/2/2 \r\nf 4\nf -4 -1\n")
     assert len(load_mesh(path).faces) == 1

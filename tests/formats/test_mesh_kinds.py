@@ -1,4 +1,4 @@
-"""OBJ, OFF, STL and PLY meshes as programs write them, by their right values."""
+"""OBJ, OFF, STL and PLY meshes as programs write them, compared with known values."""
 
 import struct
 
@@ -44,7 +44,7 @@ def loaded(folder, name, content):
 
 
 def places(mesh):
-    """The corners ``[F, 3, 3]``."""
+    """Return the corners ``[F, 3, 3]``."""
     return mesh.vertices[mesh.faces]
 
 
@@ -79,7 +79,7 @@ def test_concave_polygons_keep_their_area():
 
 
 def test_many_polygons_of_all_kinds_in_their_order():
-    """Convex ones stay fans; every polygon has the triangles of its own place."""
+    """Convex ones become fans; the triangles keep the order of the polygons."""
     arrow = np.array([[0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0]], float)
     points = np.concatenate([arrow, arrow + [5, 0, 0], np.pad(COMB, ((0, 0), (0, 1))) + [20, 0, 0]])
     polygons = [[4, 5, 6], [0, 1, 2, 3], [5, 6], [*range(8, 20)], [4, 5, 6, 7], [0, 1, 2], [1]]
@@ -93,18 +93,20 @@ def test_many_polygons_of_all_kinds_in_their_order():
     assert cut(ring, [[*range(6)]]).tolist() == fan
 
 
-def test_polygons_without_area_or_that_cut_themselves_are_cut_somehow():
+def test_polygons_without_area_or_that_intersect_themselves_are_cut_somehow():
     points = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 1, 0], [2, 2, 0], [3, 3, 0]], float)
     for polygon in ([0, 1, 2, 3], [0, 1, 4, 5], [0, 0, 1, 1], [0, 1, 0, 1, 2, 2, 0]):
         assert cut(points, [polygon]).shape == (len(polygon) - 2, 3)
 
 
-def test_too_many_concave_corners_are_spoken_of(monkeypatch):
+def test_too_many_concave_corners_are_named(monkeypatch):
     monkeypatch.setattr("gamba_warp.formats.parts.MAX_WORK", 4000)
     sides, points = SideFiles("a.obj"), np.pad(np.array(COMB, float), ((0, 0), (0, 1)))
     corners, lengths = np.tile(np.arange(12), 3), np.full(3, 12)
     assert cut_polygons(sides, points, corners, lengths).shape == (30, 3)
-    assert sides.warnings == ["polygons that are not convex are too many: some are false"]
+    assert sides.warnings == [
+        "too many concave polygons: some are triangulated as if they were convex"
+    ]
 
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "ply"])
@@ -123,7 +125,7 @@ def test_concave_polygons_of_files(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "ply"])
 def test_vertices_of_no_face_are_left_out(tmp_path, suffix):
-    """They moved and shrank the object in every picture."""
+    """Otherwise they move and shrink the object in every picture."""
     rows = ["9 9 9", *FOUR, "nan 0 0"]
     text = {
         "obj": "".join(f"v {row}\n" for row in rows) + "f 2 3 4 5\n",
@@ -168,7 +170,7 @@ def test_spellings_of_obj(tmp_path, name):
     ["v 1 0", "v 1 0 x", "v 1_0 0 0", "f 1 2 0", "f 1 2 +3", "f 1 2 3/", "f 1/2/3/4 2 3",
      "f /1 2 3", "f 1 2 " + 99 * "1", "vt", "vn 1 2", "f 1 2 3.0", "v 1 0 0\0", "f 1 2 1_0"],
 )  # fmt: skip
-def test_lines_of_obj_that_are_none(tmp_path, line):
+def test_invalid_lines_of_obj(tmp_path, line):
     if line == "f 1 2 3/":  # without a texture coordinate
         assert len(loaded(tmp_path, "a.obj", V + line).faces) == 1
         return
@@ -195,7 +197,7 @@ def test_colours_of_obj_of_any_range(tmp_path, numbers):
 
 
 def test_materials_of_obj(tmp_path):
-    """Two libraries on a line, one with a BOM; blanks in names; each face has its material."""
+    """Two libraries on a line, one with a BOM; blanks in names; a material for each face."""
     (tmp_path / "one.mtl").write_bytes("\ufeffnewmtl a b\nKd 1 0 0\n".encode())
     (tmp_path / "two.mtl").write_bytes(b"\tNEWMTL c\r\n\tkd 0 1 0\r\n\tKd 0 0 1\r\n")
     text = "mtllib one.mtl two.mtl\n" + V
@@ -333,7 +335,7 @@ def test_a_ply_of_one_face(tmp_path):
         assert len(loaded(tmp_path, "a.ply", content).faces) in (1, 2)
 
 
-def test_what_a_ply_has_beside_is_named(tmp_path):
+def test_further_elements_of_ply_are_named(tmp_path):
     text = ply(FOUR, ["4 0 1 2 3"]).replace(
         "end_header", "element edge 1\nproperty int a\nend_header"
     )
@@ -357,8 +359,8 @@ def test_textures_of_ply(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
-def test_colours_go_round(tmp_path, kind):
-    """Every display value, written and read: to 1/255, dark ones of .glb too."""
+def test_colours_round_trip(tmp_path, kind):
+    """Every display value comes back to 1/255, dark ones of .glb too."""
     values = np.arange(256)
     colors = np.stack([values, values[::-1], np.roll(values, 99)], 1)
     points = np.stack([np.cos(values), np.sin(values), values / 99], 1)
@@ -373,7 +375,7 @@ def test_colours_go_round(tmp_path, kind):
     np.testing.assert_allclose(viewed.colors[viewed.faces], colors[faces] / 255, atol=1.01 / 255)
 
 
-def test_colours_of_another_program_go_round(tmp_path):
+def test_colours_of_another_program(tmp_path):
     box = trimesh.creation.box()
     light = np.tile(to_linear(np.array([51, 128, 204]) / 255), (8, 1))
     box.visual.vertex_colors = np.rint(np.column_stack([light, np.ones(8)]) * 255).astype(np.uint8)

@@ -156,7 +156,7 @@ def test_transparency_of_mtl(tmp_path):
 
 
 def test_colour_profiles_of_textures(tmp_path):
-    """They count beside an .obj; glTF wants them ignored, as its renderers do."""
+    """They are used beside an .obj; glTF ignores them, as its renderers do."""
     path, image = write_quad(tmp_path), colours("RGB", (16, 16))
     image.save(tmp_path / "paint.png")
     before = load_mesh(path).materials[0].texture

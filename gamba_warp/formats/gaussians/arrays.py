@@ -1,4 +1,4 @@
-"""Gaussians as arrays that are fit to be written, and arrays of strangers as sound Gaussians."""
+"""Conversion and validation of Gaussians: arrays to write, and arrays of untrusted files."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ MAX_REACH = 1e18  # of means and scales: the squares of larger numbers overflow 
 MIN_SCALE = 1e-12  # keeps the logarithm of a scale finite
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}  # degree of the harmonics by their number K
 _NAMES = ("means", "quats", "scales", "opacities", "colors")
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices beside each index
 
 
 def flip_axes(gaussians: Gaussians) -> Gaussians:
-    """From OpenCV's axes (y down, z forward) to OpenGL's (y up, z backward), and back."""
+    """Turn from OpenCV's axes (y down, z forward) to OpenGL's (y up, z backward), or back."""
     half_turn = torch.diag(gaussians.means.new_tensor([1.0, -1.0, -1.0]))
     return gaussians.transformed(half_turn, gaussians.means.new_zeros(3))
 
@@ -26,12 +27,12 @@ def flip_axes(gaussians: Gaussians) -> Gaussians:
 def export_arrays(
     path: str | Path, gaussians: Gaussians, axes: Axes = "opencv"
 ) -> dict[str, np.ndarray]:
-    """One object's Gaussians as float32 arrays fit to be written: finite, quaternions normalised.
+    """Return one object's Gaussians as float32 arrays: finite, quaternions normalised.
 
     Args:
         path: named in errors.
-        gaussians: one object, no batch dimension.
-        axes: those of the format; those of ``gaussians`` are OpenCV's.
+        gaussians: one object in OpenCV's axes, no batch dimension.
+        axes: axes of the format.
 
     Returns:
         ``means [N, 3]``, ``quats [N, 4]`` wxyz, ``scales [N, 3]``, ``opacities [N]``,
@@ -42,9 +43,8 @@ def export_arrays(
         UserError: a value is not finite, or there is no Gaussian.
     """
     if gaussians.opacities.dim() != 1:
-        raise ValueError(
-            f"one object expected, got leading shape {tuple(gaussians.opacities.shape[:-1])}"
-        )
+        shape = tuple(gaussians.opacities.shape[:-1])
+        raise ValueError(f"one object expected, got leading shape {shape}")
     if gaussians.num == 0:
         raise UserError(f"{path}: not written, there is no Gaussian")
     gaussians = gaussians.detach().to("cpu", torch.float32)
@@ -52,11 +52,9 @@ def export_arrays(
         gaussians = flip_axes(gaussians)
     if gaussians.quats is None:
         gaussians.quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(gaussians.num, 4)
-    arrays = {name: getattr(gaussians, name).numpy() for name in _NAMES}
-    harmonics = gaussians.harmonics
-    arrays["harmonics"] = (
-        np.zeros((gaussians.num, 0, 3), np.float32) if harmonics is None else harmonics.numpy()
-    )
+    if gaussians.harmonics is None:
+        gaussians.harmonics = torch.zeros(gaussians.num, 0, 3)
+    arrays = {name: getattr(gaussians, name).numpy() for name in (*_NAMES, "harmonics")}
     bad = sum(~np.isfinite(value.reshape(gaussians.num, -1)).all(1) for value in arrays.values())
     if np.any(bad):
         count = np.count_nonzero(bad)
@@ -66,43 +64,41 @@ def export_arrays(
     return arrays
 
 
-def sound_gaussians(
+def checked_gaussians(
     path: str | Path, arrays: dict[str, np.ndarray], left_out: list[str] | None = None
 ) -> Gaussians:
-    """Arrays of a file, activated values in any order of bytes, as one object.
+    """Validate the activated values of a file, and return them as one object.
 
     Without harmonics colours are clipped to [0, 1]; with them a base colour may lie outside.
 
     Args:
         path: named in errors.
-        arrays: as ``export_arrays`` returns them; ``harmonics`` may be missing, quaternions may
-            have any length > 0.
-        left_out: gets a line of how many Gaussians are left out because they cannot be drawn: a
-            value that is not finite, means or scales over ``MAX_REACH``, a scale below 0, or a
-            rotation of length zero. None: a file that has one is refused.
+        arrays: as ``export_arrays`` returns them, in any byte order; ``harmonics`` may be missing,
+            quaternions may have any length > 0.
+        left_out: receives one line that counts the Gaussians left out because they cannot be
+            drawn: a value that is not finite, means or scales over ``MAX_REACH``, a scale below 0,
+            or a rotation of length zero. None: a file with such Gaussians is refused.
 
     Returns:
         Float32 Gaussians on the CPU, ``quats`` normalised.
 
     Raises:
-        UserError: no Gaussian, none that can be drawn, or one that cannot where ``left_out`` is
-            None.
+        UserError: there is no Gaussian, none can be drawn, or one cannot and ``left_out`` is None.
     """
-    values: dict[str, torch.Tensor] = {}
-    odd: dict[str, torch.Tensor] = {}  # the Gaussians whose value of a name is not finite
     count = len(arrays["opacities"])
     if count == 0:
         raise UserError(f"{path}: holds no Gaussians")
+    values: dict[str, torch.Tensor] = {}
+    finite: dict[str, torch.Tensor] = {}  # [N], by attribute
     for name, array in arrays.items():
+        if not array.size:  # harmonics of degree 0
+            continue
         with np.errstate(over="ignore"):
             array = np.ascontiguousarray(array, np.float32)
         values[name] = torch.from_numpy(array if array.flags.writeable else array.copy())
-        finite = torch.from_numpy(np.isfinite(array.reshape(count, -1)).all(1))
-        if not finite.all():
-            odd[name] = ~finite
-    checks: dict[str, torch.Tensor] = {}
-    if odd:
-        checks[f"{' or '.join(odd)} that are not finite"] = torch.stack([*odd.values()]).any(0)
+        finite[name] = values[name].reshape(count, -1).isfinite().all(1)
+    odd = " or ".join(name for name, which in finite.items() if not which.all())
+    checks = {f"{odd} that are not finite": ~torch.stack([*finite.values()]).all(0)}
     for name in ("means", "scales"):
         far = (values[name].abs() > MAX_REACH) & values[name].isfinite()
         checks[f"{name} over {MAX_REACH:g}"] = far.any(1)
@@ -118,22 +114,34 @@ def sound_gaussians(
             raise UserError(f"{path}: {line}{advice}")
         left_out.append(f"{line}: left out")
         values = {name: value[keep] for name, value in values.items()}
-    harmonics = values.get("harmonics")
-    if harmonics is not None and harmonics.shape[1] == 0:
-        harmonics = None
-    colors = values["colors"]
-    return Gaussians(
-        means=values["means"],
-        quats=_unit(values["quats"]),
-        scales=values["scales"],
-        opacities=values["opacities"].clamp(0, 1),
-        colors=colors.clamp(0, 1) if harmonics is None else colors,
-        harmonics=harmonics,
-    )
+    values["quats"] = _unit(values["quats"])
+    values["opacities"] = values["opacities"].clamp(0, 1)
+    if "harmonics" not in values:
+        values["colors"] = values["colors"].clamp(0, 1)
+    return Gaussians(**values)
+
+
+def rest_names(count: int) -> tuple[str, ...]:
+    """Return the names of a ``.ply``'s properties for ``count`` coefficients of the harmonics."""
+    return tuple(f"f_rest_{i}" for i in range(count))
+
+
+def harmonics_of(path: str | Path, rest: np.ndarray) -> np.ndarray:
+    """Return the columns ``f_rest_*`` of a ``.ply``, ``[N, 3 K]``, as harmonics ``[N, K, 3]``.
+
+    Raises:
+        UserError: they are not of degree 0 to 3.
+    """
+    count = rest.shape[1]
+    if count not in (0, 9, 24, 45):
+        raise UserError(
+            f"{path}: {count} properties f_rest_*; harmonics of degree 1, 2 and 3 have 9, 24 and 45"
+        )
+    return rest.reshape(len(rest), 3, count // 3).transpose(0, 2, 1)
 
 
 def _unit(quats: torch.Tensor) -> torch.Tensor:
-    """Quaternions of length 1, of such that are not zero."""
+    """Normalise nonzero quaternions."""
     lengths = quats.norm(dim=1, keepdim=True)
     odd = ((lengths == 0) | ~lengths.isfinite())[:, 0]  # the squares leave float32's range
     if odd.any():
@@ -143,28 +151,21 @@ def _unit(quats: torch.Tensor) -> torch.Tensor:
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The place of the largest number of each quaternion, and the other three.
+    """Split unit quaternions ``[N, 4]`` into the index of the largest number and the other three.
 
-    A quaternion and its negative are one rotation: the largest is made positive.
-
-    Args:
-        quats: ``[N, 4]``, unit.
+    The sign is chosen so that the largest number is positive.
 
     Returns:
         ``[N]`` int64, and ``[N, 3]`` within ±1/√2, in their order.
     """
-    largest = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    sign = np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = np.stack([np.delete(np.arange(4), place) for place in range(4)])[largest]
-    return largest, quats[rows[:, None], others] * sign
+    largest = np.abs(quats).argmax(1)[:, None]
+    sign = np.where(np.take_along_axis(quats, largest, 1) < 0, -1.0, 1.0)
+    return largest[:, 0], np.take_along_axis(quats, _OTHERS[largest[:, 0]], 1) * sign
 
 
 def from_smallest_three(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
-    """The quaternions ``[N, 4]`` of ``smallest_three``."""
-    others = np.stack([np.delete(np.arange(4), place) for place in range(4)])[largest]
-    rows = np.arange(len(three))
+    """Return the quaternions ``[N, 4]`` of ``smallest_three``."""
     quats = np.empty((len(three), 4))
-    quats[rows[:, None], others] = three
-    quats[rows, largest] = np.sqrt(np.maximum(0.0, 1.0 - (three**2).sum(1)))
+    np.put_along_axis(quats, _OTHERS[largest], three, 1)
+    quats[np.arange(len(three)), largest] = np.sqrt(np.maximum(0.0, 1.0 - (three**2).sum(1)))
     return quats

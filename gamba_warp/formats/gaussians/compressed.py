@@ -4,7 +4,7 @@ A chunk states the bounds of its positions, of the logarithms of its scales and 
 Gaussian is four 32-bit words: position and scale with 11, 10 and 11 bits between the chunk's
 bounds, the rotation as its three smaller numbers with 10 bits each behind 2 bits that name the
 largest, colour and opacity with 8 bits. Harmonics are 8 bits each, in [-4, 4]. Neighbours in space
-are put into one chunk, so that its bounds are narrow.
+share a chunk, so that its bounds are narrow.
 """
 
 from __future__ import annotations
@@ -14,45 +14,38 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import UserError
-from ..ply_data import PlyData
-from ..ply_header import PlyHeader
-from .arrays import MIN_SCALE, from_smallest_three, smallest_three
+from ..ply_data import PlyData, PlyHeader
+from .arrays import MIN_SCALE, from_smallest_three, harmonics_of, rest_names, smallest_three
 
 CHUNK = 256
 _REACH = 4.0  # of a harmonic's coefficient
-_LOW = ("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")
-_SCALES = (
-    ("min_scale_x", "min_scale_y", "min_scale_z"),
-    ("max_scale_x", "max_scale_y", "max_scale_z"),
+_MEANS, _SCALES, _COLORS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
+BOUNDS = tuple(
+    f"{end}_{name}"
+    for names in (_MEANS, _SCALES, _COLORS)
+    for end in ("min", "max")
+    for name in names
 )
-_COLORS = ("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")
-BOUNDS = tuple(name for pair in (_LOW, _SCALES, _COLORS) for names in pair for name in names)
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _MAX_LOG = 20.0  # of a scale, as PlayCanvas has it
 
 
 def is_compressed(header: PlyHeader) -> bool:
-    """Whether a header's vertices are packed."""
-    return any(
-        element.name == "vertex" and any(item.name in WORDS for item in element.properties)
-        for element in header.elements
-    )
+    """Return True if a header's vertices are packed."""
+    vertices = (element.properties for element in header.elements if element.name == "vertex")
+    return any(item.name in WORDS for properties in vertices for item in properties)
 
 
 def packed(arrays: dict[str, np.ndarray]) -> tuple[list[str], bytes, bool]:
-    """Packs one object's arrays.
-
-    Args:
-        arrays: as ``export_arrays`` returns them.
+    """Pack one object's arrays of ``export_arrays``.
 
     Returns:
-        The header's lines of the elements, the bytes of the elements, and whether a coefficient of
+        The header's lines of the elements, the bytes of the elements, and True if a coefficient of
         the harmonics was clipped.
     """
-    order = _along_a_curve(arrays["means"])
+    order = _morton_order(arrays["means"])
     count = len(order)
-    chunks = -(-count // CHUNK)
-    starts = np.arange(0, count, CHUNK)
+    starts, at = np.arange(0, count, CHUNK), np.arange(count) // CHUNK
     rgb = arrays["colors"][order].astype(np.float64)
     logs = np.log(arrays["scales"][order].clip(MIN_SCALE).astype(np.float64))
     logs = logs.clip(-_MAX_LOG, _MAX_LOG)
@@ -62,7 +55,6 @@ def packed(arrays: dict[str, np.ndarray]) -> tuple[list[str], bytes, bool]:
         high = np.maximum.reduceat(values, starts).astype("<f4")
         bounds += [low, high]
         wide = np.maximum(high.astype(np.float64) - low, 1e-30)
-        at = np.repeat(np.arange(chunks), CHUNK)[:count]
         steps.append(((values - low[at]) / wide[at]).clip(0, 1))
     largest, three = smallest_three(arrays["quats"][order].astype(np.float64))
     opacities = arrays["opacities"][order].astype(np.float64).clip(0, 1)[:, None]
@@ -74,26 +66,25 @@ def packed(arrays: dict[str, np.ndarray]) -> tuple[list[str], bytes, bool]:
             _join(np.hstack([steps[2], opacities]), (8, 8, 8, 8)),
         ]
     ).astype("<u4")
-    lines = [f"element chunk {chunks}", *(f"property float {name}" for name in BOUNDS)]
+    lines = [f"element chunk {len(starts)}", *(f"property float {name}" for name in BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in WORDS)]
     rest = arrays["harmonics"][order].transpose(0, 2, 1).reshape(count, -1)
     if rest.shape[1]:
         lines += [f"element sh {count}"]
-        lines += [f"property uchar f_rest_{i}" for i in range(rest.shape[1])]
+        lines += [f"property uchar {name}" for name in rest_names(rest.shape[1])]
     eighths = np.floor((rest / (2 * _REACH) + 0.5) * 256).clip(0, 255).astype(np.uint8)
     body = np.hstack(bounds).astype("<f4").tobytes() + words.tobytes() + eighths.tobytes()
     return lines, body, bool((np.abs(rest) > _REACH).any())
 
 
 def unpacked(path: Path, data: PlyData) -> dict[str, np.ndarray]:
-    """The arrays of a compressed file, as ``sound_gaussians`` takes them.
+    """Return the arrays of a compressed file for ``checked_gaussians``.
 
     Raises:
         UserError: an element or a property is missing, or their numbers do not fit.
     """
     words = _table(path, data, "vertex", WORDS, np.uint32)
     count = len(words)
-    chunks = data.elements.get("chunk", {})
     wanted = -(-count // CHUNK)
     there = sum(element.count for element in data.header.elements if element.name == "chunk")
     if there != wanted:
@@ -101,11 +92,11 @@ def unpacked(path: Path, data: PlyData) -> dict[str, np.ndarray]:
             f"{path}: false header, {count} packed vertices have {wanted} chunks, not {there}"
         )
     at = np.arange(count) // CHUNK
-    means = _between(path, data, _LOW, at, _split(words[:, 0], (11, 10, 11)))
+    means = _between(path, data, _MEANS, at, _split(words[:, 0], (11, 10, 11)))
     logs = _between(path, data, _SCALES, at, _split(words[:, 2], (11, 10, 11)))
     rgba = _split(words[:, 3], (8, 8, 8, 8))
     colors = rgba[:, :3]
-    if "min_r" in chunks:  # early writers kept colours without bounds
+    if "min_r" in data.elements.get("chunk", {}):  # early writers kept colours without bounds
         colors = _between(path, data, _COLORS, at, colors)
     three = (_split(words[:, 1] & 0x3FFFFFFF, (10, 10, 10)) - 0.5) * np.sqrt(2)
     with np.errstate(over="ignore"):
@@ -121,27 +112,20 @@ def unpacked(path: Path, data: PlyData) -> dict[str, np.ndarray]:
 
 
 def _harmonics(path: Path, data: PlyData, count: int) -> np.ndarray:
-    found = data.elements.get("sh", {})
-    if not found:
+    if not (found := data.elements.get("sh", {})):
         return np.zeros((count, 0, 3))
-    if len(found) not in (9, 24, 45):
-        raise UserError(
-            f"{path}: {len(found)} properties f_rest_*; "
-            "harmonics of degree 1, 2 and 3 have 9, 24 and 45"
-        )
-    table = _table(path, data, "sh", tuple(f"f_rest_{i}" for i in range(len(found))), np.uint8)
+    table = _table(path, data, "sh", rest_names(len(found)), np.uint8)
     if len(table) != count:
         raise UserError(f"{path}: false header, {count} vertices but {len(table)} harmonics")
     # The middle of each step, but the ends are the ends.
     middle = np.where(table == 0, 0.0, np.where(table == 255, 1.0, (table + 0.5) / 256))
-    values = (middle - 0.5) * 2 * _REACH
-    return values.reshape(count, 3, -1).transpose(0, 2, 1)
+    return harmonics_of(path, (middle - 0.5) * 2 * _REACH)
 
 
 def _table(
     path: Path, data: PlyData, element: str, names: tuple[str, ...], kind: type
 ) -> np.ndarray:
-    """``[N, C]``, properties of one type. Raises UserError where one is missing or another."""
+    """Return ``[N, C]``. Raises UserError if a property is missing or of another type."""
     found = data.elements.get(element, {})
     for name in names:
         column = found.get(name)
@@ -151,17 +135,21 @@ def _table(
 
 
 def _between(
-    path: Path, data: PlyData, pair: tuple, at: np.ndarray, steps: np.ndarray
+    path: Path, data: PlyData, names: tuple[str, ...], at: np.ndarray, steps: np.ndarray
 ) -> np.ndarray:
-    low, high = (_table(path, data, "chunk", names, np.float32)[at] for names in pair)
-    with np.errstate(all="ignore"):  # a stranger's bounds; the result is checked
+    """Interpolate from the minima to the maxima of the chunks ``at``."""
+    low, high = (
+        _table(path, data, "chunk", tuple(f"{end}_{name}" for name in names), np.float32)[at]
+        for end in ("min", "max")
+    )
+    with np.errstate(all="ignore"):  # untrusted bounds; the result is checked
         values = low.astype(np.float64) * (1 - steps) + high.astype(np.float64) * steps
-    # Nothing lies between bounds of which one is infinite.
+    # Nothing lies between bounds if one is infinite.
     return np.where(np.isfinite(low) & np.isfinite(high), values, np.nan)
 
 
 def _join(steps: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Columns in [0, 1] as one 32-bit word, the first in the highest bits."""
+    """Pack columns in [0, 1] into one 32-bit word, the first in the highest bits."""
     word = np.zeros(len(steps), np.uint32)
     for column, width in zip(steps.T, bits):
         most = (1 << width) - 1
@@ -171,7 +159,7 @@ def _join(steps: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 
 def _split(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """The columns of ``_join``, float64 in [0, 1]."""
+    """Return the columns of ``_join``, float64 in [0, 1]."""
     columns, shift = [], sum(bits)
     for width in bits:
         shift -= width
@@ -180,8 +168,8 @@ def _split(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     return np.stack(columns, 1)
 
 
-def _along_a_curve(means: np.ndarray) -> np.ndarray:
-    """The order of places along Morton's curve, on a grid of 1024 a side."""
+def _morton_order(means: np.ndarray) -> np.ndarray:
+    """Return the order of positions along Morton's curve, on a grid of 1024 a side."""
     low = means.min(0)
     wide = np.maximum(means.max(0).astype(np.float64) - low, 1e-30)
     grid = ((means - low) / wide * 1023).clip(0, 1023).astype(np.uint32)

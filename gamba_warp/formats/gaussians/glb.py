@@ -1,8 +1,8 @@
-"""Gaussians as binary glTF with the Khronos extension ``KHR_gaussian_splatting``.
+"""Gaussians in binary glTF by the Khronos extension ``KHR_gaussian_splatting``.
 
 Scales are linear (early drafts of the extension stored logarithms), quaternions xyzw, axes +y up.
-Colours are those of a display, as the extension's ``srgb_rec709_display`` says; ``COLOR_0``, which
-lets a viewer without the extension show coloured points, is linear light, as glTF has it.
+Colours are display values, as the extension's ``srgb_rec709_display`` says; ``COLOR_0``, by which a
+viewer without the extension shows coloured points, is linear light, as glTF has it.
 """
 
 from __future__ import annotations
@@ -10,38 +10,38 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+import torch
+from torch.nn import functional as F
 
+from ...errors import UserError
 from ...files import atomic_path
 from ...gaussians import SH_C0, Gaussians
 from ...versions import __version__
+from ..gltf_file import Entry, GltfFile, Index, open_gltf
+from ..headers import open_shape
 from ..materials import to_linear
-from .arrays import DEGREES, export_arrays
+from .arrays import DEGREES, checked_gaussians, export_arrays, flip_axes
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"
 FLOAT = 5126
 POINTS = 0
+_STRAIGHT = 1e-4  # largest deviation of a node's matrix from a rotation times a number
 _ARRAY_BUFFER = 34962
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def harmonic_names(degree: int) -> list[str]:
     """Names of the attributes of the harmonics of degrees 1 to ``degree``, in their order."""
-    return [
-        f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}"
-        for l in range(1, degree + 1)
-        for n in range(2 * l + 1)
-    ]
+    pairs = [(l, n) for l in range(1, degree + 1) for n in range(2 * l + 1)]
+    return [f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}" for l, n in pairs]
 
 
 def save_glb(path: str | Path, gaussians: Gaussians) -> None:
-    """Writes one object as ``.glb``, turned to glTF's axes (+y up, front towards +z), atomically.
-
-    Args:
-        path: file to write.
-        gaussians: one object, no batch dimension.
+    """Write one object as ``.glb``, turned to glTF's axes (+y up, front towards +z), atomically.
 
     Raises:
         UserError: a value is not finite, there is no Gaussian, or the file cannot be written.
@@ -64,20 +64,13 @@ def save_glb(path: str | Path, gaussians: Gaussians) -> None:
     views, accessors, parts, offset = [], [], [], 0
     for value in attributes.values():
         part = value.astype("<f4")
-        views.append(
-            {"buffer": 0, "byteOffset": offset, "byteLength": part.nbytes, "target": _ARRAY_BUFFER}
-        )
-        accessors.append(
-            {
-                "bufferView": len(accessors),
-                "componentType": FLOAT,
-                "count": len(part),
-                "type": _TYPES[part.shape[1]],
-            }
-        )
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": part.nbytes}
+        accessor = {"bufferView": len(views), "componentType": FLOAT, "count": len(part)}
+        views.append(view | {"target": _ARRAY_BUFFER})
+        accessors.append(accessor | {"type": _TYPES[part.shape[1]]})
         parts.append(part.tobytes())
         offset += part.nbytes
-    # The format asks for bounds of POSITION, of the values as they are rounded.
+    # glTF requires bounds of POSITION, of the rounded values.
     means = attributes["POSITION"].astype("<f4")
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
     primitive = {
@@ -103,3 +96,126 @@ def save_glb(path: str | Path, gaussians: Gaussians) -> None:
     chunks += struct.pack("<I4s", offset, b"BIN\0") + b"".join(parts)
     with atomic_path(path) as temporary:
         temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def holds_gaussians(path: Path, file: BinaryIO, size: int) -> bool:
+    """Return True if a .glb file has a primitive with the extension; False if it is damaged."""
+    try:
+        meshes = open_gltf(path, file, size).document.entries("meshes")
+        return any(_splats(mesh) for mesh in meshes)
+    except UserError:
+        return False
+
+
+def _splats(mesh: Entry) -> list[Entry]:
+    """Return the primitives of a mesh that have the extension."""
+    return [p for p in mesh.entries("primitives") if EXTENSION in p.entry("extensions").values]
+
+
+def load_glb(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
+    """Read all Gaussians of a ``.glb``'s scene, moved by its nodes, as one object.
+
+    ``left_out`` as for ``checked_gaussians``, with a line for each primitive.
+
+    Raises:
+        UserError: the file is missing, not a ``.glb``, truncated, malformed or without Gaussians,
+            an attribute is missing or of another type, the colour space is another, a node
+            stretches or mirrors, or the values are invalid.
+    """
+    path = Path(path)
+    with open_shape(path) as (stream, size):
+        file = open_gltf(path, stream, size)
+    parts = []
+    for node, _, matrix in file.placed_nodes():
+        index = node.get("mesh", Index)
+        found = [] if index is None else _splats(file.item("meshes", index))
+        for primitive in found:
+            part = _primitive(file, primitive, left_out)
+            poses = matrix @ file.instances(node)
+            parts += [_moved(path, part, pose, left_out) for pose in poses]
+    if not parts:
+        raise UserError(f"{path}: no Gaussians in it (no primitive has {EXTENSION})")
+    return flip_axes(_joined(parts))
+
+
+def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> Gaussians:
+    """Return the Gaussians of one primitive in its own frame."""
+    path, options = file.path, primitive.entry("extensions").entry(EXTENSION).values
+    mode, given = primitive.get("mode", int, 4), primitive.entry("attributes")
+    if options.get("extensions"):
+        names = ", ".join(str(name)[:60] for name in options["extensions"])
+        raise UserError(f"{path}: its Gaussians are packed by {names[:200]}, which is not read")
+    space, kernel = options.get("colorSpace", COLOR_SPACE), options.get("kernel", "ellipse")
+    if space != COLOR_SPACE or kernel != "ellipse" or mode != POINTS:
+        raise UserError(
+            f"{path}: Gaussians of colour space {str(space)[:40]!r}, kernel {str(kernel)[:40]!r} "
+            f"and mode {mode}; only {COLOR_SPACE}, ellipse and {POINTS} are read"
+        )
+
+    def read(name: str, width: int) -> np.ndarray:
+        if name not in given.values:
+            raise UserError(f"{path}: the Gaussians have no {name}")
+        index = given.need(name, Index)
+        values = file.values(index)
+        accessor = file.item("accessors", index).values
+        if values.shape[1] != width or "bufferView" not in accessor:
+            raise UserError(f"{path}: {name} is of type {accessor['type']}, or has no data")
+        return values.astype(np.float64)
+
+    degree = 0
+    while f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in given.values:
+        degree += 1
+    if degree > 3:
+        raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are read")
+    arrays = {
+        "means": read("POSITION", 3),
+        "quats": np.roll(read(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
+        "scales": read(f"{EXTENSION}:SCALE", 3),
+        "opacities": read(f"{EXTENSION}:OPACITY", 1)[:, 0],
+        "colors": read(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3) * SH_C0 + 0.5,
+    }
+    harmonics = [read(name, 3) for name in harmonic_names(degree)]
+    counts = {name: len(value) for name, value in arrays.items()}
+    counts |= {f"coefficient {i}": len(value) for i, value in enumerate(harmonics)}
+    if len(set(counts.values())) > 1:
+        raise UserError(f"{path}: false header, its attributes have {counts} values")
+    if harmonics:
+        arrays["harmonics"] = np.stack(harmonics, 1)
+    if (arrays["scales"] < 0).any():
+        raise UserError(
+            f"{path}: scales below 0; a draft of {EXTENSION} stored logarithms, which is not read"
+        )
+    return checked_gaussians(path, arrays, left_out)
+
+
+def _moved(
+    path: Path, gaussians: Gaussians, matrix: np.ndarray, left_out: list[str] | None
+) -> Gaussians:
+    """Return the Gaussians moved by a node. Raises UserError if it stretches or mirrors."""
+    if not np.isfinite(matrix).all():
+        raise UserError(f"{path}: a node's place is not finite")
+    if (matrix == np.eye(4)).all():
+        return gaussians
+    with np.errstate(all="ignore"):
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        turn = matrix[:3, :3] / scale
+        straight = np.abs(turn @ turn.T - np.eye(3)).max() < _STRAIGHT
+    if not (scale > 0 and straight):
+        raise UserError(f"{path}: a node stretches or mirrors its Gaussians, which is not read")
+    moved = gaussians.transformed(
+        torch.from_numpy(turn).float(), torch.from_numpy(matrix[:3, 3].copy()).float(), scale
+    )
+    arrays = {name: value.numpy() for name, value in vars(moved).items() if value is not None}
+    return checked_gaussians(path, arrays, left_out)
+
+
+def _joined(parts: list[Gaussians]) -> Gaussians:
+    """Join all parts to one object; harmonics of lower degrees are padded with zeros."""
+    if len(parts) == 1:
+        return parts[0]
+    most = max(0 if part.harmonics is None else part.harmonics.shape[1] for part in parts)
+    for part in parts if most else ():
+        own = torch.zeros(part.num, 0, 3) if part.harmonics is None else part.harmonics
+        part.harmonics = F.pad(own, (0, 0, 0, most - own.shape[1]))
+    names = [name for name, value in vars(parts[0]).items() if value is not None]
+    return Gaussians(**{name: torch.cat([getattr(p, name) for p in parts]) for name in names})

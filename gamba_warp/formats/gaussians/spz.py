@@ -1,10 +1,10 @@
 """Gaussians as ``.spz``, Niantic's packed format: a tenth of a ``.ply``, read by most viewers.
 
-After a header come, each for all Gaussians: positions as 24-bit fixed point, opacities and colours
-with 8 bits, logarithms of the scales with 8 bits, rotations, harmonics with 8 bits. Version 1 has
-positions of 16-bit floats, versions 1 and 2 other rotations; version 4 has the numbers of version 3
-in another container (``spz_container.py``). All four are read. Version 3 is written: every reader
-that is looked after takes it. Axes are OpenGL's.
+The header is followed by, each for all Gaussians: positions as 24-bit fixed point, opacities and
+colours with 8 bits, logarithms of the scales with 8 bits, rotations, harmonics with 8 bits. Version
+1 has positions of 16-bit floats, versions 1 and 2 other rotations; version 4 has the numbers of
+version 3 in another container (``spz_container.py``). All four are read; version 3, which every
+maintained reader takes, is written. Axes are OpenGL's.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ..headers import open_shape
 from .arrays import (
     DEGREES,
     MIN_SCALE,
+    checked_gaussians,
     export_arrays,
     flip_axes,
     from_smallest_three,
     smallest_three,
-    sound_gaussians,
 )
 from .spz_container import COUNTS, HEADER, MAGIC, unpacked
 
@@ -36,14 +36,10 @@ _HALF = 511  # largest of the 9 bits of a rotation's number
 
 
 def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
-    """Writes one object as ``.spz``, version 3, turned to the format's axes, atomically.
-
-    Args:
-        path: file to write.
-        gaussians: one object, no batch dimension.
+    """Write one object as ``.spz``, version 3, turned to the format's axes, atomically.
 
     Returns:
-        A sentence about what is lost beyond the format's precision, or None.
+        A sentence about losses beyond the format's precision, or None.
 
     Raises:
         UserError: a value is not finite, there is no Gaussian, positions are out of the format's
@@ -78,14 +74,13 @@ def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
 
 
 def load_spz(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
-    """Reads an ``.spz`` file of version 1 to 4, from this or another program, as one object.
+    """Read an ``.spz`` file of version 1 to 4, from this or another program, as one object.
 
-    ``left_out`` as for ``sound_gaussians``.
+    ``left_out`` as for ``checked_gaussians``.
 
     Raises:
-        UserError: not a file, not ``.spz``, of another version, truncated or longer than it says,
-            or values that are not those of Gaussians; or version 4, and ``backports.zstd`` is
-            missing where Python has no ZSTD of its own.
+        UserError: the file is missing, not ``.spz``, of another version, truncated or longer than
+            it states, or its values are invalid; or version 4 without a module for ZSTD.
     """
     path = Path(path)
     with open_shape(path) as (file, _):
@@ -109,20 +104,14 @@ def load_spz(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     colors = (take("u1", 3) / 255 - 0.5) / _COLOR * SH_C0 + 0.5
     scales = np.exp(take("u1", 3) / 16 - 10)
     if found.version > 2:
-        quats = _smallest(take("<u4"))
+        quats = _unpacked_quats(take("<u4"))
     else:
         xyz = take("u1", 3) / 127.5 - 1
         quats = np.column_stack([np.sqrt(np.maximum(0.0, 1 - (xyz**2).sum(1))), xyz])
-    harmonics = (take("u1", K, 3).astype(np.float64) - 128) / 128
-    arrays = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-        "harmonics": harmonics,
-    }
-    return flip_axes(sound_gaussians(path, arrays, left_out))
+    arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    arrays["colors"] = colors
+    arrays["harmonics"] = (take("u1", K, 3).astype(np.float64) - 128) / 128
+    return flip_axes(checked_gaussians(path, arrays, left_out))
 
 
 def _bytes(values: np.ndarray) -> bytes:
@@ -130,7 +119,7 @@ def _bytes(values: np.ndarray) -> bytes:
 
 
 def _packed_quats(quats: np.ndarray) -> bytes:
-    """The three smaller numbers of xyzw with a sign and 9 bits each, behind the largest's place."""
+    """Pack the largest number's index, and of the others of xyzw a sign and 9 bits each."""
     largest, three = smallest_three(np.roll(quats.astype(np.float64), -1, axis=1))
     size = np.floor(np.abs(three) * np.sqrt(2) * _HALF + 0.5).clip(0, _HALF).astype(np.uint32)
     word = largest.astype(np.uint32)
@@ -139,7 +128,7 @@ def _packed_quats(quats: np.ndarray) -> bytes:
     return word.astype("<u4").tobytes()
 
 
-def _smallest(words: np.ndarray) -> np.ndarray:
+def _unpacked_quats(words: np.ndarray) -> np.ndarray:
     words = words.astype(np.uint32)
     columns = []
     for shift in (20, 10, 0):

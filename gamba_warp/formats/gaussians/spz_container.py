@@ -1,9 +1,9 @@
-"""What holds the numbers of an ``.spz``: one gzip stream (versions 1 to 3), or ZSTD streams (4).
+"""Containers of an ``.spz``: one gzip stream (versions 1 to 3), or ZSTD streams (version 4).
 
 Version 4 has a plain header of 32 bytes, records of extensions, a table of contents with the packed
 and the unpacked size of each stream, and then the streams: positions, opacities, colours, scales,
-rotations, and harmonics where there are any. All sizes follow from the header, so they are compared
-before anything is unpacked, and no more is unpacked than they say.
+rotations, and harmonics if any. All sizes follow from the header: they are compared before
+anything is unpacked, and no more is unpacked than they say.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ENTRY = struct.Struct("<QQ")  # of that table: bytes packed, bytes unpacked
 _MAX_RATIO = 1040  # deflate packs at most 1032 to 1; of ZSTD the reference takes 1024 to 1
 _MAX_BITS = 30  # behind the point
 _MORE = 2  # flag: extensions follow
-_MAX_EXTENSIONS = 1 << 20  # bytes of them that are looked at
+_MAX_EXTENSIONS = 1 << 20  # bytes of them that are read
 _RECORD = struct.Struct("<II")  # of an extension: kind, and bytes that follow
 _SYSTEM, _RUB = 0xADBE0003, 4  # the extension that names the axes; 4 is OpenGL's, 0 names none
 _WINDOW = 27  # log2 of the memory that a ZSTD decoder gives to any frame
@@ -37,7 +37,7 @@ COUNTS = {degree: count for count, degree in DEGREES.items()}
 
 @dataclass
 class Unpacked:
-    """The numbers of an ``.spz``, all of one kind after the other, and how to read them."""
+    """Numbers of an ``.spz``, all of one kind after the other, and the header's values."""
 
     body: bytes | bytearray
     version: int
@@ -47,24 +47,19 @@ class Unpacked:
 
 
 def unpacked(path: Path, content: bytes) -> Unpacked:
-    """The numbers of a file of any version, as many as its header says.
+    """Return the numbers of a file of any version, as many as its header states.
 
     Raises:
-        UserError: not ``.spz``, damaged, truncated, or the header is false or of another kind; or
-            version 4, and nothing here unpacks ZSTD.
+        UserError: not ``.spz``, damaged, truncated, or the header is malformed or of another
+            version; or version 4 without a module for ZSTD.
     """
-    if content.startswith(MAGIC):
-        return _from_streams(path, content)
-    return _from_gzip(path, content)
+    return (_from_streams if content.startswith(MAGIC) else _from_gzip)(path, content)
 
 
 def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]:
-    """Bytes of each kind of numbers by a header, and the header's values with an empty body.
+    """Return the bytes of each kind of numbers by a header, and the header's values.
 
-    Args:
-        path: named in errors.
-        header: 16 bytes.
-        packed: bytes of the file, which could not hold more than ``_MAX_RATIO`` times as many.
+    The ``packed`` bytes of the file cannot hold more than ``_MAX_RATIO`` times as many.
     """
     _, version, count, degree, bits, _, _ = HEADER.unpack(header)
     if degree not in COUNTS:
@@ -138,16 +133,15 @@ def _from_streams(path: Path, content: bytes) -> Unpacked:
 
 
 def _stream(path: Path, zstd: Any, number: int, packed: memoryview, size: int) -> bytes:
-    """One ZSTD frame of exactly ``size`` bytes; one more than these is all that is unpacked."""
+    """Unpack one ZSTD frame of exactly ``size`` bytes, and at most one byte more."""
     # A frame of a long stream may look back over all of it, which takes that much memory.
     window = {zstd.DecompressionParameter.window_log_max: max(_WINDOW, size.bit_length())}
     decoder = zstd.ZstdDecompressor(options=window)
     try:
         found = decoder.decompress(packed, size + 1)
     except zstd.ZstdError as error:
-        raise UserError(
-            f"{path}: stream {number} is truncated or damaged ({first_line(error)})"
-        ) from error
+        reason = first_line(error)
+        raise UserError(f"{path}: stream {number} is truncated or damaged ({reason})") from error
     if len(found) > size or decoder.unused_data:
         raise UserError(f"{path}: false header, stream {number} holds more than {size} bytes")
     if not decoder.eof or len(found) < size:
@@ -159,7 +153,7 @@ def _stream(path: Path, zstd: Any, number: int, packed: memoryview, size: int) -
 
 
 def _zstd(path: Path) -> Any:
-    """Python's module for ZSTD: its own from 3.14 on, or the same one as a package."""
+    """Return Python's module for ZSTD: its own from 3.14 on, or its backport."""
     for name in ("compression.zstd", "backports.zstd"):
         try:
             return importlib.import_module(name)
@@ -169,10 +163,7 @@ def _zstd(path: Path) -> Any:
 
 
 def _check_axes(path: Path, records: bytes) -> None:
-    """Raises UserError where an extension says that the axes are not the format's own.
-
-    All other extensions are passed over.
-    """
+    """Raise UserError if an extension names other axes than the format's own; ignore others."""
     at = 0
     while at + _RECORD.size <= len(records):
         kind, length = _RECORD.unpack_from(records, at)

@@ -1,4 +1,4 @@
-"""Files of Gaussians that are cut short, or lie: one line each, whatever the format."""
+"""Truncated and malformed files of Gaussians in every format: an error of one line each."""
 
 import gzip
 import json
@@ -72,7 +72,7 @@ def test_another_file(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [299, 301, 10_000_000, 2**32 - 1])
-def test_an_spz_that_lies_about_its_count(sound, wrong):
+def test_an_spz_with_a_false_count(sound, wrong):
     path, data = sound("spz")
     inner = bytearray(gzip.decompress(data))
     struct.pack_into("<I", inner, 8, wrong)
@@ -128,7 +128,7 @@ def test_an_spz_with_extensions_is_read(sound, tmp_path):
         (b"uchar f_rest_8", b"uchar f_rest_9", "f_rest_8"),
     ],
 )
-def test_a_compressed_ply_that_lies(sound, old, new, word):
+def test_an_invalid_compressed_ply(sound, old, new, word):
     path, data = sound("compressed-ply")
     assert old in data
     path.write_bytes(data.replace(old, new, 1))
@@ -143,7 +143,7 @@ def test_a_compressed_ply_with_bounds_that_are_not_finite(sound):
 
 
 def nan_first(kind, data):
-    """The file with a position of its first Gaussian that is not finite, and how many share it."""
+    """Return the file with a position that is not finite, and the number of Gaussians with it."""
     nan = struct.pack("<f", float("nan"))
     if kind == "spz":  # its first version has positions of 16-bit floats
         head = struct.pack("<4sIIBBBB", b"NGSP", 1, 300, 0, 12, 0, 0)
@@ -159,7 +159,7 @@ def nan_first(kind, data):
 
 
 @pytest.mark.parametrize("kind", SPLAT_FORMATS)
-def test_what_cannot_be_drawn_is_left_out_when_asked(sound, kind):
+def test_drop_bad_leaves_out_gaussians_that_cannot_be_drawn(sound, kind):
     path, whole = sound(kind)
     data, lost = nan_first(kind, whole)
     path.write_bytes(data)
@@ -198,8 +198,8 @@ def test_each_reason_is_named_once_and_all_bad_is_refused(tmp_path):
         read_gaussians(path, [])
 
 
-def test_an_infinite_bound_of_a_chunk_shrinks_nobody(sound):
-    """Of 256 Gaussians between -inf and a logarithm nobody knows the size."""
+def test_an_infinite_bound_of_a_chunk_is_refused(sound):
+    """The sizes of 256 Gaussians between -inf and a logarithm are unknown."""
     path, data = sound("compressed-ply")
     start = data.index(b"end_header\n") + 11 + 4 * BOUNDS.index("min_scale_x")
     path.write_bytes(data[:start] + struct.pack("<f", -np.inf) + data[start + 4 :])
@@ -284,6 +284,22 @@ def test_a_glb_is_moved_by_its_nodes(sound, tmp_path):
     moved = want.transformed(turn, flip @ torch.tensor([1.0, 2, 3]), 2.0)
     # float32 twice through a rotation
     check("compressed-ply", moved, read_gaussians(path))
+
+
+def test_a_glb_has_all_instances_of_its_nodes(sound):
+    path, data = sound("glb")
+    want = read_gaussians(path)
+
+    def repeat(tree, primitive):
+        tree["accessors"].append(tree["accessors"][0] | {"count": 2})
+        attributes = {"TRANSLATION": len(tree["accessors"]) - 1}
+        tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+
+    changed(path, data, repeat)
+    got = read_gaussians(path)
+    moved = torch.cat([want.means + want.means[:1], want.means + want.means[1:2]])
+    torch.testing.assert_close(got.means, moved)
+    torch.testing.assert_close(got.scales, want.scales.repeat(2, 1))
 
 
 def test_meshes_are_no_gaussians(tmp_path):

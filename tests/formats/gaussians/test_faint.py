@@ -20,7 +20,7 @@ AROUND = [np.nextafter(LIMIT, 0, dtype="f4"), LIMIT, np.nextafter(LIMIT, 1, dtyp
 
 
 def faint(count=3000):
-    """A third of them fainter than 1/255, which are large, and one of those by its last bit."""
+    """A third are large and fainter than 1/255, one of them by its last bit."""
     gaussians = some(count)
     gaussians.opacities.clamp_(min=0.01)
     gaussians.opacities[::3] = torch.rand(len(gaussians.opacities[::3])) * 0.99 * float(LIMIT)
@@ -52,7 +52,7 @@ def test_pictures_keep_every_bit(mode):
 
 @pytest.mark.parametrize("kind", SPLAT_FORMATS)
 def test_what_is_drawn_is_drawn_from_the_file(tmp_path, kind):
-    """A format of 8 bits has no step between 1/255 and nothing that it could be rounded to."""
+    """A format of 8 bits has no step between 0 and 1/255."""
     gaussians = faint()
     gaussians.opacities[1:3] = float(LIMIT) * 1.0001  # a .ply rounds its logarithm
     kept, _ = to_be_written(gaussians)

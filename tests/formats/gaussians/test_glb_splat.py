@@ -64,7 +64,7 @@ def test_a_reader_without_the_extension_sees_the_points(tmp_path):
 
 
 def renamed(data):
-    """The file with names of attributes that glTF without the extension allows."""
+    """Return the file with names of attributes that glTF without the extension allows."""
     size = struct.unpack_from("<I", data, 12)[0]
     tree = json.loads(data[20 : 20 + size])
     (primitive,) = tree["meshes"][0]["primitives"]
@@ -76,7 +76,7 @@ def renamed(data):
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_the_validator_of_khronos_accepts_it(tmp_path, degree):
-    """It knows no extension's attributes yet (its issue 252): all else must be right."""
+    """The validator knows no extension's attributes yet (its issue 252): all else must be valid."""
     modules = npm_package("gltf-validator", "2.0.0-dev.3.10")
     path = tmp_path / "chair.glb"
     save_glb(path, some(degree=degree))

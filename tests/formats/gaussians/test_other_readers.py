@@ -1,4 +1,4 @@
-"""Our files in readers that share nothing with us, and theirs in ours."""
+"""Our files in independent readers, and theirs in ours."""
 
 import gaussforge
 import numpy as np
@@ -17,7 +17,7 @@ CONVERTER = ("@playcanvas/splat-transform", "2.7.1")
 
 @pytest.mark.parametrize("kind", SPLAT_FORMATS)
 def test_an_object_lies_the_same_way_in_every_format(tmp_path, kind):
-    """As ``gamba export`` writes it, whatever the axes of meshes, and none of our readers asked."""
+    """Written by ``gamba export`` with any axes of meshes, read without our readers."""
     gaussians = some(300)
     gaussians.opacities.clamp_(min=0.01)
     write_gaussians(tmp_path / "a.ply", gaussians, "ply")

@@ -36,7 +36,7 @@ def header(count, kind="float", properties=PROPERTIES, form="binary_little_endia
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("rotated", [True, False])
 def test_what_is_saved_is_loaded(tmp_path, turned, rotated):
-    """Also of older versions, which could turn y up and said so in a comment."""
+    """Older versions could turn y up and state it in a comment."""
     gaussians = some(rotated=rotated)
     comments = ["one\ntwo", "é", *(["frame opengl"] if turned else [])]
     written = flip_axes(gaussians) if turned else gaussians
@@ -122,7 +122,7 @@ def test_infinite_logarithms_and_logits_have_a_meaning(tmp_path):
     "kind, full", [("uchar", 255), ("ushort", 65535), ("float", 1), ("float", 255), ("int", 255)]
 )
 def test_red_green_blue_are_colours_where_there_are_no_harmonics(tmp_path, form, kind, full):
-    """As ns-export of nerfstudio writes them (uchar), and in each type that meshes have."""
+    """As nerfstudio's ns-export writes them (uchar), and in each type of meshes."""
     rgb = np.array([[0.2, 0.4, 0.6], [1, 0, 0.8]]) * full
     order, code = ">" if "big" in form else "<", {"uchar": "u1", "ushort": "u2", "int": "i4"}
     names = [*PROPERTIES[:3], *PROPERTIES[6:]]
@@ -195,8 +195,8 @@ BAD_FILES = {
     "no format": (["element vertex 2", "property float x"], "format is none"),
     "ascii": (header(2, form="ascii"), "vertex"),
     "odd format": (header(2, form="binary"), "format is binary"),
-    "no vertices": (["format binary_little_endian 1.0"], "element vertex COUNT"),
-    "faces alone": ([header(2)[0], "element face 2"], "element vertex COUNT"),
+    "no vertices": (["format binary_little_endian 1.0"], "no property x, y, z; not Gaussians"),
+    "faces alone": ([header(2)[0], "element face 2"], "no property x, y, z; not Gaussians"),
     "half a colour": (
         header(2, properties=[*PROPERTIES[:4], *PROPERTIES[6:-1], "red", "green", "blue"]),
         "no property f_dc_1, f_dc_2",
@@ -208,8 +208,8 @@ BAD_FILES = {
     "negative": (header(-1), "element vertex COUNT"),
     "huge": (header("9" * 5000), "element vertex COUNT"),
     "lies": (header(10**15), "truncated or false header, 1000000000000000 vertex take"),
-    "no properties": (header(2, properties=[]), "no properties"),
-    "list": (header(2, "list uchar float"), "not a plain number"),
+    "no properties": (header(2, properties=[]), "no property x, y, z; not Gaussians"),
+    "list": (header(2, "list uchar float"), "no property x, y, z; not Gaussians"),
     "odd type": (header(2, "half"), "'half x' is not a plain number"),
     "twice": (header(2, properties=[*PROPERTIES, "x"]), "x is given twice"),
     "odd element": ([*header(2), "element face many"], "expected 'element face COUNT'"),
@@ -218,6 +218,8 @@ BAD_FILES = {
     "cloud": (header(2, properties=PROPERTIES[:3]), "no property f_dc_0, f_dc_1, f_dc_2"),
     "no opacity": (header(2, properties=PROPERTIES[:6] + PROPERTIES[7:]), "no property opacity"),
 }
+SIZES = {"cloud": 24, "no opacity": 104, "list": 28}  # bytes of the data, if not those of GOOD
+SIZES |= dict.fromkeys(["none", "no vertices", "faces alone", "no properties"], 0)
 
 
 @pytest.mark.parametrize("case", BAD_FILES)
@@ -227,8 +229,8 @@ def test_bad_files_are_refused_with_the_reason(tmp_path, case):
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        size = {"cloud": 24, "no opacity": 104, "none": 0}.get(case, len(GOOD))
-        write(path, content, GOOD[:size])
+        size = SIZES.get(case, len(GOOD))
+        write(path, content, bytes(size) if case == "list" else GOOD[:size])
     said = refused(None, load_ply, path)
     assert str(path) in said and reason in said
 
@@ -259,7 +261,7 @@ def test_rotations_of_length_zero_are_refused(tmp_path):
 
 
 def test_values_whose_squares_overflow(tmp_path):
-    """A long or short rotation is one; a place or a size beyond all bounds is none."""
+    """Rotations of any length are valid; positions and sizes have a limit."""
     rows = np.ones((3, 14), "<f4")
     rows[1, 10:], rows[2, 10:] = 1e30, 1e-30
     loaded = load_ply(write(tmp_path / "a.ply", header(3), rows.tobytes()))

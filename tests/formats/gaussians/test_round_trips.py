@@ -1,4 +1,4 @@
-"""Every format of Gaussians, written and read by us; what it cannot hold is said."""
+"""Round trips of every format of Gaussians, with a line about its losses."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_one_gaussian_without_rotation(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["ply", "compressed-ply"])
 def test_files_of_older_versions_are_turned_back(tmp_path, kind):
-    """Those could have y up, and said so in a comment; it is of the axes, and does not go on."""
+    """Older files state y up in a comment, which is not copied."""
     gaussians = some(300, degree=2)
     comments = ["two\nlines", "frame opengl"]
     path, _ = written(tmp_path, flip_axes(gaussians), kind, comments=comments)
@@ -63,7 +63,7 @@ def test_files_of_older_versions_are_turned_back(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", SPLAT_FORMATS)
 def test_what_comments_say(tmp_path, kind):
-    """No more of them than the header of a file may hold."""
+    """At most as many as a header can hold."""
     path, _ = written(tmp_path, some(), kind, comments=["from a chair", *map(str, range(40))])
     found = comments_of(path)
     if "ply" not in kind:
@@ -188,7 +188,7 @@ def test_harmonics_are_channel_major_in_a_ply(tmp_path):
 
 
 def test_version_1_and_2_of_spz(tmp_path):
-    """Made by hand by the published layout; the values are exact in it."""
+    """Built by hand from the published layout, with values that it holds exactly."""
     import gzip
     import struct
 

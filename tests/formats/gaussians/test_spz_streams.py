@@ -1,4 +1,4 @@
-"""An .spz of version 4: built here from the published layout, cut short, lying, a bomb."""
+"""An .spz of version 4, built here from the published layout: valid, malformed, a bomb."""
 
 import gzip
 import importlib
@@ -26,19 +26,19 @@ def zstd():
 
 
 def raw_frame(data):
-    """A frame of one raw block, by the format's description: no library had a hand in it."""
+    """Return a frame of one raw block, built by the format's description without a library."""
     block = (len(data) << 3 | 1).to_bytes(3, "little")
     return MAGIC + b"\xa0" + struct.pack("<I", len(data)) + block + data
 
 
 def bomb(blocks):
-    """A frame of blocks that repeat one byte 131,072 times, in a window of 2 MB."""
+    """Return a frame of blocks that repeat one byte 131,072 times, in a window of 2 MB."""
     repeat = ((1 << 17) << 3 | 2).to_bytes(3, "little") + b"\0"
     return MAGIC + b"\x00\x58" + repeat * blocks + b"\1\0\0"
 
 
 def container(streams, count, degree, bits=12, pack=raw_frame, extensions=b"", **other):
-    """The file; ``other`` replaces numbers of the header, ``frames`` and ``sizes`` of the table."""
+    """Return the file; ``other`` replaces values of the header and of the table."""
     frames = other.get("frames") or [pack(stream) for stream in streams]
     sizes = other.get("sizes") or [(len(f), len(s)) for f, s in zip(frames, streams)]
     flags = other.get("flags", 2 if extensions else 0)
@@ -177,7 +177,7 @@ def test_a_header_or_a_table_that_lies(tmp_path, case):
 
 
 def far(size):
-    """A raw frame that promises, or wants to look back over, ``size`` bytes."""
+    """Return a raw frame that states, or has a window of, ``size`` bytes."""
     return MAGIC + b"\xe0" + struct.pack("<Q", size) + (18 << 3 | 1).to_bytes(3, "little")
 
 
