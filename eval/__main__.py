@@ -1,4 +1,4 @@
-"""``python -m gamba_warp.eval views|geometry …``: the same as ``gamba eval-views`` and so on."""
+"""``python -m gamba_warp.eval views|geometry …``: ``gamba eval-views`` or ``eval-geometry``."""
 
 import sys
 

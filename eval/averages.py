@@ -1,4 +1,4 @@
-"""Means and medians over objects, with bootstrap intervals, and differences object by object."""
+"""Means and medians over objects with bootstrap intervals, and paired differences."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 LEVEL = 0.95  # share of the resampled means within an interval
 RESAMPLES = 10_000
 BOOTSTRAP = {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"}
-_AT_ONCE = 1_000_000  # numbers drawn at once, which bounds the memory
+_BATCH = 1_000_000  # numbers drawn at once; bounds the memory
 
-Statistic = Callable[[np.ndarray], np.ndarray]  # of ``[.., n]`` objects, ``[..]``
+Statistic = Callable[[np.ndarray], np.ndarray]  # ``[.., n]`` objects to ``[..]``
 
 
 def mean_of(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """Averages the numbers of records with the same keys, nested ones too.
+    """Average the numbers of records with the same keys, nested ones too.
 
-    A number that is None in some records is averaged over the others; the mean is None where no
-    record has the number. Texts, lists and booleans are left out.
+    None values are skipped; the mean is None if all values are. Texts, lists and booleans are left
+    out.
     """
     return _over_objects(records, lambda values: sum(values) / len(values))
 
 
 def median_of(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """The medians of the numbers that ``mean_of`` averages, with the same keys."""
+    """Return the medians of the numbers that ``mean_of`` averages, with the same keys."""
     return _over_objects(records, lambda values: float(np.median(values)))
 
 
@@ -36,18 +36,17 @@ def intervals_of(
     seed: int = 0,
     statistic: Statistic = lambda values: values.mean(-1),
 ) -> dict[str, Any]:
-    """Computes bootstrap intervals of the means of ``mean_of``: percentiles over resamples.
+    """Compute percentile bootstrap intervals of the means of ``mean_of``.
 
-    Objects are drawn with repetition, as many as there are, and averaged (Efron 1979). The interval
-    tells how far the mean depends on the choice of objects and nothing else; with a handful of
-    objects it is too narrow.
+    Each resample draws as many objects as there are, with replacement (Efron 1979). The interval
+    covers only the choice of objects; with a handful of objects it is too narrow.
 
     Args:
         records: records with the same keys, one for each object.
         level: share of the resampled means within the interval.
         resamples: number of draws.
-        seed: of the draws; every number has the same draws.
-        statistic: what is computed of the objects drawn; the mean unless told.
+        seed: of the draws, which are the same for every number.
+        statistic: of the objects drawn; by default the mean.
 
     Returns:
         The keys of ``mean_of``, each ``[low, high]``; None with fewer than 2 objects.
@@ -66,11 +65,11 @@ def bootstrap(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> list[float] | None:
-    """Computes the percentile interval of one statistic; see ``intervals_of``.
+    """Compute the percentile interval of one statistic; see ``intervals_of``.
 
     Args:
-        values: ``[.., n]`` float64, of n objects; what belongs to one object is drawn together.
-        statistic: of ``[.., draws, n]``, ``[draws]``.
+        values: ``[.., n]`` float64, of n objects; all values of an object are drawn together.
+        statistic: maps ``[.., draws, n]`` to ``[draws]``.
         level: share of the resampled statistics within the interval.
         resamples: number of draws.
         seed: of the draws.
@@ -82,9 +81,9 @@ def bootstrap(
     if count < 2:
         return None
     random = np.random.default_rng(seed)
-    batch = max(1, _AT_ONCE // count)
+    batch = max(1, _BATCH // count)
     ends = [(1 - level) / 2, (1 + level) / 2]
-    with np.errstate(all="ignore"):  # a sum may be too large for a number
+    with np.errstate(all="ignore"):  # a sum may overflow
         found = [
             statistic(values[..., random.integers(0, count, (min(batch, resamples - at), count))])
             for at in range(0, resamples, batch)
@@ -93,19 +92,19 @@ def bootstrap(
 
 
 def median(values: np.ndarray) -> np.ndarray:
-    """The median of ``[.., n]`` objects, as a statistic of ``intervals_of``."""
+    """Return the median of ``[.., n]`` objects, as a statistic of ``intervals_of``."""
     return np.median(values, -1)
 
 
 def summary_of(values: Sequence[float | None]) -> dict[str, Any]:
-    """Mean and median of one number over objects, each with its bootstrap interval.
+    """Return mean and median of one number over objects, with bootstrap intervals.
 
     Args:
-        values: one for each object; those that are None are passed over.
+        values: one for each object; None is skipped.
 
     Returns:
-        ``mean, interval, median, median_interval``; None where there is no value, and the intervals
-        also where there is one only.
+        ``mean, interval, median, median_interval``; None without values, the intervals also with a
+        single value.
     """
     known = np.array([value for value in values if value is not None], np.float64)
     return {
@@ -117,10 +116,9 @@ def summary_of(values: Sequence[float | None]) -> dict[str, Any]:
 
 
 def minus(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Subtracts the numbers of ``b`` from those of ``a``, nested ones too.
+    """Subtract the numbers of ``b`` from those of ``a``, nested ones too.
 
-    A key whose values are not numbers in both, or that is not in both, is left out; None where one
-    of them is None.
+    Only keys with numbers in both are kept; the difference is None if one of the two is None.
     """
     result: dict[str, Any] = {}
     for key in (key for key in a if key in b):
@@ -137,7 +135,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _over_objects(records: list[dict[str, Any]], summary: Callable) -> dict[str, Any]:
-    """Applies ``summary`` to the values that each number has in the records; None without any."""
+    """Apply ``summary`` to the values of each number over the records; None without values."""
     result: dict[str, Any] = {}
     for key in dict.fromkeys(key for record in records for key in record):
         values = [record.get(key) for record in records]

@@ -1,7 +1,7 @@
-"""``gamba compare``: reports of several methods, held to one protocol and truth, in one table.
+"""``gamba compare``: reports of several methods with the same protocol and truth in one table.
 
-A method has a report of ``eval-views``, one of ``eval-geometry``, or both. The table runs over the
-objects that all methods have; it is Markdown, JSON, and a page that loads nothing else.
+A method has a report of ``eval-views``, one of ``eval-geometry``, or both. The table covers the
+objects that all methods have. It is written as Markdown, JSON and a self-contained page.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from .report import OK, csv_of, flat
 from .tables import Column, Lines, Row, figures, markdown
 
 FORMAT = "gamba_warp.compare.1"
-MOST = 50  # reports
+MAX_REPORTS = 50
 VIEWS, SHAPES = "eval-views", "eval-geometry"
-_LETTERS = 60  # of a method's name
-_NAMED = 5  # objects of a method that a line names
+_MAX_LETTERS = 60  # of a method's name
+_MAX_NAMED = 5  # objects of a method named in a line
 
-# Of shapes, what is compared, and of the table what the paper has besides pictures.
+# Metrics of shapes: those of the paper's table, then the others.
 OF_SHAPES = {"chamfer": Column("Chamfer ↓", 4), "iou": Column("Volume IoU ↑", 4)}
 _FSCORE = "fscore."  # before a threshold
 _MORE_OF_SHAPES = {
@@ -38,11 +38,11 @@ _MORE_OF_SHAPES = {
     "completeness": Column("completeness ↓", 4),
     "normal_consistency": Column("normals ↑", 3),
 }
-# A field of the protocol that tells the kind of a report.
-_TELLS = {"max_psnr": VIEWS, "occupancy": SHAPES}
-# What of a protocol decides no number of one object: names, what is under test, and how a method's
-# own files lie in space.
-_FREE = {
+# Fields of the protocol that identify the kind of a report.
+_KIND_BY_FIELD = {"max_psnr": VIEWS, "occupancy": SHAPES}
+# Fields of a protocol that may differ between methods, because no number of an object depends on
+# them: names, the method under test, and the pose of its files.
+_MAY_DIFFER = {
     VIEWS: (
         *("source", "data", "split", "split_version", "uids", "uids_sha256"),
         *("baselines", "contact_sheet", "distance", "rendering", "pictures", "resize_pictures"),
@@ -50,8 +50,11 @@ _FREE = {
     ),
     SHAPES: ("name", "definitions", "frame", "pred_axes", "reference", "distance"),
 }
-# Of those, what is worth a line where methods differ in it.
-_NOTED = {VIEWS: ("split", "resize_pictures", "rendering", "lpips"), SHAPES: ("frame", "pred_axes")}
+# Those whose differences are noted in the table.
+_NOTED_FIELDS = {
+    VIEWS: ("split", "resize_pictures", "rendering", "lpips"),
+    SHAPES: ("frame", "pred_axes"),
+}
 
 # Gamba (Shen et al. 2024), Table 1: PSNR, SSIM, LPIPS, Chamfer distance, Volume IoU, seconds.
 TABLE_1: dict[str, tuple[float | None, ...]] = {
@@ -75,7 +78,7 @@ Figures = dict[str, Number | None]
 
 
 def _keys(kind: str, protocol: dict[str, Any]) -> list[str]:
-    """The figures that are compared of a kind of report, nested ones with dots."""
+    """Return the keys of the compared figures of a kind of report, nested ones with dots."""
     if kind == VIEWS:
         return list(all_figures())
     known = protocol.get("thresholds")
@@ -84,23 +87,23 @@ def _keys(kind: str, protocol: dict[str, Any]) -> list[str]:
     return [*OF_SHAPES, *fscores, *_MORE_OF_SHAPES]
 
 
-class _OfViews(msgspec.Struct):
-    """What is used of the record of an object that ``eval-views`` evaluated, beside its figures."""
+class _ViewsRecord(msgspec.Struct):
+    """Fields used of an object's record from ``eval-views``, besides its figures."""
 
     truth_sha256: str
     views: list[int]
     seconds: dict[str, Number] = {}
 
 
-class _OfShapes(msgspec.Struct):
-    """Likewise, of an object that ``eval-geometry`` evaluated."""
+class _ShapesRecord(msgspec.Struct):
+    """Fields used of an object's record from ``eval-geometry``, besides its figures."""
 
     gt_sha256: str
     kind: str
 
 
-_RECORDS = {VIEWS: _OfViews, SHAPES: _OfShapes}
-_TRUTH = ("truth_sha256", "views", "gt_sha256")  # what two records of an object must agree in
+_RECORDS = {VIEWS: _ViewsRecord, SHAPES: _ShapesRecord}
+_TRUTH = ("truth_sha256", "views", "gt_sha256")  # must be equal in two records of an object
 
 
 class _Document(msgspec.Struct):
@@ -118,7 +121,7 @@ class Report:
         protocol: as the file states it.
         records: of the objects that were evaluated, by name; see ``_RECORDS``.
         figures: likewise.
-        failed: reasons by name, of those that could not be evaluated.
+        failed: reasons by name, of the objects that failed.
     """
 
     path: Path
@@ -131,13 +134,13 @@ class Report:
 
 @dataclass
 class Compared:
-    """What is compared.
+    """Methods with their reports.
 
     Attributes:
         methods: names, in the order of their first report.
         reports: by kind and method.
-        seconds: of an object, as the user stated them, by method.
-        notes: on what differs between methods without changing what a number means.
+        seconds: per object, as stated by the user, by method.
+        notes: differences between methods that do not change the meaning of a number.
     """
 
     methods: list[str]
@@ -147,18 +150,18 @@ class Compared:
 
 
 def read_reports(arguments: tuple[str, ...], seconds: tuple[str, ...]) -> Compared:
-    """Reads reports, and checks that they are of one protocol and one truth.
+    """Read reports, and check that they have the same protocol and truth.
 
     Args:
         arguments: ``NAME=FILE`` each, or a folder with a report.json.
         seconds: ``NAME=SECONDS`` each.
 
     Raises:
-        UserError: an argument is not of this form, a file is no report, a method has two of one
-            kind, or two reports have different protocols or truths; the message says in what.
+        UserError: an argument is malformed, a file is not a report, a method has two of one kind,
+            or two reports differ in protocol or truth; the message names the difference.
     """
-    if len(arguments) > MOST:
-        raise UserError(f"{len(arguments)} reports, at most {MOST} are compared")
+    if len(arguments) > MAX_REPORTS:
+        raise UserError(f"{len(arguments)} reports, at most {MAX_REPORTS} are compared")
     methods: dict[str, None] = {}
     reports: dict[str, dict[str, Report]] = {VIEWS: {}, SHAPES: {}}
     for argument in arguments:
@@ -182,7 +185,7 @@ def read_reports(arguments: tuple[str, ...], seconds: tuple[str, ...]) -> Compar
     for kind, of in reports.items():
         for one, other in combinations(of.values(), 2):
             _check_pair(one, other)
-        for key in _NOTED[kind]:
+        for key in _NOTED_FIELDS[kind]:
             names: dict[str, list[str]] = {}
             for name, report in of.items():
                 names.setdefault(_shown(report.protocol.get(key)), []).append(name)
@@ -196,23 +199,23 @@ def _split(argument: str, what: str, option: str = "") -> tuple[str, str]:
     name, equals, text = argument.partition("=")
     if not (name and equals and text):
         raise UserError(f"{option}{argument}: give NAME={what}")
-    if len(name) > _LETTERS or not name.isprintable() or "|" in name:
-        raise UserError(f"{option}{argument}: a name has at most {_LETTERS} letters and no '|'")
+    if len(name) > _MAX_LETTERS or not name.isprintable() or "|" in name:
+        raise UserError(f"{option}{argument}: a name has at most {_MAX_LETTERS} letters and no '|'")
     return name, text
 
 
 def read_report(path: Path) -> Report:
-    """Reads a report of ``eval-views`` or ``eval-geometry``.
+    """Read a report of ``eval-views`` or ``eval-geometry``.
 
     Args:
         path: the file, or the folder with its ``report.json``.
 
     Raises:
-        UserError: there is none, or it is no such report; the message says why.
+        UserError: it is missing or not such a report; the message gives the reason.
     """
     path = path / "report.json" if path.is_dir() else path
     content = parse_document(read_bytes(path), _Document, str(path))
-    kind = next((kind for told, kind in _TELLS.items() if told in content.protocol), None)
+    kind = next((kind for name, kind in _KIND_BY_FIELD.items() if name in content.protocol), None)
     if kind is None:
         raise UserError(f"{path}: no report of gamba eval-views or gamba eval-geometry")
     report = Report(path, kind, content.protocol)
@@ -234,7 +237,7 @@ def read_report(path: Path) -> Report:
 
 
 def _check_pair(first: Report, report: Report) -> None:
-    """Raises UserError where two reports of one kind cannot stand in one table."""
+    """Raise UserError if two reports of one kind cannot share a table."""
     pair = (report, first)
     mine, other = (flat(r.protocol, lists=True) for r in pair)
     for key in dict.fromkeys((*mine, *other)):
@@ -242,8 +245,8 @@ def _check_pair(first: Report, report: Report) -> None:
         if a == b:
             continue
         top = key.split(".")[0]
-        free = top in _FREE[report.kind] and (top != "lpips" or None in (a, b))
-        if top == "surface" and report.kind == SHAPES:  # of Gaussians, which a method may not have
+        free = top in _MAY_DIFFER[report.kind] and (top != "lpips" or None in (a, b))
+        if top == "surface" and report.kind == SHAPES:  # used for Gaussians only
             free = not all(any(v.kind == "gaussians" for v in r.records.values()) for r in pair)
         if not free:
             raise UserError(
@@ -263,36 +266,34 @@ def _shown(value: Any) -> str:
 
 
 def join(compared: Compared, against: str | None) -> dict[str, Any]:
-    """Makes the table of methods.
+    """Make the table of methods.
 
-    A figure is averaged over the objects for which every method that has this figure at all has a
-    value, so that no method is spared the objects that it failed at without the others being spared
-    them too.
+    A figure is averaged over the objects for which every method with this figure has a value, so an
+    object at which one method failed counts for none.
 
     Args:
-        compared: as ``read_reports`` returns it.
-        against: the method that the others are compared with, object by object; the first one if
-            None.
+        compared: as from ``read_reports``.
+        against: baseline of the paired differences; None: the first method.
 
     Returns:
-        ``format, version, against, bootstrap, notes``; ``common``: the names of the objects by
-        figure; ``rows``: for each method ``name``, ``seconds`` with where they come from, and by
-        figure ``{mean, interval, median, median_interval}``, None where it has no such figure;
-        ``differences``: likewise, each method minus ``against``; ``missing``: by kind of report and
-        method, the reasons by object; ``reports``: the files and their protocols.
+        ``format, version, against, bootstrap, notes``; ``common``: names of the objects by figure;
+        ``rows``: for each method ``name``, ``seconds`` with their origin, and by figure ``{mean,
+        interval, median, median_interval}`` or None; ``differences``: likewise, each method minus
+        ``against``; ``missing``: by kind of report and method, the reasons by object; ``reports``:
+        the files and their protocols.
 
     Raises:
-        UserError: there is no such method, or no object is common to all.
+        UserError: ``against`` is unknown, or no object is common to all.
     """
     names = compared.methods
     base = names[0] if against is None else against
     if base not in names:
         raise UserError(f"--against {base}: the methods are {', '.join(names)}")
-    # by figure, method and object; a method without any value of a figure does not have it
+    # By figure, method and object; a method without any value of a figure is left out.
     values: dict[str, dict[str, dict[str, float]]] = {}
     common: dict[str, list[str]] = {}
     for kind, reports in compared.reports.items():
-        # the protocols are the same but for what decides no number
+        # All protocols have the same thresholds.
         keys = _keys(kind, next((r.protocol for r in reports.values()), {}))
         for key in keys:
             found = {
@@ -310,7 +311,7 @@ def join(compared: Compared, against: str | None) -> dict[str, Any]:
             )
 
     def summaries(name: str, less: str | None = None) -> dict[str, Any]:
-        """The figures of a method, or its values less another one's, object by object."""
+        """Summarise the figures of a method, or its paired differences to another."""
         found: dict[str, Any] = dict.fromkeys(values)
         for key, of in values.items():
             if common[key] and name in of and (less is None or less in of):
@@ -343,7 +344,7 @@ def join(compared: Compared, against: str | None) -> dict[str, Any]:
 
 
 def _seconds(compared: Compared, name: str, uids: list[str]) -> dict[str, Any]:
-    """The time of one object, and where it comes from."""
+    """Return the time per object, and its origin."""
     if name in compared.seconds:
         return {"seconds": compared.seconds[name], "seconds_from": "stated"}
     report = compared.reports[VIEWS].get(name)
@@ -351,13 +352,13 @@ def _seconds(compared: Compared, name: str, uids: list[str]) -> dict[str, Any]:
     if report and isinstance(source, dict) and source.get("kind") == "checkpoint":
         times = [report.records[uid].seconds for uid in uids if uid in report.records]
         known = [seconds["predict"] for seconds in times if "predict" in seconds]
-        if known:  # the median: the first object's time holds the compilation of the kernels
+        if known:  # median, because the first object's time includes compilation
             return {"seconds": statistics.median(known), "seconds_from": "measured"}
     return {"seconds": None, "seconds_from": None}
 
 
 def _missing(reports: dict[str, Report]) -> dict[str, dict[str, str]]:
-    """By method, why it lacks objects that another one has or tried."""
+    """Return the reasons for objects that a method lacks and another has, by method."""
     known = {uid for report in reports.values() for uid in (*report.records, *report.failed)}
     return {
         name: {
@@ -369,9 +370,9 @@ def _missing(reports: dict[str, Report]) -> dict[str, dict[str, str]]:
 
 
 def _columns(joined: dict[str, Any], paper: bool) -> tuple[dict[str, Column], ...]:
-    """Those of the table, of the one on other grounds, and of the one of more about shapes.
+    """Return the columns of the main table, of other backgrounds, and of further shape metrics.
 
-    The first one has the kinds that were evaluated, and beside the paper's table all that it has.
+    The main table has the kinds that were evaluated; with ``paper`` all columns of Table 1.
     """
     of_views, grounds = (
         {
@@ -397,7 +398,7 @@ def _columns(joined: dict[str, Any], paper: bool) -> tuple[dict[str, Column], ..
 
 
 def main_lines(joined: dict[str, Any], paper: bool) -> Lines:
-    """The lines of the first table: a method each, with its time; arguments as below."""
+    """Return the lines of the main table, one per method, with its time."""
     rows = [Row([row["name"]], row) for row in joined["rows"]]
     lines = figures([""], _columns(joined, paper)[0], rows)
     lines[0].append("time [s] ↓")
@@ -408,7 +409,7 @@ def main_lines(joined: dict[str, Any], paper: bool) -> Lines:
 
 
 def csv_text(joined: dict[str, Any]) -> str:
-    """The text of ``compare.csv``: a line for each method and each difference.
+    """Return the text of ``compare.csv``, one line per method and per difference.
 
     Figures have the columns ``KEY.mean``, ``KEY.low`` and ``KEY.high`` (of the interval).
     """
@@ -424,7 +425,7 @@ def csv_text(joined: dict[str, Any]) -> str:
 
 
 def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
-    """Texts and tables in their order."""
+    """Yield texts and tables in order."""
     columns, grounds, of_shapes = _columns(joined, paper)
     yield main_lines(joined, paper)
     counts: dict[int, list[str]] = {}
@@ -440,8 +441,10 @@ def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
     for kind, methods in joined["missing"].items():
         for name, missing in methods.items():
             if missing:
-                some = "; ".join(one_line(f"{u}: {r}") for u, r in list(missing.items())[:_NAMED])
-                more = "; ..." if len(missing) > _NAMED else ""
+                some = "; ".join(
+                    one_line(f"{u}: {r}") for u, r in list(missing.items())[:_MAX_NAMED]
+                )
+                more = "; ..." if len(missing) > _MAX_NAMED else ""
                 yield f"{kind}: {name} lacks {_count(len(missing))} ({some}{more})."
     yield from (f"{note}." for note in joined["notes"])
     if joined["differences"]:
@@ -464,7 +467,7 @@ def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
 
 
 def _unit(joined: dict[str, Any]) -> float:
-    """The length of the longest side of the true shape, in reports of shapes."""
+    """Return the length of the true shape's longest side in reports of shapes."""
     protocols = (
         kinds[SHAPES]["protocol"] for kinds in joined["reports"].values() if SHAPES in kinds
     )
@@ -477,19 +480,22 @@ def _count(number: int) -> str:
 
 
 def markdown_page(joined: dict[str, Any], paper: bool) -> str:
-    """The text of ``compare.md``.
+    """Return the text of ``compare.md``.
 
     Args:
-        joined: what ``join`` returns.
-        paper: whether the paper's own figures are printed too.
+        joined: the result of ``join``.
+        paper: add the paper's own figures.
     """
     parts = [p if isinstance(p, str) else markdown(p) for p in _parts(joined, paper)]
     return "\n\n".join(parts) + "\n"
 
 
 def html_page(joined: dict[str, Any], paper: bool) -> str:
-    """The text of ``compare.html``; arguments as for ``markdown_page``."""
-    from gamba_warp.pages.page import Section, page_text  # with torch, which the table does without
+    """Return the text of ``compare.html``; arguments as for ``markdown_page``."""
+    from gamba_warp.pages.page import (
+        Section,
+        page_text,
+    )  # imports torch, which the table does not need
 
     sections, texts = [], []
     for part in _parts(joined, paper):

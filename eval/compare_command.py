@@ -1,6 +1,6 @@
 """``gamba compare``: reports of several methods in one table.
 
-``--help`` answers at once, so what is slow to import is imported by the command itself.
+Slow imports are inside the command, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ def compare_command(
 ) -> int:
     """PSNR, SSIM, LPIPS, Chamfer, Volume IoU and time of several methods, as the paper's Table 1.
 
-    Each method is evaluated before, by eval-views, eval-geometry or both; a name given twice has
-    both reports. Means are over the objects that all methods have. Reports of different protocols,
-    or of different true pictures or shapes, are refused.
+    First evaluate each method by eval-views, eval-geometry or both; give a name twice for both
+    reports. Means are over the objects that all methods have. Reports of different protocols, or of
+    different true pictures or shapes, are refused.
 
     Args:
-        reports: NAME=FILE: a report.json, or the folder that it is in.
-        against: The method that the others are subtracted from, object by object; the first one.
-        seconds: NAME=SECONDS that a method takes for an object, where no report has measured it.
-        paper: Also print the figures of the paper's Table 1, of other objects and protocol.
+        reports: NAME=FILE: a report.json, or its folder.
+        against: Baseline of the paired differences; by default the first method.
+        seconds: NAME=SECONDS: time of a method per object, if no report has measured it.
+        paper: Also print the paper's Table 1, which has other objects and another protocol.
         out: Folder for compare.json, compare.md, compare.html, compare.csv and, of the first table,
             compare.tex.
         json: Print compare.json in place of the table.

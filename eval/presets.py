@@ -1,4 +1,4 @@
-"""Protocols of the field: small files of fields, each with its source and what that leaves open."""
+"""Published protocols: JSON files of fields, with their sources and open points."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import msgspec
 
 
 class Preset(msgspec.Struct, forbid_unknown_fields=True):
-    """A protocol as its file has it.
+    """A protocol file.
 
     Attributes:
-        source: whose it is, and where it is written.
-        stated: what the source states, by field, or by a subject that is no field.
-        open: what the source leaves open, likewise, and what was chosen.
-        shapes: fields of ``GeometryProtocol`` that differ from "default"; None: it has no shapes.
-        views: options of ``eval-views`` that differ from the default; None: it has no views.
+        source: authors and publication.
+        stated: statements of the source, by field or another subject.
+        open: points that the source leaves open, likewise, and our choices.
+        shapes: fields of ``GeometryProtocol`` that differ from "default"; None without shapes.
+        views: options of ``eval-views`` that differ from the default; None without views.
     """
 
     source: str
@@ -34,10 +34,10 @@ PRESETS = {
 
 
 def explain(name: str, fields: dict[str, Any]) -> str:
-    """A protocol in words: each field with what its source states of it or leaves open.
+    """Describe a protocol: each field with the statements and open points of its source.
 
     Args:
-        name: of ``PRESETS``, or another one, which has no source.
+        name: of ``PRESETS``, or any other, which has no source.
         fields: the values, by field.
     """
     preset = PRESETS.get(name, Preset("the fields below are all there is"))

@@ -1,4 +1,4 @@
-"""The report of many objects: means with intervals, failures by name, as JSON and as CSV."""
+"""Report over many objects: means with intervals and failures by name, as JSON and CSV."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Times one stage."""
+        """Time one stage."""
         start = time.perf_counter()
         yield
         self.seconds[stage] = round(time.perf_counter() - start, self._digits)
 
 
 def flat(record: dict[str, Any], prefix: str = "", lists: bool = False) -> dict[str, Any]:
-    """Nested dicts in one level, with keys joined by a dot; lists only where asked for."""
+    """Flatten nested dicts, with keys joined by dots; lists are dropped unless ``lists``."""
     result: dict[str, Any] = {}
     for key, value in record.items():
         if isinstance(value, dict):
@@ -54,11 +54,10 @@ def flat(record: dict[str, Any], prefix: str = "", lists: bool = False) -> dict[
 
 
 def check_finite(record: dict[str, Any]) -> dict[str, Any]:
-    """Returns the record as it is.
+    """Return the record unchanged.
 
     Raises:
-        UserError: one of its numbers, nested ones and those of lists too, is NaN or infinite; names
-            it.
+        UserError: a number, nested or in a list, is NaN or infinite; the message names it.
     """
     for key, value in flat(record, lists=True).items():
         for item in value if isinstance(value, list) else [value]:
@@ -70,7 +69,7 @@ def check_finite(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def finite_or_none(value: Any) -> Any:
-    """The value with None for each number, nested ones too, that JSON cannot hold."""
+    """Replace numbers that JSON cannot hold, nested ones too, by None."""
     if isinstance(value, dict):
         return {key: finite_or_none(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -79,7 +78,7 @@ def finite_or_none(value: Any) -> Any:
 
 
 def failure(name: str, error: Exception | str) -> dict[str, str]:
-    """The record of an object that could not be evaluated; its reason is one line."""
+    """Return the record of an object that failed, with a reason of one line."""
     return {"name": name, "status": FAILED, "reason": first_line(error)}
 
 
@@ -90,20 +89,20 @@ def make_report(
     left_out: tuple[str, ...] = (),
     **more: Any,
 ) -> dict[str, Any]:
-    """Makes the report of a batch.
+    """Make the report of a batch.
 
     Args:
-        protocol: everything that decides what the numbers mean.
-        objects: one record for each object, with ``name`` and ``status``, and ``reason`` where it
-            failed. One with a number that is not finite becomes a failure: an evaluation of
-            hours must not be lost when its report is written.
+        protocol: everything that defines the numbers.
+        objects: one record for each object, with ``name`` and ``status``, and ``reason`` if it
+            failed. A record with a number that is not finite becomes a failure, so that it does not
+            cost the whole report.
         used: versions of packages by name.
-        left_out: keys of the records that have no meaningful mean.
+        left_out: keys of the records without a meaningful mean.
         more: further top-level entries.
 
     Returns:
-        ``protocol, versions, bootstrap`` (how the intervals are made), what ``over_objects``
-        returns, and ``more``.
+        ``protocol, versions, bootstrap`` (parameters of the intervals), the entries of
+        ``over_objects``, and ``more``.
     """
     report = {
         "protocol": protocol,
@@ -116,7 +115,7 @@ def make_report(
 
 
 def over_objects(objects: list[dict[str, Any]], left_out: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The part of a report that the records decide; arguments as for ``make_report``.
+    """Return the part of a report computed from the records; arguments as for ``make_report``.
 
     Returns:
         ``objects`` (by name), ``mean, interval`` (of the mean, over objects), ``median, num_ok,
@@ -144,12 +143,12 @@ def over_objects(objects: list[dict[str, Any]], left_out: tuple[str, ...] = ()) 
 
 
 def json_of(report: dict[str, Any]) -> str:
-    """The text of ``report.json``."""
+    """Return the text of ``report.json``."""
     return json.dumps(report, indent=2, allow_nan=False) + "\n"
 
 
 def csv_of(report: dict[str, Any]) -> str:
-    """A line of CSV for each object; keys are ``outer.inner``, lists of words become one text."""
+    """Return one CSV line per object; keys are ``outer.inner``, and lists of words are joined."""
 
     def plain(value: Any) -> Any:
         words = isinstance(value, list) and all(isinstance(item, str) for item in value)
@@ -164,16 +163,16 @@ def csv_of(report: dict[str, Any]) -> str:
 
 
 def save_report(report: dict[str, Any], folder: Path) -> None:
-    """Writes ``report.json`` and ``objects.csv`` into an existing folder, each whole or not at all.
+    """Write ``report.json`` and ``objects.csv`` into an existing folder, each atomically.
 
     Raises:
-        UserError: they cannot be written there; they are then in a temporary folder, if that can be
-            written, which the message names.
+        UserError: they cannot be written there. They are then written to a temporary folder, if
+            possible, which the message names.
     """
 
-    def save(place: Path) -> None:
-        write_json(place / "report.json", report)
-        write_text(place / "objects.csv", csv_of(report))
+    def save(target: Path) -> None:
+        write_json(target / "report.json", report)
+        write_text(target / "objects.csv", csv_of(report))
 
     try:
         save(folder)
@@ -186,7 +185,7 @@ def save_report(report: dict[str, Any], folder: Path) -> None:
 
 
 def summary_lines(report: dict[str, Any]) -> list[str]:
-    """One line ``name  mean [low, high]  median`` for each number, and one for each failure."""
+    """Return lines ``name  mean [low, high]  median`` of each number, and one of each failure."""
     lines, intervals, medians = [], flat(report["interval"], lists=True), flat(report["median"])
     for name, value in flat(report["mean"]).items():
         shown, ends = "n/a" if value is None else f"{value:.5g}", intervals.get(name)
@@ -200,7 +199,7 @@ def count_line(report: dict[str, Any], folder: Path | None, beside: int) -> str:
     """Return the counts of evaluated and failed objects and the path of the report.
 
     Args:
-        report: what ``make_report`` returns.
+        report: the result of ``make_report``.
         folder: where it was written, or None.
         beside: the number of failures of baselines.
     """
@@ -211,13 +210,13 @@ def count_line(report: dict[str, Any], folder: Path | None, beside: int) -> str:
 
 @contextmanager
 def stdout_to_stderr() -> Iterator[None]:
-    """Sends what is printed meanwhile, by libraries too, to stderr: stdout is for the report."""
+    """Redirect stdout, of libraries too, to stderr: stdout is for the report."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    saved = os.dup(1)
     try:
         os.dup2(2, 1)
         yield
     finally:
         sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(saved, 1)
+        os.close(saved)

@@ -1,4 +1,4 @@
-"""Markdown tables of means or medians with their intervals, as all evaluations print them."""
+"""Markdown and LaTeX tables of means or medians with intervals, shared by all evaluations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Column(NamedTuple):
     """A column of figures.
 
     Attributes:
-        title: heads it.
+        title: its heading.
         digits: number of decimals.
     """
 
@@ -28,10 +28,9 @@ class Row(NamedTuple):
     """A row of figures.
 
     Attributes:
-        names: what stands before the figures.
-        figures: by key, as ``averages.summary_of`` makes them, of which the intervals may lack;
-            None where there is no such figure.
-        signed: whether positive values get a plus sign, as differences have it.
+        names: cells before the figures.
+        figures: by key, as from ``averages.summary_of``, intervals optional; None if missing.
+        signed: positive values get a plus sign, for differences.
     """
 
     names: Sequence[str]
@@ -42,13 +41,13 @@ class Row(NamedTuple):
 def figures(
     head: Sequence[str], columns: Mapping[str, Column], rows: Iterable[Row], of: str = "mean"
 ) -> Lines:
-    """The lines of a table of figures, for ``markdown``; "-" where a row has no such figure.
+    """Return the lines of a table of figures, for ``markdown``; "-" for a missing figure.
 
     Args:
-        head: of the names.
+        head: titles of the names.
         columns: by the figures' keys.
-        rows: each with so many names.
-        of: what is shown of each figure, "mean" or "median".
+        rows: each with as many names as ``head``.
+        of: statistic shown, "mean" or "median".
     """
     ends = {"mean": "interval", "median": "median_interval"}[of]
     lines = [[*head, *(column.title for column in columns.values())]]
@@ -63,12 +62,12 @@ def figures(
 
 
 def markdown(lines: Lines) -> str:
-    """A Markdown table of lines, aligned in plain text too."""
+    """Format lines as a Markdown table, aligned in plain text too."""
     return table(lines[0], lines[1:], aligned=True)
 
 
 def latex(lines: Lines) -> str:
-    """A LaTeX ``tabular`` of lines, with the rules of booktabs."""
+    """Format lines as a LaTeX ``tabular`` with the rules of booktabs."""
     arrows = str.maketrans({"↑": r"$\uparrow$", "↓": r"$\downarrow$"})
     escaped = [
         [re.sub(r"([&%$#_{}])", r"\\\1", cell).translate(arrows) for cell in line] for line in lines

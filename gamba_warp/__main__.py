@@ -1,4 +1,4 @@
-"""``python -m gamba_warp``, which is the console script ``gamba``."""
+"""``python -m gamba_warp``: the same as the console script ``gamba``."""
 
 from .cli import main
 

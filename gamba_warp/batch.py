@@ -1,4 +1,4 @@
-"""Many inputs, one after the other: one that fails is noted, and the rest go on."""
+"""Processing of many inputs: a failure is recorded, and the rest go on."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 Item = TypeVar("Item")
-# What one bad input may raise: everything else is a defect of the program, and stops it.
+# Errors that one bad input may raise. Any other is a bug, and stops the program.
 EXPECTED = (UserError, ValueError, ArithmeticError, OSError, RuntimeError, MemoryError)
 
 
@@ -28,17 +28,17 @@ def for_each(
     unit: str,
     failures: list[tuple[Item, str]] | None = None,
 ) -> list[tuple[Item, str]]:
-    """Calls ``function(name, item)`` on each, with a progress bar.
+    """Call ``function(name, item)`` on each item, with a progress bar.
 
     Args:
         named: the items by name.
-        function: what to do with each.
+        function: called on each.
         desc: the bar's title.
-        unit: what one item is called.
-        failures: list to add to; who gives it has it also when the loop is interrupted.
+        unit: the noun for one item.
+        failures: list to append to; the caller has it even if the loop is interrupted.
 
     Returns:
-        The items that failed, each with a reason of one line, after what was in ``failures``.
+        ``failures`` with the failed items appended, each with a reason of one line.
     """
     failures = [] if failures is None else failures
     with progress_bar(named.items(), desc=desc, unit=unit) as bar:
@@ -53,25 +53,25 @@ def for_each(
 
 
 def progress_bar(items: Iterable[Item] | None = None, **options: Any) -> tqdm[Item]:
-    """A bar of tqdm's on stderr, with its options; nothing is drawn where that is no terminal.
+    """Return a tqdm bar on stderr; nothing is drawn unless stderr is a terminal.
 
-    A log or a pipe would keep every state of the bar, one behind the other on one line.
+    A log or a pipe would collect every state of the bar on one long line.
     """
     from tqdm import tqdm
 
-    bar: Any = tqdm(items, disable=None, **options)  # without items nothing says of what it is
+    bar: Any = tqdm(items, disable=None, **options)  # without items its type is unknown
     return bar
 
 
 def say(line: str) -> None:
-    """Prints a line about an item on stdout, above the progress bar of ``for_each``."""
+    """Print a line about an item on stdout, above the progress bar of ``for_each``."""
     from tqdm import tqdm
 
     tqdm.write(one_line(line))
 
 
 def warn(path: Path, lines: Iterable[str]) -> None:
-    """Prints in one line on stderr, above the bar, what of a file is not used; nothing of none."""
+    """Print warnings about a file on stderr, in one line above the bar, if there are any."""
     from tqdm import tqdm
 
     if text := "; ".join(lines):
@@ -79,11 +79,11 @@ def warn(path: Path, lines: Iterable[str]) -> None:
 
 
 class Stages:
-    """What a command is doing: shown behind the bar of ``for_each``, and timed.
+    """Stages of a command, timed and shown beside the bar of ``for_each``.
 
     Attributes:
-        show: shows a name; None where there is no bar.
-        seconds: of each stage, over all items: by the clock, and of the processor.
+        show: shows a name; None without a bar.
+        seconds: wall-clock and CPU seconds of each stage, over all items.
     """
 
     def __init__(self) -> None:
@@ -92,9 +92,9 @@ class Stages:
         self._name, self._since = "start", (None, 0.0)
 
     def begin(self, name: str) -> None:
-        """Ends the stage before, and begins one; the same name may come again for each item."""
+        """End the current stage and begin another; a name may recur for each item."""
         now = time.perf_counter(), time.process_time()
-        then = self._since[0] or now[0]  # what was before the first stage has no clock
+        then = self._since[0] or now[0]  # before the first stage no clock runs
         spent = self.seconds.setdefault(self._name, [0.0, 0.0])
         spent[0] += now[0] - then
         spent[1] += now[1] - self._since[1]
@@ -103,13 +103,13 @@ class Stages:
             self.show(name)
 
     def table(self) -> str:
-        """Ends the last stage; one line a stage, with the seconds."""
+        """End the last stage and return one line per stage, with its seconds."""
         self.begin("")
         rows = {name: spent for name, spent in self.seconds.items() if name}
         rows["all"] = [sum(spent[i] for spent in rows.values()) for i in (0, 1)]
         lines = [f"{name:<16} {wall:8.2f} {work:8.2f}" for name, (wall, work) in rows.items()]
         start, (_, work) = next(iter(rows.items()))
-        lines[0] = f"{start:<16} {'':8} {work:8.2f}"  # no clock ran before the program
+        lines[0] = f"{start:<16} {'':8} {work:8.2f}"  # wall-clock time of the start is unknown
         return "\n".join([f"{'stage':<16} {'clock s':>8} {'CPU s':>8}", *lines])
 
 
@@ -117,21 +117,21 @@ STAGES = Stages()
 
 
 def counted(count: int, unit: str) -> str:
-    """A number of things: ``1 picture``, ``2 pictures``."""
+    """Format a count: ``1 picture``, ``2 pictures``."""
     return f"{count:,} {unit}" + ("" if count == 1 else "s")
 
 
 def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: Path) -> int:
-    """Says what failed, and where the results are.
+    """Print the failures and the folder of the results.
 
     Args:
-        count: of the inputs.
-        unit: what one input is called.
+        count: number of inputs.
+        unit: the noun for one input.
         failures: as ``for_each`` returns them.
         out: folder of the results.
 
     Returns:
-        The exit code, 1 after a failure.
+        The exit code: 1 if an input failed, else 0.
     """
     for item, reason in failures:
         print(f"gamba: failed: {item}: {reason}", file=sys.stderr)
@@ -146,25 +146,23 @@ def plan_outputs(
     reads: Iterable[Path | None] = (),
     own: Sequence[str] = (),
 ) -> dict[str, Path]:
-    """A name for each input: its stem, with a number where two inputs would share an output.
+    """Name each input by its stem, with a number where two inputs would share an output.
 
-    ``.compressed.ply`` is one suffix: the other formats are not compressed in its way. Whose name
-    has a number is said.
-
-    Two names that differ in capitals only are one name to many file systems, and so they are here.
+    ``.compressed.ply`` counts as one suffix. Numbered names are printed. Names that differ only in
+    case count as equal, as on many file systems.
 
     Args:
         inputs: files that are read.
-        suffixes: what follows the name in each output, such as ``-mesh.glb``.
-        folder: of the outputs; it need not be there yet.
-        reads: other files, and folders, that the command reads; None is passed over.
-        own: names of files in the folder that the command writes of no one input.
+        suffixes: of the outputs, appended to the name, such as ``-mesh.glb``.
+        folder: of the outputs; it need not exist yet.
+        reads: other files and folders that the command reads; None is skipped.
+        own: names of files that the command writes into the folder for no single input.
 
     Returns:
         The inputs by name, in their order. The outputs are ``folder / (name + suffix)``.
 
     Raises:
-        UserError: an output would overwrite something that is read.
+        UserError: an output would overwrite an input.
     """
     names: dict[str, Path] = {}
     taken = {name.casefold() for name in own}
@@ -191,15 +189,15 @@ def plan_outputs(
 
 
 def check_not_read(targets: Iterable[Path], reads: Iterable[Path | None]) -> None:
-    """Refuses outputs that would replace what the command reads.
+    """Refuse outputs that would replace an input of the command.
 
     Args:
-        targets: files that the command is to write; those that are not there yet are fine.
-        reads: files that it reads, and folders, of which every file may be read.
+        targets: files that the command will write; they need not exist yet.
+        reads: files that it reads, and folders, in which it may read any file.
 
     Raises:
-        UserError: a target is one of the files, also by a link or by other capitals, or a file in
-            one of the folders.
+        UserError: a target is one of the files, perhaps by a link or in other case, or lies in one
+            of the folders.
     """
     files: dict[tuple[int, int], Path] = {}
     folders: dict[tuple[int, int], Path] = {}
@@ -219,7 +217,7 @@ def check_not_read(targets: Iterable[Path], reads: Iterable[Path | None]) -> Non
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """What tells a file from every other, links followed; None where there is none."""
+    """Return the device and inode of a file, links followed; None if it is missing."""
     try:
         found = os.stat(path)
     except (OSError, ValueError):

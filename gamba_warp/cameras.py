@@ -1,8 +1,8 @@
-"""Cameras, and the conventions that hold for them everywhere.
+"""Cameras and their conventions.
 
 ``viewmats [.., V, 4, 4]`` map world to camera in the OpenCV frame (x right, y down, z forward).
 ``Ks [.., V, 3, 3]`` are in pixels, with pixel centres at +0.5. Dataset files hold camera-to-world
-matrices in the OpenGL/Blender frame (x right, y up, z backward); ``from_opengl`` is the bridge.
+matrices in the OpenGL/Blender frame (x right, y up, z backward); ``from_opengl`` converts them.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ class Cameras:
     height: int
 
     def __getitem__(self, index) -> Cameras:
-        """Indexes the leading dimensions of both tensors."""
+        """Index the leading dimensions of both tensors."""
         return replace(self, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
     def to(self, *args, **kwargs) -> Cameras:
-        """Moves or converts both tensors, with the arguments of ``torch.Tensor.to``."""
+        """Move or convert both tensors, with the arguments of ``torch.Tensor.to``."""
         return replace(
             self, viewmats=self.viewmats.to(*args, **kwargs), Ks=self.Ks.to(*args, **kwargs)
         )
 
     def resized(self, width: int, height: int) -> Cameras:
-        """Returns the same cameras for another picture size; the field of view stays."""
+        """Return the same cameras for another picture size; the field of view stays."""
         factor = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
         return Cameras(self.viewmats, self.Ks * factor[:, None], width, height)
 
 
 def intrinsics(width: int, height: int, fov: float = DEFAULT_FOV) -> Tensor:
-    """Returns K ``[3, 3]`` float32 of square pixels, a centred axis and a vertical fov, degrees."""
+    """Return K ``[3, 3]`` float32 of square pixels, a centred axis and a vertical fov, degrees."""
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     return torch.tensor(
         [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]], dtype=torch.float32
@@ -60,13 +60,13 @@ def intrinsics(width: int, height: int, fov: float = DEFAULT_FOV) -> Tensor:
 
 
 def from_opengl(camera_to_world: Tensor) -> Tensor:
-    """Converts camera-to-world OpenGL matrices to world-to-camera OpenCV ones, ``[.., 4, 4]``."""
+    """Convert camera-to-world OpenGL matrices to world-to-camera OpenCV ones, ``[.., 4, 4]``."""
     inverse = torch.linalg.inv(camera_to_world.double())
     return (_FLIP @ inverse).to(camera_to_world.dtype)
 
 
 def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
-    """Returns ``[4, 4]`` float32 of the reference camera, which looks at the origin along +z."""
+    """Return ``[4, 4]`` float32 of the reference camera, which looks along +z at the origin."""
     viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[2, 3] = distance
     return viewmat
@@ -75,7 +75,7 @@ def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
 def orbit(
     azimuths: Tensor, elevation: float | Tensor = 0.0, distance: float | Tensor = DEFAULT_DISTANCE
 ) -> Tensor:
-    """Returns world-to-camera matrices ``[V, 4, 4]`` float32 on an orbit about the origin.
+    """Return world-to-camera matrices ``[V, 4, 4]`` float32 on an orbit about the origin.
 
     The world is the reference camera's frame, so "up" is -y. The reference camera itself has
     azimuth and elevation 0, and a camera of positive elevation looks down from above.
@@ -102,7 +102,7 @@ def orbit(
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """Returns ``[count, 3]`` float64 unit vectors, evenly spread and none along an axis."""
+    """Return ``[count, 3]`` float64 unit vectors, evenly spread and none along an axis."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     angle = np.pi * (1 + 5**0.5) * k
@@ -113,7 +113,7 @@ def fibonacci_sphere(count: int) -> np.ndarray:
 def relative_to_reference(
     viewmats: Tensor, reference: Tensor, distance: float = DEFAULT_DISTANCE
 ) -> tuple[Tensor, Tensor]:
-    """Expresses poses in the reference camera's frame, at a normalised distance.
+    """Express poses in the reference camera's frame, at a normalised distance.
 
     The new world has the object's origin, the axes of the reference camera, and a unit in which the
     reference camera is at ``distance``. If the reference camera looks at the origin, its new matrix
@@ -137,11 +137,11 @@ def relative_to_reference(
 
 
 def exact_product(rows: Tensor, matrix: Tensor) -> Tensor:
-    """``rows @ matrix`` for three columns and rows, with all digits in both directions.
+    """Compute ``rows @ matrix`` with inner size 3, in full precision forward and backward.
 
-    A training lets a GPU round the factors of its matrix products to TF32, which keeps 11 bits of
-    each. That setting belongs to the process, and a backward pass runs when a guard around the
-    forward pass is over. So geometry makes no matrix products: it multiplies and adds.
+    Training lets a GPU round the factors of matrix products to TF32, with 11 bits each. The setting
+    is process-wide, and a backward pass runs after any guard around the forward pass has ended. So
+    geometry multiplies and adds instead.
 
     Args:
         rows: ``[.., N, 3]``.
@@ -155,7 +155,7 @@ def exact_product(rows: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _inverse(matrices: Tensor) -> Tensor:
-    """Inverts ``[.., 3, 3]`` by cofactors; torch's own would wait for the GPU to see failures."""
+    """Invert ``[.., 3, 3]`` by cofactors; ``torch.linalg.inv`` would synchronise with the GPU."""
     a, b, c = matrices.unbind(-2)
     pairs = ((b, c), (c, a), (a, b))
     columns = torch.stack([torch.linalg.cross(x, y) for x, y in pairs], -1)
@@ -163,7 +163,7 @@ def _inverse(matrices: Tensor) -> Tensor:
 
 
 def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
-    """Computes Plücker coordinates (o × d, d) of the rays through all pixel centres, world frame.
+    """Compute Plücker coordinates (o × d, d) of the rays through all pixel centres, world frame.
 
     Args:
         viewmats: ``[.., 4, 4]``.
@@ -179,7 +179,7 @@ def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tenso
     y = torch.arange(height, device=Ks.device, dtype=Ks.dtype) + 0.5
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     pixels = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], -1)
-    # This is d_world = Rᵀ K⁻¹ p, written for row vectors.
+    # d_world = Rᵀ K⁻¹ p, for row vectors.
     to_world = exact_product(_inverse(Ks).mT, rotation)
     directions = exact_product(pixels.reshape(-1, 3), to_world)
     directions = directions / directions.norm(dim=-1, keepdim=True)

@@ -18,8 +18,8 @@ from .errors import FileWarning, UserError
 from .files import DISK_ERRORS
 from .versions import __version__, advice, missing
 
-# A command has one or two words. That of the words "a b-c" is the function ``a_b_c_command`` of
-# the module ``gamba_warp.commands.a_b_c``, if MODULES names no other; it is imported when called.
+# A command has one or two words. The command "a b-c" is the function ``a_b_c_command`` of
+# ``gamba_warp.commands.a_b_c``, unless MODULES names another module; it is imported when called.
 COMMANDS = {
     "demo": "Train, reconstruct and evaluate on the starter set.",
     "reconstruct": "Pictures to 3D Gaussians.",
@@ -46,11 +46,11 @@ COMMANDS = {
     "weights lpips": "Fetch the LPIPS-VGG weights.",
     "doctor": "Say what this machine can run.",
 }
-# Commands that a person waits for; trainings and measurements keep torch's own way of waiting.
+# Interactive commands (``share_cores``); training and measurements keep torch's busy-waiting.
 SHARING = {"reconstruct", "export", "render", "app"}
-# Those that run the network or fit, whose tensors are made and freed again and again.
+# Commands that allocate and free large tensors repeatedly (``keep_memory``).
 KEEPING = {"reconstruct", "app", "train", "ablate", "bench", "demo", "fit", "eval-views"}
-# Those that launch kernels.
+# Commands that launch kernels (``quiet_warp``).
 LAUNCHING = KEEPING | {"export", "render", "stress", "gpu-check", "doctor"}
 MODULES = {
     "app": "gamba_warp.app.server",
@@ -65,8 +65,8 @@ MODULES = {
 }
 
 
-def _find(arguments: list[str]) -> tuple[str, list[str]]:
-    """The command's name, and its own arguments."""
+def _find_command(arguments: list[str]) -> tuple[str, list[str]]:
+    """Split the arguments into the command's name and its options."""
     for words in (2, 1):
         name = " ".join(arguments[:words])
         if name in COMMANDS:
@@ -78,23 +78,22 @@ def _find(arguments: list[str]) -> tuple[str, list[str]]:
 
 
 def load_command(name: str) -> Callable[..., int | None]:
-    """Imports the function of one of ``COMMANDS``."""
+    """Import the function of one of ``COMMANDS``."""
     plain = name.replace(" ", "_").replace("-", "_")
     module = importlib.import_module(MODULES.get(name, f"gamba_warp.commands.{plain}"))
     return getattr(module, f"{plain}_command")
 
 
 def run(name: str, arguments: list[str]) -> int:
-    """Runs one command.
+    """Run one command.
 
     Args:
         name: one of ``COMMANDS``.
         arguments: its options.
 
     Returns:
-        The exit code: 0 all was done, 1 some inputs failed, 2 the input is bad or something that
-        it needs (memory, a file, the disk) cannot be had, 130 Ctrl-C. Anything else is a defect of
-        the program, and keeps its traceback.
+        The exit code: 0 success, 1 some inputs failed, 2 bad input or a missing resource (memory,
+        a file, the disk), 130 Ctrl-C. Any other error is a bug, and keeps its traceback.
     """
     try:
         import tyro
@@ -110,35 +109,35 @@ def run(name: str, arguments: list[str]) -> int:
         if name in LAUNCHING and not helps:
             quiet_warp()
         command = load_command(name)
-        arguments = _joined(arguments, command)
+        arguments = _merge_repeated(arguments, command)
         expand = getattr(sys.modules.get(command.__module__), "expand", None)
         arguments = expand(arguments) if expand else arguments
-        # An option that is left out is None; the word is no value of it.
+        # None marks an option that is left out; the word "None" is not a valid value.
         plain = (tyro.conf.DisallowNone,)
         return tyro.cli(command, args=arguments, prog=f"gamba {name}", config=plain) or 0
     except BrokenPipeError:
-        raise  # the reader of the output left; see ``main``
+        raise  # the reader of the output closed it; see ``main``
     except KeyboardInterrupt:
-        _complain("interrupted")
+        _print_error("interrupted")
         return 130
     except Exception as error:
-        reason = _outside_reason(error, name)
+        reason = _user_message(error, name)
         if reason is None:
             raise
-        _complain(reason)
+        _print_error(reason)
         return 2
 
 
-def _joined(arguments: list[str], command: Callable) -> list[str]:
-    """The arguments with the values of an option that is there twice behind one another.
+def _merge_repeated(arguments: list[str], command: Callable) -> list[str]:
+    """Merge the values of a repeated option, of which tyro silently keeps the last only.
 
-    tyro keeps the last ones without a word. Raises UserError for an option that takes one value.
+    Raises UserError if the option takes one value.
     """
     options = dict(_options(command))
     first: dict[str, list[str]] = {}
     groups = [values := []]
     for at, word in enumerate(arguments):
-        if word == "--":  # what follows are no options
+        if word == "--":  # no options follow
             groups.append(arguments[at:])
             break
         if not re.match("--?[A-Za-z]", word):
@@ -162,10 +161,10 @@ def _joined(arguments: list[str], command: Callable) -> list[str]:
 
 
 def _options(kind: Any) -> Iterator[tuple[str, tuple[str, bool]]]:
-    """Of a command or class of options: each option, what it is an alias of, if it is a list."""
+    """Yield each option of a command or options class, its full name, and if it takes a list."""
     noted = get_type_hints(kind, include_extras=True)
     for name, hint in get_type_hints(kind).items():
-        parts = hint, *get_args(hint)  # of a union its members
+        parts = hint, *get_args(hint)  # with the members of a union
         several = any(... in get_args(part) for part in parts)  # tuple[str, ...]
         aliases = [
             x for note in get_args(noted[name]) for x in getattr(note, "aliases", None) or ()
@@ -176,14 +175,14 @@ def _options(kind: Any) -> Iterator[tuple[str, tuple[str, bool]]]:
             yield from _options(part)
 
 
-def _outside_reason(error: Exception, command: str) -> str | None:
-    """What is wrong outside of the program, in one line; None for a defect of the program."""
+def _user_message(error: Exception, command: str) -> str | None:
+    """Return the user-facing message of an error, in one line; None for a bug."""
     text = " ".join(str(error).split())
     if isinstance(error, UserError):
         return text or "bad input"
     if isinstance(error, ModuleNotFoundError):
         return advice(error.name or "", command)
-    # torch's errors of memory are RuntimeErrors, and on the CPU of no type of their own.
+    # torch raises plain RuntimeErrors when it runs out of memory on the CPU.
     exhausted = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
     if isinstance(error, MemoryError) or exhausted:
         return f"not enough memory ({text[:200]})" if text else "not enough memory"
@@ -195,38 +194,38 @@ def _outside_reason(error: Exception, command: str) -> str | None:
     return None
 
 
-def _complain(text: str) -> None:
-    """Prints one line to the standard error, unless that is closed or its disk is full."""
+def _print_error(text: str) -> None:
+    """Print one line to standard error, unless that is closed or its disk is full."""
     with suppress(OSError, ValueError):
         print(f"gamba: {text}", file=sys.stderr, flush=True)
 
 
-_ordinary = warnings.formatwarning
+_default_format = warnings.formatwarning
 
 
-def _told(message: Any, category: type[Warning], *where: Any, **others: Any) -> str:
-    """A warning as it is printed: of a file one line, which needs no place in the code."""
+def _format_warning(message: Any, category: type[Warning], *where: Any, **others: Any) -> str:
+    """Format a warning; that of a file is one line without a place in the code."""
     if issubclass(category, FileWarning):
         return f"gamba: warning: {message}\n"
-    return _ordinary(message, category, *where, **others)
+    return _default_format(message, category, *where, **others)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the console script."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # names of files need not be UTF-8
+        if isinstance(stream, io.TextIOWrapper):  # file names need not be UTF-8
             stream.reconfigure(errors="backslashreplace")
-    warnings.formatwarning = _told
+    warnings.formatwarning = _format_warning
     try:
         code = _main(arguments)
         sys.stdout.flush()
-    except OSError as error:  # Python would complain again at exit, when it flushes
+    except OSError as error:  # Python would fail again when it flushes at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError):  # the reader left, as `head` does
+        if isinstance(error, BrokenPipeError):  # the reader closed the pipe, as `head` does
             code = 141
         elif error.errno in DISK_ERRORS:
-            _complain(f"cannot write the standard output: {error.strerror}")
+            _print_error(f"cannot write the standard output: {error.strerror}")
             code = 2
         else:
             raise
@@ -244,8 +243,8 @@ def _main(arguments: list[str]) -> int:
         print(__version__)
         return 0
     try:
-        name, rest = _find(arguments)
+        name, rest = _find_command(arguments)
     except UserError as error:
-        _complain(str(error))
+        _print_error(str(error))
         return 2
     return run(name, rest)

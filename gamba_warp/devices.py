@@ -1,4 +1,4 @@
-"""The device that a command computes on, and how it shares the cores."""
+"""Device, precision, memory and threads of a command."""
 
 from __future__ import annotations
 
@@ -20,21 +20,20 @@ if TYPE_CHECKING:
     import torch
 
 _TRIAL_SECONDS, _TRIAL_ROWS = 0.05, 2048
-_FASTER = 1.2  # how much faster bfloat16 must be: a choice on the edge would change from run to run
-_ALL_DIGITS = 1e-6  # relative rms error of a product of float32; rounded factors make it 2e-3
-# Options of glibc's mallopt, and their values: what is kept free, and the size from which a block
-# is mapped by itself.
-_KEEP, _MAPPED = (-1, 1 << 30), (-3, 256 << 20)
+_FASTER = 1.2  # least speed-up for bfloat16: near 1 the choice would vary from run to run
+_FLOAT32_ERROR = 1e-6  # relative rms error of a float32 product; rounded factors make it 2e-3
+# Options of glibc's mallopt (malloc.h) with their values in bytes.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = (-1, 1 << 30), (-3, 256 << 20)
 
 
 def pick_device(name: DeviceChoice) -> torch.device:
-    """The device of the option ``--device``.
+    """Return the device of the option ``--device``.
 
     Args:
-        name: ``auto`` is CUDA where there is a device, else the CPU.
+        name: ``auto`` is CUDA if a device is available, else the CPU.
 
     Raises:
-        UserError: CUDA is asked for and is not there.
+        UserError: CUDA is asked for and not available.
     """
     import torch
 
@@ -44,12 +43,12 @@ def pick_device(name: DeviceChoice) -> torch.device:
 
 
 def share_cores() -> None:
-    """Lets threads that wait sleep at once, where other programs use the cores too.
+    """Reduce OpenMP busy-waiting on a loaded machine.
 
-    By default the threads of torch's CPU operators turn in a loop for milliseconds while they wait
-    for each other. Where a core is not free, that takes the time of the thread that is waited for:
-    a mesh took five times as long beside a training on two cores (docs/pace.md). It must be called
-    before torch is imported, and leaves what the user has set as it is.
+    By default the threads of torch's CPU operators spin for milliseconds while they wait for each
+    other. On a busy core that takes time from the thread they wait for: a mesh took five times as
+    long beside a training on two cores (docs/pace.md). Call it before torch is imported. Variables
+    that the user has set win.
     """
     chosen = {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & {*os.environ}
     if chosen or "torch" in sys.modules or not hasattr(os, "getloadavg"):
@@ -59,32 +58,31 @@ def share_cores() -> None:
 
 
 def keep_memory() -> None:
-    """Lets the process keep the memory that it frees, up to 1 GiB, where glibc gives it.
+    """Let glibc keep up to 1 GiB of freed memory.
 
-    It is for the tensors of torch's own operators. Their blocks of some MiB are otherwise given
-    back at once, and the system clears each page again at the next use (docs/lab/step.md says what
-    that costs a picture). The results of our operators do not need it: the pool of
-    ``kernels/runtime/memory.py`` keeps them in every program, also those over 256 MiB, which glibc
-    gives back as before.
+    Otherwise glibc returns the tensors of torch's operators, of some MiB each, to the system at
+    once, and the system clears each page at the next use (docs/lab/step.md has the cost per
+    picture). Results of our operators stay in the pool of ``kernels/runtime/memory.py``, in every
+    program and also over 256 MiB, from where glibc returns blocks as before.
 
-    It changes the allocator of the whole process, so only commands call it; a program that runs the
-    network often may do so too. What the user has set by MALLOC_* or GLIBC_TUNABLES stays.
+    The allocator is process-wide, so only commands call this; a program that runs the network often
+    may do so too. Settings of the user by MALLOC_* or GLIBC_TUNABLES win.
     """
     chosen = [name for name in os.environ if name.startswith("MALLOC_")]
     if chosen or "GLIBC_TUNABLES" in os.environ or sys.platform != "linux":
         return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries lack it
     if mallopt is not None:
-        for option, value in (_KEEP, _MAPPED):
+        for option, value in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
             mallopt(ctypes.c_int(option), ctypes.c_int(value))
 
 
 def quiet_warp() -> None:
-    """Has Warp say its warnings alone, and not its start and each module that it loads.
+    """Silence Warp's messages on start and on each module that it loads; warnings stay.
 
-    Where there is no GPU, its start also says that no driver was found: that line, which Warp's own
-    machine code writes, is held back. These are settings of the whole process, so only commands
-    call this; a level that somebody chose stays.
+    Without a GPU, Warp's native code also reports a missing driver at its start; that line is
+    filtered from stderr. The settings are process-wide, so only commands call this. A log level
+    that was set before stays.
     """
     import torch
     import warp
@@ -110,13 +108,13 @@ def quiet_warp() -> None:
 
 
 def pick_precision(name: Precision, device: torch.device, width: int) -> torch.dtype:
-    """The dtype of the option ``--precision``.
+    """Return the dtype of the option ``--precision``.
 
     Args:
-        name: ``auto`` is bfloat16 where a product of the model's size is at least 1.2 times as
-            fast in it as in float32 (``network_products``), else float32. The trial takes about
-            0.1 s once a process; a processor without bfloat16 products fails it by far.
-        device: where the model computes.
+        name: ``auto`` is bfloat16 if a product of the model's size is at least 1.2 times as fast
+            as in float32 (``network_products``), else float32. The trial takes about 0.1 s, once
+            per process; a processor without bfloat16 products is far below.
+        device: of the model.
         width: channels of the model's tokens.
 
     Returns:
@@ -126,18 +124,18 @@ def pick_precision(name: Precision, device: torch.device, width: int) -> torch.d
 
     if name != "auto":
         return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
-    faster = _gain_of_bfloat16(str(device), width, torch.get_num_threads())
+    faster = _bfloat16_speedup(str(device), width, torch.get_num_threads())
     return torch.bfloat16 if faster >= _FASTER else torch.float32
 
 
 @functools.cache
-def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
-    """How many times as fast a product is in bfloat16 as in float32, by the fastest of each."""
+def _bfloat16_speedup(name: str, width: int, threads: int) -> float:
+    """Return the speed-up of a product in bfloat16 over float32, by the fastest run of each."""
     import torch
     from torch.utils.benchmark import Timer
 
     device = torch.device(name)
-    g = torch.Generator().manual_seed(0)  # the state of torch's own chance belongs to the caller
+    g = torch.Generator().manual_seed(0)  # leaves torch's global generator alone
     full = torch.randn(_TRIAL_ROWS, width, generator=g).to(device)
     matrix = torch.randn(width, 4 * width, generator=g).to(device)
     pairs = [(full, matrix), (full.bfloat16(), matrix.bfloat16())]
@@ -149,10 +147,10 @@ def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
     return best[0] / best[1]
 
 
-class _Products:
-    """How many threads are inside each of the two settings below; before them all, torch's own.
+class _MatmulUsers:
+    """Number of threads inside each of the two contexts below, and torch's setting before them.
 
-    torch has one setting for the whole process.
+    The setting is process-wide.
     """
 
     lock = threading.Lock()
@@ -160,25 +158,25 @@ class _Products:
     before = "highest"
 
 
-def _count(network: int = 0, float32: int = 0) -> None:
-    """Counts threads that come or go, and sets what those that are left need."""
+def _update_precision(network: int = 0, float32: int = 0) -> None:
+    """Add to the counts of threads, and set the precision that the remaining ones need."""
     import torch
 
-    with _Products.lock:
-        if not (_Products.network or _Products.float32):
-            _Products.before = torch.get_float32_matmul_precision()
-        _Products.network += network
-        _Products.float32 += float32
-        wanted = "medium" if _Products.network else _Products.before
-        torch.set_float32_matmul_precision("highest" if _Products.float32 else wanted)
+    with _MatmulUsers.lock:
+        if not (_MatmulUsers.network or _MatmulUsers.float32):
+            _MatmulUsers.before = torch.get_float32_matmul_precision()
+        _MatmulUsers.network += network
+        _MatmulUsers.float32 += float32
+        wanted = "medium" if _MatmulUsers.network else _MatmulUsers.before
+        torch.set_float32_matmul_precision("highest" if _MatmulUsers.float32 else wanted)
 
 
 @contextmanager
 def float32_weights() -> Iterator[None]:
-    """Networks that are made inside are of float32, whatever torch's default dtype is.
+    """Create networks in float32 inside, whatever torch's default dtype is.
 
-    The operators take no float64, and random weights are drawn otherwise in it. The default is the
-    process's: where it is another, other threads see this one meanwhile.
+    The operators take no float64, and random weights differ in it. The default dtype is
+    process-wide, so other threads see float32 meanwhile.
     """
     import torch
 
@@ -192,26 +190,26 @@ def float32_weights() -> Iterator[None]:
 
 @contextmanager
 def network_products(device: torch.device, precision: torch.dtype | None = None) -> Iterator[None]:
-    """Matrix products inside are those of a network: in ``precision``, by the fastest library.
+    """Compute a network's matrix products in ``precision``, by the fastest library.
 
-    What it does to products of float32 depends on the processor:
+    float32 products depend on the processor:
 
-    - AMD with AVX-512, without AMX: oneDNN makes them. torch gives them to MKL, which makes no use
-      of AVX-512 there and takes twice as long on a Zen 5. torch's setting for oneDNN is "medium",
-      which also allows it to round the factors to bfloat16; without AMX nothing is to be gained by
-      that, and all digits are kept. Once a process a product is compared with float64, and where
-      its error is not that of float32, nothing is changed.
-    - Other CPUs: nothing. Intel's are those that MKL is made for.
-    - A GPU: nothing. It rounds the factors (TF32) where the process lets it.
+    - AMD with AVX-512 and without AMX: oneDNN. By default torch calls MKL, which does not use
+      AVX-512 there and takes twice as long on a Zen 5. torch selects oneDNN by the setting
+      "medium", which also permits factors rounded to bfloat16; without AMX oneDNN does not round
+      them. Once per process a product is compared with float64; if its error is larger than that
+      of float32, nothing is changed.
+    - Other CPUs: unchanged. MKL is made for Intel's.
+    - GPUs: unchanged. They round the factors (TF32) if the process allows it.
 
-    Products of bfloat16 are torch's autocast, on every processor. Inside ``float32_products``, of
-    whichever thread, and inside torch.compile the library stays as it is. What autograd computes
-    later is outside, unless ``backward`` is called inside too.
+    bfloat16 products use torch's autocast, on every processor. Inside ``float32_products`` of any
+    thread, and inside torch.compile, the library is unchanged. A later backward pass is not
+    covered, unless ``backward`` is called inside too.
 
     Args:
-        device: where the network computes.
-        precision: ``torch.bfloat16``, or ``torch.float32``, which also ends an autocast of the
-            caller inside; None leaves an autocast as it is.
+        device: of the network.
+        precision: ``torch.bfloat16``, or ``torch.float32``, which disables an outer autocast
+            inside; None leaves an autocast as it is.
     """
     import torch
 
@@ -222,48 +220,48 @@ def network_products(device: torch.device, precision: torch.dtype | None = None)
         if device.type != "cpu" or torch.compiler.is_compiling() or not _onednn_is_better():
             yield
             return
-        _count(network=1)
+        _update_precision(network=1)
         try:
             yield
         finally:
-            _count(network=-1)
+            _update_precision(network=-1)
 
 
 @contextmanager
 def float32_products() -> Iterator[None]:
-    """Matrix products of float32 inside keep all digits, and are made by torch's own library.
+    """Compute float32 matrix products in full precision, by torch's default library.
 
-    - A GPU does not round their factors (no TF32), whatever the process lets it do otherwise.
-    - A CPU makes them by MKL, or what else torch was built with: ``network_products`` changes
-      nothing inside. That is for comparisons; it loses no digits either.
+    - A GPU does not round their factors (no TF32), whatever the process allows.
+    - A CPU uses MKL, or the library torch was built with: ``network_products`` has no effect
+      inside. That serves comparisons; it is as exact.
 
-    What autograd computes later is outside.
+    A later backward pass is not covered.
     """
-    _count(float32=1)
+    _update_precision(float32=1)
     try:
         yield
     finally:
-        _count(float32=-1)
+        _update_precision(float32=-1)
 
 
 @functools.cache
 def _onednn_is_better() -> bool:
-    """Whether this is such a processor, and oneDNN's products have all digits."""
+    """True on AMD with AVX-512 and without AMX, if oneDNN's products are exact to float32."""
     import torch
 
-    known = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.6 does not say
+    known = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.6 lacks it
     amx = any(value for name, value in known.items() if name.startswith("amx"))
     amd = str(known.get("cpu_name", "")).startswith("AMD")
     if amx or not (amd and known.get("avx512_f")) or not torch.backends.mkldnn.is_available():
         return False
     a, b = torch.randn(2, 128, 128, generator=torch.Generator().manual_seed(0))
     truth = a.double() @ b.double()
-    # The caller's autocast would round this product, and all later ones would be MKL's.
-    with _Products.lock, torch.autocast("cpu", enabled=False):
+    # An outer autocast would round this product, and the cached answer would be False.
+    with _MatmulUsers.lock, torch.autocast("cpu", enabled=False):
         before = torch.get_float32_matmul_precision()
         torch.set_float32_matmul_precision("medium")
         try:
             error = (a @ b).double() - truth
         finally:
             torch.set_float32_matmul_precision(before)
-    return bool(error.norm() <= _ALL_DIGITS * truth.norm())
+    return bool(error.norm() <= _FLOAT32_ERROR * truth.norm())

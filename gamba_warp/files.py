@@ -1,4 +1,4 @@
-"""Atomic writes: a file or folder is either whole or not there; what is unfinished has a name."""
+"""Atomic writes: a file or folder is either complete or absent. Unfinished ones have a prefix."""
 
 import errno
 import fnmatch
@@ -21,28 +21,28 @@ from .kernels.runtime.system import is_own
 PACKAGE = Path(__file__).resolve().parent
 # The folder of a checkout: of this package, of tests/ and of starter/.
 CHECKOUT = PACKAGE.parent
-# The shipped model and pictures to try it on: two in an installed package, more in a checkout,
-# where the starter set's data lie beside them.
+# The shipped model and example pictures: two in an installed package, more in a checkout, which
+# also has the starter set's data.
 STARTER = PACKAGE / "starter" if (PACKAGE / "starter").is_dir() else CHECKOUT / "starter"
-# What is not finished has a name that begins so. No command takes names with a dot for inputs.
+# Prefix of unfinished files. Commands ignore inputs whose names begin with a dot.
 PART = ".gamba-part-"
 _PART_NAME = re.compile(re.escape(PART) + "[a-z0-9_]{8}")
 _DAY = 24 * 3600.0  # seconds; no command writes one file for so long
-_READ = 1 << 20  # bytes read at once of a file that may be larger than the memory
-# Reasons of a failed write that are the disk's, even where the error names no file.
+_READ = 1 << 20  # bytes read at once; a file may be larger than the memory
+# Codes of a failed write that blame the disk, even if the error names no file.
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 
 
 def reason_of(error: BaseException) -> str:
-    """What an error says, in one line; its type where it says nothing."""
+    """Return the message of an error in one line; its type if the message is empty."""
     text = getattr(error, "strerror", None) or str(error)
     return " ".join(text.split()) or type(error).__name__
 
 
 def why_not_written(error: BaseException) -> str | None:
-    """Why a file could not be written, in one line; None if the error says something else.
+    """Return why a file could not be written, in one line; None for an unrelated error.
 
-    safetensors has an error type of its own, also for a full disk.
+    safetensors has its own error type, also for a full disk.
     """
     text = reason_of(error)
     if isinstance(error, OSError):
@@ -54,17 +54,17 @@ def why_not_written(error: BaseException) -> str | None:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yields a path of the same name in a new folder beside; on success the file moves to ``path``.
+    """Yield a path of the same name in a new folder beside; on success the file moves to ``path``.
 
-    Many writers go by the suffix, and safetensors makes a temporary file of its own beside what it
-    writes: in a folder of ours both are right, and what a killed process leaves can be told. The
-    file is on the disk before it has its name, so a power cut leaves it whole or not there.
+    The name keeps its suffix, by which many writers choose the format. The folder also holds the
+    temporary file that safetensors makes, and marks the leftovers of a killed process. The file is
+    synced before it is renamed, so a power cut leaves it complete or absent.
 
     Raises:
         UserError: the folder or the file cannot be written, or the disk is full.
     """
     path = Path(path)
-    # What lies in a folder that is unfinished itself goes to the disk with it, all at once.
+    # A file inside an unfinished folder is synced with that folder.
     alone = not any(_PART_NAME.fullmatch(parent.name) for parent in path.parents)
     with _unfinished(path) as folder:
         temporary = folder / path.name
@@ -79,7 +79,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _unfinished(path: Path) -> Iterator[Path]:
-    """Yields a new folder beside ``path`` that goes in the end; what the disk raises names it."""
+    """Yield a temporary folder beside ``path``; errors of the disk name ``path``."""
     folder = None
     try:
         folder = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
@@ -102,11 +102,11 @@ def _umask() -> int:
 
 @contextmanager
 def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
-    """Yields a temporary folder beside ``path``; on success it takes that name, else it goes.
+    """Yield a temporary folder beside ``path``; it is renamed on success, else removed.
 
     Args:
-        path: the folder that is to be.
-        replace: whether a folder of that name, if there is one, goes; else it is an error.
+        path: the final folder.
+        replace: replace an existing folder of that name; else it is an error.
 
     Raises:
         UserError: the folder or a file in it cannot be written, or the disk is full.
@@ -123,16 +123,16 @@ def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
         temporary.chmod(0o777 & ~_umask())  # mkdtemp makes 0700
         with _set_aside(path) if replace else nullcontext():
             if sys.platform == "win32" and path.is_dir():
-                path.rmdir()  # there a rename does not replace an empty folder
-            temporary.rename(path)  # an empty folder may be there
+                path.rmdir()  # a rename on Windows replaces no empty folder
+            temporary.rename(path)  # replaces an empty folder
         _sync(path.parent)
 
 
 @contextmanager
 def _set_aside(folder: Path) -> Iterator[None]:
-    """Gives a folder, if it is there, an unfinished name; it goes if all is well, else it is back.
+    """Rename a folder, if it exists, to an unfinished name; remove it on success, else restore it.
 
-    Half of a folder must not look like a whole one while it is removed.
+    A partly removed folder must not look complete.
     """
     doomed = folder.with_name(PART + secrets.token_hex(4))
     there = folder.exists()
@@ -148,7 +148,7 @@ def _set_aside(folder: Path) -> Iterator[None]:
 
 
 def remove_folder(folder: Path) -> None:
-    """Removes a folder that is ours; at no time half of it has its name.
+    """Remove a folder; it is never partly there under its name.
 
     Raises:
         OSError: it cannot be renamed.
@@ -158,11 +158,11 @@ def remove_folder(folder: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Waits until a file or a folder is on the disk, where the system can do that.
+    """Wait until a file or folder is on the disk, if the system supports it.
 
-    Windows opens no folders for it, and drives of other machines may refuse it.
+    Windows cannot sync folders, and network drives may refuse.
     """
-    # Windows syncs only what can be written.
+    # Windows syncs only writable handles.
     mode = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
     try:
         handle = os.open(path, mode)
@@ -176,11 +176,11 @@ def _sync(path: Path) -> None:
 
 
 def sweep(folder: str | Path, age: float = _DAY) -> None:
-    """Removes what killed processes left in a folder: names of ``PART``, ours, of a certain age.
+    """Remove leftovers of killed processes: the user's own files named ``PART``, of a certain age.
 
     Args:
-        folder: what lies in deeper folders stays.
-        age: seconds since anything in it was last written; 0 where nobody else writes there.
+        folder: deeper folders are not searched.
+        age: seconds since the last write; 0 if no other process writes there.
     """
     try:
         found = [e for e in os.scandir(folder) if _PART_NAME.fullmatch(e.name)]
@@ -196,36 +196,36 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
                 shutil.rmtree(entry.path, ignore_errors=True)
             elif entry.is_file():
                 os.unlink(entry.path)
-        except OSError:  # it has gone meanwhile
+        except OSError:  # removed meanwhile
             continue
 
 
 def _last_written(entry: os.DirEntry) -> float:
-    """When a file, or a folder and what is right in it, was last written, Unix seconds."""
+    """Return the last write to a file, or to a folder and its direct entries, in Unix seconds."""
     inner = os.scandir(entry.path) if entry.is_dir(follow_symlinks=False) else ()
     return max(e.stat(follow_symlinks=False).st_mtime for e in (entry, *inner))
 
 
 def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yields what ``os.walk`` does, for linked folders too; nothing whose name begins with a dot.
+    """Yield like ``os.walk``, also into linked folders, without names that begin with a dot.
 
-    A folder comes once, under the name without a link if it has one: links come after all else. A
-    link to a folder that ``root`` lies in is passed over. The caller may remove subfolders from
-    the list, which are then not entered; both lists are sorted.
+    A folder comes once; links come last, so that a name without a link is preferred. A link to a
+    parent of ``root`` is skipped. The caller may remove subfolders from the list, which are then
+    not entered. Both lists are sorted.
     """
 
-    def place(folder: str | Path) -> tuple[int, int] | None:
+    def identity(folder: str | Path) -> tuple[int, int] | None:
         try:
             status = os.stat(folder)
-        except OSError:  # it has gone meanwhile
+        except OSError:  # removed meanwhile
             return None
         return status.st_dev, status.st_ino
 
-    seen = {None, *map(place, Path(os.path.realpath(root)).parents)}
+    seen = {None, *map(identity, Path(os.path.realpath(root)).parents)}
     waiting = [os.fspath(root)]
-    for start in waiting:  # which grows by the links that are found
+    for start in waiting:  # grows by the links that are found
         for folder, subfolders, files in os.walk(start):
-            if (here := place(folder)) in seen:
+            if (here := identity(folder)) in seen:
                 subfolders.clear()
                 continue
             seen.add(here)
@@ -236,19 +236,19 @@ def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
 
 
 def visible(folder: Path, pattern: str) -> Iterator[Path]:
-    """Yields the files whose names match, at any depth (``walk``)."""
+    """Yield the files whose names match, at any depth (``walk``)."""
     for inner, _, files in walk(folder):
         for name in fnmatch.filter(files, pattern):
             yield Path(inner, name)
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Writes ``value`` as indented JSON, atomically; NaN and infinity are refused."""
+    """Write ``value`` as indented JSON, atomically; NaN and infinity are refused."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes UTF-8 text, atomically; what of a file's name is not UTF-8 is written with escapes.
+    """Write UTF-8 text, atomically; surrogates, as of file names, are escaped.
 
     Raises:
         UserError: the file cannot be written.
@@ -258,10 +258,10 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def output_folder(path: str | Path) -> Path:
-    """Makes the folder, parents included, checks that files can be made in it, and sweeps it.
+    """Make a folder with its parents, check that it is writable, and sweep it.
 
     Raises:
-        UserError: it is a file, or cannot be made or written.
+        UserError: it is a file, or cannot be created or written.
     """
     path = Path(path)
     try:
@@ -276,13 +276,13 @@ def output_folder(path: str | Path) -> Path:
 
 @contextmanager
 def only_process(folder: Path, what: str) -> Iterator[None]:
-    """Holds a folder for this process alone; the system lets go of it when the process ends.
+    """Lock a folder for this process; the system releases the lock when the process ends.
 
-    The file ``.lock`` in the folder stays; it holds the number of the process that had it last.
+    The file ``.lock`` in the folder stays, with the pid of its last owner.
 
     Args:
-        folder: it is there.
-        what: what the process does with it, for the message: "trains", "runs".
+        folder: exists.
+        what: verb for the message: "trains", "runs".
 
     Raises:
         UserError: another process holds it, or the lock cannot be made.
@@ -313,9 +313,9 @@ def only_process(folder: Path, what: str) -> Iterator[None]:
 
 
 def sha256_of_all(paths: Iterable[Path], folder: Path) -> str:
-    """The SHA-256 of the names of files in a folder and of their own SHA-256s, sorted by path.
+    """Return the SHA-256 of the names of files in a folder and their SHA-256s, sorted by path.
 
-    A file that cannot be read counts as that: it stops none of the others.
+    An unreadable file counts as "unreadable" and does not stop the others.
     """
     digest = hashlib.sha256()
     for path in sorted(paths):
@@ -328,10 +328,10 @@ def sha256_of_all(paths: Iterable[Path], folder: Path) -> str:
 
 
 def sha256(path: str | Path) -> str:
-    """The SHA-256 of a file, 64 hexadecimal digits.
+    """Return the SHA-256 of a file, 64 hexadecimal digits.
 
     Raises:
-        UserError: the file cannot be read, or is no plain file.
+        UserError: the file cannot be read, or is not a plain file.
     """
     digest = hashlib.sha256()
     if Path(path).exists() and not Path(path).is_file():  # a pipe or a device has no end
@@ -346,7 +346,7 @@ def sha256(path: str | Path) -> str:
 
 
 def check_sha256(path: str | Path, want: str) -> None:
-    """Compares a file's SHA-256 with ``want``, 64 hexadecimal digits.
+    """Compare a file's SHA-256 with ``want``, 64 hexadecimal digits.
 
     Raises:
         UserError: the file cannot be read or has another content.

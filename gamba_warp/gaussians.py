@@ -1,4 +1,4 @@
-"""The container of activated Gaussian parameters that every part of the package passes on."""
+"""Container of activated Gaussian parameters."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Gaussians:
         opacities: ``[.., N]`` in (0, 1).
         colors: ``[.., N, 3]`` RGB in [0, 1].
         harmonics: ``[.., N, K, 3]``, K of 3, 8 or 15: coefficients of the spherical harmonics of
-            degrees 1 to 1, 2 or 3 in the order and signs of 3DGS, which a direction of view adds
-            to ``colors`` (Kerbl et al. 2023); None: the colour is the same from all sides.
+            degrees 1 to 1, 2 or 3 in the order and signs of 3DGS, for the view-dependent part
+            added to ``colors`` (Kerbl et al. 2023); None: the colour is view-independent.
     """
 
     means: Tensor
@@ -52,65 +52,65 @@ class Gaussians:
 
     @property
     def degree(self) -> int:
-        """The highest degree of the spherical harmonics, 0 to 3."""
+        """Highest degree of the spherical harmonics, 0 to 3."""
         return 0 if self.harmonics is None else {3: 1, 8: 2, 15: 3}[self.harmonics.shape[-2]]
 
     @property
     def num(self) -> int:
-        """The number N of Gaussians of one object."""
+        """Number N of Gaussians of one object."""
         return self.opacities.shape[-1]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """Returns a container with ``function`` applied to every tensor that is not None."""
+        """Return a container with ``function`` applied to every tensor that is not None."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         made: dict[str, Any] = {k: v if v is None else function(v) for k, v in values.items()}
         return Gaussians(**made)
 
     def __getitem__(self, index) -> Gaussians:
-        """Indexes the leading batch dimensions, the same way in every tensor."""
+        """Index the leading batch dimensions, the same way in every tensor."""
         return self.map(lambda value: value[index])
 
     def select(self, keep: Tensor) -> Gaussians:
-        """Returns the Gaussians of one object (no batch dimension) that ``keep [N]`` selects."""
+        """Return the Gaussians of one object (no batch dimension) that ``keep [N]`` selects."""
         return self.map(lambda value: value[keep])
 
     def drawn(self, least: float | None = None) -> Gaussians:
-        """Returns the Gaussians of one object that can be seen; what is not finite stays.
+        """Return the Gaussians of one object that are drawn, and any with an opacity of NaN.
 
         Args:
-            least: opacity under which a Gaussian is left out. None: 1/255, under which the
-                rasterizer draws nothing, so that every picture keeps all its bits.
+            least: opacity below which a Gaussian is left out. None: 1/255, below which the
+                rasterizer draws nothing, so that pictures stay bit-identical.
         """
         return self.select(~(self.opacities < (ALPHA_MIN if least is None else least)))
 
     def to(self, *args, **kwargs) -> Gaussians:
-        """Moves or converts every tensor, with the arguments of ``torch.Tensor.to``."""
+        """Move or convert every tensor, with the arguments of ``torch.Tensor.to``."""
         return self.map(lambda value: value.to(*args, **kwargs))
 
     def detach(self) -> Gaussians:
-        """Returns the same values, detached from the graph."""
+        """Return the same values, detached from the graph."""
         return self.map(torch.Tensor.detach)
 
     def in_unit(self, center: Tensor, side: float) -> Gaussians:
-        """The same object with ``center [3]`` at the origin and the length ``side`` as the unit."""
+        """Return the object with ``center [3]`` at the origin and ``side`` as the unit length."""
         return replace(self, means=(self.means - center) / side, scales=self.scales / side)
 
     def transformed(self, rotation: Tensor, translation: Tensor, scale: float = 1.0) -> Gaussians:
-        """Moves all Gaussians by the same motion, ``x -> scale · rotation · x + translation``.
+        """Return the Gaussians moved by ``x -> scale · rotation · x + translation``.
 
         Args:
             rotation: ``[3, 3]``, a proper rotation.
             translation: ``[3]``.
             scale: > 0.
         """
-        turn = matrix_to_quat(rotation)
+        rotation_quat = matrix_to_quat(rotation)
         quats = self.quats
         if quats is None:
             quats = torch.zeros_like(self.means[..., :1]).expand(*self.means.shape[:-1], 4).clone()
             quats[..., 0] = 1.0
         return Gaussians(
             means=scale * self.means @ rotation.mT + translation,
-            quats=quat_multiply(turn.to(quats), quats),
+            quats=quat_multiply(rotation_quat.to(quats), quats),
             scales=scale * self.scales,
             opacities=self.opacities,
             colors=self.colors,
@@ -119,10 +119,10 @@ class Gaussians:
 
 
 def turn_harmonics(harmonics: Tensor, rotation: Tensor) -> Tensor:
-    """The coefficients after what they colour has been turned, ``Y(R d) c' = Y(d) c`` for all d.
+    """Rotate spherical-harmonic coefficients: ``Y(R d) c' = Y(d) c`` for all d.
 
-    The matrix between them is the solution of this equation at more directions than coefficients,
-    in float64, which is exact up to rounding.
+    The matrix between them is the least-squares solution at more directions than coefficients, in
+    float64, which is exact up to rounding.
 
     Args:
         harmonics: ``[.., K, 3]``, K of 3, 8 or 15, degrees 1 and above.
@@ -140,7 +140,7 @@ def turn_harmonics(harmonics: Tensor, rotation: Tensor) -> Tensor:
 
 
 def quat_multiply(p: Tensor, q: Tensor) -> Tensor:
-    """Computes the Hamilton product of wxyz quaternions ``[.., 4]``: first rotation q, then p."""
+    """Compute the Hamilton product of wxyz quaternions ``[.., 4]``: first rotation q, then p."""
     pw, px, py, pz = p.unbind(-1)
     qw, qx, qy, qz = q.unbind(-1)
     return torch.stack(
@@ -155,10 +155,10 @@ def quat_multiply(p: Tensor, q: Tensor) -> Tensor:
 
 
 def matrix_to_quat(rotation: Tensor) -> Tensor:
-    """Computes the wxyz quaternion ``[4]``, w >= 0, of a rotation matrix ``[3, 3]``.
+    """Compute the wxyz quaternion ``[4]``, w >= 0, of a rotation matrix ``[3, 3]``.
 
-    It is an eigenvector of Bar-Itzhack's symmetric matrix, which is exact near every angle, also
-    near 180°.
+    It is an eigenvector of Bar-Itzhack's symmetric matrix, which is exact at every angle, also near
+    180°.
     """
     m = rotation.double()
     k = m.new_zeros(4, 4)

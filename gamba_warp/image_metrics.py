@@ -1,7 +1,7 @@
-"""Measures of how far two pictures are apart, and the registry of those that are reported.
+"""Image metrics, and the registry of those that are reported.
 
-A measure that ``METRICS`` holds is taken by ``gamba eval-views``, by the validation of a training
-and in ablations, and stands in their reports, tables and pages. Importing this loads no torch.
+``gamba eval-views``, validation during training and ablations compute every metric in ``METRICS``
+and show it in reports, tables and pages. Importing this module loads no torch.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from .conventions import GROUNDS, WHITE
 if TYPE_CHECKING:
     from torch import Tensor
 
-MAX_PSNR = 100.0  # dB; given for equal pictures, whose PSNR has no bound
+MAX_PSNR = 100.0  # dB; of equal pictures, whose PSNR is infinite
 SSIM_WINDOW = 11  # pixels
 SSIM_SIGMA = 1.5  # pixels; kornia has it fixed
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """Computes the peak signal-to-noise ratio of the whole picture, in dB, at most ``MAX_PSNR``.
+    """Compute the peak signal-to-noise ratio of the whole picture, in dB, at most ``MAX_PSNR``.
 
     Args:
         a: ``[.., H, W, C]`` in [0, 1].
@@ -35,7 +35,7 @@ def psnr(a: Tensor, b: Tensor) -> Tensor:
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Computes the structural similarity (Wang et al. 2004), mean over channels and whole windows.
+    """Compute the structural similarity (Wang et al. 2004), mean over channels and whole windows.
 
     The window is Gaussian, 11x11, with sigma 1.5; the range is 1 and nothing is padded. The result
     equals scikit-image's with ``gaussian_weights=True, use_sample_covariance=False``.
@@ -55,14 +55,14 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     _same_shape(a, b)
     if min(a.shape[-3:-1]) < SSIM_WINDOW:
         raise ValueError(f"pictures of {a.shape[-2]}x{a.shape[-3]}; SSIM needs 11x11 or more")
-    # This needs float64: in flat regions the variances are differences of nearly equal numbers.
+    # float64, because in flat regions variances are differences of nearly equal numbers.
     x, y = (v.double().reshape(-1, *v.shape[-3:]).permute(0, 3, 1, 2) for v in (a, b))
     values = ssim_map(x, y, SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
     return values.mean((1, 2, 3)).reshape(a.shape[:-3])
 
 
 def mask_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Computes the intersection over union of two masks.
+    """Compute the intersection over union of two masks.
 
     Args:
         a: ``[.., H, W]`` bool.
@@ -82,20 +82,20 @@ def _same_shape(a: Tensor, b: Tensor) -> None:
 
 
 class Metric(NamedTuple):
-    """A measure of pictures, as records, tables and pages have it.
+    """An image metric, as records, tables and pages show it.
 
     Attributes:
-        title: heads its column.
-        compare: of pictures ``[V, H, W, 3]`` in [0, 1] or of masks ``[V, H, W]`` bool, and the
-            true ones, ``[V]``; None: it is that of LPIPS's network, which may not be there.
+        title: heading of its column.
+        compare: function of pictures ``[V, H, W, 3]`` in [0, 1] or masks ``[V, H, W]`` bool, and
+            the true ones; returns ``[V]``. None: LPIPS, whose network may be missing.
         unit: or "".
-        digits: that are shown after the point.
-        more_is_better: else less is.
-        of_masks: it compares what the object covers, by alpha, and no colours.
-        on_grounds: it depends on the background, and is also taken on each of ``GROUNDS``.
-        ground: the key of ``GROUNDS`` that it is taken on; None: white.
-        least_side: pictures with a shorter side have no such figure.
-        in_compare: the table of ``gamba compare`` has it; its JSON has all.
+        digits: decimals shown.
+        more_is_better: False if less is.
+        of_masks: compares masks (alpha) instead of colours.
+        on_grounds: depends on the background, so it is also computed on each of ``GROUNDS``.
+        ground: the key of ``GROUNDS`` that it is computed on; None: white.
+        least_side: it is undefined for pictures with a shorter side.
+        in_compare: shown in the table of ``gamba compare``; its JSON has all metrics.
     """
 
     title: str
@@ -111,12 +111,12 @@ class Metric(NamedTuple):
 
     @property
     def head(self) -> str:
-        """The title with the unit."""
+        """Title with the unit."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     @property
     def grey(self) -> float:
-        """The value of its ground."""
+        """Grey value of its background."""
         return WHITE if self.ground is None else GROUNDS[self.ground]
 
 
@@ -129,7 +129,7 @@ METRICS = {
 
 
 def on_grounds() -> dict[str, Metric]:
-    """Those of ``METRICS`` that depend on the background, on each of ``GROUNDS``, by their keys."""
+    """Return the background-dependent ``METRICS`` on each of ``GROUNDS``, by key."""
     return {
         f"{name}_{key}": metric._replace(title=f"{metric.title} on {key}", unit="", ground=key)
         for key in GROUNDS
@@ -139,7 +139,7 @@ def on_grounds() -> dict[str, Metric]:
 
 
 def all_figures() -> dict[str, Metric]:
-    """Every figure of a picture by its key in records: on white, then on the other grounds."""
+    """Return every metric by its key in records: on white, then on the other backgrounds."""
     return METRICS | on_grounds()
 
 
@@ -148,18 +148,18 @@ def measure(
     masks: tuple[Tensor, Tensor] | None,
     keys: Container[str] | None = None,
 ) -> dict[str, Tensor]:
-    """Takes every figure that needs no network.
+    """Compute every metric that needs no network.
 
     Args:
-        pictures: of a grey value: those to judge, and the true ones, on that ground.
-        masks: of the same views, see ``Metric.compare``; None where there are none.
-        keys: of the figures, or None for all.
+        pictures: returns the pictures to judge and the true ones on a grey value.
+        masks: of the same views, see ``Metric.compare``; None without masks.
+        keys: of the metrics, or None for all.
 
     Returns:
-        Figures ``[V]`` float64 by their keys, in the order of ``all_figures``.
+        Values ``[V]`` float64 by key, in the order of ``all_figures``.
 
     Raises:
-        ValueError: as the measures do.
+        ValueError: as the metrics do.
     """
     found = {}
     for key, metric in all_figures().items():

@@ -1,7 +1,7 @@
-"""Reading and writing pictures; any common file becomes RGBA, and errors name the file.
+"""Reading and writing pictures; common formats become RGBA, and errors name the file.
 
-Every picture of a stranger is opened by ``open_picture``: few formats, bounded before decoding.
-``to_rgba`` makes sRGB with alpha of what it holds.
+``open_picture`` opens every untrusted picture: few formats, size checked before decoding.
+``to_rgba`` converts it to sRGB with alpha.
 """
 
 import functools
@@ -23,17 +23,17 @@ from .files import atomic_path
 from .versions import to_install
 
 MAX_PIXELS = 64 * 1024 * 1024
-MAX_SIDE = 32_768  # pixels; panoramas are shorter, and what pads to a square stays possible
-# Pillow knows thirty more; one of them (EPS) starts another program, and none is a photo's.
-# JPEG stands for MPO too.
+MAX_SIDE = 32_768  # pixels; panoramas are shorter, and padding to a square stays possible
+# Pillow knows thirty more; one of them (EPS) starts another program, and none is for photos.
+# JPEG includes MPO.
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM")
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
 PICTURE_SUFFIXES |= {".heic", ".heif", ".avif"}
 
-_COUNTED = 16 << 20  # bytes of a file whose frames are counted, which reads all of it
-_BAND = 1 << 22  # pixels that are converted at once
-_PLAIN = ("L", "LA", "RGB", "RGBA", "CMYK")  # modes that have no palette, and 8 bits
-_MOST_PROFILE = 4 << 20  # bytes; a press's profile takes 3 MB
+_COUNT_FRAMES_UP_TO = 16 << 20  # bytes of a file; counting frames reads all of it
+_BAND = 1 << 22  # pixels converted at once
+_PLAIN = ("L", "LA", "RGB", "RGBA", "CMYK")  # modes of 8 bits without a palette
+_MAX_PROFILE = 4 << 20  # bytes; a profile for printing takes 3 MB
 _ORIENTATION = 0x0112  # of EXIF
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -51,7 +51,7 @@ _CHUNKS = {
     "gAMA": ("gamma", [1 / 2.2]),
     "cHRM": ("chromaticity", [0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06]),
 }
-_QUIET = threading.Lock()  # the filters of warnings belong to the process
+_QUIET = threading.Lock()  # warning filters are process-wide
 
 
 @contextmanager
@@ -61,21 +61,21 @@ def open_picture(
     max_pixels: int = MAX_PIXELS,
     formats: Sequence[str] = FORMATS,
 ) -> Iterator[Image.Image]:
-    """Opens a picture whose size is checked before anything is decoded.
+    """Open a picture; its size is checked before anything is decoded.
 
-    Whatever a decoder raises inside the ``with`` block becomes one line as well.
+    Errors of the decoder inside the ``with`` block become one line too.
 
     Args:
         source: path, or a binary file that can seek.
-        name: what to call it in an error; the path, if not given.
+        name: for error messages; by default the path.
         max_pixels: largest width times height.
-        formats: names of Pillow's formats; nothing else is looked at, whatever the file's suffix.
+        formats: Pillow's names of the allowed formats, whatever the file's suffix.
 
     Yields:
         The picture, not decoded yet. EXIF rotation is not applied.
 
     Raises:
-        UserError: it is missing, empty, no plain file, not a picture of these formats, larger than
+        UserError: it is missing, empty, not a plain file or picture of these formats, larger than
             ``max_pixels`` or ``MAX_SIDE``, or damaged.
     """
     name = source if name is None else name
@@ -99,10 +99,10 @@ def open_picture(
 
 
 def check_size(width: int, height: int, name: object, max_pixels: int = MAX_PIXELS) -> None:
-    """Refuses a picture that is larger than ``max_pixels``, or longer than ``MAX_SIDE``.
+    """Refuse a picture that is larger than ``max_pixels``, or longer than ``MAX_SIDE``.
 
     Raises:
-        UserError: it is; the message begins with ``name``.
+        UserError: it is too large; the message begins with ``name``.
     """
     if width * height > max_pixels:
         raise UserError(f"{name}: {width}x{height} is over {max_pixels >> 20} megapixels")
@@ -127,7 +127,7 @@ def _check_file(path: str | Path, name: object) -> None:
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Keeps Pillow's warnings of odd headers and of size to itself: the size is checked here."""
+    """Silence Pillow's warnings about headers and size; the size is checked in this module."""
     with _QUIET, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -136,19 +136,19 @@ def _without_warnings() -> Iterator[None]:
 def load_rgba(
     path: str | Path, longest: int | None = None, warn: Callable[[str], None] | None = None
 ) -> np.ndarray:
-    """Reads one still picture.
+    """Read one still picture.
 
     Grey, palette, RGB, CMYK and RGBA files of 8 and 16 bits are converted to sRGB, by their colour
-    profile if they have one, and EXIF rotation is applied. HEIC needs pillow-heif.
+    profile if present, and EXIF rotation is applied. HEIC needs pillow-heif.
 
     Args:
         path: the file.
-        longest: pixels; a picture that is at least four times as long is reduced by a whole
-            factor, weighted by alpha, to no less than twice this. None keeps its size.
+        longest: pixels; a picture at least four times as long is reduced by a whole factor,
+            weighted by alpha, to no less than twice this. None keeps its size.
         warn: as for ``to_rgba``.
 
     Returns:
-        ``[H, W, 4]`` float32 in [0, 1], colour not premultiplied; alpha 1 where the file has none.
+        ``[H, W, 4]`` float32 in [0, 1], colour not premultiplied; alpha is 1 if the file has none.
 
     Raises:
         UserError: the file is missing, empty, not a picture, truncated, animated or too large.
@@ -158,13 +158,13 @@ def load_rgba(
 
 
 def load_rgba8(path: str | Path) -> np.ndarray:
-    """As ``load_rgba``, but ``[H, W, 4]`` uint8, a quarter of the memory."""
+    """Read like ``load_rgba``, but ``[H, W, 4]`` uint8, a quarter of the memory."""
     with _still(path) as image:
         return to_rgba(image, path, np.uint8, turned=True)
 
 
 def picture_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of a still picture after EXIF rotation; its pixels need not be sound.
+    """Return width and height of a still picture after EXIF rotation, without decoding it.
 
     Raises:
         UserError: as ``load_rgba``, but for damaged pixels.
@@ -176,24 +176,24 @@ def picture_size(path: str | Path) -> tuple[int, int]:
 
 @contextmanager
 def _still(path: str | Path) -> Iterator[Image.Image]:
-    _check_file(path, path)  # to open a pipe would wait for whoever writes into it
-    formats = (*FORMATS, *_phones(path))
+    _check_file(path, path)  # opening a pipe would wait for its writer
+    formats = (*FORMATS, *_phone_formats(path))
     with open_picture(path, max_pixels=MAX_PIXELS, formats=formats) as image:
-        # An MPO is a phone's JPEG, followed by a preview or a depth map; so is a HEIC.
+        # Phones append a preview or a depth map to a JPEG (MPO) or a HEIC.
         if image.format not in ("MPO", "HEIF") and getattr(image, "is_animated", False):
-            small = os.path.getsize(path) <= _COUNTED
+            small = os.path.getsize(path) <= _COUNT_FRAMES_UP_TO
             frames = getattr(image, "n_frames", 1) if small else "many"
             raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
         yield image
 
 
-def _phones(path: str | Path) -> tuple[str, ...]:
-    """The formats of phones, if a file is of these. Raises UserError if no reader is installed."""
+def _phone_formats(path: str | Path) -> tuple[str, ...]:
+    """Return AVIF or HEIF if the file is one. Raises UserError if no reader is installed."""
     try:
         with open(path, "rb") as file:
             head = file.read(12)
     except OSError:
-        return ()  # ``open_picture`` says why
+        return ()  # ``open_picture`` reports it
     if head[4:8] != b"ftyp":
         return ()
     if head[8:12] in (b"avif", b"avis"):
@@ -211,11 +211,11 @@ def _phones(path: str | Path) -> tuple[str, ...]:
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF's orientation, 1 to 8; 1 (upright) where EXIF is absurd, for the picture is not."""
+    """Return EXIF's orientation, 1 to 8; 1 (upright) if EXIF is invalid."""
     try:
         with _without_warnings():
             value = image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # the reader of EXIF has as many kinds of errors as the decoders
+    except Exception:  # as decoders, it raises errors of many types
         return 1
     return value if value in _UPRIGHT else 1
 
@@ -230,17 +230,17 @@ def to_rgba(
     profiled: bool = True,
     warn: Callable[[str], None] | None = None,
 ) -> np.ndarray:
-    """Decodes a picture of ``open_picture``; what it held is freed on the way.
+    """Decode a picture of ``open_picture``, and free it on the way.
 
     Args:
         image: not decoded yet.
-        name: what to call it in a warning.
+        name: for warnings.
         dtype: float32 or uint8 of the result.
         longest: as for ``load_rgba``.
-        turned: whether EXIF rotation is applied.
-        profiled: whether colours are converted to sRGB by the profile in the file.
-        warn: takes a line where the profile cannot be used, and colours are taken for sRGB. None:
-            Python's warnings, once for a line.
+        turned: apply EXIF rotation.
+        profiled: convert colours to sRGB by the profile in the file.
+        warn: called with a line if the profile cannot be used and colours are taken for sRGB.
+            None: Python's warnings, once per line.
 
     Returns:
         ``[H, W, 4]`` float32 in [0, 1] or uint8, colour not premultiplied.
@@ -254,12 +254,12 @@ def to_rgba(
     if orientation in _UPRIGHT:
         plain = plain.transpose(_UPRIGHT[orientation])
     if plain is not image:
-        image.close()  # two large pictures are too much beside the floats
+        image.close()  # frees memory for the floats
     return _pixels(plain, dtype, convert)
 
 
 def _with_alpha(image: Image.Image) -> Image.Image:
-    """The picture in a mode of ``_PLAIN``, I or F, where a transparent value became alpha."""
+    """Return the picture in a mode of ``_PLAIN``, I or F, with a transparent value made alpha."""
     key, raw = image.info.get("transparency"), _raw_mode(image)
     if raw in _LOW_BYTES and image.format == "PNG":
         return _rounded(image, raw, key)
@@ -268,7 +268,7 @@ def _with_alpha(image: Image.Image) -> Image.Image:
         if image.mode == "1":
             return image.convert("L")
         return image if grey or image.mode in _PLAIN else image.convert("RGBA")
-    if image.mode.startswith("I"):  # Pillow would cut 16 bits off at 255, and lose alpha
+    if image.mode.startswith("I"):  # Pillow would clip 16 bits at 255, and lose alpha
         values = np.asarray(image).astype(np.uint32)
         alpha = np.where(values == key, 0, 255).astype(np.uint8)
         grey = ((values + 128) // 257).astype(np.uint8)
@@ -311,7 +311,7 @@ def _rounded(image: Image.Image, raw: str, key: Sequence[int] | None) -> Image.I
 
 
 def _raw_mode(image: Image.Image) -> str | None:
-    """How the file holds the pixels, in Pillow's words; known before they are decoded."""
+    """Return Pillow's raw mode of the pixels in the file, known before decoding."""
     tiles = getattr(image, "tile", None)
     raw = tiles[0][3] if tiles else None
     return raw if isinstance(raw, str) else None
@@ -320,7 +320,7 @@ def _raw_mode(image: Image.Image) -> str | None:
 def _pixels(
     image: Image.Image, dtype: type, convert: Callable[[Image.Image], Image.Image] | None
 ) -> np.ndarray:
-    """``[H, W, 4]`` float32 in [0, 1] or uint8, made in bands, since floats take the most room."""
+    """Return ``[H, W, 4]`` float32 in [0, 1] or uint8, converted in bands to save memory."""
     out = np.empty((image.height, image.width, 4), dtype)
     grey, top = image.mode.startswith(("I", "F")), 65535.0  # PIL reads 16-bit colour as 8-bit
     rows = max(1, _BAND // image.width)
@@ -352,7 +352,7 @@ def _pixels(
 def _conversion(
     image: Image.Image, name: object, warn: Callable[[str], None]
 ) -> Callable[[Image.Image], Image.Image] | None:
-    """What brings 8-bit pixels of this picture to sRGB; None where they are, or nobody can."""
+    """Return the conversion of 8-bit pixels to sRGB; None if not needed or not possible."""
     if "icc_profile" not in image.info:
         for chunk, (key, srgb) in _CHUNKS.items() if "srgb" not in image.info else ():
             values = np.ravel(image.info.get(key, srgb))
@@ -361,12 +361,12 @@ def _conversion(
         return None
     profile = image.info["icc_profile"]
     try:
-        if not isinstance(profile, bytes) or not 0 < len(profile) <= _MOST_PROFILE:
+        if not isinstance(profile, bytes) or not 0 < len(profile) <= _MAX_PROFILE:
             raise ValueError("it is damaged or too large")
         grey = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
         mode = "L" if grey else "CMYK" if image.mode == "CMYK" else "RGB"
         return _from_profile(profile, mode)
-    except Exception as error:  # littleCMS is missing, or its errors, of many types
+    except Exception as error:  # littleCMS is missing, or raises errors of many types
         reason = first_line(error)
         warn(f"{name}: its colour profile is not used ({reason}); colours are taken for sRGB")
         return None
@@ -374,29 +374,29 @@ def _conversion(
 
 @functools.lru_cache(8)
 def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Image] | None:
-    """What brings pixels of L, RGB or CMYK, alpha beside them, from a profile to sRGB.
+    """Return the conversion of L, RGB or CMYK pixels from a profile to sRGB; alpha is kept.
 
-    None where that moves no value by more than 1: such a profile is sRGB, and the rest rounding.
+    None if no value changes by more than 1: then the profile is sRGB up to rounding.
     """
     from PIL import ImageCms
 
     source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-    space = cast(Any, source.profile).xcolor_space.strip()  # Pillow's stub has none of it
+    space = cast(Any, source.profile).xcolor_space.strip()  # missing in Pillow's stub
     if space not in {"L": ("GRAY", "RGB"), "RGB": ("RGB",), "CMYK": ("CMYK",)}[mode]:
         raise ValueError(f"it is of {space}, the picture of {mode}")
-    own = "L" if space == "GRAY" else space
-    # Of grey littleCMS keeps a few steps for speed; a table of all 256 needs none.
+    source_mode = "L" if space == "GRAY" else space
+    # For speed littleCMS interpolates grey between a few steps; the table below has all 256.
     flags = ImageCms.Flags.NOOPTIMIZE if mode == "L" else ImageCms.Flags.NONE
     srgb = ImageCms.createProfile("sRGB")
-    transform = ImageCms.buildTransform(source, srgb, own, "RGB", flags=flags)
+    transform = ImageCms.buildTransform(source, srgb, source_mode, "RGB", flags=flags)
 
     def colours(band: Image.Image) -> Image.Image:
-        made = ImageCms.applyTransform(band.convert(own), transform)
-        assert made is not None  # as it is not made in place
+        made = ImageCms.applyTransform(band.convert(source_mode), transform)
+        assert made is not None  # because it is not in place
         return made
 
     levels = np.arange(256, dtype=np.uint8)
-    if mode == "L":  # grey stays grey, as masks have to
+    if mode == "L":  # grey stays grey, as masks must
         table = np.asarray(colours(Image.fromarray(levels[None])))[0, :, 1]
         if np.abs(table.astype(int) - levels).max() <= 1:
             return None
@@ -411,7 +411,7 @@ def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Im
 def _beside_alpha(
     colours: Callable[[Image.Image], Image.Image],
 ) -> Callable[[Image.Image], Image.Image]:
-    """The same for pictures with alpha, which stays as it is."""
+    """Extend a conversion to pictures with alpha, which is copied."""
 
     def convert(band: Image.Image) -> Image.Image:
         made = colours(band)
@@ -424,17 +424,17 @@ def _beside_alpha(
 
 @functools.lru_cache(1024)
 def _warn_once(line: str) -> None:
-    with _QUIET:  # while another thread has no warnings, this one would be lost
+    with _QUIET:  # else another thread's filter could drop it
         warnings.warn(one_line(line), FileWarning, stacklevel=2)
 
 
 def to_uint8(picture: np.ndarray) -> np.ndarray:
-    """Rounds ``[.., C]`` float values in [0, 1] to 8 bits; NaN becomes 0."""
+    """Round ``[.., C]`` float values in [0, 1] to 8 bits; NaN becomes 0."""
     return (np.clip(np.nan_to_num(picture), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
-    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], in the format of the suffix.
+    """Write ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], in the format of the suffix.
 
     Raises:
         UserError: the file cannot be written.
@@ -447,14 +447,14 @@ def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
 
 
 def find_pictures(images: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Resolves files and folders to picture files.
+    """Resolve files and folders to picture files.
 
     Args:
-        images: files, which are taken as they are, and folders, whose files with a picture's
-            suffix are taken in sorted order, without sub-folders.
+        images: files, which are kept as they are, and folders, whose files with a picture's suffix
+            follow in sorted order, without sub-folders.
 
     Returns:
-        The files, each once; and the folders that give no file, with the reason.
+        The files, each once; and the folders without pictures, with the reason.
     """
     pictures: dict[Path, None] = {}
     failures = []

@@ -1,4 +1,4 @@
-"""Commands as processes of their own: their end, their time, the most memory that they took."""
+"""Commands in child processes, with their exit, run time and peak memory."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from typing import IO
 
 from .kernels.runtime.system import end_signals
 
-LOOK = 0.1  # seconds between two looks at a process
+LOOK = 0.1  # seconds between two polls of a process
 GAMBA = (sys.executable, "-m", "gamba_warp")
 
 
 @dataclass(frozen=True)
 class End:
-    """How a process ended.
+    """Result of a process.
 
     Attributes:
         code: exit code, 128 + n for signal n.
-        seconds: how long it ran.
-        peak_memory: most bytes of memory that it held; None where the system does not say.
+        seconds: its run time.
+        peak_memory: peak memory in bytes; None if the system does not report it.
     """
 
     code: int
@@ -35,12 +35,12 @@ class End:
 
     @property
     def stopped(self) -> bool:
-        """Whether somebody asked it to stop."""
+        """True if a signal asked it to stop."""
         return self.code - 128 in (signal.SIGINT, *end_signals())
 
 
 class Child:
-    """A process that runs, in a group of its own; it ends with this process."""
+    """A running child in its own process group; it ends with this process."""
 
     def __init__(
         self,
@@ -48,12 +48,12 @@ class Child:
         output: IO[bytes] | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        """Starts it.
+        """Start the process.
 
         Args:
             command: words, such as ``[*GAMBA, "export", ..]``.
-            output: gets both its outputs, and it reads nothing; None: it has those of this process.
-            environment: variables beside those of this process.
+            output: receives stdout and stderr, and stdin is empty; None: it inherits all three.
+            environment: variables added to those of this process.
 
         Raises:
             OSError: it cannot be started.
@@ -72,7 +72,7 @@ class Child:
         )
 
     def _end_with_parent(self) -> None:
-        """In the child: a kill of this process is no reason to go on without it."""
+        """Make the child die with its parent; runs in the child."""
         import ctypes
 
         with contextlib.suppress(OSError, AttributeError):
@@ -81,14 +81,14 @@ class Child:
             os._exit(1)
 
     def poll(self) -> End | None:
-        """How it ended; None while it runs."""
+        """Return how it ended; None while it runs."""
         if self._process.returncode is not None or not hasattr(os, "wait4"):
             self._process.poll()
         else:
             number, status, usage = os.wait4(self._process.pid, os.WNOHANG)
             if number:
                 self._process.returncode = os.waitstatus_to_exitcode(status)
-                # Bytes on macOS, 1,024 of them elsewhere.
+                # In bytes on macOS, else in KiB.
                 self._memory = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
         code = self._process.returncode
         if code is None:
@@ -97,7 +97,7 @@ class Child:
         return End(code if code >= 0 else 128 - code, seconds, self._memory)
 
     def ask(self, number: int) -> None:
-        """Sends a signal to it and to all processes that it started; Windows has only an end."""
+        """Send a signal to its process group; on Windows, terminate it."""
         with contextlib.suppress(OSError):
             if hasattr(os, "killpg"):
                 os.killpg(self._process.pid, number)
@@ -105,30 +105,30 @@ class Child:
                 self._process.terminate()
 
     def kill(self) -> None:
-        """Ends it with all that it started, if it runs, and waits until it is gone."""
+        """Kill its process group, if it runs, and wait until it is gone."""
         if self._process.returncode is not None:
             return
         if hasattr(os, "killpg"):
             self.ask(signal.SIGKILL)
         elif sys.platform == "win32":
-            # By its whole path: Windows would look in the working directory before its own folders.
+            # By its full path: Windows would search the working directory first.
             root = os.environ.get("SystemRoot", "C:\\Windows")
             taskkill = os.path.join(root, "System32", "taskkill.exe")
             words = [taskkill, "/F", "/T", "/PID", str(self._process.pid)]
             with contextlib.suppress(OSError, subprocess.TimeoutExpired):
                 subprocess.run(words, capture_output=True, timeout=30)
-        self._process.kill()  # does nothing if it is gone; else at least the process itself ends
+        self._process.kill()  # at least the process itself; does nothing if it is gone
         self._process.wait()
 
     def wait(self, look: Callable[[], None], seconds: float = math.inf) -> End | None:
-        """Waits for its end, and ends it when its time is up or something is raised.
+        """Wait for its end; kill it on a timeout or an exception.
 
         Args:
             look: called every tenth of a second.
             seconds: time limit.
 
         Returns:
-            How it ended, None if it was ended.
+            How it ended; None if it was killed.
         """
         until = time.monotonic() + seconds
         try:
@@ -142,12 +142,12 @@ class Child:
 
 @contextlib.contextmanager
 def stop_requests(insist: bool = False) -> Iterator[list[int]]:
-    """Collects the signals that ask this process to stop, in the yielded list.
+    """Collect the signals that ask this process to stop in the yielded list.
 
-    A SIGHUP that is ignored stays so (``end_signals``).
+    An ignored SIGHUP stays ignored (``end_signals``).
 
     Args:
-        insist: whether a SIGINT after another signal interrupts at once.
+        insist: interrupt at once on a SIGINT after another signal.
     """
     received: list[int] = []
 

@@ -1,4 +1,4 @@
-"""Rendering: from Gaussians and cameras to pictures, by the rasterizer kernels."""
+"""Rendering of Gaussians by the rasterizer kernels."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ from .kernels.rasterize.meta import Meta
 
 @dataclass
 class Rendering:
-    """What ``render`` returns.
+    """Result of ``render``.
 
     Attributes:
         rgb: ``[.., V, H, W, 3]``, composited on the background.
         alpha: ``[.., V, H, W, 1]`` in [0, 1].
-        depth: ``[.., V, H, W, 1]`` expected depth in object units, or None if not asked for.
+        depth: ``[.., V, H, W, 1]`` expected depth in object units, or None if not requested.
         meta: the rasterizer's counts of its work.
     """
 
@@ -36,19 +36,19 @@ def render(
     depth: bool = False,
     **options,
 ) -> Rendering:
-    """Renders every object in each of its views, all in one launch.
+    """Render every object in each of its views, in one launch.
 
     Args:
         gaussians: Gaussians with leading dimensions ``..``.
         cameras: cameras with the same leading dimensions, then V.
         background: RGB in [0, 1], ``[3]`` or ``[.., V, 3]``; None means black.
-        depth: whether the expected depth is rendered too.
+        depth: render the expected depth too.
         options: further arguments of ``rasterization``.
     """
     if background is not None:
         background = background.expand(*cameras.viewmats.shape[:-2], 3)
     colors = gaussians.colors
-    if gaussians.harmonics is not None:  # all coefficients, the colours as that of degree 0
+    if gaussians.harmonics is not None:  # with the colours as degree 0
         options["sh_degree"] = gaussians.degree
         constant = (colors - 0.5) / SH_C0
         colors = torch.cat([constant[..., None, :], gaussians.harmonics], -2)

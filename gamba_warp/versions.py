@@ -1,8 +1,8 @@
-"""The version of this package, and the other packages that it uses: versions, and which may lack.
+"""Versions of this package and its dependencies, required and optional.
 
 The core (setup.cfg, ``install_requires``) runs the kernels and the model, and turns a picture with
-alpha into a ``.ply``, a turntable and a page. Everything else comes with an extra, and
-``to_install`` says how to get it.
+alpha into a ``.ply``, a turntable and a page. Everything else needs an extra; ``to_install`` tells
+how to install it.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _USED = (
     "gsplat",
     "tyro",
 )
-# The extra that brings a library (by the name it is imported by). A command that has an extra of
-# its own names that instead, where it holds the library too.
+# The extra that brings a library, by import name. A command with its own extra (``OWN``) names that
+# instead if it holds the library too.
 EXTRA_OF = {
     "backports.zstd": "spz",
     "gradio": "app",
@@ -82,7 +82,7 @@ HOLDS = {
     },
     "all": set(EXTRA_OF),
 }
-# What a command cannot begin without; what only some of its options need is found missing then.
+# Libraries that a command always needs; those of single options are checked on use.
 NEEDS = {
     "ablate": ("kornia",),
     "app": ("gradio",),
@@ -99,7 +99,7 @@ NEEDS = {
 
 
 def installed(*packages: str) -> dict[str, str]:
-    """Versions of those of the packages that are installed, by their names on PyPI."""
+    """Return versions of the installed ones among the packages, by their names on PyPI."""
     from importlib.metadata import PackageNotFoundError, version
 
     found = {}
@@ -112,7 +112,7 @@ def installed(*packages: str) -> dict[str, str]:
 
 
 def used_versions() -> dict[str, str]:
-    """Versions of this package, of Python and of every package that is used, by name."""
+    """Return versions of this package, Python and every dependency, by name."""
     import platform
 
     found = installed(*_USED)
@@ -127,7 +127,7 @@ def used_versions() -> dict[str, str]:
 
 
 def missing(command: str) -> str | None:
-    """Says what a command needs and what is not installed, in one line; None if all is there.
+    """Return a line about a library that a command needs and is not installed; None if complete.
 
     Args:
         command: one of ``cli.COMMANDS``.
@@ -138,10 +138,10 @@ def missing(command: str) -> str | None:
 
 
 def advice(library: str, command: str) -> str | None:
-    """Says how to get an optional library that a command needs; None for any other library.
+    """Return how to install an optional library that a command needs; None for any other library.
 
     Args:
-        library: what could not be imported; also one of its modules, as ``scipy.spatial``.
+        library: the failed import; also a submodule, such as ``scipy.spatial``.
         command: the command that needs it.
     """
     name = library if library in EXTRA_OF else library.partition(".")[0]
@@ -154,13 +154,13 @@ def advice(library: str, command: str) -> str | None:
 
 
 def require(*libraries: str) -> None:
-    """Refuses what is not installed before any work is done for it.
+    """Refuse missing libraries before any work is done.
 
     Args:
-        libraries: names by which they are imported, such as ``trimesh``.
+        libraries: import names, such as ``trimesh``.
 
     Raises:
-        ModuleNotFoundError: one is not there; the console script says how to get it (``advice``).
+        ModuleNotFoundError: one is missing; the console script tells how to get it (``advice``).
     """
     for name in libraries:
         if find_spec(name) is None:
@@ -168,16 +168,16 @@ def require(*libraries: str) -> None:
 
 
 def to_install(extra: str) -> str:
-    """How to get an extra, in a few words: from the checkout, or from a wheel's file.
+    """Return how to install an extra: from the checkout, or from a wheel's file.
 
-    The distribution's name stands in no package index, so whoever registers it there would be
-    given what a line with that name installs.
+    It names no package: the name is not registered in any index, and somebody else could register
+    it.
     """
     return f"pip install '.[{extra}]' in the checkout, or 'FILE.whl[{extra}]'"
 
 
 def import_open3d() -> ModuleType:
-    """Returns the ``open3d`` module; it is imported nowhere else.
+    """Return the ``open3d`` module, which is imported nowhere else.
 
     Its Linux wheel wants ``libusb-1.0.so.0`` from the system; ``libusb-package`` carries the
     library, and loading it first satisfies the linker without root.
@@ -190,7 +190,7 @@ def import_open3d() -> ModuleType:
 
             ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
         except (ImportError, OSError):
-            pass  # the system's own library may be there; else the import says what is missing
+            pass  # the system may have the library; else the import reports it
     import open3d
 
     return open3d

@@ -1,1 +1,1 @@
-"""Shapes against true ones: ``gamba eval-geometry``."""
+"""Metrics of predicted shapes: ``gamba eval-geometry``."""

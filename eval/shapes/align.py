@@ -1,7 +1,7 @@
-"""Alignment of a prediction with the truth: the steps that a protocol names, one after the other.
+"""Alignment of a prediction with the truth by the steps of a protocol, in order.
 
-The search for a turn needs no start: it looks at thousands of turns, by distances that are read
-from a lattice of nearest points in place of a tree, and follows the best of them.
+The search for a rotation needs no initial guess. It scores thousands of rotations by a lattice of
+nearest points instead of a tree, and refines the best of them.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ STEPS: dict[Step, str] = {
     "icp": "the same with scale",
 }
 
-# How far correspondences reach in each round of ICP; the truth's longest side is 1.
+# Largest distance of correspondences in each round of ICP; the truth's longest side is 1.
 ICP_DISTANCES = (0.2, 0.1, 0.05)
 
 TURNS, CANDIDATES, ROUNDS, APART = 4096, 32, 20, 20.0  # of the search, as STEPS has them
 SCORED, FOLLOWED, JUDGED = 256, 1024, 4096  # points
-LATTICE = 64  # places a side
-ALIKE = 1.2  # times the least Chamfer distance, under which a turned shape is the same shape
+LATTICE = 64  # cells per side
+ALIKE = 1.2  # times the least Chamfer distance, below which a rotated shape counts as the same
 
 
 def aligned(
     predicted: Points, truth: Points, steps: Sequence[Step]
 ) -> tuple[Similarity, dict[str, float]]:
-    """Finds the motion of the prediction that the steps make together.
+    """Compute the motion of the prediction by all steps.
 
     Args:
         predicted: points on the prediction.
@@ -50,8 +50,8 @@ def aligned(
         steps: of ``STEPS``.
 
     Returns:
-        The motion; and of the last ICP Open3D's ``fitness`` (share of points with a partner) and
-        ``inlier_rmse``.
+        The motion; and Open3D's ``fitness`` (share of points with a partner) and ``inlier_rmse`` of
+        the last ICP.
 
     Raises:
         UserError: the prediction is a single point.
@@ -70,14 +70,14 @@ def aligned(
 
 
 def match_boxes(predicted: Points, truth: Points) -> Similarity:
-    """Finds the translation and scale after which the bounding boxes agree in centre and side."""
+    """Return the translation and scale that match centre and longest side of the boxes."""
     boxes = [(p.positions.min(0), p.positions.max(0)) for p in (predicted, truth)]
     centers, sides = zip(*(((low + high) / 2, (high - low).max()) for low, high in boxes))
     return _of_size(centers, sides)
 
 
 def match_moments(predicted: Points, truth: Points) -> Similarity:
-    """Finds the translation and scale after which centroids and mean square radii are equal."""
+    """Return the translation and scale that match centroids and mean square radii."""
     centers = [points.positions.mean(0) for points in (predicted, truth)]
     radii = [
         np.sqrt(((points.positions - center) ** 2).sum(1).mean())
@@ -92,12 +92,12 @@ def _of_size(centers: Sequence[np.ndarray], sizes: Sequence[float]) -> Similarit
 
 
 def icp(predicted: Points, truth: Points, with_scale: bool) -> tuple[Similarity, dict[str, float]]:
-    """Finds a small rotation, a translation and, if asked for, a scale by Open3D's ICP.
+    """Find a small rotation, a translation and optionally a scale by Open3D's ICP.
 
     Args:
-        predicted: points to be moved.
-        truth: points to be met.
-        with_scale: whether the scale is free.
+        predicted: points to move.
+        truth: target points.
+        with_scale: the scale is free.
 
     Returns:
         The motion, and Open3D's ``fitness`` (share of points with a partner) and ``inlier_rmse``.
@@ -121,7 +121,7 @@ def icp(predicted: Points, truth: Points, with_scale: bool) -> tuple[Similarity,
 
 
 def search_yaw(predicted: Points, truth: Points) -> Similarity:
-    """Finds the turn about z with the lowest Chamfer distance; see ``STEPS``."""
+    """Find the rotation about z with the lowest Chamfer distance; see ``STEPS``."""
     angles = np.radians(np.arange(360.0))
     turns = np.zeros((360, 3, 3))
     turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)
@@ -134,7 +134,7 @@ def search_yaw(predicted: Points, truth: Points) -> Similarity:
 
 
 def search_turns(predicted: Points, truth: Points) -> Similarity:
-    """Finds the turn about any axis with the lowest Chamfer distance; see ``STEPS``."""
+    """Find the rotation about any axis with the lowest Chamfer distance; see ``STEPS``."""
     turns, moves, chamfer = _candidates(_Cloud.of(predicted), _Cloud.of(truth))
     best = chamfer.argmin()
     return Similarity(turns[best], moves[best])
@@ -149,15 +149,15 @@ _SEARCHES = {
 
 
 def symmetry(truth: Points) -> list[list[float]]:
-    """Turns after which a shape is itself, within the noise of a few thousand points.
+    """Find the rotational symmetries of a shape, within the noise of a few thousand points.
 
     Args:
         truth: points on the shape.
 
     Returns:
         ``[x, y, z, degrees]`` each: a unit axis and an angle of 20 to 180 degrees; at most 31, each
-        20 degrees or more from the others, and least Chamfer distance first. Of a shape that may
-        be turned by any angle these are some of many.
+        20 degrees or more from the others, by increasing Chamfer distance. A continuous symmetry
+        gives some samples.
     """
     from scipy.spatial.transform import Rotation
 
@@ -167,7 +167,7 @@ def symmetry(truth: Points) -> list[list[float]]:
     found: list[list[float]] = []
     kept = np.eye(3)[None]
     for at in chamfer.argsort():
-        # The least one is that of no turn, or it has one less only by the points' noise.
+        # The minimum belongs to the identity, up to the points' noise.
         if chamfer[at] <= ALIKE * chamfer.min() and (_degrees(turns[at], kept) >= APART).all():
             kept = np.concatenate([kept, turns[at][None]])
             vector = Rotation.from_matrix(turns[at]).as_rotvec(degrees=True)
@@ -177,13 +177,13 @@ def symmetry(truth: Points) -> list[list[float]]:
 
 
 class _Cloud(NamedTuple):
-    """Points about their centroid, with the nearest of them for each place of a lattice.
+    """Centred points with a lattice of their nearest ones.
 
     Attributes:
-        center: ``[3]``.
-        points: ``[N, 3]`` in random order, less the centre.
+        center: ``[3]``, their centroid.
+        points: ``[N, 3]`` in random order, minus the centre.
         reach: half of the lattice's side.
-        index: ``[LATTICE, LATTICE, LATTICE]``, which of the points is near each place.
+        index: ``[LATTICE, LATTICE, LATTICE]``, index of a point near each cell.
     """
 
     center: np.ndarray
@@ -199,29 +199,29 @@ class _Cloud(NamedTuple):
         order = np.random.default_rng(0).permutation(len(cloud.positions))
         points = cloud.positions[order] - center
         reach = max(1.25 * float(np.abs(points).max()), 1e-12)
-        place = _places(points, reach)
-        there = np.full((LATTICE,) * 3, -1)
-        there[tuple(place.T)] = np.arange(len(points))
-        nearest_place = distance_transform_edt(
-            there < 0, return_distances=False, return_indices=True
+        cell = _cells(points, reach)
+        index = np.full((LATTICE,) * 3, -1)
+        index[tuple(cell.T)] = np.arange(len(points))
+        nearest_cell = distance_transform_edt(
+            index < 0, return_distances=False, return_indices=True
         )
-        return cls(center, points, reach, there[tuple(np.asarray(nearest_place))])
+        return cls(center, points, reach, index[tuple(np.asarray(nearest_cell))])
 
     def near(self, queries: np.ndarray) -> np.ndarray:
-        """A near one of the points, ``[.., 3]``, for each query ``[.., 3]``."""
-        place = _places(queries, self.reach)
-        return self.points[self.index[place[..., 0], place[..., 1], place[..., 2]]]
+        """Return an approximate nearest point ``[.., 3]`` for each query ``[.., 3]``."""
+        cell = _cells(queries, self.reach)
+        return self.points[self.index[cell[..., 0], cell[..., 1], cell[..., 2]]]
 
 
-def _places(points: np.ndarray, reach: float) -> np.ndarray:
-    place = ((points / reach + 1) * (LATTICE / 2)).astype(np.int64)
-    return place.clip(0, LATTICE - 1)
+def _cells(points: np.ndarray, reach: float) -> np.ndarray:
+    cell = ((points / reach + 1) * (LATTICE / 2)).astype(np.int64)
+    return cell.clip(0, LATTICE - 1)
 
 
 def _chamfer(one: _Cloud, two: _Cloud, turns: np.ndarray, count: int) -> np.ndarray:
-    """``[M]`` Chamfer distances after each of ``[M, 3, 3]`` turns of the first cloud."""
+    """Return Chamfer distances ``[M]`` after each rotation ``[M, 3, 3]`` of the first cloud."""
     found = np.empty(len(turns))
-    for at in range(0, len(turns), 256):  # which bounds the memory
+    for at in range(0, len(turns), 256):  # bounds the memory
         part = turns[at : at + 256]
         there = one.points[:count] @ part.transpose(0, 2, 1)
         back = two.points[:count] @ part
@@ -230,19 +230,19 @@ def _chamfer(one: _Cloud, two: _Cloud, turns: np.ndarray, count: int) -> np.ndar
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
-    """Mean lengths ``[M]`` of vectors ``[M, n, 3]``."""
+    """Return mean lengths ``[M]`` of vectors ``[M, n, 3]``."""
     return np.sqrt(np.einsum("mni,mni->mn", vectors, vectors)).mean(1)
 
 
 def _candidates(
     one: _Cloud, two: _Cloud, also: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The best turns ``[C, 3, 3]``, moves ``[C, 3]`` and their Chamfer distances ``[C]``.
+    """Return the best rotations ``[C, 3, 3]``, translations ``[C, 3]``, Chamfer distances ``[C]``.
 
     Args:
-        one: what is turned.
-        two: what it is turned to.
-        also: turns ``[.., 3, 3]`` that are followed beside the best of all.
+        one: cloud to rotate.
+        two: target.
+        also: further initial rotations ``[.., 3, 3]``.
     """
     every = spread_turns(TURNS)
     kept = np.empty((0, 3, 3)) if also is None else also
@@ -255,7 +255,7 @@ def _candidates(
     points = one.points[:FOLLOWED]
     for _ in range(ROUNDS):
         moved = points @ turns.transpose(0, 2, 1) + moves[:, None]
-        turns, moves = _fitted(points, two.near(moved))
+        turns, moves = _kabsch(points, two.near(moved))
     few, chamfer = Points(two.points[:JUDGED]), []
     for turn, move in zip(turns, moves):
         moved = Points(one.points[:JUDGED] @ turn.T + move)
@@ -263,10 +263,10 @@ def _candidates(
     return turns, moves + two.center - turns @ one.center, np.array(chamfer)
 
 
-def _fitted(points: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turns ``[M, 3, 3]`` and moves ``[M, 3]`` that bring points ``[n, 3]`` to ``[M, n, 3]`` best.
+def _kabsch(points: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotations ``[M, 3, 3]`` and translations ``[M, 3]`` of ``[n, 3]`` to ``[M, n, 3]``.
 
-    By singular values (Kabsch 1976), mirror images excluded.
+    Least squares by singular values (Kabsch 1976), without reflections.
     """
     middle, middles = points.mean(0), targets.mean(1)
     u, _, v = np.linalg.svd((targets - middles[:, None]).transpose(0, 2, 1) @ (points - middle))
@@ -276,16 +276,16 @@ def _fitted(points: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def spread_turns(count: int) -> np.ndarray:
-    """Rotations ``[count, 3, 3]``, evenly spread: super-Fibonacci spirals (Alexa 2022)."""
+    """Return evenly spread rotations ``[count, 3, 3]``: super-Fibonacci spirals (Alexa 2022)."""
     from scipy.spatial.transform import Rotation
 
-    place = np.arange(count) + 0.5
-    inner, outer = np.sqrt(place / count), np.sqrt(1 - place / count)
-    a, b = (2 * np.pi * place / step for step in (np.sqrt(2), 1.533751168755204288118041))
+    index = np.arange(count) + 0.5
+    inner, outer = np.sqrt(index / count), np.sqrt(1 - index / count)
+    a, b = (2 * np.pi * index / step for step in (np.sqrt(2), 1.533751168755204288118041))
     quats = [inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)]
     return Rotation.from_quat(np.stack(quats, 1)).as_matrix()
 
 
 def _degrees(turn: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Angles ``[..]`` between a rotation and each of ``[.., 3, 3]``."""
+    """Return angles ``[..]`` in degrees between a rotation and each of ``[.., 3, 3]``."""
     return np.degrees(np.arccos(((np.einsum("ij,mij->m", turn, others) - 1) / 2).clip(-1, 1)))

@@ -1,6 +1,6 @@
 """``gamba eval-geometry``: predicted shapes against true ones.
 
-``--help`` answers at once, so what is slow to import is imported by the command itself.
+Slow imports are inside the command, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -32,47 +32,47 @@ Distance = Annotated[float, Meta(ge=0.01, le=1000)]
 
 @dataclass(frozen=True)
 class ShapesOptions:
-    """What to evaluate, and what differs from the protocol; None leaves the protocol's value.
+    """Options of ``gamba eval-geometry``; None keeps the protocol's value.
 
     Attributes:
         pred: Gaussians (.ply), a mesh or a point cloud; or a folder of them.
         gt: A mesh or a point cloud; or a folder, paired with PRED by name.
-        out: Folder for report.json, objects.csv, table.md and table.tex. An evaluation that was
-            interrupted goes on there with the objects that it lacks.
+        out: Folder for report.json, objects.csv, table.md and table.tex. An interrupted evaluation
+            resumes there.
         baseline: Folders of other predictions of the same objects: PRED is compared with each,
-            object by object. A folder's name names its row.
+            object by object. Rows are named by the folders.
         protocol: default, gso (the objects of "gamba data gso", in the input camera's frame), a
-            protocol of the field (triposr, sf3d, spar3d, syncdreamer, gamba), or a JSON file: a
+            published protocol (triposr, sf3d, spar3d, syncdreamer, gamba), or a JSON file: a
             protocol, or the report.json of an evaluation to repeat.
-        explain: Print the protocol: what its source states, what it leaves open, and what was
-            chosen; nothing is evaluated.
+        explain: Print the protocol: statements of its source, open points and our choices; nothing
+            is evaluated.
         set: Fields of the protocol, FIELD=JSON each: --set num_points=10000 surface.voxels=64
             thresholds=[0.1,0.2]. "--explain" lists them.
-        surface: How Gaussians become a surface; centers is a diagnostic.
-        align: Steps that align predictions with the truth before comparing, in their order: box
-            (bounding boxes), scale (centroids and spread of points), yaw and turn (search about
-            the upward axis or about all), rigid and icp (ICP without and with scale); or none.
+        surface: Method that turns Gaussians into a surface; centers is a diagnostic.
+        align: Steps that align predictions with the truth, in order: box (bounding boxes), scale
+            (centroids and spread of points), yaw and turn (rotation search about the upward axis or
+            any), rigid and icp (ICP without and with scale); or none.
         frame: Frame of the predictions: that of the GT file, its unit frame (z-up, longest side 1,
             centred), or the reference camera's (needs --data).
-        up: Upward axis of GT files; auto goes by the format: y of .obj, .glb and .gltf; of others
-            it is not known, and taken for z.
-        pred_axes: Axes of PRED files: opencv (y down), opengl (y up), z-up, or frame:
-            those of --frame already. auto goes by the format: opencv of Gaussians, opengl of
-            .obj, .glb and .gltf; where those of PRED or GT are not known, coordinates are used as
-            they are, and the report says so.
+        up: Upward axis of GT files; auto goes by the format: y for .obj, .glb and .gltf; for others
+            it is unknown, and z is assumed.
+        pred_axes: Axes of PRED files: opencv (y down), opengl (y up), z-up, or frame: those of
+            --frame. auto goes by the format: opencv for Gaussians, opengl for .obj, .glb and .gltf;
+            if those of PRED or GT are unknown, coordinates are used unchanged, and the report notes
+            it.
         data: Dataset whose objects have the same names, for --frame reference.
         reference: Index of the input view, for --frame reference.
         distance: Distance of the input camera in the model's world, for --frame reference.
         points: Number of points on each surface.
-        voxels: Number of voxels in a unit of length, for surfaces of Gaussians.
+        voxels: Number of voxels per unit of length, for surfaces of Gaussians.
         views: Number of views of the TSDF.
         pixels: Side of the TSDF's depth maps.
         seed: Seed of the random points.
-        sensitivity: Evaluate under every protocol, and under each change of one field of this one,
-            in place of once: a table and a chart of what the choices alone change, in OUT.
-        paint: Paint the distance on so many objects' surfaces, from the best to the worst, in
-            OUT/painted.html.
-        workers: Pairs evaluated at the same time, each in a process of its own.
+        sensitivity: Evaluate under every protocol, and under each change of one field of this one:
+            a table and a chart of the effect of the protocol, in OUT.
+        paint: Number of objects whose surfaces are painted by distance, from the best to the worst,
+            in OUT/painted.html.
+        workers: Pairs evaluated at the same time, each in its own process.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.
     """
@@ -111,18 +111,18 @@ def eval_geometry_command(
 ) -> int:
     """Chamfer distance, F-score, normal consistency and Volume IoU of shapes.
 
-    Prints the means with 95 % intervals over objects. Options that are not given are those of the
-    protocol. Exit code 1 where an object failed (each is listed), 2 where nothing could start.
+    Prints the means with 95 % intervals over objects. Options default to the protocol's values.
+    Exit code 1 if an object failed (each is listed), 2 if nothing could start.
 
     Args:
-        options: what to evaluate, and how.
-        json: Print the report, as report.json holds it, in place of the summary.
-        csv: Print the objects, as objects.csv holds them, in place of the summary.
+        options: of the evaluation.
+        json: Print report.json in place of the summary.
+        csv: Print objects.csv in place of the summary.
     """
     if json and csv:
         raise UserError("--json and --csv: give one of them")
     if options.explain:
-        return _explained(options)
+        return _explain(options)
     if options.pred is None or options.gt is None:
         raise UserError("give PRED and GT: two files or two folders")
     from ..report import FAILED, count_line, csv_of, json_of, summary_lines
@@ -170,8 +170,8 @@ def eval_geometry_command(
     return code
 
 
-def _explained(options: ShapesOptions) -> int:
-    """Prints the protocol that the options name, with its source."""
+def _explain(options: ShapesOptions) -> int:
+    """Print the protocol that the options name, with its source."""
     from .. import presets
     from ..report import flat
     from .protocol import PRESETS, chosen_protocol

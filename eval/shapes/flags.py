@@ -1,4 +1,4 @@
-"""What is unusual about a mesh: it is evaluated all the same, and its record states it."""
+"""Cleaning of meshes, and flags of their defects for the records."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ FLAGS = {
     "duplicate": "a face is given more than once",
     "selfintersecting": "a face cuts another",
 }
-STRICT = tuple(flag for flag in FLAGS if flag != "open")  # the flags that "strict" refuses
+STRICT = tuple(flag for flag in FLAGS if flag != "open")  # refused by "strict"
 
 
-class Tidied(NamedTuple):
-    """A mesh as it is evaluated, and the flags of the mesh that it was made from.
+class CleanMesh(NamedTuple):
+    """A cleaned mesh, and the flags of the original.
 
     Attributes:
-        mesh: without repeated vertices and faces and without flat faces; it may have no face left.
+        mesh: without duplicate vertices, duplicate faces and faces without area; may be empty.
         flags: names from ``FLAGS``, in their order.
     """
 
@@ -35,19 +35,19 @@ class Tidied(NamedTuple):
     flags: list[str]
 
 
-def tidied(mesh: Mesh) -> Tidied:
-    """Merges vertices at one place, drops faces without area and repeated faces, and sets flags.
+def clean_mesh(mesh: Mesh) -> CleanMesh:
+    """Merge equal vertices, drop faces without area and duplicate faces, and set flags.
 
-    None of this moves the surface.
+    The surface does not change.
 
     Args:
-        mesh: any mesh; of one without area no face is left.
+        mesh: any mesh; without area the result has no face.
     """
     vertices, index = merged(mesh.vertices)
     faces = index[mesh.faces]
     flat = ~(np.abs(Mesh(vertices, faces).normals()).max(1) > 0)
     order = np.sort(faces, axis=1)
-    rank = np.lexsort(order.T)  # equal rows in a row, in the order of the file
+    rank = np.lexsort(order.T)  # equal rows adjacent, in the order of the file
     repeated = np.zeros(len(faces), bool)
     repeated[rank[1:]] = (order[rank[1:]] == order[rank[:-1]]).all(1)
     kept = Mesh(vertices, faces[~flat & ~repeated])
@@ -58,7 +58,7 @@ def tidied(mesh: Mesh) -> Tidied:
         found.add("duplicate")
     if len(kept.faces) and cuts_itself(kept.vertices, kept.faces):
         found.add("selfintersecting")
-    return Tidied(kept, [flag for flag in FLAGS if flag in found])
+    return CleanMesh(kept, [flag for flag in FLAGS if flag in found])
 
 
 def _edge_flags(mesh: Mesh) -> set[str]:

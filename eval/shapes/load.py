@@ -1,4 +1,4 @@
-"""The load stage of an evaluation: a file becomes an ``Evaluated``, in the truth's unit frame.
+"""Loading stage of an evaluation: files become ``LoadedShape``, in the truth's unit frame.
 
 ``load_truth`` and ``load_prediction`` read a file (``load_shape``), turn Gaussians into a surface,
 move the shape into the unit frame, and clean and flag its mesh. ``compare`` is the next stage.
@@ -24,13 +24,13 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import extract_surface
 from gamba_warp.surfaces.options import SurfaceOptions
 
-from .flags import STRICT, tidied
+from .flags import STRICT, clean_mesh
 from .protocol import GeometryProtocol
 from .shape import SUFFIXES, Mesh, Points, Shape, Similarity
 
-HUGE = 1e18  # the squares of larger coordinates overflow float32
-ROUNDED = 1e-3  # how far the rotations of a catalogue, texts of few digits, may be from one
-FAR = 1e6  # units of the truth's longest side; farther out float32 holds nothing of a shape
+HUGE = 1e18  # squares of larger coordinates overflow float32
+ROUNDED = 1e-3  # tolerance of a catalogue's rotations, which have few digits
+FAR = 1e6  # units of the truth's longest side; beyond, float32 cannot resolve a shape
 KINDS = {Gaussians: "gaussians", Mesh: "mesh", Points: "points"}
 UNKNOWN = "unknown"  # axes
 # From a file's axes to z-up, by their names.
@@ -39,9 +39,9 @@ TO_Z_UP = {
     "opengl": Y_TO_Z_UP,
     "z-up": np.eye(3),
 }
-# Those of the frames that predictions may be in; those of the truth's file depend on the file.
+# Axes of the frames of predictions; those of "gt" depend on the file.
 FRAME_AXES = {"unit": "z-up", "reference": "opencv"}
-DATASET = "dataset"  # axes of the meshes that a dataset was rendered from, as it says them
+DATASET = "dataset"  # axes stated by the dataset that was rendered from the meshes
 _FOLLOWED = "which was rendered of these meshes with another axis up; --up is followed"
 _OTHER_FILES = (
     "other bounding boxes than the meshes that DATA was rendered from; DATA's axes are not used, "
@@ -50,16 +50,16 @@ _OTHER_FILES = (
 
 
 @dataclass
-class Evaluated:
-    """A shape as it is compared.
+class LoadedShape:
+    """A shape ready for comparison.
 
     Attributes:
-        source: as the file holds it.
+        source: as in the file.
         shape: in the truth's unit frame.
         flags: of the mesh (for Gaussians: of their surface), names from ``flags.FLAGS``.
-        motion: what brought the file's coordinates into the unit frame.
-        axes: of the file, a key of ``TO_Z_UP``, ``UNKNOWN``, or of a truth ``DATASET``.
-        warning: of a truth, why its place in its dataset is not used; or empty.
+        motion: from the file's coordinates into the unit frame.
+        axes: of the file: a key of ``TO_Z_UP``, ``UNKNOWN``, or for a truth ``DATASET``.
+        warning: reason why the dataset's placement of a truth is not used; or empty.
     """
 
     source: Shape
@@ -71,7 +71,7 @@ class Evaluated:
 
     @property
     def kind(self) -> str:
-        """What the file holds: "gaussians", "mesh" or "points"."""
+        """Kind of the file's content: "gaussians", "mesh" or "points"."""
         return KINDS[type(self.source)]
 
     @property
@@ -81,7 +81,7 @@ class Evaluated:
         return [*([self.warning] if self.warning else []), *omitted]
 
     def is_closed(self) -> bool | None:
-        """Whether the mesh is closed, as ``Mesh.is_closed`` says it; None for points."""
+        """Return True if the mesh is closed (``Mesh.is_closed``); None for points."""
         return "open" not in self.flags if isinstance(self.shape, Mesh) else None
 
 
@@ -90,20 +90,20 @@ def load_truth(
     protocol: GeometryProtocol,
     rotation: list[list[float]] | None = None,
     placement: Placement | None = None,
-) -> Evaluated:
-    """Reads a true mesh or cloud and moves it into its unit frame.
+) -> LoadedShape:
+    """Read a true mesh or cloud, and move it into its unit frame.
 
     Args:
         path: file.
-        protocol: says which axis of the file points up, and which flags are refused.
+        protocol: with the upward axis of the file and the refused flags.
         rotation: ``[3, 3]``, applied first, for files whose object lies on its side; or None.
-        placement: of the mesh that the dataset was rendered from. It places the truth, in place of
-            the protocol and the rotation, where the file has that mesh's bounding box and the
-            protocol does not ask for another upward axis. None: there is none.
+        placement: of the dataset's source mesh, or None. It replaces the protocol's axis and the
+            rotation if the file has that mesh's bounding box and the protocol asks for no other
+            upward axis.
 
     Raises:
-        UserError: it cannot be read, is made of Gaussians, or has no extent; or ``rotation``
-            also stretches.
+        UserError: the file cannot be read, holds Gaussians, or has no extent; or ``rotation`` is
+            not a rotation.
     """
     shape = load_shape(path)
     if isinstance(shape, Gaussians):
@@ -114,13 +114,13 @@ def load_truth(
             if asked is None or _same_up(placement, TO_Z_UP[asked], rotation):
                 matrix, scale = placement.transform, placement.scale
                 motion = Similarity(matrix[:, :3], scale * matrix[:, 3], scale)
-                return _evaluated(shape, motion.apply(shape), motion, DATASET, protocol)
+                return _loaded(shape, motion.apply(shape), motion, DATASET, protocol)
             warning = f"--up {protocol.up} contradicts DATA, {_FOLLOWED}"
         elif placement is not None and asked is None:
             warning = _OTHER_FILES
         axes = asked or axes_of(path, shape)
         motion = unit_motion(shape, axes, rotation)
-        found = _evaluated(shape, motion.apply(shape), motion, axes, protocol)
+        found = _loaded(shape, motion.apply(shape), motion, axes, protocol)
         return replace(found, warning=warning)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
@@ -129,7 +129,7 @@ def load_truth(
 def _same_up(
     placement: Placement, turn: np.ndarray, rotation: list[list[float]] | None = None
 ) -> bool:
-    """Tells if one direction in the file points up by a placement, and by a turn to z-up."""
+    """Return True if a placement and a rotation to z-up agree on the file's upward direction."""
     if rotation is not None:
         turn = turn @ np.asarray(rotation, np.float64)
     up, other = placement.transform[2, :3], turn[2]
@@ -137,22 +137,22 @@ def _same_up(
 
 
 def axes_of(path: Path, shape: Shape) -> str:
-    """The axes of a shape's file by its format, or by the comment "axes NAME" of a ``.ply``.
+    """Return the axes of a shape's file by its format, or by the comment "axes NAME" of a ``.ply``.
 
-    ``UNKNOWN`` where neither says them.
+    ``UNKNOWN`` without either.
     """
     if isinstance(shape, Gaussians):
         return "opencv"
     if path.suffix.lower() == ".ply":
         with open_shape(path) as (file, _):
-            said = {f"axes {axes}": axes for axes in TO_Z_UP}
-            found = [said[c] for c in read_ply_header(path, file).comments if c in said]
+            known = {f"axes {axes}": axes for axes in TO_Z_UP}
+            found = [known[c] for c in read_ply_header(path, file).comments if c in known]
         return found[0] if found else UNKNOWN
     return "opengl" if default_up(path) == "y" else UNKNOWN
 
 
 def turn_between(axes: str, frame: str) -> np.ndarray:
-    """``[3, 3]`` from a file's axes to a frame's; none where one of them is not known."""
+    """Return the rotation ``[3, 3]`` from a file's axes to a frame's; identity if unknown."""
     if UNKNOWN in (axes, frame):
         return np.eye(3)
     return TO_Z_UP[frame].T @ TO_Z_UP[axes]
@@ -160,15 +160,14 @@ def turn_between(axes: str, frame: str) -> np.ndarray:
 
 def load_prediction(
     path: Path, motion: Similarity, frame_axes: str, protocol: GeometryProtocol
-) -> Evaluated:
-    """Reads a predicted shape, turns and moves it, and turns Gaussians into a surface.
+) -> LoadedShape:
+    """Read a predicted shape, move it, and turn Gaussians into a surface.
 
     Args:
         path: file.
         motion: from the frame of the predictions into the truth's unit frame.
         frame_axes: of that frame, a key of ``TO_Z_UP`` or ``UNKNOWN``.
-        protocol: says how the file's axes lie, how Gaussians become a surface, and which flags are
-            refused.
+        protocol: with the file's axes, the options of surfaces, and the refused flags.
 
     Raises:
         UserError: it cannot be read, has no surface, or lies far away.
@@ -186,7 +185,7 @@ def load_prediction(
     try:
         if isinstance(shape, Gaussians):
             shape = to_surface(shape, protocol.surface, protocol.seed, protocol.num_points)
-        return _evaluated(source, shape, motion, axes, protocol)
+        return _loaded(source, shape, motion, axes, protocol)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 
@@ -194,16 +193,16 @@ def load_prediction(
 def unit_motion(
     shape: Mesh | Points, axes: str, rotation: list[list[float]] | None = None
 ) -> Similarity:
-    """The motion after which a shape is z-up and centred, with a longest side of 1.
+    """Return the motion that makes a shape z-up and centred, with a longest side of 1.
 
     Args:
-        shape: at least two places.
-        axes: of the shape, a key of ``TO_Z_UP``; others are taken for z-up.
+        shape: at least two distinct points.
+        axes: of the shape, a key of ``TO_Z_UP``; otherwise z-up is assumed.
         rotation: ``[3, 3]``, applied first; or None.
 
     Raises:
-        UserError: it has no extent, or is so far from the origin that its numbers cannot hold it;
-            or ``rotation`` also stretches or mirrors.
+        UserError: the extent is zero, or lost to rounding far from the origin; or ``rotation``
+            also stretches or mirrors.
     """
     turn = TO_Z_UP.get(axes, np.eye(3))
     if rotation is not None:
@@ -219,31 +218,31 @@ def unit_motion(
 
 
 def _positions(shape: Shape) -> np.ndarray:
-    """``[N, 3]``: the vertices, points, or centres of Gaussians."""
+    """Return the vertices, points, or centres of Gaussians, ``[N, 3]``."""
     if isinstance(shape, Gaussians):
         return shape.means.numpy()
     return shape.vertices if isinstance(shape, Mesh) else shape.positions
 
 
-def _evaluated(
+def _loaded(
     source: Shape, shape: Mesh | Points, motion: Similarity, axes: str, protocol: GeometryProtocol
-) -> Evaluated:
+) -> LoadedShape:
     if isinstance(shape, Points):
-        return Evaluated(source, shape, [], motion, axes)
-    mesh, flags = tidied(shape)
+        return LoadedShape(source, shape, [], motion, axes)
+    mesh, flags = clean_mesh(shape)
     if len(mesh.faces) == 0:
         raise UserError("the mesh has no area")
     refused = [flag for flag in flags if flag in STRICT]
     if protocol.strict and isinstance(source, Mesh) and refused:
         raise UserError(f"--strict: {', '.join(refused)}")
-    return Evaluated(source, mesh, flags, motion, axes)
+    return LoadedShape(source, mesh, flags, motion, axes)
 
 
 def load_shape(path: Path) -> Shape:
-    """Reads Gaussians, a mesh, or a point cloud, by what the file holds.
+    """Read Gaussians, a mesh or a point cloud, by the content of the file.
 
-    The counts that the file's header states are compared with its size first, so that a false
-    header costs no memory; no native library sees the file's bytes.
+    The counts in the header are compared with the file's size first, so that a false header costs
+    no memory. No native library reads the file.
 
     Raises:
         UserError: missing, unreadable, empty, with a false header, or with values that are not
@@ -269,7 +268,7 @@ def load_shape(path: Path) -> Shape:
 
 
 def _has_faces(path: Path) -> bool:
-    """Whether a ``.ply`` says in its header that it has faces."""
+    """Return True if the header of a ``.ply`` declares faces."""
     with open_shape(path) as (file, _):
         elements = read_ply_header(path, file).elements
     return any(element.name == "face" and element.count for element in elements)
@@ -288,16 +287,16 @@ def _load_points(path: Path) -> Points:
 def to_surface(
     gaussians: Gaussians, options: SurfaceOptions, seed: int, count: int
 ) -> Mesh | Points:
-    """Turns one object's Gaussians into a mesh, or into points for the method "centers".
+    """Turn one object's Gaussians into a mesh, or into points for the method "centers".
 
     Args:
         gaussians: one object, no batch dimension.
-        options: how they become a surface.
+        options: of the surface.
         seed: of the points, for "centers".
         count: number of points, for "centers".
 
     Raises:
-        UserError: there is no surface.
+        UserError: the surface is empty.
     """
     if options.method == "centers":
         return centers(gaussians, count, seed)
@@ -306,7 +305,7 @@ def to_surface(
 
 
 def centers(gaussians: Gaussians, count: int, seed: int) -> Points:
-    """Draws ``count`` centres with repetition, each with a chance proportional to its opacity.
+    """Draw ``count`` centres with replacement, with probability proportional to opacity.
 
     Raises:
         UserError: no Gaussian has any opacity.

@@ -1,4 +1,4 @@
-"""The compare stage of an evaluation: metrics of two shapes, aligned, in one frame and unit."""
+"""Comparison stage of an evaluation: alignment and metrics of two shapes in one frame and unit."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gamba_warp.gaussians import Gaussians
 
 from .align import aligned, match_moments, symmetry
 from .command import ChamferForm
-from .load import Evaluated, centers
+from .load import LoadedShape, centers
 from .occupancy import RULES, grid_around, syncdreamer_grid
 from .protocol import GeometryProtocol
 from .shape import Mesh, Points, halves, nearest, sample, visible_points
 
-# Turns that files are mistaken by: half ones, and quarter ones about x between y-up and z-up.
+# Rotations by which files are often wrong: by 180 degrees, and between y-up and z-up.
 TURNS = {
     "as it is": np.eye(3),
     "180 degrees about x": np.diag([1.0, -1, -1]),
@@ -27,21 +27,21 @@ TURNS = {
     "90 degrees about x": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
     "-90 degrees about x": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
-_FEW = 5_000  # points that are enough to tell
+_FEW = 5_000  # points, enough for a warning
 
 
 def compare(
     predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
 ) -> tuple[Mesh | Points, dict[str, Any]]:
-    """Computes all metrics of one pair, after the protocol's alignment.
+    """Compute all metrics of one pair, after the protocol's alignment.
 
     Args:
         predicted: in the truth's unit frame.
         truth: in its unit frame.
-        protocol: says how points and voxels are taken, and how the prediction is aligned.
+        protocol: with the rules of points, voxels and alignment.
 
     Returns:
-        The aligned prediction; and what the three functions below return.
+        The aligned prediction; and the results of the three functions below.
 
     Raises:
         UserError: a shape cannot be sampled or aligned.
@@ -57,11 +57,11 @@ def compare(
 def align_shape(
     predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
 ) -> tuple[Mesh | Points, dict[str, Any]]:
-    """Moves a prediction as the protocol says; arguments as for ``compare``.
+    """Align a prediction by the protocol; arguments as for ``compare``.
 
     Returns:
-        The prediction; and, where the protocol aligns, ``alignment`` (the motion) and, where it
-        searches for a turn, ``gt_symmetry`` (see ``align.symmetry``).
+        The prediction; ``alignment`` (the motion) if the protocol aligns; and ``gt_symmetry`` (see
+        ``align.symmetry``) if it searches for a rotation.
 
     Raises:
         UserError: it cannot be sampled or aligned.
@@ -79,23 +79,23 @@ def align_shape(
 def point_metrics(
     predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
 ) -> dict[str, Any]:
-    """What ``surface_metrics`` says of points of two shapes, and ``noise_floor``."""
+    """Compute ``surface_metrics`` of points of two shapes, and ``noise_floor``."""
     points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, truth))
     found = surface_metrics(points, true_points, protocol)
     return found | {"noise_floor": noise_floor(truth, protocol, true_points)}
 
 
 def take_points(shape: Mesh | Points, protocol: GeometryProtocol, seed: int) -> Points:
-    """Points by the protocol's rule; from a point cloud always a random draw."""
+    """Sample points by the protocol's rule; from a point cloud always at random."""
     if protocol.points == "views" and isinstance(shape, Mesh):
         return syncdreamer_points(shape)
     return sample(shape, protocol.num_points, seed)
 
 
 def syncdreamer_points(mesh: Mesh) -> Points:
-    """The points that SyncDreamer's ``eval_mesh.py`` takes: the surface that 16 cameras see."""
+    """Sample like SyncDreamer's ``eval_mesh.py``: the surface visible from 16 cameras."""
     viewmats = orbit(torch.arange(16) * 22.5, 30.0, 1.5).double().numpy()
-    # from y-down, z-forward (the reference camera's world) to the truth's z-up
+    # From y-down, z-forward (the reference camera's world) to the truth's z-up.
     turn = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     fov = 2 * math.degrees(math.atan(128 / 280))
     K = intrinsics(256, 256, fov).double().numpy()
@@ -103,13 +103,13 @@ def syncdreamer_points(mesh: Mesh) -> Points:
 
 
 def noise_floor(truth: Mesh | Points, protocol: GeometryProtocol, points: Points) -> float | None:
-    """Chamfer distance between two samples of the truth; None for a cloud of a single point.
+    """Return the Chamfer distance between two samples of the truth; None for a single point.
 
-    The distances of one way stand for both, since either sample is as good as the other.
+    Distances are computed one way only, because the two samples are exchangeable.
 
     Args:
         truth: the shape.
-        protocol: says how it is sampled.
+        protocol: with the sampling rule.
         points: its sample with the seed of the protocol.
     """
     if isinstance(truth, Points):
@@ -125,11 +125,11 @@ def noise_floor(truth: Mesh | Points, protocol: GeometryProtocol, points: Points
 def shape_iou(
     predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
 ) -> dict[str, Any]:
-    """Volume IoU by the protocol's rule and grid.
+    """Compute the Volume IoU by the protocol's rule and grid.
 
     Returns:
-        ``iou`` (None without volume), ``iou_voxel`` (the side of a voxel) and, where ``iou`` is
-        None, ``iou_reason``.
+        ``iou`` (None without volume), ``iou_voxel`` (the side of a voxel) and, if ``iou`` is None,
+        ``iou_reason``.
     """
     if protocol.occupancy == "none":
         return {"iou": None, "iou_reason": "the protocol takes none"}
@@ -144,24 +144,24 @@ def shape_iou(
     fill = RULES[protocol.occupancy].fill
     iou = volume_iou(fill(predicted, grid), fill(truth, grid))
     if iou is None and grid.step > 1 / protocol.iou_voxels:
-        iou = 0.0  # They are far apart, or one is far larger: they share less than a voxel.
+        iou = 0.0  # Far apart, or of very different size: they share less than a voxel.
     if iou is None:
         return {"iou": None, "iou_reason": "neither shape fills a voxel", "iou_voxel": grid.step}
     return {"iou": iou, "iou_voxel": grid.step}
 
 
 def chamfer_by_turn(
-    predicted: Evaluated, truth: Evaluated, protocol: GeometryProtocol
+    predicted: LoadedShape, truth: LoadedShape, protocol: GeometryProtocol
 ) -> dict[str, float]:
-    """Measures how the Chamfer distance changes if the prediction's file has other axes.
+    """Compute the Chamfer distance for other axes of the prediction's file.
 
-    The turns are about the origin of the file. Of Gaussians the centres are compared, because their
-    surface is looked for near the truth alone.
+    The rotations are about the origin of the file. Gaussians are compared by their centres, because
+    their surface is extracted near the truth only.
 
     Args:
         predicted: before any alignment.
         truth: the true shape.
-        protocol: says the seed; where it aligns, centroids and sizes are matched first.
+        protocol: with the seed; if it aligns, centroids and sizes are matched first.
 
     Returns:
         Distances between few points, by the key of ``TURNS``.
@@ -181,15 +181,15 @@ def chamfer_by_turn(
 
 
 def surface_metrics(predicted: Points, truth: Points, protocol: GeometryProtocol) -> dict:
-    """Measures how far two surfaces are apart, by points on them.
+    """Compute distances between two surfaces, by points on them.
 
     Args:
         predicted: at least one point.
         truth: at least one point, in the same frame; the truth's longest side is 1.
-        protocol: says the unit, the form of the Chamfer distance and the thresholds.
+        protocol: with the unit, the form of the Chamfer distance and the thresholds.
 
     Returns:
-        ``accuracy`` (mean distance from predicted to true points), ``completeness`` (from true to
+        ``accuracy`` (mean distance from predicted to true points), ``completeness`` (true to
         predicted), ``chamfer`` (of both, in the protocol's form), ``chamfer_squared`` (mean of the
         two mean squared distances), ``fscore`` ``{str(threshold): 0..1}`` (harmonic mean of
         precision and recall), ``hausdorff`` (the largest distance of either way) and
@@ -228,6 +228,6 @@ def _chamfer(there: np.ndarray, back: np.ndarray, form: ChamferForm) -> float:
 
 
 def volume_iou(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Intersection over union of two bool arrays of one shape; None where both are empty."""
+    """Return the intersection over union of two bool arrays; None if both are empty."""
     either = np.count_nonzero(a | b)
     return float(np.count_nonzero(a & b) / either) if either else None

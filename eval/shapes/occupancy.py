@@ -1,4 +1,4 @@
-"""The voxels that a mesh fills, by several rules, for meshes that are not closed as well."""
+"""Voxels filled by a mesh, by several rules, also for open meshes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gamba_warp.formats.parts import merged
 from .command import OccupancyRule
 from .shape import Mesh, directed_edges
 
-VOTERS = 26  # rays from a point
+VOTERS = 26  # rays per point
 
 
 @dataclass
 class Grid:
-    """Points of a regular grid.
+    """Regular grid of points.
 
     Attributes:
         origin: ``[3]``, the first point.
@@ -31,20 +31,20 @@ class Grid:
     shape: tuple[int, int, int]
 
     def points(self) -> np.ndarray:
-        """Returns ``[X, Y, Z, 3]`` float32."""
+        """Return the points ``[X, Y, Z, 3]`` float32."""
         axes = [self.origin[k] + self.step * np.arange(self.shape[k]) for k in range(3)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
 
 
 def grid_around(*meshes: Mesh, resolution: int) -> Grid:
-    """The voxel centres around several meshes, with one empty voxel on each side.
+    """Return the voxel centres around several meshes, with one empty voxel on each side.
 
-    Voxel faces lie on multiples of their side, so the grid does not depend on the meshes' extents
-    as long as they fit into a cube of side 2; around larger ones the voxels grow with them.
+    Voxel faces lie on multiples of their side, so the grid is the same for all meshes within a cube
+    of side 2; for larger ones the voxels grow.
 
     Args:
         meshes: at least one.
-        resolution: number of voxels in a unit of length.
+        resolution: number of voxels per unit of length.
     """
     low = np.min([mesh.vertices.min(0) for mesh in meshes], axis=0)
     high = np.max([mesh.vertices.max(0) for mesh in meshes], axis=0)
@@ -56,7 +56,7 @@ def grid_around(*meshes: Mesh, resolution: int) -> Grid:
 
 
 def syncdreamer_grid(size: int = 64) -> Grid:
-    """The lattice of mesh2sdf: ``size`` points a side from -1 in steps of 2 / size."""
+    """Return the lattice of mesh2sdf: ``size`` points per side from -1 in steps of 2 / size."""
     return Grid(np.full(3, -1.0), 2.0 / size, (size, size, size))
 
 
@@ -69,7 +69,7 @@ def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
     inside |= majority(mesh, grid)
     if len(parts) > 1 or len(parts[0].faces) < len(mesh.faces):
         points = grid.points()
-        # only within a part's box can more than half of the rays cross it
+        # More than half of the rays can cross a part only within its box.
         for part in parts:
             low, high = part.vertices.min(0), part.vertices.max(0)
             first = np.maximum(np.ceil((low - grid.origin) / grid.step).astype(int), 0)
@@ -92,18 +92,18 @@ def majority(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 
 def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
-    """Occupancy ``[X, Y, Z]`` bool, as mesh2sdf has it without its repair. See ``RULES``.
+    """Compute occupancy ``[X, Y, Z]`` bool like mesh2sdf without its repair. See ``RULES``.
 
-    Rays run along the grid's lines. One that meets an edge is decided as if it were moved by very
-    little along y and by less along z, so that it meets exactly one of the faces there. Places on
-    the surface are outside; in mesh2sdf the rounding of their distance decides.
+    Rays follow the grid's lines. A ray that meets an edge is treated as shifted infinitesimally
+    along y and by less along z, so that it meets exactly one of the faces. Points on the surface
+    are outside; in mesh2sdf rounding decides.
     """
     corners = (mesh.vertices.astype(np.float32).astype(np.float64) - grid.origin) / grid.step
     corners = corners[mesh.faces]
     first = np.ceil(corners[..., 1:].min(1)).clip(0).astype(int)
     last = np.floor(corners[..., 1:].max(1)).astype(int)
     count = (np.minimum(last, np.array(grid.shape[1:]) - 1) - first + 1).clip(0)
-    face = np.repeat(np.arange(len(corners)), count.prod(1))  # once for each line in its box
+    face = np.repeat(np.arange(len(corners)), count.prod(1))  # once per line in its box
     within = np.arange(len(face)) - np.repeat(count.prod(1).cumsum() - count.prod(1), count.prod(1))
     line = first[face] + np.stack(np.divmod(within, count[face, 1]), -1)
     (y, z), x = (corners[face, :, 1:] - line[:, None]).transpose(2, 0, 1), corners[face, :, 0]
@@ -122,10 +122,10 @@ def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 
 def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
-    """Occupancy ``[X, Y, Z]`` bool. See ``RULES``.
+    """Compute occupancy ``[X, Y, Z]`` bool. See ``RULES``.
 
-    The generalised winding number (Jacobson et al. 2013) is the mean, over all directions, of the
-    signed crossings of a ray; here over the directions of ``majority``.
+    The generalised winding number (Jacobson et al. 2013) is the mean of a ray's signed crossings
+    over all directions; here over those of ``majority``.
     """
     scene, points, normals = mesh.scene(), grid.points().reshape(-1, 3), mesh.normals()
     total = np.zeros(len(points))
@@ -145,16 +145,16 @@ def _crossings(scene, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def _majority_at(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Asks rays from points ``[.., 3]``, of each until its majority can no longer change."""
-    scene, places, ways = mesh.scene(), points.reshape(-1, 3), directions()
-    # Where a plane parts a point from the mesh, one ray of each opposite pair meets nothing.
-    reach, at = mesh.vertices @ ways.T, places @ ways.astype(np.float32).T
-    asked = np.flatnonzero((at <= reach.max(0) + 1e-5).all(1))
-    votes = np.zeros(len(places), np.int32)
-    for left, direction in zip(range(VOTERS - 1, -1, -1), ways):
-        votes[asked] += _crossings(scene, places[asked], direction) % 2
-        found = votes[asked]
-        asked = asked[(2 * found <= VOTERS) & (2 * (found + left) > VOTERS)]
+    """Cast rays from points ``[.., 3]``, each until its majority is decided."""
+    scene, origins, rays = mesh.scene(), points.reshape(-1, 3), directions()
+    # If a plane separates a point from the mesh, one ray of each opposite pair misses.
+    reach, at = mesh.vertices @ rays.T, origins @ rays.astype(np.float32).T
+    undecided = np.flatnonzero((at <= reach.max(0) + 1e-5).all(1))
+    votes = np.zeros(len(origins), np.int32)
+    for left, direction in zip(range(VOTERS - 1, -1, -1), rays):
+        votes[undecided] += _crossings(scene, origins[undecided], direction) % 2
+        found = votes[undecided]
+        undecided = undecided[(2 * found <= VOTERS) & (2 * (found + left) > VOTERS)]
     return (2 * votes > VOTERS).reshape(points.shape[:-1])
 
 
@@ -166,8 +166,7 @@ def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
 
     scene = mesh.scene()
     near = _near(mesh, grid)
-    # Places that no face is near to are one with their neighbours: what they form is a node each,
-    # and so is every place near a face.
+    # Connected points away from all faces form one node; each point near a face is its own node.
     node = cast(np.ndarray, label(~near, connectivity=1))
     node[near] = node.max() + 1 + np.arange(np.count_nonzero(near))
     links = []
@@ -190,16 +189,16 @@ def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 
 def _near(mesh: Mesh, grid: Grid) -> np.ndarray:
-    """Marks the points ``[X, Y, Z]`` bool of which one is at an end of any step that meets a face.
+    """Mark points ``[X, Y, Z]`` bool so that each step across a face has one at an end.
 
-    Those are in the boxes of the faces, and one step before each of them.
+    They are in the boxes of the faces, and one step before each box.
     """
     one, two, three = ((mesh.vertices - grid.origin) / grid.step)[mesh.faces.T]
-    last, room = np.array(grid.shape) - 1, 0.01  # for rounding
-    low = np.minimum(np.minimum(one, two), three) - room
-    high = np.maximum(np.maximum(one, two), three) + room
+    last, margin = np.array(grid.shape) - 1, 0.01  # margin for rounding
+    low = np.minimum(np.minimum(one, two), three) - margin
+    high = np.maximum(np.maximum(one, two), three) + margin
     low, high = (np.floor(end).clip(0, last).astype(int) for end in (low, high))
-    # 1 where a box begins and -1 where it ends, along each axis, so that sums count the boxes
+    # 1 where a box begins and -1 where it ends, along each axis: cumulative sums count the boxes.
     shape = np.array(grid.shape) + 1
     count = np.zeros(shape.prod())
     for ends in np.ndindex(2, 2, 2):
@@ -212,22 +211,22 @@ def _near(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 
 def _is_flat(part: Mesh) -> bool:
-    """Whether all faces of a connected part lie in one plane, which bounds nothing."""
+    """Return True if all faces of a connected part lie in one plane, which bounds no volume."""
     normals = part.normals()
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     return bool(np.abs(np.cross(normals, normals[0])).max() < 1e-6)
 
 
 def directions() -> np.ndarray:
-    """Unit vectors ``[VOTERS, 3]`` in opposite pairs, so that a sheet never gets more than half."""
-    from gamba_warp.cameras import fibonacci_sphere  # with torch, which few need
+    """Return unit vectors ``[VOTERS, 3]`` in opposite pairs, so a sheet gets at most half."""
+    from gamba_warp.cameras import fibonacci_sphere  # imports torch
 
     half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
     return np.concatenate([half, -half])
 
 
 def connected_parts(mesh: Mesh) -> list[Mesh]:
-    """The parts of a mesh that share no edge, where vertices at one place count as one."""
+    """Split a mesh into parts that share no edge, after merging equal vertices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -258,8 +257,8 @@ class Rule(NamedTuple):
     """A rule of occupancy.
 
     Attributes:
-        meaning: in words, for reports.
-        fill: gives the voxels of a grid that a mesh fills, ``[X, Y, Z]`` bool.
+        meaning: description for reports.
+        fill: function of a mesh and a grid that returns occupancy, ``[X, Y, Z]`` bool.
     """
 
     meaning: str

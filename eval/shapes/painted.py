@@ -1,4 +1,4 @@
-"""Where the error lies: each surface painted by its distance to the other one, on one page."""
+"""Page of error maps: each surface painted by its distance to the other one."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from gamba_warp.viewer.page import write_viewer
 from ..report import OK
 from .shape import Mesh, Points, nearest, sample
 
-FAR = 0.1  # distance of the last colour; the truth's longest side is 1
-SIZE, GROUND = 160, 0.5  # of a picture, pixels; grey behind it
-_FINE, _FACES = 1 / 48, 40_000  # longest edge of a painted mesh, while it has no more faces
+FAR = 0.1  # distance of the last colour, in units of the truth's longest side
+SIZE, GROUND = 160, 0.5  # side of a picture in pixels; grey background
+_FINE, _FACES = 1 / 48, 40_000  # longest edge of a painted mesh; most faces after refinement
 _DISCS = 6000  # of a surface in the viewer
-# from the truth's z-up to y-down, z-forward: the reference camera's world, and the viewer's
+# From the truth's z-up to y-down, z-forward: the reference camera's world and the viewer's.
 _TO_CAMERA = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-# From dark blue by green to yellow, each lighter than the one before: also without colour.
+# From dark blue over green to yellow, with increasing lightness, so also legible in grey.
 _STOPS = np.array(
     [
         *((68, 1, 84), (71, 45, 123), (59, 82, 139), (44, 114, 142), (33, 145, 140)),
@@ -37,9 +37,9 @@ _STOPS = np.array(
 
 
 def paint(name: str, predicted: Mesh | Points, truth: Mesh | Points, folder: Path) -> None:
-    """Paints a pair: NAME.png, and for both sides pages with the viewer and, of meshes, ``.glb``.
+    """Paint a pair: NAME.png, and for both sides a viewer page and, for meshes, a ``.glb``.
 
-    They are FOLDER/painted/NAME.html and .glb, and of the truth NAME.truth.html and .glb.
+    They are FOLDER/painted/NAME.html and .glb, and for the truth NAME.truth.html and .glb.
 
     Args:
         name: of the object; it may have slashes.
@@ -56,7 +56,7 @@ def paint(name: str, predicted: Mesh | Points, truth: Mesh | Points, folder: Pat
         path.parent.mkdir(parents=True, exist_ok=True)
         to = "prediction" if end else "truth"
         note = f"distance to the {to}: dark 0, yellow {FAR:g} and more of the longest side"
-        view = (2.2, 34.0, 20.0)  # as in the pictures
+        view = (2.2, 34.0, 20.0)  # like the pictures
         page = path.with_suffix(".html")
         write_viewer(page, f"{name}{end}", as_discs(shape, other), view=view, note=note)
         shape = refined(shape)
@@ -69,31 +69,31 @@ def paint(name: str, predicted: Mesh | Points, truth: Mesh | Points, folder: Pat
 
 
 def as_discs(shape: Mesh | Points, other: Mesh | Points) -> Gaussians:
-    """A surface as flat round Gaussians, painted by their distance to the other one.
+    """Convert a surface to flat round Gaussians, painted by their distance to the other one.
 
     Args:
-        shape: z up; of a cloud without normals they are balls.
+        shape: z up; a cloud without normals gives balls.
         other: z up.
 
     Returns:
-        ``[N]``, y down as the viewer has it; N is at most 6,000.
+        Gaussians ``[N]``, y down like the viewer; N is at most 6,000.
     """
     points = _evenly(shape)
-    places = points.positions
-    others = places[min(1, len(places) - 1) :: 2]  # the nearest of the rest is a gap away
-    gap = float(np.median(nearest(Points(others), Points(places[::2]))[0]))
-    size = torch.full((len(places), 3), max(0.6 * gap, 1e-3))
+    positions = points.positions
+    odd = positions[min(1, len(positions) - 1) :: 2]
+    gap = float(np.median(nearest(Points(odd), Points(positions[::2]))[0]))
+    size = torch.full((len(positions), 3), max(0.6 * gap, 1e-3))
     quats = None
     if points.normals is not None:
         size[:, 2] /= 10
         x, y, z = (points.normals * np.where(points.normals[:, 2:] < 0, -1, 1)).T
         quats = torch.from_numpy(np.stack([1 + z, -y, x, 0 * z], 1)).float()  # z to the normal
-    colors = colors_of(distances(Points(places), other)) / 255
+    colors = colors_of(distances(Points(positions), other)) / 255
     discs = Gaussians(
-        torch.from_numpy(places).float(),
+        torch.from_numpy(positions).float(),
         quats,
         size,
-        torch.full((len(places),), 0.98),
+        torch.full((len(positions),), 0.98),
         torch.from_numpy(colors).float(),
     )
     turn = torch.from_numpy(_TO_CAMERA).float()
@@ -101,7 +101,7 @@ def as_discs(shape: Mesh | Points, other: Mesh | Points) -> Gaussians:
 
 
 def _evenly(shape: Mesh | Points) -> Points:
-    """At most ``_DISCS`` points of a shape, about equally far from each other."""
+    """Sample at most ``_DISCS`` points of a shape, about equally spaced."""
     o3d = import_open3d()
     many = sample(shape, 4 * _DISCS, 0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(many.positions))
@@ -112,7 +112,7 @@ def _evenly(shape: Mesh | Points) -> Points:
 
 
 def refined(shape: Mesh | Points) -> Mesh | Points:
-    """A mesh whose edges are short enough to show where on a large face the error lies."""
+    """Subdivide a mesh until its edges are short enough to show errors within large faces."""
     from trimesh.remesh import subdivide
 
     while isinstance(shape, Mesh) and len(shape.faces) * 4 <= _FACES:
@@ -127,22 +127,22 @@ def refined(shape: Mesh | Points) -> Mesh | Points:
 
 
 def distances(shape: Mesh | Points, other: Mesh | Points) -> np.ndarray:
-    """How far each vertex or point is from the other surface, ``[N]``; from a cloud's points."""
-    places = shape.vertices if isinstance(shape, Mesh) else shape.positions
+    """Return the distance ``[N]`` of each vertex or point to the other surface or cloud."""
+    positions = shape.vertices if isinstance(shape, Mesh) else shape.positions
     if isinstance(other, Mesh):
-        return other.scene().compute_distance(places.astype(np.float32)).numpy()
-    return nearest(Points(places), other)[0]
+        return other.scene().compute_distance(positions.astype(np.float32)).numpy()
+    return nearest(Points(positions), other)[0]
 
 
 def colors_of(distance: np.ndarray) -> np.ndarray:
-    """Colours ``[N, 3]`` uint8 of distances ``[N]``: the last one from ``FAR`` on."""
-    place = np.clip(distance / FAR, 0, 1) * (len(_STOPS) - 1)
+    """Return colours ``[N, 3]`` uint8 of distances ``[N]``, clipped at ``FAR``."""
+    level = np.clip(distance / FAR, 0, 1) * (len(_STOPS) - 1)
     steps = np.arange(len(_STOPS))
-    return np.stack([np.interp(place, steps, part) for part in _STOPS.T], -1).round().astype("u1")
+    return np.stack([np.interp(level, steps, part) for part in _STOPS.T], -1).round().astype("u1")
 
 
 def pictures(shape: Mesh | Points, colors: np.ndarray) -> np.ndarray:
-    """Four views around a coloured shape, ``[4, SIZE, SIZE, 3]`` floats on the grey ground."""
+    """Render four views around a coloured shape, ``[4, SIZE, SIZE, 3]`` floats on grey."""
     viewmats = orbit(torch.tensor([30.0, 120.0, 210.0, 300.0]), 20.0, 2.2).double().numpy()
     viewmats[:, :3, :3] = viewmats[:, :3, :3] @ _TO_CAMERA
     K = intrinsics(SIZE, SIZE, 34.0).double().numpy()
@@ -179,29 +179,29 @@ def _splatted(cloud: Points, colors: np.ndarray, viewmat: np.ndarray, K: np.ndar
 
 
 def painted_page(report: dict[str, Any], folder: Path, count: int) -> None:
-    """Writes FOLDER/painted.html: objects from the best to the worst Chamfer distance.
+    """Write FOLDER/painted.html: objects from the best to the worst Chamfer distance.
 
     Args:
         report: of the evaluation.
-        folder: where ``paint`` has put its files.
-        count: so many objects, evenly spaced in that order.
+        folder: of the files from ``paint``.
+        count: number of objects, evenly spaced in that order.
 
     Raises:
-        UserError: it cannot be written, or a picture is not there.
+        UserError: it cannot be written, or a picture is missing.
     """
     done = [record for record in report["objects"] if record["status"] == OK]
     done.sort(key=lambda record: record["chamfer"])
-    places = np.unique(np.linspace(0, len(done) - 1, min(count, len(done))).round().astype(int))
+    ranks = np.unique(np.linspace(0, len(done) - 1, min(count, len(done))).round().astype(int))
     scale = np.broadcast_to(colors_of(np.linspace(0, FAR, 640)) / 255, (24, 640, 3))
-    said = (
+    text = (
         f"Distances from 0 (dark) to {FAR:g} (yellow) and farther, in units of the truth's longest "
         "side. First the prediction by its distance to the truth, then the truth by its "
-        "distance to the prediction, so that what is missing shows there. Either leads to "
-        "the surface in the viewer."
+        "distance to the prediction, which shows missing parts. Each links to the surface in "
+        "the viewer."
     )
-    sections = [Section("", said, strip=scale)]
-    for place in places:
-        record, name = done[place], done[place]["name"]
+    sections = [Section("", text, strip=scale)]
+    for rank in ranks:
+        record, name = done[rank], done[rank]["name"]
         score = ", ".join(f"{k}: {v:.3f}" for k, v in record["fscore"].items())
         iou = "" if record["iou"] is None else f", Volume IoU {record['iou']:.3f}"
         sides = [f"painted/{name}", f"painted/{name}.truth"]
@@ -209,10 +209,10 @@ def painted_page(report: dict[str, Any], folder: Path, count: int) -> None:
         rows = [np.concatenate(np.split(row, 2, axis=1)) for row in np.split(picture, 2)]
         sections.append(
             Section(
-                f"{place + 1} of {len(done)}: {name}",
+                f"{rank + 1} of {len(done)}: {name}",
                 f"Chamfer {record['chamfer']:.4f}{iou}, F-score at {score}",
                 links=dict(zip(sides, rows)),
                 files=[f"{side}.glb" for side in sides if (folder / f"{side}.glb").is_file()],
             )
         )
-    write_text(folder / "painted.html", page_text("Where the errors lie", "", sections))
+    write_text(folder / "painted.html", page_text("Error maps", "", sections))

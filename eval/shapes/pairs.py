@@ -1,7 +1,7 @@
-"""Pairs of a predicted and a true file: found, evaluated one after the other, and reported.
+"""Pairs of predicted and true files: search, evaluation and report.
 
-Pairs are evaluated in a child process, which one of them may kill. What is slow to import is
-imported by the functions that run there.
+Pairs are evaluated in child processes, so that a crash fails only one pair. Functions that run
+there import slow modules themselves.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from gamba_warp.data.dataset import ViewDataset
     from gamba_warp.data.layouts import Placement
 
-PAIR_SECONDS = 3600.0  # a pair takes seconds, the slowest protocol on a huge shape minutes
+PAIR_SECONDS = 3600.0  # time limit; a pair takes seconds, at worst minutes
 PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch")
-# entries of the records that have no meaningful mean
+# Entries of the records without a meaningful mean.
 _NO_MEAN = (
     *("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed", "chamfer_turned"),
     "gt_symmetry",
@@ -62,11 +62,11 @@ class Pair(NamedTuple):
     """Two files of one object.
 
     Attributes:
-        name: of the object: its uid in the dataset where there is one, else ``object_names``.
+        name: of the object: its uid in the dataset if there is one, else by ``object_names``.
         pred: the predicted shape.
         gt: the true shape.
-        rotation: ``[3, 3]`` that turns the true shape upright first, as its catalogue says; None.
-        placement: of the mesh that the dataset was rendered from, where it says it; None.
+        rotation: ``[3, 3]`` from the catalogue, which turns the true shape upright first; or None.
+        placement: of the dataset's source mesh, or None.
     """
 
     name: str
@@ -77,10 +77,10 @@ class Pair(NamedTuple):
 
 
 class Objects(NamedTuple):
-    """What a dataset says of its objects.
+    """Objects of a dataset.
 
     Attributes:
-        uids: of the objects, by the names that their files have (``object_names``).
+        uids: by the names of their files (``object_names``).
         splits: by uid.
     """
 
@@ -89,10 +89,10 @@ class Objects(NamedTuple):
 
 
 def open_objects(data: Path | None) -> tuple[ViewDataset, Objects] | tuple[None, None]:
-    """The dataset that ``--data`` names, and what it says of its objects.
+    """Open the dataset of ``--data``; return it and its objects.
 
     Raises:
-        UserError: it cannot be opened, two objects have one name, or its splits are bad.
+        UserError: it cannot be opened, two objects have one name, or its splits are invalid.
     """
     if data is None:
         return None, None
@@ -103,7 +103,7 @@ def open_objects(data: Path | None) -> tuple[ViewDataset, Objects] | tuple[None,
 
 
 def _by_name(uids: Iterable[str], folder: Path) -> dict[str, str]:
-    """Uids by the names that files of them have. Raises UserError where two have one name."""
+    """Return uids by the names of their files. Raises UserError if two have one name."""
     uids, found = list(uids), dict[str, str]()
     for name, uid in zip(object_names([PurePosixPath(uid) for uid in uids]), uids):
         if found.setdefault(name, uid) != uid:
@@ -112,17 +112,17 @@ def _by_name(uids: Iterable[str], folder: Path) -> dict[str, str]:
 
 
 def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[str, Any]:
-    """Evaluates the files that the options name, and writes the report's files.
+    """Evaluate the files that the options name, and write the report's files.
 
     Args:
-        options: what to compare, and where the report goes.
-        protocol: how to compare; see ``chosen_protocol``.
+        options: with the files to compare and the folder of the report.
+        protocol: of the comparison; see ``chosen_protocol``.
 
     Returns:
-        The report: what ``make_report`` returns, ``inputs``, ``flags``, ``axes`` and ``warnings``;
-        ``baselines``: for each what the report says of the predictions themselves; and
-        ``differences``: for each the prediction's value minus the baseline's over the ``objects``
-        that both have: ``mean, interval, median, median_interval``.
+        The report: that of ``make_report``, ``inputs``, ``flags``, ``axes`` and ``warnings``;
+        ``baselines``: the same entries for each baseline; and ``differences``: for each baseline
+        the prediction's value minus its value over the ``objects`` that both have: ``mean,
+        interval, median, median_interval``.
 
     Raises:
         UserError: something cannot be opened or written.
@@ -130,26 +130,26 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     if (protocol.frame == "reference") != (options.data is not None):
         raise UserError("--frame reference and --data: give both or neither")
     listed = gso.NAMES if protocol.name == "gso" else ()
-    assert options.pred is not None and options.gt is not None  # the command asks for them
+    assert options.pred is not None and options.gt is not None  # checked by the command
     dataset, known = open_objects(options.data)
     found = find_all(options.pred, options.baseline, options.gt, listed, known)
     if options.paint and options.out is None:
         raise UserError("--paint: needs --out")
     folder = output_folder(options.out) if options.out is not None else None
-    journal = Journal(folder, protocol, options.data)
-    ways: dict[str, dict[str, Any]] = {name: {} for name in found}
+    cache = RecordCache(folder, protocol, options.data)
+    extra: dict[str, dict[str, Any]] = {name: {} for name in found}
     if options.paint:
-        ways[PREDICTED]["evaluate"] = partial(evaluate_pair, painted=folder)
+        extra[PREDICTED]["evaluate"] = partial(evaluate_pair, painted=folder)
     run = partial(
         evaluate_pairs,
         protocol=protocol,
         dataset=dataset,
-        journal=journal,
+        cache=cache,
         workers=options.workers,
     )
     with stdout_to_stderr():
         objects = {
-            name: failures + run(pairs, **ways[name]) for name, (pairs, failures) in found.items()
+            name: failures + run(pairs, **extra[name]) for name, (pairs, failures) in found.items()
         }
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
     predicted = objects.pop(PREDICTED)
@@ -178,56 +178,56 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
             from .painted import painted_page
 
             painted_page(report, folder, options.paint)
-        journal.end()
+        cache.end()
     return report
 
 
-class _Noted(msgspec.Struct):
-    """A line of the journal."""
+class _CacheLine(msgspec.Struct):
+    """A line of the cache file."""
 
     key: str
     record: dict[str, Any]
 
 
-class Journal:
-    """The records of an evaluation that is under way, so that an interrupted one goes on.
+class RecordCache:
+    """File of finished records, by which an interrupted evaluation resumes.
 
-    A line of the file is a pair's record with a key of all that decides it: the protocol, this
-    program's version and both files.
+    Each line has a pair's record with a hash of its inputs: the protocol, this program's version
+    and both files.
     """
 
     def __init__(self, folder: Path | None, protocol: GeometryProtocol, data: Path | None) -> None:
         self._file = None if folder is None else folder / "objects.jsonl"
-        self._decides = [protocol.to_json(), __version__, str(data and data.resolve())]
+        self._context = [protocol.to_json(), __version__, str(data and data.resolve())]
         self._known: dict[str, dict[str, Any]] = {}
         if self._file is not None and self._file.is_file():
-            for noted in read_lines(self._file, _Noted):
-                self._known[noted.key] = noted.record
+            for line in read_lines(self._file, _CacheLine):
+                self._known[line.key] = line.record
 
     def key(self, pair: Pair) -> str:
-        """What decides the pair's record."""
+        """Return the hash of the pair's inputs."""
         with suppress(UserError):
             files = [sha256(pair.pred), sha256(pair.gt), pair.name, pair.rotation]
-            return hashlib.sha256(json.dumps([*self._decides, *files]).encode()).hexdigest()
-        return ""  # which no entry has: the pair will fail by name
+            return hashlib.sha256(json.dumps([*self._context, *files]).encode()).hexdigest()
+        return ""  # matches no entry; the pair will fail
 
     def get(self, key: str) -> dict[str, Any] | None:
-        """The record that is known, or None."""
+        """Return the cached record, or None."""
         return self._known.get(key)
 
     def add(self, key: str, record: dict[str, Any]) -> None:
-        """Notes a record; failures are tried again the next time, so they are not noted."""
+        """Store a record; failures are not stored, so that they are tried again."""
         if self._file is not None and record["status"] == OK:
             with open(self._file, "a", encoding="utf-8") as file:
                 file.write(json.dumps(finite_or_none({"key": key, "record": record})) + "\n")
 
     def end(self) -> None:
-        """Removes the file: the report holds it all."""
+        """Remove the file, once the report is written."""
         if self._file is not None:
             self._file.unlink(missing_ok=True)
 
 
-Found = tuple[list[Pair], list[dict[str, str]]]  # what find_pairs returns
+PairsAndFailures = tuple[list[Pair], list[dict[str, str]]]  # result of find_pairs
 
 
 def find_all(
@@ -236,21 +236,21 @@ def find_all(
     gt: Path,
     listed: Iterable[str] = (),
     known: Objects | None = None,
-) -> dict[str, Found]:
-    """Pairs the predictions, and those of each baseline, with the truths.
+) -> dict[str, PairsAndFailures]:
+    """Pair the predictions, and those of each baseline, with the truths.
 
     Args:
         pred: predicted shapes.
         baselines: folders of other predictions.
         gt: true shapes.
-        listed: names that the protocol lists: those that are missing are failures.
-        known: what the dataset says of its objects, where there is one.
+        listed: names listed by the protocol; missing ones are failures.
+        known: objects of the dataset, or None.
 
     Returns:
-        What ``find_pairs`` returns by name: ``PREDICTED``, and the names of the baselines' folders.
+        Results of ``find_pairs`` by name: ``PREDICTED``, and the names of the baselines' folders.
 
     Raises:
-        UserError: as for ``find_pairs``; or a baseline is no folder, or two have one name.
+        UserError: as for ``find_pairs``; or a baseline is not a folder, or two have one name.
     """
     folders = {PREDICTED: pred}
     for path in baselines:
@@ -266,24 +266,23 @@ def find_all(
 def find_pairs(
     pred: Path, gt: Path, expected: Iterable[str] = (), known: Objects | None = None
 ) -> tuple[list[Pair], list[dict[str, str]]]:
-    """Pairs two files, or the files of two folders by their names (``object_names``).
+    """Pair two files, or the files of two folders by name (``object_names``).
 
-    Where the folder of truths has a ``catalogue.json``, that gives the names of its files; such a
-    folder is a library, of which only what is predicted or expected is looked for. Of the meshes of
-    a dataset, also the other objects of a split that a prediction is of.
+    A ``catalogue.json`` in the folder of truths names its files; of such a library only predicted
+    or expected objects are used. With a dataset, all objects of each split that has a prediction
+    are expected.
 
     Args:
         pred: predicted shapes.
         gt: true shapes.
-        expected: names of which a library must have a prediction, too.
-        known: what the dataset says of its objects, where there is one.
+        expected: names that must have a prediction.
+        known: objects of the dataset, or None.
 
     Returns:
-        The pairs, sorted by name, and a failure record of each name that has no or several
-        partners.
+        The pairs, sorted by name, and a failure record of each name with no or several partners.
 
     Raises:
-        UserError: nothing is there, or a file on one side and a folder on the other.
+        UserError: a path is missing or empty, or one is a file and the other a folder.
     """
     for path in (pred, gt):
         if not path.exists():
@@ -321,9 +320,9 @@ def find_pairs(
 
 
 def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Path]]:
-    """The shape files in a folder by ``object_names``. Raises UserError for none.
+    """Return the shape files in a folder by ``object_names``. Raises UserError if it has none.
 
-    A further file of one name is another object where it was rendered as one (``find_meshes``).
+    A further file of the same name is another object if it was rendered as one (``find_meshes``).
     """
     files = (path for path in visible(folder, "*") if path.suffix.lower() in SUFFIXES)
     paths = sorted(path for path in files if path.is_file())
@@ -338,7 +337,7 @@ def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Pa
 
 
 def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: float) -> Similarity:
-    """The motion from the input camera's world, where a model predicts, to the dataset's.
+    """Return the motion from the input camera's world, the model's, to the dataset's.
 
     Args:
         dataset: that the object belongs to.
@@ -362,13 +361,13 @@ def evaluate_pair(
     motion: Similarity | None,
     painted: Path | None = None,
 ) -> dict[str, Any]:
-    """Loads and compares one pair.
+    """Load and compare one pair.
 
     Args:
         pair: the files.
-        protocol: what to do.
+        protocol: of the comparison.
         motion: of the prediction into the truth's unit frame; None: the same as the truth's.
-        painted: the folder in which the surfaces are painted, or None.
+        painted: folder for painted surfaces, or None.
 
     Returns:
         The object's record.
@@ -419,39 +418,39 @@ def evaluate_pairs(
     protocol: GeometryProtocol,
     dataset: ViewDataset | None,
     evaluate: Callable[..., dict[str, Any]] = evaluate_pair,
-    journal: Journal | None = None,
+    cache: RecordCache | None = None,
     workers: int = 1,
 ) -> list[dict[str, Any]]:
-    """Evaluates every pair; what goes wrong with one is its failure and stops no other.
+    """Evaluate every pair; a failure is recorded and stops no other.
 
-    That includes what ends a process: the pairs are evaluated in a child, see ``run_each``.
+    That includes crashes, because the pairs are evaluated in child processes (``run_each``).
 
     Args:
         pairs: the files.
-        protocol: what to do.
-        dataset: whose objects have the names of the pairs, for the frame "reference".
-        evaluate: makes the record of one pair, as ``evaluate_pair`` does; a function of a module.
-        journal: of what is done already, and for what is done here; or None.
+        protocol: of the comparison.
+        dataset: with the objects of the pairs, for the frame "reference".
+        evaluate: makes the record of one pair, like ``evaluate_pair``; must be picklable.
+        cache: of finished records; or None.
         workers: pairs evaluated at the same time.
 
     Returns:
         One record for each pair.
     """
-    # Where torch is not loaded yet, both processes would begin with the same number of threads.
+    # Without torch loaded, both processes would start with the same number of threads.
     threads = sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
     attempt = partial(
         _attempt, protocol=protocol, dataset=dataset, evaluate=evaluate, threads=threads
     )
-    journal = journal or Journal(None, protocol, None)
-    keys = [journal.key(pair) for pair in pairs]
-    objects = [record for key in keys if (record := journal.get(key))]
-    left = [at for at, key in enumerate(keys) if journal.get(key) is None]
+    cache = cache or RecordCache(None, protocol, None)
+    keys = [cache.key(pair) for pair in pairs]
+    objects = [record for key in keys if (record := cache.get(key))]
+    left = [at for at, key in enumerate(keys) if cache.get(key) is None]
     waiting = [pairs[at] for at in left]
     found = run_each(attempt, waiting, workers=workers, seconds=PAIR_SECONDS)
     for index, result in progress_bar(found, total=len(waiting), unit="object"):
         if isinstance(result, Failed):
             result = failure(waiting[index].name, result.reason)
-        journal.add(keys[left[index]], result)
+        cache.add(keys[left[index]], result)
         objects.append(result)
     return objects
 
@@ -463,12 +462,12 @@ def _attempt(
     evaluate: Callable[..., dict[str, Any]],
     threads: int | None,
 ) -> dict[str, Any]:
-    """In the child: one pair's record, or the ``failure`` that one of its errors is."""
+    """Return one pair's record, or the ``failure`` of an error; runs in the child."""
     import torch
 
     if threads is not None:
         torch.set_num_threads(threads)
-    quiet_warp()  # the process is ours alone
+    quiet_warp()  # the child runs nothing else
     try:
         motion = None
         if protocol.frame == "unit":
@@ -479,5 +478,5 @@ def _attempt(
         return evaluate(pair, protocol, motion)
     except UserError as error:
         return failure(pair.name, error)
-    except Exception as error:  # whatever a library runs into, the others are still evaluated
+    except Exception as error:  # of any library; the other pairs go on
         return failure(pair.name, f"{type(error).__name__}: {error}")

@@ -1,4 +1,4 @@
-"""What the numbers of ``eval-geometry`` mean: the protocol, its presets and its files."""
+"""Protocols of ``eval-geometry``: definitions, presets and files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from .occupancy import RULES
 Thresholds = Annotated[
     tuple[Annotated[float, Meta(gt=0, le=100)], ...], Meta(min_length=1, max_length=100)
 ]
-VERSION = 5  # goes up whenever the same protocol would give other numbers
+VERSION = 5  # raised whenever the same protocol would give other numbers
 
 POINTS: dict[PointRule, str] = {
     "area": "area-uniform on the whole surface, inner faces included; faces given twice and faces "
@@ -76,31 +76,31 @@ DEFINITIONS = {
 
 @dataclass(frozen=True)
 class GeometryProtocol:
-    """All that decides a number of ``eval-geometry``.
+    """Complete definition of the numbers of ``eval-geometry``.
 
-    Lengths that are fields: the truth's longest side is 1. Those that a report states, and the
-    thresholds, are in units in which it is ``unit`` long.
+    Fields that are lengths assume that the truth's longest side is 1. In reports, and for the
+    thresholds, it is ``unit``.
 
     Attributes:
-        name: name of the preset, or whatever a file says.
-        points: how points are put on surfaces, one of ``POINTS``.
-        num_points: number of points of a shape (for "area", and for point clouds).
+        name: name of the preset, or that in a file.
+        points: rule for points on surfaces, one of ``POINTS``.
+        num_points: number of points per shape (for "area", and for point clouds).
         seed: seed of the random points, of both shapes.
-        unit: length of the truth's longest side: 2 where a source fills the cube [-1, 1]^3.
+        unit: length of the truth's longest side: 2 for sources that use the cube [-1, 1]^3.
         chamfer: the form of the Chamfer distance, one of ``FORMS``.
         thresholds: distances of the F-score.
-        occupancy: rule of the Volume IoU, one of ``occupancy.RULES``; "none": it is not taken.
+        occupancy: rule of the Volume IoU, one of ``occupancy.RULES``; "none" skips it.
         grid: grid of the Volume IoU, one of ``GRIDS``.
-        iou_voxels: number of the grid's voxels in a unit of length, for "around".
-        align: steps by which predictions are aligned with the truth, of ``align.STEPS``.
-        frame: the frame that predictions are in (see the command).
-        up: the upward axis of the truth's files.
-        pred_axes: the axes of the predictions' files (see the command).
+        iou_voxels: number of the grid's voxels per unit of length, for "around".
+        align: steps of the alignment with the truth, of ``align.STEPS``.
+        frame: of the predictions (see the command).
+        up: upward axis of the truth's files.
+        pred_axes: axes of the predictions' files (see the command).
         reference: index of the input view, for the frame "reference".
         distance: distance of the input camera in the model's world, for the frame "reference".
-        strict: whether meshes count as failures that are not manifold, cut themselves, are turned
-            inside out or have degenerate or doubled faces.
-        surface: how Gaussians become a surface.
+        strict: meshes that are not manifold, intersect themselves, are inverted, or have degenerate
+            or duplicate faces are failures.
+        surface: options of surfaces of Gaussians.
     """
 
     name: Annotated[str, Meta(max_length=200)] = "default"
@@ -123,7 +123,7 @@ class GeometryProtocol:
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
 
     def definitions(self) -> dict[str, str]:
-        """Says what the names mean: the rules chosen, and each metric."""
+        """Return the definitions of the chosen rules and of each metric."""
         return {
             "points": POINTS[self.points],
             "chamfer": FORMS[self.chamfer],
@@ -136,15 +136,15 @@ class GeometryProtocol:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the protocol for a report; ``read_protocol`` reads it back."""
+        """Return the protocol for a report; ``read_protocol`` reads it back."""
         return {"version": VERSION, **self.fields(), "definitions": self.definitions()}
 
     def fields(self) -> dict[str, Any]:
-        """All values by field, as JSON has them."""
+        """Return all values by field, as in JSON."""
         return asdict(self) | {"thresholds": list(self.thresholds), "align": list(self.align)}
 
     def changes(self) -> list[str]:
-        """Names the fields that differ from the preset of this name, else from the default."""
+        """Return the fields that differ from the preset of this name, else from the default."""
         preset = asdict(PRESETS.get(self.name, PRESETS["default"]))
         mine = asdict(self)
         changed = [k for k in mine if k not in ("name", "surface") and mine[k] != preset[k]]
@@ -160,10 +160,10 @@ PRESETS = {"default": GeometryProtocol()} | {
 
 
 def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
-    """The protocol that the options name, with the values that they give themselves.
+    """Return the protocol that the options name, with their own values.
 
     Raises:
-        UserError: there is no such protocol, or a number is out of its range.
+        UserError: the protocol is unknown, or a number is out of its range.
     """
     base = read_protocol(options.protocol)
     check_options(options)
@@ -180,22 +180,22 @@ def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
 
 
 def with_fields(protocol: GeometryProtocol, texts: Sequence[str]) -> GeometryProtocol:
-    """The protocol with fields that are given as ``FIELD=JSON``, of the surface ``surface.FIELD``.
+    """Set fields of a protocol, given as ``FIELD=JSON`` or ``surface.FIELD=JSON``.
 
-    A value that is no JSON is taken for a text.
+    A value that is not JSON counts as text.
 
     Raises:
-        UserError: not of this form, an unknown field, or a value out of its range.
+        UserError: a malformed text, an unknown field, or a value out of its range.
     """
     value = protocol.fields()
     for text in texts:
         field, sign, given = text.partition("=")
         inner, _, name = field.rpartition(".")
-        place = value["surface"] if inner == "surface" else value
-        if not sign or inner not in ("", "surface") or name not in place or field == "surface":
+        target = value["surface"] if inner == "surface" else value
+        if not sign or inner not in ("", "surface") or name not in target or field == "surface":
             known = ", ".join([*(k for k in value if k != "surface"), "surface.…"])
             raise UserError(f"--set {text}: not FIELD=JSON, FIELD one of {known}")
-        place[name] = value_of(given)
+        target[name] = value_of(given)
     return _checked(value, f"--set {' '.join(texts)}")
 
 
@@ -207,9 +207,9 @@ def _checked(value: dict[str, Any], whose: str | Path) -> GeometryProtocol:
 
 
 def read_protocol(choice: str) -> GeometryProtocol:
-    """Finds a preset by its name, or reads a JSON file: a protocol, or a report that holds one.
+    """Find a preset by name, or read a JSON file: a protocol, or a report with one.
 
-    Fields that a file leaves out are those of the preset that its ``name`` gives, or of default.
+    Missing fields are those of the preset of its ``name``, or of the default.
 
     Raises:
         UserError: neither a preset nor a readable file; an unknown field, a value of the wrong type

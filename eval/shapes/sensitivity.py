@@ -1,7 +1,7 @@
-"""What the choices of a protocol alone change: the same predictions under many protocols.
+"""Sensitivity to the protocol: the same predictions under many protocols.
 
-Every named protocol, and the chosen one with one field changed at a time. Where the files lie in
-space is no choice: frames and axes are those of the chosen protocol throughout.
+Every named protocol, and the chosen one with one field changed at a time. Frames and axes describe
+the files, so they are always those of the chosen protocol.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .shape import Similarity
 
 CHOSEN = "chosen"
 _SIZE = (1000, 640)  # of the chart, pixels
-_PLACE = ("frame", "up", "pred_axes", "reference", "distance", "strict", "seed")
-# What else others choose, by field. Those of "surface" tell only of Gaussians.
+_FILE_FIELDS = ("frame", "up", "pred_axes", "reference", "distance", "strict", "seed")
+# Alternative values by field. Those of "surface" matter only for Gaussians.
 _CHANGES: dict[str, tuple[Any, ...]] = {
     "points": ("area", "views"),
     "num_points": (2_000, 10_000, 30_000, 100_000),
@@ -51,10 +51,10 @@ _CHANGES: dict[str, tuple[Any, ...]] = {
 }
 
 
-# What decides each stage's result.
+# Fields that each stage's result depends on.
 _LOADED = ("surface", "num_points", "seed")
 _MOVED = (*_LOADED, "points", "align")
-_DECIDE = {
+_DEPENDS_ON = {
     "load_prediction": _LOADED,
     "align_shape": _MOVED,
     "point_metrics": (*_MOVED, "unit", "chamfer", "thresholds"),
@@ -63,7 +63,7 @@ _DECIDE = {
 
 
 def variants(protocol: GeometryProtocol) -> dict[str, GeometryProtocol]:
-    """The protocols compared, by what they are: the chosen one, its changes, the named ones."""
+    """Return the protocols to compare by label: the chosen one, its changes, the named ones."""
     found = {CHOSEN: protocol}
     for field, values in _CHANGES.items():
         inner, _, name = field.rpartition(".")
@@ -75,24 +75,24 @@ def variants(protocol: GeometryProtocol) -> dict[str, GeometryProtocol]:
             if changed != protocol:
                 shown = "+".join(value) or "none" if isinstance(value, tuple) else str(value)
                 found[f"{field} = {shown}"] = changed
-    place = {name: getattr(protocol, name) for name in _PLACE}
+    of_files = {name: getattr(protocol, name) for name in _FILE_FIELDS}
     named: dict[GeometryProtocol, list[str]] = {}
     for name, preset in PRESETS.items():
-        named.setdefault(replace(preset, name="", **place), []).append(name)
+        named.setdefault(replace(preset, name="", **of_files), []).append(name)
     return found | {f"protocol {', '.join(names)}": p for p, names in named.items()}
 
 
 def evaluate_variants(
     options: ShapesOptions, protocol: GeometryProtocol
 ) -> tuple[str, list[dict[str, Any]]]:
-    """Evaluates all pairs under all variants; writes sensitivity.json, .md and .svg into OUT.
+    """Evaluate all pairs under all variants; write sensitivity.json, .md and .svg into OUT.
 
     Args:
-        options: what to compare, and where the results go.
+        options: with the files to compare and the folder of the results.
         protocol: the chosen one.
 
     Returns:
-        The table, as sensitivity.md has it, and the records of all objects.
+        The table of sensitivity.md, and the records of all objects.
 
     Raises:
         UserError: something cannot be opened or written, or no object could be evaluated.
@@ -137,11 +137,11 @@ def vary_pair(
     motion: Similarity | None,
     protocols: dict[str, GeometryProtocol],
 ) -> dict[str, Any]:
-    """The record of one pair: metrics under each protocol, or why there are none.
+    """Return the record of one pair: metrics, or the reason of a failure, under each protocol.
 
     Args:
         pair: the files.
-        protocol: the chosen one, by which the truth is loaded.
+        protocol: the chosen one, which loads the truth.
         motion: of the prediction into the truth's unit frame; None: the same as the truth's.
         protocols: by label.
 
@@ -156,9 +156,9 @@ def vary_pair(
     known: dict[Any, Any] = {}
 
     def once(function: Callable, *arguments: Any) -> Any:
-        """What the function returns: computed once for all protocols that have it in common."""
+        """Return the function's result, computed once for all protocols that share it."""
         chosen = arguments[-1]
-        key = (function, *(repr(getattr(chosen, name)) for name in _DECIDE[function.__name__]))
+        key = (function, *(repr(getattr(chosen, name)) for name in _DEPENDS_ON[function.__name__]))
         if key not in known:
             known[key] = function(*arguments)
         return known[key]
@@ -170,21 +170,21 @@ def vary_pair(
             moved, _ = once(align_shape, loaded.shape, truth.shape, chosen)
             metrics = once(point_metrics, moved, truth.shape, chosen)
             metrics = metrics | once(shape_iou, moved, truth.shape, chosen)
-            found[label] = check_finite(_shown(metrics, chosen))
+            found[label] = check_finite(_row_figures(metrics, chosen))
         except UserError as error:
             found[label] = {"failed": str(error)}
     return {"name": pair.name, "status": OK, "variants": found}
 
 
-def _shown(metrics: dict[str, Any], protocol: GeometryProtocol) -> dict[str, Any]:
-    """The figures of a row: Chamfer, the F-score at the least threshold, normals, Volume IoU."""
+def _row_figures(metrics: dict[str, Any], protocol: GeometryProtocol) -> dict[str, Any]:
+    """Return a row's figures: Chamfer, F-score at the least threshold, normals, Volume IoU."""
     least = f"{min(protocol.thresholds):g}"
     keys = ("chamfer", "normal_consistency", "iou", "noise_floor")
     return {key: metrics[key] for key in keys} | {"fscore": metrics["fscore"][least]}
 
 
 def _page(rows: dict[str, dict[str, Any]], count: int) -> str:
-    """The text of ``sensitivity.md``."""
+    """Return the text of ``sensitivity.md``."""
     base = rows[CHOSEN]["mean"]
     lines: Lines = [
         ["", "objects", "Chamfer", "of the chosen", "F-score", "at", "normals", "Volume IoU"]
@@ -212,7 +212,7 @@ def _page(rows: dict[str, dict[str, Any]], count: int) -> str:
 
 
 def _chart(rows: dict[str, dict[str, Any]]) -> str:
-    """The text of ``sensitivity.svg``: each row's Chamfer distance and F-score."""
+    """Return the text of ``sensitivity.svg``: each row's Chamfer distance and F-score."""
     from gamba_warp.pages.charts import Axis, Point, Series, chart, picture
 
     kinds: dict[str, list[Point]] = {"a field changed": [], "a named protocol": []}

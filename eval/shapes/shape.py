@@ -1,6 +1,7 @@
-"""What is evaluated, meshes and points, their motions, and the points drawn on them.
+"""Meshes and point clouds, their motions, sampling and nearest points.
 
-The process that only hands pairs to a child reads this module, so torch is imported by functions.
+The parent process, which only passes pairs to children, imports this module, so functions import
+torch.
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ class Points:
 
     @cached_property
     def _sorted(self) -> tuple[np.ndarray, np.ndarray]:
-        """The order of the points by the cells of a grid, and their places in it, float32.
+        """Order of the points by the cells of a grid, and the sorted positions in float32.
 
-        What lies near each other then lies so in memory too, which halves the time of a search.
+        Neighbours are then close in memory, which halves the time of a search.
         """
-        places = self.positions.astype(np.float32)
-        low, side = places.min(0), np.ptp(places, axis=0).max()
-        # 32 cells a side, so that a key has 16 bits, which numpy sorts in linear time
-        cells = ((places - low) / (side or 1) * 31.999).astype(np.uint16)
+        positions = self.positions.astype(np.float32)
+        low, side = positions.min(0), np.ptp(positions, axis=0).max()
+        # 32 cells per side, so that keys have 16 bits, which numpy sorts in linear time.
+        cells = ((positions - low) / (side or 1) * 31.999).astype(np.uint16)
         order = np.argsort(cells @ np.array([1024, 32, 1], np.uint16), kind="stable")
-        return order, places[order]
+        return order, positions[order]
 
     @cached_property
     def _tree(self):
@@ -64,7 +65,7 @@ class Mesh:
     Attributes:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64, F > 0.
-        omitted: what of the file's shape is not read, one line each.
+        omitted: parts of the file that are not read, one line each.
     """
 
     vertices: np.ndarray
@@ -72,29 +73,29 @@ class Mesh:
     omitted: tuple[str, ...] = ()
 
     def scene(self):
-        """Returns an Open3D ``RaycastingScene`` that holds these triangles alone."""
+        """Return an Open3D ``RaycastingScene`` of these triangles."""
         scene = import_open3d().t.geometry.RaycastingScene()
         scene.add_triangles(self.vertices.astype(np.float32), self.faces.astype(np.uint32))
         return scene
 
     def corners(self) -> np.ndarray:
-        """Returns ``[F, 3, 3]``, the places of each face's three corners."""
+        """Return ``[F, 3, 3]``, the positions of each face's corners."""
         return self.vertices[self.faces]
 
     def normals(self) -> np.ndarray:
-        """Returns ``[F, 3]``, each face's normal; its length is twice the area of the face."""
+        """Return ``[F, 3]``, each face's normal, twice as long as the face's area."""
         corners = self.corners()
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
     def is_closed(self) -> bool:
-        """Whether every edge has an even number of faces, after vertices at one place are merged.
+        """Return True if every edge has an even number of faces, after merging equal vertices.
 
-        The parity of crossings then means inside and outside, whatever the faces' orientation. Of
-        a mesh that is ``flags.tidied`` it is the same as having no flag "open".
+        The parity of crossings then separates inside and outside, for any orientation of the faces.
+        For a mesh of ``flags.clean_mesh`` it means the absence of the flag "open".
         """
         faces = merged(self.vertices)[1][self.faces]
         edges = np.sort(directed_edges(faces), axis=1)
-        edges = edges[edges[:, 0] != edges[:, 1]]  # without those of faces that have no area
+        edges = edges[edges[:, 0] != edges[:, 1]]  # without those of degenerate faces
         counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
         return bool((counts % 2 == 0).all())
 
@@ -103,17 +104,17 @@ Shape: TypeAlias = "Mesh | Points | Gaussians"
 
 
 def directed_edges(faces: np.ndarray) -> np.ndarray:
-    """``[3 F, 2]`` edges of ``[F, 3]`` faces, in the direction in which each face runs along it."""
+    """Return edges ``[3 F, 2]`` of faces ``[F, 3]``, in each face's direction."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
 @dataclass
 class Similarity:
-    """The motion ``x -> scale · rotation · x + translation``.
+    """Motion ``x -> scale · rotation · x + translation``.
 
     Attributes:
-        rotation: ``[3, 3]`` float64, proper; of a truth that was rendered stretched or mirrored,
-            what that was, too.
+        rotation: ``[3, 3]`` float64, proper; for a truth that was rendered stretched or mirrored it
+            includes that.
         translation: ``[3]`` float64.
         scale: > 0.
     """
@@ -123,7 +124,7 @@ class Similarity:
     scale: float = 1.0
 
     def points(self, x: np.ndarray) -> np.ndarray:
-        """Moves ``[N, 3]``."""
+        """Move points ``[N, 3]``."""
         return self.scale * x @ self.rotation.T + self.translation
 
     @overload
@@ -133,13 +134,13 @@ class Similarity:
     @overload
     def apply(self, shape: Gaussians) -> Gaussians: ...
     def apply(self, shape: Shape) -> Shape:
-        """Moves a shape of any kind."""
+        """Move a shape of any kind."""
         if isinstance(shape, Mesh):
             return Mesh(self.points(shape.vertices), shape.faces)
         if isinstance(shape, Points):
             normals = shape.normals
             if normals is not None:
-                normals = normals @ np.linalg.inv(self.rotation)  # the transpose of a rotation
+                normals = normals @ np.linalg.inv(self.rotation)  # transpose of a rotation
                 normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
             return Points(self.points(shape.positions), normals)
         import torch
@@ -150,16 +151,16 @@ class Similarity:
         return shape.transformed(rotation, translation, self.scale)
 
     def after(self, turn: np.ndarray) -> Similarity:
-        """This motion after a rotation ``[3, 3]`` about the origin."""
+        """Return this motion after a rotation ``[3, 3]`` about the origin."""
         return Similarity(self.rotation @ turn, self.translation, self.scale)
 
     def of(self, first: Similarity) -> Similarity:
-        """This motion after another one."""
+        """Return this motion after another one."""
         moved = self.points(first.translation[None])[0]
         return Similarity(self.rotation @ first.rotation, moved, self.scale * first.scale)
 
     def record(self) -> dict:
-        """Returns the motion for a report: ``scale, rotation, translation`` as plain numbers."""
+        """Return the motion for a report: ``scale, rotation, translation`` as plain numbers."""
         return {
             "scale": float(self.scale),
             "rotation": self.rotation.tolist(),
@@ -168,10 +169,10 @@ class Similarity:
 
 
 def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
-    """Draws points on a shape: uniformly by area on a mesh, at most ``count`` from a cloud.
+    """Sample points of a shape: uniformly by area on a mesh, at most ``count`` from a cloud.
 
     Args:
-        shape: a mesh or a cloud; a cloud of no more than ``count`` points comes back as it is.
+        shape: a mesh or a cloud; a cloud of at most ``count`` points is returned unchanged.
         count: number of points.
         seed: of the draw.
 
@@ -198,15 +199,15 @@ def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
 
 
 def nearest(queries: Points, points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the nearest of M points to each of N queries, in float32.
+    """Find the nearest of M points to each of N queries, in float32.
 
-    Both are sorted, and the points' tree is built, when they are first used so, and kept.
+    The sorted arrays and the points' tree are built at the first use, and cached.
 
     Returns:
         Distances ``[N]`` float32 and indices ``[N]``.
     """
-    order, places = queries._sorted
-    found, squared = points._tree.knn_search(places, 1)
+    order, positions = queries._sorted
+    found, squared = points._tree.knn_search(positions, 1)
     distances, indices = np.empty(len(order), np.float32), np.empty(len(order), np.int64)
     distances[order] = np.sqrt(squared.numpy()[:, 0])
     indices[order] = points._sorted[0][found.numpy()[:, 0]]
@@ -214,7 +215,7 @@ def nearest(queries: Points, points: Points) -> tuple[np.ndarray, np.ndarray]:
 
 
 def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:
-    """Draws two parts of a cloud that share no point, each of at most ``count`` points.
+    """Draw two disjoint parts of a cloud, each of at most ``count`` points.
 
     Args:
         points: at least two points.
@@ -232,14 +233,14 @@ def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:
 def visible_points(
     mesh: Mesh, viewmats: np.ndarray, K: np.ndarray, size: int, voxel: float
 ) -> Points:
-    """Points of depth maps as SyncDreamer's script takes them, one mean point in each voxel.
+    """Back-project depth maps like SyncDreamer's script, with one mean point per voxel.
 
-    Depth is interpolated between the corners as they lie in the picture, not in space, and what
-    is seen at a pixel's centre is put on the ray through its upper left corner. Neither is exact;
-    with large faces it moves points by hundredths, and without it the figures are others.
+    As there, depth is interpolated linearly in the picture, not in space, and the depth of a
+    pixel's centre is put on the ray through its upper left corner. Neither is exact: with large
+    faces points move by hundredths. But exact points would change the figures.
 
     Args:
-        mesh: what the cameras see.
+        mesh: visible to the cameras.
         viewmats: ``[V, 4, 4]`` world to camera, OpenCV.
         K: ``[3, 3]`` intrinsics in pixels, of every camera.
         size: side of the square depth maps, pixels.
@@ -255,16 +256,16 @@ def visible_points(
     corners = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2)
     rays = np.zeros((size * size, 6), np.float32)
     rays[:, :2], rays[:, 5] = corners + 0.5, 1  # along the depth, in pixels
-    seen = []
+    visible = []
     for viewmat in viewmats.astype(np.float64):
-        there = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
-        pixels = there @ K.T
-        flat = Mesh(np.column_stack([pixels[:, :2] / pixels[:, 2:], there[:, 2]]), mesh.faces)
+        camera = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = camera @ K.T
+        flat = Mesh(np.column_stack([pixels[:, :2] / pixels[:, 2:], camera[:, 2]]), mesh.faces)
         depth = flat.scene().cast_rays(rays)["t_hit"].numpy().astype(np.float64)
         hit = np.isfinite(depth)
-        places = np.column_stack([corners[hit], np.ones(hit.sum())]) * depth[hit][:, None]
-        seen.append((places @ np.linalg.inv(K).T - viewmat[:3, 3]) @ viewmat[:3, :3])
-    points = np.concatenate(seen).astype(np.float32)
+        scaled = np.column_stack([corners[hit], np.ones(hit.sum())]) * depth[hit][:, None]
+        visible.append((scaled @ np.linalg.inv(K).T - viewmat[:3, 3]) @ viewmat[:3, :3])
+    points = np.concatenate(visible).astype(np.float32)
     if len(points) == 0:
         raise UserError("no camera sees the mesh")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

@@ -1,4 +1,4 @@
-"""What a report of shapes says beside means: flags, axes, warnings, differences to baselines."""
+"""Flags, axes, warnings and differences to baselines for a report of shapes, and its tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..averages import LEVEL, intervals_of, mean_of, median, median_of, minus
 from ..report import OK, flat
 from ..tables import Column, Lines, Row, figures, markdown
 
-PREDICTED = "predicted"  # name of the row of what is under test
+PREDICTED = "predicted"  # name of the row under test
 METRICS = (
     *("iou", "chamfer", "chamfer_squared", "accuracy", "completeness", "hausdorff"),
     *("fscore", "normal_consistency"),
@@ -19,22 +19,22 @@ _SHOWN = {
     "chamfer": Column("Chamfer", 4),
     "normal_consistency": Column("normal consistency", 4),
 }
-# A turn is warned of where it leaves at most such shares of the Chamfer distance: of one object's,
-# or of the mean of many.
+# Largest shares of the Chamfer distance after a rotation for a warning: of one object's, or of the
+# mean over at least MANY.
 FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
-AS_IS = "as it is"  # among the turns
-_NAMED = 3  # objects that a warning names
+AS_IS = "as it is"  # key of the identity
+_NAMED = 3  # most objects named in a warning
 
 
 def differences_of(objects: list[dict[str, Any]], others: list[dict[str, Any]]) -> dict[str, Any]:
-    """The metrics of shapes minus those of other shapes, over the objects that both have.
+    """Summarise metrics minus those of a baseline, over the objects that both have.
 
     Args:
-        objects: records as ``eval-geometry`` makes them.
+        objects: records of ``eval-geometry``.
         others: those of a baseline.
 
     Returns:
-        ``objects`` (how many), ``mean``, ``interval``, ``median`` and ``median_interval``.
+        ``objects`` (their number), ``mean``, ``interval``, ``median`` and ``median_interval``.
     """
     known = {record["name"]: record for record in others if record["status"] == OK}
     pairs = [
@@ -52,7 +52,7 @@ def differences_of(objects: list[dict[str, Any]], others: list[dict[str, Any]]) 
 
 
 def page(report: dict[str, Any]) -> str:
-    """The text of ``table.md``, from a report of ``eval-geometry``."""
+    """Return the text of ``table.md`` from a report of ``eval-geometry``."""
     note = (
         f"Means over objects with {100 * LEVEL:g} % bootstrap intervals over objects; differences "
         "object by object, over the objects that both have. Lengths: the truth's longest side is "
@@ -63,7 +63,7 @@ def page(report: dict[str, Any]) -> str:
 
 
 def lines_of(report: dict[str, Any], of: str) -> Lines:
-    """The lines of a table of a report's "mean" or "median", as ``page`` has them."""
+    """Return the lines of a table of a report's "mean" or "median", as in ``page``."""
     thresholds = sorted(report["protocol"]["thresholds"])
     middle = thresholds[len(thresholds) // 2]
     columns = _SHOWN | {f"fscore.{middle:g}": Column(f"F-score at {middle:g}", 4)}
@@ -80,12 +80,12 @@ def lines_of(report: dict[str, Any], of: str) -> Lines:
 
 
 def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a report says of the evaluated shapes besides metrics.
+    """Summarise the evaluated shapes besides metrics.
 
     Returns:
-        ``flags`` and ``axes``: for each side how many shapes have which; and ``warnings``: of
-        truths that are not placed as the dataset says, of what of the files' shapes is not read,
-        and of turns that would better the score by far.
+        ``flags`` and ``axes``: counts for each side; and ``warnings``: about truths that are not
+        placed as in the dataset, parts of files that are not read, and rotations that would improve
+        the score a lot.
     """
     done = [record for record in objects if record["status"] == OK]
     sides = ("pred", "gt")
@@ -97,7 +97,7 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def file_warnings(done: list[dict[str, Any]]) -> list[str]:
-    """Says, of the records of the evaluated objects, of how many files there is which warning."""
+    """Return each warning of the evaluated files, with the number of files."""
     found = []
     for key, name in (("gt_warnings", "truths"), ("pred_warnings", "predictions")):
         counts = Counter(text for record in done for text in record.get(key, ()))
@@ -106,10 +106,10 @@ def file_warnings(done: list[dict[str, Any]]) -> list[str]:
 
 
 def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
-    """Says which turns of the predictions' files would better the score by far.
+    """Warn about rotations of the predictions' files that would improve the score a lot.
 
-    One turn that betters the mean of many objects is one warning; else each turn that betters
-    single objects by ``FAR_BETTER`` is one.
+    A rotation that improves the mean of many objects gives one warning; else there is one for each
+    rotation that improves single objects by ``FAR_BETTER``.
 
     Args:
         done: records of the evaluated objects.

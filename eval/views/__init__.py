@@ -1,1 +1,1 @@
-"""Views against true ones: ``gamba eval-views``."""
+"""Image metrics of predicted views: ``gamba eval-views``."""

@@ -1,7 +1,7 @@
-"""Views that need no model, which a single-view model has to beat.
+"""Baselines without a model, which a single-view model has to beat.
 
-Each baseline is called with a ``Truth`` and returns what it shows in place of every view of it. It
-sees the input view and the cameras alone; the retrieval sees the training split too.
+A baseline maps a ``Truth`` to pictures of all its views. It uses only the input view and the
+cameras; the retrieval uses the training split too.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from .compare import Shown, Truth, shown
 
 Baseline = Callable[[Truth], Shown | None]
 
-THUMBNAIL = 32  # pixels a side, for the retrieval
-_CHUNK = 512  # thumbnails whose colours are compared at once
+THUMBNAIL = 32  # pixels per side, for the retrieval
+_CHUNK = 512  # thumbnails compared at once by colour
 MEANING = {
     "background": "an empty picture for every view",
     "input_copy": "the input picture for every view",
@@ -47,23 +47,23 @@ MEANING = {
 
 
 def background(truth: Truth) -> Shown:
-    """An empty picture for every view."""
+    """Return an empty picture for every view."""
     white = torch.full_like(truth.rgb[:1], WHITE).expand_as(truth.rgb)
     return Shown(white, torch.zeros_like(truth.images[..., 3]))
 
 
 def input_copy(truth: Truth) -> Shown:
-    """The input picture for every view."""
+    """Return the input picture for every view."""
     alpha = truth.images[..., 3]
     return Shown(truth.rgb[:1].expand_as(truth.rgb), alpha[:1].expand_as(alpha))
 
 
 def billboard(truth: Truth) -> Shown:
-    """The input picture as a plane through the object's centre, parallel to its image plane.
+    """Render the input picture as a plane through the object's centre, parallel to its image plane.
 
     The centre is the origin and the input camera's axes are those of the world, so the plane is
-    z = 0. Every pixel's ray is cut with it, and the point projected into the input camera. This is
-    exact; from behind the picture is mirrored, and edge-on the plane is not seen.
+    z = 0. The intersection of each pixel's ray is projected into the input camera, which is exact.
+    From behind the picture is mirrored; edge-on the plane is invisible.
     """
     viewmats, Ks = truth.cameras.viewmats.double(), truth.cameras.Ks.double()
     count, height, width = truth.mask.shape
@@ -71,35 +71,36 @@ def billboard(truth: Truth) -> Shown:
     y = torch.arange(height, device=Ks.device, dtype=Ks.dtype) + 0.5
     pixels = torch.stack([*torch.meshgrid(x, y, indexing="xy"), x.new_ones(height, width)], -1)
     rotations = viewmats[:, :3, :3]
-    # row vectors: d_world = p K⁻ᵀ R, of depth 1; the camera's centre = -t R
+    # Row vectors: d_world = p K⁻ᵀ R, of depth 1; the camera's centre is -t R.
     rays = pixels.reshape(-1, 3) @ torch.linalg.inv(Ks).mT @ rotations
     centres = -viewmats[:, None, :3, 3] @ rotations
     depth = -centres[..., 2] / rays[..., 2]
     points = centres + depth[..., None] * rays
-    seen = (points + viewmats[0, :3, 3]) @ Ks[0].mT  # into the input camera, which is not turned
-    size = seen.new_tensor([width, height])
-    places = seen[..., :2] / seen[..., 2:] / size * 2 - 1
-    # What a ray within 1e-5 of the plane sees is far narrower than a pixel, or only rounding.
-    hit = (depth > 0) & (rays[..., 2].abs() > 1e-5) & places.isfinite().all(-1) & (seen[..., 2] > 0)
-    places = torch.where(hit[..., None], places, 2.0)  # outside of the picture
+    projected = (points + viewmats[0, :3, 3]) @ Ks[0].mT  # input camera, without rotation
+    size = projected.new_tensor([width, height])
+    grid = projected[..., :2] / projected[..., 2:] / size * 2 - 1
+    # Within 1e-5 of the plane's direction a ray sees less than a pixel, or rounding errors.
+    hit = (depth > 0) & (rays[..., 2].abs() > 1e-5) & grid.isfinite().all(-1)
+    hit &= projected[..., 2] > 0
+    grid = torch.where(hit[..., None], grid, 2.0)  # outside the picture
     rgba = truth.images[0].double()
     premultiplied = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
     sampled = grid_sample(
         premultiplied.permute(2, 0, 1).expand(count, -1, -1, -1),
-        places.view(count, height, width, 2),
+        grid.view(count, height, width, 2),
         align_corners=False,
     ).permute(0, 2, 3, 1)
     rgb, alpha = sampled[..., :3], sampled[..., 3:]
     return Shown((rgb + WHITE * (1 - alpha)).to(truth.rgb), alpha[..., 0].to(truth.rgb))
 
 
-class Found(NamedTuple):
-    """A training view.
+class NearestView(NamedTuple):
+    """A training view, nearest to a query picture.
 
     Attributes:
         uid: its object.
         view: its index.
-        distance: from the picture that it was found for, in [0, 2]; see ``MEANING``.
+        distance: from the query, in [0, 2]; see ``MEANING``.
     """
 
     uid: str
@@ -108,23 +109,23 @@ class Found(NamedTuple):
 
 
 class Retrieval:
-    """The nearest training view, and its object's views from about the same cameras.
+    """Nearest training view of the input, with its object's views from the nearest cameras.
 
     Attributes:
-        failures: reasons by uid, for training objects that cannot be read.
-        found: by uid, what was found for each object shown.
+        failures: reasons by uid, of training objects that cannot be read.
+        found: nearest training views by uid of the query object.
     """
 
     def __init__(self, training: ViewDataset) -> None:
-        """Reads every view of every training object once, as thumbnails.
+        """Read every view of every training object once, as thumbnails.
 
         Raises:
             UserError: none can be read.
         """
         self.training = training
         self.failures: dict[str, str] = {}
-        self.found: dict[str, Found] = {}
-        self._places: list[tuple[str, int]] = []  # (uid, view) of each thumbnail
+        self.found: dict[str, NearestView] = {}
+        self._sources: list[tuple[str, int]] = []  # (uid, view) of each thumbnail
         found = []
         for uid in progress_bar(training.uids, desc="retrieval index", unit="object"):
             try:
@@ -133,30 +134,30 @@ class Retrieval:
                 self.failures[uid] = str(error)
                 continue
             found.append((255 * small).round().byte())
-            self._places += [(uid, view) for view in range(len(small))]
+            self._sources += [(uid, view) for view in range(len(small))]
         if not found:
             raise UserError("no training object can be read")
         self._thumbnails = torch.cat(found)  # [M, THUMBNAIL², 4]; 8 bits: 4 kB a view
         self._alphas = self._thumbnails[..., 3].float() / 255
         self._areas = self._alphas.sum(1)
 
-    def nearest(self, image: Tensor, uid: str) -> Found | None:
-        """Finds the nearest view of another object than ``uid``.
+    def nearest(self, image: Tensor, uid: str) -> NearestView | None:
+        """Find the nearest view of an object other than ``uid``.
 
         Args:
             image: ``[H, W, 4]`` straight RGBA in [0, 1].
             uid: the object shown.
 
         Returns:
-            The view; None where there is no other object.
+            The view; None without another object.
         """
         query = thumbnails(image[None])[0]
         both = torch.minimum(self._alphas, query[:, 3]).sum(1)
         either = (self._areas + query[:, 3].sum() - both).clamp(min=1e-6)
-        shape = 1 - both / either  # 1 where both are empty: nothing tells them apart
-        shape[torch.tensor([place[0] == uid for place in self._places])] = torch.inf
+        shape = 1 - both / either  # 1 if both are empty
+        shape[torch.tensor([source[0] == uid for source in self._sources])] = torch.inf
         best, at = torch.inf, -1
-        # The colours only add to the first term, so in its order most views need no second look.
+        # The colour term is never negative: sorted by the shape term, most views can be skipped.
         for part in shape.argsort().split(_CHUNK):
             if shape[part[0]] >= best:
                 break
@@ -164,13 +165,13 @@ class Retrieval:
             common = torch.minimum(rgba[..., 3], query[:, 3])
             apart = (rgba[..., :3] - query[:, :3]).abs().mean(-1)
             color = (common * apart).sum(1) / common.sum(1).clamp(min=1e-6)
-            value, place = (shape[part] + color).min(0)
+            value, row = (shape[part] + color).min(0)
             if value < best:
-                best, at = float(value), int(part[place])
-        return None if at < 0 else Found(*self._places[at], best)
+                best, at = float(value), int(part[row])
+        return None if at < 0 else NearestView(*self._sources[at], best)
 
     def __call__(self, truth: Truth) -> Shown | None:
-        """Returns the pictures; None without another object. Raises UserError for a bad picture."""
+        """Return the pictures; None without another object. Raises UserError for a bad picture."""
         found = self.nearest(truth.images[0].cpu(), truth.uid)
         if found is None:
             return None
@@ -178,56 +179,56 @@ class Retrieval:
         uid, view, _ = found
         poses = torch.from_numpy(self.training.files(uid).camera_to_world)
         viewmats = from_opengl(poses).double()
-        there, _ = relative_to_reference(viewmats, viewmats[view])
-        wanted = truth.cameras.viewmats[:, :3, :3].cpu().double()
-        # trace of R_a R_bᵀ = 1 + 2 cos(angle between them)
-        chosen = torch.einsum("vij,wij->vw", wanted, there[:, :3, :3]).argmax(1)
+        relative, _ = relative_to_reference(viewmats, viewmats[view])
+        rotations = truth.cameras.viewmats[:, :3, :3].cpu().double()
+        # trace(R_a R_bᵀ) = 1 + 2 cos(angle between them)
+        chosen = torch.einsum("vij,wij->vw", rotations, relative[:, :3, :3]).argmax(1)
         chosen[0] = view
-        needed, places = chosen.unique(return_inverse=True)
+        needed, rows = chosen.unique(return_inverse=True)
         images = self.training.load(uid, needed.tolist(), truth.rgb.shape[1]).images
         if images.shape[1:3] != truth.rgb.shape[1:3]:
             raise UserError(f"{uid}: its pictures have another shape")
-        return shown(images[places].to(truth.images.device))
+        return shown(images[rows].to(truth.images.device))
 
 
 def thumbnails(images: Tensor) -> Tensor:
-    """Straight RGBA ``[V, THUMBNAIL², 4]`` of ``[V, H, W, 4]``, averaged over areas."""
+    """Return area averages ``[V, THUMBNAIL², 4]`` of straight RGBA ``[V, H, W, 4]``."""
     premultiplied = torch.cat([images[..., :3] * images[..., 3:], images[..., 3:]], -1)
     small = adaptive_avg_pool2d(premultiplied.permute(0, 3, 1, 2), THUMBNAIL).flatten(2).mT
     return torch.cat([small[..., :3] / small[..., 3:].clamp(min=1e-6), small[..., 3:]], -1)
 
 
 class TrainingMeshes:
-    """The meshes that a dataset was rendered from, by uid.
+    """Source meshes of a dataset's views, by uid.
 
-    The dataset says how a file's points came into the world of its views. One that does not: the
-    file is turned to z-up by its suffix, after the rotation that ``catalogue.json`` states, its
+    The dataset states the placement of a file's points in the world of its views. Without a
+    placement the file is rotated as in ``catalogue.json``, turned to z-up by its suffix, its
     bounding box is centred, and its longest side becomes 1.
     """
 
     def __init__(self, folder: Path, training: ViewDataset) -> None:
-        """Finds the files; none is read yet.
+        """Find the files, without reading them.
 
         Raises:
-            UserError: there is no folder, no mesh of any training object, or a bad catalogue.
+            UserError: the folder is missing, has no training object's mesh, or a bad catalogue.
         """
         self.training = training
         self.meshes = {mesh.uid: mesh for mesh in find_meshes(folder)}
         if not self.meshes.keys() & set(training.uids):
             raise UserError(f"{folder}: has a mesh of none of the {len(training)} training objects")
 
-    def place(self, found: Found, distance: float) -> Surface:
-        """The mesh of an object, so turned and sized that its view is the input picture.
+    def place(self, found: NearestView, distance: float) -> Surface:
+        """Place an object's mesh so that its nearest view coincides with the input picture.
 
         Args:
-            found: the object, and the view that was taken for the input.
-            distance: of the input camera from the object's centre in the world of the result.
+            found: the object and its nearest view.
+            distance: from the input camera to the object's centre, in units of the result.
 
         Returns:
             Triangles in the input camera's world: its axes, the object's centre as the origin.
 
         Raises:
-            UserError: there is no such mesh, it is not the one that was rendered, or it or the view
+            UserError: the mesh is missing or not the one that was rendered, or it or the view
                 cannot be read.
         """
         if found.uid not in self.meshes:
@@ -244,8 +245,8 @@ class TrainingMeshes:
         _, scale = relative_to_reference(viewmat[None], viewmat, distance)
         return Surface(scale.item() * vertices @ viewmat[:3, :3].numpy().T, loaded.faces)
 
-    def save(self, path: Path, found: Found, distance: float) -> None:
-        """Writes what ``place`` returns as a ``.ply``; the errors are those of both."""
+    def save(self, path: Path, found: NearestView, distance: float) -> None:
+        """Write the result of ``place`` as a ``.ply``."""
         surface = self.place(found, distance)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_mesh(path, surface, "opencv")

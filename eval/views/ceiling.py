@@ -1,4 +1,4 @@
-"""What Gaussians could show at best: every object fitted to its own true views."""
+"""Upper bound of Gaussians: each object fitted to its own true views."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from .compare import Shown, Truth, ViewsProtocol, render_views
 
 @dataclass
 class Ceiling:
-    """The result of ``gamba fit`` on all views of an object, made now or read from its file.
+    """Gaussians of ``gamba fit`` on all views of an object, fitted now or read from a file.
 
     Attributes:
         dataset: whose objects are fitted.
         protocol: input view and distance.
         device: torch device.
         folder: of files ``<uid>.ply`` in the world of view 0, as ``gamba fit`` writes them.
-        job: how objects are fitted; None: only the files that are there count.
+        job: of the fits; None: only existing files are used.
         uids: the objects to fit.
     """
 
@@ -39,7 +39,7 @@ class Ceiling:
     uids: Sequence[str] = ()
 
     def __call__(self, truth: Truth) -> Shown | None:
-        """Returns the pictures, or None for an object that has no file and is not to be fitted.
+        """Return the pictures; None for an object without a file that is not to be fitted.
 
         Raises:
             UserError: its views cannot be used, or a file is bad.
@@ -51,14 +51,14 @@ class Ceiling:
             fit_object(self.job, truth.uid)
         elif self.job is not None or not path.exists():
             return None
-        # from the world of view 0, its camera at DEFAULT_DISTANCE, to that of the truth
+        # From the world of view 0, its camera at DEFAULT_DISTANCE, to the input camera's.
         views = self.dataset.load(truth.uid, views=[0, self.protocol.reference])
         first, reference = views.cameras.viewmats
         scale = self.protocol.distance / reference[:3, 3].norm()
         scale = scale / (DEFAULT_DISTANCE / first[:3, 3].norm())
-        turn = (reference[:3, :3] @ first[:3, :3].T).to(self.device)
+        rotation = (reference[:3, :3] @ first[:3, :3].T).to(self.device)
         fitted = load_ply(path).to(self.device)
-        moved = fitted.transformed(turn, turn.new_zeros(3), scale.item())
+        moved = fitted.transformed(rotation, rotation.new_zeros(3), scale.item())
         return render_views(moved, truth.cameras)
 
 
@@ -72,16 +72,16 @@ def open_ceiling(
     out: Path | None,
     steps: int,
 ) -> Ceiling:
-    """Opens the ceiling that ``--ceiling`` asks for.
+    """Open the ceiling of the option ``--ceiling``.
 
     Args:
         wanted: a number of objects, or a folder of fitted ``.ply`` files.
-        dataset: where the views come from.
+        dataset: of the views.
         uids: the objects under evaluation.
         protocol: as for ``Ceiling``.
         device: torch device.
-        out: the report's folder, where fitted objects are kept.
-        steps: number of steps of a fit.
+        out: the report's folder, for the fitted objects.
+        steps: of each fit.
 
     Raises:
         UserError: neither a number above 0 nor a folder with a file for any of ``uids``; or a

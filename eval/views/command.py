@@ -1,6 +1,6 @@
 """``gamba eval-views``: predicted views against true ones.
 
-``--help`` answers at once, so what is slow to import is imported by the command itself.
+Slow imports are inside the command, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..presets import PRESETS
 
 @dataclass(frozen=True, kw_only=True)
 class ViewsOptions:
-    """What to evaluate, and how.
+    """Options of ``gamba eval-views``.
 
     Attributes:
         checkpoint: A model; a folder of .ply files named by object; or a folder with a folder of
@@ -32,46 +32,44 @@ class ViewsOptions:
             cameras (docs/compare-methods.md).
         data: Dataset of posed views.
         out: Folder for report.json, objects.csv, table.md, contact_sheet.png and strips/ (input |
-            prediction | truth); without it the table is printed and that is all.
-        protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, the first
-            view being the input, with what is missing of them in the report;
-            then --size, --reference, --views, --split and --limit are its own. splatter-image,
-            gamba: those of these papers, as far as they say them (gamba eval-geometry --protocol
-            NAME --explain); such options change them, and the report says so.
+            prediction | truth); without it only the table is printed.
+        protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, with the
+            first view as the input; the report lists missing objects. It fixes --size, --reference,
+            --views, --split and --limit. splatter-image, gamba: those of these papers, as far as
+            published (gamba eval-geometry --protocol NAME --explain); these options change them,
+            and the report notes that.
         split: Split of the dataset.
         reference: Index of the input view; 0 by default.
         views: Number of views of an object, input included, evenly spaced; all by default.
         size: Height of the pictures compared; the files' own by default.
-        limit: Only so many objects, evenly spaced in the order of names.
+        limit: Number of objects, evenly spaced in the order of names; all by default.
         baselines: Also score an empty picture, a copy of the input, the input as a billboard, and
             the nearest training object.
-        ceiling: Also score Gaussians fitted to all views: of so many objects (18 s each on two
-            cores, written into OUT/ceiling), or those in a folder that gamba fit wrote.
+        ceiling: Also score Gaussians fitted to all views: a number of objects to fit (18 s each on
+            two cores, written into OUT/ceiling), or a folder that gamba fit wrote.
         ceiling_steps: Steps of each fit.
-        lpips: LPIPS where its weights are there (gamba weights lpips). Where it takes more than a
-            minute, a line says first how long.
-        strips: Comparison pictures for the first so many objects.
-        sheet: So many best, median and worst objects in the contact sheet; 0 for none.
+        lpips: LPIPS, if its weights are installed (gamba weights lpips). The time is printed first
+            if it is over a minute.
+        strips: Number of objects with comparison pictures, from the first.
+        sheet: Number of best, median and worst objects each in the contact sheet; 0 for none.
         save_gaussians: Also write OUT/gaussians/NAME.ply, in the input camera's
             world (eval-geometry --frame reference reads them).
         save_retrieval: Folder of the meshes that DATA was rendered from (with catalogue.json, or
-            named by object): also write OUT/retrieval/NAME.ply, the mesh of the training object
-            that the retrieval takes, placed where the input camera sees it as it was
-            found (eval-geometry --frame reference).
-        save_pictures: Also write OUT/pictures/NAME/OBJECT/VIEW.png: what was compared of the model
-            and of each baseline, in the form in which pictures of other methods are read.
-        resize_pictures: Pictures under test may have another size than those compared, and are
-            resized to it.
+            named by object): also write OUT/retrieval/NAME.ply, the retrieval's training mesh,
+            placed so that the input camera sees its nearest view (eval-geometry --frame reference).
+        save_pictures: Also write OUT/pictures/NAME/OBJECT/VIEW.png: the compared pictures of the
+            model and of each baseline, in the format of pictures of other methods.
+        resize_pictures: Accept pictures under test of another size, and resize them.
         distance: Distance of the input camera, for .ply files; a checkpoint states its own.
-        background_margin: Of a model: drop the 3DGS tokens of plain background, but for those
-            within so many patches of the object. It was not trained for that, unless its decoder is
-            "rays", which does it always.
-        detail: Of a model: into how many Gaussians a side each of the front may split, as for gamba
-            reconstruct; if not given, the most for which the input has the pixels, at the size that
-            is compared.
-        encoder_weights: The image encoder's file, for a checkpoint that does not hold it.
-        precision: Precision of a model's products; "auto" is bfloat16 where that is faster.
-        device: Device that everything runs on.
+        background_margin: For a model: drop 3DGS tokens of plain background farther than this many
+            patches from the object. Models are not trained for it, except with the decoder "rays",
+            which always does it.
+        detail: For a model: number of Gaussians per side that each of the front may split into, as
+            for gamba reconstruct; by default the most that the input's pixels allow, at the
+            compared size.
+        encoder_weights: The image encoder's file, for a checkpoint without it.
+        precision: Precision of a model's matrix products; "auto" is bfloat16 if that is faster.
+        device: Device of all computations.
     """
 
     checkpoint: Annotated[Path, tyro.conf.arg(aliases=["--predictions"])]
@@ -101,7 +99,7 @@ class ViewsOptions:
     device: DeviceChoice = "auto"
 
     def check(self) -> None:
-        """Checks the ranges of the numbers.
+        """Check the ranges of the numbers.
 
         Raises:
             UserError: a number is out of its range; the message names the option.
@@ -121,20 +119,20 @@ class ViewsOptions:
             require("trimesh")
 
     def filled(self) -> ViewsOptions:
-        """These options, with the protocol's own where none are given.
+        """Return these options with the protocol's values where none are given.
 
         Raises:
             UserError, ModuleNotFoundError: as for ``check``.
         """
         self.check()
-        own = {"reference": 0} | self._own()
-        return replace(self, **{k: v for k, v in own.items() if getattr(self, k) is None})
+        preset = {"reference": 0} | self._preset()
+        return replace(self, **{k: v for k, v in preset.items() if getattr(self, k) is None})
 
     def changed(self) -> list[str]:
-        """Those of the protocol's own options that are others here."""
-        return [name for name, value in self._own().items() if getattr(self, name) != value]
+        """Return the names of the protocol's options that differ here."""
+        return [name for name, value in self._preset().items() if getattr(self, name) != value]
 
-    def _own(self) -> dict[str, Any]:
+    def _preset(self) -> dict[str, Any]:
         return PRESETS[self.protocol].views or {} if self.protocol in PRESETS else {}
 
 
@@ -147,9 +145,9 @@ def eval_views_command(
     """PSNR, SSIM, LPIPS and mask IoU of predicted views; the input view and novel views apart.
 
     Args:
-        options: what to evaluate, and how.
-        json: Print the report, as report.json holds it, in place of the table.
-        csv: Print the objects, as objects.csv holds them, in place of the table.
+        options: of the evaluation.
+        json: Print report.json in place of the table.
+        csv: Print objects.csv in place of the table.
     """
     options = options.filled()
     if json and csv:

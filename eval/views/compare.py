@@ -1,4 +1,4 @@
-"""True views of an object, predicted views of it, and the metrics between the two."""
+"""True and predicted views of an object, and the metrics between them."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from gamba_warp.vision.lpips import LPIPS
 
 from ..averages import mean_of
 
-BATCH = 4  # views compared at once, which bounds the memory of LPIPS features
+BATCH = 4  # views compared at once; bounds the memory of LPIPS features
 NEARLY_EMPTY = 0.01  # share of the picture; see ViewsProtocol
 
 Values = dict[str, float | None]  # one view's metrics
 
 
 class Shown(NamedTuple):
-    """Pictures that are compared.
+    """Pictures to compare.
 
     Attributes:
-        rgb: ``[V, H, W, 3]`` on white; what is rendered is not clipped to [0, 1] yet.
-        alpha: ``[V, H, W]`` in [0, 1]; None where nothing says what the object covers.
+        rgb: ``[V, H, W, 3]`` on white; renderings are not yet clipped to [0, 1].
+        alpha: ``[V, H, W]`` in [0, 1]; None if unknown.
     """
 
     rgb: Tensor
     alpha: Tensor | None
 
     def on(self, ground: float = WHITE) -> Tensor:
-        """RGB ``[V, H, W, 3]`` in [0, 1] on a grey value; without alpha on white alone."""
+        """Return RGB ``[V, H, W, 3]`` in [0, 1] on a grey value; always on white without alpha."""
         if self.alpha is None or ground == WHITE:
             return self.rgb.clamp(0, 1)
         return over_another(self.rgb, self.alpha[..., None], WHITE, ground).clamp(0, 1)
 
     def mask(self) -> Tensor | None:
-        """``[V, H, W]`` bool."""
+        """Return the mask ``[V, H, W]`` bool; None without alpha."""
         return None if self.alpha is None else self.alpha > 0.5
 
 
 @dataclass(frozen=True)
 class ViewsProtocol:
-    """What the numbers of ``eval-views`` mean.
+    """Definition of the numbers of ``eval-views``.
 
     Attributes:
         split: split of the dataset.
@@ -61,28 +61,28 @@ class ViewsProtocol:
         views: number of views of an object, input included, evenly spaced in file order; None: all.
         size: height of the pictures compared; None: the files' own.
         lpips: the network, or None.
-        lpips_reason: why there is no LPIPS, or None.
+        lpips_reason: why LPIPS is missing, or None.
         distance: of the input camera from the object's centre, object units.
-        background: grey value that both sides are composited on.
-        grounds: grey values of the other backgrounds, by the end of their metrics' names: both
-            sides are composited on them by their alpha, which pictures without alpha do not have.
-        region: part of the picture that the picture metrics run over.
-        rendering: how predicted values are compared.
-        max_psnr: dB, given to equal pictures.
+        background: grey value behind both sides.
+        grounds: grey values of the other backgrounds, by suffix of their metrics' names. Pictures
+            without alpha are not compared on them.
+        region: part of the picture covered by the image metrics.
+        rendering: clipping and rounding of predicted values.
+        max_psnr: dB, of equal pictures.
         ssim: window and convention.
-        mask_iou: when a pixel counts as covered.
+        mask_iou: definition of a covered pixel.
         averaging: order of the means.
         poses: frame and distance of the cameras.
-        split_version: version of the rule or file that made the split.
-        nearly_empty: a view is nearly empty where the mean of its true alpha over the picture is
-            smaller. Such views count in all means; the report also has the same means without
-            them, because their PSNR is high whatever is predicted.
-        mean_error: how the PSNR of the mean error comes about.
-        evaluation: of a named evaluation, what it is and which of its objects are missing; or None.
-        pictures: how pictures under test are read and matched; None: Gaussians are rendered.
-        resize_pictures: whether those of another size are resized.
+        split_version: version of the split's rule or file.
+        nearly_empty: a view is nearly empty if its mean true alpha is smaller. Such views count in
+            all means; the report also has the means without them, because their PSNR is high for
+            any prediction.
+        mean_error: definition of the PSNR of the mean error.
+        evaluation: a named evaluation and its missing objects, or None.
+        pictures: reading and matching of pictures under test; None: Gaussians are rendered.
+        resize_pictures: pictures of another size are resized.
         name: of the protocol.
-        changed: the options of its own that were given others.
+        changed: names of its options that were changed.
     """
 
     split: str
@@ -113,17 +113,17 @@ class ViewsProtocol:
 
 @dataclass
 class Truth:
-    """One object's views to compare with.
+    """True views of one object.
 
     Attributes:
         uid: the object.
         images: ``[V, H, W, 4]`` straight RGBA in [0, 1]; view 0 is the input.
         cameras: V cameras in the input camera's world.
         views: their V indices in the dataset.
-        shown: the pictures as they are compared.
+        shown: the pictures to compare.
         rgb: ``[V, H, W, 3]``, the pictures on white.
         mask: ``[V, H, W]`` bool.
-        coverage: V shares of the picture, in [0, 1], that the object covers: means of alpha.
+        coverage: V shares of the picture covered by the object: means of alpha, in [0, 1].
         digest: SHA-256 of the pictures, 16 digits.
     """
 
@@ -141,15 +141,15 @@ class Truth:
 
 
 def shown(images: Tensor) -> Shown:
-    """What is compared of straight RGBA ``[V, H, W, 4]``."""
+    """Return straight RGBA ``[V, H, W, 4]`` as pictures to compare."""
     return Shown(over_background(images, WHITE), images[..., 3])
 
 
 def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
-    """Chooses views: the input first, then ``wanted - 1`` others evenly spaced (None: all).
+    """Choose views: the input, then ``wanted - 1`` others evenly spaced (None: all).
 
     Raises:
-        UserError: there is no view ``reference``.
+        UserError: view ``reference`` is missing.
     """
     if not 0 <= reference < count:
         raise UserError(f"no view {reference} for the input among its {count}")
@@ -158,16 +158,16 @@ def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
 
 
 def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: str) -> Truth:
-    """Loads one object's views, with cameras in the input camera's world.
+    """Load one object's views, with cameras in the input camera's world.
 
     Args:
-        dataset: where the views come from.
+        dataset: of the views.
         uid: the object.
-        protocol: says which views, their size and the distance.
+        protocol: with the choice of views, their size and the distance.
         device: torch device of the result.
 
     Raises:
-        UserError: there is no such view, or a file cannot be read.
+        UserError: a view is missing, or a file cannot be read.
     """
     views = choose_views(dataset.num_views(uid), protocol.reference, protocol.views)
     loaded = dataset.load(uid, views=views, size=protocol.size)
@@ -176,17 +176,17 @@ def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: 
 
 
 def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
-    """Renders on white, once for all backgrounds."""
+    """Render on white, once for all backgrounds."""
     with torch.no_grad():
         out = render(gaussians, cameras, background=cameras.viewmats.new_full((3,), WHITE))
     return Shown(out.rgb, out.alpha[..., 0])
 
 
 def compare(candidates: Mapping[str, Shown], truth: Truth) -> dict[str, list[Values]]:
-    """Computes all figures of each view for each candidate; LPIPS is None yet.
+    """Compute all metrics of each view for each candidate, except LPIPS, which stays None.
 
-    Besides, ``mse``: the mean squared error that the PSNR on white states. Masks and figures on
-    other backgrounds go by alpha, and are None where a candidate has none.
+    ``mse`` is the mean squared error of the PSNR on white. Masks and metrics on other backgrounds
+    are None for a candidate without alpha.
     """
     result: dict[str, list[Values]] = {}
     for name, pictures in candidates.items():
@@ -210,11 +210,11 @@ def add_lpips(
     truth: Truth,
     lpips: LPIPS,
 ) -> None:
-    """Adds LPIPS, on every background, to what ``compare`` returned.
+    """Add LPIPS, on every background, to the result of ``compare``.
 
-    Nearly all the time goes into the features. They are computed once for the truth, and once for
-    a candidate that shows the same picture (an expanded tensor) in every view. A bar shows how far
-    they are, where they take more than two seconds.
+    Features take nearly all the time. They are computed once for the truth, and once for a
+    candidate with the same picture (an expanded tensor) in every view. A progress bar appears after
+    two seconds.
     """
     total = lpips_pictures(candidates, truth)
     about = {"desc": f"LPIPS of {truth.uid}", "unit": "picture", "leave": False, "delay": 2}
@@ -223,7 +223,7 @@ def add_lpips(
 
 
 def lpips_pictures(candidates: Mapping[str, Shown], truth: Truth) -> int:
-    """The number of pictures whose features ``add_lpips`` computes."""
+    """Return the number of pictures whose features ``add_lpips`` computes."""
     count = 0
     for metric in all_figures().values():
         if metric.compare is None:
@@ -240,7 +240,7 @@ def _add_lpips(
     lpips: LPIPS,
     done: Callable[[int], object],
 ) -> None:
-    """As ``add_lpips``; ``done`` is told the number of pictures after each part."""
+    """Like ``add_lpips``; calls ``done`` with the number of pictures after each part."""
     for key, metric in all_figures().items():
         if metric.compare is not None:
             continue
@@ -263,19 +263,18 @@ def _add_lpips(
 
 
 def summary(views: list[Values], coverage: list[float]) -> dict[str, Any]:
-    """Means over the novel views (None without any), and the input view (the first) apart.
+    """Average over the novel views (None without any), with the input view (the first) apart.
 
     Args:
         views: metrics of each view.
-        coverage: what the object covers of each, see ``Truth``.
+        coverage: of each view, see ``Truth``.
 
     Returns:
-        The metrics, ``input``, and ``without_nearly_empty``: the same without the views that are
-        nearly empty.
+        The metrics, ``input``, and ``without_nearly_empty``: the same without nearly empty views.
     """
-    seen = [None if share < NEARLY_EMPTY else view for view, share in zip(views, coverage)]
+    covered = [None if share < NEARLY_EMPTY else view for view, share in zip(views, coverage)]
     parts = []
-    for chosen in (views, seen):
+    for chosen in (views, covered):
         novel = mean_of([view for view in chosen[1:] if view is not None])
         absent = dict.fromkeys(views[0])
         parts.append({**absent, **novel, "input": chosen[0] or absent})

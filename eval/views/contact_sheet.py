@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: strips of objects, and a sheet of the best, median and worst."""
+"""Pictures of an evaluation: strips per object, and a sheet of best, median and worst."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from gamba_warp.images import save_image, to_uint8
 
 from .compare import Truth, choose_views
 
-TILE = 128  # pixels a side; pictures are fitted into it
+TILE = 128  # pixels per side; pictures are fitted into it
 _LABEL, _HEADER, _GAP, _LINE = 200, 22, 4, 16  # pixels
 RULE = "by PSNR of the novel views, of the input view where there are no others"
 
 
 @dataclass
 class Row:
-    """One object.
+    """Row of one object.
 
     Attributes:
         lines: its label.
@@ -40,10 +40,10 @@ class Row:
 
 
 def choose_ranks(count: int, each: int) -> dict[int, str]:
-    """Chooses ranks, of which 0 is the best: ``each`` of the best, the median and the worst.
+    """Choose ``each`` of the best, median and worst ranks; 0 is the best.
 
     Returns:
-        Labels by rank. An object that is in two groups is listed once; of few objects all are.
+        Labels by rank; an object in two groups is listed once.
     """
     middle = max(0, (count - each) // 2)
     groups = {
@@ -60,7 +60,7 @@ def choose_ranks(count: int, each: int) -> dict[int, str]:
 
 
 def label(record: dict[str, Any], place: str) -> list[str]:
-    """The lines beside an object's pictures: its name, its place, and its figures."""
+    """Return the lines beside an object's pictures: its name, rank and metrics."""
     lines = [record["name"], place]
     for kind, values in (("novel", record), ("input", record["input"])):
         known = [
@@ -74,7 +74,7 @@ def label(record: dict[str, Any], place: str) -> list[str]:
 
 
 def contact_sheet(path: Path, rows: list[Row]) -> None:
-    """Writes a PNG: label | input | true novel views | the same predicted, a row an object.
+    """Write a PNG with a row per object: label | input | true novel views | predicted ones.
 
     Raises:
         UserError: the file cannot be written.
@@ -103,7 +103,7 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
 
 
 def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
-    """Writes rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
+    """Write rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
     rows = choose_views(len(rgb), 0, count)
     strips = [torch.cat([truth.rgb[0], rgb[row], truth.rgb[row]], 1) for row in rows]
     output_folder(path.parent)

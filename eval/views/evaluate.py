@@ -1,4 +1,4 @@
-"""Objects of a dataset evaluated one after the other, and their report."""
+"""Evaluation of the objects of a dataset, and the report."""
 
 from __future__ import annotations
 
@@ -61,30 +61,30 @@ from .pictures import PicturePredictions, Pictures, save_pictures
 from .predictions import Predictions, open_predictions
 from .table import page, tables_of, without_nearly_empty
 
-LONG = 60.0  # seconds of LPIPS, from which on they are said before
+LONG = 60.0  # seconds of LPIPS from which the time is printed first
 SHEET_VIEWS = 4  # novel views of an object in the contact sheet
-# errors that are the failure of one object and stop no other
+# Errors that fail only one object.
 ERRORS = (UserError, OSError, MemoryError, ValueError, RuntimeError, ArithmeticError)
 
 
 @dataclass
 class Job:
-    """What is the same for every object.
+    """State shared by all objects.
 
     Attributes:
-        predictions: what is under test.
-        dataset: where the true views come from.
+        predictions: under test.
+        dataset: of the true views.
         uids: the objects.
-        protocol: what the numbers mean.
+        protocol: definition of the numbers.
         network: of LPIPS, or None.
         device: torch device.
         baselines: by name.
-        left_out: reasons by name, of baselines that cannot be had.
-        missing: a failure record of each object of the protocol that the dataset lacks.
-        failures: ``{name, reason}`` of what failed of the baselines.
-        retrieval: the baseline of this name, if it is one of them.
-        meshes: of the training objects, to be placed as the retrieval's shapes; or None.
-        told: whether it was said how long LPIPS takes.
+        left_out: reasons by name, of unavailable baselines.
+        missing: failure records of the protocol's objects that the dataset lacks.
+        failures: ``{name, reason}`` of failed baselines.
+        retrieval: the baseline of this name, if used.
+        meshes: of the training objects, for the retrieval's shapes; or None.
+        time_printed: True once the time of LPIPS was estimated.
     """
 
     predictions: Predictions
@@ -99,20 +99,20 @@ class Job:
     failures: list[dict[str, str]] = field(default_factory=list)
     retrieval: Retrieval | None = None
     meshes: TrainingMeshes | None = None
-    told: bool = False
+    time_printed: bool = False
 
     def predict(self, truth: Truth) -> Gaussians | Pictures:
-        """Returns the Gaussians or pictures under test. Raises UserError where there are none."""
+        """Return the Gaussians or pictures under test. Raises UserError if they are missing."""
         if isinstance(self.predictions, PicturePredictions):
             return self.predictions.pictures(self.dataset, truth)
         return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
 
     def fail(self, name: str, error: Exception | str) -> None:
-        """Notes a failure of a baseline."""
+        """Record a failure of a baseline."""
         self.failures.append({"name": name, "reason": failure(name, error)["reason"]})
 
     def shown(self, truth: Truth) -> dict[str, Shown]:
-        """Returns what each baseline shows; one that fails is noted and stops no other."""
+        """Return the pictures of each baseline; failures are recorded and stop no other."""
         result = {}
         for name, baseline in self.baselines.items():
             try:
@@ -126,10 +126,10 @@ class Job:
 
 
 def open_job(options: ViewsOptions) -> Job:
-    """Opens everything that the options name, and makes the folder of the report.
+    """Open everything that the options name, and make the folder of the report.
 
     Raises:
-        UserError: something is not there, cannot be read, or cannot be written.
+        UserError: something is missing, cannot be read, or cannot be written.
     """
     device = str(pick_device(options.device))
     dataset = open_dataset(options.data, options.split)
@@ -200,7 +200,7 @@ def open_job(options: ViewsOptions) -> Job:
 
 
 def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
-    """Raises UserError where a file of this evaluation would replace one that it reads."""
+    """Raise UserError if an output of this evaluation would replace an input."""
     if options.out is None:
         return
     if options.save_pictures:
@@ -218,10 +218,10 @@ def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
 
 
 def _add_baselines(job: Job, options: ViewsOptions) -> None:
-    """Adds the four that need no fit; the retrieval only where there is a training split.
+    """Add the four baselines without a fit; the retrieval only with a training split.
 
     Raises:
-        UserError: meshes of the training objects are asked for, and cannot be had.
+        UserError: meshes of the training objects are requested but unavailable.
     """
     job.baselines |= {"background": background, "input_copy": input_copy, "billboard": billboard}
     try:
@@ -239,14 +239,14 @@ def _add_baselines(job: Job, options: ViewsOptions) -> None:
 
 
 def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
-    """Evaluates the objects that the options name, and writes the report's files.
+    """Evaluate the objects that the options name, and write the report's files.
 
     Returns:
-        The report: what ``report_of`` returns, and ``interrupted``: whether Ctrl-C ended it.
+        The report of ``report_of``, and ``interrupted``: True after Ctrl-C.
 
     Raises:
         UserError: something cannot be opened or written.
-        KeyboardInterrupt: Ctrl-C, and there is no record yet.
+        KeyboardInterrupt: Ctrl-C before the first record.
     """
     job, folder = open_job(options), options.out
     objects: list[dict[str, Any]] = []
@@ -274,28 +274,28 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
         if wanted and (rows := sheet_rows(job, objects, options.sheet)):
             contact_sheet(folder / "contact_sheet.png", rows)
         else:
-            (folder / "contact_sheet.png").unlink(missing_ok=True)  # that of an earlier run
+            (folder / "contact_sheet.png").unlink(missing_ok=True)  # of an earlier run
     return report
 
 
 def pictures_of(predicted: Gaussians | Pictures, truth: Truth) -> Pictures:
-    """What is under test as pictures of the true views: as it is, or rendered."""
+    """Return the prediction as pictures of the true views; Gaussians are rendered."""
     if isinstance(predicted, Pictures):
         return predicted
     return Pictures(render_views(predicted, truth.cameras))
 
 
 def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dict[str, Any]:
-    """Evaluates one object and its baselines.
+    """Evaluate one object and its baselines.
 
     Args:
-        job: what to do.
+        job: shared state.
         uid: the object.
-        folders: of what is written of it: ``strips``, ``gaussians``, ``retrieval`` (its mesh) and
-            ``pictures`` (what was compared, a folder for the model and for each baseline).
+        folders: of its outputs: ``strips``, ``gaussians``, ``retrieval`` (its mesh) and
+            ``pictures`` (the compared ones, in a folder for the model and for each baseline).
 
     Returns:
-        The object's record, with those of its baselines in it.
+        The object's record, including those of its baselines.
 
     Raises:
         UserError: a file cannot be read or written, or a number is not finite.
@@ -315,8 +315,8 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         by_view = compare(candidates, truth)
     with stages("lpips"):
         if job.network:
-            if not job.told:
-                tell_lpips(job, candidates, truth, job.network)
+            if not job.time_printed:
+                print_lpips_time(job, candidates, truth, job.network)
             add_lpips(by_view, candidates, truth, job.network)
     if not pictures.has_input:
         by_view[""][0] = dict.fromkeys(by_view[""][0])
@@ -357,12 +357,12 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
     }
 
 
-def tell_lpips(job: Job, candidates: Mapping[str, Shown], truth: Truth, lpips: LPIPS) -> None:
-    """Says how long LPIPS will take, by the time of one picture, where that is over a minute."""
-    job.told = True
+def print_lpips_time(job: Job, candidates: Mapping[str, Shown], truth: Truth, lpips: LPIPS) -> None:
+    """Print the time that LPIPS will take, estimated from one picture, if over a minute."""
+    job.time_printed = True
     began = time.perf_counter()
     with torch.no_grad():
-        lpips.features(truth.rgb[:1])[0].sum().item()  # which a GPU has to wait for
+        lpips.features(truth.rgb[:1])[0].sum().item()  # .item() waits for a GPU
     each, pictures = time.perf_counter() - began, lpips_pictures(candidates, truth)
     one, whole = each * pictures, each * pictures * len(job.uids)
     if whole < LONG:
@@ -370,14 +370,14 @@ def tell_lpips(job: Job, candidates: Mapping[str, Shown], truth: Truth, lpips: L
     height, width = truth.rgb.shape[1:3]
     tqdm.write(
         f"LPIPS: {each:.2g} s a picture of {width} x {height}, {pictures} pictures an object: "
-        f"about {_span(one)} an object and {_span(whole)} for all {len(job.uids)}; "
+        f"about {_duration(one)} an object and {_duration(whole)} for all {len(job.uids)}; "
         "--no-lpips leaves it out",
         file=sys.stderr,
     )
 
 
-def _span(seconds: float) -> str:
-    """A time in words."""
+def _duration(seconds: float) -> str:
+    """Format a duration."""
     for unit, size in (("hours", 3600), ("minutes", 60)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.2g} {unit}"
@@ -385,10 +385,10 @@ def _span(seconds: float) -> str:
 
 
 def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
-    """Rows of the contact sheet; the chosen objects are predicted again, so that none is kept.
+    """Return rows of the contact sheet; the chosen objects are predicted again to save memory.
 
     Args:
-        job: what to do.
+        job: shared state.
         records: of all objects.
         each: number of objects in each group (best, median, worst).
     """
@@ -403,7 +403,7 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         try:
             truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
             made = pictures_of(job.predict(truth), truth).shown
-        except ERRORS:  # a file that went bad meanwhile; the report has what it was
+        except ERRORS:  # a file changed meanwhile; the report has its record
             continue
         views = choose_views(len(truth.rgb), 0, SHEET_VIEWS + 1)[1:]
         ground = WHITE if made.alpha is None else GREY
@@ -414,17 +414,17 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
 
 
 def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, Any]:
-    """The report: what ``make_report`` returns, and entries for the baselines.
+    """Return the report: that of ``make_report``, with entries for the baselines.
 
     Args:
-        job: what was done.
+        job: shared state.
         data: the dataset, whose name the report holds.
         objects: the records; those of ``job.missing`` are added.
 
     Returns:
-        Besides, ``baselines`` (their means), ``left_out_baselines`` (reasons by name), the rows
-        ``table`` and ``differences`` of ``table.md``, ``nearly_empty`` (how many views and objects
-        are, of how many), and ``without_nearly_empty``: both sets of rows without these views.
+        The report, with ``baselines`` (their means), ``left_out_baselines`` (reasons by name), the
+        rows ``table`` and ``differences`` of ``table.md``, ``nearly_empty`` (counts of views and
+        objects), and ``without_nearly_empty``: both sets of rows without these views.
     """
     done = [record for record in objects if record["status"] == OK]
     others = {
@@ -457,7 +457,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
 
 
 def count_nearly_empty(done: list[dict[str, Any]]) -> dict[str, int]:
-    """How many views are nearly empty, and of how many objects; of the records evaluated."""
+    """Count the nearly empty views and their objects among the evaluated records."""
     return {
         "views": sum(record["num_nearly_empty"] for record in done),
         "of_views": sum(len(record["views"]) for record in done),

@@ -1,13 +1,13 @@
-"""Pictures that some method rendered, matched with the true views; and such folders of our own.
+"""Reading and writing pictures rendered by any method, matched with the true views.
 
-The contract (docs/compare-methods.md has it in the words of a user): a folder with one folder for
-each object, of the names that the dataset has. In it lie pictures,
+Format (for users in docs/compare-methods.md): one folder for each object, named as in the dataset,
+with pictures,
 
-- with a ``transforms.json``: a picture belongs to the true view at whose camera it was taken;
-- without one: a picture belongs to the true view whose file has the same name without suffix, or,
-  where not one name is that of a true file, to the view of that number.
+- with a ``transforms.json``: a picture belongs to the true view with the same camera;
+- without one: a picture belongs to the true view whose file has the same stem, or, if no stem
+  matches, to the view of that number.
 
-No picture is moved, turned or cropped.
+Pictures are not moved, rotated or cropped.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from .compare import Shown, Truth, shown
 
 TRANSFORMS = "transforms.json"
 CAMERA = 1e-3  # radians; share of the camera's distance; share of the picture's side
-FLAT = 8 / 255  # how far a background may be from white, and from flat
-_NAMED = 5  # views that a message names
+FLAT = 8 / 255  # tolerance of a white background, and of a flat one
+_MAX_NAMED = 5  # views named in a message
 MEANING = (
     f"files of 8 bits; a picture at a camera of its own belongs to the true view whose camera is "
     f"turned by at most {CAMERA:g} radians against it, moved by at most {CAMERA:g} of its distance "
@@ -46,12 +46,12 @@ MEANING = (
 
 @dataclass
 class Pictures:
-    """What is shown in place of the views of an object.
+    """Pictures under test of one object.
 
     Attributes:
         shown: the pictures.
-        has_input: whether there is a picture of view 0; where not, it is white.
-        record: how they were found, for the object's record.
+        has_input: True if view 0 has a picture; else it is white.
+        record: details of the matching, for the object's record.
     """
 
     shown: Shown
@@ -63,18 +63,18 @@ class PicturePredictions:
     """A folder with a folder of pictures for each object.
 
     Attributes:
-        distance: of the input camera; it is only the unit in which a report states cameras.
+        distance: of the input camera; only the unit of the report's cameras.
         source: kind, name, and the SHA-256 of the names and SHA-256s of all pictures and cameras.
     """
 
     def __init__(self, folder: Path, distance: float, device: str, resize: bool = False) -> None:
-        """Opens the folder; no picture is decoded yet.
+        """Open the folder, without decoding pictures.
 
         Args:
             folder: the folder.
             distance: as the attribute.
             device: torch device of the results.
-            resize: whether pictures of another size than those compared are resized to it.
+            resize: resize pictures of another size to that of the true ones.
         """
         self.folder, self.distance, self.device, self.resize = folder, distance, device, resize
         files = (p for p in visible(folder, "*") if _is_picture(p) or p.name == TRANSFORMS)
@@ -82,7 +82,7 @@ class PicturePredictions:
         self.source = {"kind": "pictures", "path": folder.name, "sha256": content}
 
     def check(self, uids: Sequence[str]) -> None:
-        """Raises UserError where not one of the objects has a folder, so that nothing begins."""
+        """Raise UserError if no object has a folder, before any work."""
         if not any((self.folder / uid).is_dir() for uid in uids):
             raise UserError(
                 f"{self.folder}: has a folder of pictures for none of the {len(uids)} objects; "
@@ -90,27 +90,27 @@ class PicturePredictions:
             )
 
     def pictures(self, dataset: ViewDataset, truth: Truth) -> Pictures:
-        """Reads the pictures of one object.
+        """Read the pictures of one object.
 
         Args:
             dataset: that the object belongs to.
             truth: the views to compare with; all but the input (the first) must have a picture.
 
         Raises:
-            UserError: there is no folder, a view lacks its picture or has two, a picture cannot be
-                read, is of another size, or has a background that is not white.
+            UserError: the folder is missing, a view lacks its picture or has two, or a picture
+                cannot be read, has another size, or a background that is not white.
         """
         folder = self.folder / truth.uid
         if not folder.is_dir():
             raise UserError(f"{folder}: no such folder")
         files, views = dataset.files(truth.uid), truth.views
         if (folder / TRANSFORMS).is_file():
-            by, found, given = "camera", *_by_camera(folder, files, views)
+            by, found, given = "camera", *_match_by_camera(folder, files, views)
         else:
-            by, found, given = _by_name(folder, files, views)
+            by, found, given = _match_by_name(folder, files, views)
         lacking = [view for view in views[1:] if view not in found]
         if lacking or not found:
-            raise UserError(_lacks(folder, lacking or views, views, by))
+            raise UserError(_missing_message(folder, lacking or views, views, by))
         rgba = torch.zeros(len(views), *truth.rgb.shape[1:3], 4)
         there = [view in found for view in views]
         alphas, resized = {}, 0
@@ -119,7 +119,7 @@ class PicturePredictions:
                 with open_picture(found[view]) as image:
                     alphas[view] = image.has_transparency_data
                 picture = load_rgba8(found[view])
-                fitted = self._fitted(found[view], picture, truth, files, view)
+                fitted = self._resized(found[view], picture, truth, files, view)
                 resized += fitted is not picture
                 rgba[row] = torch.from_numpy(fitted.astype(np.float32) / 255)
         if len(set(alphas.values())) > 1:
@@ -135,14 +135,14 @@ class PicturePredictions:
             pictures = Shown(pictures.rgb, None)
         return Pictures(pictures, there[0], record)
 
-    def _fitted(
+    def _resized(
         self, path: Path, picture: np.ndarray, truth: Truth, files: ObjectFiles, view: int
     ) -> np.ndarray:
-        """The picture at the size compared: as it is, or resized as the true picture is."""
+        """Return the picture at the compared size, resized like the true picture if needed."""
         (height, width), (tall, wide) = picture.shape[:2], truth.rgb.shape[1:3]
         if (width, height) == (wide, tall):
             return picture
-        true, size = files.images[view], files.sizes[view]  # a pack may not say the size
+        true, size = files.images[view], files.sizes[view]  # a pack may not state the size
         if size is None and isinstance(true, Path):
             with open_picture(true) as image:
                 size = image.size
@@ -153,7 +153,7 @@ class PicturePredictions:
             )
         if abs(width * tall - height * wide) > max(width, height) / 2:
             raise UserError(f"{path}: {width}x{height} has not the shape of {wide}x{tall}")
-        # As the dataset resizes: PIL premultiplies RGBA, and its box filter is the area average.
+        # Like the dataset: PIL premultiplies RGBA, and its box filter is the area average.
         kind = Image.Resampling.BOX if tall < height else Image.Resampling.BILINEAR
         return np.asarray(Image.fromarray(picture).resize((wide, tall), kind))
 
@@ -163,30 +163,30 @@ def _is_picture(path: Path) -> bool:
 
 
 def holds_pictures(folder: Path) -> bool:
-    """Whether there is any picture in the folders of a folder."""
+    """True if a sub-folder holds a picture."""
     return any(_is_picture(p) and p.parent != folder for p in visible(folder, "*"))
 
 
-def _by_camera(
+def _match_by_camera(
     folder: Path, files: ObjectFiles, views: Sequence[int]
 ) -> tuple[dict[int, Path], int]:
-    """Pictures by view, of a folder with cameras; and how many pictures there are.
+    """Match pictures by their cameras; return them by view, and their number.
 
     Raises:
-        UserError: the cameras cannot be read, two are at the camera of one view, or none is at
-            that of a view; the message says how far the nearest is away.
+        UserError: the cameras cannot be read, or a view matches two or none; the message gives the
+            distance of the nearest.
     """
     given = LAYOUTS["transforms"][1](folder)
     lenses = np.stack([_lens(given, i) for i in range(len(given.images))])
     found, far = {}, {}
     for view in views:
-        # The Frobenius norm of R - R' is sqrt(8) sin(angle / 2): exact for small angles too.
+        # The Frobenius norm of R - R' is sqrt(8) sin(angle / 2), accurate for small angles too.
         poses, pose = given.camera_to_world, files.camera_to_world[view]
         chord = np.linalg.norm(poses[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(8)
         angle = 2 * np.arcsin(np.clip(chord, 0, 1))
-        way = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.linalg.norm(pose[:3, 3])
+        shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.linalg.norm(pose[:3, 3])
         # radians; distances of the true camera from the origin; sides of the picture
-        off = np.stack([angle, way, np.abs(lenses - _lens(files, view)).max(1)], 1)
+        off = np.stack([angle, shift, np.abs(lenses - _lens(files, view)).max(1)], 1)
         near = np.flatnonzero((off <= CAMERA).all(1))
         if len(near) > 1:
             names = " and ".join(given.images[i].name for i in near[:2])
@@ -199,27 +199,28 @@ def _by_camera(
     if lacking:
         turn, move, lens = far[lacking[0]]
         raise UserError(
-            f"{_lacks(folder, lacking, views, 'camera')}; the nearest to view {lacking[0]} is "
-            f"turned by {np.degrees(turn):.3g} degrees, moved by {move:.3g} of the distance, and "
+            f"{_missing_message(folder, lacking, views, 'camera')}; the nearest to view "
+            f"{lacking[0]} is turned by {np.degrees(turn):.3g} degrees, "
+            f"moved by {move:.3g} of the distance, and "
             f"its lens differs by {lens:.3g} of the picture"
         )
     return found, len(given.images)
 
 
 def _lens(files: ObjectFiles, view: int) -> np.ndarray:
-    """Focal lengths and centre in sides of the picture, ``[4]``."""
+    """Return focal lengths and centre in units of the picture's sides, ``[4]``."""
     size = np.array(files.sizes[view] or (1, 1), np.float64)
     K = files.Ks[view]
     return np.concatenate([np.diag(K)[:2] / size, K[:2, 2] / size])
 
 
-def _by_name(
+def _match_by_name(
     folder: Path, files: ObjectFiles, views: Sequence[int]
 ) -> tuple[str, dict[int, Path], int]:
-    """Whether it goes by "name" or "number", the pictures by view, and how many there are.
+    """Match pictures by name or number; return which, the pictures by view, and their number.
 
     Raises:
-        UserError: two pictures are of one view.
+        UserError: two pictures match one view.
     """
     given: dict[str, Path] = {}
     for path in sorted(filter(_is_picture, folder.iterdir())):
@@ -236,8 +237,10 @@ def _by_name(
     return "number", {view: numbers[view] for view in views if view in numbers}, len(given)
 
 
-def _lacks(folder: Path, lacking: Sequence[int], views: Sequence[int], by: str) -> str:
-    some = ", ".join(map(str, lacking[:_NAMED])) + (", ..." if len(lacking) > _NAMED else "")
+def _missing_message(folder: Path, lacking: Sequence[int], views: Sequence[int], by: str) -> str:
+    some = ", ".join(map(str, lacking[:_MAX_NAMED])) + (
+        ", ..." if len(lacking) > _MAX_NAMED else ""
+    )
     word = {"camera": "at the camera", "name": "of the name", "number": "of the number"}[by]
     plural = "" if len(lacking) == 1 else "s"
     return (
@@ -247,12 +250,12 @@ def _lacks(folder: Path, lacking: Sequence[int], views: Sequence[int], by: str) 
 
 
 def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> None:
-    """Refuses opaque pictures on a flat background of another colour than white.
+    """Refuse opaque pictures on a flat background that is not white.
 
-    A method's fog is not flat, so this does not hide what a method does badly.
+    Fog is not flat, so it still counts against the method.
 
     Raises:
-        UserError: over half of what is empty in the true pictures has one such colour.
+        UserError: over half of the empty pixels of the true pictures have one such colour.
     """
     empty = (truth.images[..., 3] == 0).cpu() & torch.tensor(found)[:, None, None]
     pixels = rgb[empty]
@@ -269,12 +272,11 @@ def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> 
 
 
 def save_pictures(folder: Path, files: ObjectFiles, views: Sequence[int], pictures: Shown) -> None:
-    """Writes pictures as ``PicturePredictions`` reads them, named as the true files are.
+    """Write pictures as ``PicturePredictions`` reads them, named like the true files.
 
     Args:
         folder: of one object; made if need be.
-        files: of the true views, whose names the pictures get, or their numbers where two true
-            files have one name.
+        files: of the true views, which give the names; numbers if two have the same stem.
         views: numbers of the views.
         pictures: with alpha.
 

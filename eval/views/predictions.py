@@ -1,4 +1,4 @@
-"""What is under test: a checkpoint, a folder of Gaussians as ``.ply`` files, or one of pictures."""
+"""Predictions under test: a checkpoint, a folder of ``.ply`` Gaussians, or one of pictures."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ from .pictures import PicturePredictions, holds_pictures
 
 
 class PlyPredictions:
-    """``<folder>/<uid>.ply``, 3DGS layout, in the reference camera's world.
+    """Gaussians in files ``<folder>/<uid>.ply``, 3DGS layout, in the reference camera's world.
 
     Attributes:
         distance: of the reference camera from the origin of that world, object units.
-        source: what is under test, for the report: its kind, its name, and the SHA-256 of the names
-            and SHA-256s of the files.
+        source: for the report: kind, name, and the SHA-256 of the names and SHA-256s of the files.
     """
 
     def __init__(self, folder: Path, distance: float, device: str) -> None:
@@ -36,7 +35,7 @@ class PlyPredictions:
         self.source = {"kind": "ply", "path": folder.name, "sha256": content}
 
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
-        """Returns one object's Gaussians (no batch dimension).
+        """Return one object's Gaussians (no batch dimension).
 
         Args:
             dataset: that the object belongs to.
@@ -44,15 +43,15 @@ class PlyPredictions:
             reference: index of the input view.
 
         Raises:
-            UserError: there are none, or the file cannot be read.
+            UserError: the file is missing or cannot be read.
         """
         return load_ply(self.folder / f"{uid}.ply").to(self.device)
 
 
 class ModelPredictions:
-    """A checkpoint, shown the reference view alone; attributes as those of ``PlyPredictions``.
+    """A checkpoint, given only the reference view; attributes as those of ``PlyPredictions``.
 
-    Its Gaussians are those that ``gamba reconstruct`` writes of that view: see ``model.predict``.
+    Its Gaussians are those of ``gamba reconstruct`` for that view: see ``model.predict``.
     """
 
     def __init__(
@@ -83,10 +82,10 @@ class ModelPredictions:
 
     @torch.no_grad()
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
-        """Runs the model on the reference view, on the model's own background.
+        """Run the model on the reference view, on the model's own background.
 
         Arguments and result are those of ``PlyPredictions.gaussians``. The front splits by the
-        picture at the size that is compared.
+        picture at the compared size.
         """
         config = self.model.config
         views = dataset.load(uid, views=[reference], size=config.image_size)
@@ -113,22 +112,22 @@ def open_predictions(
     detail: Detail | None = None,
     size: int | None = None,
 ) -> Predictions:
-    """Opens a folder with ``.ply`` files or with pictures, else a checkpoint.
+    """Open a folder with ``.ply`` files or with pictures, else a checkpoint.
 
     Args:
         path: the folder or the checkpoint.
         distance: of the reference camera, for ``.ply`` files; a checkpoint states its own.
         device: torch device.
         encoder_weights: as for ``load_model``.
-        resize: whether pictures of another size are resized.
+        resize: resize pictures of another size.
         margin: ``background_margin`` of a model, see ``Gamba.forward``.
-        precision: of a model's products, see ``devices.pick_precision``.
+        precision: of a model's matrix products, see ``devices.pick_precision``.
         detail: of a model's front, see ``model.predict.reconstruct``.
-        size: height of the pictures that are compared; None: that of the files.
+        size: height of the compared pictures; None: that of the files.
 
     Raises:
-        UserError: there is nothing, the checkpoint cannot be read, or there is a margin, a
-            precision or a detail and no model that can have it.
+        UserError: ``path`` is missing, the checkpoint cannot be read, or a margin, a precision or a
+            detail is given without a model that takes it.
     """
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint, folder of .ply files or of pictures")

@@ -14,24 +14,24 @@ from ..tables import Column, Row, figures, markdown
 from .compare import NEARLY_EMPTY
 
 Record = dict[str, Any]
-Records = dict[str, Record]  # uid -> what summary() returns
+Records = dict[str, Record]  # uid -> result of summary()
 Rows = list[dict[str, Any]]
 MEAN_ERROR = "psnr_of_mean_error"
 
 
 def _decibels(errors: np.ndarray) -> np.ndarray:
-    """PSNR of the mean of squared errors ``[.., n]``."""
+    """Return the PSNR of the mean of squared errors ``[.., n]``."""
     return -10 * np.log10(errors.mean(-1))
 
 
 def _rows(
     named: dict[str, list[tuple[Record, ...]]], statistic: Callable[[np.ndarray], np.ndarray]
 ) -> Rows:
-    """A row for each kind of views and each name that has objects with such views.
+    """Return a row for each kind of views and each name that has such views.
 
     Args:
-        named: by name, of each object its record, or two, whose difference counts.
-        statistic: makes a PSNR of their mean squared errors ``[1 or 2, .., n]``.
+        named: by name, a tuple per object: one record, or two to subtract.
+        statistic: PSNR of mean squared errors ``[1 or 2, .., n]``.
     """
     rows = []
     for kind in ("novel", "input"):
@@ -54,7 +54,7 @@ def _rows(
 
 
 def table_of(candidates: dict[str, Records]) -> Rows:
-    """Rows of all candidates, novel views before the input.
+    """Return rows of all candidates, novel views before the input.
 
     Returns:
         ``{views, name, objects}``, for each figure ``{mean, interval, median, median_interval}``,
@@ -65,7 +65,7 @@ def table_of(candidates: dict[str, Records]) -> Rows:
 
 
 def differences_of(model: Records, baselines: dict[str, Records]) -> Rows:
-    """Rows like ``table_of``'s: the model's value minus the baseline's, over objects with both."""
+    """Return rows like ``table_of``: model minus baseline, over objects with both."""
     named = {
         f"model - {name}": [(model[uid], r) for uid, r in records.items() if uid in model]
         for name, records in baselines.items()
@@ -74,14 +74,14 @@ def differences_of(model: Records, baselines: dict[str, Records]) -> Rows:
 
 
 def tables_of(candidates: dict[str, Records]) -> dict[str, Rows]:
-    """``table``, of all candidates, and ``differences``, of "model" to each other one."""
+    """Return ``table`` of all candidates and ``differences`` of "model" to each other one."""
     others = {name: records for name, records in candidates.items() if name != "model"}
     gains = differences_of(candidates["model"], others)
     return {"table": table_of(candidates), "differences": gains}
 
 
 def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
-    """The same records without the views that are nearly empty."""
+    """Return the records without nearly empty views."""
     return {
         name: {uid: record["without_nearly_empty"] for uid, record in records.items()}
         for name, records in candidates.items()
@@ -89,11 +89,11 @@ def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
 
 
 def means(rows: Rows, signed: bool = False) -> str:
-    """A Markdown table of the rows' means on white, with their intervals.
+    """Return a Markdown table of the rows' means on white, with intervals.
 
     Args:
         rows: those of ``table_of`` or ``differences_of``.
-        signed: whether positive means get a plus sign.
+        signed: positive means get a plus sign.
     """
     return _markdown(rows, signed, {key: Column(m.head, m.digits) for key, m in METRICS.items()})
 
@@ -101,7 +101,7 @@ def means(rows: Rows, signed: bool = False) -> str:
 def _markdown(rows: Rows, signed: bool, columns: dict[str, Column], of: str = "mean") -> str:
     shown = []
     for row in rows:
-        error = row[MEAN_ERROR]  # no mean and no median, but beside the medians it stands
+        error = row[MEAN_ERROR]  # neither mean nor median; shown beside the medians
         error = {"median": error["value"], "median_interval": error["interval"]}
         names = row["views"], row["name"], str(row["objects"])
         shown.append(Row(names, row | {MEAN_ERROR: error}, signed))
@@ -109,7 +109,7 @@ def _markdown(rows: Rows, signed: bool, columns: dict[str, Column], of: str = "m
 
 
 def page(report: dict[str, Any]) -> str:
-    """The text of ``table.md``, from a report of ``eval-views``."""
+    """Return the text of ``table.md`` from a report of ``eval-views``."""
     counts, lpips = report["nearly_empty"], report["protocol"]["lpips_reason"]
     few = f"nearly empty (the object covers under {100 * NEARLY_EMPTY:g} % of the true picture)."
     note = f"None of the {counts['of_views']} views is {few}"
@@ -143,7 +143,7 @@ def page(report: dict[str, Any]) -> str:
         title = "Means as above, without the views that are nearly empty:"
         more.append((title, report["without_nearly_empty"], white, "mean"))
     for title, part, columns, of in more:
-        # the rows of novel views; those of the input where there are no novel ones
+        # Rows of the novel views, or of the input without novel ones.
         rows, gains = (
             [row for row in part[key] if row["views"] == part[key][0]["views"]]
             for key in ("table", "differences")

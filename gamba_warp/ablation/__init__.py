@@ -1,1 +1,1 @@
-"""``gamba ablate``: plans of rows, each trained and evaluated alike, and their table."""
+"""``gamba ablate``: training and evaluation of the rows of a plan, and their table."""

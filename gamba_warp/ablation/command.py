@@ -1,6 +1,6 @@
-"""``gamba ablate``: rows of a plan, trained and evaluated alike, and their table.
+"""``gamba ablate``: training and evaluation of the rows of a plan, and their table.
 
-``--help`` answers at once, so what is slow to import is imported by the functions.
+Slow imports are inside functions, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from .tasks import Task
 
 _Count = Annotated[int, Meta(ge=1, le=1_000_000)]
-# Seconds on one core of a desktop of about 2020, one row alone. They are fits by eye to a few runs,
-# and a machine, an encoder or LPIPS in the loss may differ by a factor of three.
+# Seconds on one core of a desktop of about 2020, with one job. Rough fits to a few runs; a machine,
+# an encoder or LPIPS in the loss may change them by a factor of three.
 _STEP, _TOKEN, _PIXEL = 0.05, 1.2e-7, 8e-7
 _VIEW, _SHAPE, _FIT, _START = 1.3, 9.0, 4e-6, 15.0
 _GAIN = 0.7  # n threads are n^0.7 times as fast as one
@@ -52,32 +52,32 @@ def ablate_command(
     retry: bool = False,
     dry_run: bool = False,
 ) -> int:
-    """Trains and evaluates the rows of a plan alike: same data, seeds and budget, one table.
+    """Train and evaluate the rows of a plan with the same data, seeds and budget; write one table.
 
-    Writes table.json, table.md and index.html. Every row is a few commands, each a process of its
-    own, so one that fails stops no other. Ctrl-C stops; the same command goes on, and what is done
-    is not done again. Exit code 1 where a row failed.
+    Writes table.json, table.md and index.html. Every row is a few commands, each in its own
+    process, so a failed row stops no other. After Ctrl-C the same command resumes and skips
+    finished work. Exit code 1 if a row failed.
 
     Args:
         plan: Name of a shipped plan (paper-table2, questions, ours), or a JSON file.
         data: Dataset of posed views.
-        out: Folder of the results; out/ablation/NAME of the plan if not given.
-        rows: Only these rows; all if not given.
+        out: Folder of the results; by default out/ablation/NAME of the plan.
+        rows: Only these rows; all by default.
         seeds: Seeds of every row, in place of the plan's.
         steps: Training steps of every row, in place of the plan's budget.
         minutes: Training time of every row, in place of the plan's budget.
         split: Part of the dataset that rows are evaluated on.
-        objects: So many of its objects, evenly spaced in the order of names.
-        views: Views of an object, the input included, evenly spaced.
-        size: Height of the pictures compared, pixels; if not given, the plan's, or the files' own.
+        objects: Number of its objects, evenly spaced in the order of names.
+        views: Views per object, including the input, evenly spaced.
+        size: Height of the pictures compared, pixels; by default the plan's, or the files' own.
         meshes: Folder of the meshes that DATA was rendered from: also evaluate shapes.
-        geometry_objects: So many of the objects have their shapes evaluated; all by default.
+        geometry_objects: Number of objects whose shapes are evaluated; all by default.
         jobs: Rows that run at once.
-        threads: CPU threads of each; the cores shared among the jobs by default.
+        threads: CPU threads of each row; by default the cores are shared among the jobs.
         device: Device of every command; auto is the GPU if there is one.
-        restart: Do commands anew whose options are others now; what they made before goes.
-        retry: Run rows again that failed.
-        dry_run: Print the commands and about how long they take, and do nothing.
+        restart: Run commands again whose options changed; their former results are deleted.
+        retry: Run failed rows again.
+        dry_run: Only print the commands and an estimate of their time.
     """
     import sys
 
@@ -89,7 +89,7 @@ def ablate_command(
     from ..kernels.runtime.system import cores
     from ..untrusted.children import Failed, end_idle, run_each
     from .jobs import Settings, budget_of, check
-    from .plan import keep_plan, named, open_plan
+    from .plan import named, open_plan, save_plan
     from .run import row_line, run_tasks
     from .tasks import task_of
 
@@ -109,9 +109,9 @@ def ablate_command(
         check(settings)
     wanted = [chosen.row(name) for name in dict.fromkeys(rows)] or chosen.rows
     if len({*seeds}) != len(seeds):
-        raise UserError("--seeds: one is there twice")
-    # In a child: what a process held before it became a command counts as that command's memory, so
-    # the one that starts commands must not load torch.
+        raise UserError("--seeds: a seed is repeated")
+    # In a child, because the memory of a process counts for the commands that it starts: this
+    # process must not load torch.
     for _, answer in run_each(open_inputs, [(settings, wanted)]):
         if isinstance(answer, Failed):
             raise UserError(answer.reason)
@@ -130,7 +130,7 @@ def ablate_command(
             if task.changed and not restart:
                 raise UserError(
                     f"row {task.name}: was run with another plan: {task.changed}; give --restart "
-                    "(what is another now is done anew) or another --out"
+                    "(changed commands run again) or another --out"
                 )
             if task.record.status == "failed" and retry:
                 task.record.status = "begun"
@@ -142,28 +142,28 @@ def ablate_command(
     check_not_read([settings.out / "table.json"], [settings.data, settings.meshes])
     out = output_folder(settings.out)
     with only_process(out, "runs an ablation"):
-        keep_plan(chosen, out)
+        save_plan(chosen, out)
         tasks = find_tasks()
         for task in tasks:
             if task.changed:
-                task.begin_anew()
+                task.restart()
         todo = [task for task in tasks if task.record.status == "begun"]
         for task in tasks:
             if task not in todo:
                 print(f"{row_line(task)} (before)", flush=True)
-        tqdm.monitor_interval = 0  # its thread could hold a lock at the moment of a fork
+        tqdm.monitor_interval = 0  # its thread could hold a lock during a fork
         with progress_bar(total=len(tasks), initial=len(tasks) - len(todo), unit="run") as bar:
 
-            def ended(task: Task) -> None:
+            def on_end(task: Task) -> None:
                 tqdm.write(row_line(task), sys.stdout)
                 sys.stdout.flush()
                 bar.update()
 
-            code = run_tasks(todo, jobs, threads, ended)
+            code = run_tasks(todo, jobs, threads, on_end)
         if code:
-            print("stopped; the same command goes on from here")
+            print("stopped; the same command resumes from here")
             return code
-        from .page import write_results  # not before: it loads torch
+        from .page import write_results  # loads torch
 
         bad = write_results(settings)
         print(f"wrote {out / 'table.md'}, table.json and index.html")
@@ -171,13 +171,13 @@ def ablate_command(
 
 
 def open_inputs(given: tuple[Settings, list[Row]]) -> None:
-    """Opens what the commands of an ablation will read.
+    """Open the inputs of an ablation's commands.
 
     Args:
-        given: what is the same for every row, and the rows.
+        given: settings shared by all rows, and the rows.
 
     Raises:
-        UserError: something is not there.
+        UserError: an input is missing.
     """
     from ..data.dataset import open_dataset
     from ..devices import pick_device
@@ -201,17 +201,17 @@ def open_inputs(given: tuple[Settings, list[Row]]) -> None:
 
 
 def row_minutes(settings: Settings, row: Row, threads: int, known: float | None) -> float:
-    """About how long a row takes with one seed, minutes.
+    """Estimate the minutes of a row with one seed.
 
     Args:
-        settings: the plan, and what is the same for every row.
+        settings: the plan, and the settings shared by all rows.
         row: of the plan.
         threads: of each command.
-        known: seconds of a step of this row, where it ran before; None: by its size.
+        known: seconds per step of this row in an earlier run; None: estimated from its size.
     """
     from .jobs import fit_options, train_config
 
-    faster, what = threads**_GAIN, settings.evaluation
+    faster, evaluation = threads**_GAIN, settings.evaluation
     shapes = 0.0
     if row.kind == "fit":
         fit = fit_options(settings, row)
@@ -227,18 +227,18 @@ def row_minutes(settings: Settings, row: Row, threads: int, known: float | None)
         step = _STEP + batch * (work + _PIXEL * views * config.views.size**2)
         step = known or step / faster
         spent = settings.budget[1] * (60 if name == "minutes" else step)
-        objects = what.objects
-        spent += objects * what.views * _VIEW / faster
+        objects = evaluation.objects
+        spent += objects * evaluation.views * _VIEW / faster
     if settings.meshes is not None:
-        shapes = min(objects, what.geometry_objects or objects) * _SHAPE
+        shapes = min(objects, evaluation.geometry_objects or objects) * _SHAPE
     return (spent + shapes + _START) / 60
 
 
 def print_plan(settings: Settings, tasks: list[Task], jobs: int, threads: int) -> None:
-    """Prints the commands of every row and an estimate of the time.
+    """Print the commands of every row and an estimate of the time.
 
     Args:
-        settings: the plan, and what is the same for every row.
+        settings: the plan, and the settings shared by all rows.
         tasks: rows with their seeds.
         jobs: rows at once.
         threads: of each command.
@@ -260,5 +260,5 @@ def print_plan(settings: Settings, tasks: list[Task], jobs: int, threads: int) -
                 print(f"    gamba {shlex.join(stage.words_in(task.folder))}")
     print(
         f"{len(tasks)} runs, {jobs} at once with {threads} threads each: roughly "
-        f"{total / jobs / 60:.1f} hours of what is not done (within a factor of three)"
+        f"{total / jobs / 60:.1f} hours left (within a factor of three)"
     )

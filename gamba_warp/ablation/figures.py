@@ -1,4 +1,4 @@
-"""The figures of rows, from the reports and logs that their commands wrote."""
+"""Figures of rows, from the reports and logs of their commands."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ Objects = dict[str, dict[str, float]]  # metrics by object
 
 @dataclass
 class SeedResult:
-    """What a row has with one seed.
+    """Results of a row with one seed.
 
     Attributes:
-        task: what of it is done, and where.
+        task: its state and folder.
         objects: metrics of the novel views, or of the views held out from a fit, and of shapes, by
-            object. What was not evaluated lacks.
+            object; only those that were evaluated.
         views: indices of these views, by object.
         size: height of the pictures compared, or None for the files' own.
-        log: of the training; of a fit there is none.
+        log: of the training; empty for a fit.
         step_seconds: median time of a step, seconds, or None.
-        missing: objects that could not be evaluated.
+        missing: objects that failed.
     """
 
     task: Task
@@ -53,14 +53,14 @@ class SeedResult:
 
 @dataclass
 class RowResult:
-    """What a row has.
+    """Results of a row.
 
     Attributes:
         row: of the plan.
         gaussians: N.
-        seeds: results of those that have ended well.
-        failed: reasons, by the seed, of those that have not.
-        absent: seeds that were not run, or not to the end, or with another plan.
+        seeds: results of the seeds that succeeded.
+        failed: reasons by seed, of those that failed.
+        absent: seeds that were not run, not finished, or run with another plan.
     """
 
     row: Row
@@ -70,7 +70,7 @@ class RowResult:
     absent: list[int] = field(default_factory=list)
 
     def values(self, seeds: set[int] | None = None) -> Objects:
-        """Metrics by object, means over seeds; of the objects and metrics that all seeds have.
+        """Return metrics by object, averaged over seeds; only those that all seeds have.
 
         Args:
             seeds: only these; None for all.
@@ -86,12 +86,12 @@ class RowResult:
 
     @property
     def first(self) -> SeedResult:
-        """That of the smallest seed, of which there is one."""
+        """Result of the smallest seed."""
         return self.seeds[min(self.seeds)]
 
 
 def collect(settings: Settings) -> list[RowResult]:
-    """Reads what the rows of a plan have: the plan's seeds, and all others that were run.
+    """Read the results of a plan's rows: the plan's seeds, and all others that were run.
 
     Raises:
         UserError: a report or a record is damaged.
@@ -132,14 +132,14 @@ class _Protocol(msgspec.Struct, frozen=True):
 
 
 class _Report(msgspec.Struct):
-    """What is read of a report of ``gamba eval-views``, ``eval-geometry`` or ``fit``."""
+    """Fields used of a report of ``gamba eval-views``, ``eval-geometry`` or ``fit``."""
 
-    objects: list[_Object]  # pyright: ignore[reportInvalidTypeForm] (made of the registry)
+    objects: list[_Object]  # pyright: ignore[reportInvalidTypeForm] (made from the registry)
     failures: list[dict[str, Any]] = []
     protocol: _Protocol = _Protocol()
 
     def figures(self, keys: Iterable[str], end: str = "") -> Objects:
-        """Those of the objects that were evaluated; of keys with another end."""
+        """Return metrics of the evaluated objects, from the keys with suffix ``end``."""
         found = {}
         for record in self.objects:
             values = ((key, getattr(record, key + end)) for key in keys)
@@ -149,7 +149,7 @@ class _Report(msgspec.Struct):
 
 
 def read_result(task: Task) -> SeedResult:
-    """Reads what a row has with one seed, which has ended well.
+    """Read the results of a row with one seed that succeeded.
 
     Raises:
         UserError: a report is missing or damaged.
@@ -177,7 +177,7 @@ def read_result(task: Task) -> SeedResult:
 
 
 def empty_psnr(data: Path, views: dict[str, list[int]], size: int | None) -> dict[str, float]:
-    """PSNR of an empty (white) picture against the views that a row was evaluated on.
+    """Compute the PSNR of an empty (white) picture against the views of a row's evaluation.
 
     Args:
         data: the dataset.
@@ -185,7 +185,7 @@ def empty_psnr(data: Path, views: dict[str, list[int]], size: int | None) -> dic
         size: height of the pictures; None: the files' own.
 
     Returns:
-        dB, means over the views, by object. An object that cannot be read lacks.
+        dB, means over the views, by object; unreadable objects are left out.
     """
     import torch
 
@@ -201,13 +201,13 @@ def empty_psnr(data: Path, views: dict[str, list[int]], size: int | None) -> dic
 
 
 def read_log(path: Path) -> RunRecord:
-    """What a run's log says; nothing where it lacks."""
+    """Read a run's log; an empty record if it is missing."""
     with contextlib.suppress(UserError):
         return read_run_log(path)
     return RunRecord()
 
 
 def step_seconds(log: RunRecord) -> float | None:
-    """The median time of a step of a training, seconds, or None."""
+    """Return the median time of a training step, seconds, or None."""
     seconds = log.values("train.seconds")
     return statistics.median(seconds) if seconds else None

@@ -1,4 +1,4 @@
-"""The commands of a row, and the checks that nothing is wrong with any of them before one runs."""
+"""Commands of a row, and their checks before any of them runs."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from .plan import Evaluation, FitOptions, Plan, Row, Values
 if TYPE_CHECKING:
     from gamba_warp.train.config import TrainConfig
 
-# The command gives these to every row alike, or they would make rows see different samples.
+# Set by the command for all rows, or they would give rows different samples.
 RESERVED = ("data", "set", "preset", "out", "config", "resume", "init", "seed", "device")
 RESERVED += ("threads", "tensorboard")
 BUDGET = ("steps", "epochs", "minutes")
 STRIPS = 4  # objects whose pictures are on the page
-ROW = "ROW"  # stands for the row's folder in the commands that are kept
+ROW = "ROW"  # placeholder of the row's folder in recorded commands
 
 
 @dataclass(frozen=True)
 class Settings:
-    """A plan, and what is the same for every row of it.
+    """A plan, and the settings shared by all rows.
 
     Attributes:
         plan: the plan.
         data: the dataset.
         out: folder of the ablation.
-        evaluation: what every row is evaluated on.
+        evaluation: objects and views of the evaluation.
         budget: option ``steps`` or ``minutes``, and its value.
         meshes: folder of the true meshes, or None: no shapes are evaluated.
         device: of all commands that have the option.
@@ -55,10 +55,10 @@ class Stage:
     """One command of a row.
 
     Attributes:
-        name: "train", "views", "shapes" or "fit"; its results lie in a folder.
-        words: of the command, without ``gamba``; ``ROW`` stands for the row's folder.
-        folder: name of the folder of the results, in that of the row.
-        makes: the file in it that is there when the command has ended well.
+        name: "train", "views", "shapes" or "fit".
+        words: of the command, without ``gamba``, with ``ROW`` for the row's folder.
+        folder: name of the folder of its results, in that of the row.
+        makes: a file in it that exists once the command has succeeded.
     """
 
     def __init__(self, name: str, *words: object, makes: str = "report.json") -> None:
@@ -67,7 +67,7 @@ class Stage:
         self.makes = f"{self.folder}/{makes}"
 
     def words_in(self, folder: Path) -> list[str]:
-        """The words with the row's folder in its place."""
+        """Return the words with the row's folder filled in."""
         mark = f"{ROW}/"
         return [str(folder / w.removeprefix(mark)) if w.startswith(mark) else w for w in self.words]
 
@@ -76,10 +76,10 @@ FOLDERS = {"train": "run", "views": "views", "shapes": "shapes", "fit": "fit"}
 
 
 def budget_of(plan: Plan, steps: int | None, minutes: float | None) -> tuple[str, float]:
-    """The budget of every row: the command's, or else the plan's.
+    """Return the budget of every row: the command's, or else the plan's.
 
     Raises:
-        UserError: there is none or more than one, or a row has one of its own.
+        UserError: it is missing or ambiguous, or a row sets its own.
     """
     for row in plan.rows:
         own = [name for name in _merged(row.options) if name in BUDGET and row.kind == "train"]
@@ -97,34 +97,35 @@ def budget_of(plan: Plan, steps: int | None, minutes: float | None) -> tuple[str
 
 
 def stages(settings: Settings, row: Row, seed: int) -> list[Stage]:
-    """The commands of a row, in their order.
+    """Return the commands of a row, in order.
 
     Raises:
-        UserError: an option or a field of the row is wrong; names the row.
+        UserError: an option or a field of the row is invalid; names the row.
     """
     from gamba_warp.train.config import command_line
 
-    what, distance = settings.evaluation, None
-    alike = ["--seed", seed, "--device", settings.device]
+    evaluation, distance = settings.evaluation, None
+    shared = ["--seed", seed, "--device", settings.device]
     if row.kind == "fit":
-        words: list[object] = ["fit", settings.data, "--split", what.split]
+        words: list[object] = ["fit", settings.data, "--split", evaluation.split]
         for name, value in msgspec.to_builtins(fit_options(settings, row)).items():
             words += [] if value is None else [option(name), value]
-        made = [Stage("fit", *words, *alike)]
+        made = [Stage("fit", *words, *shared)]
     else:
         config = train_config(settings, row)
         distance = config.model_config().distance
         words = ["eval-views", "--checkpoint", f"{ROW}/run/model.safetensors"]
-        words += ["--data", settings.data, "--split", what.split, "--limit", what.objects]
-        words += ["--views", what.views, *(["--size", what.size] if what.size else [])]
+        words += ["--data", settings.data, "--split", evaluation.split]
+        words += ["--limit", evaluation.objects, "--views", evaluation.views]
+        words += ["--size", evaluation.size] if evaluation.size else []
         words += ["--strips", STRIPS, "--sheet", 0, "--no-baselines", "--device", settings.device]
         words += ["--save-gaussians"] if settings.meshes else []
         if row.background_margin is not None:
             words += ["--background-margin", row.background_margin]
-        training = shlex.split(command_line(config.to_dict()))[1:] + [*alike, "--no-tensorboard"]
+        training = shlex.split(command_line(config.to_dict()))[1:] + [*shared, "--no-tensorboard"]
         made = [Stage("train", *training, makes="model.safetensors"), Stage("views", *words)]
-    if settings.meshes:  # of all objects, or of some that ``run.choose`` copies
-        count = what.geometry_objects
+    if settings.meshes:  # of all objects, or of those that ``run.choose`` copies
+        count = evaluation.geometry_objects
         folder = f"{made[-1].folder}/gaussians" if count is None else f"chosen-{count}"
         words = ["eval-geometry", f"{ROW}/{folder}", settings.meshes, "--frame", "reference"]
         words += ["--data", settings.data]
@@ -135,7 +136,7 @@ def stages(settings: Settings, row: Row, seed: int) -> list[Stage]:
 
 
 def fit_options(settings: Settings, row: Row) -> FitOptions:
-    """The options of a row's fit. Raises UserError, which names the row."""
+    """Return the options of a row's fit. Raises UserError, which names the row."""
     try:
         return msgspec.convert(_merged(settings.plan.base.fit, row.options), FitOptions)
     except msgspec.ValidationError as error:
@@ -143,23 +144,23 @@ def fit_options(settings: Settings, row: Row) -> FitOptions:
 
 
 def gaussians_of(settings: Settings, row: Row) -> int:
-    """N, the number of Gaussians of a row (with the decoder "rays" the most there can be)."""
+    """Return N, the number of Gaussians of a row (the maximum for the decoder "rays")."""
     if row.kind == "fit":
         return fit_options(settings, row).gaussians
     return train_config(settings, row).model_config().num_gaussians
 
 
 def _merged(*groups: Values) -> Values:
-    """Groups joined, the later ones first; null takes away; names with underscores."""
+    """Merge groups of values; later ones win, null removes; names get underscores."""
     both = {name.replace("-", "_"): value for group in groups for name, value in group.items()}
     return {name: value for name, value in both.items() if value is not None}
 
 
 def train_config(settings: Settings, row: Row) -> TrainConfig:
-    """The options of a row's training: on what, with which model, how and how long.
+    """Return the options of a row's training.
 
     Raises:
-        UserError: one of them is unknown, or its value is wrong; names the row.
+        UserError: an option is unknown, or its value is invalid; names the row.
     """
     from gamba_warp.train.config import GROUPS, config_of
 
@@ -176,19 +177,19 @@ def train_config(settings: Settings, row: Row) -> TrainConfig:
     options = {n: v for n, v in _merged(base.options, row.options).items() if n not in BUDGET}
     for name, value in {**options, settings.budget[0]: settings.budget[1]}.items():
         if name in RESERVED:
-            raise UserError(f"{source}: options: {name} is not for a plan to give")
+            raise UserError(f"{source}: options: {name} cannot be set by a plan")
         for item in value if isinstance(value, list) else [value]:
             if isinstance(item, str) and (item.startswith("-") or not item.isprintable()):
-                raise UserError(f"{source}: {name}: {item!r} is no value of an option")
+                raise UserError(f"{source}: {name}: {item!r} is not a valid value of an option")
         values.setdefault(of.get(name, "run"), {})[name] = value
     return config_of(values, source)
 
 
 def check(settings: Settings) -> None:
-    """Checks the commands of every row of the plan.
+    """Check the commands of every row of the plan.
 
     Raises:
-        UserError: names the first row that is wrong, and what of it.
+        UserError: names the first invalid row, and its fault.
     """
     plan = settings.plan
     for row in plan.rows:
@@ -200,17 +201,18 @@ def check(settings: Settings) -> None:
 
 
 def difference(old: dict[str, list[str]], new: dict[str, list[str]]) -> str | None:
-    """The first option that is another in the commands of a row; None where there is none."""
+    """Return the first option that differs between two sets of commands; None if they are equal."""
     if old == new:
         return None
-    there, here = (
+    before, after = (
         [f"{words[0]} {part}" for words in of.values() for part in _options(words[1:])]
         for of in (old, new)
     )
-    gone, come = [p for p in there if p not in here], [p for p in here if p not in there]
-    return f"{next(iter(gone), 'nothing')} then, {next(iter(come), 'nothing')} now"
+    removed = [part for part in before if part not in after]
+    added = [part for part in after if part not in before]
+    return f"{next(iter(removed), 'nothing')} then, {next(iter(added), 'nothing')} now"
 
 
 def _options(words: Sequence[str]) -> list[str]:
-    """The words of a command, each option with its values."""
+    """Split the words of a command into options with their values."""
     return re.split(" (?=--)", shlex.join(words))

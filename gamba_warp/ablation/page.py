@@ -1,4 +1,4 @@
-"""What an ablation shows: ``table.md``, and the page with curves and pictures."""
+"""Outputs of an ablation: ``table.md``, and the page with curves and pictures."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _LABELS |= {"chamfer": "Chamfer", "iou": "Volume IoU"}
 _GROUNDS = {key: metric.head for key, metric in image_metrics.on_grounds().items()}
 _DIGITS = {key: metric.digits for key, metric in image_metrics.all_figures().items()}
 _DIGITS |= {"chamfer": 4, "iou": 3}
-_MOST_ROWS = 24  # of one picture
+_MAX_ROWS = 24  # of one picture
 _HELD_OUT = "Held-out novel views, PSNR [dB]"
 _CURVES = {"Loss of training": ("train.loss", True), _HELD_OUT: ("val.psnr_novel", False)}
 Lines = list[list[str]]  # cells by row, the head first
 
 
 def write_results(settings: Settings) -> bool:
-    """Writes the table and the page from what all rows of the plan have so far.
+    """Write the table and the page from the results of all rows so far.
 
     Returns:
-        Whether a row of the table has failed.
+        True if a row of the table has failed.
 
     Raises:
         UserError: a report is damaged, or a file cannot be written.
@@ -78,34 +78,34 @@ def _markdown_page(table: dict[str, Any]) -> str:
 
 
 def _about(table: dict[str, Any]) -> str:
-    """What the numbers of the table are."""
-    what, (budget, value) = table["evaluation"], *table["budget"].items()
-    size = f"at {what['size']} pixels" if what["size"] else "at their own size"
+    """Describe the numbers of the table."""
+    evaluation, (budget, value) = table["evaluation"], *table["budget"].items()
+    size = f"at {evaluation['size']} pixels" if evaluation["size"] else "at their own size"
     share = 100 * table["bootstrap"]["level"]
     order = "the same samples" if budget == "steps" else "samples in the same order"
     text = (
         f"Every row has {value:g} {budget} of training, on {order} of {table['data']}. "
         f"Means over seeds and objects with {share:g} % bootstrap intervals over objects: the "
-        f"novel ones of {what['views']} views, {size}, of {_evaluated(table)} of the part "
-        f"{what['split']}. An interval tells how far a mean depends on the choice of objects, and "
-        "the spread between seeds how far it depends on chance in training."
+        f"novel ones of {evaluation['views']} views, {size}, of {_count(table)} of the split "
+        f"{evaluation['split']}. An interval covers the choice of objects, and the spread between "
+        "seeds the randomness of training."
     )
     if any(row["kind"] == "fit" for row in table["rows"]):
         text += (
-            " Fits are compared with the views that were held out from them, and a step of theirs "
-            "is one of the fit of one object."
+            " Fits are compared with their held-out views, and their step is a step of the fit of "
+            "one object."
         )
     return text
 
 
-def _evaluated(table: dict[str, Any]) -> str:
-    """Number of evaluated objects of the rows; of those asked for too, where it differs."""
-    wanted = table["evaluation"]["objects"]
+def _count(table: dict[str, Any]) -> str:
+    """Format the number of evaluated objects, and of those requested if it differs."""
+    requested = table["evaluation"]["objects"]
     rows = [row for row in table["rows"] if row["figures"]]
     counts = sorted({row["objects"] for row in rows}) or [0]
     number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
-    fewer = any(row["objects"] < wanted for row in rows if row["kind"] == "train")
-    return f"{number} objects" + (f" ({wanted} were asked for)" if fewer else "")
+    fewer = any(row["objects"] < requested for row in rows if row["kind"] == "train")
+    return f"{number} objects" + (f" ({requested} were requested)" if fewer else "")
 
 
 def _cells(figures: Mapping[str, Any], keys: Iterable[str], signed: bool = False) -> list[str]:
@@ -114,7 +114,7 @@ def _cells(figures: Mapping[str, Any], keys: Iterable[str], signed: bool = False
 
 
 def _tables(table: dict[str, Any]) -> dict[str, Lines]:
-    """The tables by title: the main one, grounds, differences, seeds, numbers of Gaussians."""
+    """Return tables by title: main, backgrounds, differences, seeds, numbers of Gaussians."""
     rows, head = table["rows"], ["", *_LABELS.values()]
     main: Lines = [[*head, "seconds a step", "memory", "parameters", "paper"]]
     for row in rows:
@@ -157,14 +157,14 @@ def _tables(table: dict[str, Any]) -> dict[str, Lines]:
         found[f"Series {name}"] = lines = [["Gaussians", "PSNR [dB]", "quality", *shares]]
         for k, number in enumerate(series["numbers"]):
             quality = "-" if series["quality"] is None else f"{100 * series['quality'][k]:.1f} %"
-            own = [values[k] for values in series["reached"].values()]
-            cells = ["-" if value is None else f"{100 * value:.0f} %" for value in own]
+            reached = [values[k] for values in series["reached"].values()]
+            cells = ["-" if value is None else f"{100 * value:.0f} %" for value in reached]
             lines.append([f"{number:,}", f"{series['psnr'][k]:.2f}", quality, *cells])
     return found
 
 
 def _sentences(series: dict[str, Any]) -> list[str]:
-    """What a series says, a sentence for each share."""
+    """Describe a series, one sentence per share."""
     found = []
     count, rows = series["objects"], "fits" if series["kind"] == "fit" else "models"
     for share in (f"{100 * share:g}" for share in SHARES):
@@ -185,31 +185,33 @@ def _sentences(series: dict[str, Any]) -> list[str]:
 
 
 def _remarks(table: dict[str, Any]) -> list[str]:
-    """Sentences below the table: notes of the rows, failures, what is not there."""
+    """Return sentences below the table: notes of the rows, failures, missing results."""
     found = [f"{row['title']}: {row['note']}" for row in table["rows"] if row["note"]]
     for row in table["rows"]:
         title = row["title"]
         found += [f"failed: {title}, seed {s}: {why}" for s, why in row["failed"].items()]
         for seed, names in row["missing"].items():
-            found.append(f"{title}, seed {seed}: {len(names)} objects lack; first {names[0]}")
+            found.append(
+                f"{title}, seed {seed}: {len(names)} objects are missing; first {names[0]}"
+            )
         if row["absent"]:
             seeds = ", ".join(map(str, row["absent"]))
-            found.append(f"{title}: not run, or not to the end: seed {seeds}.")
-    lonely = [row["title"] for row in table["rows"] if len(row["seeds"]) == 1]
-    if lonely:
-        found.append(f"One seed alone, so no spread is known: {', '.join(lonely)}.")
-    cost = "Memory is the most that the process of the training held, the libraries in it included."
+            found.append(f"{title}: not run or not finished: seed {seeds}.")
+    single = [row["title"] for row in table["rows"] if len(row["seeds"]) == 1]
+    if single:
+        found.append(f"A single seed, so the spread is unknown: {', '.join(single)}.")
+    cost = "Memory is the peak of the training process, libraries included."
     threads = sorted({(t, j) for row in table["rows"] for t in row["threads"] for j in row["jobs"]})
     if threads:
         shown = " or ".join(f"{j} at once with {t} CPU threads each" for t, j in threads)
-        cost += f" Rows ran {shown}, and their times are those."
+        cost += f" Rows ran {shown}, which their times reflect."
     if any(row["peak_memory_of"] == "GPU" for row in table["rows"]):
-        cost = "Memory is what torch held on the GPU at most."
+        cost = "Memory is torch's peak on the GPU."
     return [*found, cost]
 
 
 def _needed(series: Mapping[str, Any]) -> list[Section]:
-    """What is needed, in words and as a curve of quality over the number."""
+    """Return sections of the numbers of Gaussians needed, with curves of quality over N."""
     found = []
     for name, part in series.items():
         text = " ".join([DEFINITION, *_sentences(part)])
@@ -221,7 +223,7 @@ def _needed(series: Mapping[str, Any]) -> list[Section]:
 
 
 def _curves(results: list[RowResult], compare_with: str | None) -> list[Section]:
-    """Curves of each row that was trained, beside those of the row compared with."""
+    """Return the curves of each trained row, beside those of the row compared with."""
     trained = {r.row.name: r for r in results if r.row.kind == "train" and r.seeds}
     records = {}
     for name, result in trained.items():
@@ -247,16 +249,16 @@ def _curves(results: list[RowResult], compare_with: str | None) -> list[Section]
 
 
 def _pictures(results: list[RowResult]) -> list[Section]:
-    """The same few objects as every row shows them, the true views above.
+    """Return pictures of the same few objects from every row, below the true views.
 
-    A model's picture has a row a view, input | prediction | truth; a fit's has truth | fitted.
+    A model's picture has one row per view, input | prediction | truth; a fit's has truth | fitted.
     """
     found = []
-    for kind, folder, columns, truth, what in (
+    for kind, folder, columns, truth, caption in (
         ("train", "views", 3, 2, "the first is the input view"),
         ("fit", "fit", 2, 0, "held-out views"),
     ):
-        rows = [r for r in results if r.row.kind == kind and r.seeds][:_MOST_ROWS]
+        rows = [r for r in results if r.row.kind == kind and r.seeds][:_MAX_ROWS]
         strips = {r.row.label: r.first.task.folder / folder / "strips" for r in rows}
         shared = [{path.name for path in strip.glob("*.png")} for strip in strips.values()]
         for name in sorted(set.intersection(*shared))[:STRIPS] if shared else ():
@@ -268,5 +270,5 @@ def _pictures(results: list[RowResult]) -> list[Section]:
                     views[label] = shown[1]
             if views:
                 title = f"{Path(name).stem}, {'models' if kind == 'train' else 'fits'}"
-                found.append(Section(title, f"Views: {what}.", views=views))
+                found.append(Section(title, f"Views: {caption}.", views=views))
     return found

@@ -1,4 +1,4 @@
-"""The plan of an ablation: a JSON document, one of the shipped ones by its name, or a file."""
+"""Plans of ablations: JSON documents, shipped or given as files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..untrusted.names import plain_name
 from ..untrusted.ranges import Seed
 
 PLANS = Path(__file__).parent / "plans"
-MAX_PLAN = 1 << 20  # bytes; ours have 5,000
+MAX_PLAN = 1 << 20  # bytes; the shipped plans have 5,000
 METRICS = (*image_metrics.METRICS, "chamfer", "iou")
 
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}\Z")]
@@ -31,7 +31,7 @@ Values = Annotated[dict[Word, Value], Meta(max_length=200)]
 
 
 class FitOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of ``gamba fit`` that a plan may set; they mean what they mean there."""
+    """Options of ``gamba fit`` that a plan may set, with the same meaning."""
 
     gaussians: Count = FitConfig.gaussians
     steps: Steps = FitConfig.steps
@@ -43,14 +43,14 @@ class FitOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Evaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What every row is evaluated on.
+    """Objects and views of every row's evaluation.
 
     Attributes:
         split: part of the dataset.
-        objects: so many of it, evenly spaced in the order of names.
-        views: of an object, the input included, evenly spaced.
+        objects: their number, evenly spaced in the order of names.
+        views: per object, including the input, evenly spaced.
         size: height of the pictures compared, pixels; None: the files' own.
-        geometry_objects: so many of the objects have their shapes evaluated; None: all.
+        geometry_objects: number of objects whose shapes are evaluated; None: all.
     """
 
     split: Literal["val", "test"] = "test"
@@ -61,7 +61,7 @@ class Evaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What all rows have.
+    """Defaults of all rows.
 
     Attributes:
         preset: of ``gamba train``.
@@ -84,14 +84,14 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         title: in the table; the name, if empty.
         kind: "train" trains and evaluates a model, "fit" fits objects one by one.
         set: fields of ``GambaConfig`` that differ from the base's.
-        options: of ``gamba train``, or of ``gamba fit``, that differ; null takes one of the base's
-            away.
+        options: of ``gamba train``, or of ``gamba fit``, that differ; null removes one of the
+            base's.
         seeds: in place of the plan's.
-        compare_with: name of the row that this one is compared with, in place of the plan's.
-        series: name of the series of numbers of Gaussians that the row belongs to.
-        background_margin: the model is evaluated without its tokens of plain background, but for
-            those within so many patches of the object; None: with all.
-        paper: figures that the paper states, by the metric's name.
+        compare_with: name of the reference row, in place of the plan's.
+        series: name of the row's series of numbers of Gaussians.
+        background_margin: evaluate the model without tokens of plain background farther than this
+            many patches from the object; None: with all.
+        paper: figures of the paper, by the metric's name.
         note: a sentence below the table.
     """
 
@@ -109,7 +109,7 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def label(self) -> str:
-        """What the table calls it."""
+        """Name in the table."""
         return self.title or self.name
 
 
@@ -121,10 +121,10 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         title: of its page.
         rows: of the table, in its order.
         note: sentences at the head of the page.
-        seeds: every row is run with each.
-        base: what all rows have.
-        evaluation: what they are evaluated on.
-        compare_with: name of the row that the others are compared with; None: with none.
+        seeds: of every row.
+        base: defaults of all rows.
+        evaluation: objects and views of the evaluation.
+        compare_with: name of the reference row; None without one.
     """
 
     name: Name
@@ -139,7 +139,7 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     compare_with: Name | None = None
 
     def row(self, name: str) -> Row:
-        """The row of a name. Raises UserError, naming those there are, where there is none."""
+        """Return the row of a name. Raises UserError, which lists the names, if it is missing."""
         for row in self.rows:
             if row.name == name:
                 return row
@@ -147,20 +147,20 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         raise UserError(f"plan {self.name} has no row {name}; it has {names}")
 
     def seeds_of(self, row: Row) -> list[int]:
-        """The seeds of a row."""
+        """Return the seeds of a row."""
         return list(self.seeds if row.seeds is None else row.seeds)
 
 
 def shipped() -> list[str]:
-    """Names of the plans that come with the package."""
+    """Return the names of the shipped plans."""
     return sorted(path.stem for path in PLANS.glob("*.json"))
 
 
 def open_plan(text: str) -> Plan:
-    """Reads the shipped plan of a name, or that of a file.
+    """Read a shipped plan by name, or a plan file.
 
     Raises:
-        UserError: there is neither, or the document is no sound plan.
+        UserError: neither exists, or the plan is invalid.
     """
     if text in shipped():
         return read_plan(PLANS / f"{text}.json")
@@ -170,10 +170,10 @@ def open_plan(text: str) -> Plan:
 
 
 def read_plan(path: str | Path) -> Plan:
-    """Reads a plan and checks what can be told from it alone; ``jobs.check`` does the rest.
+    """Read a plan and check it by itself; ``jobs.check`` checks its options.
 
     Raises:
-        UserError: the file cannot be read, or is no sound plan; names the row.
+        UserError: the file cannot be read, or the plan is invalid; names the row.
     """
     plan = parse_document(read_bytes(path, MAX_PLAN), Plan, str(path))
     with named(path):
@@ -183,7 +183,7 @@ def read_plan(path: str | Path) -> Plan:
 
 @contextmanager
 def named(source: str | Path) -> Iterator[None]:
-    """Puts the plan's name before the message of a UserError."""
+    """Prefix the message of a UserError with the plan's name."""
     try:
         yield
     except UserError as error:
@@ -195,7 +195,7 @@ def _check(plan: Plan) -> None:
     known: set[str] = set()
     for text in (plan.title, plan.note, *(t for row in plan.rows for t in (row.title, row.note))):
         if not text.isprintable():  # a table has lines
-            raise UserError(f"{text[:80]!r}: a title or a note has a letter that does not print")
+            raise UserError(f"{text[:80]!r}: a title or note has an unprintable character")
     for row in plan.rows:
         plain_name(row.name, "row")
         if row.name in known:
@@ -205,10 +205,10 @@ def _check(plan: Plan) -> None:
         for name in (name for name, given in of_models.items() if given and row.kind == "fit"):
             raise UserError(f"row {row.name}: a fit has no model, so it has no {name}")
         for name in row.paper.keys() - {*METRICS}:
-            there = ", ".join(METRICS)
-            raise UserError(f"row {row.name}: paper: no metric {name}; there are {there}")
+            known_metrics = ", ".join(METRICS)
+            raise UserError(f"row {row.name}: paper: no metric {name}; known: {known_metrics}")
         if len({*plan.seeds_of(row)}) != len(plan.seeds_of(row)):
-            raise UserError(f"row {row.name}: a seed is there twice")
+            raise UserError(f"row {row.name}: a seed is repeated")
     others = {plan.compare_with, *(row.compare_with for row in plan.rows)}
     for name in filter(None, others):
         if plan.row(name).kind != "train":
@@ -219,8 +219,8 @@ def _check(plan: Plan) -> None:
             raise UserError(f"series {name}: it mixes models and fits")
 
 
-def keep_plan(plan: Plan, out: Path) -> None:
-    """Writes the plan into the folder, which belongs to it from then on.
+def save_plan(plan: Plan, out: Path) -> None:
+    """Write the plan into the folder, which from then on belongs to it.
 
     Raises:
         UserError: the folder belongs to another plan, or cannot be written.

@@ -1,4 +1,4 @@
-"""How many Gaussians are needed for a share of the quality, from rows of different numbers."""
+"""Number of Gaussians needed for a share of the quality, from rows of different numbers."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ DEFINITION = (
 
 
 def needed(numbers: Sequence[int], quality: Sequence[float], share: float) -> float | None:
-    """The smallest number that reaches a share of the quality.
+    """Return the smallest number that reaches a share of the quality.
 
     Args:
         numbers: N of each row, rising.
         quality: of each row.
-        share: wanted.
+        share: of the quality.
 
     Returns:
-        The number, interpolated; the first row's where that already reaches the share (then it
-        is an upper bound). None where no row does.
+        The interpolated number; the first row's if that reaches the share (an upper bound); None if
+        no row does.
     """
     for k, value in enumerate(quality):
         if value >= share:
@@ -39,14 +39,14 @@ def needed(numbers: Sequence[int], quality: Sequence[float], share: float) -> fl
 
 
 def qualities(values: np.ndarray) -> np.ndarray | None:
-    """Quality of each row, from PSNR.
+    """Compute the quality of each row from PSNR.
 
     Args:
-        values: ``[rows + 1, ..]`` dB: that of the empty picture, then that of each row, the one
-            with the most Gaussians last.
+        values: ``[rows + 1, ..]`` dB: of the empty picture, then of each row, that with the most
+            Gaussians last.
 
     Returns:
-        ``[rows, ..]``; NaN where the last row gains nothing. None where there is no row.
+        ``[rows, ..]``; NaN where the last row gains nothing. None without rows.
     """
     if len(values) < 2:
         return None
@@ -61,7 +61,7 @@ def series_of(
     empty: Mapping[str, float],
     shares: Sequence[float] = SHARES,
 ) -> dict[str, Any] | None:
-    """What a series of rows says.
+    """Summarise a series of rows.
 
     Args:
         numbers: N of each row, rising.
@@ -70,12 +70,12 @@ def series_of(
         shares: of the quality.
 
     Returns:
-        None with fewer than two rows, or without an object that all have. Else ``objects`` (how
-        many), ``empty`` (mean PSNR), ``psnr`` and ``quality`` of each number; ``needed``, by the
-        share in percent, ``{number, at_most, interval}`` of the means over objects (the interval
-        by bootstrap over objects); ``reached``, by the share, the share of the objects, each by its
-        own quality, for which each number is enough; ``no_gain``: objects that gain nothing with
-        the most Gaussians, which are left out there.
+        None with fewer than two rows, or without a common object. Else ``objects`` (their number),
+        ``empty`` (mean PSNR), ``psnr`` and ``quality`` of each number; ``needed``, by share in
+        percent, ``{number, at_most, interval}`` of the means over objects (bootstrap interval over
+        objects); ``reached``, by share, the fraction of objects whose quality reaches it at each
+        number; ``no_gain``: number of objects without gain at the most Gaussians, which
+        ``reached`` leaves out.
     """
     from gamba_warp.eval.averages import bootstrap
 
@@ -87,9 +87,9 @@ def series_of(
     quality = qualities(means)
     assert quality is not None
     known = bool(np.isfinite(quality).all())
-    own = qualities(table)
-    assert own is not None
-    gaining = np.isfinite(own).all(0)
+    per_object = qualities(table)
+    assert per_object is not None
+    gaining = np.isfinite(per_object).all(0)
     found: dict[str, Any] = {
         "numbers": list(numbers),
         "objects": len(names),
@@ -116,7 +116,7 @@ def series_of(
             "at_most": bool(known and quality[0] >= share),
             "interval": ends if ends and all(map(math.isfinite, ends)) else None,
         }
-        enough = [needed(numbers, column, share) for column in own[:, gaining].T.tolist()]
+        enough = [needed(numbers, column, share) for column in per_object[:, gaining].T.tolist()]
         found["reached"][key] = [
             sum(value is not None and value <= n * (1 + 1e-9) for value in enough) / len(enough)
             if enough

@@ -1,4 +1,4 @@
-"""The table of an ablation: means over objects and seeds, paired differences, what is needed."""
+"""Table of an ablation: means over objects and seeds, paired differences, series."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Empty = Mapping[str, Mapping[str, float]]  # by row, PSNR of an empty picture by
 
 
 def make_table(settings: Settings, results: list[RowResult], empty: Empty) -> dict[str, Any]:
-    """Makes what ``table.json`` holds.
+    """Make the content of ``table.json``.
 
     Args:
-        settings: the plan, and what is the same for every row.
+        settings: the plan, and the settings shared by all rows.
         results: of its rows.
         empty: PSNR of an empty picture, for the rows of series.
 
     Returns:
-        ``rows``, each with its figures, ``series``, and what the numbers mean.
+        ``rows`` with their figures, ``series``, and the settings of the evaluation.
     """
     from gamba_warp.eval.averages import LEVEL, RESAMPLES
 
@@ -93,7 +93,7 @@ def _median(values: list[Any]) -> float | None:
 
 
 def _figures(result: RowResult) -> dict[str, Any]:
-    """By metric: mean and interval over objects, the mean of each seed, and their spread."""
+    """Return by metric the mean and interval over objects, the seeds' means and their spread."""
     from gamba_warp.eval.averages import summary_of
 
     values, found = result.values(), {}
@@ -117,7 +117,7 @@ def _figures(result: RowResult) -> dict[str, Any]:
 
 
 def _difference(result: RowResult, reference: RowResult | None) -> dict[str, Any] | None:
-    """By metric: the row minus the one compared with, object by object, each a mean over seeds."""
+    """Return by metric the paired difference to the reference row, averaged over seeds."""
     from gamba_warp.eval.averages import summary_of
 
     if reference is None or reference is result or result.row.kind != "train":

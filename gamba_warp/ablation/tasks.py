@@ -1,4 +1,4 @@
-"""What of a row is done, with one seed, as its ``row.json`` keeps it."""
+"""State of a row with one seed, stored in its ``row.json``."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .jobs import FOLDERS, Settings, Stage, difference, stages
 from .plan import Row
 
 RECORD = "row.json"
-_MAX = 1 << 20  # bytes of a record; ours have a few kB
+_MAX = 1 << 20  # bytes of a record, which usually has a few kB
 
 
 class Ended(msgspec.Struct):
-    """A command that has ended well.
+    """Costs of a finished command.
 
     Attributes:
-        seconds: that it took, of all its parts where it was stopped on the way.
-        peak_memory: most bytes of memory that its process held, or None.
-        threads: that it had.
+        seconds: its time, summed over stops and resumes.
+        peak_memory: peak memory of its process in bytes, or None.
+        threads: its number of threads.
         jobs: rows that ran at once.
-        note: what went wrong beside, in one line.
+        note: partial failures, in one line.
     """
 
     seconds: float = 0.0
@@ -39,16 +39,16 @@ class Ended(msgspec.Struct):
 
 
 class Record(msgspec.Struct):
-    """What is known of a row with one seed.
+    """Record of a row with one seed.
 
     Attributes:
         row: its name.
         seed: its seed.
-        commands: words by the command's name, ``ROW`` in place of the row's folder.
+        commands: words by the command's name, with ``ROW`` for the row's folder.
         status: "begun", "ok" or "failed".
-        reason: why it failed, in one line.
-        ended: what has ended well, by the command's name.
-        parts: of the commands that have not.
+        reason: of a failure, in one line.
+        ended: costs of the finished commands, by name.
+        parts: costs so far of the unfinished commands.
         gamba_warp: version of the package.
     """
 
@@ -71,8 +71,8 @@ class Task:
         row: of the plan.
         folder: its folder.
         stages: its commands.
-        record: what of it is done.
-        changed: what of its commands was another one when it ran, or None.
+        record: its state.
+        changed: the first option of its commands that changed since it ran, or None.
         geometry: number of objects whose shapes are evaluated, or None for all.
     """
 
@@ -85,18 +85,18 @@ class Task:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
         return f"{self.row.name}, seed {self.record.seed}"
 
-    def following(self) -> Stage | None:
-        """The next command; None where all have ended well."""
+    def next_stage(self) -> Stage | None:
+        """Return the next command; None if all have succeeded."""
         for stage in self.stages:
             if stage.name not in self.record.ended or not (self.folder / stage.makes).exists():
                 return stage
         return None
 
-    def begin_anew(self) -> None:
-        """Removes what commands made that are others now, and what came after them.
+    def restart(self) -> None:
+        """Remove the results of changed commands, and of those after them.
 
         Raises:
             UserError: something cannot be removed.
@@ -117,17 +117,17 @@ class Task:
             raise UserError(f"cannot remove {self.folder}: {error.strerror}") from error
 
     def write(self, status: Literal["begun", "ok", "failed"] | None = None, why: str = "") -> None:
-        """Writes the record, atomically, with another status if one is given."""
+        """Write the record atomically, with a new status if given."""
         if status is not None:
             self.record.status, self.record.reason = status, why
         write_json(self.folder / RECORD, msgspec.to_builtins(self.record))
 
 
 def task_of(settings: Settings, row: Row, seed: int) -> Task:
-    """A row with one seed, and what of it is done.
+    """Return a row with one seed, and its state.
 
     Raises:
-        UserError: an option of the row is wrong, or its record is damaged.
+        UserError: an option of the row is invalid, or its record is damaged.
     """
     made = stages(settings, row, seed)
     folder = settings.out / "rows" / row.name / f"seed-{seed}"

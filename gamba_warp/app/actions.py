@@ -1,4 +1,4 @@
-"""What the page's events do: our functions, with gradio's updates for answers. It needs gradio."""
+"""Handlers of the page's events, which return gradio's updates. Imports gradio."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from ..versions import advice
 from . import work
 from .cutting import (
     Cut,
+    apply_strokes,
     cut_picture,
     editor_picture,
     examples,
-    mended,
     read_strokes,
-    restarted,
+    reset_mask,
 )
 from .guard import VISITOR
 from .server import MainThread
-from .shelf import Shelf
+from .visitor_files import VisitorFiles
 
 if TYPE_CHECKING:
     from ..model.gamba import Gamba
@@ -37,11 +37,11 @@ _FRAME = (
 )
 
 
-def plainly(function: Callable) -> Callable:
-    """A function whose bad input is one line in the page; what else it raises is our defect."""
+def with_page_errors(function: Callable) -> Callable:
+    """Wrap a handler: bad input becomes one line in the page; any other error is a bug."""
 
     @functools.wraps(function)
-    def careful(*args: Any) -> Any:
+    def wrapped(*args: Any) -> Any:
         try:
             return function(*args)
         except (UserError, MemoryError) as error:
@@ -51,41 +51,41 @@ def plainly(function: Callable) -> Callable:
             if reason is None:
                 raise
             raise _error(UserError(reason)) from None
-        except RuntimeError as error:  # torch's errors of memory have no type of their own
+        except RuntimeError as error:  # torch raises it when out of memory
             if "memory" not in str(error):
                 raise
             raise _error(MemoryError("there is not enough memory for this")) from None
 
-    return careful
+    return wrapped
 
 
 def _error(error: Exception) -> gr.Error:
-    # The page takes the text for HTML, and names of strangers' files stand in it.
+    # The page interprets the text as HTML, and it may have untrusted file names.
     text = html.escape(first_line(error))
     return gr.Error(text, title="This did not work", print_exception=False)
 
 
 class Actions:
-    """What the page's events do.
+    """Handlers of the page's events.
 
     Args:
         model: the network.
-        ways: how objects may be cut out.
-        shelf: for files.
+        ways: options of the cut-out.
+        files: store of the visitors' files.
         device: device that renders.
-        turns: who computes.
+        main_thread: runs all computations.
     """
 
     def __init__(
-        self, model: Gamba, ways: Ways, shelf: Shelf, device: str, turns: MainThread
+        self, model: Gamba, ways: Ways, files: VisitorFiles, device: str, main_thread: MainThread
     ) -> None:
-        self._turns = turns
+        self._main_thread = main_thread
         self._model = model
         self._ways = ways
-        self._shelf = shelf
+        self._files = files
         self._device = device
         for name in ("take", "leave", "example", "mend", "restart", "make"):
-            setattr(self, name, plainly(getattr(self, name)))
+            setattr(self, name, with_page_errors(getattr(self, name)))
 
     def take(
         self,
@@ -93,39 +93,39 @@ class Actions:
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """A picture that was dropped or pasted; the guard knows that it is this visitor's."""
+        """Take a dropped or pasted picture; the guard has checked its owner."""
         if not given or not given.get("path"):
             return self.leave()
         name = given.get("orig_name") or "picture"
         progress(0.2, "Looking for the object")
         try:
-            cut = self._turns.call(cut_picture, Path(given["path"]), name, self._ways)
+            cut = self._main_thread.call(cut_picture, Path(given["path"]), name, self._ways)
         except UserError as error:
-            gr.Warning(html.escape(str(error)), title="This is no picture for us")
+            gr.Warning(html.escape(str(error)), title="This picture cannot be used")
             return self.leave()
         return *self._shown(cut, request), gr.skip()
 
     def leave(self) -> tuple:
-        """The picture was taken away; what was made of it stays."""
+        """Clear the picture; its results stay."""
         return None, gr.update(visible=False), None, "", None
 
     def example(self, event: gr.EventData, request: gr.Request) -> tuple:
-        """A picture of the gallery."""
+        """Take an example of the gallery."""
         found, index = examples(), event._data["index"]
         if type(index) is not int or not 0 <= index < len(found):
-            raise UserError(f"there are {len(found)} examples, and this is none of them")
+            raise UserError(f"not one of the {len(found)} examples")
         path, title = found[index]
-        cut = self._turns.call(cut_picture, path, title, self._ways)
+        cut = self._main_thread.call(cut_picture, path, title, self._ways)
         return *self._shown(cut, request), str(path)
 
     def mend(self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request) -> tuple:
-        """The strokes become part of the mask."""
-        cut = mended(_given(cut), _layers(painted))
+        """Apply the strokes to the mask."""
+        cut = apply_strokes(_given(cut), _layers(painted))
         return cut, self._editor(cut, request)
 
     def restart(self, cut: Cut | None, request: gr.Request) -> tuple:
-        """The mask as it was found, without strokes."""
-        cut = restarted(_given(cut))
+        """Reset the mask, without strokes."""
+        cut = reset_mask(_given(cut))
         return cut, self._editor(cut, request)
 
     def make(
@@ -136,12 +136,12 @@ class Actions:
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """The object in 3D, and its viewer; strokes that nobody applied count, too."""
+        """Reconstruct the object and show its viewer; pending strokes are applied first."""
         before = _given(cut)
-        after = mended(before, _layers(painted))
-        progress(0.1, "The network looks at the picture")
-        made = self._turns.call(work.solve, self._model, after, elevation)
-        progress(0.8, "The viewer is made")
+        after = apply_strokes(before, _layers(painted))
+        progress(0.1, "Running the network")
+        made = self._main_thread.call(work.solve, self._model, after, elevation)
+        progress(0.8, "Making the viewer")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
         editor = gr.skip() if after is before else self._editor(after, request)
@@ -149,50 +149,51 @@ class Actions:
         return after, editor, (made, []), frame, gr.update(visible=True), files
 
     def writer(self, kind: str) -> Callable:
-        """The function that writes files of one kind, and adds them to those that are there."""
+        """Return the handler that writes files of one kind, and adds them to the list."""
 
         def write(
-            state: tuple[work.Made, list[Path]] | None,
+            state: tuple[work.Reconstruction, list[Path]] | None,
             request: gr.Request,
             progress: gr.Progress = gr.Progress(),  # noqa: B008
         ) -> tuple:
             if state is None:
-                raise UserError("make the object first; it may have been kept for too long")
+                raise UserError("make the object first; an older one may have expired")
             made, older = state
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
-            folder = self._place(request)
-            path, note = self._turns.call(work.write, made, kind, folder, self._device)
+            folder = self._new_folder(request)
+            path, note = self._main_thread.call(work.write, made, kind, folder, self._device)
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
             files = [*(old for old in older if old.name != path.name and old.is_file()), path]
             return (made, files), gr.update(value=[str(file) for file in files], visible=True)
 
-        return plainly(write)
+        return with_page_errors(write)
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
         note = f"<p>{html.escape(cut.note)}</p>"
         return cut, gr.update(visible=True), self._editor(cut, request), note
 
-    def _place(self, request: gr.Request) -> Path:
-        asked = request.request
-        assert asked is not None  # gradio has one for every event
-        return self._shelf.place(asked.scope[VISITOR])
+    def _new_folder(self, request: gr.Request) -> Path:
+        inner = request.request
+        assert inner is not None  # gradio sets it for every event
+        return self._files.new_folder(inner.scope[VISITOR])
 
     def _editor(self, cut: Cut, request: gr.Request) -> dict[str, Any]:
-        """The editor's value. gradio would write the same picture to the same file once more, in
-        the middle of the browser's reading it; each of ours is a new one.
+        """Return the editor's value, each time in a new file.
+
+        gradio would rewrite the same file while the browser reads it.
         """
-        path = self._place(request) / "cut-out.png"
+        path = self._new_folder(request) / "cut-out.png"
         save_image(path, editor_picture(cut) / 255.0)
         return {"background": str(path), "layers": [], "composite": str(path)}
 
 
 def _given(cut: Cut | None) -> Cut:
     if cut is None:
-        raise UserError("give a picture first; the last one may have been kept for too long")
+        raise UserError("give a picture first; an older one may have expired")
     return cut
 
 
 def _layers(painted: dict[str, Any] | None) -> list:
-    """The strokes; the guard knows that the files are this visitor's."""
+    """Read the strokes; the guard has checked the owner of the files."""
     return [read_strokes(Path(file["path"])) for file in (painted or {"layers": ()})["layers"]]

@@ -1,4 +1,4 @@
-"""Pictures to take for an example, the cut-out of one, and the strokes that mend its mask."""
+"""Example pictures, the cut-out of a picture, and strokes that correct its mask."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from ..photo.cutout import Ways
 
 
-SIDE = 720  # longer side of the picture that is painted on, pixels
-KEEP, REMOVE = "#2f6fed", "#e8590c"  # colours of the brush: blue and orange, told apart by all eyes
+SIDE = 720  # longer side of the editor's picture, pixels
+KEEP, REMOVE = "#2f6fed", "#e8590c"  # brush colours: blue and orange, safe for colour-blind users
 STROKE = 0.6  # opacity of a stroke, so that the picture shows through
-MAX_STROKES = 4 << 20  # pixels of a layer; the page's own have SIDE x SIDE
+MAX_STROKES = 4 << 20  # pixels of a layer; the page sends SIDE x SIDE
 _TILE = 12  # side of the checkerboard's squares, pixels
 _LIGHT, _DARK = 0.97, 0.86
-_GHOST = 0.22  # how much of what is cut away still shows, so that it can be painted back
+_GHOST = 0.22  # opacity of the removed parts, so that they can be painted back
 _NAME = re.compile(r"[^\w-]+")
 FOLDER = STARTER / "icons"  # the examples
 
@@ -34,14 +34,14 @@ class Cut:
     """A picture and the mask of its object.
 
     Attributes:
-        name: fit for a file.
+        name: valid as a file name.
         rgb: ``[H, W, 3]`` float32 in [0, 1], the picture at its working size.
         mask: ``[H, W]`` float32 in [0, 1], 1 on the object.
-        first: the mask as it was found, before any stroke.
-        found: ``[S, S, 4]`` float32, the object cut out and centred as it was found, whose colours
-            along the edge hold no background; None where no object was found.
-        ghost: whether there is a picture to be seen where the mask is 0.
-        note: how the object was found, for the page.
+        first: the mask before any stroke.
+        found: ``[S, S, 4]`` float32, the object cut out and centred before any stroke, without
+            background colour along its edge; None if no object was found.
+        ghost: True if the picture has colours where the mask is 0.
+        note: method of the cut-out, for the page.
     """
 
     name: str
@@ -54,15 +54,15 @@ class Cut:
 
 
 def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
-    """Reads a picture and finds its object; where none is found, the mask is empty.
+    """Read a picture and find its object; the mask is empty if none is found.
 
     Args:
-        path: the file of a stranger.
-        name: what the stranger calls it.
-        ways: how objects may be found.
+        path: an untrusted file.
+        name: the visitor's name of it.
+        ways: options of the cut-out.
 
     Raises:
-        UserError: the picture cannot be read; the message names it as the stranger does.
+        UserError: the picture cannot be read; the message has the visitor's name.
     """
     from ..data.preprocess import WORKING_SIZE, shrink
     from ..images import load_rgba
@@ -75,18 +75,18 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
         raise UserError(str(error).replace(str(path), shown)) from error
     try:
         cut = cut_out(path, ways)
-    except UserError as error:  # the picture is sound, so the object can be painted by hand
+    except UserError as error:  # the picture is valid, so the object can be painted by hand
         reason = str(error).removeprefix(f"{path}: ")
         mask = np.zeros(rgba.shape[:2], np.float32)
         note = f"No object was found ({reason}). Paint over the object with the blue brush."
         return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note)
-    ghost = cut.method != "alpha"  # what a file holds where it is transparent is no picture
+    ghost = cut.method != "alpha"  # colours of transparent pixels are arbitrary
     rgb = _clean_edge(cut.source_rgb, cut.mask, cut.rgba)
     return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, cut.how)
 
 
 def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """The picture with the found object's own colours, so that a mended one has no fringe."""
+    """Return the picture with the found object's edge colours, so that strokes leave no fringe."""
     from ..data.preprocess import PRESENT
 
     present = mask > PRESENT
@@ -101,15 +101,15 @@ def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndar
 
 
 def stem(name: str) -> str:
-    """The name of a stranger's file as a plain stem of ours: letters, digits, ``_`` and ``-``."""
+    """Reduce an untrusted file name to a stem of letters, digits, ``_`` and ``-``."""
     return _NAME.sub("-", Path(name).stem).strip("-_")[:60] or "object"
 
 
 def editor_picture(cut: Cut) -> np.ndarray:
-    """The cut-out over a checkerboard, and faintly what is cut away, to paint on.
+    """Draw the cut-out over a checkerboard, with the removed parts faint, for the editor.
 
     Returns:
-        ``[h, w, 3]`` uint8, the longer side ``SIDE`` pixels whatever the picture's own size.
+        ``[h, w, 3]`` uint8, the longer side ``SIDE`` pixels for any picture.
     """
     from ..images import to_uint8
 
@@ -123,20 +123,20 @@ def editor_picture(cut: Cut) -> np.ndarray:
 
 
 def painted_size(cut: Cut) -> tuple[int, int]:
-    """Height and width of ``editor_picture``."""
+    """Return height and width of ``editor_picture``."""
     height, width = cut.mask.shape
     factor = SIDE / max(height, width)
     return max(1, round(height * factor)), max(1, round(width * factor))
 
 
 def read_strokes(path: Path) -> np.ndarray:
-    """One layer of the editor as the page sends it.
+    """Read one layer of the editor, as sent by the page.
 
     Returns:
         ``[h, w, 4]`` uint8, straight alpha.
 
     Raises:
-        UserError: it is no PNG, or larger than any canvas.
+        UserError: it is not a PNG, or larger than any canvas.
     """
     from ..images import open_picture
 
@@ -144,15 +144,15 @@ def read_strokes(path: Path) -> np.ndarray:
         return np.asarray(image.convert("RGBA"))
 
 
-def mended(cut: Cut, layers: Sequence[np.ndarray]) -> Cut:
-    """The cut-out after the strokes: blue ones are object, orange ones are not.
+def apply_strokes(cut: Cut, layers: Sequence[np.ndarray]) -> Cut:
+    """Apply strokes to the mask: blue adds to the object, orange removes.
 
     Args:
         cut: before the strokes.
-        layers: ``[h, w, 4]`` uint8 each, straight alpha, of any size; they cover the whole picture.
+        layers: ``[h, w, 4]`` uint8 each, straight alpha, of any size, covering the whole picture.
 
     Returns:
-        The same object where nothing is painted.
+        The argument itself if nothing is painted.
     """
     mask = cut.mask
     for layer in layers:
@@ -168,13 +168,13 @@ def mended(cut: Cut, layers: Sequence[np.ndarray]) -> Cut:
     return replace(cut, mask=np.clip(mask, 0.0, 1.0).astype(np.float32))
 
 
-def restarted(cut: Cut) -> Cut:
-    """The cut-out with the mask as it was found."""
+def reset_mask(cut: Cut) -> Cut:
+    """Return the cut-out with its first mask."""
     return replace(cut, mask=cut.first)
 
 
 def model_picture(cut: Cut) -> np.ndarray:
-    """The object as the model takes it.
+    """Return the object as the model's input.
 
     Returns:
         ``[S, S, 4]`` float32 RGBA with the object in the middle.
@@ -193,12 +193,12 @@ def model_picture(cut: Cut) -> np.ndarray:
 
 
 def _resized(values: np.ndarray, height: int, width: int) -> np.ndarray:
-    """``[H, W]`` or ``[H, W, C]`` float32 at another size."""
+    """Resize ``[H, W]`` or ``[H, W, C]`` float32."""
     from PIL import Image
 
     planes = values[..., None] if values.ndim == 2 else values
     smaller = height < planes.shape[0]
-    # A mean over what a new pixel covers: a wider filter would smear a stroke over its border.
+    # The area average; a wider filter would smear strokes over their borders.
     kind = Image.Resampling.BOX if smaller else Image.Resampling.BILINEAR
     out = [
         np.asarray(Image.fromarray(plane).resize((width, height), kind))
@@ -208,13 +208,13 @@ def _resized(values: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def examples() -> list[tuple[Path, str]]:
-    """The pictures that come with the package, sorted by name, each with what it shows.
+    """Return the shipped pictures, sorted by name, each with a title.
 
     An installed package has two, a checkout more.
     """
     found = []
     for path in sorted(FOLDER.glob("*.png")):
-        # ``scopia-dog-house`` is "dog house": what comes first is who made it.
+        # ``scopia-dog-house`` becomes "dog house": the author comes first.
         title = re.sub("^(blendswap-cc-(0|by)|katorlegaz|scopia)-", "", path.stem)
         found.append((path, re.sub("[-_]", " ", title.rstrip("0123456789"))))
     return found

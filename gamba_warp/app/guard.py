@@ -1,10 +1,9 @@
-"""What stands between the page and the rest of the world.
+"""ASGI layer that restricts access to the app.
 
-The server listens on 127.0.0.1 alone. That keeps out neither a web page of somebody else, open in
-the same browser, nor other programs of this machine. So every request passes here: for our own
-name, from our own page, to one of the few addresses that the page uses; what it sends is bounded,
-is taken apart here, and names no file but those of its own visitor. And the browser is told to load
-nothing from any other host.
+The server listens on 127.0.0.1 only. That keeps out neither other web pages in the same browser nor
+other programs of this machine. So this layer checks every request: its host and origin, the path
+(one of the few that the page uses), and the size and content of its body, which may name only files
+of the same visitor. Headers forbid the browser to load anything from other hosts.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ from ..images import PICTURE_SUFFIXES
 from ..pages.serve import READ_SECONDS, is_foreign
 from ..untrusted.documents import parse_document
 from .cutting import examples
-from .shelf import KEPT, Shelf
+from .visitor_files import KEEP_SECONDS, VisitorFiles
 
-# Scripts stand in the page, and its brush compiles shaders' bindings; the viewer is a frame of the
-# page's own text with a worker made of a text.
+# The page has inline scripts, and its brush evaluates code for shaders; the viewer is an inline
+# frame with a worker from a blob.
 POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; media-src 'self' data: blob:; "
     "font-src 'self' data:; style-src 'self' 'unsafe-inline'; "
@@ -43,7 +42,7 @@ POLICY = (
     "connect-src 'self' data: blob:; frame-src 'self' blob:; object-src 'none'; base-uri 'self'; "
     "form-action 'self'; frame-ancestors 'self'"
 )
-VISITOR = "gamba.visitor"  # in the scope of a request that is let in
+VISITOR = "gamba.visitor"  # key in the scope of an accepted request
 _HEADERS = (
     (b"content-security-policy", POLICY.encode()),
     (b"referrer-policy", b"no-referrer"),
@@ -55,19 +54,19 @@ _FILE, _UPLOAD, _JOIN = "/gradio_api/file=", "/gradio_api/upload", "/gradio_api/
 _PROGRESS, _DATA = "/gradio_api/upload_progress", "/gradio_api/queue/data"
 _ALIVE = "/gradio_api/heartbeat/"
 _NO_COOKIE = "open the page first; it needs its cookie"
-_SESSION = re.compile(b"session_hash=[a-z0-9]{1,32}")  # all that an address may be followed by
-# All that the page asks for; gradio itself answers to eighty addresses.
+_SESSION = re.compile(b"session_hash=[a-z0-9]{1,32}")  # the only allowed query
+# All paths that the page reads; gradio itself serves eighty.
 _READ = re.compile(
     "/|/theme[.]css|/favicon[.]ico|/(assets|static)/.*|/gradio_api/(file=.*|heartbeat/[a-z0-9]+"
     "|queue/data|upload_progress)",
     re.DOTALL,
 )
-_MAX_CALL = 1 << 20  # bytes of a call of a function; a real one takes 2 kB
-_HEAD = 1 << 16  # bytes of an upload beside its files
-_CALL_SECONDS = READ_SECONDS  # until all of it is there
+_MAX_CALL = 1 << 20  # bytes of a function call; a real one takes 2 kB
+_HEAD = 1 << 16  # bytes of an upload besides its files
+_CALL_SECONDS = READ_SECONDS  # to receive it completely
 UPLOAD_SECONDS = 300.0
 MAX_AT_ONCE = 16  # requests of one visitor
-# The rest is ignored: gradio fails with several ranges, or with other digits than ours.
+# Others are ignored: gradio fails with several ranges, or with non-ASCII digits.
 _RANGE = re.compile(b"bytes=([0-9]{1,15}-[0-9]{0,15}|-[0-9]{1,15})")
 
 Message = MutableMapping[str, Any]
@@ -76,7 +75,7 @@ Send = Callable[[Message], Awaitable[None]]
 
 
 class GivenFile(msgspec.Struct):
-    """A file that was uploaded, or that the page was given."""
+    """A file that was uploaded or sent to the page."""
 
     path: Annotated[str, Meta(max_length=4096)]
     orig_name: Annotated[str, Meta(max_length=1024)] | None = None
@@ -84,7 +83,7 @@ class GivenFile(msgspec.Struct):
 
 
 class Painted(msgspec.Struct):
-    """The editor's value. It sends its pictures, too, which nobody needs."""
+    """The editor's value; its background and composite are ignored."""
 
     layers: Annotated[list[GivenFile], Meta(max_length=4)]
     background: Any = None
@@ -92,7 +91,7 @@ class Painted(msgspec.Struct):
 
 
 class _Call(msgspec.Struct):
-    """A call of one of the page's functions; what else gradio would take is left out."""
+    """A call of one of the page's functions, reduced to the fields that the page uses."""
 
     data: list[msgspec.Raw]
     fn_index: int
@@ -102,29 +101,29 @@ class _Call(msgspec.Struct):
 
 
 class Guard:
-    """An ASGI layer that lets in what the page itself asks for.
+    """ASGI layer that accepts only requests of the page itself.
 
     Args:
         app: gradio's.
-        shelf: the visitors' files.
-        inputs: of each of the page's functions, by its number: of which type each input is.
+        files: the visitors' files.
+        inputs: types of the inputs of each of the page's functions, by its number.
         max_bytes: largest file.
     """
 
     def __init__(
         self,
         app: Callable[[Message, Receive, Send], Awaitable[None]],
-        shelf: Shelf,
+        files: VisitorFiles,
         inputs: Mapping[int, Sequence[Any]],
         max_bytes: int,
     ) -> None:
-        self._app, self._shelf, self._inputs = app, shelf, inputs
+        self._app, self._files, self._inputs = app, files, inputs
         self._max_bytes = max_bytes
-        self._coming: Counter[str] = Counter()  # bytes of uploads that are there so far
-        self._shown = {str(path) for path, _ in examples()}
+        self._incoming: Counter[str] = Counter()  # bytes received of running uploads
+        self._examples = {str(path) for path, _ in examples()}
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        """Answers one request."""
+        """Answer one request."""
         if scope["type"] == "lifespan":
             sweeper = asyncio.create_task(self._sweep())
             try:
@@ -134,18 +133,18 @@ class Guard:
         elif scope["type"] != "http":
             await send({"type": "websocket.close", "code": 1008})
         else:
-            # The token is the browser's secret, and the folder's name is in what the page says.
+            # The token is the browser's secret; the page sees only its hash, the folder's name.
             token = Request(scope).cookies.get(_COOKIE, "")
             known = _TOKEN.fullmatch(token) is not None
             visitor = hashlib.sha256(token.encode()).hexdigest()[:32] if known else None
             scope[VISITOR] = visitor
-            with self._shelf.visited(visitor or "") as at_once:
+            with self._files.visited(visitor or "") as at_once:
                 await self._answer(scope, receive, send, at_once)
 
     async def _sweep(self) -> None:
         while True:
-            await asyncio.sleep(KEPT / 6)
-            await asyncio.to_thread(self._shelf.sweep)
+            await asyncio.sleep(KEEP_SECONDS / 6)
+            await asyncio.to_thread(self._files.sweep)
 
     async def _answer(self, scope: Message, receive: Receive, send: Send, at_once: int) -> None:
         more = list(_HEADERS)
@@ -156,7 +155,7 @@ class Guard:
                 message["headers"] = [*theirs, *more]
             await send(message)
 
-        # What a proxy would say of itself; gradio would make addresses of it.
+        # Drop headers of proxies, from which gradio would build addresses.
         kept = [h for h in scope["headers"] if b"forwarded" not in h[0] and b"gradio" not in h[0]]
         ranges = [value for name, value in kept if name == b"range"]
         if len(ranges) > 1 or not all(map(_RANGE.fullmatch, ranges)):
@@ -166,13 +165,13 @@ class Guard:
         read, answer = receive, self._app
         try:
             if is_foreign(request.headers.items()):
-                raise HTTPException(421, "this page is that of 127.0.0.1, for its own pages alone")
+                raise HTTPException(421, "only this page itself may ask, at 127.0.0.1")
             if visitor and at_once > MAX_AT_ONCE:
                 raise HTTPException(503, "too many requests at once; try again")
             if request.method in ("GET", "HEAD") and _READ.fullmatch(path):
                 stated = request.headers.get("content-length", "0")
                 if stated != "0" or "transfer-encoding" in request.headers:
-                    raise HTTPException(400, "to ask for something takes no body")
+                    raise HTTPException(400, "a read request has no body")
                 if path == "/" and visitor is None:
                     cookie = f"{_COOKIE}={secrets.token_hex(16)}; HttpOnly; SameSite=Lax; Path=/"
                     more.append((b"set-cookie", cookie.encode()))
@@ -180,15 +179,15 @@ class Guard:
                 if path == _PROGRESS:
                     answer = Response('data: {"msg": "done"}\n\n', media_type="text/event-stream")
             elif request.method != "POST" or path not in (_UPLOAD, _JOIN):
-                raise HTTPException(404, "there is nothing here")
+                raise HTTPException(404, "not found")
             elif visitor is None:
                 raise HTTPException(403, _NO_COOKIE)
             elif path == _UPLOAD:
-                answer = JSONResponse(await self._taken(request, visitor))
+                answer = JSONResponse(await self._receive_files(request, visitor))
             else:
                 _check_size(request, _MAX_CALL)
                 body = await asyncio.wait_for(request.body(), _CALL_SECONDS)
-                body = self._checked(body, visitor)
+                body = self._checked_call(body, visitor)
                 pieces = iter([{"type": "http.request", "body": body}])
 
                 async def again() -> Message:
@@ -198,19 +197,19 @@ class Guard:
 
         except (HTTPException, asyncio.TimeoutError) as error:
             if not isinstance(error, HTTPException):
-                error = HTTPException(408, "what is sent took too long")
+                error = HTTPException(408, "the request took too long")
             line, kind = error.detail, "text/plain"
-            if path == _JOIN:  # the page shows what a call's answer holds
+            if path == _JOIN:  # the page shows the detail of a call's answer
                 line, kind = msgspec.json.encode({"detail": line}).decode(), "application/json"
             answer = Response(f"{line}\n", error.status_code, media_type=kind)
         await answer(scope, read, guarded)
 
     def _check_read(self, scope: Message, visitor: str | None) -> None:
-        """Only what is the visitor's own; sessions are told apart by the visitor as well."""
+        """Allow only the visitor's own files; append the visitor to the session."""
         path, asked = scope["path"], scope.get("query_string", b"")
-        if path.startswith(_FILE) and path.removeprefix(_FILE) not in self._shown:
+        if path.startswith(_FILE) and path.removeprefix(_FILE) not in self._examples:
             try:
-                self._shelf.file(path.removeprefix(_FILE), visitor or "-")
+                self._files.file(path.removeprefix(_FILE), visitor or "-")
             except UserError as error:
                 raise HTTPException(403, str(error)) from None
         elif path.startswith(_ALIVE) or path == _DATA:
@@ -222,8 +221,8 @@ class Guard:
         if visitor and _SESSION.fullmatch(asked):
             scope["query_string"] = asked + visitor.encode()
 
-    async def _taken(self, request: Request, visitor: str) -> list[str]:
-        """Puts the files of a form on the shelf as they are; nobody looks into them yet."""
+    async def _receive_files(self, request: Request, visitor: str) -> list[str]:
+        """Store the files of a form unread."""
         _check_size(request, self._max_bytes + _HEAD)
         got = 0
 
@@ -232,9 +231,10 @@ class Guard:
             message = await request.receive()
             size = len(message.get("body", b""))
             got += size
-            self._coming[visitor] += size
-            if self._coming[visitor] > self._shelf.own or self._coming.total() > self._shelf.limit:
-                raise HTTPException(503, "too much comes in at once; try again")
+            self._incoming[visitor] += size
+            files, incoming = self._files, self._incoming
+            if incoming[visitor] > files.per_visitor or incoming.total() > files.limit:
+                raise HTTPException(503, "too many uploads at once; try again")
             return message
 
         form = FormData()
@@ -242,28 +242,28 @@ class Guard:
             sent = Request(request.scope, counted).form(max_files=4, max_fields=0)
             form = await asyncio.wait_for(sent, UPLOAD_SECONDS)
             if not form:
-                raise HTTPException(400, "no upload of files")
-            return [await asyncio.to_thread(self._keep, f, visitor) for f in form.values()]
+                raise HTTPException(400, "not an upload of files")
+            return [await asyncio.to_thread(self._store, f, visitor) for f in form.values()]
         except MultiPartException as error:
-            raise HTTPException(400, f"no upload of files ({first_line(error)})") from None
+            raise HTTPException(400, f"not an upload of files ({first_line(error)})") from None
         except UserError as error:
             raise HTTPException(503, str(error)) from None
         finally:
-            self._coming -= Counter({visitor: got})
+            self._incoming -= Counter({visitor: got})
             await form.close()
 
-    def _keep(self, file: Any, visitor: str) -> str:
+    def _store(self, file: Any, visitor: str) -> str:
         if file.size > self._max_bytes:
             raise HTTPException(413, "the file is over the maximum allowed size")
         suffix = PurePath(file.filename or "").suffix.lower()
         name = f"picture{suffix if suffix in PICTURE_SUFFIXES else ''}"
-        path = self._shelf.place(visitor, file.size) / name
+        path = self._files.new_folder(visitor, file.size) / name
         with open(path, "wb") as out:
             shutil.copyfileobj(file.file, out)
         return str(path)
 
-    def _checked(self, body: bytes, visitor: str) -> bytes:
-        """A call, put together again of what was declared, so that nothing else gets in."""
+    def _checked_call(self, body: bytes, visitor: str) -> bytes:
+        """Parse a call and encode it again, so that only declared fields pass."""
         try:
             call = parse_document(body, _Call, "the call")
             kinds = self._inputs.get(call.fn_index)
@@ -275,8 +275,8 @@ class Guard:
                     item.background = item.composite = None
                 for file in getattr(item, "layers", [item]):
                     if isinstance(file, GivenFile):
-                        self._shelf.file(file.path, visitor)
-                        file.meta = {"_type": "gradio.FileData"}  # gradio looks at such alone
+                        self._files.file(file.path, visitor)
+                        file.meta = {"_type": "gradio.FileData"}  # else gradio ignores it
             index = call.event_data.get("index") if isinstance(call.event_data, dict) else None
         except UserError as error:
             raise HTTPException(400, str(error)) from None
@@ -287,9 +287,9 @@ class Guard:
 
 
 def _check_size(request: Request, limit: int) -> None:
-    """A request must state how many bytes it sends, and may not be over the limit."""
+    """Raise HTTPException unless the request states a length within the limit."""
     stated = request.headers.get("content-length", "")
     if not re.fullmatch("[0-9]{1,15}", stated):
-        raise HTTPException(411, "what is sent must state its length")
+        raise HTTPException(411, "the request must state its length")
     if int(stated) > limit:
         raise HTTPException(413, f"more than {limit >> 20} MB, the maximum allowed size")

@@ -1,4 +1,4 @@
-"""The page: what stands where, and which action each button calls. It needs gradio throughout."""
+"""Layout of the page, and the handlers of its events. Imports gradio."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from . import work
 from .actions import Actions
 from .cutting import FOLDER, KEEP, REMOVE, SIDE, STROKE, examples
 from .guard import GivenFile, Painted
-from .shelf import KEPT
+from .visitor_files import KEEP_SECONDS
 
-WAITING = 16  # requests that wait for their turn; further ones are told to come back
+WAITING = 16  # queued requests; further ones are rejected
 _TITLE = """<h1>Gamba</h1>
-<p>One picture becomes a 3D object. All of it is computed on this machine, and nothing is sent
+<p>One picture becomes a 3D object. Everything is computed on this machine, and nothing is sent
 out.</p>"""
-_EMPTY = """<div class="stage empty"><p>The object will stand here.<br>Give a picture, look at its
+_EMPTY = """<div class="stage empty"><p>The object will appear here.<br>Give a picture, check its
 cut-out, and make it 3D.</p></div>"""
 _FILES = {"Gaussians": work.GAUSSIANS, "Mesh": work.MESHES, "To show": work.SHOWS}
 _BRUSHES = {"Paint what to keep": KEEP, "Paint what to remove": REMOVE}
-# On a phone the object stands below the window.
+# On a phone the object is below the window.
 _SHOW = """() => {
   const stage = document.querySelector("#stage").getBoundingClientRect();
   if (stage.top < 0 || stage.top > innerHeight / 2) scrollBy({top: stage.top, behavior: "smooth"});
 }"""
-# A download that the page itself starts, once the file is there.
+# Starts the download once the file exists.
 _FETCH = """(files) => {
   const file = Array.isArray(files) ? files.at(-1) : files;
   if (!file || !file.url) return;
@@ -40,16 +40,19 @@ _FETCH = """(files) => {
 
 
 def build(actions: Actions) -> gr.Blocks:
-    """Makes the page; ``server.serve`` serves it.
+    """Build the page; ``server.serve`` serves it.
 
-    One action at a time over all pages, for they share the device. gradio preprocesses nothing: it
-    would decode pictures itself, and differently, without limits.
+    One action runs at a time over all pages, because they share the device. gradio's preprocessing
+    is off: it would decode pictures differently and without limits.
     """
     gr.set_static_paths([FOLDER])
     page = gr.Blocks(title="Gamba", analytics_enabled=False, fill_width=True)
     with page:
         gr.HTML(_TITLE, elem_id="title")
-        cut, made = gr.State(None, time_to_live=KEPT), gr.State(None, time_to_live=KEPT)
+        cut, made = (
+            gr.State(None, time_to_live=KEEP_SECONDS),
+            gr.State(None, time_to_live=KEEP_SECONDS),
+        )
         with gr.Row(elem_id="bench"):
             with gr.Column(scale=5, min_width=300):
                 picture = gr.Image(
@@ -102,7 +105,7 @@ def build(actions: Actions) -> gr.Blocks:
                         value=0,
                         step=1,
                         label="Camera above the object, degrees",
-                        info="Where it looked down, this makes the object stand upright.",
+                        info="If the camera looked down, this makes the object upright.",
                         elem_id="elevation",
                     )
                     make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
@@ -130,16 +133,16 @@ def build(actions: Actions) -> gr.Blocks:
             "preprocess": False,
             "api_visibility": "private",
         }
-        # On the editor the sign that something is going on would stay: gradio shows it once more
-        # when the editor has taken its new picture.
+        # On the editor the progress sign would stay: gradio shows it again when the editor has
+        # loaded its new picture.
         quick = {**one, "show_progress": "hidden"}
         taking = {**one, "show_progress_on": picture}
         shown, mask = [cut, cut_part, editor, note, picture], [cut, editor]
-        # (The event ``input`` comes with the old picture when that is taken away.)
+        # (The event ``input`` sends the old picture when it is cleared.)
         picture.upload(actions.take, picture, shown, **taking)
         picture.clear(actions.leave, None, shown, **quick)
         gallery.select(actions.example, None, shown, **taking)
-        # Waits for no other: it has a turn of its own.
+        # Has its own queue, so that it waits for no other event.
         brush.change(_painting, brush, editor, **{**quick, "concurrency_id": "brush"})
         mend.click(actions.mend, mask, mask, **quick)
         restart.click(actions.restart, cut, mask, **quick)
@@ -178,7 +181,7 @@ def _painting(choice: str) -> Any:
 
 
 def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
-    """Of which type the page sends each input, by the function's number; it sends no states."""
+    """Return the types of the inputs that the page sends, by the function's number."""
     kinds = {
         gr.State: None,
         gr.Image: GivenFile | None,
@@ -190,11 +193,11 @@ def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
     return {number: [kinds[type(block)] for block in given] for number, given in ours.items()}
 
 
-LOOK = Path(__file__).parent / "look.css"
+CSS = Path(__file__).parent / "look.css"
 
 
 def theme() -> themes.Base:
-    """Colours, corners and fonts; fonts by their names in the system, so that none is fetched."""
+    """Return colours, corners and fonts; only system fonts, so that none is fetched."""
     return themes.Base(
         primary_hue=themes.colors.blue,
         neutral_hue=themes.colors.gray,

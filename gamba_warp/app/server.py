@@ -1,4 +1,4 @@
-"""``gamba app``: serves the page on 127.0.0.1 until Ctrl-C, and leaves nothing behind."""
+"""``gamba app``: a page on 127.0.0.1 until Ctrl-C; its files are removed at the end."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from ..conventions import DeviceChoice
 from ..errors import UserError
 from ..files import only_process
 from ..untrusted.ranges import ranged
-from .shelf import MAX_OWN, Shelf
+from .visitor_files import MAX_PER_VISITOR, VisitorFiles
 
 if TYPE_CHECKING:
     import gradio as gr
 
 HOST = "127.0.0.1"
 PREFIX = "gamba-app-"
-_PAGES = 8  # whose pictures and results are kept at once
-BACKLOG = 64  # connections that are taken in one go; each takes a descriptor
+_PAGES = 8  # pages whose pictures and results are kept at once
+BACKLOG = 64  # pending connections; each takes a descriptor
 Result = TypeVar("Result")
 
 
@@ -49,14 +49,13 @@ def app_command(
     max_upload_mb: Annotated[int, Meta(ge=1, le=1024)] = 30,
     device: DeviceChoice = "auto",
 ) -> None:
-    """Serves a page that makes 3D objects of pictures, for this machine alone, until Ctrl-C.
+    """Serve a page on this machine that turns pictures into 3D objects, until Ctrl-C.
 
     Args:
-        checkpoint: Trained model (.safetensors); the shipped model if not given.
-        encoder_weights: The image encoder's weights, where the model has a pretrained one.
-        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out, or the address of a copy
-            of one of rembg's; if not given, one that rembg keeps on this machine, or it is fetched
-            once (179 MB).
+        checkpoint: Trained model (.safetensors); the shipped model by default.
+        encoder_weights: The image encoder's weights, if the model has a pretrained one.
+        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out, or a URL of one of
+            rembg's; by default rembg's copy on this machine, else it is fetched once (179 MB).
         port: Port of 127.0.0.1; 0 picks a free one.
         open_browser: Open the browser; the address is printed in any case.
         max_upload_mb: Largest picture file, MB.
@@ -70,36 +69,37 @@ def app_command(
     ways = Ways(matte_model=matte_model, device=chosen).checked()
     model = load_model(checkpoint, chosen, encoder_weights)
     with listening, work_folder() as folder:
-        quiet(folder)
+        configure_gradio(folder)
         from .actions import Actions
         from .interface import build
 
-        turns, shelf = MainThread(), Shelf(folder, own=max(MAX_OWN, max_upload_mb << 20))
-        page = build(Actions(model, ways, shelf, str(chosen), turns))
-        serve(page, shelf, listening, max_upload_mb, open_browser, turns)
+        main_thread = MainThread()
+        files = VisitorFiles(folder, per_visitor=max(MAX_PER_VISITOR, max_upload_mb << 20))
+        page = build(Actions(model, ways, files, str(chosen), main_thread))
+        serve(page, files, listening, max_upload_mb, open_browser, main_thread)
 
 
 class MainThread:
-    """Jobs of other threads, done in turn by the one that calls ``work``.
+    """Queue of jobs that run on the thread that calls ``work``, the main thread.
 
-    gradio calls from threads that come and go. Open3D ends the whole process at its exit if it was
-    used on a thread that had ended before, and OpenMP makes a new team of threads for every thread
-    that computes. So the main thread, which has nothing else to do, computes.
+    gradio calls from short-lived threads. Open3D aborts the process at its exit if it was used on a
+    thread that has ended, and OpenMP makes a new team for every computing thread. So all jobs run
+    on the main thread.
     """
 
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue[tuple[Future, Callable, tuple]] = queue.SimpleQueue()
-        self._over = False
+        self._ended = False
 
     def call(self, function: Callable[..., Result], *args: Any) -> Result:
-        """Has the main thread call the function, and waits; what it raises is raised here.
+        """Call the function on the main thread, wait, and return its result or raise its error.
 
         Raises:
             UserError: the main thread has ended.
         """
         future: Future[Result] = Future()
         self._jobs.put((future, function, args))
-        if self._over:
+        if self._ended:
             future.cancel()
         try:
             return future.result()
@@ -107,7 +107,7 @@ class MainThread:
             raise UserError("gamba app was ended; start it again") from None
 
     def work(self) -> None:
-        """Does jobs until something that is no error of a job, such as Ctrl-C, ends it."""
+        """Run jobs until Ctrl-C or another exception that is not an ``Exception``."""
         try:
             while True:
                 future, function, args = self._jobs.get()
@@ -120,21 +120,20 @@ class MainThread:
                     raise
                 else:
                     future.set_result(result)
-        finally:  # who waits for a job must not wait for ever
-            self._over = True
+        finally:  # release the threads that wait for a job
+            self._ended = True
             while not self._jobs.empty():
                 self._jobs.get()[0].cancel()
 
 
 @contextmanager
 def work_folder() -> Iterator[Path]:
-    """A temporary folder for all that the page makes; it goes in the end.
+    """Make a temporary folder for the page's files, removed at the end.
 
-    Those of processes that were killed go at the start: nobody holds their locks.
+    Folders of killed processes, whose locks are free, are removed at the start.
     """
-    place = Path(tempfile.gettempdir())
-    for old in place.glob(f"{PREFIX}*"):
-        _remove_unheld(old)
+    for old in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        _remove_leftover(old)
     folder = Path(tempfile.mkdtemp(prefix=PREFIX)).resolve()
     try:
         with only_process(folder, "serves"):
@@ -143,29 +142,29 @@ def work_folder() -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _remove_unheld(folder: Path) -> None:
-    """Removes a folder that an ended ``gamba app`` of this user left; touches no other."""
+def _remove_leftover(folder: Path) -> None:
+    """Remove a folder that an ended ``gamba app`` of this user left, and no other."""
     try:
         made = folder.lstat()
-    except OSError:  # it is gone
+    except OSError:  # removed meanwhile
         return
-    # Anybody may put a folder of this name there, and links into it.
+    # Other users may create a folder or link of this name.
     ours = os.name != "posix" or (made.st_uid == os.geteuid() and not made.st_mode & 0o077)
     if not (stat.S_ISDIR(made.st_mode) and ours):
         return
-    if not (folder / ".lock").is_file():  # another process makes it just now
+    if not (folder / ".lock").is_file():  # another process is creating it
         return
     try:
         with only_process(folder, "serves"):
             shutil.rmtree(folder, ignore_errors=True)
-    except UserError:  # it is in use
+    except UserError:  # in use
         return
 
 
-def quiet(folder: Path) -> None:
-    """Tells gradio, before it is imported, to ask no other machine and where to put its files."""
+def configure_gradio(folder: Path) -> None:
+    """Set gradio's environment before its import: no network access, files in ``folder``."""
     for name in [name for name in os.environ if name.startswith("GRADIO_")]:
-        del os.environ[name]  # one would share the page, another start servers of its own
+        del os.environ[name]  # they could share the page or start other servers
     os.environ |= {
         "GRADIO_TEMP_DIR": str(folder),
         "GRADIO_ANALYTICS_ENABLED": "False",
@@ -175,13 +174,13 @@ def quiet(folder: Path) -> None:
 
 
 def listener(port: int) -> socket.socket:
-    """A socket that has the port, or a free one for 0; nothing is answered before it is served.
+    """Return a socket bound to the port, or to a free one for 0.
 
     Raises:
-        UserError: it is taken or not allowed.
+        UserError: the port is taken or not allowed.
     """
     taken = socket.socket()
-    if os.name == "posix":  # elsewhere it would let two servers have one port
+    if os.name == "posix":  # on Windows it would let two servers share a port
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         taken.bind((HOST, port))
@@ -194,21 +193,21 @@ def listener(port: int) -> socket.socket:
 
 def serve(
     page: gr.Blocks,
-    shelf: Shelf,
+    files: VisitorFiles,
     listening: socket.socket,
     max_mb: int,
     open_browser: bool,
-    turns: MainThread,
+    main_thread: MainThread,
 ) -> None:
-    """Serves the page until Ctrl-C or SIGTERM.
+    """Serve the page until Ctrl-C or SIGTERM.
 
     Args:
         page: of ``interface.build``.
-        shelf: for the visitors' files.
+        files: the visitors' files.
         listening: socket of ``listener``.
         max_mb: largest upload, MB.
-        open_browser: whether the browser is opened; where there is none, the address is printed.
-        turns: what this thread does meanwhile.
+        open_browser: open the browser; the address is printed in any case.
+        main_thread: queue of jobs that must run on the main thread.
 
     Raises:
         KeyboardInterrupt: Ctrl-C.
@@ -221,7 +220,7 @@ def serve(
 
     from .connections import Connection
     from .guard import Guard
-    from .interface import LOOK, inputs, theme
+    from .interface import CSS, inputs, theme
 
     port = listening.getsockname()[1]
     page.state_session_capacity = _PAGES
@@ -240,11 +239,11 @@ def serve(
         pwa=False,
         mcp_server=False,
         theme=theme(),
-        css_paths=LOOK,
+        css_paths=CSS,
     )
     server = uvicorn.Server(
         uvicorn.Config(
-            Guard(app, shelf, inputs(page), max_mb << 20),
+            Guard(app, files, inputs(page), max_mb << 20),
             http=Connection,
             ws="none",
             loop="asyncio",
@@ -255,9 +254,9 @@ def serve(
             proxy_headers=False,
         )
     )
-    new_defect = NewDefect()
-    logging.getLogger("uvicorn.error").addFilter(new_defect)
-    logging.getLogger("asyncio").addFilter(new_defect)
+    new_errors = NewErrors()
+    logging.getLogger("uvicorn.error").addFilter(new_errors)
+    logging.getLogger("asyncio").addFilter(new_errors)
     logging.getLogger("python_multipart").setLevel(logging.ERROR)  # it warns of damaged uploads
     thread = threading.Thread(target=server.run, args=[[listening]], daemon=True)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -271,18 +270,18 @@ def serve(
         print(f"{address} (Ctrl-C ends it)", flush=True)
         if open_browser:
             webbrowser.open(address)
-        turns.work()
+        main_thread.work()
     finally:
-        # It waits for no page that is open, and what breaks off now is no defect.
+        # Open pages are not waited for, and errors of broken connections are expected.
         logging.getLogger("uvicorn.error").disabled = True
         server.should_exit = server.force_exit = True
         thread.join(timeout=5)
 
 
-class NewDefect(logging.Filter):
-    """Lets an error be logged that may be our defect, once for each place that it comes from.
+class NewErrors(logging.Filter):
+    """Log filter that passes each error once per place in the code, against flooding.
 
-    A browser that leaves in the middle is none, and nobody can flood the terminal.
+    Errors of a client that disconnects are dropped.
     """
 
     def __init__(self) -> None:
@@ -290,14 +289,14 @@ class NewDefect(logging.Filter):
         self._seen: set[tuple[str, str, int]] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a record is logged."""
-        kind, _, place = record.exc_info or (None, None, None)
+        """Return True if a record is logged."""
+        kind, _, tb = record.exc_info or (None, None, None)
         if kind is None:
             return True
-        while place and place.tb_next:
-            place = place.tb_next
-        file, line = (place.tb_frame.f_code.co_filename, place.tb_lineno) if place else ("", 0)
-        defect = kind.__name__, file, line
-        new = defect not in self._seen
-        self._seen.add(defect)
+        while tb and tb.tb_next:
+            tb = tb.tb_next
+        file, line = (tb.tb_frame.f_code.co_filename, tb.tb_lineno) if tb else ("", 0)
+        error = kind.__name__, file, line
+        new = error not in self._seen
+        self._seen.add(error)
         return new and kind.__name__ not in ("ClientDisconnect", "LocalProtocolError")

@@ -1,4 +1,4 @@
-"""What the page does with a cut-out object: 3D Gaussians, the viewer, files. No web in here."""
+"""Reconstruction of a cut-out object, its viewer and files; independent of the web server."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from ..gaussians import Gaussians
     from ..model.gamba import Gamba
 
-FRAMES, SIZE = 48, 320  # views of the turntable, and their side in pixels
-# Each kind of file: what its button says, and what follows the object's name.
+FRAMES, SIZE = 48, 320  # views of the turntable; their side in pixels
+# By kind of file: the label of its button, and the suffix after the object's name.
 GAUSSIANS = {kind: (f".{kind.replace('-', ' ')}", splat_suffix(kind)) for kind in SPLAT_FORMATS}
 MESHES = {f"mesh-{kind}": (f".{kind}", f"-mesh.{kind}") for kind in MESH_FORMATS}
 SHOWS = {"gif": ("Turntable .gif", ".gif"), "html": ("Viewer .html", ".html")}
@@ -24,14 +24,14 @@ KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class Reconstruction:
     """One reconstruction.
 
     Attributes:
         name: stem of its files.
         gaussians: ``[N]`` on the CPU, upright, OpenCV's axes.
         camera: distance (object units), field of view and elevation (degrees) of the input's.
-        seconds: how long the model took.
+        seconds: run time of the model.
     """
 
     name: str
@@ -40,13 +40,13 @@ class Made:
     seconds: float
 
 
-def solve(model: Gamba, cut: Cut, elevation: float = 0.0) -> Made:
-    """One forward pass.
+def solve(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
+    """Run one forward pass.
 
     Args:
         model: on any device.
         cut: the object.
-        elevation: of the picture's camera above the object, degrees; what is made stands upright.
+        elevation: of the picture's camera above the object, degrees; the result is upright.
 
     Raises:
         UserError: the mask is empty.
@@ -59,34 +59,36 @@ def solve(model: Gamba, cut: Cut, elevation: float = 0.0) -> Made:
     gaussians = reconstruct(model, rgba).to("cpu")
     seconds = time.perf_counter() - started
     camera = model.config.distance, model.config.fov, elevation
-    return Made(cut.name, set_up(gaussians, elevation), camera, seconds)
+    return Reconstruction(cut.name, set_up(gaussians, elevation), camera, seconds)
 
 
-def viewer(made: Made) -> str:
-    """The viewer of a reconstruction, a whole HTML document.
+def viewer(made: Reconstruction) -> str:
+    """Return the viewer of a reconstruction, a complete HTML document.
 
     Raises:
-        UserError: nothing of the object can be seen.
+        UserError: the object is invisible.
     """
     from ..viewer.page import viewer_page
 
     return viewer_page(made.name, made.gaussians, camera=made.camera)
 
 
-def write(made: Made, kind: str, folder: Path, device: str = "cpu") -> tuple[Path, str | None]:
-    """Writes one file of a reconstruction.
+def write(
+    made: Reconstruction, kind: str, folder: Path, device: str = "cpu"
+) -> tuple[Path, str | None]:
+    """Write one file of a reconstruction.
 
     Args:
         made: the reconstruction.
         kind: one of ``KINDS``.
-        folder: it is there.
+        folder: exists.
         device: device that renders.
 
     Returns:
-        The file, and of Gaussians what of them it holds, in words.
+        The file, and for Gaussians a note on its content, else None.
 
     Raises:
-        UserError: the kind is not known, the object has no surface, a library is missing, or the
+        UserError: the kind is unknown, the object has no surface, a library is missing, or the
             file cannot be written.
     """
     if kind not in KINDS:

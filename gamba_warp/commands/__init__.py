@@ -1,1 +1,1 @@
-"""The commands of ``gamba``, a file each; only ``cli.py`` imports them."""
+"""Commands of ``gamba``, one file each; only ``cli.py`` imports them."""

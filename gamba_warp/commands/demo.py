@@ -1,4 +1,4 @@
-"""``gamba demo``: the whole pipeline on the starter set, by the same commands that a user types."""
+"""``gamba demo``: the whole pipeline on the starter set, by the commands of a user."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..errors import UserError
 from ..files import STARTER, only_process, output_folder
 from ..untrusted.ranges import Minutes, ranged
 
-# An installed package has the shipped model and two pictures, but no posed views and no meshes.
+# An installed package has the shipped model and two pictures, but neither views nor meshes.
 _MAKE = "make setup unpacks it in a checkout; elsewhere give the folder of one by --starter"
 
 
@@ -22,18 +22,18 @@ def demo_command(
     lpips: bool = True,
     fresh: bool = False,
 ) -> int:
-    """Reconstructs and evaluates with the shipped model, then trains one, on one page.
+    """Reconstruct and evaluate with the shipped model, then train one, and write a page.
 
-    The page is there as soon as the shipped model is through, and again when all is done. A demo
-    that was interrupted goes on where it was; what is done is not done again. An
-    installed package lacks most of the starter set, and says where to get it.
+    The page is written after the shipped model's part, and again at the end. An interrupted demo
+    resumes and skips finished stages. An installed package lacks most of the starter set, and tells
+    where to get it.
 
     Args:
         out: Folder for everything; OUT/index.html is the page.
         minutes: Training time.
         starter: The starter set's folder.
-        lpips: Fetch the LPIPS weights (64 MB) for the evaluation, if they are not there.
-        fresh: Remove what an earlier demo made in OUT, and start anew.
+        lpips: Fetch the LPIPS weights (64 MB) for the evaluation, if they are missing.
+        fresh: Remove the results of an earlier demo in OUT, and start again.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT
     from ..pages.demo import DemoResults
@@ -63,19 +63,21 @@ def demo_command(
             if lpips:
                 stages.gamba("weights", "lpips", may_fail=True)
             _shipped(stages, results, starter, out / "truth")
-            _write(results, out, minutes, "Training still runs: this page gets its second half.")
+            _write(
+                results, out, minutes, "Training still runs; the second half of this page follows."
+            )
             _train_here(stages, results, starter / "data", minutes)
         except Stopped as stopped:
-            print("stopped; the same command goes on from here")
+            print("stopped; the same command resumes from here")
             return stopped.code
         spent = f"{(time.perf_counter() - started + stages.seconds) / 60:.1f} minutes"
-        _write(results, out, minutes, f"All of it took {spent}.")
+        _write(results, out, minutes, f"The whole demo took {spent}.")
         print(f"wrote {out / 'index.html'} after {spent}")
     return 0
 
 
 def _shipped(stages, results, starter: Path, truth: Path) -> None:
-    """What the shipped model makes of pictures and objects that it was not trained on."""
+    """Run the shipped model on pictures and objects outside its training set."""
     model, views, data = results.shipped, results.views, starter / "data"
     stages.gamba(
         *("reconstruct", results.icons, "--checkpoint", model, "--out", results.results),
@@ -95,7 +97,7 @@ def _shipped(stages, results, starter: Path, truth: Path) -> None:
         shutil.copyfile(starter / "meshes" / ply.name, truth / ply.name)
     stages.gamba(
         *("eval-geometry", views / "gaussians", truth),
-        # The starter set's meshes lie in the world of its views.
+        # The starter set's meshes are in the world of its views.
         *("--frame", "reference", "--data", data, "--up", "z", "--out", results.shapes),
         makes=[results.shapes / "report.json"],
         may_fail=True,
@@ -103,7 +105,7 @@ def _shipped(stages, results, starter: Path, truth: Path) -> None:
 
 
 def _train_here(stages, results, data: Path, minutes: float) -> None:
-    """Trains a model from random weights, and measures it on the same objects."""
+    """Train a model from random weights, and evaluate it on the same objects."""
     model = results.run / "model.safetensors"
     stages.gamba(
         *("train", data, "--preset", "rays", "--minutes", minutes, "--out", results.run),
@@ -126,8 +128,8 @@ def _write(results, out: Path, minutes: float, state: str) -> None:
     from ..pages.demo import write_demo
 
     text = (
-        f"First, what the model that ships with this project ({results.shipped.name}) makes of "
-        f"pictures of objects it has never seen; nothing of it was trained on this machine. Then a "
-        f"model that was trained here, from nothing, for {minutes:g} minutes. {state}"
+        f"First, results of the shipped model ({results.shipped.name}) on pictures of unseen "
+        "objects; it was not trained on this machine. Then a model trained here from scratch for "
+        f"{minutes:g} minutes. {state}"
     )
     write_demo(out / "index.html", results, text)

@@ -51,34 +51,34 @@ def export_command(
     drop_bad: bool = False,
     device: DeviceChoice = "auto",
 ) -> int:
-    """Turns files of Gaussians into meshes, other splat formats, pages and turntables.
+    """Turn files of Gaussians into meshes, other splat formats, pages and turntables.
 
-    Meshes are NAME-mesh.FORMAT, splats NAME.FORMAT (compressed-ply: NAME.compressed.ply); files
-    of that name are replaced, but never one that is read.
+    Meshes are NAME-mesh.FORMAT, splats NAME.FORMAT (compressed-ply: NAME.compressed.ply). Existing
+    files are replaced, except inputs.
 
     Args:
         inputs: Gaussians (.ply, .splat, .spz, .glb), or folders of them.
-        files: What is written.
+        files: Outputs to write.
         surface: Method: tsdf (fused depth of many views) or density (level set; fattens thin
             parts).
         voxels: Number of voxels along the object's longest side.
-        views: Number of pictures from all around, for depth and colours.
-        pixels: Side of these pictures.
-        faces: Simplify to at most so many; 0 keeps all. 50,000 if not given, 10,000 with --texture.
+        views: Number of views around the object, for depth and colours.
+        pixels: Side of these views, pixels.
+        faces: Largest number of faces; 0 keeps all. By default 50,000, with --texture 10,000.
         colors: Give the vertices colours (.stl has none).
-        texture: Side in pixels of a picture of the colours, in the .glb, and beside the .obj with a
-            .mtl; 0 for none. 1024 is plenty for what the models make.
-        close_holes: Close holes with at most so many edges.
+        texture: Side of a colour texture in pixels, in the .glb, or beside the .obj with a .mtl; 0
+            for none. 1024 is enough for the models.
+        close_holes: Largest number of edges of holes that are closed.
         min_component: Remove parts with a smaller share of the faces.
         largest: Keep the largest part only.
         smooth: Number of smoothing steps.
-        elevation: Degrees by which the camera of turntable and 3D viewer stands above the object.
-        fov: Its field of view, degrees; 49.1 if not given. Without --distance the object stays as
-            large.
-        distance: Its distance from the object's centre, in units of the longest side; 1.5 if not
-            given.
-        drop_bad: Leave out Gaussians that cannot be drawn (a value that is not finite, a rotation
-            of length zero), and say how many; without it such a file is refused.
+        elevation: Elevation of the camera of turntable and 3D viewer above the object, degrees.
+        fov: Its field of view, degrees; 49.1 by default. Without --distance the object keeps its
+            size in the picture.
+        distance: Its distance from the object's centre, in units of the longest side; 1.5 by
+            default.
+        drop_bad: Leave out invalid Gaussians (a value that is not finite, a rotation of length
+            zero), and print their number; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
     from tqdm import tqdm

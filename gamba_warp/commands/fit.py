@@ -1,4 +1,4 @@
-"""``gamba fit``: every object of a dataset fitted on its own, and measured on held-out views."""
+"""``gamba fit``: Gaussians fitted to each object of a dataset, measured on held-out views."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ def fit_command(
     seed: Seed = 0,
     device: DeviceChoice = "auto",
 ) -> int:
-    """Fits Gaussians to the posed views of each object, without any model.
+    """Fit Gaussians to the posed views of each object, without a model.
 
     Args:
         folder: One object (transforms.json and RGBA pictures), or a dataset of them.
         out: Folder for report.json, report.md, objects/, gaussians/ and strips/ (truth | fitted).
-        objects: Names of the objects to fit; all if not given.
+        objects: Names of the objects to fit; all by default.
         split: Part of the dataset.
         limit: Number of objects to fit, evenly spaced in the order of names.
-        held_out: One view of so many is kept from the fit and measured; 0 keeps none.
+        held_out: Every so many views one is held out for the metrics; 0 for none.
         steps: Number of Adam steps.
-        minutes: Time limit of each object; the learning rates then fall with the time.
-        gaussians: Number of Gaussians in each object; the largest number with mcmc and default.
-        strategy: Fixed moves what hardly shows, and the number stays. Mcmc and default are those of
-            gsplat, which must be installed; they start with half the number and add to it.
+        minutes: Time limit of each object; the learning rates then decay with time.
+        gaussians: Number of Gaussians per object; the maximum with mcmc and default.
+        strategy: Fixed relocates nearly invisible Gaussians and keeps the number. Mcmc and default
+            are those of gsplat, which must be installed; they start with half the number and grow.
         size: Height of the pictures; the files' own by default.
-        rasterize_mode: Antialiased fits small pictures better, but files do not hold the mode, and
+        rasterize_mode: Antialiased fits small pictures better, but files do not store the mode, and
             most viewers (and eval-views) are classic.
         seed: Seed of all random numbers.
         device: Device that computes; auto is the GPU if there is one.
@@ -62,7 +62,7 @@ def fit_command(
     if held_out == 1:
         raise UserError("--held-out 1: would leave no view for the fit; 2 or more, or 0 for none")
     if minutes is not None and strategy != "fixed":
-        reason = "its schedule counts steps, and a time limit would cut it off; give --steps alone"
+        reason = "its schedule counts steps, which a time limit would cut off; give only --steps"
         raise UserError(f"--minutes {minutes:g} with --strategy {strategy}: {reason}")
     chosen = pick_device(device)
     dataset = open_dataset(folder, split)
@@ -80,7 +80,7 @@ def fit_command(
         seed=seed,
     )
     if strategy != "fixed":
-        make_strategy(config)  # a missing gsplat ends the command before it writes
+        make_strategy(config)  # fails without gsplat, before anything is written
     job = FitJob(dataset, output_folder(out), config, held_out, size, chosen)
     text, failures = fit_objects(job, uids)
     print(text)

@@ -1,4 +1,4 @@
-"""What a machine has, how fast and how exact it is: ``gamba bench, stress, gpu-check, doctor``."""
+"""Checks and benchmarks of a machine: ``gamba bench, stress, gpu-check, doctor``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..gpu_check import MINUTES, StepName
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 from ..versions import used_versions
 
-# What is measured -> the module with ``cases(settings)``, imported when it is asked for.
+# Suite -> the module with its ``cases(settings)``, imported when needed.
 SUITES = {
     "scan": "gamba_warp.kernels.bench.cases.scan",
     "conv": "gamba_warp.kernels.bench.cases.conv",
@@ -46,24 +46,24 @@ def bench_command(
     static: bool = False,
     only: tuple[str, ...] = (),
 ) -> int:
-    """Measures run time against error, with what is installed beside us.
+    """Measure run time and error, also of other installed packages.
 
-    Every variant is compared with float64 before it is timed; what fails gets no time. Writes
-    bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
+    Every variant is compared with float64 before it is timed; a failed one is not timed. Writes
+    bench.json, bench.md and bench.html. Ctrl-C keeps the results so far.
 
     Args:
         what: scan, conv, raster, block, model, or all.
         device: Device to measure; auto is the GPU if there is one.
-        quick: Small sizes and a few rounds, which take seconds.
+        quick: Small sizes and a few rounds, in seconds.
         full: All sizes, many rounds, and the torch loop at full length.
-        peers: Also measure mambapy, mamba-ssm, causal-conv1d, gsplat and gswarp, where installed.
+        peers: Also measure mambapy, mamba-ssm, causal-conv1d, gsplat and gswarp, if installed.
         out: Folder for the results. With --render it may be a .md or .html file.
-        threads: Number of CPU threads; torch's own number if not given.
+        threads: Number of CPU threads; by default torch's.
         compare: An older bench.json; prints the ratios of the times.
         render: Measure nothing; make the tables and the page of these JSON files.
-        static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
+        static: Measure nothing; compile the CUDA kernels, without a GPU, and write their resources
             (registers, stack, shared memory, occupancy) to static.json and static.md.
-        only: Measure only these cases, by their full names, as "one call".
+        only: Measure only these cases, by full name, such as "one call".
     """
     from ..measure import suites
 
@@ -85,13 +85,13 @@ def bench_command(
     written = f"wrote {folder / 'bench.json'}, bench.md and bench.html"
     print(f"{suites.summary(document, old)}; {written}")
     if document["interrupted"]:
-        print("interrupted; what was measured is kept")
+        print("interrupted; the results so far are kept")
         return 130
     return 1 if suites.failed_records(document) else 0
 
 
 def load_suite(op: str) -> ModuleType:
-    """The module with the cases of one of ``SUITES``."""
+    """Import the module with the cases of one of ``SUITES``."""
     return importlib.import_module(SUITES[op])
 
 
@@ -110,20 +110,20 @@ def stress_command(
     shrink_seconds: Annotated[float, Meta(ge=0, le=86_400)] = 30.0,
     replay: tuple[Path, ...] = (),
 ) -> int:
-    """Runs random and hostile cases of the kernels and the model, each against float64.
+    """Compare kernels and model with float64 on random and hostile cases.
 
-    Forward results and all gradients; a failing case is made small and written to a file that
-    --replay runs again. Writes stress.json and stress.md. Ctrl-C keeps what was found.
+    Checks forward results and all gradients. A failing case is shrunk and written to a file for
+    --replay. Writes stress.json and stress.md. Ctrl-C keeps the results so far.
 
     Args:
         what: scan (with the convolution), raster, model, or all (of these).
         seed: The same seed gives the same cases in the same order.
-        minutes: Time limit; 1 if not given, or none with --cases.
-        cases: Number of cases; as many as fit in --minutes if not given.
+        minutes: Time limit; by default 1, or none with --cases.
+        cases: Number of cases; by default as many as fit in --minutes.
         device: Device of the kernels; auto is the GPU if there is one.
-        threads: Number of CPU threads; torch's own number if not given.
+        threads: Number of CPU threads; by default torch's.
         out: Folder for the summary and the failing cases.
-        shrink_seconds: Time limit for making one failing case small.
+        shrink_seconds: Time limit for shrinking one failing case.
         replay: Run only these files of failing cases.
     """
     import torch
@@ -146,7 +146,7 @@ def stress_command(
     run.write()
     print(f"{run.summary()}; wrote {out / 'stress.json'}")
     if run.about["interrupted"]:
-        print("interrupted; what was found is kept")
+        print("interrupted; the results so far are kept")
         return 130
     return 1 if run.failures else 0
 
@@ -160,17 +160,17 @@ def gpu_check_command(
     minutes: Minutes = MINUTES,
     steps: tuple[StepName, ...] = (),
 ) -> int:
-    """Runs kernel checks, full-size inference and the benchmark on this machine.
+    """Run kernel checks, full-size inference and the benchmark on this machine.
 
-    Writes gpu-check.json and gpu-check.md after every item, and says what it could not do. The
-    exit code is 0 if all that could be run passed, 1 if something failed, 2 without a CUDA device.
+    Writes gpu-check.json and gpu-check.md after every item, with skipped items and their reasons.
+    Exit code 0 if all executed items passed, 1 if one failed, 2 without a CUDA device.
 
     Args:
-        device: "cpu" tries the command itself, with --quick in seconds.
+        device: "cpu" tests the command itself, with --quick in seconds.
         quick: Use tiny sizes.
         out: Folder for the results.
         minutes: Time limit of the whole run.
-        steps: Steps to take; all if not given.
+        steps: Steps to run; all by default.
     """
     from ..gpu_check.check import run_gpu_check
 
@@ -178,7 +178,7 @@ def gpu_check_command(
 
 
 def doctor_command(warm_up: bool = False) -> int:
-    """Says what this machine has and can run, and what is missing.
+    """Print what this machine has and can run, and what is missing.
 
     Args:
         warm_up: Also compile the kernels for this machine's devices, and print the time.

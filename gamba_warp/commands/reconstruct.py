@@ -20,16 +20,16 @@ from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """From where the picture was taken, and its results are shown."""
+    """Camera of the picture, and of its results."""
 
     elevation: Elevation = 0.0
-    """Degrees by which the camera of the picture stood above the object, looking down; all results
-    are turned so that the object stands upright."""
+    """Elevation of the picture's camera above the object, degrees; all results are rotated so that
+    the object is upright."""
     fov: Fov | None = None
-    """Field of view of turntable, sheet and 3D viewer, degrees; the model's (49.1) if not given.
-    Without --distance the object stays as large."""
+    """Field of view of turntable, sheet and 3D viewer, degrees; by default the model's (49.1).
+    Without --distance the object keeps its size in the picture."""
     distance: Distance | None = None
-    """Distance of their camera, object units; the model's (1.5) if not given."""
+    """Distance of their camera, object units; by default the model's (1.5)."""
 
 
 @ranged
@@ -51,26 +51,26 @@ def reconstruct_command(
     precision: Precision = "float32",
     times: bool = False,
 ) -> int:
-    """Turns pictures of single objects into 3D Gaussians, one forward pass each.
+    """Turn pictures of single objects into 3D Gaussians, in one forward pass each.
 
     Args:
         images: Picture files, or folders of them.
-        checkpoint: Trained model (.safetensors); the shipped model if not given.
-        encoder_weights: The image encoder's weights, where the model has a pretrained one.
-        files: What is written.
-        camera: From where the picture was taken, and its results are shown.
+        checkpoint: Trained model (.safetensors); the shipped model by default.
+        encoder_weights: The image encoder's weights, if the model has a pretrained one.
+        files: Outputs to write.
+        camera: Camera of the picture, and of its results.
         sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
-        mask: Picture that is white where the object is (for a single image).
-        matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or an address of rembg's.
+        mask: Picture that is white on the object (for a single image).
+        matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or a URL of one of rembg's.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
-        recenter: Bring the object into the middle of the picture, at the size of training; else it
-            stays where and as large as it is in a square picture.
-        detail: Into how many Gaussians a side each of the front may split, so that it is as sharp
-            as the picture; if not given, the most for which the cut-out has the pixels.
-        save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
+        recenter: Centre the object, at the size of training; else it keeps its position and size in
+            a square picture.
+        detail: Number of Gaussians per side that each of the front may split into, for the
+            picture's sharpness; by default the most that the cut-out's pixels allow.
+        save_inputs: Also write each cut-out as NAME-input.png, which may be edited and used again.
         device: Device that computes; auto is the GPU if there is one.
-        precision: That of the network's products; auto is bfloat16 where that is faster.
-        times: Print what each stage took.
+        precision: Precision of the network's matrix products; auto is bfloat16 if that is faster.
+        times: Print the time of each stage.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, FILE_NAME, load_model
     from ..model.detail import checked_detail
@@ -80,7 +80,7 @@ def reconstruct_command(
     from ..pages.sheet import Sheet
     from ..photo.cutout import Ways, cut_out
 
-    pictures, failures = _found(images, mask)
+    pictures, failures = _find_pictures(images, mask)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
     if not checkpoint.exists():
         raise UserError(
@@ -104,7 +104,7 @@ def reconstruct_command(
         output_folder(sheet.parent)
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
-    checked_detail(detail, model.config, 0)  # before a picture is cut out
+    checked_detail(detail, model.config, 0)  # before any cut-out
     ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
     output_folder(files.out)
 
@@ -128,10 +128,10 @@ def reconstruct_command(
     return report(len(pictures), "picture", failures, files.out)
 
 
-def _found(
+def _find_pictures(
     images: tuple[Path, ...], mask: Path | None
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """The picture files, and what gives none with the reason. Raises UserError without a file."""
+    """Return picture files, and failures with reasons. Raises UserError without a file."""
     from ..images import find_pictures
 
     if not images:

@@ -1,4 +1,4 @@
-"""``gamba render``: files of Gaussians along a path of cameras, to pictures and movies."""
+"""``gamba render``: pictures and movies of Gaussians along a camera path."""
 
 from __future__ import annotations
 
@@ -37,29 +37,29 @@ def render_command(
     drop_bad: bool = False,
     device: DeviceChoice = "auto",
 ) -> int:
-    """Renders Gaussians along a path of cameras: to a GIF, a video, or a folder of pictures.
+    """Render Gaussians along a camera path to a GIF, a video, or a folder of pictures.
 
-    A turntable and a spiral go around the object's centre, with -y up as in files that gamba
-    writes. The cameras of a file are in the frame of the file of Gaussians.
+    A turntable and a spiral go around the object's centre, with -y up as in gamba's files. Cameras
+    of a file are in the frame of the Gaussians.
 
     Args:
         inputs: Gaussians (.ply in the 3DGS layout), or folders of them.
-        trajectory: turntable, spiral (two turns, up and down), or a file of cameras: ours
+        trajectory: turntable, spiral (two turns, up and down), or a file of cameras: gamba's
             (docs/cameras.md), transforms.json, nerfstudio's camera path, 3DGS's cameras.json.
-        out: Folder for the results; of a single input also a .gif, an .mp4, or a .png of one view.
-        kind: What is written; png is a folder of pictures with their cameras.json. By default what
-            --out says, else gif.
-        size: Width of the pictures, or width and height, pixels; 512, or what the file states.
+        out: Folder for the results; for a single input also a .gif, an .mp4, or a .png of one view.
+        kind: Kind of output; png is a folder of pictures with their cameras.json. By default that
+            of --out, else gif.
+        size: Width of the pictures, or width and height, pixels; by default the file's, else 512.
         frames: Number of pictures of a turntable (48) or spiral (96).
-        fps: Pictures a second; by default a turn takes 3 seconds, and a file says its own.
-        elevation: Degrees by which a turntable's camera stands above the object.
-        fov: Field of view of the picture's shorter side, degrees; 49.1 if not given. Without
-            --distance the object stays as large.
+        fps: Pictures per second; by default the file's, else 3 seconds per turn.
+        elevation: Elevation of a turntable's camera above the object, degrees.
+        fov: Field of view of the picture's shorter side, degrees; 49.1 by default. Without
+            --distance the object keeps its size in the picture.
         distance: Distance of the camera from the object's centre, in units of its longest side.
         background: white, black, gray, #rrggbb, or none (transparent, png only).
-        depth: Also pictures of depth, 16 bits (png only).
-        drop_bad: Leave out Gaussians that cannot be drawn (a value that is not finite, a rotation
-            of length zero), and say how many; without it such a file is refused.
+        depth: Also 16-bit depth maps (png only).
+        drop_bad: Leave out invalid Gaussians (a value that is not finite, a rotation of length
+            zero), and print their number; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
     from ..pages.export import find_gaussians, read_with_warning

@@ -31,23 +31,23 @@ def view_command(
     distance: Distance | None = None,
     drop_bad: bool = False,
 ) -> None:
-    """Shows Gaussians or a training run in a browser, as one HTML page without a network.
+    """Show Gaussians or a training run in a browser, as one self-contained HTML page.
 
     Args:
         file: Gaussians (.ply, .splat, .spz, .glb), or the folder of a training run.
-        out: File for the page; a temporary file if not given.
-        mesh: A mesh of the same object, to be shown too (.glb, .obj, .ply, .stl).
-        mesh_frame: Axes of the mesh; opengl is y up, as gamba writes meshes unless asked otherwise.
+        out: File for the page; a temporary file by default.
+        mesh: A mesh of the same object, shown too (.glb, .obj, .ply, .stl).
+        mesh_frame: Axes of the mesh; opengl is y up, gamba's default for meshes.
         serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
         port: Port of --serve; 0 picks a free one.
         open_browser: Open the browser.
-        elevation: Degrees by which the camera stands above the object at the start.
-        fov: Field of view, degrees; 49.1 if not given. Without --distance the object stays as
-            large.
-        distance: Distance of the camera from the object's centre at the start, in units of its
-            longest side; 1.5 if not given.
-        drop_bad: Leave out Gaussians that cannot be drawn (a value that is not finite, a rotation
-            of length zero), and say how many; without it such a file is refused.
+        elevation: Initial elevation of the camera above the object, degrees.
+        fov: Field of view, degrees; 49.1 by default. Without --distance the object keeps its size
+            in the picture.
+        distance: Initial distance of the camera from the object's centre, in units of its longest
+            side; 1.5 by default.
+        drop_bad: Leave out invalid Gaussians (a value that is not finite, a rotation of length
+            zero), and print their number; without it such a file is refused.
     """
     import tempfile
 
@@ -89,7 +89,7 @@ def view_command(
 
 
 def _open(address: str) -> None:
-    """Opens the address in a browser, or says in one line that there is none."""
+    """Open the address in a browser, or print that none was found."""
     import webbrowser
 
     if not webbrowser.open(address):

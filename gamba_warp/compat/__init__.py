@@ -1,4 +1,4 @@
-"""Other packages' interfaces over our kernels: change the import, or take the packages' names."""
+"""Other packages' interfaces over our kernels, under their names or ours."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from email.message import Message
 from types import ModuleType
 from typing import Any
 
-# The versions whose interfaces these are.
+# Versions of the interfaces.
 VERSIONS = {"mamba_ssm": "2.3.2", "causal_conv1d": "1.7.0", "gsplat": "1.5.3"}
-# What takes the place of gsplat's own where gsplat is installed: the rest of it is torch alone.
+# Modules replaced in an installed gsplat; the others need only torch.
 _OF_GSPLAT = ("gsplat", "gsplat.cuda._wrapper", "gsplat.relocation", "gsplat.rendering")
 _HERE = __name__
 __all__ = ["take_names"]
 
 
 def take_names(*packages: str) -> None:
-    """Lets ``import mamba_ssm``, ``causal_conv1d`` and ``gsplat`` give what is in this folder.
+    """Make ``import mamba_ssm``, ``causal_conv1d`` and ``gsplat`` load the modules of this folder.
 
-    It is called once, before the first of these imports, and holds for the whole process. Their
-    versions are there too for who asks ``importlib.metadata``. Where gsplat is installed, all of
-    it that needs no CUDA (its strategies, writers of files, helpers) stays its own, over our
-    functions.
+    Call it once, before the first of these imports; it holds for the whole process.
+    ``importlib.metadata`` reports their versions. An installed gsplat keeps its parts without CUDA
+    (strategies, exporters, helpers), which then call our functions.
 
     Args:
-        packages: some of ``VERSIONS``; none are all of them.
+        packages: some of ``VERSIONS``; all by default.
 
     Raises:
         ImportError: a package of that name has been imported already.
@@ -51,13 +50,13 @@ def take_names(*packages: str) -> None:
             if under.partition(".")[0] == name and (theirs is None or under in _OF_GSPLAT):
                 sys.modules[under] = module
         if theirs is not None:
-            sys.modules[name] = _over(own, name, theirs.submodule_search_locations)
+            sys.modules[name] = _overlay(own, name, theirs.submodule_search_locations)
     if not any(isinstance(finder, _Versions) for finder in sys.meta_path):
         sys.meta_path.append(_Versions())
 
 
-def _over(own: ModuleType, name: str, folders: Any) -> ModuleType:
-    """A package with the names of ours and, for what is not among its modules, other folders."""
+def _overlay(own: ModuleType, name: str, folders: Any) -> ModuleType:
+    """Make a package with our names that finds its other modules in the given folders."""
     made = ModuleType(name, own.__doc__)
     kept = {"__name__", "__package__", "__loader__", "__spec__"}
     vars(made).update({key: value for key, value in vars(own).items() if key not in kept})
@@ -67,10 +66,10 @@ def _over(own: ModuleType, name: str, folders: Any) -> ModuleType:
 
 
 class _Versions(importlib.metadata.DistributionFinder):
-    """Finds the versions of the packages whose names are taken, behind those that are installed."""
+    """Finder of the versions of replaced packages, after the installed ones."""
 
     def find_spec(self, *_: Any) -> None:
-        """No module: all are imported already."""
+        """Find no module: all are imported already."""
 
     def find_distributions(
         self, context: importlib.metadata.DistributionFinder.Context | None = None
@@ -78,10 +77,10 @@ class _Versions(importlib.metadata.DistributionFinder):
         asked = getattr(context, "name", None)
         for name, version in VERSIONS.items():
             if asked and asked.lower().replace("-", "_") == name and name in sys.modules:
-                yield _Said(name, version)
+                yield _Distribution(name, version)
 
 
-class _Said(importlib.metadata.Distribution):
+class _Distribution(importlib.metadata.Distribution):
     def __init__(self, name: str, version: str):
         self._known = Message()
         self._known["Name"], self._known["Version"] = name, version
@@ -91,7 +90,7 @@ class _Said(importlib.metadata.Distribution):
         return self._known
 
     def read_text(self, filename: str) -> None:
-        """There are no files."""
+        """Return None: there are no files."""
 
     def locate_file(self, path: Any) -> Any:
         return path

@@ -1,4 +1,4 @@
-"""``python -m gamba_warp.compat SCRIPT …`` or ``-m MODULE …``: a program over our kernels."""
+"""``python -m gamba_warp.compat SCRIPT …`` or ``-m MODULE …``: run a program on our kernels."""
 
 import runpy
 import sys
@@ -8,7 +8,7 @@ from . import take_names
 
 
 def main(arguments: list[str]) -> None:
-    """Runs a program after the names are taken, as ``python`` itself would."""
+    """Call ``take_names``, then run a program like ``python``."""
     if arguments[:1] == ["-m"] and len(arguments) > 1:
         sys.argv = arguments[1:]
         take_names()

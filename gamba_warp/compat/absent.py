@@ -1,6 +1,6 @@
-"""Names of another package that we lack: they can be imported, and say so when they are used.
+"""Placeholders for missing names of another package: importable, but they raise when used.
 
-A program imports more than it calls, and its import line should not end it.
+Programs import more than they call, so a missing name should not fail at the import.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 
 class _Absent(type):
-    """The kind of such a name, which is a class, so that an annotation may hold it."""
+    """Metaclass of placeholders, which are classes so that annotations may use them."""
 
     def __call__(cls, *args: Any, **kwargs: Any) -> NoReturn:
         raise NotImplementedError(cls.__doc__)
@@ -22,7 +22,7 @@ class _Absent(type):
     __instancecheck__ = __subclasscheck__ = __call__
 
     def __getattr__(cls, name: str) -> NoReturn:
-        if name.startswith("_"):  # what Python and its tools look for in any class
+        if name.startswith("_"):  # probed by Python and its tools in any class
             raise AttributeError(f"{cls.__name__} has no attribute {name!r}")
         raise NotImplementedError(cls.__doc__)
 
@@ -30,21 +30,21 @@ class _Absent(type):
 def complete(
     package: str, original: str, why: str, names: dict[str, str], found: tuple[str, ...] = ()
 ) -> dict[str, list[str]]:
-    """Gives a package those names and modules of the original that it lacks.
+    """Add placeholders for the names and modules of the original that a package lacks.
 
-    Calling such a name, subclassing it, asking for its instances or for an attribute of it raises
-    ``NotImplementedError`` with one line.
+    Calling or subclassing a placeholder, an instance check against it, or access to an attribute
+    raises ``NotImplementedError`` with one line.
 
     Args:
-        package: the package's ``__name__``; its own names must be there already.
+        package: the package's ``__name__``; its own names must exist already.
         original: the name of the other package, for the line.
         why: the end of the line.
-        names: by module of the original, relative to it, names with blanks between them. A module
-            that is not here is made; of its names those that the package has are the package's.
-        found: what the package's ``__getattr__`` finds.
+        names: by module of the original, relative to it, names separated by blanks. Missing modules
+            are made; they take names that the package has from it.
+        found: names of the package's ``__getattr__``.
 
     Returns:
-        By module the names that are not here.
+        The missing names by module.
     """
     root = sys.modules[package]
     own = {name for name, value in vars(root).items() if not isinstance(value, _Absent)} | {*found}
@@ -77,7 +77,7 @@ def _of_root(root: ModuleType, names: set[str]) -> Any:
 
 
 def _module(name: str) -> ModuleType:
-    """The module of that name; where there is none an empty one is made."""
+    """Return the module of that name; make an empty one if it is missing."""
     parent, _, last = name.rpartition(".")
     if name not in sys.modules:
         above = _module(parent)

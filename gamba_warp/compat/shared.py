@@ -1,4 +1,4 @@
-"""What the interfaces share: checks, which name the argument in one line, and rows of states."""
+"""Checks of arguments, and updates of rows of states, shared by the interfaces."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ def check_tensor(
     dtypes: tuple[torch.dtype, ...] = (),
     optional: bool = False,
 ) -> None:
-    """Refuses what is no tensor, or one of another shape or dtype.
+    """Refuse a value that is not a tensor of an allowed shape and dtype.
 
     Args:
         name: of the argument.
-        value: what it got.
-        shapes: those that it may have, all if there are none. A word is any number, "S >= 3" one
-            from 3 on, and ".." in the first place any number of dimensions.
-        dtypes: those that it may have, all if there are none.
-        optional: whether it may be None.
+        value: the argument.
+        shapes: allowed ones; any by default. A word stands for any number, "S >= 3" for at least 3,
+            and a leading ".." for any number of dimensions.
+        dtypes: allowed ones; any by default.
+        optional: None is allowed.
 
     Raises:
-        TypeError: it is no tensor, or has another dtype.
+        TypeError: it is not a tensor, or has another dtype.
         ValueError: it has another shape.
     """
     if optional and value is None:
@@ -59,7 +59,7 @@ def _fits(size: tuple[int, ...], shape: Shape) -> bool:
 
 
 def one_of(name: str, value: Any, *allowed: Any) -> None:
-    """Refuses an option at other values than the allowed ones.
+    """Refuse a value of an option that is not allowed.
 
     Raises:
         ValueError: it has another value.
@@ -71,7 +71,7 @@ def one_of(name: str, value: Any, *allowed: Any) -> None:
 
 
 def positive(**numbers: float) -> None:
-    """Refuses numbers that are not above 0, by their names.
+    """Refuse numbers that are not above 0, by name.
 
     Raises:
         ValueError: one is not.
@@ -82,7 +82,7 @@ def positive(**numbers: float) -> None:
 
 
 def side(**pixels: int) -> None:
-    """Refuses sizes of a picture that are no integers from 1 to 32,768, by their names.
+    """Refuse sizes of a picture that are not integers from 1 to 32,768.
 
     Raises:
         ValueError: one is not.
@@ -93,7 +93,7 @@ def side(**pixels: int) -> None:
 
 
 def one_device(tensors: dict[str, Any]) -> None:
-    """Refuses tensors of several devices, or of one that has no kernels.
+    """Refuse tensors on several devices, or on an unsupported one.
 
     Raises:
         ValueError: they are on more than one, or on one that is neither a CPU nor CUDA.
@@ -106,12 +106,12 @@ def one_device(tensors: dict[str, Any]) -> None:
 
 @torch.no_grad()
 def of_rows(update: Callable[[Tensor], Tensor], state: Tensor, indices: Tensor | None) -> Tensor:
-    """Updates those rows of a state that indices choose; returns what ``update`` returns for them.
+    """Update selected rows of a state, and return the output of ``update`` for them.
 
     Args:
-        update: takes ``[B, ..]`` rows, updates them in place and returns the output ``[B, ..]``.
+        update: updates rows ``[B, ..]`` in place and returns the output ``[B, ..]``.
         state: ``[rows, ..]``, updated in place.
-        indices: ``[B]``; below 0 the output is 0 and no row is touched. Or None: all rows.
+        indices: ``[B]``; for negative ones the output is 0 and no row changes. None: all rows.
     """
     if indices is None:
         return update(state)

@@ -1,4 +1,4 @@
-"""All that only a CUDA machine can tell, in one run of a few minutes: its steps and their time.
+"""Steps and time limits of ``gamba gpu-check``, the checks that need a CUDA machine.
 
 This module imports nothing slow.
 """
@@ -17,7 +17,7 @@ class Step(NamedTuple):
     Attributes:
         name: of ``check.run_step``.
         seconds: time limit in a run of ``MINUTES``, compilation included.
-        packages: of which at least one is needed, and CUDA with it.
+        packages: at least one is needed, with CUDA.
     """
 
     name: StepName
@@ -25,12 +25,12 @@ class Step(NamedTuple):
     packages: tuple[str, ...] = ()
 
 
-# What matters most comes first; together they may want more than the whole time.
+# In order of importance; together they may exceed the total time.
 STEPS = (
     Step("checks", 160),
     Step("inference", 110),
     Step("bench", 160),
     Step("peers-conv", 60, ("causal-conv1d",)),
     Step("peers-scan", 90, ("mamba-ssm", "mambapy")),
-    Step("peers-raster", 480, ("gsplat", "gswarp")),  # gsplat compiles itself on first use
+    Step("peers-raster", 480, ("gsplat", "gswarp")),  # gsplat compiles on first use
 )

@@ -1,9 +1,9 @@
-"""``gamba gpu-check``: all that only a CUDA machine can tell, in one run of a few minutes.
+"""``gamba gpu-check``: checks that need a CUDA machine, in one run of a few minutes.
 
-Needs torch, numpy and warp-lang, nothing else, and no installation: in a bare checkout
-``python -m gamba_warp.gpu_check`` is the same command. Each step runs in a process of its own,
-within its time, and writes both files after every item. So whatever ends a step, a crash of another
-package or the clock, loses no more than the item under way; the files say what was not done.
+It needs only torch, numpy and warp-lang, and no installation: in a bare checkout
+``python -m gamba_warp.gpu_check`` is the same command. Each step runs in its own process with a
+time limit, and writes both files after every item. So a crash or a timeout loses only the current
+item; the files list skipped items.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ from .checks import LeftOut, checks
 
 FORMAT = "gamba_warp.gpu_check.2"
 _GRACE = 15.0  # seconds that the last item of a step may take
-_LEAST = 5.0  # seconds below which no step begins
+_LEAST = 5.0  # seconds left to begin a step
 _LATE = "its {:.0f} s were up"
-_STEP = "import sys; from {} import run_step; run_step(*sys.argv[1:])"  # of a process of its own
+_STEP = "import sys; from {} import run_step; run_step(*sys.argv[1:])"  # run in a child process
 _Item = TypeVar("_Item")
-# These cases are timed first, since the time may end before the list does; all others follow.
+# Timed first, because the time may not suffice for all cases.
 _FIRST = [
     *(("scan", "operator"), ("raster", "scene"), ("conv", "operator"), ("block", "one block")),
     *(("block", "backbone"), ("raster", "32 views"), ("scan", "training batch")),
     ("model", "one picture"),
 ]
-_ON_A_CPU = [("conv", "operator")]  # a quick run on a CPU only tries the command
-# These cases run other people's packages, and a crash there must not end the timing of ours.
+_ON_A_CPU = [("conv", "operator")]  # a quick run on a CPU only tests the command
+# Cases with other packages, in their own steps so that a crash does not affect our timings.
 _BESIDE = {
     "peers-conv": [("conv", "operator")],
     "peers-scan": [("scan", "reference loop")],
@@ -60,7 +60,7 @@ _BESIDE = {
 
 
 class Report:
-    """The document of a run, and its two files, which are written whenever something is added.
+    """Document of a run and its two files, which are rewritten with every item.
 
     Attributes:
         folder: of gpu-check.json and gpu-check.md.
@@ -78,20 +78,20 @@ class Report:
         self.settings = Settings(torch.device(asked["device"]), asked["level"], threads=threads)
 
     def write(self) -> None:
-        """Replaces both files."""
+        """Replace both files."""
         write_json(self.folder / "gpu-check.json", self.document)
         write_text(self.folder / "gpu-check.md", page(self.document))
 
     def read(self) -> None:
-        """Takes over what a step has written."""
+        """Read the document written by a step."""
         self.document = json.loads((self.folder / "gpu-check.json").read_bytes())
 
     def leave_out(self, what: str, reason: str) -> None:
-        """Records that something is not done, and why."""
+        """Record a skipped item with its reason."""
         self.document["not_done"].append({"what": what, "reason": reason})
 
     def in_time(self, items: Iterable[_Item], name: Callable[[_Item], str]) -> Iterator[_Item]:
-        """Yields items while there is time, and writes after each."""
+        """Yield items while there is time, and write after each."""
         for item in items:
             if time.time() > self.until:
                 self.leave_out(name(item), "time was up")
@@ -101,7 +101,7 @@ class Report:
 
 
 def begin(device: str, quick: bool, folder: Path) -> Report:
-    """A report of a run of which nothing is done yet."""
+    """Return the report of a new run."""
     settings = {"device": device, "level": "quick" if quick else "normal"}
     document = {"format": FORMAT, "verdict": "not finished", "machine": {}, "settings": settings}
     document |= {name: [] for name in ("steps", "checks", "failures", "not_done")}
@@ -119,20 +119,20 @@ def run_gpu_check(
     minutes: float = MINUTES,
     steps: Sequence[str] = (),
 ) -> int:
-    """Runs kernel checks, full-size inference and the benchmark on this machine.
+    """Run kernel checks, full-size inference and the benchmark on this machine.
 
     Args:
-        device: "cuda"; or "cpu", which tries the command itself.
+        device: "cuda"; or "cpu", which tests the command itself.
         quick: tiny sizes.
         out: folder for gpu-check.json and gpu-check.md.
         minutes: time limit of the whole run.
         steps: names of ``STEPS``, or none for all.
 
     Returns:
-        The exit code: 0 all that could be run passed, 1 something failed, 130 Ctrl-C.
+        The exit code: 0 all executed items passed, 1 something failed, 130 Ctrl-C.
 
     Raises:
-        UserError: there is no CUDA device, or an option is out of range.
+        UserError: CUDA is unavailable, or an option is out of range.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("no CUDA device here; --device cpu --quick tries the command itself")
@@ -162,7 +162,7 @@ def run_gpu_check(
 
 
 def do(report: Report, step: Step, seconds: float) -> None:
-    """Runs a step in a process of its own, for so long at most."""
+    """Run a step in a child process with a time limit."""
     started, failures = time.time(), len(report.document["failures"])
     row = {"name": step.name, "status": "not done", "reason": "", "seconds": 0.0}
     report.document["steps"].append(row)
@@ -194,28 +194,28 @@ def do(report: Report, step: Step, seconds: float) -> None:
 
 
 def in_a_process(words: Sequence[str], seconds: float) -> str:
-    """Runs Python with arguments, and ends it with all that it has started.
+    """Run Python with arguments, and kill its process group at the end.
 
     Returns:
-        Why it did not end well, with the last line that it wrote; else nothing.
+        The reason of a failure, with the last line of output; empty on success.
     """
-    # Kernels and compilers tell much that is no finding, so it goes to a file.
-    with tempfile.TemporaryFile() as said:
+    # Output of kernels and compilers goes to a file.
+    with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(
-            [sys.executable, *words], stdout=said, stderr=said, start_new_session=True
+            [sys.executable, *words], stdout=output, stderr=output, start_new_session=True
         )
         try:
             code = process.wait(seconds)
         except subprocess.TimeoutExpired:
             return _LATE.format(seconds)
-        finally:  # also where we are interrupted
-            if hasattr(os, "killpg"):  # it leads a group, that of what it started
+        finally:  # also after an interrupt
+            if hasattr(os, "killpg"):  # it leads the group of its children
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
             process.kill()
             process.wait()
-        said.seek(0)
-        lines = said.read().decode(errors="replace").strip().splitlines()
+        output.seek(0)
+        lines = output.read().decode(errors="replace").strip().splitlines()
     if code == 0:
         return ""
     died = f"ended with code {code}"
@@ -225,7 +225,7 @@ def in_a_process(words: Sequence[str], seconds: float) -> str:
 
 
 def run_step(folder: str | Path, name: str, until: str | float = "inf") -> None:
-    """Runs the step of that name to its end, or until its time is up, into a folder's report."""
+    """Run a step within its time limit, and write to a folder's report."""
     document = json.loads((Path(folder) / "gpu-check.json").read_bytes())
     report = Report(Path(folder), document, float(until))
     settings, quick = report.settings, report.settings.level == "quick"
@@ -261,14 +261,14 @@ def _checks(report: Report) -> None:
         except LeftOut as reason:
             report.leave_out(check.name, str(reason))
             continue
-        except Exception as error:  # a broken kernel may raise anything, and that is a finding
+        except Exception as error:  # a broken kernel may raise anything, which is a failure
             row |= {"status": "failed", "found": f"{type(error).__name__}: {first_line(error)}"}
             report.document["failures"].append(f"{check.name}: {row['found']}")
         report.document["checks"].append(row | {"seconds": time.perf_counter() - started})
 
 
 def _ceilings(settings: Settings) -> list[Variant]:
-    """What the device does at best, to judge times by."""
+    """Return reference variants: the peak rates of a copy and a matrix product."""
     count, side = (1 << 18, 256) if settings.level == "quick" else (1 << 28, 8192)
     source = torch.ones(count, device=settings.device)
     a = torch.randn(side, side, device=settings.device).bfloat16()
@@ -281,7 +281,7 @@ def _ceilings(settings: Settings) -> list[Variant]:
 
 
 def _measure(report: Report, settings: Settings, cases: list[Case]) -> None:
-    """Measures case after case; a fault of ours is a failure, a fault of a peer only a note."""
+    """Measure case after case; our faults are failures, those of peers only notes."""
     before, document = report.document["bench"], measure([], settings)
     for case in report.in_time(cases, lambda case: f"{case.op}: {case.name}"):
         records = measure([case], settings)["records"]
@@ -298,14 +298,14 @@ def _measure(report: Report, settings: Settings, cases: list[Case]) -> None:
 
 
 def joined(before: dict, later: dict) -> dict:
-    """One document of two; a case of the later one replaces an earlier."""
+    """Join two documents; a case of the later one replaces an earlier."""
     new = {(r["op"], r["case"]) for r in later["records"]}
     old = [r for r in before["records"] if (r["op"], r["case"]) not in new]
     return later | before | {"records": old + later["records"]}
 
 
 def machine_facts(settings: Settings) -> dict:
-    """Returns the facts of ``gamba bench``, with more on the GPU and on the other packages."""
+    """Return the facts of ``gamba bench``, with more on the GPU and on other packages."""
     facts = machine(settings)
     if settings.device.type == "cuda":
         gpu = torch.cuda.get_device_properties(settings.device)
@@ -322,7 +322,7 @@ def machine_facts(settings: Settings) -> dict:
 
 
 def headline(document: dict) -> list[tuple[str, str]]:
-    """Returns what was found, in rows of a name and a value."""
+    """Return the results in rows of a name and a value."""
     packages = ", ".join(f"{k} {v}" for k, v in document["machine"]["packages"].items())
     facts = document["machine"] | {"packages": packages}
     rows = [(name.replace("_", " "), str(value)) for name, value in facts.items() if value]
@@ -345,7 +345,7 @@ def headline(document: dict) -> list[tuple[str, str]]:
 
 
 def page(document: dict) -> str:
-    """Returns the document as a Markdown page."""
+    """Return the document as a Markdown page."""
     title = document["verdict"]
     lines = ["# gamba gpu-check", "", f"Written by `gamba gpu-check`, not by hand. **{title}**", ""]
     lines.append(markdown(("what", "found"), headline(document)))
@@ -360,7 +360,7 @@ def page(document: dict) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """``python -m gamba_warp.gpu_check``: the command without tyro."""
+    """Run ``python -m gamba_warp.gpu_check``: the command without tyro."""
     parser = argparse.ArgumentParser(
         prog="gamba gpu-check", description=(run_gpu_check.__doc__ or "").split("\n\n")[0]
     )

@@ -1,4 +1,4 @@
-"""Checks of the kernels on a device, for a machine that has torch and warp-lang only.
+"""Checks of the kernels on a device, for a machine with only torch and warp-lang.
 
 Each check compares a run with the float64 oracle or with another run. ``gamba gpu-check`` runs them
 all.
@@ -31,12 +31,12 @@ from ..kernels.selective_scan.cuda import launch as cuda_scan
 from ..kernels.selective_scan.cuda.launch import Tuning
 from ..measure.inference import Inference, build_model, captured
 
-# Allowed relative rms errors: of float32's sums over a few hundred terms, to which the scan adds
-# what a GPU's exponential may do. Half precision rounds inputs and outputs, and a few pixels may
-# cross the cut at the faintest alpha.
+# Allowed relative rms errors: of float32 sums over a few hundred terms; for the scan plus the error
+# of a GPU's exponential; of half precision, which rounds inputs and outputs; and of pictures, where
+# a few pixels may cross the threshold of alpha.
 LIMIT, HALF_LIMIT, PICTURE_LIMIT = 2e-6, 3e-2, 1e-3
-# Under capture torch may choose other kernels for a product; Adam's first steps go by the sign of
-# a gradient, so where that is a rounding, weights go apart.
+# Under capture torch may choose other kernels for a matrix product. Adam's first steps follow the
+# sign of the gradient, so weights with a gradient near 0 diverge.
 LOSS_LIMIT, CHANGE_LIMIT = 1e-4, 0.05
 _STEPS = 4  # of training
 # Each is batch, tokens, channels, states and groups.
@@ -61,16 +61,16 @@ RASTERS = [
 
 
 class LeftOut(Exception):
-    """Raised by a check that cannot be done here; ``str(error)`` says why."""
+    """Raised by a check that cannot run here; ``str(error)`` is the reason."""
 
 
 class Check(NamedTuple):
-    """Something that must hold on a device.
+    """A check on a device.
 
     Attributes:
         name: title of the check.
-        run: function of the device that returns the finding in words, or raises what is wrong.
-        cuda: whether only a GPU can do the check.
+        run: function of the device that returns the result in words, or raises an error.
+        cuda: the check needs a GPU.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Check(NamedTuple):
 
 
 def checks(quick: bool) -> Iterator[Check]:
-    """Yields all checks, or a few of each kind if ``quick``."""
+    """Yield all checks, or a few of each kind if ``quick``."""
     few = 2 if quick else None
     yield Check("operations of PTX, as the interpreter of the tests", _operations, cuda=True)
     for shape in SCANS[:few]:
@@ -106,7 +106,7 @@ def checks(quick: bool) -> Iterator[Check]:
 
 
 def _operations(device: torch.device) -> str:
-    """Runs the comparison of tests/ptx, which the package does not have, in a checkout."""
+    """Run the comparison of tests/ptx, which exists only in a checkout."""
     tests = Path(__file__).parents[2] / "tests" / "ptx"
     if not tests.is_dir() or importlib.util.find_spec("pytest") is None:
         raise LeftOut("needs a checkout and pytest")
@@ -117,7 +117,7 @@ def _operations(device: torch.device) -> str:
     if done.returncode:
         reasons = [line[1:].strip() for line in lines if line.startswith("E ")]
         raise AssertionError(": ".join([last, *reasons[:1]]))
-    if "passed" not in last:  # without a compiler it is skipped
+    if "passed" not in last:  # skipped without a compiler
         raise LeftOut(last)
     return "equal bit for bit, the approximate units within their bounds"
 
@@ -131,7 +131,7 @@ def _problem(shape: tuple, device: torch.device) -> Operator:
 
 
 def _scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> str:
-    """Checks the output and all gradients, from a given first state, each by its own limit."""
+    """Check the output and all gradients, with an initial state, each by its own limit."""
     problem = _problem(shape, device)
     if dtype != torch.float32:
         return within(problem.check(BOTH, dtype), HALF_LIMIT)
@@ -158,7 +158,7 @@ def _scan_twice(device: torch.device) -> str:
 
 
 def _conv(shape: tuple[int, int, int, int], device: torch.device) -> str:
-    """Checks the output and all gradients, from given first tokens."""
+    """Check the output and all gradients, with an initial state."""
     return within(conv_problem(device, shape, state=True).check(BOTH), LIMIT)
 
 
@@ -171,7 +171,7 @@ def _scene(count: int, size: int, views: int, options: dict, device: torch.devic
 
 
 def _raster(count: int, size: int, views: int, options: dict, device: torch.device) -> str:
-    """Checks picture, alphas and all gradients on a crop of the first view."""
+    """Check picture, alphas and all gradients on a crop of the first view."""
     scene = _scene(count, size, views, options, device)
     picture, alphas, _ = scene.forward()
     if not (picture.isfinite().all() and alphas.max() <= 1):
@@ -187,13 +187,13 @@ def _raster_twice(device: torch.device) -> str:
 
 
 def _layer(problem: Operator) -> tuple[Callable[..., Tensor], list[Tensor]]:
-    """Makes a layer of convolution and scan, and its inputs on the device."""
+    """Return a layer of convolution and scan, and its inputs on the device."""
     inputs = problem.at(torch.float32)
     weight = torch.linspace(-0.5, 0.5, 4 * inputs["u"].shape[2], device=problem.device)
 
     def layer(u: Tensor, weight: Tensor) -> Tensor:
         u = causal_conv1d(u, weight, activation="silu")
-        return problem.call({**inputs, "u": u})  # torch 2.6 compiles no "|" of two dicts
+        return problem.call({**inputs, "u": u})  # torch 2.6 cannot compile "|" of two dicts
 
     return layer, [inputs["u"], weight.view(-1, 4)]
 
@@ -220,7 +220,7 @@ def _side_stream(device: torch.device) -> str:
     torch.cuda.synchronize(device)
     with torch.cuda.stream(stream):
         big = torch.randn(4096, 4096, device=device)
-        for _ in range(8):  # whatever is launched on another stream would come too early
+        for _ in range(8):  # a launch on another stream would run too early
             big = big @ big * 1e-3
         out = layer(*(x + 0 * big[0, 0].nan_to_num(0.0, 0.0, 0.0) for x in inputs))
     stream.synchronize()
@@ -229,7 +229,7 @@ def _side_stream(device: torch.device) -> str:
 
 
 def _graph(device: torch.device) -> str:
-    """Checks that a replay gives the bits of a plain run, also with inputs changed meanwhile."""
+    """Check that replays equal plain runs bit for bit, also with changed inputs."""
     layer, inputs = _layer(_problem((1, 577, 70, 16, 1), device))
     with torch.no_grad():
         graph, out, _ = captured(lambda: layer(*inputs), device)
@@ -243,10 +243,10 @@ def _graph(device: torch.device) -> str:
 
 
 def within(error: Error, limit: float) -> str:
-    """Returns an error in words.
+    """Return an error as text.
 
     Raises:
-        AssertionError: it is over the limit, or not a number.
+        AssertionError: it exceeds the limit, or is NaN.
     """
     if not error.rel_rms <= limit:
         raise AssertionError(
@@ -256,7 +256,7 @@ def within(error: Error, limit: float) -> str:
 
 
 def same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
-    """Compares results bit by bit.
+    """Compare results bit by bit.
 
     Raises:
         AssertionError: one differs.
@@ -267,7 +267,7 @@ def same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
 
 
 def render_all(scene: Scene) -> dict[str, Tensor]:
-    """Renders; returns picture, alphas, the number of pairs and all gradients."""
+    """Render; return picture, alphas, the number of pairs and all gradients."""
     leaves = scene.leaves()
     given: dict[str, Any] = {**scene.arguments(), **leaves}
     renders, alphas, meta = rasterization(**given)
@@ -277,7 +277,7 @@ def render_all(scene: Scene) -> dict[str, Tensor]:
 
 
 def no_wait(device: torch.device) -> str:
-    """Checks that torch waits for the device in no call but the first, neither graph nor not."""
+    """Check that torch synchronises with the device in no call after the first."""
     scene = _scene(700, 75, 3, {"render_mode": "RGB+D"}, device)
     for run in (partial(render_all, scene), TrainingStep(device).run):
         run()
@@ -291,7 +291,7 @@ def no_wait(device: torch.device) -> str:
 
 
 def raster_graph(device: torch.device) -> str:
-    """Checks bits of replays, with sizes changed meanwhile, and with more pairs than have room."""
+    """Check replays bit by bit, with changed sizes, and with more pairs than the capacity."""
     scene = _scene(700, 75, 3, {"render_mode": "RGB+D"}, device)
     graph, made, _ = captured(partial(render_all, scene), device)
     found = []
@@ -312,9 +312,9 @@ def raster_graph(device: torch.device) -> str:
 
 
 class TrainingStep:
-    """A small model, its rendering, a loss of pictures and AdamW, all of fixed shapes.
+    """Training step of a small model with rendering, an image loss and AdamW, in fixed shapes.
 
-    The model is that of a quick run of ``gamba bench inference``, in training.
+    The model is that of a quick run of ``gamba bench inference``, in training mode.
     """
 
     def __init__(self, device: torch.device):
@@ -328,7 +328,7 @@ class TrainingStep:
         )
 
     def run(self) -> Tensor:
-        """Makes a step and returns its loss."""
+        """Make a step and return its loss."""
         self.optimizer.zero_grad(set_to_none=True)
         x = self.inputs
         picture = x.view(x.model(x.image, x.cameras))[:, 0]
@@ -340,7 +340,7 @@ class TrainingStep:
 
     @torch.no_grad()
     def begin(self, weights: list[Tensor]) -> None:
-        """Sets weights and the optimizer's state to those of a beginning, in place."""
+        """Reset weights and the optimizer's state in place."""
         for parameter, weight in zip(self.parameters, weights):
             parameter.copy_(weight)
         for state in self.optimizer.state.values():
@@ -348,11 +348,11 @@ class TrainingStep:
                 value.zero_()
 
     def weights(self) -> list[Tensor]:
-        """Returns a copy of the weights."""
+        """Return a copy of the weights."""
         return [p.detach().clone() for p in self.parameters]
 
     def train(self, step: Callable[[], Tensor], first: list[Tensor]) -> dict[str, Tensor]:
-        """Makes steps from a beginning; returns losses, and how far the weights went."""
+        """Make steps after a reset; return losses and the change of the weights."""
         self.begin(first)
         losses = torch.stack([step().clone() for _ in range(_STEPS)])
         change = [(now - old).flatten() for now, old in zip(self.weights(), first)]
@@ -360,7 +360,7 @@ class TrainingStep:
 
 
 def step_graph(device: torch.device) -> str:
-    """Checks that replays of a captured training step train as plain steps do."""
+    """Check that replays of a captured training step train like plain steps."""
     steps = TrainingStep(device)
     first = steps.weights()
     graph, loss, _ = captured(steps.run, device)

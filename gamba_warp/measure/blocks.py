@@ -26,12 +26,12 @@ from ..model.config import PRESETS, GambaConfig
 from ..model.parts.block import GambaBlock, prefix_states, run_blocks
 
 LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # allowed relative rms error to float64
-_IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # those of DINOv2 ViT-B/14 at 336 pixels
-TOKENS = 128  # number of first tokens that are compared with the oracle
+_IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # as of DINOv2 ViT-B/14 at 336 pixels
+TOKENS = 128  # number of first tokens compared with the oracle
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns all cases of blocks at the level's sizes."""
+    """Return all cases of blocks at the level's sizes."""
     blocks = [("one block", one_block, "error"), ("backbone", whole_backbone, "error")]
     return make_cases("block", settings, blocks)
 
@@ -54,19 +54,19 @@ class Backbone(Problem):
         self.sizes = {"L": self.length, "D": config.width, "depth": depth}
 
     def run(self, tokens: Tensor) -> Tensor:
-        """Runs the blocks as ``Gamba.forward`` does: first the prefix states, then the tokens."""
+        """Run the blocks like ``Gamba.forward``: the prefix states, then the tokens."""
         with network_products(self.device):
             states = prefix_states(self.blocks, self.camera, self.image)
             return run_blocks(self.blocks, tokens, states)
 
     @torch.no_grad()
     def forward(self) -> Tensor:
-        """Runs the blocks without gradients; this is what is timed."""
+        """Run the blocks without gradients (timed)."""
         return self.run(self.tokens)
 
     @torch.no_grad()
     def prepended(self) -> Tensor:
-        """Runs the paper's eq. 2 as it reads, prepending and dropping; this is timed too."""
+        """Run the paper's eq. 2 literally, prepending and dropping (timed)."""
         tokens = self.tokens
         with network_products(self.device):
             for block in self.blocks:
@@ -77,9 +77,9 @@ class Backbone(Problem):
         return tokens
 
     def backward(self) -> tuple[Tensor, ...]:
-        """Runs forward and backward, with the tokens as cotangent; this is timed too.
+        """Run forward and backward, with the tokens as cotangent (timed).
 
-        The gradients are those of the tokens and of all weights.
+        Returns the gradients of the tokens and of all weights.
         """
         tokens = self.tokens.detach().requires_grad_()
         leaves = [tokens, *(p for block in self.blocks for p in block.parameters())]
@@ -87,22 +87,22 @@ class Backbone(Problem):
             return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
 
     def oracle(self, direction: str) -> str:
-        """What the check compares with, in words."""
+        """Return a description of the check's reference."""
         text = f"float64 with the condition prepended, first {TOKENS} of {self.length} tokens"
         return text + (", gradient of these tokens" if direction == BOTH else "")
 
     def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
-        """The largest error that is allowed."""
+        """Return the largest allowed error."""
         return BACKWARD_LIMIT if direction == BOTH else LIMIT
 
-    def way(self, name: str, run: Callable[[], Tensor], **changes) -> Variant:
-        """A variant that runs the blocks forward in another way."""
+    def forward_variant(self, name: str, run: Callable[[], Tensor], **changes) -> Variant:
+        """Return a variant that runs the blocks forward by another function."""
         return self.variant(name, run=run, check=partial(self.check, "forward", run), **changes)
 
     def check(self, direction: str, run: Callable[[], Tensor] | None = None) -> Error:
-        """Measures the error of what is added to the first tokens, which depend on no later one.
+        """Measure the error of the update of the first tokens, which depend on no later one.
 
-        Or of the first tokens' gradient, with a cotangent of 0 behind them.
+        Or of their gradient, with a cotangent of 0 after them.
         """
         first = self.tokens[:, :TOKENS].double().cpu().requires_grad_(direction == BOTH)
         with torch.set_grad_enabled(direction == BOTH):
@@ -124,10 +124,10 @@ class Backbone(Problem):
 def reference_block(
     block: GambaBlock, tokens: Tensor, camera: Tensor | None, image: Tensor | None
 ) -> Tensor:
-    """Runs one Gamba block in float64 torch on the CPU, prepending and dropping (paper eq. 2).
+    """Run one Gamba block in float64 torch on the CPU, prepending and dropping (paper eq. 2).
 
     Args:
-        block: the block whose weights are used.
+        block: with the weights.
         tokens: ``[B, L, width]`` float64.
         camera: ``[B, 1, channels]``; None for a block without this condition.
         image: ``[B, K, channels]``, or None likewise.
@@ -187,5 +187,5 @@ def whole_backbone(settings: Settings) -> list[Variant]:
 def _forwards(backbone: Backbone, **changes) -> list[Variant]:
     return [
         backbone.variant("default", default=True, **changes),
-        backbone.way("prefix states off", backbone.prepended, **changes),
+        backbone.forward_variant("prefix states off", backbone.prepended, **changes),
     ]

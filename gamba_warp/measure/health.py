@@ -1,4 +1,4 @@
-"""What this machine has and can run; what is missing, and how to get it."""
+"""Devices, folders and abilities of this machine, and how to install missing parts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..vision.weights import FETCH, cache_folder, lpips_available
 
 
 def devices() -> Iterator[tuple[str, str]]:
-    """Yields the devices that torch can compute on, each with what is known of it."""
+    """Yield torch's devices with their properties."""
     yield "cpu", f"{torch.get_num_threads()} threads"
     for index in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(index)
@@ -31,7 +31,7 @@ def devices() -> Iterator[tuple[str, str]]:
 
 
 def folders() -> Iterator[tuple[str, str]]:
-    """Yields where compiled kernels and fetched weights are kept, with their size."""
+    """Yield the folders of compiled kernels and fetched weights, with their sizes."""
     wp.init()
     compiled = wp.config.kernel_cache_dir
     assert compiled is not None  # ``wp.init`` sets it
@@ -42,19 +42,19 @@ def folders() -> Iterator[tuple[str, str]]:
 
 
 def abilities() -> Iterator[tuple[str, str, bool]]:
-    """Yields each thing the package does, what is there or missing, and whether that is a fault.
+    """Yield each ability, its state, and True for a fault.
 
-    Weights that have to be fetched or trained are no fault; a library that does not work is one.
+    Missing weights are not a fault; a library that does not work is one.
     """
     for name, check in {"open3d": _open3d, "mp4": _ffmpeg}.items():
         try:
             check()
             yield name, "yes", False
-        except ModuleNotFoundError as error:  # of an extra that nobody asked for
+        except ModuleNotFoundError as error:  # of an extra that is not installed
             extra = EXTRA_OF.get(error.name or "")
             how = to_install(extra) if extra else first_line(error)
             yield name, f"no: {how}", extra is None
-        except Exception as error:  # a broken installation raises anything: that is what to tell
+        except Exception as error:  # a broken installation raises anything
             yield name, f"no: {first_line(error)}", True
     there = DEFAULT_CHECKPOINT.is_file()
     missing = "no shipped model, though it comes with the package; give --checkpoint"
@@ -74,7 +74,7 @@ def _ffmpeg() -> None:
 
 
 def warm_up_kernels() -> Iterator[tuple[str, float, float]]:
-    """Runs scan and rasterizer forward and backward on small inputs, twice on each device.
+    """Run scan and rasterizer forward and backward on small inputs, twice on each device.
 
     Yields:
         The device's type, the seconds of the first run, which compiles or loads the kernels, and

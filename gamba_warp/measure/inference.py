@@ -1,4 +1,4 @@
-"""Benchmark cases of whole models: pictures to Gaussians, by a CUDA graph too, and a view."""
+"""Benchmark cases of whole models: pictures to Gaussians, also by CUDA graphs, and a view."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from ..render import render
 Result = TypeVar("Result")
 OP, CASE = "inference", "one picture"
 HEADLINE = "CUDA graph, bfloat16"
-_GIVEN_TOKENS, _GIVEN_CHANNELS = 576, 768  # those of DINOv2 ViT-B/14 at 336 pixels
-# Allowed relative rms error of a second run. A graph runs the same kernels, but under capture torch
-# may choose other kernels for a product, and then the results differ by roundings of the dtype.
+_GIVEN_TOKENS, _GIVEN_CHANNELS = 576, 768  # as of DINOv2 ViT-B/14 at 336 pixels
+# Allowed relative rms error of a second run. Under capture torch may choose other kernels for a
+# matrix product, and then the results differ by the dtype's rounding.
 REPEAT_LIMITS = {torch.float32: 1e-4, torch.bfloat16: 1e-2}
 HALF_LIMIT = 0.03  # allowed error of bfloat16 to float32 in the worst attribute; a CPU has 0.007
 
 
 class _GivenTokens(nn.Module):
-    """Takes the encoder's part and gives the same tokens for every picture, at no cost."""
+    """Stand-in of the encoder that returns the same tokens for every picture, at no cost."""
 
     tokens: Tensor
 
@@ -54,12 +54,12 @@ class _GivenTokens(nn.Module):
 
 
 def without_encoder(config: GambaConfig) -> GambaConfig:
-    """The configuration without an image encoder; where only its tokens are prepended, none are."""
+    """Return the configuration without an image encoder and its prepended tokens."""
     return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
 
 
 def build_model(settings: Settings) -> tuple[Gamba, str]:
-    """Builds the paper's model with untrained weights; the second value names its encoder in words.
+    """Build the paper's model with untrained weights; also return a description of its encoder.
 
     A quick run has a small model, of 256 Gaussians.
     """
@@ -84,14 +84,14 @@ def _on(model: Gamba, settings: Settings) -> Gamba:
 def captured(
     run: Callable[[], Result], device: torch.device
 ) -> tuple[torch.cuda.CUDAGraph, Result, int]:
-    """Captures a function as a CUDA graph.
+    """Capture a function as a CUDA graph.
 
     Returns:
-        The graph, the function's result, which each ``replay`` fills again, and the bytes kept.
+        The graph, the function's result, which each ``replay`` overwrites, and the bytes it keeps.
     """
     stream = torch.cuda.Stream(device)
     stream.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(stream):  # torch wants everything set up before the capture
+    with torch.cuda.stream(stream):  # warm-up before the capture
         for _ in range(3):
             run()
     torch.cuda.current_stream(device).wait_stream(stream)
@@ -104,13 +104,13 @@ def captured(
 
 
 class Inference:
-    """A model with posed pictures on its device, run as it is or by a CUDA graph.
+    """A model with posed pictures on its device, run eagerly or by a CUDA graph.
 
     Attributes:
         model: the model.
         device: device of the model and of the pictures.
-        image: ``[B, H, W, C]``. Random alpha leaves no background, so that with the decoder "rays"
-            every token is computed.
+        image: ``[B, H, W, C]``, with random alpha and so without background, so that the decoder
+            "rays" computes every token.
         cameras: their cameras.
     """
 
@@ -125,13 +125,13 @@ class Inference:
 
     @torch.no_grad()
     def eager(self, dtype: torch.dtype = torch.float32) -> Gaussians:
-        """Runs the model's forward; bfloat16 means autocast."""
+        """Run the model's forward; bfloat16 means autocast."""
         mixed = dtype != torch.float32
         with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed, cache_enabled=False):
             return self.model(self.image, self.cameras)
 
     def graph(self, dtype: torch.dtype) -> Gaussians:
-        """Runs the same by a CUDA graph, which the first call captures."""
+        """Run the same by a CUDA graph, which the first call captures."""
         if dtype not in self._graphs:
             self._graphs[dtype] = captured(partial(self.eager, dtype), self.device)
         graph, result, _ = self._graphs[dtype]
@@ -139,19 +139,19 @@ class Inference:
         return result
 
     def peak(self, function: Callable, dtype: torch.dtype) -> dict[str, int]:
-        """Measures memory beside weights and input: the growth of a run, or what a graph keeps."""
+        """Measure memory besides weights and input: the growth in a run, or that of a graph."""
         if function == self.graph:
             return {"peak_bytes": self._graphs[dtype][2]}
         peak = peak_bytes(partial(function, dtype), self.device)
         return {} if peak is None else {"peak_bytes": peak}
 
     def view(self, gaussians: Gaussians) -> Tensor:
-        """Renders the reference views, ``[B, 1, H, W, 3]``."""
+        """Render the reference views, ``[B, 1, H, W, 3]``."""
         viewmats, Ks = self.cameras.viewmats[:, None], self.cameras.Ks[:, None]
         return render(gaussians, replace(self.cameras, viewmats=viewmats, Ks=Ks)).rgb
 
     def check(self, run: Callable[[], Gaussians], truth: torch.dtype = torch.float32) -> Error:
-        """Measures the error of the Gaussians of ``run`` to those of ``eager`` in ``truth``."""
+        """Measure the error of the Gaussians of ``run`` against those of ``eager`` in ``truth``."""
         got = run()
         synchronize(self.device)
         if truth not in self._truths:
@@ -164,13 +164,13 @@ class Inference:
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the cases of whole models without an image encoder."""
+    """Return the cases of whole models without an image encoder."""
     models = [("one picture", pictures, None), ("batch", batches, "B")]
     return make_cases("model", settings, models)
 
 
 def _bare(settings: Settings, preset: Preset, count: int, **changes) -> Variant:
-    """A model with fresh weights and no image encoder, on ``count`` pictures."""
+    """Return a variant with fresh weights and no image encoder, on ``count`` pictures."""
     torch.manual_seed(0)
     model = Gamba(without_encoder(PRESETS[preset])).to(settings.device).eval()
     run = Inference(model, settings.device, count)
@@ -202,7 +202,7 @@ def batches(settings: Settings) -> list[Variant]:
 
 
 def full_size(settings: Settings) -> list[Case]:
-    """Returns the one case of the paper's model, with the variants that the device can run."""
+    """Return the case of the paper's model, with the variants for the device."""
     return make_cases(OP, settings, [(CASE, _variants, None)])
 
 
@@ -212,18 +212,18 @@ def _variants(settings: Settings) -> list[Variant]:
     inference, size = Inference(model, settings.device), model.config.image_size
     full, half = torch.float32, torch.bfloat16
     same, eager, graph = REPEAT_LIMITS, inference.eager, inference.graph
-    # Name: how it runs, in which dtype; the run that it is compared with: dtype, limit and name.
-    ways = {
+    # Name: function and dtype; dtype, limit and name of the run that it is compared with.
+    modes = {
         "eager, float32": (eager, full, full, same[full], "a second run"),
         "eager, bfloat16": (eager, half, full, HALF_LIMIT, "float32"),
     }
     if settings.device.type == "cuda":
-        ways |= {
+        modes |= {
             "CUDA graph, float32": (graph, full, full, same[full], "eager"),
             HEADLINE: (graph, half, half, same[half], "eager, bfloat16"),
         }
     made = []
-    for name, (function, dtype, truth, limit, oracle) in ways.items():
+    for name, (function, dtype, truth, limit, oracle) in modes.items():
         run = partial(function, dtype)
         check, work = partial(inference.check, run, truth), partial(inference.peak, function, dtype)
         made.append(Variant(name, run, check, limit, f"{oracle} (0: the same bits)", work=work))

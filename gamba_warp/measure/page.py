@@ -1,4 +1,4 @@
-"""The page with charts: one HTML file that loads nothing else."""
+"""Page of benchmarks with charts: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _AXES = {
 
 
 def charts_of(case: str, records: Sequence[dict]) -> list[str]:
-    """Draws the case's charts, by its axis; there are none without an axis or figures."""
+    """Draw the case's charts, by its axis; none without an axis or figures."""
     axis: str | None = records[0]["axis"]
     done = [r for r in records if r["status"] == "ok"]
     if axis is None or not done:
@@ -39,11 +39,11 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
 def line_chart(
     case: str, records: Sequence[dict], axis: str, figure: str, label: str, scale: float = 1.0
 ) -> str:
-    """Draws a figure, of the record or of its work, against a parameter.
+    """Draw a figure of the record or of its work against a parameter.
 
     Args:
         case: its name.
-        records: those that were measured.
+        records: the measured ones.
         axis: name of the parameter.
         figure: key of the record or of its work.
         label: of the figure, with its unit.
@@ -65,9 +65,9 @@ def line_chart(
 
 
 def _error_chart(records: Sequence[dict], direction: str) -> str:
-    """Draws time against error, both better if less; no variant beats those on the front."""
+    """Draw time against error, both better if less, with the Pareto front."""
     errors = [r["rel_rms_error"] for r in records if r["rel_rms_error"]]
-    bottom = min(errors, default=0.0) / 3  # an error of 0 is drawn here, and labelled
+    bottom = min(errors, default=0.0) / 3  # position of an error of 0, which is labelled
     points = []
     for r in records:
         point = marked(r, r["rel_rms_error"] or 0.0)
@@ -80,13 +80,13 @@ def _error_chart(records: Sequence[dict], direction: str) -> str:
 
 
 def marked(record: dict, y: float) -> Point:
-    """Returns a record's point at a height, told apart as a peer's or a default's."""
+    """Return a record's point at a height, marked as a peer or a default."""
     mark = "peer" if record["is_peer"] else "default" if record["is_default"] else ""
     return Point(record["ms_p50"], y, record["variant"], mark)
 
 
 def _skip_chart(records: Sequence[dict]) -> str:
-    """Draws work skipped against time saved, as shares of the default of the same direction."""
+    """Draw work skipped against time saved, as shares of the default of the same direction."""
     series = []
     for direction in dict.fromkeys(r["direction"] for r in records):
         found = [r for r in records if r["direction"] == direction]
@@ -103,7 +103,7 @@ def page(
     more: More = nothing_more,
     charts: Callable[[str, Sequence[dict]], list[str]] = charts_of,
 ) -> str:
-    """Returns a self-contained HTML page with the tables and the charts."""
+    """Return a self-contained HTML page with the tables and charts."""
     sections = []
     for part in parts(documents, more):
         case = part.title.partition(": ")[2]

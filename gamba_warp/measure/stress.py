@@ -45,7 +45,7 @@ OPTIONS = {
 
 
 def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], Cameras]:
-    """Builds the model, its inputs that ask for gradients, by name, and the cameras."""
+    """Build the model, its differentiable inputs by name, and the cameras."""
     o, kind = case.options, case.kind
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(case.seed)
@@ -57,7 +57,7 @@ def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], C
             prepend=o["camera_token"],
         )
         model = Gamba(config)
-        if o["image_tokens"]:  # the blocks take image tokens although there is no encoder
+        if o["image_tokens"]:  # blocks with image tokens but without an encoder
             camera = config.width if config.camera_token else 0
             blocks = (GambaBlock(config, camera, _IMAGE_CHANNELS) for _ in range(config.depth))
             model.blocks = torch.nn.ModuleList(blocks)
@@ -86,7 +86,7 @@ def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], C
 
 @torch.no_grad()
 def _change(model: Gamba, kind: str) -> None:
-    """Moves every parameter away from its start, then does what the kind asks for."""
+    """Perturb every parameter, then apply the changes of the kind."""
     for parameter in model.parameters():
         parameter += 0.05 * torch.randn_like(parameter)
         if kind in ("tiny weights", "large weights"):
@@ -102,7 +102,7 @@ def _change(model: Gamba, kind: str) -> None:
 
 
 class _Oracle:
-    """The network in float64 from its parameters, sample by sample, the condition prepended."""
+    """The network in float64 from its parameters, per sample, with the condition prepended."""
 
     def __init__(self, case: Case, model: Gamba, trial: int) -> None:
         self.config, self.r = model.config, Rounding(case.seed, trial)
@@ -111,7 +111,7 @@ class _Oracle:
         self.orders = model.tokens.orders.cpu()
 
     def linear(self, x: Tensor, name: str, ulps: float | None = None) -> Tensor:
-        """Applies a linear layer to ``x [S, B, .., in]`` and rounds operands and result."""
+        """Apply a linear layer to ``x [S, B, .., in]``, and round operands and result."""
         ulps = self.ulps if ulps is None else ulps
         W, bias = self.weights[f"{name}.weight"], self.weights.get(f"{name}.bias")
         axes = (1,) * (x.dim() - 3)
@@ -119,13 +119,13 @@ class _Oracle:
         y = self.r(self.r(x, ulps, ulps) @ W.mT, ulps, ulps)
         if bias is None:
             return y
-        bias = self.r(bias, ulps, ulps).reshape(len(bias), *axes, 1, -1)  # rounded as W is
+        bias = self.r(bias, ulps, ulps).reshape(len(bias), *axes, 1, -1)  # rounded like W
         return self.r(y + bias, ulps, ulps)
 
     def norm(self, x: Tensor, name: str) -> Tensor:
-        """Applies the configuration's norm.
+        """Apply the configuration's norm.
 
-        The gradient is a difference: of what goes past the mean, and through it. Each is rounded.
+        The gradient is the sum of a direct term and one through the mean, each rounded.
         """
         r, x = self.r, self.r(x)
         own = lambda x: r.stored(x, torch.float32)  # noqa: E731
@@ -138,18 +138,18 @@ class _Oracle:
         return self.r(x if bias is None else x + bias[:, None, None])
 
     def silu(self, x: Tensor) -> Tensor:
-        """Applies the activation."""
+        """Apply the activation."""
         return self.r(x * self.r.sigmoid(x, EXP_ULPS), self.ulps)
 
     def tokens(self, images: Tensor, cameras: Cameras) -> Tensor:
-        """Computes the 3DGS tokens."""
+        """Compute the 3DGS tokens."""
         r, embedding = self.r, self.r(self.weights["tokens.embedding"])[:, None]
         if not self.config.additive_image_tokens:
             return embedding.expand(-1, images.shape[1], -1, -1)
         viewmats, Ks = cameras.viewmats.cpu().double(), cameras.Ks.cpu().double()
         rays = plucker_rays(viewmats, Ks, cameras.width, cameras.height)
         rays = rays.expand(SAMPLES, *rays.shape)
-        rays = r.rounded(rays + 2, 4.0) - 2  # they are differences of products of size 2
+        rays = r.rounded(rays + 2, 4.0) - 2  # differences of products of size 2
         pixels = torch.cat([r(normalize_imagenet(images)), rays], -1)
         size, grid = self.config.patch_size, self.config.grid_size
         patches = pixels.unflatten(2, (grid, size)).unflatten(4, (grid, size))
@@ -161,7 +161,7 @@ class _Oracle:
         return r(x[:, :, self.orders] + embedding)
 
     def mamba(self, x: Tensor, name: str) -> Tensor:
-        """Runs one Mamba block over ``[S, B, L, width]``."""
+        """Run one Mamba block over ``[S, B, L, width]``."""
         r, w = self.r, {k: self.weights[f"{name}.{k}"] for k in (
             "conv_weight", "conv_bias", "A_log", "D", "dt_proj.bias"
         )}  # fmt: skip
@@ -181,7 +181,7 @@ class _Oracle:
         return self.linear(r(y, self.ulps, self.ulps), f"{name}.out_proj")
 
     def run(self, inputs: dict[str, Tensor], cameras: Cameras) -> dict[str, Tensor]:
-        """Computes the Gaussians' attributes, by name."""
+        """Compute the Gaussians' attributes, by name."""
         tokens, prefix = self.tokens(inputs["images"], cameras), []
         if self.config.prepend:
             numbers = torch.cat([
@@ -201,7 +201,7 @@ class _Oracle:
         return self.decode(self.norm(tokens, "norm"))
 
     def decode(self, x: Tensor) -> dict[str, Tensor]:
-        """Applies the decoder to the normalised tokens."""
+        """Apply the decoder to the normalised tokens."""
         r, config = self.r, self.config
         x = self.silu(self.linear(x, "decoder.mlp.0"))
         x = self.silu(self.linear(x, "decoder.mlp.2"))
@@ -209,7 +209,7 @@ class _Oracle:
             "position", "opacity", "scale", "color"
         )}  # fmt: skip
         points = torch.linspace(-config.position_range, config.position_range, config.position_bins)
-        # The softmax goes in steps: where it saturates, its gradient is a difference that cancels.
+        # The softmax is split into steps, because its gradient cancels where it saturates.
         logits = heads["position"].unflatten(-1, (3, -1))
         powers = r.exp(r(logits - logits.detach().amax(-1, keepdim=True)), EXP_ULPS)
         share = r(powers / r(powers.sum(-1, keepdim=True)))
@@ -235,7 +235,7 @@ def _run(model: Gamba, o: dict, inputs: dict, cameras: Cameras) -> dict[str, Ten
 
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
-    """Runs the model and judges all attributes and the gradients of all parameters and inputs."""
+    """Run the model, and check all attributes and the gradients of all parameters and inputs."""
     model, inputs, cameras = build(case, device)
     leaves = inputs | dict(model.named_parameters())
     oracle = _Oracle(case, model, trial)

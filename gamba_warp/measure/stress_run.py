@@ -1,4 +1,4 @@
-"""A run of ``gamba stress``: its operators, its cases, and the files that it leaves."""
+"""A run of ``gamba stress``: operators, cases and files."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from ..untrusted.documents import read_document
 from ..versions import __version__, installed
 
 FORMAT = "gamba_warp.stress.1"
-# What is stressed -> modules with an ``OP``. They are imported when they are asked for.
+# Suite -> modules with an ``OP``, imported when needed.
 SUITES = {
     "scan": ("gamba_warp.kernels.stress.cases.scan", "gamba_warp.kernels.stress.cases.conv"),
     "raster": ("gamba_warp.kernels.stress.cases.raster",),
     "model": ("gamba_warp.measure.stress",),
 }
-_VERSIONS = {"gamba_warp": __version__} | installed("torch", "warp-lang")  # decide a result
-_SHRUNK = 5  # failures of a run that are made small; all are written
+_VERSIONS = {"gamba_warp": __version__} | installed("torch", "warp-lang")  # affect results
+_SHRUNK = 5  # failures of a run that are shrunk; all are written
 _HEAD = (
     *("op", "kind", "cases", "forward error", "of", "gradient error", "of", "error / limit"),
     *("undecided pixels", "steep", "non-finite", "failures"),
@@ -37,7 +37,7 @@ _HEAD = (
 
 
 def choose_ops(what: Sequence[str]) -> list[Op]:
-    """The operators of those of ``SUITES`` that are named.
+    """Return the operators of the named ``SUITES``.
 
     Args:
         what: names, or "all".
@@ -56,11 +56,11 @@ _SUMS = "cases", "nonfinite", "failures", "pixels", "undecided", "steep", "secon
 
 
 def _row(op: str, kind: str) -> dict:
-    """What the cases of a kind found, before the first of them; of the kind "all": those of an op.
+    """Return an empty row of results of a kind of cases; "all" means all kinds of an op.
 
-    The largest relative rms errors of a float32 result and of a gradient with their names; the
-    largest error over its limit, infinite if something was not finite; and ``_SUMS``, of which
-    ``Outcome`` says what they count.
+    It has the largest relative rms errors of a float32 result and of a gradient with their names;
+    the largest error over its limit, infinite if something was not finite; and ``_SUMS``, defined
+    by ``Outcome``.
     """
     nothing = {"error": 0.0, "of": ""}
     sums = dict.fromkeys(_SUMS, 0)
@@ -68,7 +68,7 @@ def _row(op: str, kind: str) -> dict:
 
 
 def _count(row: dict, outcome: Outcome, seconds: float) -> None:
-    """Counts one case."""
+    """Count one case."""
     failed = outcome.failure() is not None
     found = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
     for name in _SUMS:
@@ -81,14 +81,14 @@ def _count(row: dict, outcome: Outcome, seconds: float) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """A value with None in place of what is not finite, which JSON cannot hold."""
+    """Replace numbers that are not finite, which JSON cannot hold, by None."""
     if isinstance(value, dict):
         return {name: _plain(inner) for name, inner in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def table(rows: Sequence[dict]) -> str:
-    """A Markdown table with its columns aligned for a terminal."""
+    """Return a Markdown table aligned for a terminal."""
 
     def cells(r: dict) -> Iterator[str]:
         yield from (r["op"], r["kind"], str(r["cases"]))
@@ -103,18 +103,18 @@ def table(rows: Sequence[dict]) -> str:
 
 
 class StressRun:
-    """One run: its rows, its failures, and the files that it leaves.
+    """One run: its rows, its failures and its files.
 
     Attributes:
-        about: what is written of the run itself.
-        failures: the file and a line of text of each failing case.
+        about: description of the run.
+        failures: file and one line of text of each failing case.
 
     Args:
-        ops: what is stressed.
-        device: where the kernels run.
+        ops: the tested operators.
+        device: of the kernels.
         folder: for the summary and the failing cases.
         seed: the same seed gives the same cases in the same order.
-        shrink_seconds: time for making one failing case small.
+        shrink_seconds: time for shrinking one failing case.
     """
 
     def __init__(
@@ -127,10 +127,10 @@ class StressRun:
         self.failures: list[dict[str, str]] = []
 
     def run(self, count: int | None, seconds: float) -> None:
-        """Runs cases until there are ``count``, the time is up or Ctrl-C, with a progress bar.
+        """Run cases until ``count``, the time limit or Ctrl-C, with a progress bar.
 
         Args:
-            count: of the cases; None for no limit.
+            count: number of cases; None for no limit.
             seconds: may be infinite.
         """
         began, interrupted, worst = time.monotonic(), False, 0.0
@@ -146,8 +146,8 @@ class StressRun:
                         row = self._rows.setdefault(key, _row(*key))
                         _count(row, outcome, time.monotonic() - started)
                     if outcome.failure() is not None:
-                        bar.set_postfix_str(f"{op.name}: a failure, made small")
-                        self._keep_failure(op, case, outcome)
+                        bar.set_postfix_str(f"{op.name}: shrinking a failure")
+                        self._save_failure(op, case, outcome)
                     worst = max(worst, outcome.worst.ratio if outcome.worst else 0.0)
                     failed = f"{len(self.failures)} failures"
                     bar.set_postfix_str(f"worst {worst:.2f} of its limit, {failed}")
@@ -157,28 +157,28 @@ class StressRun:
         minutes = round((time.monotonic() - began) / 60, 2)
         self.about |= {"minutes": minutes, "interrupted": interrupted}
 
-    def _keep_failure(self, op: Op, case: Case, outcome: Outcome) -> None:
+    def _save_failure(self, op: Op, case: Case, outcome: Outcome) -> None:
         name = f"failure-{op.name}-{len(self.failures) + 1}.json"
         self.failures.append({"file": name})
 
-        def keep(case: Case, outcome: Outcome) -> None:
+        def save(case: Case, outcome: Outcome) -> None:
             write_json(self._folder / name, reproducer(case, outcome))
             self.failures[-1]["text"] = failure_text(case, outcome)
 
-        keep(case, outcome)  # as it is first, because making it small may be interrupted
+        save(case, outcome)  # first unchanged, because shrinking may be interrupted
         if len(self.failures) <= _SHRUNK:
             small, found, _ = shrink(op, case, self._device, self._shrink_seconds)
             if found.failure() is not None:
-                keep(small, found)
+                save(small, found)
 
     def _sorted(self) -> tuple[list[dict], list[dict]]:
-        """One row per op, and all others with those of an op together."""
+        """Return one row per op, and all other rows grouped by op."""
         totals = [row for row in self._rows.values() if row["kind"] == "all"]
         rows = [r for t in totals for r in self._rows.values() if r["op"] == t["op"]]
         return totals, [row for row in rows if row["kind"] != "all"]
 
     def write(self) -> None:
-        """Writes stress.json and stress.md."""
+        """Write stress.json and stress.md."""
         totals, rows = self._sorted()
         lists = {"totals": [*map(_plain, totals)], "rows": [*map(_plain, rows)]}
         content = {"format": FORMAT, **self.about, **lists, "failures": self.failures}
@@ -191,7 +191,7 @@ class StressRun:
         write_text(self._folder / "stress.md", "\n\n".join(parts) + "\n")
 
     def summary(self) -> str:
-        """The table of the cases, and a line for each failure."""
+        """Return the table of the cases, and a line for each failure."""
         totals, rows = self._sorted()
         lines = [table([*rows, *totals])]
         lines += [f"{self._folder / row['file']}: {row['text']}" for row in self.failures]
@@ -200,7 +200,7 @@ class StressRun:
 
 
 def failure_text(case: Case, outcome: Outcome) -> str:
-    """Describes a failure in one line."""
+    """Describe a failure in one line."""
     failure = outcome.failure()
     assert failure is not None
     ratio = "" if failure["ratio"] is None else f"{failure['ratio']:.3g}"
@@ -209,13 +209,13 @@ def failure_text(case: Case, outcome: Outcome) -> str:
 
 
 def reproducer(case: Case, outcome: Outcome) -> dict:
-    """The content of a file from which ``replay`` runs a case again."""
+    """Return the content of a file from which ``replay`` repeats a case."""
     failure = _plain(outcome.failure())
     return {"format": FORMAT, "case": asdict(case), "failure": failure, "versions": _VERSIONS}
 
 
 def read_reproducer(path: Path, ops: dict[str, Op]) -> Case:
-    """Reads the case of a ``reproducer``.
+    """Read the case of a ``reproducer``.
 
     Raises:
         UserError: no such file, not JSON, damaged, or from another version.
@@ -231,7 +231,7 @@ def read_reproducer(path: Path, ops: dict[str, Op]) -> Case:
         if not 0 <= case.seed < 2**31:
             raise ValueError("damaged: seed is not in 0 to 2147483647")
         _check_options(op, case.options)
-    except ValueError as error:  # msgspec's own is one
+    except ValueError as error:  # msgspec's errors are ValueErrors
         raise UserError(f"{path}: {error}") from error
     return case
 
@@ -255,10 +255,10 @@ def _check_options(op: Op, options: dict) -> None:
 
 
 def replay(paths: Sequence[Path], device: torch.device) -> Iterator[tuple[bool, str]]:
-    """Runs the cases in files; all files are read before the first case is run.
+    """Run the cases in files; all files are read before the first case is run.
 
     Yields:
-        Whether a case passes, and lines about it.
+        True if a case passes, and lines about it.
 
     Raises:
         UserError: no such file, not JSON, damaged, or from another version.

@@ -1,4 +1,4 @@
-"""A run of ``gamba bench``, and the files of its results."""
+"""A run of ``gamba bench``, and its result files."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from ..kernels.bench.static.report import NoCompiler, static_markdown, static_re
 from ..untrusted import documents
 from .page import page
 
-Maker = Callable[[Sequence[dict]], str]  # of documents, a page
+Maker = Callable[[Sequence[dict]], str]  # documents to a page
 
 
 def make_settings(
     device: torch.device, quick: bool, full: bool, peers: bool, threads: int | None
 ) -> Settings:
-    """The settings of the cases from the options of the command.
+    """Return the settings of the cases from the options of the command.
 
     Raises:
-        UserError: options contradict one another.
+        UserError: options contradict each other.
     """
     if quick and full:
         raise UserError("--quick and --full: choose one")
@@ -46,7 +46,7 @@ def make_settings(
 def choose(
     what: Sequence[str], known: Iterable[str], groups: Mapping[str, Sequence[str]]
 ) -> list[str]:
-    """Those of ``known`` that are named, by themselves or by the word for a group, in their order.
+    """Return the ``known`` names that are selected, directly or by a group, in their order.
 
     Raises:
         UserError: a name is not known.
@@ -62,18 +62,18 @@ def choose(
 def run_suites(
     suites: Mapping[str, ModuleType], settings: Settings, only: Sequence[str] = ()
 ) -> dict:
-    """Measures the cases of suites, with a progress bar.
+    """Measure the cases of suites, with a progress bar.
 
     Args:
         suites: by operator, the module with its ``cases(settings)``.
         settings: of the cases.
-        only: names of the cases to measure; all of them if there is none.
+        only: names of the cases to measure; all by default.
 
     Returns:
-        The document of the records and peers; Ctrl-C leaves what was measured in it.
+        The document of the records and peers; after Ctrl-C with the results so far.
 
     Raises:
-        UserError: the suites have no case of a name.
+        UserError: a name is not a case of the suites.
     """
     cases: list[Case] = []
     for op, module in suites.items():
@@ -98,11 +98,11 @@ def run_suites(
 
 
 def read_document(path: Path) -> dict:
-    """Reads a bench.json, and checks that it holds all that reports need.
+    """Read a bench.json, and check that it has all fields of reports.
 
     Raises:
-        UserError: no such file, not JSON, of another format, or something in it is missing, of
-            another type or out of range; the message says where.
+        UserError: no such file, not JSON, another format, or a value is missing, of another type
+            or out of range; the message names its place.
     """
     try:
         return check_document(documents.read_document(path, Any))
@@ -111,10 +111,10 @@ def read_document(path: Path) -> dict:
 
 
 def check_document(document: Any) -> dict:
-    """Checks that the content of a bench.json holds all that reports need, and returns it.
+    """Check that the content of a bench.json has all fields of reports, and return it.
 
     Raises:
-        ValueError: as ``read_document`` says.
+        ValueError: as for ``read_document``.
     """
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError(f"not a result of 'gamba bench' (format is not {FORMAT})")
@@ -128,7 +128,7 @@ def check_document(document: Any) -> dict:
     return document
 
 
-_Text = Annotated[str, Meta(max_length=10_000)]  # the longest of ours is a compiler's message
+_Text = Annotated[str, Meta(max_length=10_000)]  # the longest is a compiler's message
 _Number = Annotated[float, Meta(gt=-1e300, lt=1e300)]
 _Time = Annotated[float, Meta(gt=0, lt=1e300)]
 
@@ -172,7 +172,7 @@ _DOCUMENT = msgspec.defstruct(
 def write_document(
     document: dict, folder: Path, tables: Maker = markdown, charts: Maker = page
 ) -> None:
-    """Writes bench.json, bench.md and bench.html; ``tables`` and ``charts`` make the last two."""
+    """Write bench.json, bench.md and bench.html; ``tables`` and ``charts`` make the last two."""
     write_json(folder / "bench.json", document)
     write_pages([document], folder, tables, charts)
 
@@ -180,13 +180,13 @@ def write_document(
 def write_pages(
     documents: Sequence[dict], out: Path, tables: Maker = markdown, charts: Maker = page
 ) -> list[Path]:
-    """Writes the tables and the page of documents.
+    """Write the tables and the page of documents.
 
     Args:
-        documents: as ``read_document`` returns them.
+        documents: from ``read_document``.
         out: a .md or .html file, or a folder for bench.md and bench.html.
-        tables: what makes the Markdown.
-        charts: what makes the page.
+        tables: makes the Markdown.
+        charts: makes the page.
 
     Returns:
         The files.
@@ -205,7 +205,7 @@ def write_pages(
 
 
 def write_static(folder: Path) -> int:
-    """Compiles the CUDA kernels and writes what they take to static.json and static.md.
+    """Compile the CUDA kernels, and write their resources to static.json and static.md.
 
     Returns:
         The number of rows.
@@ -229,12 +229,12 @@ def write_static(folder: Path) -> int:
 
 
 def failed_records(document: dict) -> list[dict]:
-    """The records whose check or run failed."""
+    """Return the records whose check or run failed."""
     return [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
 
 
 def summary(document: dict, old: dict | None) -> str:
-    """Lines on failures, and the ratios of the times to those of an older document."""
+    """Return lines on failures, and the ratios of times to those of an older document."""
     lines = [] if old is None else [ratio_table(old, document)]
     for r in failed_records(document):
         lines.append(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")

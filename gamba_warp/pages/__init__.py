@@ -1,1 +1,1 @@
-"""What people look at: turntables and HTML pages with a viewer."""
+"""Turntables, and HTML pages with charts and viewers."""

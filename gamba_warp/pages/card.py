@@ -1,7 +1,7 @@
-"""The card of a trained model: what it was trained on, and how well it does, in a few lines.
+"""Model cards: training data and metrics of a trained model.
 
-It is the file ``NAME.json`` beside the weights ``NAME.safetensors``. A model without one is not
-worse for it; its pages say that nothing is known of its training.
+A card is the file ``NAME.json`` beside the weights ``NAME.safetensors``. It is optional: pages of
+a model without one state that its training is unknown.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ..image_metrics import METRICS as OF_VIEWS
 from ..image_metrics import all_figures, on_grounds
 from ..untrusted.documents import read_document
 
-_LIMIT = 1 << 20  # bytes; ours take a few kB
+_LIMIT = 1 << 20  # bytes; a card usually has a few kB
 _Text = Annotated[str, Meta(max_length=2000)]
 _Count = Annotated[int, Meta(ge=0, le=10**12)]
 _Name = Annotated[str, Meta(max_length=80)]
 OF_PICTURES = {key: metric.head for key, metric in OF_VIEWS.items()}
 OF_GROUNDS = {key: metric.head for key, metric in on_grounds().items()}
-# How each metric is called, and with how many digits it is shown.
+# Title and decimals of each metric.
 METRICS = {
     **{key: (metric.head, metric.digits) for key, metric in all_figures().items()},
     "chamfer": ("Chamfer", 4),
@@ -38,14 +38,14 @@ class Figure(msgspec.Struct, frozen=True, omit_defaults=True):
 
     Attributes:
         mean: of the objects' values.
-        interval: where it lies with 95 % certainty, or None.
+        interval: its 95 % interval, or None.
     """
 
     mean: float
     interval: tuple[float, float] | None = None
 
     def text(self, digits: int) -> str:
-        """The mean, and in brackets the interval, with so many digits after the point."""
+        """Format the mean, and in brackets the interval, with the given decimals."""
         low_high = self.interval or ()
         between = ", ".join(f"{value:.{digits}f}" for value in low_high)
         return f"{self.mean:.{digits}f}" + (f" [{between}]" if between else "")
@@ -55,7 +55,7 @@ class _Row(msgspec.Struct, frozen=True, omit_defaults=True):
     """Figures of a model or of a baseline: a field for each of ``METRICS``, None if not measured.
 
     Attributes:
-        views: views that were compared, or ``shape`` for the geometry.
+        views: the compared views, or ``shape`` for the geometry.
         name: ``model``, or the baseline's name.
         objects: number of objects.
     """
@@ -68,7 +68,7 @@ class _Row(msgspec.Struct, frozen=True, omit_defaults=True):
 if TYPE_CHECKING:
 
     class Row(_Row, frozen=True):
-        """As below."""
+        """Type of the struct below."""
 
         def __getattr__(self, key: str) -> Figure | None: ...
 else:
@@ -77,18 +77,18 @@ else:
 
 
 class ModelCard(msgspec.Struct, frozen=True):
-    """What is known of a trained model.
+    """Card of a trained model.
 
     Attributes:
-        data: what it was trained on, and its licences.
+        data: training data and its licences.
         objects: number of training objects.
         steps: number of optimizer steps.
         compute: time and machine.
         command: the training command.
         seed: of the training.
-        use: what the model is meant for.
-        limits: what it does badly.
-        measured: commands that gave the figures, and on what.
+        use: intended use.
+        limits: known weaknesses.
+        measured: commands and data of the figures.
         figures: of the model and of the baselines.
     """
 
@@ -105,28 +105,28 @@ class ModelCard(msgspec.Struct, frozen=True):
 
 
 def card_path(checkpoint: Path) -> Path:
-    """Where the card of a model file lies, whether there is one or not."""
+    """Return the path of a model file's card, which may be missing."""
     return checkpoint.with_suffix(".json")
 
 
 def read_card(checkpoint: Path) -> ModelCard | None:
-    """Reads the card of a model file.
+    """Read the card of a model file.
 
     Args:
         checkpoint: the ``.safetensors`` file.
 
     Returns:
-        The card, or None where there is none.
+        The card, or None without one.
 
     Raises:
-        UserError: the file is there and is no card.
+        UserError: the file is not a valid card.
     """
     path = card_path(checkpoint)
     return read_document(path, ModelCard, _LIMIT) if path.exists() else None
 
 
 def about_model(checkpoint: Path) -> list[tuple[str, str]]:
-    """What a page says of a model: labels and texts. A card that cannot be read is no error.
+    """Return labels and texts about a model for a page; an unreadable card is not an error.
 
     Args:
         checkpoint: the ``.safetensors`` file.
@@ -145,14 +145,14 @@ def about_model(checkpoint: Path) -> list[tuple[str, str]]:
 
 
 def _in_short(card: ModelCard) -> Iterator[tuple[str, str]]:
-    """The model's own figures, each beside the best baseline's."""
+    """Yield the model's figures, each beside the best baseline's."""
     names = {"novel": "new views", "input": "input view", "shape": "shape"}
     for own in card.figures:
         if own.name != "model":
             continue
         others = [row for row in card.figures if row.views == own.views and row is not own]
         if own.views == "input":
-            others = []  # to copy the input is no feat
+            others = []  # copying the input is trivial
         found = []
         for key, (name, digits) in METRICS.items():
             value = getattr(own, key)

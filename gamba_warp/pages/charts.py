@@ -1,4 +1,4 @@
-"""Charts as inline SVG: points, lines, bands, logarithmic axes; the page sets the colours."""
+"""Charts as inline SVG with points, lines, bands and logarithmic axes; the page sets colours."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from markupsafe import Markup
 from .templates import render
 
 WIDTH, HEIGHT = 600, 380  # of a chart, pixels
-COLOURS = 6  # that the style sheet has, --s0 to --s5
+COLOURS = 6  # of the style sheet, --s0 to --s5
 _LEFT, _RIGHT, _TOP, _BOTTOM = 74, 24, 46, 46  # margins, pixels
 _CHARACTER, _LINE = 6.4, 13.0  # size of a label's character, pixels
-_FEW = 20  # points of a line that are drawn larger
+_FEW = 20  # lines with at most so many points have larger dots
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Point:
     """One figure.
 
     Attributes:
-        x: where it lies.
+        x: horizontal value.
         y: the figure.
-        label: is drawn beside it.
-        mark: "", "default" (a ring around it) or "peer" (a square).
-        spread: low and high end of the band around it.
+        label: drawn beside it.
+        mark: "", "default" (a ring) or "peer" (a square).
+        spread: low and high end of its band.
     """
 
     x: float
@@ -42,10 +42,10 @@ class Series:
     """Points of one colour.
 
     Attributes:
-        name: in the legend, if it has letters.
+        name: in the legend, unless empty.
         points: in the order of the line.
         line: "" or "straight"; "steps", "guide" and "curve" hide the points.
-        colour: number of its colour; None: its place among the series.
+        colour: number of its colour; None: its index among the series.
     """
 
     name: str
@@ -56,14 +56,14 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """What an axis shows.
+    """An axis of a chart.
 
     Attributes:
         label: with the unit.
-        logarithmic: whether it is.
-        values: its ticks, if they are given.
-        ends: its ends; None: those of the points, with room.
-        rows: ticks in several rows, each with its name: places and texts.
+        logarithmic: False for a linear axis.
+        values: ticks, if given.
+        ends: limits; None: those of the points, with a margin.
+        rows: ticks in several rows, each with its name: positions and texts.
     """
 
     label: str
@@ -74,7 +74,7 @@ class Axis:
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Returns, by x, the points that no other one equals or beats in both x and y (less wins)."""
+    """Return, sorted by x, the points that no other equals or beats in both x and y (less wins)."""
     front: list[Point] = []
     for point in sorted(points, key=lambda p: (p.x, p.y)):
         if not front or point.y < front[-1].y:
@@ -91,20 +91,20 @@ def chart(
     size: tuple[int, int] = (WIDTH, HEIGHT),
     tooltips: Sequence[tuple[float, str]] = (),
 ) -> Markup | str:
-    """Draws a chart.
+    """Draw a chart.
 
     Points that are not finite, or not positive on a logarithmic axis, are left out.
 
     Args:
-        series: what is drawn, each over the one before.
+        series: drawn in order, later ones on top.
         x: the horizontal axis.
         y: the vertical axis, whose label is the chart's title.
-        name: for those who do not see it; the title, if not given.
-        size: width and height, pixels of its own measure.
+        name: accessible name; by default the title.
+        size: width and height in user units.
         tooltips: texts of columns of the chart by their x, rising.
 
     Returns:
-        The ``<svg>`` element, or an empty text if there is nothing to show.
+        The ``<svg>`` element, or an empty text without points.
     """
     found = [
         (s, [p for p in s.points if _fits(p.x, x) and _fits(p.y, y)], i)
@@ -119,11 +119,11 @@ def chart(
     ends = [value for p in shown for value in (p.y, *(p.spread or ()))]
     to_y = _Scale([value for value in ends if _fits(value, y)], y, bottom, top)
     drawn, named = [], []
-    for s, points, place in found:
-        colour = (place if s.colour is None else s.colour) % COLOURS
+    for s, points, index in found:
+        colour = (index if s.colour is None else s.colour) % COLOURS
         placed = [(to_x(p.x), to_y(p.y)) for p in points]
         path = placed
-        if s.line == "steps":  # the line shows the least y that can be had for at most x
+        if s.line == "steps":  # the line shows the least y reached at most x
             corners = [(after[0], at[1]) for at, after in zip(placed, placed[1:])]
             path = [p for pair in zip(placed, [*corners, placed[-1]]) for p in pair]
         spreads = [(at[0], p.spread) for at, p in zip(placed, points) if p.spread]
@@ -173,14 +173,14 @@ text { fill: var(--text); font: 12px system-ui, sans-serif; }
 
 
 def picture(drawn: Sequence[tuple[str, str]], size: tuple[int, int] = (WIDTH, HEIGHT)) -> str:
-    """Charts with their titles as one SVG file with colours of its own, for pages that load it.
+    """Combine charts with titles into one SVG file with its own colours.
 
     Args:
-        drawn: a title, and what ``chart`` returns, each.
-        size: that of the charts.
+        drawn: pairs of a title and the result of ``chart``.
+        size: of the charts.
 
     Returns:
-        The text of the file; empty if there is no chart.
+        The text of the file; empty without charts.
     """
     if not drawn:
         return ""
@@ -190,8 +190,8 @@ def picture(drawn: Sequence[tuple[str, str]], size: tuple[int, int] = (WIDTH, HE
     for i, (name, svg) in enumerate(drawn):
         x, y = _GAP + i % columns * step_x, _GAP + i // columns * step_y
         parts.append(f'<text class="title" x="{x + 6}" y="{y + 16}">{html.escape(name)}</text>')
-        place = f'<svg x="{x}" y="{y + _TITLE}" width="{size[0]}" height="{size[1]}" '
-        parts.append(str(svg).replace("<svg ", place, 1))
+        element = f'<svg x="{x}" y="{y + _TITLE}" width="{size[0]}" height="{size[1]}" '
+        parts.append(str(svg).replace("<svg ", element, 1))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}">'
         f"<style>{_STYLE}</style>{''.join(parts)}</svg>\n"
@@ -199,7 +199,7 @@ def picture(drawn: Sequence[tuple[str, str]], size: tuple[int, int] = (WIDTH, HE
 
 
 def number(value: float) -> str:
-    """A figure on an axis or in a legend, in up to six digits or as a power of ten."""
+    """Format a figure with up to six digits, or as a power of ten."""
     if value and not 1e-3 <= abs(value) < 1e6:
         return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
     return f"{value:,.6g}"
@@ -214,7 +214,7 @@ def _path(points: Sequence[tuple[float, float]]) -> str:
 
 
 class _Scale:
-    """The map from figures to pixels, with room at both ends; ``low`` and ``high`` bound it."""
+    """Map from figures to pixels, with a margin at both ends; ``low`` and ``high`` bound it."""
 
     def __init__(self, values: Sequence[float], axis: Axis, start: float, end: float) -> None:
         self._start, self._end, self._logarithmic = start, end, axis.logarithmic
@@ -222,12 +222,12 @@ class _Scale:
         self._only = values[0] if min(values) == max(values) and axis.ends is None else None
         low, high = (self._bend(value) for value in axis.ends or (min(values), max(values)))
         if axis.ends is None:
-            room = 0.08 * (high - low) or (0.3 if axis.logarithmic else abs(high) or 1.0)
-            if axis.logarithmic:  # at least a factor of 2.5, so that noise does not look like more
-                room = max(room, (0.4 - high + low) / 2)
-            low, high = low - room, high + room
+            margin = 0.08 * (high - low) or (0.3 if axis.logarithmic else abs(high) or 1.0)
+            if axis.logarithmic:  # at least a factor of 2.5, so that noise is not exaggerated
+                margin = max(margin, (0.4 - high + low) / 2)
+            low, high = low - margin, high + margin
         self._low, self._high = low, high
-        # A stranger's figures may leave no room in the range of numbers.
+        # Untrusted figures may exceed the range of floats.
         self.low = 10 ** max(low, -300.0) if axis.logarithmic else low
         self.high = 10 ** min(high, 300.0) if axis.logarithmic else high
 
@@ -236,19 +236,19 @@ class _Scale:
         return self._start + (self._end - self._start) * part
 
     def ticks(self) -> list[float]:
-        """Round values within the bounds; where all figures are one, that one."""
+        """Return round values within the bounds; if all figures are equal, that figure."""
         if self._only is not None and not self._logarithmic:
             return [float(f"{self._only:.4g}")]
         return round_values(self.low, self.high, self._logarithmic)
 
 
 def round_values(low: float, high: float, logarithmic: bool = False) -> list[float]:
-    """Round values within bounds, multiples of 1, 2 or 5 times a power of ten.
+    """Return round values within bounds: multiples of 1, 2 or 5 times a power of ten.
 
     Args:
         low: lower bound; above 0 if ``logarithmic``.
         high: upper bound, above ``low``.
-        logarithmic: whether the axis is; within a short span of one there are more values.
+        logarithmic: for a logarithmic axis, which has more values over a short span.
     """
     if logarithmic:
         powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
@@ -266,7 +266,7 @@ def round_values(low: float, high: float, logarithmic: bool = False) -> list[flo
 def _labels(
     named: Sequence[tuple[tuple[float, float], str]], width: float, bottom: float
 ) -> list[tuple[float, float, str]]:
-    """Puts texts beside their points, each at the first position that hides nothing."""
+    """Place texts beside their points, each at the first position without overlap."""
     taken = [(x - 9, y - 9, x + 9, y + 9) for (x, y), _ in named]
     found = []
     for (x, y), text in named:

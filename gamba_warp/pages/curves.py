@@ -14,7 +14,7 @@ from .charts import Axis, Point, round_values
 from .page import Section
 from .run_log import RunRecord, Series
 
-# Points of a curve: with more than the least they are averaged, eight or more at a time.
+# Points of a curve: above _LEAST they are averaged, eight or more at a time.
 _LEAST, _MOST, _EACH = 60, 100, 8
 _SIZE = (480, 250)
 _COLOUR_OF = {"held out": 1, "input view": 1, "novel views": 2}  # the same in all charts
@@ -27,9 +27,8 @@ class Chart:
     Attributes:
         title: with the unit.
         lines: names of ``RunRecord.series`` by label.
-        logarithmic: whether the vertical axis is, where values span over 3 x.
-        exact: whether points are left out where there are many, and not averaged; of validations
-            they always are.
+        logarithmic: use a logarithmic vertical axis if values span over a factor of 3.
+        exact: many points are thinned instead of averaged; validations always are.
     """
 
     title: str
@@ -67,13 +66,13 @@ _CHARTS = (
 def curves_section(
     title: str, text: str, record: RunRecord, chosen: Sequence[Chart] | None = None
 ) -> Section:
-    """A run's curves: losses, PSNR, SSIM, LPIPS, mask IoU, learning rate, speed.
+    """Return a run's curves: losses, PSNR, SSIM, LPIPS, mask IoU, learning rate, speed.
 
-    Each chart has the steps and the hours below it, and the values of a place in its tooltips.
+    Each chart has axes of steps and hours, and tooltips with the values.
 
     Args:
         title: of the section.
-        text: of the section; where the log holds no figures, a sentence says so instead.
+        text: of the section; replaced by a note if the log has no figures.
         record: the run's log.
         chosen: other charts.
     """
@@ -89,7 +88,7 @@ def curves_section(
 
 
 def _with_datasets(chart: Chart, names: Sequence[str]) -> Chart:
-    """Adds the lines of further datasets, so far as there are colours: not those of input views."""
+    """Add the lines of further datasets, except input views, as far as there are colours."""
     lines = dict(chart.lines)
     for name in names:
         for label, series in chart.lines.items():
@@ -99,7 +98,7 @@ def _with_datasets(chart: Chart, names: Sequence[str]) -> Chart:
 
 
 def _thinned(series: Series, exact: bool) -> list[Point]:
-    """The curve's points; those that were averaged have the middle 80 % of the values as spread."""
+    """Return the curve's points; averaged ones have the middle 80 % of the values as spread."""
     steps, values = np.array(series.steps), np.array(series.values)
     if exact and len(steps) > _LEAST:
         kept = np.linspace(0, len(steps) - 1, min(_MOST, len(steps))).astype(int)
@@ -118,15 +117,15 @@ def _thinned(series: Series, exact: bool) -> list[Point]:
 
 
 def _draw(chart: Chart, record: RunRecord) -> str:
-    """The chart's ``<svg>``, or an empty text where none of its lines has a point."""
+    """Return the chart's ``<svg>``, or an empty text if no line has a point."""
     lines, drawn = {}, []
-    for place, (label, name) in enumerate(chart.lines.items()):
+    for index, (label, name) in enumerate(chart.lines.items()):
         series = record.series.get(name)
         if series and series.steps:
             lines[label] = points = _thinned(series, chart.exact or name.startswith("val"))
             last = f"{label} {_short(points[-1].y)}".strip()
             kind = "straight" if len(series.steps) <= _LEAST else "curve"
-            drawn.append(charts.Series(last, points, kind, _COLOUR_OF.get(label, place)))
+            drawn.append(charts.Series(last, points, kind, _COLOUR_OF.get(label, index)))
     if not lines:
         return ""
     ends = [end for points in lines.values() for p in points for end in (p.y, *(p.spread or ()))]
@@ -145,13 +144,13 @@ def _draw(chart: Chart, record: RunRecord) -> str:
     tooltips = []
     for x in (point.x for point in finest):
         hours = np.interp(x, steps, minutes) / 60
-        told = [f"step {x:,.0f}, {f'{hours:.2f} h' if hours >= 1 else f'{hours * 60:.1f} min'}"]
+        texts = [f"step {x:,.0f}, {f'{hours:.2f} h' if hours >= 1 else f'{hours * 60:.1f} min'}"]
         for label, points in lines.items():
             near = min(points, key=lambda point: abs(point.x - x))
             away = points is not finest and abs(near.x - x) * 200 > last
-            told.append(f"{label} {_short(near.y)}".strip())
-            told[-1] += f" (step {near.x:,.0f})" if away else ""
-        tooltips.append((x, "\n".join(told)))
+            texts.append(f"{label} {_short(near.y)}".strip())
+            texts[-1] += f" (step {near.x:,.0f})" if away else ""
+        tooltips.append((x, "\n".join(texts)))
     return charts.chart(
         drawn,
         Axis("steps", False, ends=(0.0, last), rows=rows),

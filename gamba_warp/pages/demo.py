@@ -1,4 +1,4 @@
-"""The page of ``gamba demo``: what its commands wrote, on one page."""
+"""Page of ``gamba demo`` with the results of its commands."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ _BASELINES = {
 _LIBRARY = re.compile(r"^(blendswap-cc-(0|by)|katorlegaz|reallusion|scopia)-")
 _FIRST = 6  # pictures in the first section
 _TURN = 24  # views of a turntable
-_SHOWN = 5  # of these in the first section
+_SHOWN = 5  # of these, in the first section
 
 
 @dataclass(frozen=True)
 class DemoResults:
-    """Where the commands of a demo left their results.
+    """Paths of the results of a demo's commands.
 
     Attributes:
-        shipped: the model file that the demo came with.
+        shipped: the shipped model file.
         icons: pictures that were reconstructed.
-        results: what ``gamba reconstruct`` made of them; some may be missing.
+        results: of ``gamba reconstruct``; some may be missing.
         views: results of ``gamba eval-views`` of the shipped model.
         shapes: results of ``gamba eval-geometry``; the report may be missing.
-        run: run folder of ``gamba train``; it may be missing still.
-        views_here: results of ``gamba eval-views`` of that model; they may be missing still.
+        run: run folder of ``gamba train``; may not exist yet.
+        views_here: results of ``gamba eval-views`` of that model; may not exist yet.
     """
 
     shipped: Path
@@ -59,11 +59,11 @@ class DemoResults:
 
 
 def write_demo(path: Path, results: DemoResults, text: str) -> None:
-    """Writes the page.
+    """Write the page.
 
     Args:
         path: the .html file.
-        results: what is shown.
+        results: to show.
         text: a sentence or two for the head of the page.
 
     Raises:
@@ -79,27 +79,27 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
     for strip in strips:
         shown = tiles(strip)
         record = next(o for o in report["objects"] if o["name"] == strip.stem)
-        said = (
+        caption = (
             f"Shipped model. New views: {record['psnr']:.1f} dB; "
             f"input view: {record['input']['psnr']:.1f} dB."
         )
-        section = _turned(_name(strip), said, results.views / "gaussians" / f"{strip.stem}.ply")
+        section = _turned(_name(strip), caption, results.views / "gaussians" / f"{strip.stem}.ply")
         section.picture, section.views = shown[0][0], {"Predicted": shown[1], "Truth": shown[2]}
         held_out.append(section)
     icons, others = [], []
     for icon in sorted(results.icons.glob("*.png")):
         ply = results.results / f"{icon.stem}.ply"
         if ply.exists():
-            said = "Shipped model; a picture by another renderer."
-            icons.append(_turned(f"Icon: {_name(icon)}", said, ply))
+            caption = "Shipped model; a picture by another renderer."
+            icons.append(_turned(f"Icon: {_name(icon)}", caption, ply))
             icons[-1].picture = cut_out(icon).rgba
             if _name(icon) not in map(_name, strips):
                 others.append(icons[-1])
     mixed = [section for pair in zip_longest(held_out, others) for section in pair if section]
     first = (
-        "One picture in, the first of each row; one pass of the shipped model on this machine; "
-        f"views from all around out, in steps of {360 * (_TURN // _SHOWN) // _TURN} degrees, the "
-        "first from the same side. The model was trained on none of these objects."
+        "Each row has the input picture, then views of the result of one pass of the shipped model "
+        f"on this machine, in steps of {360 * (_TURN // _SHOWN) // _TURN} degrees from the input "
+        "view. The model was trained on none of these objects."
     )
     around = {section.title: _around(section) for section in mixed[:_FIRST]}
     sections = [
@@ -114,19 +114,19 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
 
 
 def _turned(title: str, text: str, ply: Path) -> Section:
-    """A reconstruction with its turntable."""
+    """Return a reconstruction with its turntable."""
     gaussians = load_ply(ply).drawn()
     turn = turntable_frames(gaussians, size=192, frames=_TURN)
     return Section(title, text, gaussians=gaussians, turntable=turn)
 
 
 def _name(path: Path) -> str:
-    """The name of an object without that of its library."""
+    """Return the name of an object without its library's."""
     return _LIBRARY.sub("", path.stem)
 
 
 def _around(section: Section) -> np.ndarray:
-    """The input and some frames of the turntable, ``[1 + _SHOWN, S, S, 3]``."""
+    """Return the input and some frames of the turntable, ``[1 + _SHOWN, S, S, 3]``."""
     assert section.picture is not None and section.turntable is not None
     frames = section.turntable[:: len(section.turntable) // _SHOWN][:_SHOWN] / 255.0
     flat = section.picture
@@ -138,7 +138,7 @@ def _around(section: Section) -> np.ndarray:
 
 
 def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | None) -> list[Section]:
-    """Metrics of the models beside those of the baselines, on white and on other grounds."""
+    """Return metrics of models and baselines, on white and on other backgrounds."""
     models = {"the shipped model": report["mean"]}
     if (here := results.views_here / "report.json").exists():
         models["the model trained here"] = read_document(here, dict[str, Any])["mean"]
@@ -164,12 +164,12 @@ def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | Non
             "they fill more of their pictures: an empty picture, which is right wherever nothing "
             f"is, has {empty:.1f} dB here and {known['background']:.1f} dB there."
         )
-    haze = "What has white haze around it is right on white, and wrong here."
+    haze = "A white haze is invisible on white, but counts here."
     parts = ("Numbers", text, OF_PICTURES), ("Numbers on black and on grey", haze, OF_GROUNDS)
     sections = []
-    for title, said, names in parts:
+    for title, caption, names in parts:
         rows = [[label, views, *(_cell(m.get(k)) for k in names)] for label, views, m in figures]
-        sections.append(Section(title, said, header=["", "views", *names.values()], table=rows))
+        sections.append(Section(title, caption, header=["", "views", *names.values()], table=rows))
     return sections
 
 
@@ -180,7 +180,7 @@ def _cell(value: float | None) -> str:
 def _trained_here(
     results: DemoResults, strips: list[Path], card: ModelCard | None
 ) -> list[Section]:
-    """The training that the demo ran, and two of the held-out objects by both models."""
+    """Return the training of the demo, and two held-out objects by both models."""
     log = results.run / "log.jsonl"
     if not log.exists():
         return [Section("Trained here", "This part is not done yet.")]
@@ -189,7 +189,7 @@ def _trained_here(
     text = (
         "A model of the preset rays, trained by this demo from random weights on the training "
         f"objects of the starter set, for {record.step:,} steps{compared}. Its curves show that "
-        "training works, its pictures what more of it is for."
+        "training works, its pictures the effect of more steps."
     )
     sections = [curves_section("Trained here", text, record)]
     both = ((strip, results.views_here / "strips" / strip.name) for strip in strips)

@@ -1,4 +1,4 @@
-"""What is written of an object: of a file by ``gamba export``, of a picture by ``reconstruct``."""
+"""Output files of an object, for ``gamba export`` and ``gamba reconstruct``."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ from .page import Section, index_page, reconstruction_page
 from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
 
-INDEX = "index.html"  # leads to the pages of several results
-_SMALL = (320, 160)  # size there of an input and its result together, pixels
+INDEX = "index.html"  # links to the pages of several results
+_SMALL = (320, 160)  # size of its thumbnails, an input and its result, pixels
 _SURFACE = SurfaceOptions(colors=True, faces=BROWSER_FACES)
 
 
 @dataclass(kw_only=True)
 class ObjectFiles:
-    """What to write of each object.
+    """Files to write for each object.
 
     Attributes:
         options: the files.
-        surface: how a mesh is made.
+        surface: options of the mesh.
         texture: side of its texture, pixels; 0: none.
         mesh: formats of the mesh.
     """
@@ -61,7 +61,7 @@ class ObjectFiles:
         self.mesh = mesh_formats(self.options.mesh)
 
     def suffixes(self, meshes: bool = True) -> list[str]:
-        """What follows the name of an object in each of its files, those of meshes the last."""
+        """Return the suffixes of an object's files, those of meshes last."""
         options = self.options
         found = [splat_suffix(kind) for kind in options.splats]
         found += [f".{options.turntable}"] if options.turntable != "none" else []
@@ -69,7 +69,7 @@ class ObjectFiles:
         return found + (mesh_suffixes(self.mesh, self.texture) if meshes else [])
 
     def require(self) -> None:
-        """Refuses what needs a library that is not installed (ModuleNotFoundError)."""
+        """Raise ModuleNotFoundError if a required library is not installed."""
         require_movie(self.options.turntable)
         if self.mesh:
             self.surface.require(self.texture)
@@ -83,20 +83,20 @@ class ObjectFiles:
         device: torch.device,
         comments: Sequence[str],
     ) -> tuple[list[str], np.ndarray | None]:
-        """Writes the files of one object, ``NAME.*`` by the section's title.
+        """Write the files of one object, ``NAME.*`` by the section's title.
 
         Args:
-            gaussians: the object, of any size anywhere.
-            shown: the object as turntable and viewer have it, at the origin in units of its
-                longest side; None: as it is.
-            view: from where they look.
-            section: of the page, which gets what is made here.
+            gaussians: the object, of any size and position.
+            shown: the object for turntable and viewer, at the origin in units of its longest side;
+                None: ``gaussians``.
+            view: of turntable and viewer.
+            section: of the page, filled in here.
             device: that renders.
             comments: lines for the header of a ``.ply``.
 
         Returns:
-            Sentences about what formats cannot hold and about the mesh, and the turntable
-            ``[F, S, S, 3]`` uint8, if one was made.
+            Sentences about losses of formats and about the mesh, and the turntable ``[F, S, S, 3]``
+            uint8, if one was made.
 
         Raises:
             UserError: a file cannot be written, or the object has no surface.
@@ -104,10 +104,10 @@ class ObjectFiles:
         options = self.options
         base, turn = options.out / section.title, None
         STAGES.begin("Gaussians")
-        said = []
+        notes = []
         for kind in options.splats:
             path = base.with_name(base.name + splat_suffix(kind))
-            said.append(write_gaussians(path, gaussians, kind, comments=comments))
+            notes.append(write_gaussians(path, gaussians, kind, comments=comments))
         if options.turntable != "none" or options.page:
             STAGES.begin("turntable")
             seen = gaussians if shown is None else shown
@@ -119,7 +119,7 @@ class ObjectFiles:
                 save_turntable(base.with_name(f"{base.name}.{options.turntable}"), turn)
             section.turntable, section.gaussians = turn, seen
             self._write_page(section, meshes=False)
-        if self.mesh:  # what takes longest comes last: all else is there to look at
+        if self.mesh:  # the slowest comes last, so that the rest can be viewed
             STAGES.begin("mesh")
             start = time.perf_counter()
             how = self.surface, options.frame, device, self.texture
@@ -127,14 +127,14 @@ class ObjectFiles:
             seconds = time.perf_counter() - start
             closed = "closed" if mesh.is_watertight() else "open"
             counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closed}"
-            said.append(f"Mesh: {counts}, {seconds:.1f} s.")
+            notes.append(f"Mesh: {counts}, {seconds:.1f} s.")
             section.mesh = mesh if shown is None else None
             self._write_page(section, meshes=True)
         STAGES.begin("rest")
-        return [*filter(None, said)], turn
+        return [*filter(None, notes)], turn
 
     def _write_page(self, section: Section, meshes: bool) -> None:
-        """The page, if it is wanted; the second time it also leads to the meshes."""
+        """Write the page, if requested; with ``meshes`` it also links to these."""
         if self.options.page:
             STAGES.begin("page")
             ends = [end for end in self.suffixes(meshes) if end != ".html"]
@@ -144,12 +144,12 @@ class ObjectFiles:
 
 @dataclass(kw_only=True)
 class ExportJob(ObjectFiles):
-    """What to write for each input.
+    """Options for each input.
 
     Attributes:
         device: device that renders.
-        view: from where turntables and pages look, in units of the object's longest side.
-        drop_bad: whether Gaussians that cannot be drawn are left out; else their file is refused.
+        view: of turntables and pages, in units of the object's longest side.
+        drop_bad: leave out invalid Gaussians; else their file is refused.
     """
 
     device: torch.device
@@ -158,17 +158,16 @@ class ExportJob(ObjectFiles):
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Files as they are given, each once; of a folder, what may hold Gaussians in it, sorted.
+    """Resolve files and folders to files of Gaussians, each once; those of a folder are sorted.
 
-    A .glb that holds a mesh is passed over: the commands put them beside the Gaussians. So are
-    names that begin with a dot: other programs hide files by it, and it marks what a killed command
-    left unfinished.
+    In folders a .glb with a mesh is skipped, because commands write them beside the Gaussians. So
+    are names that begin with a dot: hidden files, and unfinished ones of killed commands.
 
     Returns:
         The files, and the inputs that are missing or hold none, with the reason.
 
     Raises:
-        UserError: there is no input.
+        UserError: without inputs.
     """
     files: dict[Path, None] = {}
     failures = []
@@ -190,19 +189,19 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
 
 
 def holds_gaussians(path: Path) -> bool:
-    """Whether a .glb holds Gaussians, or what cannot be told; a mesh is neither."""
+    """Return True if a .glb holds Gaussians or is unreadable, False for a mesh."""
     try:
         return splat_kind(path) is not None
-    except UserError:  # it is refused with this reason when it is read
+    except UserError:  # reading it gives this error
         return True
 
 
 def read_with_warning(path: Path, drop_bad: bool) -> Gaussians:
-    """Reads a file of Gaussians for a command; a line on stderr says how many are left out.
+    """Read a file of Gaussians for a command; print the number of dropped ones on stderr.
 
     Args:
         path: the file.
-        drop_bad: whether Gaussians that cannot be drawn are left out; else their file is refused.
+        drop_bad: leave out invalid Gaussians; else the file is refused.
 
     Raises:
         UserError: as ``read_gaussians``.
@@ -214,15 +213,15 @@ def read_with_warning(path: Path, drop_bad: bool) -> Gaussians:
 
 
 def export(name: str, path: Path, job: ExportJob) -> str:
-    """Writes everything that was asked for of one file of Gaussians.
+    """Write all requested outputs of one file of Gaussians.
 
     Args:
-        name: stem of the files that are written.
+        name: stem of the outputs.
         path: the Gaussians.
-        job: what to write.
+        job: options.
 
     Returns:
-        A line about what was written.
+        A line about the outputs.
 
     Raises:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
@@ -231,23 +230,23 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     drawn = job.options.page or job.options.turntable != "none"
     shown = gaussians.in_unit(*unit_frame(gaussians)) if drawn else gaussians
     section = Section(name, table=[("Gaussians", f"{gaussians.num:,}")], **asdict(job.view))
-    said, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
-    return " ".join([f"{name}: {count}", *said])
+    notes, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
+    return " ".join([f"{name}: {count}", *notes])
 
 
 @dataclass(kw_only=True)
 class Outputs(ObjectFiles):
-    """What to write for each picture.
+    """Options for each picture.
 
     Attributes:
         checkpoint: the model's file, named in the ``.ply``.
-        about: labels and texts for the page, of the model.
+        about: labels and texts about the model for the page.
         sheet: gets a row of each picture, or None.
-        camera: elevation of the input's camera above the object, degrees (what is written stands
-            upright); distance and field of view, degrees, of the camera of turntable, sheet and
-            viewer, of which None is the model's.
-        inputs: whether each cut-out is written, too, as ``NAME-input.png``.
-        made: by name a small picture of each result that has a page.
+        camera: elevation of the input's camera above the object, degrees (outputs are upright);
+            distance and field of view, degrees, of the camera of turntable, sheet and viewer, None
+            for the model's.
+        inputs: also write each cut-out as ``NAME-input.png``.
+        made: thumbnails of results with a page, by name.
     """
 
     surface: SurfaceOptions = _SURFACE
@@ -259,21 +258,21 @@ class Outputs(ObjectFiles):
     made: dict[str, np.ndarray] = field(default_factory=dict, init=False)
 
     def suffixes(self, meshes: bool = True) -> list[str]:
-        """What follows the name of a picture in each of its files."""
+        """Return the suffixes of a picture's files."""
         return super().suffixes(meshes) + (["-input.png"] if self.inputs else [])
 
     def own(self, count: int) -> list[str]:
-        """Names of files that are of no one of so many pictures."""
+        """Return the names of files that belong to no single picture."""
         return [INDEX] if self.options.page and count > 1 else []
 
     def write_index(self) -> None:
-        """Writes the page that leads to the results, where there are several."""
+        """Write the page with links to the results, if there are several."""
         if len(self.made) > 1:
             title = f"{len(self.made):,} reconstructions"
             index_page(self.options.out / INDEX, title, self.made)
 
     def view(self, config: GambaConfig) -> Viewpoint:
-        """From where turntable, sheet and viewer look; that of the input, but for the options."""
+        """Return the viewpoint of turntable, sheet and viewer: the input's with the options."""
         return Viewpoint(0.0, config.distance, config.fov).changed(*self.camera)
 
 
@@ -285,18 +284,18 @@ def write_outputs(
     config: GambaConfig,
     seconds: float,
 ) -> None:
-    """Writes everything that was asked for of one reconstruction, as ``NAME.*`` in the folder.
+    """Write all requested outputs of one reconstruction, as ``NAME.*`` in the folder.
 
     Args:
         name: stem of the files.
-        cut: what was reconstructed, and how it was cut out.
-        gaussians: ``[N]``, on the device that is to render the turntable.
-        outputs: what to write.
+        cut: the cut-out object.
+        gaussians: ``[N]``, on the device that renders the turntable.
+        outputs: options.
         config: of the model, for the camera.
-        seconds: how long the model took.
+        seconds: run time of the model.
 
     Raises:
-        UserError: a file cannot be written, or no Gaussian can be.
+        UserError: a file cannot be written, or all Gaussians are invalid.
     """
     view = outputs.view(config)
     gaussians, count = to_be_written(gaussians, outputs.options.min_opacity)
@@ -316,6 +315,6 @@ def write_outputs(
         outputs.sheet.add(name, cut.rgba, gaussians, view)
     if outputs.options.page and turn is not None:
         flat = to_uint8(composite(cut.rgba, turn.shape[1]).numpy())
-        small = Image.fromarray(np.hstack([flat, turn[len(turn) // 8]]))  # turned a little
+        small = Image.fromarray(np.hstack([flat, turn[len(turn) // 8]]))  # rotated a little
         small.thumbnail(_SMALL)
         outputs.made[name] = np.asarray(small)

@@ -1,4 +1,4 @@
-"""What is written of an object, as options of the commands; imports nothing that is slow."""
+"""Options of output files, for the commands; without slow imports."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ..untrusted.ranges import Frames, Opacity, Side
 
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
-    """What is written of each object.
+    """Output files of each object.
 
     Attributes:
         out: Folder for the results.
         splats: Files of the Gaussians.
         mesh: Files of a coloured mesh of the surface (gamba export has its options).
-        page: Write an HTML page with a 3D viewer, and the input and the turntable if there are.
-        turntable: Moving picture of one turn.
+        page: Write an HTML page with a 3D viewer, and the input and the turntable, if any.
+        turntable: Animation of one turn.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
-        frame: Axes of meshes but .glb; opengl is y up, opencv y down as files of Gaussians are.
-        min_opacity: Leave out Gaussians fainter than this; 1/255 if not given, below which they
+        frame: Axes of meshes except .glb; opengl is y up, opencv y down like files of Gaussians.
+        min_opacity: Leave out Gaussians with a lower opacity; by default 1/255, below which they
             are never drawn. 0 keeps all.
     """
 

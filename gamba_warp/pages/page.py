@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: pictures, a 3D viewer and numbers in one file that loads nothing."""
+"""Self-contained HTML pages with pictures, a 3D viewer and numbers in one file."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _WITH_INTERVAL = re.compile(r"([-+]?[0-9][0-9.,e+-]*) (\[.*\])")
 
 @dataclass
 class Section:
-    """One block of a page; every part but the title may be left out, and all text is escaped.
+    """A block of a page; every part except the title is optional, and all text is escaped.
 
     Attributes:
         title: heading.
-        text: a sentence or two; an empty line begins another paragraph.
+        text: a sentence or two; an empty line separates paragraphs.
         picture: the input, ``[H, W, 3|4]`` floats in [0, 1].
         turntable: frames ``[F, H, W, 3]`` uint8.
         gaussians: one object ``[N]``, for the 3D viewer.
@@ -41,18 +41,18 @@ class Section:
         strip: one wide picture ``[H, W, 3]``, floats in [0, 1].
         views: pictures ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
             such as "Predicted" above "Truth".
-        links: by name a small picture ``[H, W, 3]`` uint8 that leads to NAME.html beside the page.
-        files: names of files beside the page, which it offers for download.
-        charts: what ``charts.chart`` returns.
-        table: rows of cells; text is set to the left, numbers to the right. Below a header a text
-            that is a number is one, ``1.0 [0.5, 1.5]`` is one with its interval, and "reached" and
+        links: thumbnails ``[H, W, 3]`` uint8 by name, which link to NAME.html beside the page.
+        files: names of files beside the page, for download.
+        charts: results of ``charts.chart``.
+        table: rows of cells; text is left-aligned, numbers right-aligned. Below a header, texts of
+            numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval, and "reached" and
             "missed" have colours.
         header: names of the table's columns.
         code: lines of a terminal.
-        details: long texts by name, which are hidden until they are asked for.
-        distance: distance of the viewer's camera from the origin, object units.
+        details: long texts by name, initially hidden.
+        distance: of the viewer's camera from the origin, object units.
         fov: field of view of the viewer's camera, degrees.
-        elevation: of the viewer's camera at the start, degrees.
+        elevation: initial elevation of the viewer's camera, degrees.
     """
 
     title: str
@@ -76,13 +76,13 @@ class Section:
 
 
 def page_text(title: str, text: str, sections: Sequence[Section], auto: bool = False) -> str:
-    """A whole page.
+    """Return a whole page.
 
     Args:
         title: heading of the page.
-        text: below it; an empty line begins another paragraph.
-        sections: in their order.
-        auto: whether the viewers are large and start by themselves, and sections have no headings.
+        text: below it; an empty line separates paragraphs.
+        sections: in order.
+        auto: viewers are large and start by themselves, and sections have no headings.
     """
     viewers = any(section.gaussians is not None for section in sections)
     return render(
@@ -96,7 +96,7 @@ def page_text(title: str, text: str, sections: Sequence[Section], auto: bool = F
 
 
 def reconstruction_page(path: str | Path, section: Section) -> None:
-    """Writes the page of one reconstruction atomically; its viewer is large, and starts by itself.
+    """Write the page of one reconstruction atomically; its viewer is large and starts by itself.
 
     Raises:
         UserError: the file cannot be written.
@@ -107,7 +107,7 @@ def reconstruction_page(path: str | Path, section: Section) -> None:
 def demo_page(
     path: str | Path, sections: Sequence[Section], *, title: str = "Gamba demo", text: str = ""
 ) -> None:
-    """Writes a page of many sections atomically; its viewers start when asked to.
+    """Write a page of many sections atomically; its viewers start on request.
 
     Raises:
         UserError: the file cannot be written.
@@ -116,22 +116,22 @@ def demo_page(
 
 
 def index_page(path: str | Path, title: str, results: Mapping[str, np.ndarray]) -> None:
-    """Writes, atomically, a page that leads to the pages of many reconstructions beside it.
+    """Write atomically a page with links to the pages of many reconstructions beside it.
 
     Args:
         path: the file.
         title: heading of the page.
-        results: by name a small picture ``[H, W, 3]`` uint8; NAME.html is the page.
+        results: thumbnails ``[H, W, 3]`` uint8 by name; NAME.html is the page.
 
     Raises:
         UserError: the file cannot be written.
     """
-    text = "Of each, what was given and what was made of it."
+    text = "Input and result of each."
     write_text(path, page_text(title, text, [Section("", links=results)]))
 
 
 def _image(picture: np.ndarray, label: str, css: str = "", kind: str = "PNG") -> str:
-    """An ``<img>``; WEBP takes a quarter of a PNG's size, and shows no difference that one sees."""
+    """Return an ``<img>``; WEBP takes a quarter of a PNG's size, without a visible difference."""
     content = io.BytesIO()
     options = {"optimize": True} if kind == "PNG" else {"quality": 85}
     Image.fromarray(to_uint8(picture)).save(content, kind, **options)
@@ -157,8 +157,8 @@ def _element(content: io.BytesIO, kind: str, label: str, css: str = "") -> str:
 
 def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
     assert section.gaussians is not None
-    place = (section.distance, section.fov, section.elevation)
-    which = "view" if section.picture is None else "camera"  # a picture is what a camera saw
+    viewpoint = (section.distance, section.fov, section.elevation)
+    which = "view" if section.picture is None else "camera"  # the camera of the picture
     element = frame_element(
         f"viewer{number}",
         section.title,
@@ -166,7 +166,7 @@ def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
         mesh=section.mesh,
         poster=poster,
         auto=auto,
-        **{which: place},
+        **{which: viewpoint},
     )
     return Markup(element)
 
@@ -178,7 +178,7 @@ class _Cell(NamedTuple):
 
 
 def _cells(section: Section) -> list[list[_Cell]]:
-    """The cells of the table below its header, as ``Section.table`` says."""
+    """Return the cells of the header and the table (``Section.table``)."""
 
     def cell(value: str | int | float) -> _Cell:
         if not isinstance(value, str):
@@ -190,7 +190,7 @@ def _cells(section: Section) -> list[list[_Cell]]:
         return _Cell(value, value if value in ("reached", "missed") else "")
 
     columns = [[cell(value) for value in column] for column in zip(*section.table)]
-    for column in columns:  # what is not there stands where the numbers stand
+    for column in columns:  # missing values are aligned like numbers
         if section.header and any(cell.kind == "number" for cell in column):
             column[:] = [c._replace(kind="number") if c.text in _ABSENT else c for c in column]
     heads = [[cell.kind for cell in column].count("number") * 2 > len(column) for column in columns]

@@ -1,4 +1,4 @@
-"""The page of a training run, ``RUN/index.html``: curves, pictures, what was trained and how."""
+"""Page of a training run, ``RUN/index.html``: curves, pictures, data and options."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .page import Section, demo_page
 from .run_log import RunRecord, read_run_log
 
 PAGE = "index.html"
-_WARNINGS = 20  # the last ones, on the page
+_WARNINGS = 20  # the last ones are on the page
 
 
 class _Length(msgspec.Struct, frozen=True):
@@ -31,7 +31,7 @@ class _Config(msgspec.Struct, frozen=True):
 
 
 class _Start(msgspec.Struct):
-    """What is read of the log's first line; with something of another type in it, nothing is."""
+    """Fields used of the log's first line; ignored as a whole if a type is wrong."""
 
     objects: int | None = None
     held_out: int | None = None
@@ -44,11 +44,11 @@ class _Start(msgspec.Struct):
 
 
 def write_run_page(run: Path, path: Path | None = None) -> Path:
-    """Writes a run's page, from its log and its last sample pictures.
+    """Write a run's page from its log and its last sample pictures.
 
     Args:
         run: the run folder.
-        path: the file; ``RUN/index.html`` if not given.
+        path: the file; by default ``RUN/index.html``.
 
     Returns:
         The file.
@@ -65,7 +65,7 @@ def write_run_page(run: Path, path: Path | None = None) -> Path:
     code = record.end.get("code")
     state = "finished" if record.end else "in training, or cut off"
     if type(code) is int and code > 128:
-        state = "stopped; the same command goes on from here"
+        state = "stopped; the same command resumes from here"
     hours = f"{record.minutes / 60:.1f} hours"
     spent = hours if record.minutes >= 90 else f"{record.minutes:.1f} minutes"
     sections = [
@@ -82,14 +82,14 @@ def write_run_page(run: Path, path: Path | None = None) -> Path:
     if options := record.start.get("config"):
         details = {"All options": json.dumps(options, indent=2)[:30_000]}
         sections.append(Section("Command", code=start.command[:10_000], details=details))
-    name = "/".join(run.resolve().parts[-2:])  # many a run lies in a folder that is called run
+    name = "/".join(run.resolve().parts[-2:])  # many run folders are called run
     text = f"Step {record.step:,}{total}, {spent} of training: {state}."
     demo_page(path, sections, title=f"Training of {name}", text=text)
     return path
 
 
 def _facts(record: RunRecord, start: _Start) -> list[tuple[str, str]]:
-    """What is trained on what, and how fast."""
+    """Return data, model, device and speed."""
     rows = {
         "Data": start.config.data,
         "Objects": start.objects,
@@ -126,7 +126,7 @@ def _about_curves(record: RunRecord, start: _Start) -> str:
 
 
 def _validation(record: RunRecord) -> list[Section]:
-    """The last validation as a table."""
+    """Return the last validation as a table."""
     rows = []
     for event, of in (("val", ""), *((f"val/{name}", f", {name}") for name in record.validated)):
         for view, name in (("input", "input view"), ("novel", "novel views")):
@@ -149,7 +149,7 @@ def _validation(record: RunRecord) -> list[Section]:
 
 
 def _samples(run: Path) -> list[Section]:
-    """The newest sample pictures, which the training wrote."""
+    """Return the newest sample pictures of the training."""
     found = ((re.fullmatch(r"step_(\d{1,15})\.png", p.name), p) for p in run.glob("samples/step_*"))
     step, path = max(((int(match[1]), path) for match, path in found if match), default=(0, None))
     with contextlib.suppress(UserError):

@@ -1,4 +1,4 @@
-"""Reads a run's ``log.jsonl``: figures over steps and hours, and what was said on the way."""
+"""Reading of a run's ``log.jsonl``: figures over steps and hours, and messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..untrusted import documents
 
 _MOST_WARNINGS = 1000
 _MOST_STEPS = 10**12
-# Of a training line; a validation's figures are all wanted.
+# Figures read of a training line; of a validation all are.
 _TRAIN = {"loss", "psnr", "lr", "grad_norm", "views_per_second", "seconds"}
 _NAME = re.compile(r"[a-z][a-z_]{0,30}")
 _EVENT = re.compile(r"train|best|val|val/[^/\x00-\x1f]{1,80}")  # the last of a further dataset
@@ -38,14 +38,14 @@ class Series:
     values: array = field(default_factory=lambda: array("d"))
 
     def add(self, step: float, minutes: float, value: float) -> None:
-        """Appends a point, if its step is later than that of the last one."""
+        """Append a point, if its step is later than that of the last one."""
         if not self.steps or step > self.steps[-1]:
             self.steps.append(step)
             self.minutes.append(minutes)
             self.values.append(value)
 
     def cut(self, step: float) -> None:
-        """Takes away the points of later steps."""
+        """Remove the points of later steps."""
         count = bisect_right(self.steps, step)
         for column in (self.steps, self.minutes, self.values):
             del column[count:]
@@ -53,10 +53,10 @@ class Series:
 
 @dataclass
 class RunRecord:
-    """What a log says.
+    """Content of a log.
 
     Attributes:
-        series: figures by name, such as ``train.loss``, ``val.psnr_novel`` and, of a further
+        series: figures by name, such as ``train.loss``, ``val.psnr_novel`` and, for a further
             dataset NAME, ``val/NAME.psnr_novel``; ``best.psnr`` has a point for each
             validation that was the best so far, by its mean over the datasets.
         step: the last step.
@@ -64,8 +64,8 @@ class RunRecord:
         start: the last line of the event ``start``, or empty.
         end: the line of the event ``end`` after it, or empty.
         warnings: steps and messages, the last thousand.
-        losses: the last one of "train" and of each "val"; NaN where it was not finite.
-        most: the largest of "skipped" (steps) and "device_memory" (bytes), of all lines.
+        losses: the last one of "train" and of each "val"; NaN if it was not finite.
+        most: maxima of "skipped" (steps) and "device_memory" (bytes) over all lines.
     """
 
     series: dict[str, Series] = field(default_factory=dict)
@@ -79,26 +79,26 @@ class RunRecord:
 
     @property
     def validated(self) -> list[str]:
-        """Names of the further datasets that were validated on, in the order of the log."""
+        """Names of the further validation datasets, in the order of the log."""
         found = [name[4:].rpartition(".")[0] for name in self.series if name.startswith("val/")]
         return list(dict.fromkeys(found))
 
     def values(self, name: str) -> Sequence[float]:
-        """The values of a figure by its name in ``series``; none where it lacks."""
+        """Return the values of a figure by its name in ``series``; empty if missing."""
         return self.series[name].values if name in self.series else ()
 
 
 def read_run_log(path: Path) -> RunRecord:
-    """Reads a log; lines that are damaged, cut off or of another kind are passed over.
+    """Read a log; damaged, truncated and unknown lines are skipped.
 
-    A run that was resumed wrote some steps twice: those of the last time count. Lines of older
-    versions have no minutes, which then follow from the clock of the machine.
+    A resumed run may have logged steps twice; the last ones count. Lines of older versions have no
+    minutes, which are then derived from the clock.
 
     Args:
         path: the ``log.jsonl``.
 
     Raises:
-        UserError: there is no such file, or it cannot be read.
+        UserError: the file is missing or cannot be read.
     """
     record = RunRecord()
     began, before = 0.0, 0.0  # the clock of this part, seconds, and the minutes of those before
@@ -109,7 +109,7 @@ def read_run_log(path: Path) -> RunRecord:
             if (number := _number(line.get(name))) is not None:
                 record.most[name] = max(number, record.most.get(name, 0.0))
         if event == "start":
-            for series in record.series.values():  # the run has gone back to this step
+            for series in record.series.values():  # the run was reset to this step
                 series.cut(step)
             last = [series.minutes[-1] for series in record.series.values() if series.minutes]
             record.minutes = max(last, default=0.0)
@@ -120,7 +120,7 @@ def read_run_log(path: Path) -> RunRecord:
             if minutes is None:
                 minutes = before + max(0.0, (clock or began) - began) / 60
             record.minutes = max(record.minutes, minutes)
-            if "loss" in line:  # null for one that is not finite
+            if "loss" in line:  # null if it was not finite
                 loss = _number(line["loss"])
                 record.losses[event] = math.nan if loss is None else loss
             for name, number in ((name, _number(value)) for name, value in line.items()):
@@ -139,7 +139,7 @@ def read_run_log(path: Path) -> RunRecord:
 
 
 def read_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The lines of a log that are whole, with their ``event`` and ``step``; others are passed over.
+    """Yield the complete lines of a log with ``event`` and ``step``; others are skipped.
 
     Raises:
         UserError: as ``read_run_log``.

@@ -1,4 +1,4 @@
-"""One page for a browser at the other end of a tunnel."""
+"""Server of one page, for a browser at the other end of a tunnel."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from typing import Any
 from ..errors import UserError
 
 HOSTS = ("127.0.0.1", "localhost")
-_TOLD = ("host", "origin", "sec-fetch-mode", "sec-fetch-site")
+_CHECKED = ("host", "origin", "sec-fetch-mode", "sec-fetch-site")
 _CONNECTIONS = 16  # at once; a browser opens six
-READ_SECONDS = 10.0  # a request must be there within them, and each piece of the page be taken
+READ_SECONDS = 10.0  # time limit of reading a request, and of sending each piece
 PIECE = 1 << 16  # bytes
 
 
 def is_foreign(headers: Iterable[tuple[str, str]]) -> bool:
-    """Whether a request to a server on 127.0.0.1 is not of its own page, nor of the user.
+    """Return True if a request to a server on 127.0.0.1 is neither of its page nor of the user.
 
-    A foreign web page in the same browser can send requests there, and even read the answers once
-    it has given its own name that address (DNS rebinding). The browser says so in these headers,
-    each of them once.
+    Another web page in the same browser can send requests there, and even read the answers by
+    resolving its own name to that address (DNS rebinding). The browser reveals it by these headers,
+    each of which comes once.
 
     Args:
-        headers: all of the request, by their names.
+        headers: all of the request, by name.
     """
-    said: dict[str, str] = {}
+    found: dict[str, str] = {}
     for name, value in ((name.lower(), value) for name, value in headers):
-        if name in said and name in _TOLD:
+        if name in found and name in _CHECKED:
             return True
-        said[name] = value
-    host, site = said.get("host", ""), said.get("sec-fetch-site")
+        found[name] = value
+    host, site = found.get("host", ""), found.get("sec-fetch-site")
     name, colon, port = host.partition(":")
     if name not in HOSTS or (colon and not port.isdecimal()):
         return True
-    if said.get("origin") not in (None, f"http://{host}"):
+    if found.get("origin") not in (None, f"http://{host}"):
         return True
-    followed = said.get("sec-fetch-mode") == "navigate"  # a link, whose page sees no answer
+    followed = found.get("sec-fetch-mode") == "navigate"  # a link, whose page sees no answer
     return not followed and site not in (None, "none", "same-origin")
 
 
 class PageServer(http.server.ThreadingHTTPServer):
-    """A server with a thread for each connection, so that one that stalls holds up no other.
+    """Server with a thread per connection, so that a stalled one blocks no other.
 
-    At most ``_CONNECTIONS`` are open at once; further ones are closed at the door.
+    At most ``_CONNECTIONS`` are open at once; further ones are closed immediately.
     """
 
     daemon_threads = True
@@ -57,25 +57,25 @@ class PageServer(http.server.ThreadingHTTPServer):
         super().__init__(address, page_handler(content))
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Starts a thread, or closes the connection where there are too many."""
+        """Start a thread, or close the connection if there are too many."""
         if self._free.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answers one connection."""
+        """Answer one connection."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Says nothing: a client that leaves in the middle is no fault of the page."""
+        """Print nothing: a client that disconnects is not an error."""
 
 
 def page_server(content: bytes, port: int) -> http.server.HTTPServer:
-    """A server of one page on this machine; ``serve_forever`` runs it.
+    """Return a server of one page on this machine; ``serve_forever`` runs it.
 
     Args:
         content: the page.
@@ -91,9 +91,9 @@ def page_server(content: bytes, port: int) -> http.server.HTTPServer:
 
 
 def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
-    """A request handler that answers ``/`` with one page, and everything else with 404.
+    """Return a request handler that answers ``/`` with one page, and everything else with 404.
 
-    Requests for another host's name or from another page are refused (421).
+    Requests with another host name or from another page are refused (421).
     """
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -101,10 +101,10 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
 
         def handle(self) -> None:
             def end() -> None:
-                with contextlib.suppress(OSError):  # it is closed already
+                with contextlib.suppress(OSError):  # already closed
                     self.connection.shutdown(socket.SHUT_RDWR)
 
-            # A client that sends a letter now and then would pass every single read's limit.
+            # A slow client could stay below the time limit of each single read.
             timer = threading.Timer(READ_SECONDS, end)
             timer.daemon = True
             self.reading = timer
@@ -127,10 +127,10 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
             self.send_header("Content-Length", str(len(content)))
             self.end_headers()
             view = memoryview(content)
-            for start in range(0, len(view), PIECE):  # a time limit is that of one piece
+            for start in range(0, len(view), PIECE):  # the time limit applies to one piece
                 self.wfile.write(view[start : start + PIECE])
 
         def log_message(self, format: str, *args: object) -> None:
-            """Says nothing."""
+            """Print nothing."""
 
     return Handler

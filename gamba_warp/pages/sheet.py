@@ -1,4 +1,4 @@
-"""A sheet: many pictures and what was made of them, in one picture file."""
+"""Sheet of many inputs and their results in one picture file."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ SUFFIXES = (".png", ".webp", ".jpg", ".jpeg")
 VIEWS = 5
 _TILE = 128  # pixels
 _LABEL, _GAP = 18, 12  # height of a name; between two columns of rows
-_TALL = 12  # rows in one column; with more there are two
+_TALL = 12  # most rows in one column; else there are two
 
 
 class Sheet:
-    """Collects reconstructions: of each its name, the input, and views of a turntable."""
+    """Collection of reconstructions, each with its name, input and views of a turntable."""
 
     def __init__(self, path: Path) -> None:
-        """Begins a sheet.
+        """Begin a sheet.
 
         Args:
-            path: the file that ``write`` makes.
+            path: the file that ``write`` creates.
 
         Raises:
             UserError: its suffix is not one of ``SUFFIXES``.
@@ -42,20 +42,20 @@ class Sheet:
         self._rows: list[tuple[str, np.ndarray]] = []
 
     def add(self, name: str, rgba: np.ndarray, gaussians: Gaussians, view: Viewpoint) -> None:
-        """Adds a row.
+        """Add a row.
 
         Args:
-            name: stands above the row.
-            rgba: ``[S, S, 4]`` in [0, 1], what was reconstructed.
+            name: title of the row.
+            rgba: ``[S, S, 4]`` in [0, 1], the model's input.
             gaussians: ``[N]``, on the device that renders.
-            view: from where the object is looked at.
+            view: of the turntable.
         """
         flat = over_background(resize_rgba(rgba, _TILE, _TILE), GREY)
         turn = turntable_frames(gaussians, size=_TILE, frames=VIEWS, **asdict(view))
         self._rows.append((name, np.concatenate([to_uint8(flat), *turn], axis=1)))
 
     def write(self) -> None:
-        """Writes the file, atomically; nothing if there is no row.
+        """Write the file atomically, unless there are no rows.
 
         Raises:
             UserError: it cannot be written.
@@ -75,18 +75,18 @@ class Sheet:
             sheet.paste(Image.fromarray(row), (x, y + _LABEL))
             draw.line((x + _TILE, y + _LABEL, x + _TILE, y + high - 1), "#cccccc")
         with atomic_path(self.path) as temporary:
-            sheet.save(temporary, quality=88)  # PNG has no use for it
+            sheet.save(temporary, quality=88)  # ignored for PNG
 
 
 def tiles(path: Path, columns: int = 3) -> np.ndarray:
-    """The views of a strip, as evaluations and fits write them: square ones in columns.
+    """Return the views of a strip of an evaluation or a fit: square ones in columns.
 
     Args:
         path: the picture.
         columns: of views.
 
     Returns:
-        ``[columns, V, S, S, 3]`` in [0, 1]; of ``gamba eval-views`` input, prediction and truth.
+        ``[columns, V, S, S, 3]`` in [0, 1]; for ``gamba eval-views`` input, prediction and truth.
 
     Raises:
         UserError: the picture cannot be read.

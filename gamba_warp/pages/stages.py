@@ -1,4 +1,4 @@
-"""The stages of ``gamba demo``: commands, each its own process, that are done once."""
+"""Stages of ``gamba demo``: commands in child processes, each executed once."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class _Record(msgspec.Struct):
 
 
 class Stages:
-    """What of a demo is done, as ``OUT/stages.json`` keeps it."""
+    """State of a demo, stored in ``OUT/stages.json``."""
 
     def __init__(self, out: Path) -> None:
-        """Reads what is done in a folder.
+        """Read the state of a folder.
 
         Raises:
             UserError: the record is damaged.
@@ -45,11 +45,11 @@ class Stages:
         self._path, self._record = out / "stages.json", _Record()
         if self._path.exists():
             self._record = read_document(self._path, _Record)
-        self.seconds = self._record.seconds  # that the stages took which earlier processes ran
-        self._anew = False  # whether a stage has run, so that those after it must, too
+        self.seconds = self._record.seconds  # run time of earlier processes
+        self._rerun = False  # True once a stage has run: those after it run too
 
     def forget(self) -> None:
-        """Removes what an earlier demo made; other files stay.
+        """Remove the results of an earlier demo; other files stay.
 
         Raises:
             UserError: something cannot be removed.
@@ -72,17 +72,17 @@ class Stages:
         may_fail: bool = False,
         name: str | None = None,
     ) -> None:
-        """Runs one command as its own process, its output going through, if it is not done.
+        """Run one command in a child process, with its output passed through, unless it is done.
 
-        It is done if it ended well with the same words before, all that it makes is there, and no
-        stage before it has run anew.
+        It is done if it succeeded before with the same arguments, all its results exist, and no
+        stage before it has run again.
 
         Args:
-            arguments: words of the command.
-            makes: files and folders that the command leaves.
-            reads: files that are not of the demo; with another content it is another demo.
-            may_fail: whether the demo goes on after a failure.
-            name: of the stage; the command's, if not given.
+            arguments: of the command.
+            makes: files and folders that the command creates.
+            reads: input files from outside the demo; their content is part of the options.
+            may_fail: continue the demo after a failure.
+            name: of the stage; by default the command's.
 
         Raises:
             UserError: it failed, or an earlier demo in the folder had other options or files.
@@ -100,16 +100,16 @@ class Stages:
             )
         print(f"\n$ gamba {' '.join(words)}", flush=True)
         done = stage in self._record.ended and all(path.exists() for path in makes)
-        if done and not self._anew:
+        if done and not self._rerun:
             print("done before", flush=True)
             return
-        self._record.begun[stage] = kept  # what it leaves half-done is of these options
+        self._record.begun[stage] = kept  # partial results belong to these options
         self._record.ended = [name for name in self._record.ended if name != stage]
         write_json(self._path, msgspec.to_builtins(self._record))
         started = time.perf_counter()
         code = _call(words)
         self._record.seconds += time.perf_counter() - started
-        self._anew = self._anew or bool(makes)
+        self._rerun = self._rerun or bool(makes)
         self._record.ended += [stage] if makes and code == 0 else []
         write_json(self._path, msgspec.to_builtins(self._record))
         if code - 128 in (signal.SIGINT, *end_signals()):
@@ -119,14 +119,14 @@ class Stages:
 
 
 def _call(words: list[str]) -> int:
-    """Runs a command and waits for it whatever comes; hands on what asks this process to stop."""
+    """Run a command and wait for it; forward signals that ask this process to stop."""
     with stop_requests() as received:
         child = Child([*GAMBA, *words])
 
-        def hand_on() -> None:
+        def forward_signals() -> None:
             while received:
                 child.ask(received.pop(0))
 
-        end = child.wait(hand_on)
+        end = child.wait(forward_signals)
     assert end is not None, "there is no time limit"
     return end.code

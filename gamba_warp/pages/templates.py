@@ -1,4 +1,4 @@
-"""The HTML and SVG of pages: Jinja2's templates beside this file, with all text escaped."""
+"""HTML and SVG of pages from Jinja2 templates beside this file, with all text escaped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @cache
 def _environment() -> Environment:
-    import jinja2  # not before a page is made: a command that makes none does without
+    import jinja2  # only when a page is made
 
     found = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -28,7 +28,7 @@ def _environment() -> Environment:
 
 
 def render(name: str, /, **values: Any) -> Markup:
-    """Fills a template; texts are escaped, ``Markup`` stays as it is.
+    """Fill a template; texts are escaped, ``Markup`` is inserted unchanged.
 
     Args:
         name: of the file.

@@ -1,4 +1,4 @@
-"""Turntables, which show a reconstruction from all around, as GIF or MP4."""
+"""Turntables of reconstructions, as GIF or MP4."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def turntable_frames(
     distance: float = DEFAULT_DISTANCE,
     fov: float = DEFAULT_FOV,
 ) -> np.ndarray:
-    """Renders one full turn on grey, from the reference view on, with several views a launch.
+    """Render one full turn on grey, from the reference view, with several views per launch.
 
     Args:
         gaussians: one object without batch dimension, in the reference frame, on the device that
@@ -43,7 +43,7 @@ def turntable_frames(
 
 
 def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECONDS) -> None:
-    """Writes frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
+    """Write frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
 
     Args:
         path: ends in ``.gif`` or ``.mp4``.
@@ -52,7 +52,7 @@ def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECOND
         seconds: length of one turn.
 
     Raises:
-        UserError: the suffix is another one, or the file cannot be written.
+        UserError: another suffix, or the file cannot be written.
     """
     grey = int(to_uint8(np.array(GREY)))
     sample = frames[:: max(1, len(frames) // 8)]

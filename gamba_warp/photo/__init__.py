@@ -1,1 +1,1 @@
-"""From any photograph to a cut-out object: mattes, masks, formats of cameras."""
+"""Cut-outs of objects from photographs: masks, mattes and GrabCut."""

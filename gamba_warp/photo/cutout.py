@@ -1,8 +1,7 @@
-"""Any photograph to one object, cut out and centred: each way in its order, and what it says.
+"""Cut out the object of a photograph; tries mask, alpha, plain background, SAM, matting, GrabCut.
 
-What the user gives (a mask, the picture's own transparency) is taken as it is. What is found (a
-plain background, the matte of a network, GrabCut) is judged, and the next way is tried where it
-cannot be an object.
+Masks and transparency from the user are used unchanged. Results of the other methods are checked,
+and the next method is tried if they cannot be an object.
 """
 
 from __future__ import annotations
@@ -41,33 +40,33 @@ MEND = (
 _HOW: dict[str, str] = {
     "alpha": "The picture's own transparency is the cut-out.",
     "mask": "The mask {mask} cut the object out.",
-    "plain": "The plain background was taken away.",
+    "plain": "The plain background was removed.",
     "matte": "The matting model {model} cut the object out.",
-    "sam": "Segment Anything cut the object out, which it expects in the middle.",
-    "grabcut": "Colours alone (GrabCut) cut the object out, which they expect in the middle{why}.",
+    "sam": "Segment Anything cut the object out, expected in the middle.",
+    "grabcut": "GrabCut cut the object out by colours alone, expected in the middle{why}.",
 }
-_LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the picture that an object covers
+_LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the picture covered by an object
 _MOST_EDGE = 0.7  # share of the picture's border that an object may cover
-_UNSURE = 0.4  # largest share of an alpha's sum in pixels that are neither object nor background
+_UNSURE = 0.4  # largest share of alpha's sum in pixels that are neither object nor background
 
-_HAZE = 0.1  # a fainter alpha than this is none
-_OPAQUE = 0.5  # an object whose alpha is nowhere as large is spoken of
+_HAZE = 0.1  # lower alpha is set to 0
+_OPAQUE = 0.5  # a warning is given if alpha is lower everywhere
 
 
 @dataclass
 class Ways:
-    """How an object may be found; one is made for all pictures of a command.
+    """Options and loaded models of the cut-out, shared by all pictures of a command.
 
     Attributes:
         mask: picture of the same size, white (or opaque) on the object.
-        matte_model: an ISNet or U2-Net in ONNX, or the address of a copy of one of rembg's; if
-            None, one of rembg's that is kept, or fetched.
-        sam: a checkpoint of Segment Anything, used in place of the matting model.
-        recenter: whether the object is brought into the middle, its longer side ``0.8`` of the
-            square; else the picture keeps its frame, filled up to a square.
+        matte_model: an ISNet or U2-Net in ONNX, or the URL of a copy of one of rembg's; None: one
+            of rembg's, from its cache or fetched.
+        sam: a checkpoint of Segment Anything, used instead of the matting model.
+        recenter: centre the object, its longer side ``0.8`` of the square; else the picture keeps
+            its frame, padded to a square.
         device: device of Segment Anything; the matting model runs on the CPU.
-        fetch: whether a matting model may be fetched.
-        say: gets a line before anything is fetched, and one if there is no matting model.
+        fetch: allow fetching a matting model.
+        say: called with a line before anything is fetched, and if the matting model is missing.
     """
 
     mask: str | Path | None = None
@@ -82,11 +81,11 @@ class Ways:
     _no_matte: bool = field(default=False, init=False, repr=False)
 
     def checked(self) -> Ways:
-        """Opens what was given, so that a bad file is told before any picture; returns itself.
+        """Open the given files, so that errors come before any picture; return ``self``.
 
         Raises:
             UserError: a file is missing, or of another kind.
-            ModuleNotFoundError: a library that it needs is not installed.
+            ModuleNotFoundError: a required library is not installed.
         """
         if self.sam is not None:
             self.segmenter()
@@ -95,13 +94,13 @@ class Ways:
         return self
 
     def segmenter(self) -> SamSegmenter | None:
-        """Segment Anything, opened once; None where it is not wanted."""
+        """Return Segment Anything, opened once; None if not requested."""
         if self._segmenter is None and self.sam is not None:
             self._segmenter = SamSegmenter(self.sam, self.device)
         return self._segmenter
 
     def matte(self) -> Matte | None:
-        """The matting model, opened once; None where there is none, of which ``say`` gets why."""
+        """Return the matting model, opened once; None if unavailable, reported by ``say``."""
         if self._matte is None and not self._no_matte:
             try:
                 self._matte = Matte(self.matte_model, self.fetch, self.say)
@@ -117,14 +116,13 @@ class CutOut:
 
     Attributes:
         rgba: ``[S, S, 4]`` float32 in [0, 1]: the object in the middle, its longer side
-            ``0.8 · S``; without ``Ways.recenter`` the object where it is.
-        method: the way in which it was found.
-        how: that in a sentence.
-        source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels a side.
+            ``0.8 · S``; without ``Ways.recenter`` at its place.
+        method: of the cut-out.
+        how: the method in a sentence.
+        source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels per side.
         mask: alpha of the object in it, ``[H, W]`` float32 in [0, 1].
-        editable: ``[H, W, 4]`` float32: the whole picture, of which the transparent parts keep
-            their colours. As a PNG it can be given again, and an editor can bring back what was
-            cut away wrongly.
+        editable: ``[H, W, 4]`` float32: the whole picture, with colours in transparent parts too,
+            so that an editor can restore them in a PNG, which may be used as input again.
     """
 
     rgba: np.ndarray
@@ -136,23 +134,23 @@ class CutOut:
 
     @property
     def note(self) -> str:
-        """How it was cut, and how to mend it."""
+        """The method, and how to correct the result."""
         return f"{self.how} {MEND}"
 
 
 def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
-    """Reads a picture and cuts its object out.
+    """Read a picture and cut its object out.
 
-    A mask that is given wins over all; then come the picture's own transparency, a plain
-    background, Segment Anything if given, the matting model, and GrabCut.
+    A given mask comes first; then the picture's own transparency, a plain background, Segment
+    Anything if given, the matting model, and GrabCut.
 
     Args:
         path: any picture that ``load_rgba`` reads.
-        ways: what may be used.
+        ways: options.
 
     Raises:
-        UserError: the picture or a file of ``ways`` cannot be read, or no way finds an object.
-        ModuleNotFoundError: a library that a file of ``ways`` needs is not installed.
+        UserError: the picture or a file of ``ways`` cannot be read, or no method finds an object.
+        ModuleNotFoundError: a library for a file of ``ways`` is not installed.
     """
     ways = Ways() if ways is None else ways
     rgba, why = load_rgba(path, WORKING_SIZE, ways.say), ""
@@ -165,7 +163,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     rgba = shrink(rgba, WORKING_SIZE)
     source = rgba[..., :3].copy()
     if method is None:
-        method, rgba, why = _found(path, source, ways)
+        method, rgba, why = _cut_by_methods(path, source, ways)
     try:
         centred = recenter(rgba, BORDER_RATIO if ways.recenter else None)
     except ValueError as error:
@@ -175,14 +173,16 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         mask=Path(ways.mask or "").name, model=model and model.path.name, why=why
     )
     if (most := rgba[..., 3].max()) < _OPAQUE:
-        how += f" It is nowhere more than {most:.0%} opaque, so what comes out is faint, too."
+        how += f" It is at most {most:.0%} opaque, so the result is faint, too."
     colors = np.where(rgba[..., 3:] > 0, rgba[..., :3], source)
     editable = np.dstack([colors, rgba[..., 3]])
     return CutOut(centred, method, how, source, rgba[..., 3], editable)
 
 
-def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.ndarray, str]:
-    """The way that finds an object, its ``[H, W, 4]``, and why no better one did."""
+def _cut_by_methods(
+    path: str | Path, rgb: np.ndarray, ways: Ways
+) -> tuple[Method, np.ndarray, str]:
+    """Return the first successful method, its ``[H, W, 4]``, and the failures of earlier ones."""
     if find_spec("skimage") is not None:
         rgba = plain_matte(rgb)
         if rgba is not None:
@@ -214,7 +214,7 @@ def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.nd
 
 
 def fault_of(alpha: np.ndarray) -> str | None:
-    """Why a mask cannot be that of one object that is wholly in the picture; None if it can.
+    """Return why a mask cannot be a single object completely in the picture; None if it can.
 
     Args:
         alpha: ``[H, W]`` in [0, 1].
@@ -234,12 +234,12 @@ def fault_of(alpha: np.ndarray) -> str | None:
 
 
 def _blended(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """``[H, W, 4]``, with the background's share taken out of the colours along the border.
+    """Return ``[H, W, 4]`` with the background removed from the colours along the border.
 
-    Colours of object and background are estimated as means around, weighted by alpha (the fusion of
-    blurs of Forte 2021), so that no fringe is left on another background.
+    Colours of object and background are local means weighted by alpha (the fusion of blurs of Forte
+    2021), so that no fringe is left on another background.
     """
-    alpha = np.where(alpha < _HAZE, 0, alpha)  # it would move the object's bounds
+    alpha = np.where(alpha < _HAZE, 0, alpha)  # haze would enlarge the object's bounds
     alpha = without_specks(alpha) if find_spec("skimage") is not None else alpha
     picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
     share = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]

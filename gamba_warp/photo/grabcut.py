@@ -1,9 +1,9 @@
-"""GrabCut (Rother, Kolmogorov and Blake 2004): a cut by colours alone, without any trained model.
+"""GrabCut (Rother, Kolmogorov and Blake 2004): segmentation by colours, without a trained model.
 
-The object is expected in the middle. Two mixtures of Gaussians, of the colours of object and
-background, and the cheapest border between the two take turns. The border is the exact minimum cut
-of the pixels' graph: its convex form, a total variation with weights, is solved by a primal-dual
-iteration (Pock and Chambolle 2011), so neither OpenCV nor a graph library is needed.
+The object is expected in the middle. The method alternates between fitting mixtures of Gaussians to
+the colours of object and background, and the minimum cut between them. The cut is computed exactly
+by its convex form, a weighted total variation, with a primal-dual iteration (Pock and Chambolle
+2011), so neither OpenCV nor a graph library is needed.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_SIDE = 256  # longer side of the picture in which the cut is made, pixels
-_LEAST = 16  # shorter side of a picture that is cut, pixels
+_SIDE = 256  # longer side of the segmented picture, pixels
+_LEAST = 16  # smallest shorter side of a picture, pixels
 _ROUNDS = 5  # of mixtures and cut
-_STEPS = 150  # of the primal-dual iteration in each round, which begins where the last one ended
+_STEPS = 150  # of the primal-dual iteration per round, warm-started by the last one
 _PARTS = 5  # Gaussians of a mixture
-_MEANS = 8  # steps of k-means that begin a mixture
+_MEANS = 8  # steps of k-means that initialise a mixture
 _SMOOTH = 50.0  # weight of the border, as in the paper
-_LEAST_SPREAD = 2e-4  # added to variances of colours in [0, 1]: a plain area is no point
-_MOST = 12.0  # largest log ratio of two densities that counts
-_MIDDLE = 0.12  # half axes of the ellipse that stays object, share of the sides
-_OBJECT = 0.38  # half axes of the ellipse that is object at first
+_LEAST_SPREAD = 2e-4  # added to variances of colours in [0, 1], for plain areas
+_MOST = 12.0  # clamp of the log ratio of two densities
+_MIDDLE = 0.12  # half axes of the ellipse that is always object, share of the sides
+_OBJECT = 0.38  # half axes of the initial object's ellipse
 _PRIOR = 2.0  # log odds of object in the middle, and of background in the corners
-_OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # to half of a pixel's eight neighbours
+_OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of a pixel's eight neighbours
 
 
 def grabcut(rgb: np.ndarray) -> np.ndarray:
-    """Cuts the object in the middle out by its colours.
+    """Segment the object in the middle by its colours.
 
     Args:
         rgb: ``[H, W, 3]`` float32 in [0, 1].
 
     Returns:
-        Alpha ``[H, W]`` float32 in [0, 1], soft along the border; all 0 where nothing in the middle
+        Alpha ``[H, W]`` float32 in [0, 1], soft along the border; all 0 if nothing in the middle
         differs from the rest.
     """
     height, width = rgb.shape[:2]
@@ -49,7 +49,7 @@ def grabcut(rgb: np.ndarray) -> np.ndarray:
     colors = _resized(picture, small)[0].permute(1, 2, 0).contiguous().numpy()
     inside = _connected(torch.from_numpy(_cut(colors))[None, None].float())
     alpha = _resized(inside, (height, width))
-    return _fitted(alpha, picture, max(1, round(1 / factor)))[0, 0].clamp(0, 1).numpy()
+    return _guided_filter(alpha, picture, max(1, round(1 / factor)))[0, 0].clamp(0, 1).numpy()
 
 
 def _resized(planes: Tensor, size: tuple[int, int]) -> Tensor:
@@ -59,7 +59,7 @@ def _resized(planes: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _cut(colors: np.ndarray) -> np.ndarray:
-    """The pixels of the object, bool ``[h, w]``, from colours ``[h, w, 3]``."""
+    """Return the object's pixels, bool ``[h, w]``, from colours ``[h, w, 3]``."""
     height, width = colors.shape[:2]
     y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)[None]
     radius = np.hypot(x, y).astype(np.float32)  # 1 in the middle of an edge
@@ -80,7 +80,7 @@ def _cut(colors: np.ndarray) -> np.ndarray:
 
 
 def _log_density(colors: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Log density ``[h, w]`` of each colour in the mixture that fits the pixels of a mask."""
+    """Return the log density ``[h, w]`` of each colour under the mixture of a mask's pixels."""
     chosen, flat = colors[where], colors.reshape(-1, 3)
     nearest = _nearest(chosen, _k_means(chosen))
     parts = []
@@ -98,7 +98,7 @@ def _log_density(colors: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 
 def _k_means(colors: np.ndarray) -> np.ndarray:
-    """Centres ``[K, 3]``; it starts at colours that are far apart, so it is the same every time."""
+    """Return k-means centres ``[K, 3]``, initialised deterministically by the farthest colours."""
     last, distance, found = colors.mean(0), np.full(len(colors), np.inf), []
     for _ in range(_PARTS):
         distance = np.minimum(distance, ((colors - last) ** 2).sum(1))
@@ -117,7 +117,7 @@ def _nearest(colors: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 class _Borders:
-    """What a border between two neighbours costs: little where their colours differ.
+    """Cost of a border between two neighbours, low where their colours differ.
 
     Args:
         colors: ``[h, w, 3]``.
@@ -138,13 +138,13 @@ class _Borders:
         self._flows = [np.zeros_like(weight) for weight in self._weights]
 
     def cheapest(self, price: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """The share of object ``[h, w]`` for which prices and borders together cost least.
+        """Return the labelling ``[h, w]`` in [0, 1] with the least cost of pixels and borders.
 
-        It comes to 0 or 1 but where costs are equal. The flows are kept for the next call.
+        It converges to 0 or 1, except where costs are equal. The flows are kept for the next call.
 
         Args:
-            price: what a pixel costs as a part of the object, ``[h, w]``.
-            share: where to begin, ``[h, w]`` in [0, 1].
+            price: cost of a pixel as object, ``[h, w]``.
+            share: initial labelling, ``[h, w]`` in [0, 1].
         """
         ahead = share
         for _ in range(_STEPS):
@@ -164,7 +164,7 @@ class _Borders:
 
 
 def _ends(plane: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Views of a plane ``[h, w, ..]``: all pixels that have the neighbour, and the neighbours."""
+    """Return views of a plane ``[h, w, ..]``: pixels with that neighbour, and the neighbours."""
     down, right = offset
     height, width = plane.shape[:2]
     here, there = slice(max(0, -right), width - max(0, right)), slice(max(0, right), None)
@@ -172,7 +172,7 @@ def _ends(plane: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.nd
 
 
 def _connected(inside: Tensor) -> Tensor:
-    """What hangs together with the middle half of the picture, ``[1, 1, h, w]`` of 0 and 1."""
+    """Return the components that touch the middle half, ``[1, 1, h, w]`` of 0 and 1."""
     height, width = inside.shape[-2:]
     found, before = torch.zeros_like(inside), None
     middle = np.s_[..., height // 4 : height - height // 4, width // 4 : width - width // 4]
@@ -184,8 +184,8 @@ def _connected(inside: Tensor) -> Tensor:
     return found
 
 
-def _fitted(alpha: Tensor, picture: Tensor, radius: int) -> Tensor:
-    """Lays the border of an alpha that was enlarged on that of the picture (a guided filter)."""
+def _guided_filter(alpha: Tensor, picture: Tensor, radius: int) -> Tensor:
+    """Align the border of an enlarged alpha with the picture's edges (guided filter)."""
     size = 2 * radius + 1
 
     def mean(planes: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The matte of a trained network: which file, run in a child process, and how it is to be had."""
+"""Mattes of a trained network, run in a child process, and the choice and fetching of its file."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from ..untrusted.children import Failed, run_each
 from ..versions import require, to_install
 from . import models
 
-MAX_MODEL = 2 << 30  # bytes of a model's file; the largest that rembg publishes has 1.1 GB
+MAX_MODEL = 2 << 30  # bytes of a model's file; rembg's largest has 1.1 GB
 _SECONDS = 300.0  # for one picture; it takes about six on two cores
 _MEMORY = 8 << 30  # bytes; ISNet takes two gigabytes
 
 
 class NoMatte(Exception):
-    """There is no matting model, or it failed; the text says why, in one line."""
+    """Error of a missing or failed matting model; the text is one line."""
 
 
 class Matte:
     """A matting network.
 
     Args:
-        file: an ISNet or U2-Net in ONNX, or the address of a copy of one of rembg's, which is
-            fetched; if None, one of rembg's that is kept on this machine, or else is fetched.
-        fetch: whether the network may be asked.
-        say: gets a line before anything is fetched.
+        file: an ISNet or U2-Net in ONNX, or the URL of a copy of one of rembg's, which is fetched;
+            None: one of rembg's, from its cache or fetched.
+        fetch: allow network access.
+        say: called with a line before anything is fetched.
 
     Raises:
-        UserError: ``file`` is missing, cannot be fetched, or is no matting model.
+        UserError: ``file`` is missing, cannot be fetched, or is not a matting model.
         ModuleNotFoundError: ``file`` is given, and onnxruntime is not installed.
-        NoMatte: nothing is given, and there is no model, or no onnxruntime.
+        NoMatte: no file is given, and the model or onnxruntime is missing.
     """
 
     def __init__(
@@ -59,15 +59,15 @@ class Matte:
             self._run(None)
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
-        """Alpha ``[H, W]`` float32 in [0, 1] from RGB ``[H, W, 3]`` in [0, 1].
+        """Return alpha ``[H, W]`` float32 in [0, 1] of RGB ``[H, W, 3]`` in [0, 1].
 
         Raises:
-            UserError: a file that was given fails.
-            NoMatte: a file of rembg's fails.
+            UserError: a given file fails.
+            NoMatte: rembg's file fails.
         """
         alpha = self._run(to_uint8(rgb))
         assert alpha is not None
-        # resize_rgba weights colours by alpha, and here there is only the alpha.
+        # resize_rgba weights colours by alpha; only its alpha is used here.
         planes = np.dstack([np.zeros((*alpha.shape, 3), np.float32), alpha])
         return resize_rgba(planes, *rgb.shape[:2])[..., 3]
 
@@ -75,7 +75,7 @@ class Matte:
         task = (str(self.path.absolute()), self._version, rgb, torch.get_num_threads())
         try:
             ((_, value),) = run_each(models.alpha_of, [task], seconds=_SECONDS, memory=_MEMORY)
-        except RuntimeError as error:  # no child could be started
+        except RuntimeError as error:  # no child process could be started
             value = Failed(first_line(error))
         if not isinstance(value, Failed):
             return value
@@ -86,7 +86,7 @@ class Matte:
 
 
 def _version_of(path: Path) -> tuple[int, int]:
-    """Size and time of change of a file that was given. Raises UserError if it is no plain file."""
+    """Return size and mtime of a given file. Raises UserError if it is not a plain file."""
     if not path.is_file():
         reason = "not a plain file" if path.exists() else "no such file"
         raise UserError(f"--matte-model {path}: {reason}")
@@ -97,14 +97,14 @@ def _version_of(path: Path) -> tuple[int, int]:
 
 
 def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Path:
-    """The file at an address; where none is given, rembg's that is kept, or else is fetched.
+    """Return the file of a URL; without one rembg's, from its cache or fetched.
 
     Raises:
-        UserError: the file at the address cannot be had.
+        UserError: the URL cannot be fetched.
         ModuleNotFoundError: pooch, which fetches it, is not installed.
-        NoMatte: no address is given, and there is no file.
+        NoMatte: no URL is given, and the file is unavailable.
     """
-    if address is None and (path := models.kept()) is not None:
+    if address is None and (path := models.cached()) is not None:
         return path
     if address is not None and not address.startswith("https://"):
         raise UserError(f"--matte-model {address}: only addresses of https are fetched")
@@ -113,7 +113,7 @@ def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Pa
         names = ", ".join(f"{known.name}.onnx" for known in models.PUBLISHED)
         raise UserError(f"--matte-model {address}: an address must end in one of {names}")
     if not models.may_fetch() or not fetch:
-        reason = "GAMBA_OFFLINE forbids to fetch it" if fetch else "it may not be fetched"
+        reason = "GAMBA_OFFLINE forbids fetching it" if fetch else "it may not be fetched"
     elif address is None and find_spec("pooch") is None:
         raise NoMatte(f"pooch, which fetches it, is not installed: {to_install('photo')}")
     else:
@@ -131,5 +131,5 @@ def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Pa
 
 
 def to_stderr(line: str) -> None:
-    """Says a line on stderr, as the commands do."""
+    """Print a line on stderr, like the commands."""
     print(f"gamba: {line}", file=sys.stderr, flush=True)

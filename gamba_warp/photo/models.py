@@ -1,10 +1,10 @@
-"""Matting networks: where a copy may lie, how one is fetched, and how one is run.
+"""Matting networks: location, fetching and inference.
 
-The files and their places are those of rembg, so that who has rembg needs nothing more. rembg
-itself is not used: its first import compiles numba functions for minutes (docs/photo.md).
+Files and folders are those of rembg, so its copies are used. rembg itself is not used: its first
+import compiles numba functions for minutes (docs/photo.md).
 
-A file is a stranger's graph, and onnxruntime reads and runs it in native code. It may crash, hang
-or take all memory: ``matte.py`` calls ``alpha_of`` in a child process, and there it costs a child.
+A file is an untrusted graph, which onnxruntime reads and runs in native code. It may crash, hang or
+exhaust memory, so ``matte.py`` calls ``alpha_of`` in a child process.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from ..batch import progress_bar
 from ..errors import UserError, first_line
 
 _FROM = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
-_SECONDS = 20  # without an answer, after which the network counts as not there
-_OPEN = 1024  # side of the input where the file leaves it open, pixels
+_SECONDS = 20  # timeout of the network
+_OPEN = 1024  # side of a dynamic input, pixels
 _SIDES = (32, 2048)  # smallest and largest side of an input, pixels
-_U2NET = 320  # up to this side: U2-Net and its like, which are trained on ImageNet's colours
+_U2NET = 320  # up to this side: U2-Net and similar, with ImageNet's normalisation
 _MEAN, _SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Published(NamedTuple):
-    """A model that rembg publishes.
+    """A model published by rembg.
 
     Attributes:
         name: of the model; its file is ``NAME.onnx``.
-        sha256: of the file whose MD5 sum rembg states.
+        sha256: of the file with rembg's MD5 sum.
         megabytes: size of the file.
         licence: of the weights.
     """
@@ -46,11 +46,11 @@ class Published(NamedTuple):
 
     @property
     def address(self) -> str:
-        """Where it is published."""
+        """URL of the file."""
         return f"{_FROM}/{self.name}.onnx"
 
 
-# The first is the one that is fetched; of those that are there, the first is used.
+# The first is fetched; of the cached ones, the first is used.
 PUBLISHED = (
     Published(
         "isnet-general-use",
@@ -80,11 +80,11 @@ PUBLISHED = (
 
 
 class NotFetched(Exception):
-    """The model could not be fetched; the text says why, in one line."""
+    """Error of a failed download; the text is one line."""
 
 
 def _homes() -> tuple[Path, Path]:
-    """The folder of rembg, and the one that it had before: it looks into both itself."""
+    """Return rembg's folder and its former one, both of which rembg searches."""
     chosen, data = os.environ.get("U2NET_HOME"), os.environ.get("XDG_DATA_HOME")
     if chosen:
         return Path(chosen).expanduser(), Path(chosen).expanduser()
@@ -92,8 +92,8 @@ def _homes() -> tuple[Path, Path]:
     return Path(os.path.expanduser(new)), Path(os.path.expanduser(f"{data or '~'}/.u2net"))
 
 
-def kept() -> Path | None:
-    """A published model that lies in rembg's folders, the best that is there; None if none is."""
+def cached() -> Path | None:
+    """Return the best published model in rembg's folders; None without one."""
     home, former = _homes()
     for model in PUBLISHED:
         file = f"{model.name}.onnx"
@@ -104,39 +104,39 @@ def kept() -> Path | None:
 
 
 def may_fetch() -> bool:
-    """Whether the network may be asked: not where ``GAMBA_OFFLINE`` is set."""
+    """Return True if network access is allowed: unless ``GAMBA_OFFLINE`` is set."""
     return os.environ.get("GAMBA_OFFLINE", "0") in ("", "0")
 
 
 def is_address(file: str | Path | None) -> bool:
-    """Whether this is an address of the web, and not the name of a file."""
+    """Return True for a URL, False for a file name."""
     return str(file).startswith(("https://", "http://"))
 
 
 def published(address: str) -> Published | None:
-    """The model whose file an address names; None for any other file, whose digest nobody knows."""
+    """Return the model whose file a URL names; None for other files, without a known digest."""
     name = urlsplit(address).path.rpartition("/")[2]
     return next((model for model in PUBLISHED if name == f"{model.name}.onnx"), None)
 
 
 def fetch(model: Published, address: str) -> Path:
-    """Fetches a model into rembg's folder, with its progress on stderr.
+    """Fetch a model into rembg's folder, with its progress on stderr.
 
-    The file has its name only when all of it is there and its digest is right.
+    The file gets its name only when it is complete and its digest is right.
 
     Args:
-        model: which one.
-        address: of the file, https; any copy will do, for its digest is compared.
+        model: to fetch.
+        address: https URL of the file; any copy, because its digest is compared.
 
     Raises:
         ModuleNotFoundError: pooch is not installed.
-        NotFetched: there is no network, the file is not what it should be, or cannot be written.
+        NotFetched: the network is unavailable, the digest is wrong, or the file cannot be written.
     """
     import pooch
 
     pooch.get_logger().setLevel("ERROR")
     bar: Any = progress_bar(total=model.megabytes * 10**6, unit="B", unit_scale=True)
-    # Any: pooch's own types know no such bar, and no arguments by name.
+    # Any, because pooch's types allow neither such a bar nor keyword arguments.
     downloader: Any = pooch.HTTPDownloader(
         progressbar=bar, timeout=_SECONDS, hooks={"response": _stays_secure}
     )
@@ -150,7 +150,7 @@ def fetch(model: Published, address: str) -> Path:
         )
     except Exception as error:  # of requests, of urllib3, of the disk, and a ValueError of pooch
         reason = first_line(error)[:200]
-        # requests puts several errors into one another
+        # requests nests several errors
         names = {type(error).__name__, type(error.__context__).__name__}
         if names & {"ConnectionError", "ConnectTimeout", "ReadTimeout", "ProxyError", "SSLError"}:
             reason = f"{urlsplit(address).hostname} cannot be reached"
@@ -159,7 +159,7 @@ def fetch(model: Published, address: str) -> Path:
 
 
 def _stays_secure(response: Any, **options: Any) -> None:
-    """Refuses a redirection out of https; requests calls it before it follows one."""
+    """Refuse a redirect away from https; a hook that requests calls before it follows one."""
     if response.is_redirect:
         goal = urljoin(response.url, response.headers["location"])
         if urlsplit(goal).scheme != "https":
@@ -167,19 +167,18 @@ def _stays_secure(response: Any, **options: Any) -> None:
 
 
 def alpha_of(task: tuple[str, tuple[int, int], np.ndarray | None, int]) -> np.ndarray | None:
-    """Runs a network on one picture.
+    """Run a network on one picture.
 
     Args:
-        task: the model's file; its size and its time of change, which tell a file from the one that
-            has replaced it; RGB ``[H, W, 3]`` uint8, or None if the file is only to be looked at;
-            and the number of threads.
+        task: the model's file; its size and mtime, as a cache key; RGB ``[H, W, 3]`` uint8, or None
+            to check the file only; and the number of threads.
 
     Returns:
-        Alpha ``[h, w]`` float32 in [0, 1] as the network gives it, h and w of its input; None where
-        there is no picture.
+        The network's alpha ``[h, w]`` float32 in [0, 1], h and w of its input; None without a
+        picture.
 
     Raises:
-        UserError: the file is no network of this kind, or gives no numbers.
+        UserError: the file is not a matting network, or its output is not finite.
     """
     path, version, rgb, threads = task
     session, size, names = _opened(path, version, threads)
@@ -188,7 +187,7 @@ def alpha_of(task: tuple[str, tuple[int, int], np.ndarray | None, int]) -> np.nd
     batch = _input(rgb, size)
     try:
         out = np.asarray(session.run([names[1]], {names[0]: batch})[0], np.float32)
-    except Exception as error:  # onnxruntime has errors of its own for every kind of trouble
+    except Exception as error:  # onnxruntime has many error types
         raise UserError(f"{path}: cannot be run ({first_line(error)})") from error
     alpha = out.reshape(-1)[: size[0] * size[1]]
     if out.shape[-2:] != size or not np.isfinite(alpha).all():
@@ -203,12 +202,12 @@ def alpha_of(task: tuple[str, tuple[int, int], np.ndarray | None, int]) -> np.nd
 def _opened(
     path: str, version: tuple[int, int], threads: int
 ) -> tuple[Any, tuple[int, int], tuple[str, str]]:
-    """The session, the size (height, width) of its input, and the names of input and output."""
+    """Return the session, the input's size (height, width), and the names of input and output."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    options.log_severity_level = 4  # what goes wrong comes as an error
+    options.log_severity_level = 4  # errors are raised anyway
     try:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         inputs, outputs = session.get_inputs(), session.get_outputs()
@@ -224,7 +223,7 @@ def _opened(
 
 
 def _input(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """``[1, 3, h, w]`` float32 as the networks were trained: U2-Net by ImageNet's colours."""
+    """Normalise to ``[1, 3, h, w]`` float32 as in training: U2-Net by ImageNet's statistics."""
     small = Image.fromarray(rgb).resize((size[1], size[0]), Image.Resampling.LANCZOS)
     values = np.asarray(small, np.float32) / max(1, int(np.asarray(small).max()))
     if max(size) <= _U2NET:

@@ -1,4 +1,4 @@
-"""The opacity of Gaussians as a field, and its level set by marching cubes (scikit-image)."""
+"""Opacity field of Gaussians, and its level set by marching cubes (scikit-image)."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ import torch
 from ..errors import UserError
 from ..gaussians import Gaussians
 
-HAZE = 0.05  # opacity that still separates inside from outside, when cavities are filled
-EDGE = 1.1  # the grid ends at this coordinate, and surfaces are closed there
-LEAST = 0.005  # alpha below this is left out
-MOST_POINTS = 1 << 27  # largest grid: half a gigabyte, five times that while it is filled
+HAZE = 0.05  # opacity that separates inside from outside when cavities are filled
+EDGE = 1.1  # largest coordinate of the grid; surfaces are closed there
+LEAST = 0.005  # lower alpha is ignored
+MOST_POINTS = 1 << 27  # largest grid: half a gigabyte, five times that during filling
 _BATCH = 2_000_000  # points evaluated at once: 100 MB
 
 
 def level_set(gaussians: Gaussians, voxels: int, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """A surface by marching cubes on ``opacity_volume``, whose closed cavities are filled.
+    """Extract a surface by marching cubes on ``opacity_volume``, with closed cavities filled.
 
-    It fattens thin parts by about the Gaussians' own width.
+    Thin parts become thicker by about the width of a Gaussian.
 
     Args:
         gaussians: one object.
-        voxels: number of voxels a unit.
+        voxels: number of voxels per unit.
         level: value of the volume at the surface, in (0, 1).
 
     Returns:
         Vertices ``[V, 3]`` float64 and faces ``[F, 3]`` int64, outside in front.
 
     Raises:
-        UserError: the density nowhere reaches the level, or the grid would be too large.
+        UserError: the density does not reach the level, or the grid would be too large.
     """
     from skimage.measure import marching_cubes
 
@@ -41,15 +41,15 @@ def level_set(gaussians: Gaussians, voxels: int, level: float) -> tuple[np.ndarr
         raise UserError(f"the density's maximum is {volume.max():.3g}, under {level}")
     volume[_cavities(volume)] = 1.0
     vertices, faces, _, _ = marching_cubes(volume, level)
-    faces = faces[:, ::-1]  # scikit-image winds them so that larger values are in front
+    faces = faces[:, ::-1]  # scikit-image's faces point to larger values
     return origin + vertices.astype(np.float64) / voxels, faces.astype(np.int64)
 
 
 def _cavities(volume: np.ndarray) -> np.ndarray:
-    """The voxels on the inner side of a shell, bool; the first voxel counts as outside.
+    """Return the voxels inside a shell, bool; the first voxel counts as outside.
 
-    A shell of splats leaks at the level of its surface, so what lies inside is found where even a
-    faint haze closes it, and grown up to the ridge of the shell.
+    A shell of splats has holes at the level of the surface. So the inside is found at a faint haze,
+    where the shell is closed, and grown to the ridge of the shell.
     """
     from skimage.measure import label
     from skimage.segmentation import watershed
@@ -62,20 +62,20 @@ def _cavities(volume: np.ndarray) -> np.ndarray:
 
 
 def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.ndarray]:
-    """1 - prod(1 - alpha) at grid points, alpha = opacity · exp(-d²/2), d the Mahalanobis distance.
+    """Compute 1 - prod(1 - alpha) on a grid, alpha = opacity · exp(-d²/2), d Mahalanobis distance.
 
-    Each Gaussian is evaluated at the points it reaches, and nowhere else.
+    Each Gaussian is evaluated only at the points it reaches.
 
     Args:
         gaussians: one object; Gaussians outside [-1, 1]^3 or without volume are left out, and so
-            are alpha under 0.005 and what reaches beyond [-1.1, 1.1]^3.
-        voxels: number of grid points a unit.
+            are alpha under 0.005 and parts beyond [-1.1, 1.1]^3.
+        voxels: number of grid points per unit.
 
     Returns:
         The volume ``[X, Y, Z]`` float32 with an empty margin, and its first point ``[3]``.
 
     Raises:
-        UserError: nothing is visible, or the grid would be too large.
+        UserError: no Gaussian is visible, or the grid would be too large.
     """
     from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
@@ -116,7 +116,7 @@ def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.nd
 
 
 def _rounded_up(sizes: torch.Tensor) -> torch.Tensor:
-    """Rounds up to the next of 1, 2, 3, 4, 5, 7, 9, ..., so that there are few sizes."""
+    """Round up to the next of 1, 2, 3, 4, 5, 7, 9, ..., to have few sizes."""
     steps = [1]
     while steps[-1] < int(sizes.max()):
         steps.append(max(steps[-1] + 1, steps[-1] * 5 // 4))
@@ -125,7 +125,7 @@ def _rounded_up(sizes: torch.Tensor) -> torch.Tensor:
 
 
 def _splat(absorbed, gaussians, to_unit, box, first, voxels) -> None:
-    """Adds -log(1 - alpha) of some Gaussians, each in a ``box [P, 3]`` of points around it."""
+    """Add -log(1 - alpha) of some Gaussians, each in a ``box [P, 3]`` of points around it."""
     position = gaussians.means * voxels
     points = position.round().long()[:, None] + box
     offset = (points - position[:, None]) / voxels

@@ -1,4 +1,4 @@
-"""Gaussians to a surface: fused depth (TSDF) or a density's level set, made clean and coloured."""
+"""Surfaces of Gaussians by fused depth (TSDF) or a level set, with cleaning and colours."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ class Surface:
     texture: Texture | None = None
 
     def is_watertight(self) -> bool:
-        """Whether every edge has two faces."""
+        """Return True if every edge has two faces."""
         import trimesh
 
         return bool(trimesh.Trimesh(self.vertices, self.faces, process=False).is_watertight)
 
 
 def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int = 0) -> Surface:
-    """The surface of one object that is about the origin and has a longest side of about 1.
+    """Extract the surface of an object about the origin with a longest side of about 1.
 
-    What lies outside [-1, 1]^3 is left out.
+    Parts outside [-1, 1]^3 are left out.
 
     Args:
         gaussians: one object, on the device that renders.
@@ -52,7 +52,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
         texture: side of a texture, pixels; 0: none.
 
     Raises:
-        UserError: there is no surface, or a value is not finite.
+        UserError: the surface is empty, or a value is not finite.
         ValueError: the method has no surface.
     """
     if options.method not in ("tsdf", "density"):
@@ -88,7 +88,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
 
 
 def near_and_visible(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians whose centre is within [-1, 1]^3.
+    """Return the Gaussians whose centre is within [-1, 1]^3.
 
     Raises:
         UserError: a value is not finite, no Gaussian is visible, or all are outside.
@@ -107,10 +107,10 @@ def near_and_visible(gaussians: Gaussians) -> Gaussians:
 
 
 def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """The centre ``[3]`` and the longest side of an object anywhere.
+    """Return the centre ``[3]`` and the longest side of an object at any position.
 
-    Only visible Gaussians count. Of their centres, half a percent at each end of each axis is left
-    out, so that what floats far from the object does not count.
+    Only visible Gaussians count, without half a percent of the centres at each end of each axis, so
+    that floaters far from the object do not count.
 
     Raises:
         UserError: a value is not finite, no Gaussian is visible, or all are at one point.
@@ -133,7 +133,7 @@ def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
 def surface_of(
     gaussians: Gaussians, options: SurfaceOptions, device: torch.device, texture: int = 0
 ) -> Surface:
-    """The surface of an object of any size anywhere, in its own frame.
+    """Extract the surface of an object of any size and position, in its own frame.
 
     Args:
         gaussians: one object.
@@ -142,7 +142,7 @@ def surface_of(
         texture: side of a texture, pixels; 0: none.
 
     Raises:
-        UserError: there is no surface.
+        UserError: the surface is empty.
     """
     center, side = unit_frame(gaussians)
     moved = gaussians.in_unit(center, side).to(device)
@@ -162,18 +162,18 @@ def cleaned_mesh(
     smooth: int = 0,
     max_faces: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh without double and null faces; what else is asked for is done in this order.
+    """Remove duplicate and null faces of a mesh, then apply the options in order.
 
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``, outside in front.
-        min_component: parts with a smaller share of all faces are removed.
-        min_diameter: parts whose bounding box has a shorter diagonal are removed, in units of the
+        min_component: remove parts with a smaller share of all faces.
+        min_diameter: remove parts whose bounding box has a shorter diagonal, in units of the
             whole's.
-        largest: only the part with the most faces stays.
-        close_holes: holes with at most so many edges are closed; 0: none.
+        largest: keep only the part with the most faces.
+        close_holes: largest number of edges of holes to close; 0: none.
         smooth: steps of Taubin smoothing, which hardly shrinks.
-        max_faces: quadric decimation to at most so many, borders kept; 0: all stay.
+        max_faces: target of quadric decimation, which keeps borders; 0: none.
 
     Returns:
         Vertices ``[V, 3]`` float64, all in use, and faces ``[F, 3]`` int64.
@@ -204,7 +204,7 @@ def cleaned_mesh(
     if meshes.current_mesh().face_number() == 0:
         raise UserError("no part of the surface is large enough")
     if close_holes:
-        # Closing holes needs a manifold; of the faces at an edge of more than two, the smallest go.
+        # Closing holes needs a manifold: the smallest faces at non-manifold edges are removed.
         meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
         meshes.meshing_repair_non_manifold_vertices()
         meshes.meshing_close_holes(maxholesize=close_holes, newfaceselected=False)
@@ -220,7 +220,7 @@ def cleaned_mesh(
 
 
 def _part_sizes(faces: np.ndarray) -> np.ndarray:
-    """The number of faces of each part; faces of one part are joined by edges."""
+    """Return the number of faces of each part, connected by edges."""
     import trimesh
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -24,16 +24,16 @@ from .texture import Texture
 
 
 def save_mesh(path: str | Path, surface: Surface, axes: Axes = "opengl") -> None:
-    """Writes a surface, atomically, with vertex colours where the format has them (not .stl).
+    """Write a surface atomically, with vertex colours if the format has them (not .stl).
 
-    A texture is embedded in ``.glb``; beside an ``.obj`` it is NAME.png, which NAME.mtl names; the
-    others have the vertex colours. Those of a ``.glb`` are linear light, as the format asks. A
-    ``.ply`` says its axes in a comment, which ``eval-geometry`` reads.
+    A texture is embedded in a ``.glb``; beside an ``.obj`` it is NAME.png, named by NAME.mtl; the
+    other formats have vertex colours. Those of a ``.glb`` are linear, as the format requires. A
+    ``.ply`` states its axes in a comment, which ``eval-geometry`` reads.
 
     Args:
         path: ends in .obj, .glb, .ply or .stl.
-        surface: what to write, in OpenCV's axes (y down), as the Gaussians.
-        axes: those of the file; a ``.glb`` has OpenGL's (y up) in any case, as the format asks.
+        surface: in OpenCV's axes (y down), like the Gaussians.
+        axes: of the file; a ``.glb`` always has OpenGL's (y up), as the format requires.
 
     Raises:
         UserError: another suffix, or the file cannot be written.
@@ -53,31 +53,31 @@ def save_mesh(path: str | Path, surface: Surface, axes: Axes = "opengl") -> None
     if colors is not None and kind != "stl":
         opaque = np.ones((len(colors), 1), np.float32)
         mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(np.hstack([colors, opaque])))
-    if colors is not None and kind == "glb":  # linear light of 8 bits is too coarse
+    if colors is not None and kind == "glb":  # 8 bits are too coarse for linear colours
         mesh.visual = ColorVisuals(mesh)
         mesh.vertex_attributes["COLOR_0"] = to_linear(colors)
         data = cast(bytes, mesh.export(file_type=kind, tree_postprocessor=_name_colors))
     else:
-        data = cast("bytes | str", mesh.export(file_type=kind))  # a dict: other kinds
-    if isinstance(data, bytes) and kind == "ply":  # what no .ply says by itself
+        data = cast("bytes | str", mesh.export(file_type=kind))  # other kinds return a dict
+    if isinstance(data, bytes) and kind == "ply":  # .ply itself has no field for axes
         data = data.replace(b"\nelement", f"\ncomment axes {axes}\nelement".encode(), 1)
     _write(Path(path), data)
 
 
 def _name_colors(tree: dict) -> None:
-    """Gives the colours of a glTF document their name, before which trimesh writes a line."""
+    """Rename the colours in a glTF document, which trimesh writes with a leading underscore."""
     for primitive in tree["meshes"][0]["primitives"]:
         primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
 
 
 def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
-    """Writes a .glb that holds its texture, or an .obj after the files that it names."""
+    """Write a .glb with its texture, or an .obj after the files that it names."""
     import trimesh
     from PIL import Image
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    # A vertex at a seam of the texture is there twice.
+    # Vertices at seams of the texture are duplicated.
     corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
     found, faces = merged(corners)
     vertices, uvs = surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:]
@@ -106,7 +106,7 @@ def _write(path: Path, content: bytes | str) -> None:
 
 
 def mesh_suffixes(formats: Sequence[MeshFormat], texture: int) -> list[str]:
-    """What follows NAME in each file that ``write_meshes`` writes."""
+    """Return the suffixes of the files of ``write_meshes``."""
     found = [f"-mesh.{kind}" for kind in formats]
     return found + (["-mesh.mtl", "-mesh.png"] if texture and "obj" in formats else [])
 
@@ -120,14 +120,14 @@ def write_meshes(
     device: torch.device,
     texture: int = 0,
 ) -> Surface:
-    """Makes an object's surface and writes it as ``NAME-mesh.FORMAT``.
+    """Extract an object's surface and write it as ``NAME-mesh.FORMAT``.
 
     Args:
         base: folder and NAME.
-        gaussians: an object of any size anywhere.
+        gaussians: an object of any size and position.
         formats: formats of the files.
-        options: how the surface is made.
-        axes: axes of all but .glb, which is y up in any case.
+        options: of the surface.
+        axes: of all formats except .glb, which is always y up.
         device: device that renders.
         texture: side of a texture, pixels; 0: none.
 
@@ -135,7 +135,7 @@ def write_meshes(
         The surface in the Gaussians' own frame.
 
     Raises:
-        UserError: there is no surface, or a file cannot be written.
+        UserError: the surface is empty, or a file cannot be written.
     """
     found = surface_of(gaussians, options, device, texture)
     for kind in formats:

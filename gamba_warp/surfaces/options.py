@@ -1,4 +1,4 @@
-"""How Gaussians become a surface; imports nothing that is slow."""
+"""Options of surfaces of Gaussians; without slow imports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Voxels = Annotated[int, Meta(ge=8, le=1024)]
 Views = Annotated[int, Meta(ge=8, le=1000)]
 Pixels = Annotated[int, Meta(ge=8, le=4096)]
 Faces = Annotated[int, Meta(ge=0, le=2**31 - 1)]
-# What a browser turns without a stutter and loads at once (docs/formats.md has the sizes).
+# Sizes that a browser loads and renders smoothly (docs/formats.md).
 BROWSER_FACES, TEXTURED_FACES = 50_000, 10_000
 Texels = Annotated[int, Meta(ge=0, le=8192)]
 Holes = Annotated[int, Meta(ge=0, le=10_000)]
@@ -26,29 +26,29 @@ PartShare = Annotated[float, Meta(ge=0, lt=1)]
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How Gaussians become a surface; lengths in units of the object's longest side.
+    """Options of a surface of Gaussians; lengths in units of the object's longest side.
 
     Attributes:
         method: tsdf (depth of many views, fused), density (marching cubes on 1 - prod(1 - alpha)),
             or centers (opacity-weighted centres; biased inwards, a diagnostic without volume).
-        voxels: voxels a unit, of the TSDF and of the density; 8 to 1024.
+        voxels: voxels per unit, of the TSDF and of the density; 8 to 1024.
         views: TSDF cameras, on a Fibonacci sphere; also those of the colours.
         pixels: side of a depth map.
-        truncation: distance at which the TSDF is cut off, in voxels.
+        truncation: of the TSDF, in voxels.
         transmittance: depth is where a ray's transmittance has fallen to this. Fitted and predicted
             Gaussians are half transparent, so the median (0.5) lies behind the surface.
         min_alpha: pixels with less have no depth.
-        clear_alpha: pixels with less say that nothing is there.
+        clear_alpha: pixels with less are empty.
         max_slope: pixels of a steeper surface, depth over width, have no depth.
-        min_support: fused voxels that a smaller share of the views support are dropped.
+        min_support: fused voxels seen by a smaller share of the views are dropped.
         level: the density's value at the surface.
         min_component: smaller parts are removed, as a share of all faces.
         min_diameter: shorter parts are removed, as a share of the whole's diagonal.
-        largest: only the largest part is kept.
-        close_holes: holes with at most so many edges are closed.
+        largest: keep only the largest part.
+        close_holes: largest number of edges of holes that are closed.
         smooth: steps of Taubin smoothing.
-        faces: at most so many, by decimation; 0: as many as there are.
-        colors: give vertices the colour that the views show.
+        faces: largest number of faces, by decimation; 0: no limit.
+        colors: colour vertices from the views.
     """
 
     method: Method = "tsdf"
@@ -71,7 +71,7 @@ class SurfaceOptions:
     colors: bool = False
 
     def check(self) -> None:
-        """Checks the ranges of the numbers.
+        """Check the ranges of the numbers.
 
         Raises:
             UserError: a number is out of its range; the message names the option.
@@ -79,7 +79,7 @@ class SurfaceOptions:
         check_options(self)
 
     def require(self, texture: int = 0) -> None:
-        """Refuses a surface whose libraries are not installed, before any work is done for it.
+        """Check that the libraries are installed, before any work.
 
         Args:
             texture: side of its texture, pixels; 0: none.

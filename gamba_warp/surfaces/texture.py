@@ -1,4 +1,4 @@
-"""A surface's colours, from the views that see it: of places, or as a picture over an atlas."""
+"""Colours of a surface from rendered views, at points or as a texture atlas."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _PADDING = 4  # texels between the pieces of the atlas
 
 
 def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:
-    """The mean colour of each vertex in the views that see it; those in front count most.
+    """Return the mean colour of each vertex over the views that see it, weighted by the angle.
 
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``.
         views: pictures and depth.
-        voxels: number of voxels a unit; a view sees a vertex if its depth there differs by less
+        voxels: number of voxels per unit; a view sees a vertex if its depth there differs by less
             than four voxels.
 
     Returns:
-        ``[V, 3]`` float32 in [0, 1]; a vertex that no view sees has the nearest one's colour.
+        ``[V, 3]`` float32 in [0, 1]; an unseen vertex has the nearest seen one's colour.
 
     Raises:
         UserError: no view sees any vertex.
@@ -35,7 +35,7 @@ def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels:
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """``[V, 3]`` float64, unit, outside."""
+    """Return unit normals ``[V, 3]`` float64 that point outside."""
     import trimesh
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -45,20 +45,20 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def point_colors(
     positions: np.ndarray, directions: np.ndarray, views: Views, voxels: int
 ) -> np.ndarray:
-    """The mean colour of places on a surface in the views that see them; those in front count most.
+    """Return the mean colour of surface points over the views that see them, weighted by the angle.
 
     Args:
         positions: ``[P, 3]``.
         directions: ``[P, 3]``, unit normals of the surface there, outside.
         views: pictures and depth.
-        voxels: number of voxels a unit; a view sees a place if its depth there differs by less
+        voxels: number of voxels per unit; a view sees a point if its depth there differs by less
             than four voxels.
 
     Returns:
-        ``[P, 3]`` float32 in [0, 1]; a place that no view sees has the nearest one's colour.
+        ``[P, 3]`` float32 in [0, 1]; an unseen point has the nearest seen one's colour.
 
     Raises:
-        UserError: no view sees any.
+        UserError: no view sees any point.
     """
     from scipy.spatial import KDTree
 
@@ -88,7 +88,7 @@ def _seen(
     K: Tensor,
     near: float,
 ) -> tuple[Tensor, Tensor]:
-    """Cosines ``[P, 1]``, 0 where one view does not see the point, and the colours ``[P, 3]``."""
+    """Return cosines ``[P, 1]``, 0 for points hidden in a view, and colours ``[P, 3]``."""
     height, width = depth.shape
     seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     facing = -(normals @ viewmat[:3, :3].T * seen).sum(-1) / seen.norm(dim=-1)
@@ -99,7 +99,7 @@ def _seen(
     x, y = torch.where(inside[:, None], pixel, 0).unbind(-1)
     found = depth[y, x]
     visible = inside & ((found - seen[:, 2]).abs() < near) & (found < CLEAR)
-    # Between pixels' centres, of the pixels that hit something.
+    # Interpolated between the centres of pixels that hit the object.
     hit = ((depth > 0) & (depth < CLEAR)).to(rgb)[..., None]
     picture = torch.cat([rgb * hit, hit], -1).permute(2, 0, 1)[None]
     grid = (at / size * 2 - 1)[None, None]
@@ -110,11 +110,11 @@ def _seen(
 
 @dataclass
 class Texture:
-    """The colours of a surface as a picture.
+    """Colours of a surface as a picture.
 
     Attributes:
-        uvs: ``[F, 3, 2]`` float64 in [0, 1], places in the picture of the corners of each face; v
-            is up.
+        uvs: ``[F, 3, 2]`` float64 in [0, 1], positions of each face's corners in the picture; v is
+            up.
         image: ``[N, N, 3]`` float32 RGB in [0, 1] (display values), the first row on top.
     """
 
@@ -125,7 +125,7 @@ class Texture:
 def bake_texture(
     vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int, side: int
 ) -> Texture:
-    """Cuts a surface into an atlas and colours its texels by what the views see there.
+    """Unwrap a surface into an atlas and colour its texels from the views.
 
     Args:
         vertices: ``[V, 3]``.
@@ -152,7 +152,7 @@ def bake_texture(
     image[texels] = point_colors(positions, directions, views, voxels)
     known = np.zeros(side * side, bool)
     known[texels] = True
-    # Every texel has the nearest known colour, so that seams do not show.
+    # Empty texels get the nearest known colour, to hide seams.
     missing = ~known.reshape(side, side)
     found = distance_transform_edt(missing, return_distances=False, return_indices=True)
     rows, columns = cast("tuple[np.ndarray, np.ndarray]", found)
@@ -160,12 +160,12 @@ def bake_texture(
 
 
 def unwrapped(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
-    """``[F, 3, 2]``, a place in one square for each corner; faces do not overlap there.
+    """Return texture coordinates ``[F, 3, 2]`` of each corner; faces do not overlap.
 
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``.
-        side: of the picture that is to be made, pixels: by it the pieces are kept apart.
+        side: of the texture, pixels, which sets the padding between charts.
     """
     import xatlas
 
@@ -179,7 +179,7 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
 
 
 def covered_texels(uvs: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The texels whose centres lie in a face.
+    """Return the texels whose centres lie in a face.
 
     Args:
         uvs: ``[F, 3, 2]``, v up.
@@ -195,9 +195,9 @@ def covered_texels(uvs: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, 
     size = high - low + 1
     counts = size.prod(1)
     owner = np.repeat(np.arange(len(uvs)), counts)
-    place = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    x = low[owner, 0] + place % size[owner, 0]
-    y = low[owner, 1] + place // size[owner, 0]
+    index = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    x = low[owner, 0] + index % size[owner, 0]
+    y = low[owner, 1] + index // size[owner, 0]
     center = np.stack([x, y], 1) + 0.5
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
@@ -206,5 +206,5 @@ def covered_texels(uvs: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, 
         second = (off[:, 0] * ac[owner, 1] - off[:, 1] * ac[owner, 0]) / area[owner]
         third = (ab[owner, 0] * off[:, 1] - ab[owner, 1] * off[:, 0]) / area[owner]
     weights = np.stack([1 - second - third, second, third], 1)
-    inside = (weights >= -1e-9).all(1)  # NaN is not
+    inside = (weights >= -1e-9).all(1)  # False for NaN
     return (y * side + x)[inside], owner[inside], weights[inside]

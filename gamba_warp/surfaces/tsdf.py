@@ -18,18 +18,18 @@ from ..render import render
 from ..versions import import_open3d
 from .options import SurfaceOptions
 
-CLEAR = 1e5  # depth of a ray that meets nothing
+CLEAR = 1e5  # depth of a ray that misses
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch
 
 
 @dataclass
 class Views:
-    """What cameras around an object see, on the CPU.
+    """Pictures and depth maps of cameras around an object, on the CPU.
 
     Attributes:
-        cameras: V of them.
-        depth: ``[V, H, W]`` float32, object units along the camera's axis; 0 is not known, and
-            ``CLEAR`` where a ray meets nothing.
+        cameras: ``[V]``.
+        depth: ``[V, H, W]`` float32, object units along the camera's axis; 0 is unknown, and
+            ``CLEAR`` where a ray misses.
         rgb: ``[V, H, W, 3]`` float32 in [0, 1], not multiplied by alpha; 0 without a depth.
     """
 
@@ -38,12 +38,12 @@ class Views:
     rgb: Tensor
 
     def hit(self) -> Tensor:
-        """``[V, H, W]`` bool: pixels that see a surface."""
+        """Return the pixels that see a surface, ``[V, H, W]`` bool."""
         return (self.depth > 0) & (self.depth < CLEAR)
 
 
 def sphere_cameras(count: int, radius: float, pixels: int) -> Cameras:
-    """Cameras around the origin that each see the whole sphere of ``radius``, and little more."""
+    """Return cameras around the origin, each with the whole sphere of ``radius`` in view."""
     forward = -fibonacci_sphere(count)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right, axis=1, keepdims=True)
@@ -58,20 +58,20 @@ def sphere_cameras(count: int, radius: float, pixels: int) -> Cameras:
 
 @torch.no_grad()
 def look_around(gaussians: Gaussians, options: SurfaceOptions) -> Views:
-    """Renders an object from all around, on a Fibonacci sphere.
+    """Render an object from all around, on a Fibonacci sphere.
 
-    On a slanted surface the near edge of a Gaussian is taken for its centre, and all views together
-    would make the object larger: pixels of a steeper surface than ``max_slope`` have no depth.
+    On slanted surfaces the depth is that of a Gaussian's near edge, which would enlarge the object.
+    So pixels of a surface steeper than ``max_slope`` have no depth.
 
     Args:
         gaussians: one object, about the origin, on the device that renders.
-        options: number and side of the pictures, and what has a depth in them.
+        options: with the number and side of the pictures, and the thresholds of depth.
 
     Raises:
         UserError: no pixel of any view is covered.
     """
     reach = gaussians.means.norm(dim=-1) + 2 * gaussians.scales.amax(-1)
-    # One far Gaussian must not make all others small in the pictures.
+    # Quantile, because a single far Gaussian would shrink all others in the pictures.
     radius = float(torch.quantile(reach.cpu()[:: 1 + gaussians.num // 2**20], 0.999)) * 1.05
     count = options.views
     cameras = sphere_cameras(count, radius, options.pixels)
@@ -93,13 +93,13 @@ def look_around(gaussians: Gaussians, options: SurfaceOptions) -> Views:
 
 
 def _slope(views: Views, k: int) -> Tensor:
-    """The steepness ``[H, W]`` of the plane through a pixel's 5 x 5 neighbours in view ``k``.
+    """Return the slope ``[H, W]`` of the plane through a pixel's 5 x 5 neighbours in view ``k``.
 
-    The plane has least squares over the neighbours that hit something, from their moments. Pixels
-    without a plane have the steepness 0.
+    The plane is a least-squares fit to the neighbours with a depth, from their moments. Pixels
+    without a plane have slope 0.
     """
     depth = views.depth[k]
-    hit = ((depth > 0) & (depth < CLEAR)).float()  # of this view alone: there are many
+    hit = ((depth > 0) & (depth < CLEAR)).float()  # one view at a time, to save memory
     depth = depth * hit
     step = torch.arange(-2.0, 3.0).expand(5, 5)
     x, y, one = step, step.T, torch.ones(5, 5)
@@ -112,7 +112,7 @@ def _slope(views: Views, k: int) -> Tensor:
     count = count.clamp_min(1)
     sxx, syy, sxy = sxx - sx * sx / count, syy - sy * sy / count, sxy - sx * sy / count
     sxz, syz = sxz - sx * sz / count, syz - sy * sz / count
-    # A single row of pixels has no plane.
+    # A single row of pixels defines no plane.
     over = torch.where(sxx * syy - sxy * sxy > 1e-3, 1 / (sxx * syy - sxy * sxy), 0.0)
     dx, dy = (syy * sxz - sxy * syz) * over, (sxx * syz - sxy * sxz) * over
     width = depth / views.cameras.Ks[k, 0, 0]  # width of a pixel at the surface
@@ -122,19 +122,19 @@ def _slope(views: Views, k: int) -> Tensor:
 def fuse(
     views: Views, voxels: int, truncation: float, support: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The zero level of the mean, over the views, of each voxel's signed distance to the depth.
+    """Fuse depth maps: the zero level of the mean signed distance of each voxel over the views.
 
     Args:
-        views: what is fused.
-        voxels: number of voxels a unit.
-        truncation: largest distance that counts behind a surface, in voxels.
-        support: voxels that fewer views support are left out.
+        views: to fuse.
+        voxels: number of voxels per unit.
+        truncation: largest distance behind a surface, in voxels.
+        support: voxels seen by fewer views are left out.
 
     Returns:
         Vertices ``[V, 3]`` float64 and faces ``[F, 3]`` int64, outside in front.
 
     Raises:
-        UserError: there is no surface.
+        UserError: the surface is empty.
     """
     o3d = import_open3d()
     grid = o3d.t.geometry.VoxelBlockGrid(
@@ -151,13 +151,13 @@ def fuse(
     for depth, hit, pose in zip(views.depth, views.hit(), poses, strict=True):
         if hit.any():
             near = _image(torch.where(hit, depth, 0.0))
-            # It looks at every fourth pixel only, and raises where none of these hits anything.
+            # It samples every fourth pixel, and raises if none of these has a depth.
             with contextlib.suppress(RuntimeError):
                 blocks = grid.compute_unique_block_coordinates(near, K, pose, **reach)
                 grid.hashmap().activate(blocks)
     if not grid.hashmap().size():
         raise UserError("the fused depth has no surface")
-    # Every view is fused into every block: views that look through a block clear it.
+    # Every view is fused into every block, because views through empty space clear it.
     blocks = grid.hashmap().key_tensor()
     blocks = blocks[grid.hashmap().active_buf_indices().to(o3d.core.int64)]
     for depth, pose in zip(views.depth, poses):
@@ -170,7 +170,7 @@ def fuse(
 
 
 def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sort vertices and faces: Open3D's threads list the same ones in another order each time."""
+    """Sort vertices and faces, whose order varies with Open3D's threads."""
     vertices, index = merged(vertices)
     faces = index[faces]
     first = faces.argmin(1)[:, None] + np.arange(3)

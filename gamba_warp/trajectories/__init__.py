@@ -1,1 +1,1 @@
-"""Paths of cameras: turntables, spirals, files of other programs; and the movies along them."""
+"""Camera paths: turntables, spirals, files of other programs; and movies along them."""

@@ -1,15 +1,15 @@
-"""Files of cameras: our own, NeRF's transforms.json, nerfstudio's camera path, 3DGS's cameras.json.
+"""Camera files: our own, NeRF's transforms.json, nerfstudio's camera path, 3DGS's cameras.json.
 
 - ours (``gamba-cameras``): ``width, height``, optional ``fps``, and ``frames`` of ``viewmat`` (4x4,
-  world to camera, OpenCV) and ``K`` (3x3, pixels) or ``fov`` (degrees, vertical), which may also
-  stand once for all frames.
-- ``transforms.json``: ``frames`` of ``transform_matrix``, read as by ``data.layouts``.
+  world to camera, OpenCV) and ``K`` (3x3, pixels) or ``fov`` (degrees, vertical), which may also be
+  given once for all frames.
+- ``transforms.json``: ``frames`` of ``transform_matrix``, read like ``data.layouts``.
 - nerfstudio's camera path: ``camera_path`` of ``camera_to_world`` (16 numbers by rows, OpenGL) and
   ``fov`` (degrees, vertical); ``render_width, render_height, fps, seconds``.
 - 3DGS's ``cameras.json``: a list of ``position, rotation`` (camera to world, OpenCV), ``fx, fy,
   width, height``.
 
-All say where the cameras are in the frame of the Gaussians, as their file holds them.
+All are in the frame of the Gaussians' file.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from ..untrusted.documents import parse_document, read_bytes
 
 FORMAT = "gamba-cameras"
 MAX_FRAMES = 10_000
-MAX_SIDE = 16_384  # pixels that a file may state
-DEFAULT_SIDE = 512  # pixels, where neither file nor caller states a size
+MAX_SIDE = 16_384  # pixels in a file
+DEFAULT_SIDE = 512  # pixels, without a size from file or caller
 _SHORTEST, _LONGEST = 1e-2, 1e3  # focal lengths, in sides of the picture
 
 _Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
@@ -50,7 +50,7 @@ class _Frame(Struct):
     fov: _Fov | None = None
 
 
-class _Ours(Struct):
+class _GambaCameras(Struct):
     width: _Side
     height: _Side
     frames: Annotated[list[_Frame], Meta(min_length=1, max_length=MAX_FRAMES)]
@@ -60,13 +60,13 @@ class _Ours(Struct):
     fov: _Fov | None = None
 
 
-class _Posed(Struct):
+class _NerfstudioCamera(Struct):
     camera_to_world: Annotated[list[_Number], Meta(min_length=16, max_length=16)]
     fov: _Fov
 
 
 class _Nerfstudio(Struct):
-    camera_path: Annotated[list[_Posed], Meta(min_length=1, max_length=MAX_FRAMES)]
+    camera_path: Annotated[list[_NerfstudioCamera], Meta(min_length=1, max_length=MAX_FRAMES)]
     render_width: Annotated[float, Meta(ge=1, le=MAX_SIDE)]
     render_height: Annotated[float, Meta(ge=1, le=MAX_SIDE)]
     camera_type: str = "perspective"
@@ -74,7 +74,7 @@ class _Nerfstudio(Struct):
     seconds: Annotated[float, Meta(gt=0, le=1e6)] | None = None
 
 
-class _Seen(Struct):
+class _SplattingCamera(Struct):
     position: _Triple
     rotation: Annotated[list[_Triple], Meta(min_length=3, max_length=3)]
     width: _Side
@@ -83,16 +83,16 @@ class _Seen(Struct):
     fy: Annotated[float, Meta(gt=0, le=1e9)]
 
 
-_Views = Annotated[list[_Seen], Meta(min_length=1, max_length=MAX_FRAMES)]
+_Views = Annotated[list[_SplattingCamera], Meta(min_length=1, max_length=MAX_FRAMES)]
 
 
 @dataclass
 class CameraPath:
-    """Cameras one after the other.
+    """Sequence of cameras.
 
     Attributes:
         cameras: ``[V]`` float64.
-        fps: pictures a second as the file states it, or None.
+        fps: pictures per second from the file, or None.
     """
 
     cameras: Cameras
@@ -100,17 +100,17 @@ class CameraPath:
 
 
 def load_path(file: str | Path, size: tuple[int, int | None] | None = None) -> CameraPath:
-    """Reads a file of cameras in any of the forms above.
+    """Read a file of cameras in any of the formats above.
 
     Args:
         file: JSON of at most 64 MB.
-        size: width and height of the pictures, or the width alone, which keeps the shape of the
-            picture. Another shape keeps the vertical field of view, and shows more or less at the
-            sides. None is the file's own size.
+        size: width and height of the pictures, or only the width, which keeps the aspect ratio.
+            Another ratio keeps the vertical field of view, and shows more or less at the sides.
+            None is the file's own size.
 
     Raises:
-        UserError: the file is bad, is of no known form, or its cameras differ in size; one line
-            says where.
+        UserError: the file is invalid, of unknown format, or its cameras differ in size; one line
+            names the place.
     """
     source, data = str(file), read_bytes(file)
     value = parse_document(data, object, source)
@@ -121,7 +121,7 @@ def load_path(file: str | Path, size: tuple[int, int | None] | None = None) -> C
     elif "camera_path" in value:
         path = _of_nerfstudio(parse_document(data, _Nerfstudio, source), source)
     elif value.get("format") == FORMAT:
-        path = _ours(parse_document(data, _Ours, source), source)
+        path = _ours(parse_document(data, _GambaCameras, source), source)
     elif "frames" in value:
         path = _of_transforms(Path(file), source)
     else:
@@ -133,12 +133,12 @@ def load_path(file: str | Path, size: tuple[int, int | None] | None = None) -> C
 def save_path(
     file: str | Path, cameras: Cameras, fps: float | None = None, extra: Sequence[dict] = ()
 ) -> None:
-    """Writes cameras in our own form, atomically.
+    """Write cameras in our own format, atomically.
 
     Args:
         file: the ``.json``.
         cameras: ``[V]``.
-        fps: pictures a second.
+        fps: pictures per second.
         extra: further fields of each of the V frames, such as the name of its picture.
 
     Raises:
@@ -157,12 +157,12 @@ def save_path(
 
 def _unknown(source: str) -> UserError:
     return UserError(
-        f"{source}: no file of cameras that is known: it holds neither frames (ours, "
-        "transforms.json) nor a camera_path (nerfstudio), and is no list of views (3DGS)"
+        f"{source}: not a known camera file: it has neither frames (gamba, transforms.json) nor a "
+        "camera_path (nerfstudio), and is not a list of views (3DGS)"
     )
 
 
-def _ours(path: _Ours, source: str) -> CameraPath:
+def _ours(path: _GambaCameras, source: str) -> CameraPath:
     width, height, Ks = path.width, path.height, []
     for number, frame in enumerate(path.frames):
         fov = path.fov if frame.fov is None else frame.fov
@@ -185,7 +185,7 @@ def _of_nerfstudio(path: _Nerfstudio, source: str) -> CameraPath:
     Ks = torch.stack([_centred(width, height, posed.fov) for posed in path.camera_path])
     _check_rotations(poses, source)
     rate = path.fps
-    if path.seconds is not None:  # as nerfstudio itself: the length counts, not the rate
+    if path.seconds is not None:  # like nerfstudio: the length counts, not the rate
         rate = min(1000.0, len(poses) / path.seconds)
     return CameraPath(Cameras(from_opengl(poses), Ks, width, height), rate)
 
@@ -195,13 +195,13 @@ def _of_transforms(file: Path, source: str) -> CameraPath:
     stated = {size or (DEFAULT_SIDE, DEFAULT_SIDE) for size in sizes}
     width, height = _one_size(stated, source)
     for K, size in zip(Ks, sizes):
-        if size is None:  # it is in fractions of the picture's side
+        if size is None:  # in fractions of the picture's side
             K[:2] *= DEFAULT_SIDE
     views = from_opengl(torch.from_numpy(poses))
     return CameraPath(Cameras(views, torch.from_numpy(Ks), width, height))
 
 
-def _of_splatting(views: list[_Seen], source: str) -> CameraPath:
+def _of_splatting(views: list[_SplattingCamera], source: str) -> CameraPath:
     width, height = _one_size({(view.width, view.height) for view in views}, source)
     poses = torch.eye(4, dtype=torch.float64).repeat(len(views), 1, 1)
     poses[:, :3, :3] = _tensor([view.rotation for view in views])
@@ -230,7 +230,7 @@ def _centred(width: int, height: int, fov: float) -> Tensor:
 
 
 def _check(cameras: Cameras, source: str) -> None:
-    """Refuses what is no camera that can render."""
+    """Refuse invalid cameras."""
     _check_rotations(cameras.viewmats, source)
     size = _tensor([cameras.width, cameras.height])
     for number, K in enumerate(cameras.Ks):
@@ -247,7 +247,7 @@ def _check(cameras: Cameras, source: str) -> None:
 
 
 def _check_rotations(matrices: Tensor, source: str) -> None:
-    """Refuses matrices ``[V, 4, 4]`` that turn other than rigidly."""
+    """Refuse matrices ``[V, 4, 4]`` that are not rigid motions."""
     rotation = matrices[:, :3, :3]
     unit = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)) < 1e-2
     last = (matrices[:, 3] - _tensor([0, 0, 0, 1])).abs().amax(1) < 1e-6
@@ -255,13 +255,13 @@ def _check_rotations(matrices: Tensor, source: str) -> None:
     if not bool(right.all()):
         number = int((~right).nonzero()[0])
         raise UserError(
-            f"{source}: frame {number}: the matrix is not a rotation with a place "
+            f"{source}: frame {number}: the matrix is not a rotation with a translation "
             "(its last row is 0 0 0 1, and it neither scales nor mirrors)"
         )
 
 
 def _sized(cameras: Cameras, width: int, height: int | None) -> Cameras:
-    """The same cameras for pictures of another size; their vertical field of view stays."""
+    """Return the cameras for pictures of another size, with the same vertical field of view."""
     if height is None:
         height = max(1, round(cameras.height * width / cameras.width))
     scale = height / cameras.height

@@ -1,4 +1,4 @@
-"""One file of Gaussians along one path of cameras: what ``gamba render`` writes."""
+"""Rendering of a file of Gaussians along a camera path, for ``gamba render``."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ Color = tuple[float, float, float]
 
 FRAMES = 48  # of one turn
 SECONDS = 3.0  # of one turn
-FPS = 24.0  # of a file of cameras that states none
+FPS = 24.0  # of a camera file without a rate
 SIDE = 512  # pixels
 _SIDES = Meta(ge=16, le=4096)
-_NEAR = 0.01  # nearest depth that is drawn
-_SAMPLE = 8  # frames from which a GIF takes its colours
+_NEAR = 0.01  # nearest rendered depth
+_SAMPLE = 8  # frames for the palette of a GIF
 _NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5)}
 
 
 def parse_size(text: str) -> tuple[int, int | None]:
-    """Width and height of ``WxH``, or the width of ``W`` and None, in pixels.
+    """Parse ``WxH`` to width and height, or ``W`` to the width and None, in pixels.
 
     Raises:
-        UserError: it is neither, or a side is out of range.
+        UserError: the text is malformed, or a side is out of range.
     """
     found = re.fullmatch(r"(\d{1,9})(?:[xX](\d{1,9}))?", text.strip())
     if found is None:
@@ -50,10 +50,10 @@ def parse_size(text: str) -> tuple[int, int | None]:
 
 
 def parse_background(text: str) -> Color | None:
-    """RGB in [0, 1] of a name or of ``#rrggbb``; None for ``none``, which is transparent.
+    """Parse a name or ``#rrggbb`` to RGB in [0, 1]; None for ``none``, which is transparent.
 
     Raises:
-        UserError: it is none of these.
+        UserError: the text is malformed.
     """
     if text == "none":
         return None
@@ -69,14 +69,14 @@ def parse_background(text: str) -> Color | None:
 
 @dataclass
 class Film:
-    """Where the camera goes, and what it takes.
+    """Cameras and options of a rendering along a path.
 
     Attributes:
         cameras: ``[V]``, in an object's unit frame, or in the file's own frame.
-        own: whether they are in the file's own frame.
-        rate: pictures a second.
+        own: True if they are in the file's own frame.
+        rate: pictures per second.
         background: RGB in [0, 1], or None for transparent pictures.
-        depth: whether pictures have their depth beside them.
+        depth: also write depth maps.
     """
 
     cameras: Cameras
@@ -92,19 +92,19 @@ def plan_path(
     frames: int | None,
     view: dict[str, float | None],
 ) -> tuple[Cameras, bool, float]:
-    """The cameras of the options of ``gamba render``.
+    """Return the cameras for the options of ``gamba render``.
 
     Args:
         trajectory: turntable, spiral, or a file of cameras.
-        size: as ``parse_size`` gives it.
+        size: as from ``parse_size``.
         frames: number of pictures of a turntable or spiral.
         view: elevation, distance and fov of a turntable or spiral; None is the default.
 
     Returns:
-        The cameras, whether they are in the file's own frame, and the pictures a second.
+        The cameras, True if they are in the file's own frame, and the pictures per second.
 
     Raises:
-        UserError: the file is bad, or an option does not go with it.
+        UserError: the file is invalid, or an option does not apply to it.
     """
     if trajectory in ("turntable", "spiral"):
         width, height = size or (SIDE, None)
@@ -134,22 +134,22 @@ def shoot(
     device: torch.device,
     tell=lambda count: None,
 ) -> None:
-    """Renders a file of Gaussians along a path, and writes what was asked for, atomically.
+    """Render a file of Gaussians along a path, and write the output atomically.
 
     Args:
-        target: the ``.gif`` or ``.mp4``; of ``png`` the folder, or a ``.png`` for a single view.
-        kind: what is written.
-        gaussians: one object of any size anywhere.
+        target: the ``.gif`` or ``.mp4``; for ``png`` the folder, or a ``.png`` for a single view.
+        kind: of the output.
+        gaussians: one object of any size and position.
         frame: its centre ``[3]`` and its longest side.
-        film: where the camera goes.
+        film: cameras and options.
         device: device that renders.
-        tell: called with the number of pictures that are newly done, as a progress bar wants it.
+        tell: called with the number of newly finished pictures, for a progress bar.
 
     Raises:
         UserError: a file cannot be written, or is too large for its kind.
     """
     center, side = frame
-    # At the origin with side 1 float32 has the most digits, whatever the place of the object.
+    # Rendered at the origin with side 1, where float32 is most precise.
     moved = gaussians.in_unit(center, side).to(device)
     cameras = to_unit(film.cameras, center, side) if film.own else film.cameras
     own = film.cameras if film.own else placed(film.cameras, center, side)
@@ -159,16 +159,16 @@ def shoot(
         for picture, depth in render_path(moved, part, film.background, film.depth, **near):
             yield picture, None if depth is None else depth * side
 
-    def told():
+    def counted():
         for view in views(cameras):
             yield view
             tell(1)
 
     if kind == "png" and target.suffix.lower() == ".png":
-        save_image(target, next(told())[0] / 255.0)
+        save_image(target, next(counted())[0] / 255.0)
         return
     if kind == "png":
-        save_pictures(target, told(), own, film.rate)
+        save_pictures(target, counted(), own, film.rate)
         return
     count = len(cameras.viewmats)
     every = cameras[:: max(1, count // _SAMPLE)]
@@ -178,5 +178,5 @@ def shoot(
     else:
         sample = np.zeros((0, 1, 1, 3), np.uint8)
     red, green, blue = (round(255 * value) for value in film.background or (1.0, 1.0, 1.0))
-    frames = (picture for picture, _ in told())
+    frames = (picture for picture, _ in counted())
     save_movie(target, frames, film.rate, sample, (red, green, blue))

@@ -1,4 +1,4 @@
-"""Pictures along a path of cameras, and their files: GIF, MP4, folders of PNG."""
+"""Pictures along a camera path, and their files: GIF, MP4, folders of PNG."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from .files import save_path
 CAMERAS = "cameras.json"  # in a folder of pictures
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch, which takes a few hundred MB
 _CHUNK_GAUSSIANS = 1 << 22  # Gaussians projected in one launch, over all of its views
-_GIF_BYTES = 512 << 20  # Pillow holds all frames of a GIF, a byte a pixel
-_PALETTE_PIXELS = 1 << 15  # from which 255 colours are found
+_GIF_BYTES = 512 << 20  # Pillow holds all frames of a GIF, one byte per pixel
+_PALETTE_PIXELS = 1 << 15  # sample for a palette of 255 colours
 _OURS = re.compile(rf"\d{{4,}}(-depth)?\.png|{re.escape(CAMERAS)}")
 _DEPTH_STEPS = 65_535
 
@@ -40,18 +40,18 @@ def render_path(
     depth: bool = False,
     **options,
 ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
-    """Renders along a path, several views a launch, and yields one picture after the other.
+    """Render along a path, several views per launch, and yield the pictures one by one.
 
     Args:
         gaussians: one object without batch dimension, on the device that renders.
         cameras: ``[V]``.
         background: RGB in [0, 1]; None makes RGBA pictures with straight alpha.
-        depth: whether the expected depth is rendered too.
+        depth: render the expected depth too.
         options: further arguments of ``rasterization``.
 
     Yields:
-        Of each view its picture ``[H, W, 3|4]`` uint8 and its depth ``[H, W]`` float32 along the
-        camera's axis, 0 where nothing is seen, or None.
+        For each view the picture ``[H, W, 3|4]`` uint8, and the depth ``[H, W]`` float32 along the
+        camera's axis, 0 on the background, or None.
     """
     cameras = cameras.to(gaussians.means.device, torch.float32)
     color = None if background is None else gaussians.means.new_tensor(background)
@@ -70,7 +70,7 @@ def render_path(
 
 
 def require_movie(kind: str) -> None:
-    """Refuses ``mp4`` where its library is not installed, before any view is rendered.
+    """Refuse ``mp4`` without its library, before any view is rendered.
 
     Raises:
         ModuleNotFoundError: as ``versions.require``.
@@ -86,18 +86,18 @@ def save_movie(
     sample: np.ndarray,
     background: tuple[int, int, int] = (255, 255, 255),
 ) -> None:
-    """Writes frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
+    """Write frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
 
     Args:
         path: ends in ``.gif`` or ``.mp4``.
         frames: each ``[H, W, 3]`` uint8; for MP4 the last row or column is repeated if their number
             is odd, since H.264 needs even sizes.
-        rate: frames a second.
-        sample: ``[K, H, W, 3]`` some of the frames, from which a GIF takes its colours.
+        rate: frames per second.
+        sample: ``[K, H, W, 3]`` some of the frames, for the palette of a GIF.
         background: RGB that a GIF keeps exactly.
 
     Raises:
-        UserError: the suffix is another one, or the file cannot be written.
+        UserError: another suffix, or the file cannot be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
@@ -110,10 +110,10 @@ def save_movie(
 
 
 def check_gif(width: int, height: int, frames: int) -> None:
-    """Refuses a GIF that would take too much memory, before anything is rendered.
+    """Refuse a GIF that would take too much memory, before anything is rendered.
 
     Raises:
-        UserError: it would; the message says what to do.
+        UserError: it would; the message names alternatives.
     """
     if width * height * frames > _GIF_BYTES:
         raise UserError(
@@ -134,7 +134,7 @@ def _write_gif(
     def pictures() -> Iterator[Image.Image]:
         for frame in frames:
             picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
-            # Pillow looks colours up so coarsely that white may become a neighbour of white.
+            # Pillow's colour lookup is coarse, so that white may become a similar colour.
             red, green, blue = (frame[..., i] == background[i] for i in range(3))
             picture.paste(0, mask=Image.fromarray(red & green & blue))
             yield picture
@@ -146,7 +146,7 @@ def _write_gif(
 
 
 def _palette(frames: np.ndarray, background: tuple[int, int, int]) -> Image.Image:
-    """One palette of the background and 255 others for all frames: colours do not flicker."""
+    """Return one palette for all frames, of the background and 255 others, against flicker."""
     pixels = frames.reshape(-1, 3)
     pixels = pixels[(pixels != background).any(1)]
     pixels = pixels[:: 1 + len(pixels) // _PALETTE_PIXELS]
@@ -166,16 +166,16 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     height, width = first.shape[:2]
     odd = ((0, height % 2), (0, width % 2), (0, 0))
     size = f"{width + width % 2}x{height + height % 2}"
-    # imageio's own writer passes over ffmpeg's exit code, so a full disk would go unnoticed.
+    # imageio's own writer ignores ffmpeg's exit code, and so a full disk.
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo"]
     command += ["-pix_fmt", "rgb24", "-s", size, "-r", f"{rate:.6f}", "-i", "-", "-an"]
     command += ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "10"]
     command += ["-movflags", "+faststart", f"file:{path}"]
-    with tempfile.TemporaryFile() as told:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=told)
+    with tempfile.TemporaryFile() as messages:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages)
         assert process.stdin is not None
         try:
-            with suppress(BrokenPipeError):  # it ended before its input: its exit code says why
+            with suppress(BrokenPipeError):  # it ended early; the exit code is checked below
                 for frame in itertools.chain([first], rest):
                     process.stdin.write(np.pad(frame, odd, mode="edge").tobytes())
             with suppress(BrokenPipeError):
@@ -186,16 +186,16 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
             process.wait()
             raise
         if code:
-            told.seek(0)
-            lines = told.read().decode(errors="replace").strip().splitlines()
+            messages.seek(0)
+            lines = messages.read().decode(errors="replace").strip().splitlines()
             raise OSError(f"ffmpeg ended with code {code} ({lines[0] if lines else ''})")
 
 
 def check_folder(path: Path) -> None:
-    """Refuses a folder that holds other things than pictures of ours: it would be replaced.
+    """Refuse a folder with other files than ours, because it would be replaced.
 
     Raises:
-        UserError: it does, or is no folder.
+        UserError: it has other files, or is not a folder.
     """
     if not path.exists():
         return
@@ -212,16 +212,16 @@ def save_pictures(
     cameras: Cameras,
     rate: float,
 ) -> None:
-    """Writes a folder of ``0000.png`` and so on with ``cameras.json``, whole or not at all.
+    """Write a folder of ``0000.png`` and so on with ``cameras.json``, atomically.
 
-    Depth, where there is one, becomes ``0000-depth.png`` of 16 bits, 0 where it is not known; the
-    length of a step is the frame's ``depth_unit``.
+    Depth becomes a 16-bit ``0000-depth.png``, 0 where unknown; the length of a step is the frame's
+    ``depth_unit``.
 
     Args:
-        folder: replaced if it is there; see ``check_folder``.
-        views: as ``render_path`` yields them, with depths in the cameras' own unit.
-        cameras: ``[V]``, in the frame of the file that is shown.
-        rate: pictures a second, for ``cameras.json``.
+        folder: replaced if it exists; see ``check_folder``.
+        views: from ``render_path``, with depths in the cameras' own unit.
+        cameras: ``[V]``, in the frame of the rendered file.
+        rate: pictures per second, for ``cameras.json``.
 
     Raises:
         UserError: it cannot be written.

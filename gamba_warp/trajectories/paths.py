@@ -1,4 +1,4 @@
-"""Paths of cameras about an object, and those that a file holds."""
+"""Camera paths about an object, or from a file."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..gaussians import Gaussians
 from .files import load_path
 
-SWING = 30.0  # degrees by which a spiral rises above its elevation, and falls below it
+SWING = 30.0  # amplitude of a spiral's elevation, degrees
 TURNS = 2  # of a spiral
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where an object is looked at.
+    """Position of a camera that looks at an object.
 
     Attributes:
         elevation: degrees; a camera of positive elevation looks down.
@@ -38,10 +38,10 @@ class Viewpoint:
         distance: float | None = None,
         fov: float | None = None,
     ) -> Viewpoint:
-        """The viewpoint with what is given; None leaves a number as it is.
+        """Return the viewpoint with some values replaced; None keeps a value.
 
-        A new field of view without a distance keeps the object as large in the picture as it was,
-        so the camera goes nearer or farther.
+        A new field of view without a distance keeps the object's size in the picture by moving the
+        camera.
         """
         if fov is not None and distance is None:
             before, after = (math.tan(math.radians(angle) / 2) for angle in (self.fov, fov))
@@ -60,7 +60,7 @@ def turntable(
     fov: float = DEFAULT_FOV,
     size: int | tuple[int, int] = 256,
 ) -> Cameras:
-    """One full turn about the origin at one elevation; the first camera has azimuth 0.
+    """Return one full turn about the origin at one elevation; the first camera has azimuth 0.
 
     Args:
         frames: number of cameras, >= 1.
@@ -83,10 +83,10 @@ def spiral(
     fov: float = DEFAULT_FOV,
     size: int | tuple[int, int] = 256,
 ) -> Cameras:
-    """``TURNS`` turns about the origin while the camera rises, falls below, and comes back.
+    """Return ``TURNS`` turns about the origin with a varying elevation.
 
-    Its elevation follows one sine of ``SWING`` degrees about ``elevation``, so the last camera is
-    followed by the first without a jump, and the object is seen from above and from below.
+    The elevation follows one period of a sine of ``SWING`` degrees about ``elevation``, so that the
+    path is closed and shows the object from above and below.
 
     Args:
         frames: number of cameras, >= 1.
@@ -112,43 +112,43 @@ def _around(
 ) -> Cameras:
     width, height = (size, size) if isinstance(size, int) else size
     K = intrinsics(width, height, fov)
-    if width < height:  # the angle is that of the width: an object in the middle stays whole
+    if width < height:  # the angle is that of the width, so that a centred object is not cropped
         K[[0, 1], [0, 1]] *= width / height
     viewmats = orbit(azimuths, elevation, distance)
     return Cameras(viewmats, K.expand(len(azimuths), 3, 3), width, height)
 
 
 def read_path(file: str | Path, size: tuple[int, int | None] | None = None) -> Cameras:
-    """The cameras of a file, in the frame of the file of Gaussians that it belongs to.
+    """Read the cameras of a file, in the frame of its Gaussians.
 
     Args:
-        file: one of the forms of ``trajectories.files``.
-        size: width and height of the pictures, or the width alone; the file's own if not given.
+        file: one of the formats of ``trajectories.files``.
+        size: width and height of the pictures, or only the width; by default the file's own.
 
     Returns:
         Cameras ``[V]`` float64.
 
     Raises:
-        UserError: the file is bad; one line says where.
+        UserError: the file is invalid; one line names the place.
     """
     return load_path(file, size).cameras
 
 
 def upright(elevation: float) -> Tensor:
-    """The rotation ``[3, 3]`` float32 that sets up what a camera of this elevation saw.
+    """Return the rotation ``[3, 3]`` float32 from a camera of this elevation to an upright world.
 
     Args:
         elevation: of the camera above the object, degrees.
 
     Returns:
-        It turns points of the camera's axes, about the object's centre, into a world whose up is
-        -y: there the camera is that of ``orbit([0], elevation)``.
+        Rotates points in the camera's axes, about the object's centre, into a world whose up is -y:
+        there the camera is that of ``orbit([0], elevation)``.
     """
     return orbit(torch.zeros(1), elevation)[0, :3, :3].T.contiguous()
 
 
 def set_up(gaussians: Gaussians, elevation: float) -> Gaussians:
-    """An object in the axes of a camera of this elevation, degrees, made ``upright``."""
+    """Rotate an object from the axes of a camera of this elevation, degrees, to ``upright``."""
     if not elevation:
         return gaussians
     turn = upright(elevation).to(gaussians.means)
@@ -156,7 +156,7 @@ def set_up(gaussians: Gaussians, elevation: float) -> Gaussians:
 
 
 def placed(cameras: Cameras, center: Tensor, side: float) -> Cameras:
-    """Cameras about an object in its unit frame, in the frame where it has its place and size.
+    """Convert cameras from an object's unit frame to the frame with its position and size.
 
     Args:
         cameras: ``[V]``, about the origin, of an object with longest side 1.
@@ -173,7 +173,7 @@ def placed(cameras: Cameras, center: Tensor, side: float) -> Cameras:
 
 
 def to_unit(cameras: Cameras, center: Tensor, side: float) -> Cameras:
-    """The inverse of ``placed``: cameras of an object's own frame, in its unit frame; float32."""
+    """Convert cameras from an object's own frame to its unit frame, the inverse of ``placed``."""
     viewmats = cameras.viewmats.double().clone()
     shift = (viewmats[..., :3, :3] @ center.double().cpu()[:, None])[..., 0]
     viewmats[..., :3, 3] = (viewmats[..., :3, 3] + shift) / side

@@ -1,1 +1,1 @@
-"""The 3D viewer: its program and the pages that hold it."""
+"""3D viewer: its program and pages."""

@@ -1,10 +1,9 @@
-"""What the viewer's page holds of an object: packed records that go to the graphics card as is.
+"""Packed records of an object for the viewer, uploaded to the graphics card unchanged.
 
-One Gaussian is 32 bytes, as in ``.splat``, and finer: three float32 of the mean, seven float16
-(opacity, colour, scales) and three 16-bit numbers of the rotation. The rotation is the vector
-part of the quaternion over 1 + w (modified Rodrigues parameters): no place with w >= 0 is singular.
-The Gaussians that cover most come first, so that the viewer can leave out the last ones while it
-moves.
+One Gaussian has 32 bytes, as in ``.splat``, with more precision: three float32 of the mean, seven
+float16 (opacity, colour, scales) and three 16-bit numbers of the rotation. The rotation is the
+vector part of the quaternion over 1 + w (modified Rodrigues parameters), which is regular for
+w >= 0. Gaussians are sorted by covered area, so that the viewer can skip the last ones in motion.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from ..formats.meshes import TexturedMesh, load_mesh
 from ..gaussians import Gaussians
 from ..images import to_uint8
 
-_COUNTS = 0.05  # opacity from which a Gaussian counts for the object's extent
+_VISIBLE = 0.05  # opacity from which a Gaussian counts for the object's extent
 _MOST = 6e4  # float16 ends at 65504
 
 
@@ -32,11 +31,11 @@ RECORD = np.dtype(
 
 
 class Frame(NamedTuple):
-    """Where the viewer's own frame lies: it is the object's, moved and scaled.
+    """The viewer's frame: the object's, moved and scaled.
 
     Attributes:
-        center: ``[3]`` float64, the point that becomes the origin.
-        size: the length that becomes 1.
+        center: ``[3]`` float64, its origin.
+        size: its unit of length.
     """
 
     center: np.ndarray
@@ -44,17 +43,17 @@ class Frame(NamedTuple):
 
 
 def own_frame(gaussians: Gaussians, name: str) -> Frame:
-    """A frame in which an object of any size anywhere is about the origin with a longest side of 1.
+    """Return a frame that moves an object to the origin, with a longest side of 1.
 
-    Half a percent of the centres at each end of each axis does not count, so that what floats far
-    from the object does not make it small.
+    Half a percent of the centres at each end of each axis does not count, so that floaters far from
+    the object do not shrink it.
 
     Raises:
         UserError: the object has no extent.
     """
     opacities = gaussians.opacities.detach().cpu().numpy()
     means = (
-        gaussians.means.detach().double().cpu().numpy()[opacities >= min(_COUNTS, opacities.max())]
+        gaussians.means.detach().double().cpu().numpy()[opacities >= min(_VISIBLE, opacities.max())]
     )
     low, high = np.percentile(means, [0.5, 99.5], axis=0)
     reach = 4 * float(gaussians.scales.detach().double().median())
@@ -65,7 +64,7 @@ def own_frame(gaussians: Gaussians, name: str) -> Frame:
 
 
 def visible(gaussians: Gaussians, name: str) -> Gaussians:
-    """One object's Gaussians that can be seen, those that cover most first, on the CPU.
+    """Return one object's visible Gaussians, sorted by covered area, on the CPU.
 
     Args:
         gaussians: ``[N]``.
@@ -96,15 +95,15 @@ def visible(gaussians: Gaussians, name: str) -> Gaussians:
 
 
 def pack_gaussians(gaussians: Gaussians, frame: Frame) -> tuple[bytes, bytes]:
-    """The records, and the coefficients of the harmonics.
+    """Return the records, and the coefficients of the harmonics.
 
     Args:
         gaussians: ``[N]``, finite, on the CPU.
         frame: the viewer's frame.
 
     Returns:
-        32 bytes a Gaussian; and float16 ``[N, K * 3]``, each row filled up with zeros to a multiple
-        of 8 numbers, or nothing.
+        32 bytes per Gaussian; and float16 ``[N, K * 3]``, each row zero-padded to a multiple of 8
+        numbers, or nothing.
     """
     records = np.empty(gaussians.num, RECORD)
     records["means"] = (gaussians.means.double().numpy() - frame.center) / frame.size
@@ -147,13 +146,13 @@ class ViewedMesh(NamedTuple):
 
 
 def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
-    """Reads a mesh file for the viewer, which shows OpenCV's axes (y down).
+    """Read a mesh file for the viewer, which uses OpenCV's axes (y down).
 
-    A texture is seen as its colours at the corners.
+    A texture is reduced to its colours at the corners.
 
     Args:
         path: the file.
-        axes: those of the file; OpenGL's (y up) are what ``save_mesh`` writes.
+        axes: of the file; ``save_mesh`` writes OpenGL's (y up) by default.
 
     Raises:
         UserError: as ``load_mesh``.
@@ -161,7 +160,7 @@ def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
     mesh = load_mesh(path)
     vertices = mesh.vertices * ([1.0, -1.0, -1.0] if axes == "opengl" else 1.0)
     paint = (255 * _corner_colors(mesh) + 0.5).astype(np.int64)
-    # A vertex that has several colours becomes several.
+    # A vertex with several colours is split.
     keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]
     found, corners = np.unique(keys, return_inverse=True)
     colors = np.stack([found >> 16 & 255, found >> 8 & 255, found & 255], 1) / np.float32(255)
@@ -170,7 +169,7 @@ def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
 
 
 def _corner_colors(mesh: TexturedMesh) -> np.ndarray:
-    """``[F, 3, 3]`` display values: the product of material, texture and vertices' colours."""
+    """Return display values ``[F, 3, 3]``: the product of material, texture and vertex colours."""
     light = to_linear(mesh.colors[..., :3].astype(np.float32) / 255)
     for i, material in enumerate(mesh.materials):
         mine = mesh.material_ids == i
@@ -185,7 +184,7 @@ def _corner_colors(mesh: TexturedMesh) -> np.ndarray:
 
 
 def pack_mesh(mesh: Any, frame: Frame, name: str) -> tuple[bytes, int, int]:
-    """A mesh as float32 vertices, 8-bit RGBA of the vertices, and 32-bit corners of the faces.
+    """Pack a mesh as float32 vertices, their 8-bit RGBA, and 32-bit corners of the faces.
 
     Args:
         mesh: has ``vertices [V, 3]``, ``faces [F, 3]`` and ``colors [V, 3]`` in [0, 1] or None.
@@ -196,7 +195,7 @@ def pack_mesh(mesh: Any, frame: Frame, name: str) -> tuple[bytes, int, int]:
         The bytes, V and F.
 
     Raises:
-        UserError: a vertex is not finite, there are no faces, or a face names no vertex.
+        UserError: a vertex is not finite, faces are missing, or an index is out of range.
     """
     vertices = (np.asarray(mesh.vertices, np.float64) - frame.center) / frame.size
     faces = np.asarray(mesh.faces, np.int64)

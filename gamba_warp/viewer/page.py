@@ -1,4 +1,4 @@
-"""The viewer's page: one HTML document that fills the window and loads nothing."""
+"""Page of the viewer: one self-contained HTML document that fills the window."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..files import write_text
 from ..gaussians import Gaussians
 from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
 
-# As they need each other.
+# In order of their dependencies.
 _SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "ui", "main")
-# The page may load only what is inlined in it. The worker that sorts is made of a text of the page.
+# The page may load only inlined content; the sorting worker is made from a text of the page.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
     "script-src 'unsafe-inline'; worker-src blob:"
@@ -28,7 +28,7 @@ POLICY = (
 
 
 class ViewerParts(NamedTuple):
-    """What differs between two viewers, as texts that stand in HTML as they are.
+    """Object-specific parts of a viewer, as texts for HTML.
 
     Attributes:
         object: JSON about the object and its cameras.
@@ -44,7 +44,7 @@ class ViewerParts(NamedTuple):
 
 
 def viewer_page(title: str, gaussians: Gaussians, **options: Any) -> str:
-    """The viewer of one object as a whole document, for a file or for the ``srcdoc`` of a frame.
+    """Return the viewer of one object as a document, for a file or the ``srcdoc`` of a frame.
 
     Arguments and errors are those of ``viewer_parts``.
     """
@@ -53,16 +53,16 @@ def viewer_page(title: str, gaussians: Gaussians, **options: Any) -> str:
 
 
 def write_viewer(path: str | Path, title: str, gaussians: Gaussians, **options: Any) -> None:
-    """Writes ``viewer_page`` to a file, atomically; arguments and errors as there.
+    """Write ``viewer_page`` to a file, atomically; arguments and errors as there.
 
     Raises:
-        UserError: also where the file cannot be written.
+        UserError: also if the file cannot be written.
     """
     write_text(path, viewer_page(title, gaussians, **options))
 
 
 def program_page(title: str = "") -> str:
-    """The document without an object: ``{{object}}`` and the like stand where its parts go."""
+    """Return the document without an object, with slots such as ``{{object}}``."""
     texts = {
         "policy": POLICY,
         "title": html.escape(title),
@@ -85,7 +85,7 @@ def viewer_parts(
     view: tuple[float, float, float] | None = None,
     note: str = "",
 ) -> ViewerParts:
-    """What fills the slots of ``program_page``.
+    """Return the texts for the slots of ``program_page``.
 
     Args:
         title: name of the object.
@@ -93,10 +93,10 @@ def viewer_parts(
         mesh: the object's surface in the same world, with ``vertices [V, 3]``, ``faces [F, 3]`` and
             ``colors [V, 3]`` in [0, 1] or None; or no mesh.
         camera: distance from the origin in object units, field of view of the shorter side and
-            elevation, both in degrees, of the input's camera: it is the first view, and shown as
-            lines. None: there was no input, and the object may have any size and be anywhere.
-        view: the first view if there is no camera; its distance is that from the object's centre in
-            units of the object's longest side.
+            elevation, both in degrees, of the input's camera: the initial view, also drawn as
+            lines. None: without an input; the object may have any size and position.
+        view: the initial view without a camera; its distance is from the object's centre, in units
+            of the object's longest side.
         note: a few words below the title.
 
     Raises:
@@ -135,15 +135,15 @@ def frame_element(
     auto: bool = False,
     **options: Any,
 ) -> str:
-    """A place of another page in which the viewer runs, in a frame of its own.
+    """Return an element of another page in which the viewer runs, in its own frame.
 
     The page also needs ``frames_script()``, once, and ``POLICY`` or a wider policy.
 
     Args:
-        name: of the place, unlike those of the page's other places: letters and digits.
+        name: unique id of the element: letters and digits.
         title: as for ``viewer_parts``, like ``gaussians``.
-        poster: HTML that stands there until the viewer is started.
-        auto: whether it starts by itself.
+        poster: HTML shown until the viewer starts.
+        auto: start without a click.
         options: as for ``viewer_parts``; errors as there.
     """
     parts = viewer_parts(title, gaussians, **options)
@@ -160,7 +160,7 @@ def frame_element(
 
 
 def frames_script() -> str:
-    """What starts the viewers of a page: the program, once, and a script."""
+    """Return the script that starts the viewers of a page, with the program."""
     script, program = _program("frames.js"), json_text(program_page())
     return (
         f'<script type="application/json" id="viewer-program">{program}</script>\n'
@@ -169,7 +169,7 @@ def frames_script() -> str:
 
 
 def json_text(value: Any) -> str:
-    """JSON that can stand in a script element and in an attribute: nothing in it ends either."""
+    """Return JSON that is safe in script elements and attributes."""
     text = json.dumps(value)
     for letter in "<>&'":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
@@ -177,6 +177,6 @@ def json_text(value: Any) -> str:
 
 
 def _filled(template: str, texts: Mapping[str, str]) -> str:
-    """The slots filled at once, so that what looks like one in a text stays as it is."""
+    """Fill all slots at once, so that slots within texts are not replaced."""
     names = "|".join(texts)
     return re.sub(r"\{\{(" + names + r")\}\}", lambda match: texts[match[1]], template)

@@ -1,1 +1,1 @@
-"""Networks that others trained: VGG16, LPIPS over it, and how their weights are fetched."""
+"""Pretrained networks: VGG16 and LPIPS, and the fetching of their weights."""

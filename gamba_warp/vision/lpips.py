@@ -1,4 +1,4 @@
-"""LPIPS with VGG16: how different two pictures look to a person (Zhang et al. 2018)."""
+"""LPIPS with VGG16: perceptual distance of pictures (Zhang et al. 2018)."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from ..devices import float32_weights
 from .vgg import VGG16Trunk
 from .weights import WIDTHS, read_cached
 
-# This is LPIPS's own normalisation of pictures in [-1, 1] (its "scaling layer").
+# LPIPS's normalisation of pictures in [-1, 1] (its "scaling layer").
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
 
 class LPIPS(nn.Module):
-    """Learned perceptual distance, VGG16, version 0.1, frozen; ``load_lpips`` makes one."""
+    """Learned perceptual distance, VGG16, version 0.1, frozen; created by ``load_lpips``."""
 
     shift: Tensor
     scale: Tensor
 
     @float32_weights()
     def __init__(self, state: dict[str, Tensor]) -> None:
-        """Takes torchvision's ``features.N.*`` and ``lin0`` .. ``lin4``, each ``[C]``."""
+        """Take torchvision's ``features.N.*`` and ``lin0`` .. ``lin4``, each ``[C]``."""
         super().__init__()
         self.trunk = VGG16Trunk()
         for k, width in enumerate(WIDTHS):
             self.register_buffer(f"lin{k}", torch.empty(width))
         self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None], persistent=False)
         self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None], persistent=False)
-        # A picture [.., H, W, 3] is channels last already, and the convolutions keep that layout.
+        # Pictures [.., H, W, 3] are channels last, and the convolutions keep that layout.
         self.trunk.to(memory_format=torch.channels_last)
         renamed = {n if n.startswith("lin") else f"trunk.{n}": v for n, v in state.items()}
         self.load_state_dict(renamed)
         self.eval()
 
     def forward(self, a: Tensor, b: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
-        """Computes the distance of picture pairs; gradients reach each input that asks for them.
+        """Compute the distance of picture pairs, differentiable in both inputs.
 
         Args:
             a: ``[.., H, W, 3]`` RGB in [0, 1], H and W at least 16.
             b: the same shape.
-            precision: float32; or bfloat16, for convolutions as ``VGG16Trunk.lower`` has them: the
-                value changes by less than a thousandth, and so does the gradient's direction
-                (one minus the cosine).
+            precision: float32; or bfloat16, for the convolutions of ``VGG16Trunk.lower``: the value
+                changes by less than a thousandth, and so does the gradient's direction (one minus
+                the cosine).
 
         Returns:
             ``[..]`` float32, 0 for equal pictures.
@@ -64,7 +64,7 @@ class LPIPS(nn.Module):
         return self.distance(x, y).reshape(a.shape[:-3])
 
     def features(self, pictures: Tensor) -> list[Tensor]:
-        """Computes what ``distance`` compares: five maps ``[B, C, h, w]``, unit length per pixel.
+        """Compute the features for ``distance``: five maps ``[B, C, h, w]``, unit length per pixel.
 
         Args:
             pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
@@ -72,7 +72,7 @@ class LPIPS(nn.Module):
         return [_unit(y) for y in self.trunk(self._normalized(pictures))]
 
     def _lower(self, a: Tensor, b: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """``features`` of both, by ``VGG16Trunk.lower``."""
+        """Compute ``features`` of both by ``VGG16Trunk.lower``."""
         found = self.trunk.lower(self._normalized(a), self._normalized(b))
         return [_unit(y) for y in found[0]], [_unit(y) for y in found[1]]
 
@@ -81,7 +81,7 @@ class LPIPS(nn.Module):
         return (2 * x - 1 - self.shift) / self.scale
 
     def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
-        """Computes ``[B]`` from two ``features``, for comparing one picture with many."""
+        """Compute distances ``[B]`` from two ``features``, to compare one picture with many."""
         total = a[0].new_zeros(len(a[0]))
         for k, (x, y) in enumerate(zip(a, b, strict=True)):
             weighted = torch.einsum("bchw,c->bhw", (x - y).square(), getattr(self, f"lin{k}"))
@@ -90,17 +90,16 @@ class LPIPS(nn.Module):
 
 
 def _unit(x: Tensor) -> Tensor:
-    # The 1e-20 keeps the gradient of a pixel without features finite, and is too small to matter
-    # for any other pixel.
+    # 1e-20 keeps the gradient of a pixel without features finite, and is negligible elsewhere.
     x = x.float()
     return x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()
 
 
 def load_lpips() -> LPIPS:
-    """Makes LPIPS-VGG with the weights in the cache, on the CPU.
+    """Create LPIPS-VGG with the weights in the cache, on the CPU.
 
     Raises:
-        UserError: the cache holds no weights (the message names the command that fetches them), or
-            the file is damaged.
+        UserError: the weights are not in the cache (the message names the command that fetches
+            them), or the file is damaged.
     """
     return LPIPS(read_cached())

@@ -1,4 +1,4 @@
-"""VGG16's convolutions, which serve as the trunk of LPIPS and as an encoder of image tokens."""
+"""VGG16's convolutions, the trunk of LPIPS and an encoder of image tokens."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from torch.nn import functional as F
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from .weights import CONVS, WIDTHS, read_cached, read_torchvision
 
-FULL_BLOCKS = 4  # of the five, which ``VGG16Trunk.lower`` computes in float32
+FULL_BLOCKS = 4  # of five, computed in float32 by ``VGG16Trunk.lower``
 _LAYERS = sum(map(len, CONVS))
 
 
 class _Lower(torch.autograd.Function):
-    """``VGG16Trunk.lower``: both batches in one pass, and the gradient of the first alone.
+    """``VGG16Trunk.lower``: both batches in one pass, with the gradient of the first only.
 
-    The gradient by a layer's input is the convolution with the turned kernel. It is bfloat16 all
-    the way; the ReLUs that it passes are those of the forward pass, whose changes are what spoils
-    a gradient when the first blocks are rounded.
+    The gradient of a layer's input is the convolution with the flipped kernel, in bfloat16
+    throughout. It uses the ReLU masks of the forward pass; rounding the first blocks there would
+    change these masks and so the gradient.
     """
 
     @staticmethod
@@ -71,8 +71,8 @@ class VGG16Trunk(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        # Weights in bfloat16 by layer, made when they are first asked for: turned around for the
-        # gradient, and as they are for the blocks that are rounded.
+        # bfloat16 weights by layer, created on first use: flipped ones for the gradient, and
+        # unchanged ones for the rounded blocks.
         self.turned: dict[str, Tensor] = {}
         self.rounded: dict[str, nn.Conv2d] = {}
         self.features = nn.ModuleDict()
@@ -84,7 +84,7 @@ class VGG16Trunk(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """Maps normalised ``[B, 3, H, W]`` to the features relu1_2, 2_2, 3_3, 4_3 and 5_3.
+        """Map normalised ``[B, 3, H, W]`` to the features relu1_2, 2_2, 3_3, 4_3 and 5_3.
 
         Raises:
             ValueError: the pictures are smaller than 16 pixels.
@@ -100,11 +100,10 @@ class VGG16Trunk(nn.Module):
         return outputs
 
     def lower(self, a: Tensor, b: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """``forward`` of two batches with products in bfloat16 where little depends on them.
+        """Run ``forward`` on two batches, partly in bfloat16 where that hardly matters.
 
-        These are all of the gradient, and those of block 5; the first four blocks are float32 in
-        the forward pass. (docs/lab/step.md has what each choice gives.) The gradient reaches ``a``
-        alone.
+        bfloat16 are the whole gradient and block 5; the first four blocks are float32 in the
+        forward pass (docs/lab/step.md has the effect of each choice). Only ``a`` gets a gradient.
 
         Args:
             a: ``[B, 3, H, W]``, normalised, H and W at least 16.
@@ -130,7 +129,7 @@ class VGG16Trunk(nn.Module):
 
 
 class VGG16Features(nn.Module):
-    """VGG16's last features as image tokens, frozen; ``vgg16_features`` makes one.
+    """VGG16's last features as image tokens, frozen; created by ``vgg16_features``.
 
     Attributes:
         dim: size of a token, 512.
@@ -143,7 +142,7 @@ class VGG16Features(nn.Module):
     std: Tensor
 
     def __init__(self, state: dict[str, Tensor]) -> None:
-        """Takes torchvision's ``features.N.weight`` and ``.bias`` from ``state``, nothing else."""
+        """Take torchvision's ``features.N.weight`` and ``.bias`` of ``state``; ignore the rest."""
         super().__init__()
         self.trunk = VGG16Trunk()
         self.trunk.load_state_dict({n: v for n, v in state.items() if n.startswith("features.")})
@@ -152,9 +151,9 @@ class VGG16Features(nn.Module):
         self.eval()
 
     def forward(self, images: Tensor) -> Tensor:
-        """Maps ``[B, H, W, 3]`` RGB in [0, 1] to relu5_3 tokens ``[B, (H // 16)·(W // 16), 512]``.
+        """Map ``[B, H, W, 3]`` RGB in [0, 1] to relu5_3 tokens ``[B, (H // 16)·(W // 16), 512]``.
 
-        The tokens run along rows.
+        Tokens are in row-major order.
 
         Raises:
             ValueError: the pictures are smaller than 16 pixels.
@@ -164,12 +163,12 @@ class VGG16Features(nn.Module):
 
 
 def vgg16_features(path: str | Path | None = None) -> VGG16Features:
-    """Makes VGG16's ImageNet features as image tokens, on the CPU.
+    """Create VGG16's ImageNet features as image tokens, on the CPU.
 
     Args:
         path: torchvision's ``vgg16-397923af.pth``; None takes the weights in the cache.
 
     Raises:
-        UserError: the file is missing or holds other weights, or the cache holds none.
+        UserError: the file is missing or has other weights, or the cache has none.
     """
     return VGG16Features(read_cached() if path is None else read_torchvision(Path(path)))

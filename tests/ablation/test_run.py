@@ -1,4 +1,4 @@
-"""Rows run, fail, stop and go on: with commands that write small reports at once."""
+"""Rows that run, fail, stop and resume, with fake commands that write small reports."""
 
 import contextlib
 import json
@@ -92,11 +92,11 @@ def test_rows_run_once_and_their_figures_are_these(gamba, tmp_path, capsys):
     text = (tmp_path / "out" / "table.md").read_text()
     assert "| 23.00 [21.00, 25.00]" in text and "PSNR [dB] 12.72" in text and "b: Why." in text
     assert "| b - a | +1.00 [1.00, 1.00]" in text and "1.414" in text
-    assert "of 3 objects (27 were asked for) of the part test." in text
+    assert "of 3 objects (27 were requested) of the split test." in text
     assert found["a"]["objects"] == 3 and made["evaluation"]["objects"] == 27
     assert "On black and on grey" in text and "| a | 19.00 [17.00, 21.00] | -" in text
     page = (tmp_path / "out" / "index.html").read_text()
-    assert "of 3 objects (27 were asked for) of the part test." in page
+    assert "of 3 objects (27 were requested) of the split test." in page
     assert page.count("<svg") == 4 and "23.00 <span>[21.00, 25.00]</span>" in page
     assert made["evaluation"]["views"] == 4 and made["budget"] == {"steps": 4}
     before = page
@@ -206,7 +206,7 @@ AFTER = ["train b/0", "eval-views b/0", "train c/0", "eval-views c/0"]
 
 @pytest.fixture
 def waiting(gamba, tmp_path):
-    """What starts an ablation as a process, its plan, and the run that waits for a signal."""
+    """Start an ablation as a process whose run waits for a signal."""
     path = write_plan(tmp_path, "a", {"name": "b", "options": {"clip": 6}}, "c")
     (tmp_path / "calls").write_text("")
     command = [sys.executable, "-c", DRIVER, *FAKE, str(path), str(tmp_path / "data")]
@@ -227,7 +227,7 @@ def test_a_signal_lets_the_training_save_and_the_same_command_goes_on(gamba, wai
     process.send_signal(number)
     said, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
-    assert "the same command goes on" in said and (run / "saved").exists()
+    assert "the same command resumes" in said and (run / "saved").exists()
     record = json.loads((run.parent / "row.json").read_text())
     assert record["status"] == "begun" and record["parts"]["train"]["seconds"] > 0
     assert gamba(path) == (0, AFTER)

@@ -1,4 +1,4 @@
-"""How many Gaussians are needed: by hand, and where there is no answer."""
+"""Number of Gaussians needed: by hand, and without an answer."""
 
 import math
 

@@ -7,7 +7,7 @@ from helpers import micro
 
 from gamba_warp import cli
 from gamba_warp.ablation.figures import empty_psnr
-from gamba_warp.ablation.run import why
+from gamba_warp.ablation.run import failure_reason
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views.baselines import background
 from gamba_warp.eval.views.compare import Truth, compare
@@ -78,12 +78,12 @@ def test_why_a_command_failed_is_its_own_last_word(tmp_path):
     log = tmp_path / "train.log"
     old = b"$ gamba train A\ngamba: of an older run\n"
     log.write_bytes(old + b"$ gamba train B\n 10%|#  |\r 20%|## |\ngamba: too bad\nwrote nothing\n")
-    assert why(2, log) == "too bad"
+    assert failure_reason(2, log) == "too bad"
     log.write_bytes(old + b"$ gamba train B\nTraceback\nKeyError: 'x'\n\n")
-    assert why(1, log) == "exit code 1: KeyError: 'x'"
-    assert why(128 + 9, log) == "died of signal 9 (SIGKILL), perhaps for want of memory"
+    assert failure_reason(1, log) == "exit code 1: KeyError: 'x'"
+    assert failure_reason(128 + 9, log) == "died of signal 9 (SIGKILL), perhaps out of memory"
     log.write_bytes(old + b"$ gamba train B\n")
-    assert why(70, log) == "exit code 70: it said nothing"
+    assert failure_reason(70, log) == "exit code 70: no output"
     log.write_bytes(b"$ gamba train B\n")
-    assert why(70, log) == "exit code 70: it said nothing"
-    assert "it said nothing" in why(70, tmp_path / "none")
+    assert failure_reason(70, log) == "exit code 70: no output"
+    assert "no output" in failure_reason(70, tmp_path / "none")

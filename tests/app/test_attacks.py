@@ -1,4 +1,4 @@
-"""What programs of the machine and foreign web pages try on ``gamba app``, by raw requests."""
+"""Attacks on ``gamba app`` by local programs and foreign web pages, as raw requests."""
 
 import io
 import json
@@ -69,7 +69,7 @@ def test_a_program_that_does_as_the_page_does(program, private):
 
 @pytest.mark.parametrize("meta", [None, {"_type": "gradio.FileData"}])
 def test_only_files_of_the_visitor_are_taken(served, program, private, meta):
-    """And nobody is told which files there are."""
+    """The answer does not reveal which files exist."""
     other = Program(served.host).opened()
     theirs, mine = other.upload(private.read_bytes()), program.upload(private.read_bytes())
     link = Path(mine).with_name("link.png")
@@ -88,7 +88,7 @@ def test_only_files_of_the_visitor_are_taken(served, program, private, meta):
             lines[str(path), len(data)] = answer.status, answer.line
     assert len(set(lines.values())) == 1, lines
     assert set(lines.values()) == {
-        (400, "this file is not here, or no longer; give the picture once more")
+        (400, "this file is missing or has expired; give the picture again")
     }
     for item in (str(private), [given(private)], {"url": str(private)}, 1, {"a": given(private)}):
         for number, data in ((TAKE, [item]), (MEND, [None, item]), (MEND, [item, None])):
@@ -96,7 +96,7 @@ def test_only_files_of_the_visitor_are_taken(served, program, private, meta):
 
 
 def test_a_session_is_that_of_its_visitor(served, program, private):
-    """A page's picture is not another's, who knows what its browser calls itself."""
+    """A page's picture is not available to another that knows its session."""
     assert "data" in program.result(TAKE, [given(program.upload(private.read_bytes()))])
     assert "data" in program.result(RESTART, [None])
     other = Program(served.host, session=program.session).opened()
@@ -156,7 +156,7 @@ def test_more_layers_than_the_editor_has(program):
     ids=range(11),
 )
 def test_foreign_pages_get_nothing(served, program, headers):
-    """By a form, a request of a script, or a name that is given the address 127.0.0.1."""
+    """Refuse forms, requests of scripts, and names that resolve to 127.0.0.1."""
     headers = {name: value.format(host=served.host) for name, value in headers.items()}
     before = sorted(served.temporary.rglob("*"))
     for route in ROUTES:
@@ -231,7 +231,7 @@ def test_a_page_that_is_open_is_heard_of(served, program):
 
 
 def test_half_sent_requests_stop_nothing(served, program):
-    """More of them than the server takes; the page is answered in between."""
+    """More connections than the limit; the page is still answered."""
     host, port = served.host.split(":")
     held = []
     for _ in range(3):
@@ -258,7 +258,7 @@ def test_what_is_closed(served, program):
         *("gradio_api/call/take/1", "gradio_api/vibe-code", "gradio_api/deep_link", "nothing"),
     ):
         answer = program.ask(f"/{route}")
-        assert (answer.status, answer.line) == (404, "there is nothing here"), route
+        assert (answer.status, answer.line) == (404, "not found"), route
     for route in (
         *("run/predict", "api/take", "call/take", "call/v2/take", "cancel", "reset"),
         *("component_server", "component_server/", "process_recording", "vibe-edit", "stream/1"),
@@ -293,7 +293,7 @@ def test_other_inputs_are_one_line(program, number, data):
 @pytest.mark.parametrize("index", [-1, 10**6, 1.0, "0", None, [0, 1], True, {"a": 1}])
 def test_no_such_example_is_one_line(program, index):
     output = program.result(EXAMPLE, [], event_data={"index": index, "value": 1})
-    assert "and this is none of them" in output["error"]
+    assert "not one of the" in output["error"]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The app's connections: too many of them, requests that come slowly, answers that nobody takes."""
+"""Connections of the app: too many, slow requests, and clients that do not read."""
 
 import socket
 import threading
@@ -16,7 +16,7 @@ LARGE = 32 << 20  # bytes; more than the system's buffers take
 
 @pytest.fixture
 def address(monkeypatch):
-    """A server of a word, of many bytes, and of a stream that does not end."""
+    """Server of a word, of many bytes, and of an endless stream."""
     monkeypatch.setattr(connections, "READ_SECONDS", 0.4)
     monkeypatch.setattr(connections, "CONNECTIONS", 3)
 
@@ -115,7 +115,7 @@ def test_who_takes_nothing_is_left(address):
 
 
 def test_who_takes_slowly_gets_all(address):
-    """Longer than the time limit, which is for each piece."""
+    """Takes longer than the time limit, which applies to each piece."""
     with asked(address, "large") as client:
         got, started = 0, time.monotonic()
         while part := client.recv(1 << 20):

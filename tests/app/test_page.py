@@ -1,4 +1,4 @@
-"""The whole way in a browser, and what the page does with bad input."""
+"""The whole workflow in a browser, and the page's answers to bad input."""
 
 import io
 import os
@@ -31,7 +31,7 @@ def served(browser, tmp_path_factory):
 
 @dataclass
 class Open:
-    """The page, every address that it asked for, and what its console complains of."""
+    """The page, all requested URLs, and the errors of its console."""
 
     page: Any
     asked: list[str] = field(default_factory=list)
@@ -70,14 +70,14 @@ def toast(page):
 
 
 def middle(page):
-    """The colour in the middle of what is painted on, 0 to 255."""
+    """Return the colour in the middle of the editor's picture, 0 to 255."""
     shot = Image.open(io.BytesIO(page.locator("#editor canvas").first.screenshot()))
     x, y = shot.width // 2, shot.height // 2
     return np.asarray(shot.convert("RGB"))[y - 2 : y + 3, x - 2 : x + 3].mean((0, 1))
 
 
 def until(found, what):
-    """Waits for what has no event of its own."""
+    """Wait for a condition without an event."""
     deadline = time.monotonic() + PATIENCE
     while not found():
         assert time.monotonic() < deadline, what
@@ -208,7 +208,7 @@ def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):
 
 
 def test_ctrl_c_leaves_nothing(served):
-    """The last one: it ends the server of this file."""
+    """Must be the last test: ends the server of this file."""
     assert len(served.folders()) == 1
     served.process.send_signal(signal.SIGINT)
     out, err = served.process.communicate(timeout=30)

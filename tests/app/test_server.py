@@ -1,4 +1,4 @@
-"""What the page's server lets in, leaves behind, and computes on."""
+"""Requests, leftover files and threads of the page's server."""
 
 import asyncio
 import hashlib
@@ -12,15 +12,14 @@ from pathlib import Path
 import pytest
 from helpers.app import FORM, form
 
-from gamba_warp.app import guard, server
-from gamba_warp.app import shelf as shelves
+from gamba_warp.app import guard, server, visitor_files
 from gamba_warp.app.server import MainThread
-from gamba_warp.app.shelf import Shelf
+from gamba_warp.app.visitor_files import VisitorFiles
 from gamba_warp.errors import UserError
 
 
-def answered(host, kind="http", path="/", method="GET", shelf=None, body=b"", token=None, more=()):
-    """Messages of the guard for a request, and the scopes that it passes on."""
+def answered(host, kind="http", path="/", method="GET", files=None, body=b"", token=None, more=()):
+    """Return the guard's messages for a request, and the scopes that it passes on."""
     sent, inside = [], []
 
     async def app(scope, receive, send):
@@ -42,7 +41,7 @@ def answered(host, kind="http", path="/", method="GET", shelf=None, body=b"", to
     place, _, asked = path.partition("?")
     scope = {"type": kind, "headers": headers, "path": place, "method": method}
     scope["query_string"] = asked.encode()
-    layer = guard.Guard(app, shelf or Shelf(Path("unused")), {}, 1 << 20)
+    layer = guard.Guard(app, files or VisitorFiles(Path("unused")), {}, 1 << 20)
     asyncio.run(layer(scope, receive, send))
     return sent, inside
 
@@ -88,7 +87,7 @@ def test_what_a_browser_says_it_says_once(name):
 
 @pytest.mark.parametrize("place", ["heartbeat/abc", "queue/data?session_hash=abc"])
 def test_a_session_is_told_apart_by_its_visitor(place):
-    """Whose heartbeat ends, of that visitor's session gradio forgets what it holds."""
+    """When a heartbeat ends, gradio drops the state of that visitor's session only."""
     path = f"/gradio_api/{place}"
     for token in ("a" * 32, "b" * 32):
         [scope] = answered("localhost", path=path, token=token)[1]
@@ -147,59 +146,59 @@ def test_a_cookie_is_given_once_and_is_the_visitor():
 
 
 def test_all_uploads_together_are_bounded(tmp_path):
-    """A megabyte each; the first ones go."""
-    shelf, paths = Shelf(tmp_path, limit=4 << 20), []
+    """A megabyte each; the oldest are removed."""
+    files, paths = VisitorFiles(tmp_path, limit=4 << 20), []
     for k in range(9):
         body = form(bytes([k]) * (1 << 20))
         request = {"path": "/gradio_api/upload", "method": "POST", "body": body}
-        sent, _ = answered("localhost", shelf=shelf, token="a" * 32, **request)
+        sent, _ = answered("localhost", files=files, token="a" * 32, **request)
         assert sent[0]["status"] == 200
         paths.append(Path(json.loads(sent[1]["body"])[0]))
         os.utime(paths[-1], (time.time() - 100 + k,) * 2)
         kept = [path for path in tmp_path.rglob("*") if path.is_file()]
-        assert sum(path.stat().st_size for path in kept) <= shelf.limit
+        assert sum(path.stat().st_size for path in kept) <= files.limit
     assert [path.is_file() for path in paths] == [False] * 5 + [True] * 4
     assert not paths[0].parent.exists()
 
 
-def kept_file(shelf, visitor, size=1000):
-    path = shelf.place(visitor, size) / "picture.png"
+def kept_file(files, visitor, size=1000):
+    path = files.new_folder(visitor, size) / "picture.png"
     path.write_bytes(bytes(size))
     return path
 
 
 def test_files_of_who_is_here_stay(tmp_path):
-    """Visitors that are gone make room first; without any, a new file is refused."""
-    shelf = Shelf(tmp_path, limit=3000)
-    with shelf.visited("a"):
-        first, left, last = (kept_file(shelf, visitor) for visitor in "aba")
+    """Files of inactive visitors are removed first; without any, a new file is refused."""
+    files = VisitorFiles(tmp_path, limit=3000)
+    with files.visited("a"):
+        first, left, last = (kept_file(files, visitor) for visitor in "aba")
         for path, age in ((first, 90), (left, 50), (last, 9)):
             os.utime(path, (time.time() - age,) * 2)
-        newer = kept_file(shelf, "c")
+        newer = kept_file(files, "c")
         assert first.is_file() and last.is_file() and not left.exists(), "though it was newer"
-        with shelf.visited("c"), pytest.raises(UserError, match="leave no room"):
-            shelf.place("d", 1000)
+        with files.visited("c"), pytest.raises(UserError, match="leave no room"):
+            files.new_folder("d", 1000)
         assert newer.is_file() and not (tmp_path / "d").exists()
-        os.utime(first, (time.time() - shelves.KEPT - 9,) * 2)
-        shelf.sweep()
+        os.utime(first, (time.time() - visitor_files.KEEP_SECONDS - 9,) * 2)
+        files.sweep()
         assert first.is_file(), "the page is open"
-    shelf.sweep()
+    files.sweep()
     assert not first.exists() and last.is_file() and newer.is_file()
 
 
 def test_a_visitor_displaces_its_own_files_alone(tmp_path):
-    shelf = Shelf(tmp_path, limit=9000, own=2000)
-    other = kept_file(shelf, "b")
+    files = VisitorFiles(tmp_path, limit=9000, per_visitor=2000)
+    other = kept_file(files, "b")
     os.utime(other, (1 << 30,) * 2)
     os.utime(other, (time.time() - 99,) * 2)
-    mine = [kept_file(shelf, "a") for _ in range(4)]
+    mine = [kept_file(files, "a") for _ in range(4)]
     assert [path.is_file() for path in (other, *mine)] == [True, False, False, True, True]
 
 
-def dawdled(shelf, uploads, seconds=0.3):
-    """Statuses of uploads at once, of (token, bytes that come and no more); and the guard."""
+def dawdled(files, uploads, seconds=0.3):
+    """Return statuses of stalled simultaneous uploads (token, bytes received), and the guard."""
     sent = [[] for _ in uploads]
-    layer = guard.Guard(None, shelf, {}, 1 << 20)
+    layer = guard.Guard(None, files, {}, 1 << 20)
 
     async def ask(k, token, content):
         for _ in range(50 * k):  # one after the other
@@ -233,28 +232,30 @@ def dawdled(shelf, uploads, seconds=0.3):
 
 
 def test_what_is_stated_takes_no_room(tmp_path):
-    """One visitor states a megabyte sixteen times; another's file stays, and so does its page."""
-    shelf = Shelf(tmp_path, limit=3 << 20)
-    other = kept_file(shelf, visitor_of("b" * 32))
+    """A visitor announces a megabyte sixteen times; files and page of another stay."""
+    files = VisitorFiles(tmp_path, limit=3 << 20)
+    other = kept_file(files, visitor_of("b" * 32))
     empty = form(b"")[:-20]
-    assert dawdled(shelf, [("a", empty)] * 16 + [("b", empty)])[0] == [None] * 17
+    assert dawdled(files, [("a", empty)] * 16 + [("b", empty)])[0] == [None] * 17
     assert other.is_file()
 
 
 def test_what_has_come_in_is_bounded(tmp_path):
-    """By visitor, and of all together; who leaves makes room."""
+    """Limit uploads per visitor and in total; an ended upload frees its share."""
     content = form(bytes(500_000))[:-20]
-    statuses, layer = dawdled(Shelf(tmp_path, own=700_000), [("a", content), ("a", content)])
-    assert sorted(statuses, key=str) == [503, None] and not layer._coming
+    statuses, layer = dawdled(
+        VisitorFiles(tmp_path, per_visitor=700_000), [("a", content), ("a", content)]
+    )
+    assert sorted(statuses, key=str) == [503, None] and not layer._incoming
     each = [(token, content) for token in "abc"]
-    statuses, layer = dawdled(Shelf(tmp_path, limit=1_200_000), each)
-    assert sorted(statuses, key=str) == [503, None, None] and not layer._coming
+    statuses, layer = dawdled(VisitorFiles(tmp_path, limit=1_200_000), each)
+    assert sorted(statuses, key=str) == [503, None, None] and not layer._incoming
 
 
 def test_requests_of_one_visitor_are_bounded(tmp_path):
     empty = form(b"")[:-20]
-    shelf = Shelf(tmp_path)
-    assert dawdled(shelf, [("a", empty)] * 17 + [("b", empty)])[0] == [None] * 16 + [503, None]
+    files = VisitorFiles(tmp_path)
+    assert dawdled(files, [("a", empty)] * 17 + [("b", empty)])[0] == [None] * 16 + [503, None]
 
 
 @pytest.mark.parametrize("name", ["_CALL_SECONDS", "UPLOAD_SECONDS"])
@@ -274,23 +275,23 @@ def test_a_body_that_does_not_come_is_refused(monkeypatch, name):
     headers += [(b"cookie", f"gamba-visitor={'a' * 32}".encode())]
     headers += [(b"content-type", FORM["Content-Type"].encode())]
     scope = {"type": "http", "method": "POST", "path": path, "headers": headers}
-    layer = guard.Guard(None, Shelf(Path("unused")), {}, 1 << 20)
+    layer = guard.Guard(None, VisitorFiles(Path("unused")), {}, 1 << 20)
     asyncio.run(asyncio.wait_for(layer(scope, receive, send), 10))
     assert sent[0]["status"] == 408 and b"took too long" in sent[1]["body"]
 
 
 def test_old_files_go_by_themselves(tmp_path, monkeypatch):
-    monkeypatch.setattr(guard, "KEPT", 0.06)
-    monkeypatch.setattr(shelves, "KEPT", 0.06)
-    shelf = Shelf(tmp_path)
-    path = shelf.place("a") / "picture.png"
+    monkeypatch.setattr(guard, "KEEP_SECONDS", 0.06)
+    monkeypatch.setattr(visitor_files, "KEEP_SECONDS", 0.06)
+    files = VisitorFiles(tmp_path)
+    path = files.new_folder("a") / "picture.png"
     path.write_bytes(b"x")
 
     async def lives(scope, receive, send):
         await asyncio.sleep(0.3)
 
     assert path.exists()
-    asyncio.run(guard.Guard(lives, shelf, {}, 1)({"type": "lifespan"}, None, None))
+    asyncio.run(guard.Guard(lives, files, {}, 1)({"type": "lifespan"}, None, None))
     assert not path.exists() and not path.parent.exists()
 
 
@@ -298,7 +299,7 @@ def test_nothing_of_the_environment_opens_the_server(monkeypatch, tmp_path):
     for name in ("GRADIO_SHARE", "GRADIO_NUM_WORKERS", "GRADIO_ROOT_PATH", "GRADIO_ANYTHING"):
         monkeypatch.setenv(name, "7")
     monkeypatch.setattr(os, "environ", dict(os.environ))
-    server.quiet(tmp_path)
+    server.configure_gradio(tmp_path)
     ours = {name: value for name, value in os.environ.items() if name.startswith("GRADIO_")}
     assert ours.pop("GRADIO_TEMP_DIR") == str(tmp_path)
     assert set(ours.values()) == {"False"}
@@ -306,7 +307,7 @@ def test_nothing_of_the_environment_opens_the_server(monkeypatch, tmp_path):
 
 @pytest.fixture
 def temporary(tmp_path, monkeypatch):
-    """The folder for temporary files, which is everybody's."""
+    """Folder for temporary files, shared by all users."""
     folder = tmp_path / "tmp"
     folder.mkdir()
     monkeypatch.setattr(server.tempfile, "tempdir", str(folder))
@@ -336,7 +337,7 @@ def test_the_folder_goes_and_so_do_those_of_the_killed(temporary):
 
 
 def test_a_link_is_not_followed(tmp_path, temporary):
-    """Neither one in a folder's place nor one in that of its lock, with any version of filelock."""
+    """Links in place of a folder or its lock, with any version of filelock."""
     home = left_folder(tmp_path / "home")
     (temporary / f"{server.PREFIX}folder").symlink_to(home)
     left = left_folder(temporary / f"{server.PREFIX}lock")
@@ -371,7 +372,7 @@ def test_a_port_in_use_is_one_line():
 
 
 def test_a_defect_is_logged_once_and_a_browser_that_leaves_is_none():
-    new = server.NewDefect()
+    new = server.NewErrors()
 
     def logged(kind):
         try:
@@ -388,23 +389,23 @@ def test_a_defect_is_logged_once_and_a_browser_that_leaves_is_none():
 
 
 def test_jobs_are_done_by_the_one_that_works():
-    turns, found = MainThread(), []
+    main_thread, found = MainThread(), []
 
     def fail(error):
         raise error
 
     def ask():
-        found.append(turns.call(lambda a, b: (a + b, threading.get_ident()), 2, 3))
+        found.append(main_thread.call(lambda a, b: (a + b, threading.get_ident()), 2, 3))
         for error in (UserError("no picture"), ZeroDivisionError("ours"), KeyboardInterrupt()):
             try:
-                turns.call(fail, error)
+                main_thread.call(fail, error)
             except Exception as caught:
                 found.append(str(caught))
 
     thread = threading.Thread(target=ask)
     thread.start()
     with pytest.raises(KeyboardInterrupt):
-        turns.work()
+        main_thread.work()
     thread.join(timeout=10)
     assert found == [
         (5, threading.get_ident()),
@@ -415,18 +416,18 @@ def test_jobs_are_done_by_the_one_that_works():
 
 
 def test_who_waits_does_not_wait_for_ever():
-    """Ctrl-C comes during one job; others stand behind it, and one comes later."""
-    turns, ended = MainThread(), []
+    """Ctrl-C during one job, with others queued, and one that comes later."""
+    main_thread, ended = MainThread(), []
 
     def wait(function):
         try:
-            turns.call(function)
+            main_thread.call(function)
         except UserError:
             ended.append(function.__name__)
 
     def interrupt():
         deadline = time.monotonic() + 10
-        while turns._jobs.qsize() < 2 and time.monotonic() < deadline:
+        while main_thread._jobs.qsize() < 2 and time.monotonic() < deadline:
             time.sleep(0.001)
         raise KeyboardInterrupt
 
@@ -435,7 +436,7 @@ def test_who_waits_does_not_wait_for_ever():
         thread.start()
         time.sleep(0.02)
     with pytest.raises(KeyboardInterrupt):
-        turns.work()
+        main_thread.work()
     wait(print)
     for thread in threads:
         thread.join(timeout=10)

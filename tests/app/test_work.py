@@ -45,7 +45,7 @@ def made(tmp_path_factory):
 
 
 def test_a_picture_from_above_stands_upright(tmp_path, made):
-    """As ``reconstruct --elevation`` turns it, in the viewer's camera and in every file."""
+    """Rotation like ``reconstruct --elevation``, in the viewer's camera and in every file."""
     picture = cut_out(tmp_path / "thing.png")
     cut = cutting.cut_picture(picture, "thing.png", Ways())
     above = work.solve(load_model(STARTER / "tiny.safetensors"), cut, 30.0)
@@ -83,15 +83,15 @@ def test_a_plain_picture_is_cut_out(two):
 @pytest.mark.parametrize("size", [(60, 100), (432, 720), (31, 57)])
 def test_strokes_keep_and_remove(two, size):
     cut = cutting.cut_picture(two, "two.png", Ways())
-    without = cutting.mended(cut, [stroke(size, (0.2, 0.5, 0.8, 1.0), cutting.REMOVE)])
+    without = cutting.apply_strokes(cut, [stroke(size, (0.2, 0.5, 0.8, 1.0), cutting.REMOVE)])
     assert without.mask[30, 25] == 1 and without.mask[30, 70] == 0
     side = cutting.model_picture(without).shape[0]
     assert side == 25  # 20 pixels are four fifths of it
     assert cut.mask[30, 70] == 1, "the first one is as it was"
-    again = cutting.mended(without, [stroke(size, (0.2, 0.5, 0.8, 0.9), cutting.KEEP)])
+    again = cutting.apply_strokes(without, [stroke(size, (0.2, 0.5, 0.8, 0.9), cutting.KEEP)])
     assert again.mask[30, 70] == 1 and again.mask[5, 70] == 0
-    np.testing.assert_array_equal(cutting.restarted(again).mask, cut.mask)
-    assert cutting.mended(cut, [np.zeros((*size, 4), np.uint8)]) is cut
+    np.testing.assert_array_equal(cutting.reset_mask(again).mask, cut.mask)
+    assert cutting.apply_strokes(cut, [np.zeros((*size, 4), np.uint8)]) is cut
 
 
 def test_a_mended_object_has_no_fringe(tmp_path):
@@ -101,7 +101,7 @@ def test_a_mended_object_has_no_fringe(tmp_path):
     picture = picture.rotate(20, Image.Resampling.BICUBIC, fillcolor="white")
     picture.resize((100, 100), Image.Resampling.LANCZOS).save(tmp_path / "a.png")
     cut = cutting.cut_picture(tmp_path / "a.png", "a.png", Ways())
-    mended = cutting.mended(cut, [stroke((50, 50), (0.4, 0.4, 0.6, 0.6), cutting.REMOVE)])
+    mended = cutting.apply_strokes(cut, [stroke((50, 50), (0.4, 0.4, 0.6, 0.6), cutting.REMOVE)])
     rgba = cutting.model_picture(mended)
     edge = rgba[(rgba[..., 3] > 0.3) & (rgba[..., 3] < 0.95)]
     # White would have a green of 1; what the flood leaves of it is within its tolerance.
@@ -123,16 +123,16 @@ def test_what_is_painted_on(two):
 
 
 def test_without_an_object_it_can_be_painted(tmp_path):
-    """An even picture holds nothing; what is painted is cut out."""
+    """A uniform picture has no object; the painted area is cut out."""
     save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
     cut = cutting.cut_picture(tmp_path / "even.png", "even.png", Ways())
     assert not cut.mask.any() and cut.note.startswith("No object was found (")
     assert str(tmp_path) not in cut.note
     with pytest.raises(UserError, match="no object found.*paint over the object"):
         cutting.model_picture(cut)
-    painted = cutting.mended(cut, [stroke((80, 100), (0.25, 0.2, 0.75, 0.8), cutting.KEEP)])
+    painted = cutting.apply_strokes(cut, [stroke((80, 100), (0.25, 0.2, 0.75, 0.8), cutting.KEEP)])
     assert cutting.model_picture(painted).shape == (38, 38, 4)  # 30 pixels over 0.8
-    removed = cutting.mended(painted, [stroke((8, 10), (0, 0, 1, 1), cutting.REMOVE)])
+    removed = cutting.apply_strokes(painted, [stroke((8, 10), (0, 0, 1, 1), cutting.REMOVE)])
     with pytest.raises(UserError, match="no object found"):
         cutting.model_picture(removed)
 
@@ -186,7 +186,7 @@ def test_the_turntable(made, tmp_path, monkeypatch):
 
 
 def test_a_mesh(made, tmp_path, monkeypatch):
-    """The surface itself takes half a minute, and has tests of its own."""
+    """The surface is faked: it takes half a minute and has its own tests."""
     trimesh = pytest.importorskip("trimesh")
     asked = []
 

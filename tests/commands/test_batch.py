@@ -1,4 +1,4 @@
-"""One loop over many inputs: what is noted, what stops it, and what is said at the end."""
+"""Loop over many inputs: recorded failures, fatal errors, and the final report."""
 
 from pathlib import Path
 

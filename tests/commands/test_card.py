@@ -1,4 +1,4 @@
-"""The model's card: what pages say of a model, and that docs/model-card.md says the same."""
+"""Model cards: the text on pages, and its agreement with docs/model-card.md."""
 
 import json
 from pathlib import Path

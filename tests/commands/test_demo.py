@@ -1,4 +1,4 @@
-"""The demo on three objects and a few seconds of training: all commands run, the page is whole."""
+"""The demo on three objects with a few seconds of training: all commands and the page."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ def demo(starter, out, *options):
 
 @pytest.fixture
 def short(tmp_path, monkeypatch):
-    """One command is a process, as all are for users; the others share what this one has loaded."""
+    """Run one command as a process, as for users; the others share this process's imports."""
     protocol = tmp_path / "coarse.json"
     surface = {"voxels": 48, "views": 16, "pixels": 96}
     protocol.write_text(json.dumps({"num_points": 2000, "iou_voxels": 16, "surface": surface}))
@@ -72,7 +72,7 @@ def test_demo(starter, short, tmp_path, monkeypatch):
         assert part in page, part
     # what was shipped comes before what was trained here, and the page says which is which
     assert page.index("never seen</h2>") < page.index("Numbers") < page.index("Trained here</h2>")
-    assert "nothing of it was trained on this machine" in page
+    assert "it was not trained on this machine" in page
     card = json.loads(checkpoint.DEFAULT_CHECKPOINT.with_suffix(".json").read_text())
     shipped = [row for row in card["figures"] if (row["views"], row["name"]) == ("novel", "model")]
     known = f"the shipped model has {shipped[0]['psnr']['mean']:.1f} dB in new views"
@@ -96,7 +96,7 @@ def test_without_the_shipped_model(starter, tmp_path, monkeypatch, capsys):
 
 
 class Calls:
-    """Stands in for the processes: notes the stages, and leaves what each would make."""
+    """Stand-in of the processes that records the stages and writes their results."""
 
     def __init__(self, monkeypatch, out):
         self.stages, self.out, self.codes, self.pages = [], out, {}, []
@@ -126,7 +126,7 @@ def test_an_interrupted_demo_goes_on(starter, tmp_path, monkeypatch, capsys):
     calls = Calls(monkeypatch, out)
     calls.codes = {"eval-views": 143}
     assert demo(starter, out) == 143 and calls.stages == ALL[:2] and not calls.pages
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "the same command resumes" in capsys.readouterr().out
     calls.codes, calls.stages = {"train": 1}, []
     assert demo(starter, out) == 2 and calls.stages == ALL[1:4]
     calls.codes, calls.stages = {}, []
@@ -143,7 +143,7 @@ def test_the_page_is_there_before_the_training(starter, tmp_path, monkeypatch):
     assert demo(starter, out) == 0
     (early, first), (late, second) = calls.pages
     assert (early, late) == (3, 5)
-    assert "Training still runs" in first and "All of it took" in second
+    assert "Training still runs" in first and "The whole demo took" in second
     name = checkpoint.DEFAULT_CHECKPOINT.name
     assert all(name in text and "for 2 minutes" in text for text in (first, second))
 

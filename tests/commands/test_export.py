@@ -152,7 +152,7 @@ def test_mesh_files_are_read_back(tmp_path, kind):
 
 @pytest.mark.parametrize("command", ["export", "view", "render"])
 def test_gaussians_that_cannot_be_drawn_are_left_out_when_asked(ball, tmp_path, capsys, command):
-    """One line says how many; the others are drawn as if these had never been there."""
+    """One line has their number; the others are drawn as without them."""
     data = bytearray(ball.read_bytes())
     start = data.index(b"end_header\n") + 11
     data[start : start + 4] = struct.pack("<f", float("nan"))

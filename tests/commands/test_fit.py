@@ -1,4 +1,4 @@
-"""Fitting one object: the gradients lead from a random start to a known scene; the command."""
+"""Fitting of one object: convergence from a random start to a known scene, and the command."""
 
 import functools
 import json
@@ -52,7 +52,7 @@ def test_known_scene_is_found_from_a_random_start():
 
 @pytest.mark.parametrize("frozen", ["all", "lr_means", "lr_scales", "lr_opacities", "lr_colors"])
 def test_each_gradient_has_its_part(frozen):
-    """Without learning nothing is reached; without one attribute's gradient, less."""
+    """No fit without learning, and a worse one without one attribute's gradient."""
     rates = STILL if frozen == "all" else {frozen: 0.0}
     config = replace(QUICK, relocate_every=0)
     reached, _ = held_out_psnr(replace(config, **rates))
@@ -72,7 +72,7 @@ def test_same_seed_same_bits():
 
 
 def test_the_mode_reaches_the_fit():
-    """What is fitted in one mode looks better in it than in the other."""
+    """Gaussians fitted in one mode look better in it than in the other."""
     cameras = views_around(6)
     images = photograph(cloud(1), cameras)
     truth = over_background(images, 1.0)
@@ -105,7 +105,7 @@ def test_fewer_views_than_a_step_wants():
 
 
 def test_hull_of_a_ball():
-    """Silhouettes of a ball of radius 0.3: the hull holds it and is little larger."""
+    """Silhouettes of a ball of radius 0.3: the hull contains it and is little larger."""
     cameras = views_around(24, width=130, height=128)
     centres = -(cameras.viewmats[:, :3, :3].mT @ cameras.viewmats[:, :3, 3:])[..., 0]
     y, x = torch.meshgrid(torch.arange(128) + 0.5, torch.arange(130) + 0.5, indexing="ij")

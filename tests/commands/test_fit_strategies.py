@@ -92,7 +92,7 @@ def test_few_steps_and_few_gaussians(name, steps, count):
 
 @NEEDS_GSPLAT
 def test_the_largest_number_holds_for_default():
-    """gsplat's own has none: where far more want to grow than may, the surplus goes again."""
+    """gsplat's own has no limit: with far more candidates, the surplus is removed again."""
     cameras = views_around(3)
     images = photograph(cloud(1), cameras)
     config = replace(QUICK, gaussians=53, start_share=0.9, grow_grad=0.0, strategy="default")
@@ -144,7 +144,7 @@ def test_command(name, tmp_path):
 @NEEDS_GSPLAT
 @BOTH
 def test_interrupt(name, tmp_path, monkeypatch, capsys):
-    """What was finished is kept; nothing of the object that was begun is written."""
+    """Finished objects are kept; nothing of the interrupted one is written."""
     for seed, uid in enumerate(("ball", "blob")):
         write_object(tmp_path / "data" / uid, cloud(seed))
     after, steps = densify.Densified.after, []

@@ -1,4 +1,4 @@
-"""``gamba gpu-check`` on a CPU: its steps, its files, what it says when something is not there."""
+"""``gamba gpu-check`` on a CPU: its steps, files and messages about missing parts."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def settings(device, level):
 
 @pytest.fixture
 def on_paper():
-    """Tensors on a GPU that is not there."""
+    """Fake tensors on a missing GPU."""
     if not dry_run.can_dry_run():
         pytest.skip(f"torch {torch.__version__} needs a GPU for it")
     with dry_run.dry_run() as launches:
@@ -44,7 +44,7 @@ def on_paper():
 
 
 def autocast(monkeypatch):
-    """Made as if there were a GPU, else it turns itself off."""
+    """Autocast for a fake GPU; otherwise it disables itself."""
     with monkeypatch.context() as patched:
         patched.setattr(torch.cuda, "is_available", lambda: True)
         patched.setattr(torch.cuda, "is_bf16_supported", lambda *_: True)
@@ -52,7 +52,7 @@ def autocast(monkeypatch):
 
 
 def test_a_graph_can_hold_the_model(monkeypatch, on_paper):
-    """No operator of the forward pass, and none inside our own operators, waits for the GPU."""
+    """No operator of the forward pass synchronises with the GPU, including our own."""
     config = replace(PRESETS["paper"], depth=2)
     with torch.device("cuda"):
         model = Gamba(config, "random").eval()
@@ -111,7 +111,7 @@ OTHERS = (
 
 
 def test_torch_and_warp_are_enough(tmp_path):
-    """A real run with everything else hidden."""
+    """A real run with all other packages hidden."""
     (tmp_path / "sitecustomize.py").write_text(HIDE.format(names=OTHERS))
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "OMP_NUM_THREADS": "1"}
     out = tmp_path / "out"
@@ -204,7 +204,7 @@ def test_the_benchmark_step(tmp_path):
 
 @pytest.fixture
 def children(monkeypatch):
-    """Stands for the processes: ``child(name, seconds)`` gives what is added and how they end."""
+    """Stand-in of the processes: ``child(name, seconds)`` returns additions and the exit."""
 
     def switch(child):
         def run(words, seconds):
@@ -272,7 +272,7 @@ def test_an_interrupt_keeps_what_was_done(children, tmp_path):
 
 
 def test_the_whole_run_ends_in_its_time(monkeypatch, children, tmp_path):
-    """Steps that take all they are given leave nothing for the last ones, which are told."""
+    """Steps that use their whole time leave none for the last ones, which are reported."""
     now, given = [0.0], []
 
     def child(name, seconds):
@@ -295,7 +295,7 @@ def test_the_whole_run_ends_in_its_time(monkeypatch, children, tmp_path):
 
 
 def test_peers_have_steps_of_their_own(monkeypatch, children, tmp_path):
-    """What breaks there takes nothing along, and what is not installed is not begun."""
+    """A crash there affects nothing else, and missing packages are skipped."""
     runs = []
 
     def child(name, seconds):

@@ -74,7 +74,7 @@ def test_odd_objects_are_reconstructed(tmp_path, checkpoints, decoder):
 
 
 def test_a_white_object_on_white_is_seen_by_its_alpha(tmp_path, checkpoints):
-    """Fresh weights of the decoder rays show what the picture shows, on any background."""
+    """Fresh weights of the decoder rays reproduce the picture, on any background."""
     paths = [save(tmp_path, name, pictures()[name]) for name in ("white", "side")]
     model = checkpoints / "rays.safetensors"
     assert reconstruct(*paths, "--checkpoint", model, "--out", tmp_path, "--no-page") == 0

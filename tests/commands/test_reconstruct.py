@@ -35,7 +35,7 @@ def picture(tmp_path):
 
 
 class Recorder(torch.nn.Module):
-    """Stands in for a model: keeps what it is given."""
+    """Stand-in of a model that records its inputs."""
 
     def __init__(self, background):
         super().__init__()
@@ -184,7 +184,7 @@ def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeyp
 
 
 def test_the_precision_reaches_the_network(tmp_path, picture, checkpoint, monkeypatch, capsys):
-    monkeypatch.setattr("gamba_warp.devices._gain_of_bfloat16", lambda *_: 2.0)
+    monkeypatch.setattr("gamba_warp.devices._bfloat16_speedup", lambda *_: 2.0)
     made = {}
     for precision in ("float32", "bfloat16", "auto"):
         options = [*quick(checkpoint, tmp_path / precision), "--precision", precision]

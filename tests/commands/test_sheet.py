@@ -35,7 +35,7 @@ def test_a_row_is_the_input_and_views_around(tmp_path):
 
 
 def sheet_of(path, count):
-    """A sheet of white rows whose names cannot be written as they are."""
+    """Return a sheet of white rows with unprintable names."""
     sheet = Sheet(path)
     sheet._rows += [(f"n{n}\udcff", np.zeros((128, 768, 3), np.uint8)) for n in range(count)]
     sheet.write()

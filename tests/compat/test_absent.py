@@ -1,4 +1,4 @@
-"""Names of other packages that are not here: importable, one line when used, and in the pages."""
+"""Missing names of other packages: importable, an error of one line on use, and documented."""
 
 import importlib
 import importlib.util

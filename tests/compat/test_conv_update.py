@@ -49,7 +49,7 @@ def test_pieces_make_the_whole(width, size, ring, bias, activation, dtype, updat
 
 @pytest.mark.parametrize("states, activation", [(False, None), (True, "swish")])
 def test_the_reference(states, activation):
-    """In float64 and any number of taps; its gradient flows."""
+    """float64, any number of taps, and gradients."""
     x, weight = torch.randn(2, 3, 11).double().requires_grad_(), torch.randn(3, 6).double()
     bias, first = torch.randn(3).double(), torch.randn(2, 3, 5).double()
     before = first if states else torch.zeros_like(first)

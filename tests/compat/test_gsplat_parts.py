@@ -179,7 +179,7 @@ def lists_of(projected, tile):
 
 
 def blended(monkeypatch, scene, channels):
-    """Float64 leaves of the picture's parts and what gsplat's accumulate makes of them."""
+    """Return float64 leaves of the picture's parts, and gsplat's accumulate of them."""
     monkeypatch.setitem(sys.modules, "nerfacc", nerfacc())
     projected = project(scene)
     num = scene["means"].shape[-2]
@@ -203,7 +203,7 @@ def blended(monkeypatch, scene, channels):
 @pytest.mark.parametrize("tile, channels", [(16, 3), (5, 2), (20, 7), (32, 3)])
 @pytest.mark.parametrize("packed", [False, True])
 def test_pixels(monkeypatch, tile, channels, packed):
-    """Tiles of any size, also those that are no tiles of ours."""
+    """Tiles of any size, also unlike ours."""
     projected, got, want, expected, alphas = blended(monkeypatch, scene_of(), channels)
     names = ("means2d", "conics", "colors", "opacities")
     offsets, rows = lists_of(projected, tile)
@@ -288,7 +288,7 @@ def test_refusals():
 
 
 def faint(kind, by="quats"):
-    """Leaves of ours and theirs, what the projections return, and which Gaussians are seen."""
+    """Return leaves and projections of both, and the visible Gaussians."""
     got, want = twice(tiny_of(kind))
     covars = None
     if by == "covars":  # the same rounded covariances
@@ -330,7 +330,7 @@ def test_gradients_of_small_factors_are_those_of_gsplat(kind):
 
 @pytest.mark.parametrize("by", ["quats", "covars"])
 def test_pictures_cull_by_the_true_factor(by):
-    """Of opaque needles, those whose factor is below 1 / 255 are not drawn."""
+    """Opaque needles with a factor below 1 / 255 are not drawn."""
     scene = tiny_of("needle")
     scene["opacities"][:] = 0.99
     got = leaves(scene, torch.float32)

@@ -80,7 +80,7 @@ def test_harmonics(per_view, degree):
 
 @pytest.mark.parametrize("kind", ["classic", "antialiased"])
 def test_covariances(kind):
-    """The projection of covariances is another code, in float64."""
+    """Covariances are projected by other code, in float64."""
     scene = scene_of()
     scene["means"][:, :5] *= 9
     scene["means"][:, 5] = float("nan")
@@ -190,7 +190,7 @@ OPTIONS = {name: OTHER[DEFAULTS[name]] for name in MUST_BE_DEFAULT} | dict(
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_refusals(name):
-    """One line that begins with the argument and says what is allowed."""
+    """Errors of one line that begin with the argument and list the allowed values."""
     with pytest.raises(ValueError, match=rf"^{name} .*allowed (is|are) ") as error:
         rasterization(**{**scene_of(), name: OPTIONS[name]})
     assert len(str(error.value).splitlines()) == 1

@@ -20,7 +20,7 @@ NEEDS_GSPLAT = pytest.mark.skipif(
 
 
 def test_relocation():
-    """Equation 9 in whole numbers' arithmetic, and one Gaussian that stays as it is."""
+    """Equation 9 in integer arithmetic, and a single Gaussian, which does not change."""
     opacities = torch.tensor([0.3, 0.9, 0.99, 0.005, 0.6])
     scales, ratios = torch.rand(5, 3) + 0.1, torch.tensor([1, 2, 51, 7, 99])
     binoms = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)]).float()

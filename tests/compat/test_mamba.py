@@ -37,7 +37,7 @@ SHAPES = [
 
 
 def inputs(B, C, dtype=torch.float32, without=()):
-    """All tensors by name, B and C of these shapes; one that does not vary is float32."""
+    """Return all tensors by name, B and C of these shapes; constant ones are float32."""
     shape = (BATCH, CHANNELS, LENGTH)
     made = {
         "u": torch.randn(shape).to(dtype),
@@ -155,7 +155,7 @@ def norm(x, weight, eps=1e-6):
 
 
 def block_in_float64(**g):
-    """What mamba_inner_fn does, from its arguments by name."""
+    """Compute mamba_inner_fn from its arguments by name."""
     x, z = g["xz"].chunk(2, 1)
     padded = F.pad(x, (g["conv1d_weight"].shape[2] - 1, 0))
     x = F.silu(F.conv1d(padded, g["conv1d_weight"], g["conv1d_bias"], groups=x.shape[1]))
@@ -417,7 +417,7 @@ def test_layers_of_one_kind_have_one_result(capsys):
 
 
 def test_float32_layers_where_the_default_is_float64():
-    """The same bits; and of float64 layers a line says what is allowed."""
+    """The same bits; float64 layers give an error that lists the allowed dtypes."""
 
     def run():
         torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""Programs that import mamba_ssm, causal_conv1d and gsplat by their own names get ours."""
+"""Programs that import mamba_ssm, causal_conv1d and gsplat get our modules."""
 
 import importlib.util
 import subprocess
@@ -45,7 +45,7 @@ assert all(x.__module__ == "gamba_warp.compat.gsplat.relocation" for x in ours)
 
 
 def run(*arguments):
-    """A new process: names are taken once in each."""
+    """Run a new process, because names can be taken once per process."""
     command = [sys.executable, "-m", "gamba_warp.compat", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True)
 
@@ -63,7 +63,7 @@ def test_a_program_gets_our_interfaces_under_their_names(tmp_path):
 
 
 def test_a_module_runs_as_with_python(monkeypatch):
-    """Its own arguments, and the present folder before all others."""
+    """Own arguments, and the current folder first on the path."""
     calls = []
     monkeypatch.setattr(program, "take_names", lambda: calls.append("names"))
     monkeypatch.setattr(program.runpy, "run_module", lambda *x, **y: calls.append((sys.argv, x, y)))
@@ -83,7 +83,7 @@ def test_what_cannot_be_run_is_one_line(tmp_path):
 
 
 def test_names_are_refused(monkeypatch):
-    """An imported package is not replaced, and nothing is taken; nor is a name that is not here."""
+    """Refuse packages that are already imported, and unknown names, without any change."""
     monkeypatch.setitem(sys.modules, "causal_conv1d", object())
     before = dict(sys.modules)
     for names, kind, text in (

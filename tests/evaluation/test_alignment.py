@@ -42,7 +42,7 @@ SHAPES = {
 
 
 def motions(count):
-    """Turns of any size, moves of several lengths of the object, and scales from 1/5 to 5."""
+    """Return rotations of any angle, translations of several lengths, and scales from 1/5 to 5."""
     random = np.random.default_rng(7)
     turns = Rotation.random(count, rng=8).as_matrix()
     scales = np.exp(random.uniform(-1.6, 1.6, count))
@@ -122,11 +122,11 @@ def test_a_nearly_symmetric_box_has_no_symmetry():
 
 
 def test_a_fitted_turn_is_no_mirror():
-    """Points to their mirror images: not the mirror, but the best of all turns."""
+    """Points to their mirror images: the best rotation, not the reflection."""
     points = sample(CHAIR, 500, 0).positions
     points = points - points.mean(0)
     targets = [sign * points for sign in (np.ones(3), -np.ones(3), np.array([1, 1, -1]))]
-    for turn, target in zip(align._fitted(points, np.stack(targets))[0], targets):
+    for turn, target in zip(align._kabsch(points, np.stack(targets))[0], targets):
         assert np.linalg.det(turn) == pytest.approx(1)
         assert np.allclose(turn, Rotation.align_vectors(target, points)[0].as_matrix())
 

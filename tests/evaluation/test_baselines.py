@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def truth_at(azimuths, elevation=0.0, distance=1.5, image=None):
-    """A truth whose input picture is ``image``, seen again from the other cameras."""
+    """Return a truth whose input picture is ``image``, with further cameras."""
     viewmats = torch.cat(
         [orbit(torch.zeros(1)), orbit(torch.tensor(azimuths), elevation, distance)]
     )
@@ -39,7 +39,7 @@ def truth_at(azimuths, elevation=0.0, distance=1.5, image=None):
 
 
 def test_billboard_reproduces_the_input():
-    """Also with an axis off the centre, and a camera that looks past the object."""
+    """Also with an off-centre axis, and a camera that looks past the object."""
     truth = truth_at([30.0])
     truth.cameras.Ks = truth.cameras.Ks.clone()
     truth.cameras.Ks[:, 0, 2] += 3.3
@@ -51,7 +51,7 @@ def test_billboard_reproduces_the_input():
 
 
 def test_billboard_is_what_a_camera_sees_of_the_plane():
-    """Each picture against rays cut with the plane one by one, and a picture that is a formula."""
+    """Each picture against single ray-plane intersections, and an analytic picture."""
     x = (torch.arange(WIDTH) + 0.5)[None, :].expand(HEIGHT, WIDTH)
     y = (torch.arange(HEIGHT) + 0.5)[:, None].expand(HEIGHT, WIDTH)
     image = torch.stack([x / WIDTH, y / HEIGHT, 0 * x, torch.ones_like(x)], -1)
@@ -130,7 +130,7 @@ def data(tmp_path):
 
 
 def test_retrieval_finds_the_twin_and_its_views(data):
-    """The twin's view 0 is view 4 of ``seen``; from there on, the others follow by camera."""
+    """The twin's view 0 is view 4 of ``seen``; the other views follow by camera."""
     retrieval = Retrieval(open_dataset(data, "train"))
     truth = load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu")
     uid, view, distance = retrieval.nearest(truth.images[0], "twin")

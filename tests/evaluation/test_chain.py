@@ -1,4 +1,4 @@
-"""``data render``, ``eval-views`` and ``eval-geometry`` on one set: names and axes are its own."""
+"""``data render``, ``eval-views`` and ``eval-geometry`` on one set, with its names and axes."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.pairs import find_pairs, open_objects
-from gamba_warp.eval.views.baselines import Found, TrainingMeshes
+from gamba_warp.eval.views.baselines import NearestView, TrainingMeshes
 from gamba_warp.files import STARTER
 from gamba_warp.formats.meshes import Y_TO_Z_UP
 from gamba_warp.train.sources.pack import PackSettings, write_pack
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def shape(seed):
-    """Boxes that no turn brings onto themselves, of one colour, away from the origin; y-up."""
+    """Boxes without rotational symmetry, of one colour, away from the origin; y-up."""
     rng = np.random.default_rng(seed)
     sizes, places = rng.uniform(0.2, 1.0, (3, 3)), rng.uniform(-0.4, 0.4, (3, 3))
     parts = [trimesh.creation.box(size).apply_translation(at) for size, at in zip(sizes, places)]
@@ -93,7 +93,7 @@ def test_a_set_says_its_names_and_axes(tmp_path, capsys):
 
 
 def write_seen(data, folder):
-    """What the depth pictures show, as clouds in the input camera's world: on the true surface."""
+    """Write the depth maps as clouds in the input camera's world, on the true surface."""
     folder.mkdir()
     dataset = open_dataset(data)
     for uid in dataset.uids:
@@ -146,7 +146,7 @@ def test_truths_and_retrieved_meshes_lie_where_the_views_show_them(rendered):
     assert report["axes"]["gt"] == {"dataset": 2} and report["warnings"] == []
     placed = TrainingMeshes(meshes, open_dataset(data))
     for name in NAMES[:2]:
-        placed.save(rendered / "placed" / f"{name}.ply", Found(name, 0, 0.0), 1.5)
+        placed.save(rendered / "placed" / f"{name}.ply", NearestView(name, 0, 0.0), 1.5)
     code, report = geometry(rendered / "out", rendered / "placed", meshes, data)
     assert code == 0 and report["mean"]["chamfer"] < 1e-5  # float32 in the .ply
     # A pack says it too.
@@ -156,7 +156,7 @@ def test_truths_and_retrieved_meshes_lie_where_the_views_show_them(rendered):
 
 
 def test_what_contradicts_a_set_is_told(tmp_path, capsys):
-    """An axis that is asked for, and meshes that were not rendered, which are not placed either."""
+    """A requested axis, and meshes that were not rendered, which are not placed either."""
     write(tmp_path / "meshes" / "lamp.obj", shape(1))
     render(tmp_path / "meshes", tmp_path / "data", "--depth", "--up", "z")
     data, seen = tmp_path / "data", tmp_path / "seen"
@@ -177,11 +177,11 @@ def test_what_contradicts_a_set_is_told(tmp_path, capsys):
     assert report["warnings"] == [] and report["axes"]["gt"] == {"z-up": 1}
     meshes = TrainingMeshes(tmp_path / "others", open_dataset(data))
     with pytest.raises(UserError, match="lamp.ply: not the mesh that DATA's lamp was"):
-        meshes.place(Found("lamp", 0, 0.0), 1.5)
+        meshes.place(NearestView("lamp", 0, 0.0), 1.5)
 
 
 def test_who_is_missing_of_a_set(tmp_path):
-    """Of the split that was predicted all; of the others, and of what was not rendered, none."""
+    """All missing objects of the predicted split, and none of others or unrendered ones."""
     for name in (*NAMES, "vase"):
         write(tmp_path / "meshes" / name / "model.glb", shape(0))
         write(tmp_path / "meshes" / name / "model.obj", shape(0))
@@ -203,7 +203,7 @@ def test_who_is_missing_of_a_set(tmp_path):
 
 
 def test_a_set_of_folders_in_folders(tmp_path):
-    """Its uids have slashes; predictions are found in such folders, or by the name in one."""
+    """Uids with slashes; predictions are found in such folders, or by name in a single one."""
     write(tmp_path / "meshes" / "a" / "b.obj", shape(0))
     render(tmp_path / "meshes", tmp_path / "flat", "--depth")
     shutil.move(tmp_path / "flat" / "a-b", tmp_path / "data" / "a" / "b")

@@ -19,7 +19,7 @@ UIDS = ("a", "b", "c", "d")
 
 
 def views_report(offset=0.0, kind="pictures", uids=UIDS):
-    """As eval-views writes it, of what is read of it."""
+    """Make a report like eval-views, with the fields that are read."""
     objects = [
         {
             **{"name": uid, "status": "ok", "truth_sha256": f"{uid}0", "views": [0, 1]},
@@ -99,7 +99,7 @@ def test_means_intervals_and_paired_differences(files):
 
 
 def test_methods_are_compared_by_their_shapes_alone(files):
-    """Every figure of shapes, object by object, in the unit of the protocol, as rows for others."""
+    """All metrics of shapes, paired by object, in the protocol's unit."""
     reports = []
     for offset in (0.0, 0.5, -1.0):
         report = change(shapes_report(offset), thresholds=[0.01, 0.5], unit=2.0)

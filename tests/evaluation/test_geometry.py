@@ -288,7 +288,7 @@ def test_batch_lists_every_failure(tmp_path):
 
 @pytest.mark.parametrize("name", ["default", "sf3d", "syncdreamer"])
 def test_what_a_protocol_needs_and_a_file_has_not(tmp_path, name):
-    """No volume, no normals, no extent, nothing to align: named, and the others are evaluated."""
+    """Missing volume, normals, extent or alignment: reported, and the others are evaluated."""
     box = trimesh.creation.box((1.0, 0.6, 0.8))
     for uid in ("cloud", "good", "line", "open", "point", "sheet", "speck"):
         export(tmp_path / "gt" / f"{uid}.ply", box)

@@ -1,4 +1,4 @@
-"""Files whose axes differ: turned where both are known, told where not, warned of where wrong."""
+"""Files with different axes: rotated if known, reported if not, warned about if wrong."""
 
 import json
 from pathlib import Path
@@ -74,7 +74,7 @@ def test_gaussians_of_a_mesh_against_the_mesh(files, capfd):
 
 
 def test_misstated_axes_are_warned_of(files, capfd):
-    """ICP does not find back, and is warned of as well."""
+    """ICP cannot correct it, and there is a warning too."""
     for align in ("none", "icp"):
         words = [files / "made.ply", files / "true.obj", "--align", align, "--pred-axes", "frame"]
         report, err = evaluate(capfd, *words, *CENTERS)
@@ -88,7 +88,7 @@ def test_misstated_axes_are_warned_of(files, capfd):
 
 
 def test_what_is_not_known_is_used_as_it_is_and_told(files, capfd):
-    """A .ply does not say which way is up, unless by a comment; then it may be asked for."""
+    """A .ply states its upward axis only by a comment; else an option can."""
     report, err = evaluate(capfd, files / "true.obj", files / "true.ply")
     assert report["axes"] == {"pred": {"opengl": 1}, "gt": {"unknown": 1}}
     assert report["mean"]["chamfer"] > 0.05 and "90 degrees about x" in report["warnings"][0]
@@ -118,7 +118,7 @@ def test_our_own_mesh_files_say_their_axes(files, capfd, axes):
 
 
 def test_axes_can_be_asked_for(files, capfd):
-    """Of the predictions, and by the frame: in the unit frame coordinates are z-up."""
+    """For predictions, and by the frame: in the unit frame coordinates are z-up."""
     bear(Z_TO_Y_UP, Y_DOWN).export(files / "down.stl")
     report, _ = evaluate(capfd, files / "down.stl", files / "true.obj", "--pred-axes", "opencv")
     assert report["mean"]["iou"] == 1 and report["axes"]["pred"] == {"opencv": 1}
@@ -136,7 +136,7 @@ def test_axes_can_be_asked_for(files, capfd):
 
 
 def test_good_shapes_are_not_warned_of(tmp_path, capfd):
-    """A cube is the same from all sides, and a poor prediction is not better turned."""
+    """A symmetric cube, and a poor prediction that no rotation improves."""
     trimesh.creation.box().export(tmp_path / "cube.obj")
     trimesh.creation.icosphere(3, 0.6).export(tmp_path / "ball.obj")
     for pred in ("cube.obj", "ball.obj"):
@@ -144,7 +144,7 @@ def test_good_shapes_are_not_warned_of(tmp_path, capfd):
 
 
 def test_one_turn_of_many_is_one_warning():
-    """Poor predictions, none of which is far better turned, all of which are a little."""
+    """Poor predictions, all slightly improved by a rotation, but none a lot."""
 
     def record(straight, turned):
         values = {"as it is": straight, "180 degrees about x": turned, "180 degrees about y": 0.2}

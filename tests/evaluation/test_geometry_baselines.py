@@ -22,7 +22,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.load import load_truth
 from gamba_warp.eval.shapes.pairs import find_pairs, out_of_reference
 from gamba_warp.eval.shapes.protocol import PRESETS
-from gamba_warp.eval.views.baselines import Found, TrainingMeshes
+from gamba_warp.eval.views.baselines import NearestView, TrainingMeshes
 from gamba_warp.formats.meshes import Y_TO_Z_UP, load_mesh
 from gamba_warp.formats.ply import save_ply
 
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def stairs():
-    """Three boxes that no turn brings onto themselves; centred, longest side 1."""
+    """Three boxes without rotational symmetry; centred, longest side 1."""
     boxes = [((1.0, 0.2, 0.3), (0, 0.3, 0)), ((0.3, 0.4, 0.3), (0.35, 0, 0))]
     boxes += [((0.2, 0.2, 0.6), (-0.4, -0.3, 0.05))]
     parts = [trimesh.creation.box(size).apply_translation(at) for size, at in boxes]
@@ -116,7 +116,7 @@ def test_distance_of_the_found_camera_does_not_matter(world):
     """The unit is that in which the input camera stands at the model's distance."""
     training = open_dataset(world / "data", "train")
     meshes = TrainingMeshes(world / "meshes", training)
-    placed = meshes.place(Found("seen", 3, 0.1), 2.5).vertices
+    placed = meshes.place(NearestView("seen", 3, 0.1), 2.5).vertices
     viewmat = training.load("seen", [3]).cameras.viewmats[0].numpy()
     world_vertices = stairs().vertices @ TURN.T
     # seen by the found camera, moved along its axis to 2.5 / 1.6 of the distance and as much larger
@@ -124,7 +124,7 @@ def test_distance_of_the_found_camera_does_not_matter(world):
     apart = np.linalg.norm(placed[:, None] - local[None], axis=-1).min(1)
     assert apart.max() < 1e-5
     with pytest.raises(UserError, match="no mesh of the training object gone"):
-        meshes.place(Found("gone", 0, 0.1), 1.5)
+        meshes.place(NearestView("gone", 0, 0.1), 1.5)
 
 
 @pytest.mark.parametrize("case", ["out", "baselines", "absent", "others", "train"])
@@ -220,7 +220,7 @@ def test_differences_are_paired(tmp_path, capsys):
 
 
 def test_an_object_that_only_a_baseline_has(tmp_path):
-    """A prediction that is missing must not go unseen, in a library neither."""
+    """A missing prediction is reported, also with a library."""
     boxes(tmp_path / "gt", a=1.0, b=1.0, unused=1.0)
     entries = [{"model": f"{name}.ply", "uid": name} for name in ("a", "b", "unused")]
     (tmp_path / "gt" / "catalogue.json").write_text(json.dumps({"objects": entries}))

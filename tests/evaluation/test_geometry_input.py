@@ -1,4 +1,4 @@
-"""What ``gamba eval-geometry`` reads, refuses and says about its input."""
+"""Inputs of ``gamba eval-geometry``: accepted, refused, and flagged ones."""
 
 import json
 import struct
@@ -14,7 +14,7 @@ from helpers.meshes import glb
 from gamba_warp.cli import run
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes import pairs
-from gamba_warp.eval.shapes.flags import tidied
+from gamba_warp.eval.shapes.flags import clean_mesh
 from gamba_warp.eval.shapes.load import load_shape
 from gamba_warp.eval.shapes.protocol import read_protocol
 from gamba_warp.eval.shapes.shape import Mesh
@@ -35,7 +35,7 @@ def as_mesh(source):
 
 
 def evaluate(capfd, *arguments):
-    """Exit code, and the report printed on stdout, which must hold nothing else."""
+    """Return the exit code and the report on stdout, which must have nothing else."""
     words = [str(word) for word in arguments]
     code = run("eval-geometry", [*words, "--points", "1000", "--json"])
     printed = capfd.readouterr()
@@ -123,7 +123,7 @@ LIES = {
 
 @pytest.fixture
 def frugal():
-    """A gigabyte more of address space than now: what trusts such a header runs into it."""
+    """Limit the address space to a gigabyte more, against readers that trust false headers."""
     import resource
 
     import_open3d()
@@ -237,9 +237,9 @@ FLAGGED["nonmanifold"].vertices[8:, 2] *= 2  # now they share an edge
 
 @pytest.mark.parametrize("flag", FLAGGED)
 def test_flags(flag):
-    mesh, flags = tidied(FLAGGED[flag])
+    mesh, flags = clean_mesh(FLAGGED[flag])
     assert flags == [flag]
-    assert tidied(mesh)[1] == [f for f in flags if f not in ("degenerate", "duplicate")]
+    assert clean_mesh(mesh)[1] == [f for f in flags if f not in ("degenerate", "duplicate")]
 
 
 def test_flags_are_told_and_strict_refuses_them(tmp_path, capfd):
@@ -265,7 +265,7 @@ def test_flags_are_told_and_strict_refuses_them(tmp_path, capfd):
 def test_sound_meshes_have_no_flags():
     for mesh in (trimesh.creation.icosphere(3), trimesh.creation.torus(0.4, 0.1), box()):
         corners = mesh.vertices[mesh.faces].reshape(-1, 3)
-        assert tidied(Mesh(corners, np.arange(len(corners)).reshape(-1, 3)))[1] == []
+        assert clean_mesh(Mesh(corners, np.arange(len(corners)).reshape(-1, 3)))[1] == []
 
 
 def test_units_are_independent_of_the_format(tmp_path, capfd):
@@ -334,7 +334,7 @@ def test_json_or_csv(tmp_path, capsys):
 
 
 def test_one_crash_stops_no_other(tmp_path, capfd, monkeypatch):
-    """Nor does what a library prints get into the report on stdout."""
+    """Output of libraries does not get into the report on stdout either."""
     broken = partial(pairs.evaluate_pairs, evaluate=talking_pair)
     monkeypatch.setattr(pairs, "evaluate_pairs", broken)
     code, report = evaluate(capfd, *pairs_of(tmp_path, ("bad", "good")))

@@ -1,4 +1,4 @@
-"""Volume IoU of meshes that are not closed, and answers known beforehand."""
+"""Volume IoU of open meshes, and known answers."""
 
 import math
 import subprocess
@@ -11,7 +11,7 @@ import trimesh
 from lab.studies.drift import doubled, drift, known_shapes, with_flips, with_hole
 
 from gamba_warp.eval.shapes import occupancy
-from gamba_warp.eval.shapes.flags import tidied
+from gamba_warp.eval.shapes.flags import clean_mesh
 from gamba_warp.eval.shapes.metrics import compare, shape_iou, volume_iou
 from gamba_warp.eval.shapes.occupancy import (
     RULES,
@@ -41,7 +41,7 @@ def cube(move=(0.0, 0, 0), side=1.0):
 @pytest.mark.parametrize("name", SHAPES)
 def test_every_shape_is_closed_and_full(name):
     mesh = SHAPES[name]
-    assert mesh.is_closed() and tidied(mesh)[1] in ([], ["selfintersecting"])
+    assert mesh.is_closed() and clean_mesh(mesh)[1] in ([], ["selfintersecting"])
     volume = {
         "ball": math.pi / 6,
         "cube": 1.0,
@@ -67,7 +67,7 @@ def test_drift_of_the_default_rule(share):
 
 
 def test_the_default_rule_does_not_mind_orientation():
-    """Where the winding number finds nothing."""
+    """A case where the winding number finds nothing."""
     for mesh in (SHAPES["ball"], SHAPES["torus"]):
         values = drift(mesh, lambda m, seed: with_flips(with_hole(m, 0.05, seed), 0.5, seed), 16, 1)
         assert values["solid"] > 0.95 > 0.1 > values["winding"]
@@ -98,7 +98,7 @@ def test_steps_far_from_every_face_need_no_ray(name, monkeypatch):
 
 
 def test_votes_that_are_decided_are_not_taken():
-    """Points are asked until the majority is known; the outcome is that of all rays."""
+    """Early stopping once the majority is decided gives the result of all rays."""
     for mesh in (with_hole(SHAPES["torus"], 0.2, 0), scattered(40, 0.3, 2)):
         grid = grid_around(mesh, resolution=13)
         rays = [occupancy._rays(grid.points(), way) for way in directions()]
@@ -118,11 +118,11 @@ def test_holes_and_flips_are_what_they_say():
     assert abs(len(with_hole(ball, 0.2, 0).faces) / len(ball.faces) - 0.8) < 0.01
     flips = with_flips(ball, 0.3, 0)
     assert abs(np.mean(flips.faces != ball.faces) / (2 / 3) - 0.3) < 0.03
-    assert len(tidied(doubled(ball))[0].faces) == len(ball.faces)
+    assert len(clean_mesh(doubled(ball))[0].faces) == len(ball.faces)
 
 
 def test_open_sheets_hold_nothing(monkeypatch):
-    """In one plane, and beside closed parts; what faces another sheet is another matter."""
+    """Flat sheets, alone and beside closed parts; facing sheets are another case."""
     corners = np.array([[-0.4, -0.4, 0.0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]])
     square = np.array([[0, 1, 2], [0, 2, 3]])
     turn = trimesh.transformations.rotation_matrix(0.6, [1, 2, 3])[:3, :3]

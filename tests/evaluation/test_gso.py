@@ -1,4 +1,4 @@
-"""The protocol ``gso`` of both evaluations: its options, its list, and what is missing of it."""
+"""Protocol ``gso`` of both evaluations: options, list and missing objects."""
 
 import json
 

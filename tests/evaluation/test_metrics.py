@@ -222,7 +222,7 @@ RED, WHITE = [0.9, 0.1, 0.1], [1.0, 1.0, 1.0]
 
 
 def test_one_rendering_serves_all_grounds():
-    """What is composited by alpha is what the rasterizer draws on that background."""
+    """Compositing by alpha equals rendering on that background."""
     scene = balls(RED, [0.2, 0.9, 0.4])
     shown = render_views(scene, cameras())
     for grey in (1.0, 0.5, 0.0):
@@ -259,7 +259,7 @@ def red_ball(tmp_path):
 
 
 def test_a_metric_of_the_registry_is_everywhere(red_ball, monkeypatch, capsys):
-    """In records, means, baselines, differences, CSV, tables, and the comparison of methods."""
+    """Present in records, means, baselines, differences, CSV, tables, and comparisons."""
 
     def mean_error(a, b):
         return (a.double() - b.double()).abs().mean((-3, -2, -1))

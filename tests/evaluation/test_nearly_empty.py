@@ -1,4 +1,4 @@
-"""Views that show next to nothing: counted, in the means, and left out of a second set of means."""
+"""Nearly empty views: counted in the means, and left out of a second set of means."""
 
 import math
 

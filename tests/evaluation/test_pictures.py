@@ -1,4 +1,4 @@
-"""Folders of pictures that any method rendered: what is matched, refused and said."""
+"""Folders of pictures rendered by any method: matching, refusals and messages."""
 
 import shutil
 

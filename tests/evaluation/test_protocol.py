@@ -1,4 +1,4 @@
-"""Protocol files of strangers, and reports that hold what JSON cannot."""
+"""Untrusted protocol files, and reports with values that JSON cannot hold."""
 
 import json
 import math

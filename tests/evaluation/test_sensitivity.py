@@ -1,4 +1,4 @@
-"""One set of predictions under many protocols, and evaluations that go on after an interruption."""
+"""One set of predictions under many protocols, and resumed evaluations."""
 
 import json
 from dataclasses import replace
@@ -12,7 +12,7 @@ from gamba_warp.cli import run
 from gamba_warp.eval.shapes import sensitivity
 from gamba_warp.eval.shapes.load import load_prediction, load_truth
 from gamba_warp.eval.shapes.metrics import compare
-from gamba_warp.eval.shapes.pairs import Journal, Pair, evaluate_pairs, find_pairs
+from gamba_warp.eval.shapes.pairs import Pair, RecordCache, evaluate_pairs, find_pairs
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.tables import latex
 from gamba_warp.formats.ply import save_ply
@@ -112,22 +112,22 @@ def test_rows_that_differ_by_the_surface_or_the_thresholds_alone(folders):
 
 
 def test_an_interrupted_evaluation_goes_on(folders):
-    """What is noted is not evaluated again, unless the protocol or a file has changed."""
+    """Cached records are reused unless the protocol or a file has changed."""
     pairs, _ = find_pairs(folders / "pred", folders / "gt")
-    first = evaluate_pairs(pairs[:1], SMALL, None, journal=Journal(folders, SMALL, None))
+    first = evaluate_pairs(pairs[:1], SMALL, None, cache=RecordCache(folders, SMALL, None))
     noted = folders / "objects.jsonl"
     lines = noted.read_text()
     # what is no record: nested too deeply, of another kind, and a line that was cut off
     noted.write_text("[" * 10**5 + '\n{"key": "a", "record": 5}\n' + lines + '{"key": "cut of')
     pairs = [pair._replace(name="bad" if pair.name == "b" else pair.name) for pair in pairs]
     again = evaluate_pairs(
-        pairs, SMALL, None, murderous_pair, journal=Journal(folders, SMALL, None)
+        pairs, SMALL, None, murderous_pair, cache=RecordCache(folders, SMALL, None)
     )
     assert again[0] == first[0] and again[1]["status"] == "failed"
-    other = Journal(folders, replace(SMALL, seed=5), None)
+    other = RecordCache(folders, replace(SMALL, seed=5), None)
     assert other.get(other.key(pairs[0])) is None
     trimesh.creation.box().export(pairs[0].pred)
-    changed = Journal(folders, SMALL, None)
+    changed = RecordCache(folders, SMALL, None)
     assert changed.get(changed.key(pairs[0])) is None
     assert changed.get(changed.key(Pair("gone", folders / "gone", folders / "gone"))) is None
     changed.end()

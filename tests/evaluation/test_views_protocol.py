@@ -1,4 +1,4 @@
-"""Named protocols of views: what they fill in, and what changes of them a report names."""
+"""Named protocols of views: their values, and the changes in a report."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def test_a_protocol_fills_in_what_is_not_given():
 
 
 def test_what_is_given_changes_a_protocol_and_is_named():
-    """Also the value that would be there without a protocol."""
+    """Also the default value without a protocol."""
     changed = options(protocol="splatter-image", reference=0, size=64)
     assert (changed.reference, changed.size) == (0, 64)
     assert changed.changed() == ["size", "reference"]

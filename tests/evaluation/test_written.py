@@ -1,4 +1,4 @@
-"""What ``eval-views --checkpoint`` measures is what ``reconstruct`` writes; LPIPS says its time."""
+"""``eval-views --checkpoint`` measures the output of ``reconstruct``; LPIPS prints its time."""
 
 import re
 from contextlib import nullcontext
@@ -112,7 +112,7 @@ def test_a_detail_that_cannot_be_is_refused(model, tmp_path, capsys):
 
 
 class Counted:
-    """In place of LPIPS: it counts the pictures whose features it makes."""
+    """Stand-in of LPIPS that counts the pictures whose features it computes."""
 
     def __init__(self):
         self.calls = []

@@ -9,7 +9,7 @@ CPU = torch.device("cpu")
 
 
 class Graph:
-    """Runs a function at each replay, and fills what it returned first."""
+    """Graph that runs a function at each replay, and copies the result into the first one."""
 
     def __init__(self, run, spoil=None):
         self.run, self.spoil, self.made = run, spoil, run()
@@ -55,7 +55,7 @@ def test_rendering(graph, monkeypatch):
 
 
 def test_a_training_step(graph):
-    """Both begin alike, so on a CPU they make the same bits."""
+    """The same start gives the same bits on a CPU."""
     graph()
     assert graphs.step_graph(CPU) == "losses to 0.0e+00, the weights' change to 0.0e+00"
     graph(lambda loss: loss.mul_(1.001))

@@ -1,4 +1,4 @@
-"""A training step on a GPU that is not there: nothing of it may make the host wait."""
+"""A training step on a fake GPU: no operation may synchronise with the host."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from gamba_warp.train.step import Objective, forward
 
 @pytest.fixture
 def on_paper(monkeypatch):
-    """Tensors on a GPU that is not there, where the rasterizer knows its room already."""
+    """Fake tensors on a missing GPU, where the rasterizer's capacity is known."""
     if not dry_run.can_dry_run():
         pytest.skip(f"torch {torch.__version__} needs a GPU for it")
     room = capacity.Room(0, 1 << 20)

@@ -1,4 +1,4 @@
-"""The ways to an object, in their order; each says what it did, and its result can be mended."""
+"""Methods of the cut-out, in order, with their messages and editable results."""
 
 import functools
 import shutil
@@ -26,7 +26,7 @@ SIZE = (140, 211)
 
 @pytest.fixture
 def network(tmp_path):
-    """A network that takes red for object."""
+    """A network that classifies red as the object."""
     pytest.importorskip("onnxruntime")
     path = tmp_path / "red.onnx"
     path.write_bytes(matting_network(size=352))
@@ -107,7 +107,7 @@ def test_an_object_that_is_soft_everywhere_is_spoken_of(tmp_path, alpha):
     rgba = np.zeros((40, 50, 4))
     rgba[10:30, 8:40] = 0.9, 0.2, 0.1, alpha
     Image.fromarray((rgba * 255).astype(np.uint8)).save(tmp_path / "soft.png")
-    said = "nowhere more than 35% opaque" in cut_out(tmp_path / "soft.png").how
+    said = "at most 35% opaque" in cut_out(tmp_path / "soft.png").how
     assert said == (alpha < 0.5)
 
 
@@ -191,18 +191,18 @@ def test_models_are_found_where_rembg_keeps_them(tmp_path, monkeypatch):
     for name in ("U2NET_HOME", "REMBG_HOME", "XDG_DATA_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert models.kept() is None
+    assert models.cached() is None
     old = tmp_path / ".u2net" / "u2netp.onnx"
     new = tmp_path / ".rembg" / "models" / "u2net" / "u2net.onnx"
     for path in (old, new):
         path.parent.mkdir(parents=True)
         path.touch()
-        assert models.kept() == path  # the second is the better one
+        assert models.cached() == path  # the second is the better one
     monkeypatch.setenv("U2NET_HOME", str(old.parent))
-    assert models.kept() == old
+    assert models.cached() == old
     monkeypatch.delenv("U2NET_HOME")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    assert models.kept() is None
+    assert models.cached() is None
 
 
 def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypatch, busy):
@@ -283,7 +283,7 @@ def test_a_model_comes_from_the_address_of_a_copy(tmp_path, monkeypatch, busy, m
     said = []
     ways = Ways(matte_model=f"{mirror}/u2netp.onnx?download=true", say=said.append).checked()
     assert cut_out(busy[0], ways).how == "The matting model u2netp.onnx cut the object out."
-    assert len(said) == 1 and f"from {mirror}" in said[0] and models.kept() is not None
+    assert len(said) == 1 and f"from {mirror}" in said[0] and models.cached() is not None
     (tmp_path / "rembg" / "models" / "u2netp" / "u2netp.onnx").unlink()
     http = mirror.replace("https", "http")
     for address, reason in (

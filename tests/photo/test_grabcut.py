@@ -1,4 +1,4 @@
-"""GrabCut: its cut is the cheapest one, it finds objects by colour, and it refuses all else."""
+"""GrabCut: minimum cut, objects by colour, and refusals."""
 
 import numpy as np
 import pytest

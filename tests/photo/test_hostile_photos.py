@@ -1,4 +1,4 @@
-"""What people and their telephones give: a result, or one line and nothing half-written."""
+"""Photos of people and phones: a result, or an error of one line without partial files."""
 
 import os
 

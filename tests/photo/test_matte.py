@@ -1,4 +1,4 @@
-"""Matting networks: any size of input, files that are none, a real one; each in a child process."""
+"""Matting networks: input sizes, invalid files, and a real one; each in a child process."""
 
 import hashlib
 import json
@@ -154,7 +154,7 @@ def _fetch(path):
 
 @pytest.mark.slow
 def test_a_real_network_cuts_real_photographs(real_model):
-    """Two of scikit-image's: what is surely object and what is surely not, as boxes."""
+    """Two of scikit-image's photographs, with boxes of certain object and background."""
     data = Path(pytest.importorskip("skimage").__file__).parent / "data"
     ways = Ways(matte_model=real_model)
     for name, inside, outside in (

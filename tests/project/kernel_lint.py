@@ -34,7 +34,7 @@ Found = Iterator[tuple[int, str, str]]  # line, rule, what
 
 
 def findings(sources: dict[str, str]) -> list[str]:
-    """What breaks a rule in files, Python or C++, given as texts by their names."""
+    """Return violations in Python or C++ files, given as texts by name."""
     trees = {name: ast.parse(text) for name, text in sources.items() if name.endswith(".py")}
     structs: dict[str, bool] = {}  # whether what has that name has arrays
     for node in (node for tree in trees.values() for node in ast.walk(tree)):

@@ -1,4 +1,4 @@
-"""The public names: each is what it says, in whatever order modules are imported."""
+"""Public names: each is the right object, for any order of imports."""
 
 import ast
 import re
@@ -29,7 +29,7 @@ BESIDE = ("gamba_warp.render", "gamba_warp.kernels.selective_scan.reference",
 
 
 def run(code: str) -> str:
-    """What a fresh Python prints."""
+    """Return the output of a fresh Python."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -81,7 +81,7 @@ print("right")
 
 
 def test_a_public_name_can_be_replaced(monkeypatch):
-    """As in tests of programs that use it; the import system alone cannot."""
+    """As in tests of programs that use it."""
     with monkeypatch.context() as patch:
         patch.setattr(gamba_warp, "render", print)
         assert gamba_warp.render is print

@@ -1,4 +1,4 @@
-"""The core runs without the libraries of the extras, and says how to get one that is missing."""
+"""The core runs without the extras, and tells how to install a missing library."""
 
 import ast
 import configparser
@@ -100,7 +100,7 @@ def test_each_library_is_in_the_extras_that_are_named():
 
 
 def test_no_module_imports_an_extra_when_it_is_loaded():
-    """Types are no imports, and what a function imports comes when it is called."""
+    """Imports for types and inside functions do not count."""
     for folder in ("gamba_warp", "kernels", "train", "eval"):
         for path in (ROOT / folder).rglob("*.py"):
             if path in ALL_OF_IT:
@@ -190,7 +190,7 @@ def test_what_only_an_option_needs(tmp_path):
         f"needs onnxruntime, which is not installed: {versions.to_install('photo')}"
     ), done.stderr
     done = in_the_core("reconstruct", tmp_path / "busy.png", *quick)
-    assert done.returncode == 0 and "Colours alone (GrabCut)" in done.stdout, done.stderr
+    assert done.returncode == 0 and "GrabCut cut the object out" in done.stdout, done.stderr
     assert versions.to_install("photo") in done.stderr
 
 

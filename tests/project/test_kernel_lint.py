@@ -1,4 +1,4 @@
-"""The rules of kernel_lint.py: the tree keeps them, and each is seen to be broken."""
+"""Rules of kernel_lint.py: the tree obeys them, and violations are found."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What README and pages tell a reader to type is understood, and the short of it runs."""
+"""Commands in README and pages parse, and the short ones run."""
 
 import contextlib
 import functools
@@ -86,7 +86,7 @@ def parsed(monkeypatch):
 
 
 def own(words: list[str]) -> list[str] | None:
-    """The words behind ``gamba``, however it is called; None for another program."""
+    """Return the words after ``gamba``, in any form; None for another program."""
     if words[0] == "gamba":
         return words[1:]
     for name in ("train", "gpu_check"):
@@ -123,7 +123,7 @@ def test_commands_are_understood(block, parsed, capsys):
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_commands_in_sentences_are_understood(path, parsed, capsys):
-    """Those with options: a bare name needs no arguments in a sentence."""
+    """Commands with options; a bare name needs no arguments in a sentence."""
     for text in INLINE.findall(path.read_text(encoding="utf-8")):
         words = text.replace("\n", " ").split()[1:]
         known = any(" ".join(words[:n]) in cli.COMMANDS for n in (1, 2))
@@ -168,7 +168,7 @@ def test_names_that_pages_showed_can_be_imported(name):
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
-    """A folder with what the pages take for granted: photos, meshes, the starter set."""
+    """Folder with the files that the pages assume: photos, meshes, the starter set."""
     for name in ("photo.png", "other.png"):
         cut_out(tmp_path / name)
     (tmp_path / "starter").symlink_to(ROOT / "starter")
@@ -207,7 +207,7 @@ def prepare(block: Block, folder) -> None:
 
 
 def assert_alike(found: str, wanted: str) -> None:
-    """The same words; numbers within 2 %, as another processor may round otherwise."""
+    """Compare words, and numbers within 2 %, for other processors' rounding."""
     number = re.compile(r"-?\d+\.?\d*")
     assert number.sub("#", found) == number.sub("#", wanted)
     numbers = zip(map(float, number.findall(found)), map(float, number.findall(wanted)))

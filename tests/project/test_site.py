@@ -1,4 +1,4 @@
-"""The site builds without a broken link, and README keeps to what it promises."""
+"""The site builds without broken links, and README keeps its promises."""
 
 import json
 import os

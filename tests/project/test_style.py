@@ -1,4 +1,4 @@
-"""The house rules that a machine can check."""
+"""Style rules that can be checked automatically."""
 
 import ast
 import re

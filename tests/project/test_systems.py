@@ -1,4 +1,4 @@
-"""What only some systems have: the package loads and works without it, or says so in one line.
+"""Features of some systems: the package works without them, or raises an error of one line.
 
 Nothing here runs on macOS or Windows: what these lack is taken away on the machine of the tests.
 """

@@ -1,4 +1,4 @@
-"""The wheel holds all that a first picture needs, and nothing in it looks for a checkout."""
+"""The wheel has everything for a first picture, and needs no checkout."""
 
 import json
 import os

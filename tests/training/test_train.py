@@ -405,7 +405,7 @@ def test_bfloat16_keeps_float32_weights(data, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("gain", "chosen"), [(2.0, "bfloat16"), (1.0, "float32")])
 def test_auto_is_the_precision_that_the_trial_finds(data, tmp_path, monkeypatch, gain, chosen):
-    monkeypatch.setattr("gamba_warp.devices._gain_of_bfloat16", lambda *_: gain)
+    monkeypatch.setattr("gamba_warp.devices._bfloat16_speedup", lambda *_: gain)
     for name in ("auto", chosen):
         options = {"optim": {"precision": name}, "length": {"steps": 2}}
         assert run(data, tmp_path / name, **options) == 0

@@ -82,7 +82,7 @@ def test_another_field_of_view_keeps_the_object_as_large():
 
 
 def test_upright_puts_the_camera_where_it_stood():
-    """What a camera at 35 degrees sees stays where it was in its picture."""
+    """The picture of a camera at 35 degrees does not change."""
     gaussians = some(30, rotated=True)
     seen = orbit(torch.zeros(1), 0.0, 2.0)
     plain = render(gaussians, Cameras(seen, intrinsics(41, 41)[None], 41, 41)).rgb
@@ -185,8 +185,8 @@ def test_another_size_keeps_the_vertical_field_of_view(tmp_path):
 GOOD = {"viewmat": np.eye(4).tolist(), "fov": 50}
 HEAD = {"format": "gamba-cameras", "width": 32, "height": 32}
 BAD = {
-    "no form": ({"a": 1}, "no file of cameras that is known"),
-    "a number": (3, "no file of cameras that is known"),
+    "no form": ({"a": 1}, "not a known camera file"),
+    "a number": (3, "not a known camera file"),
     "no frames": ({**HEAD, "frames": []}, "length >= 1"),
     "no angle": ({**HEAD, "frames": [{"viewmat": np.eye(4).tolist()}]}, "neither K nor fov"),
     "huge": ({**HEAD, "width": 10**6, "frames": [GOOD]}, "<= 16384"),

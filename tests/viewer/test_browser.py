@@ -1,4 +1,4 @@
-"""What the tests hear of a page: all that it complains of, and nothing of the driver's speed."""
+"""Messages of a page: all its errors, and none about the driver's speed."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""What the page of the viewer holds: as exact as it claims, small, and self-contained."""
+"""Content of the viewer's page: precise as stated, small, and self-contained."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The viewer in a browser: it shows what our rasterizer shows, follows hands, and says nothing."""
+"""The viewer in a browser: pictures like our rasterizer's, controls, and no errors."""
 
 import base64
 import io
@@ -163,7 +163,7 @@ def ball(x, y, z, colour):
 
 
 def double_click(opened, x, y):
-    """Clicks where the camera rests, and waits until it has gone where that leads."""
+    """Click with the camera at rest, and wait for the end of the motion."""
     opened.promised("gambaViewer.rest()")
     opened.page.mouse.dblclick(x, y)
     opened.until("gambaViewer.picks.size === 0")
@@ -186,7 +186,7 @@ def test_a_double_click_looks_at_the_point_below(viewer, mode):
 
 
 def test_a_double_click_finds_the_rim_of_many(viewer):
-    """At 3.2 deviations each of 200 blocks 1/176, still over 1/255, and all of them two thirds."""
+    """200 Gaussians at 3.2 deviations: each blocks 1/176, over 1/255; together two thirds."""
     many = ball(0.0, 0.0, 0.0, [0.0, 0.0, 1.0])
     for name in ("means", "scales", "opacities", "colors"):
         value = getattr(many, name)

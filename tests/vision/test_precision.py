@@ -1,4 +1,4 @@
-"""The precision of products: the trial of "auto", float32 by another library, and bfloat16."""
+"""Precision of matrix products: the trial of "auto", float32 by oneDNN, and bfloat16."""
 
 import sys
 import threading
@@ -17,7 +17,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def better(monkeypatch):
-    """As on a processor on which oneDNN is chosen."""
+    """Act like a processor for which oneDNN is chosen."""
     monkeypatch.setattr(devices, "_onednn_is_better", lambda: True)
 
 
@@ -136,19 +136,19 @@ def test_a_library_that_rounds_is_not_taken(monkeypatch):
 
 @pytest.mark.parametrize(("gain", "want"), [(1.0, torch.float32), (2.0, torch.bfloat16)])
 def test_auto_takes_what_is_faster(monkeypatch, gain, want):
-    monkeypatch.setattr(devices, "_gain_of_bfloat16", lambda *_: gain)
+    monkeypatch.setattr(devices, "_bfloat16_speedup", lambda *_: gain)
     assert devices.pick_precision("auto", CPU, 64) == want
     assert devices.pick_precision("float32", CPU, 64) == torch.float32
     assert devices.pick_precision("bfloat16", CPU, 64) == torch.bfloat16
 
 
 def test_the_trial_is_made_once_and_leaves_chance_alone():
-    devices._gain_of_bfloat16.cache_clear()
+    devices._bfloat16_speedup.cache_clear()
     torch.manual_seed(5)
     state = torch.get_rng_state()
     chosen = [devices.pick_precision("auto", CPU, 24) for _ in range(2)]
     assert chosen[0] == chosen[1] and torch.equal(torch.get_rng_state(), state)
-    info = devices._gain_of_bfloat16.cache_info()
+    info = devices._bfloat16_speedup.cache_info()
     assert (info.misses, info.hits) == (1, 1)
 
 
@@ -179,4 +179,4 @@ def test_memory_is_kept_unless_the_user_has_a_say(monkeypatch, name):
 
     monkeypatch.setattr(devices.ctypes, "CDLL", lambda _: Library())
     devices.keep_memory()
-    assert called == ([] if name else [devices._KEEP, devices._MAPPED])
+    assert called == ([] if name else [devices._TRIM_THRESHOLD, devices._MMAP_THRESHOLD])

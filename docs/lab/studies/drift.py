@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from gamba_warp.batch import progress_bar
-from gamba_warp.eval.shapes.flags import tidied
+from gamba_warp.eval.shapes.flags import clean_mesh
 from gamba_warp.eval.shapes.metrics import volume_iou
 from gamba_warp.eval.shapes.occupancy import RULES, enclosed, grid_around
 from gamba_warp.eval.shapes.shape import Mesh
@@ -98,7 +98,7 @@ def drift(mesh: Mesh, damage: Callable[[Mesh, int], Mesh], voxels: int, seeds: i
     truth = enclosed(mesh, grid)
     values: dict[str, list[float]] = {name: [] for name in RULES}
     for seed in range(seeds):
-        broken = tidied(damage(mesh, seed)).mesh
+        broken = clean_mesh(damage(mesh, seed)).mesh
         for name, rule in RULES.items():
             values[name].append(volume_iou(rule.fill(broken, grid), truth) or 0.0)
     return {name: float(np.mean(some)) for name, some in values.items()}

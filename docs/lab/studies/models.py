@@ -124,7 +124,7 @@ def compiled(settings: Settings) -> list[Variant]:
         runs["torch.compile"] = _Lazy(compiled_block)
     if settings.device.type == "cuda":
         runs["CUDA graph"] = _Lazy(graph)
-    return [backbone.way(name, run, default=run is plain) for name, run in runs.items()]
+    return [backbone.forward_variant(name, run, default=run is plain) for name, run in runs.items()]
 
 
 class _Pictures:

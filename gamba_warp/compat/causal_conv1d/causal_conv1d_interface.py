@@ -1,4 +1,4 @@
-"""causal-conv1d's functions: whole sequences by our kernel, and the next tokens of a sequence."""
+"""causal-conv1d's functions, for whole sequences and for the next tokens of one."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ def causal_conv1d_update(
     cache_seqlens: Tensor | None = None,
     conv_state_indices: Tensor | None = None,
 ) -> Tensor:
-    """Convolves the next tokens, and updates the state in place; no gradient flows through it.
+    """Convolve the next tokens, and update the state in place, without gradients.
 
     Args:
         x: ``[B, D]`` or ``[B, D, L]`` float32, bfloat16 or float16.
         conv_state: ``[B, D, S]``, the last S tokens, S at least W - 1; with ``conv_state_indices``
             ``[rows, D, S]``.
-        weight: ``[D, W]``; the last tap meets the present token.
+        weight: ``[D, W]``; the last tap weights the current token.
         bias: ``[D]``, or None for 0.
         activation: None, "silu" or "swish" (the same).
-        cache_seqlens: ``[B]`` int32 or int64, tokens seen so far. With it the state is a ring:
-            token t lies in column t mod S.
+        cache_seqlens: ``[B]`` int32 or int64, tokens so far. With it the state is a ring buffer:
+            token t is in column t mod S.
         conv_state_indices: ``[B]`` int32 or int64, the state's row for each element of the batch;
-            below 0 the output is 0 and no state is touched.
+            for negative ones the output is 0 and no state changes.
 
     Returns:
         The shape and dtype of x.
@@ -53,7 +53,7 @@ def causal_conv1d_update(
     """
     if cache_seqlens is None and conv_state_indices is None and activation in ACTIVATIONS:
         out = conv_step(x, weight, bias, conv_state, activation is not None)
-        if out is not None:  # None, and nothing done, also where an argument is wrong
+        if out is not None:  # None without effect also for an invalid argument
             return out
     check_tensor("x", x, ("B", "D"), ("B", "D", "L"), dtypes=DTYPES)
     batch, channels = x.shape[:2]
@@ -81,20 +81,20 @@ def causal_conv1d_ref(
     activation: str | None = None,
     seq_idx: None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """The convolution in plain torch and the dtype of ``weight``, to compare with.
+    """Compute the convolution in plain torch and the dtype of ``weight``, as a reference.
 
     Args:
-        x: ``[B, D, L]``, any real float dtype, as ``causal_conv1d_fn``; likewise the others.
+        x: ``[B, D, L]``, any real float dtype, as in ``causal_conv1d_fn``; likewise the others.
         weight: ``[D, W]``, any W.
         bias: ``[D]``, or None for 0.
         initial_states: ``[B, D, W-1]``, or None for 0.
         return_final_states: also return the last W - 1 tokens, ``[B, D, W-1]``.
-        final_states_out: where to write them, or None.
+        final_states_out: output tensor for them, or None.
         activation: None, "silu" or "swish" (the same).
         seq_idx: must be None.
 
     Returns:
-        The shape and dtype of x, and the final states if asked for.
+        The shape and dtype of x, and the final states if requested.
 
     Raises:
         ValueError: another ``activation``, or a ``seq_idx``.
@@ -118,7 +118,7 @@ def causal_conv1d_update_ref(
     activation: str | None = None,
     cache_seqlens: Tensor | None = None,
 ) -> Tensor:
-    """``causal_conv1d_update`` in plain torch and the dtype of ``weight``, to compare with.
+    """Compute ``causal_conv1d_update`` in plain torch and the dtype of ``weight``, as a reference.
 
     Args:
         x: ``[B, D]`` or ``[B, D, L]``, any real float dtype.
@@ -126,7 +126,7 @@ def causal_conv1d_update_ref(
         weight: ``[D, W]``, any W.
         bias: ``[D]``, or None for 0.
         activation: None, "silu" or "swish" (the same).
-        cache_seqlens: ``[B]`` integers; with it the state is a ring, as in
+        cache_seqlens: ``[B]`` integers; with it the state is a ring buffer, as in
             ``causal_conv1d_update``.
 
     Returns:
@@ -146,7 +146,7 @@ def causal_conv1d_update_ref(
         places = cache_seqlens.long()[:, None] + torch.arange(-before, length, device=x.device)
         columns = places.remainder(size)[:, None].expand(-1, tokens.shape[1], -1)
         window = torch.cat([conv_state.gather(2, columns[..., :before]), tokens], -1)
-        new = max(0, length - size)  # of more tokens than columns, two would meet in a column
+        new = max(0, length - size)  # with more tokens than columns, two would share a column
         conv_state.scatter_(2, columns[..., before + new :], tokens[..., new:].to(conv_state.dtype))
     out = (window.to(weight.dtype).unfold(-1, before + 1, 1) * weight[:, None]).sum(-1)
     if bias is not None:

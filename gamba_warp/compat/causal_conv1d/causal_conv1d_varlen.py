@@ -1,4 +1,4 @@
-"""The states of packed sequences, under causal-conv1d's path."""
+"""States of packed sequences, under causal-conv1d's path."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["causal_conv1d_varlen_states", "causal_conv1d_varlen_states_ref"]
 
 @torch.no_grad()
 def causal_conv1d_varlen_states(x: Tensor, cu_seqlens: Tensor, state_len: int) -> Tensor:
-    """The last tokens of each of several sequences in one row; no gradient flows through it.
+    """Return the last tokens of each packed sequence, without gradients.
 
     Args:
-        x: ``[tokens, D]``, the sequences behind one another.
-        cu_seqlens: ``[S + 1]`` integers, ascending: where each begins, and where the last ends.
-        state_len: how many tokens are taken.
+        x: ``[tokens, D]``, the sequences concatenated.
+        cu_seqlens: ``[S + 1]`` integers, ascending: the start of each, and the end of the last.
+        state_len: number of tokens.
 
     Returns:
         ``[S, D, state_len]`` in x's dtype, 0 where a sequence is shorter. Channels are adjacent.

@@ -1,6 +1,6 @@
-"""gsplat's names for the pinhole path of 3D Gaussians, over our rasterizer: change the import.
+"""gsplat's names for the pinhole path of 3D Gaussians, over our rasterizer.
 
-The strategies and the writers of files are gsplat's own and load it when they are used.
+The strategies and exporters are gsplat's own, and load it when used.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = [
 
 _OF_STRATEGY = ("DefaultStrategy", "MCMCStrategy", "Strategy")
 _OF_GSPLAT = {"PngCompression": "gsplat.compression", "export_splats": "gsplat.exporter"}
-# Names of gsplat 1.5.3, in the first place those of later versions behind them.
+# Names of gsplat 1.5.3; in the first entry those of later versions follow.
 ABSENT = complete(
     __name__,
     "gsplat",

@@ -1,4 +1,4 @@
-"""gsplat's lists of tiles, and the pictures that our compositor makes of lists."""
+"""gsplat's tile lists, and compositing of such lists."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from ..shared import check_tensor, one_device, positive, side
 
 LIMITS = Limits(ALPHA_MIN, 0.999, T_MIN)  # gsplat 1.5.3 clamps alpha at 0.999
 SKIP = Skip().bits()
-_ROOM = 2**19  # numbers of (tile, pair, pixel) that are worked on at once: they fit a cache
+_BLOCK = 2**19  # (tile, pair, pixel) elements processed at once, which fit a cache
 
 
 def pair_ids(images: Tensor, tiles: Tensor, depths: Tensor, count: int) -> Tensor:
-    """Makes gsplat's numbers of pairs, image | tile | depth, whose order is that of the lists.
+    """Make gsplat's ids of pairs, image | tile | depth, which sort the lists.
 
     Args:
         images: ``[P]`` int64.
-        tiles: ``[P]`` int64, tile of the picture.
+        tiles: ``[P]`` int64, index of the tile in the picture.
         depths: ``[P]`` float32.
-        count: tiles of a picture.
+        count: tiles per picture.
 
     Returns:
         ``[P]`` int64; the lower half holds the bits of the depth.
@@ -52,7 +52,7 @@ def isect_tiles(
     image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of tiles and Gaussians whose boxes meet.
+    """Find pairs of tiles and Gaussians whose boxes overlap.
 
     Args:
         means2d: ``[.., N, 2]`` pixels, or packed ``[nnz, 2]``.
@@ -63,7 +63,7 @@ def isect_tiles(
         tile_height: rows of tiles.
         sort: by image, tile and depth; else by image and Gaussian.
         segmented: a way of sorting, without effect here.
-        packed: whether the tensors are packed.
+        packed: the tensors are packed.
         n_images: of packed tensors.
         image_ids: ``[nnz]`` of packed tensors.
         gaussian_ids: of packed tensors; not used.
@@ -73,7 +73,7 @@ def isect_tiles(
         int32 ``[n_isects]``, the index in the flattened Gaussians.
 
     Raises:
-        TypeError: no tensor.
+        TypeError: an argument is not a tensor.
         ValueError: a shape or number is not as above, or the numbers of pairs do not fit 63 bits.
     """
     check_tensor("means2d", means2d, ("..", 2))
@@ -113,7 +113,7 @@ def isect_tiles(
 def isect_offset_encode(
     isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int
 ) -> Tensor:
-    """Where the list of each tile begins.
+    """Return the start of each tile's list.
 
     Args:
         isect_ids: ``[n_isects]`` int64, sorted, from ``isect_tiles``.
@@ -125,8 +125,8 @@ def isect_offset_encode(
         ``[n_images, tile_height, tile_width]`` int32.
 
     Raises:
-        TypeError: no tensor.
-        ValueError: ``isect_ids`` has not one dimension.
+        TypeError: an argument is not a tensor.
+        ValueError: ``isect_ids`` is not one-dimensional.
     """
     check_tensor("isect_ids", isect_ids, ("P",))
     tiles = tile_width * tile_height
@@ -143,16 +143,16 @@ def blend(
     views: int = 1,
     keep: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Blends I pictures: ``[I, H, W, C]`` and alphas ``[I, H, W, 1]``, with gradients.
+    """Composite I pictures ``[I, H, W, C]`` and alphas ``[I, H, W, 1]``, with gradients.
 
     Args:
         layers: R rows of each picture: means2d ``[I, R, 2]`` pixels, conics ``[I, R, 3]`` (a, k, e
             of ``a (dx + k dy)² + e dy²``), opacities ``[I, R]``, and colors ``[I * R, C]``, or
-            ``[I / views * R, C]`` if an object's views share them. The lists name rows of all.
-        bins: the lists of tiles.
-        tiling: the cut into tiles.
-        views: pictures of an object, which share the colours; 1 if none do.
-        keep: given, in backward, the absolute gradients ``[I * R, 2]`` of the centres; or None.
+            ``[I / views * R, C]`` if an object's views share them. The lists index rows of all.
+        bins: the tile lists.
+        tiling: the division into tiles.
+        views: pictures per object that share the colours; 1 if none do.
+        keep: called in backward with the absolute gradients ``[I * R, 2]`` of the centres; or None.
     """
     size = Size(tiling.width, tiling.height, views, int(views == 1), SKIP)
     renders, alphas, *_ = composite(*layers, list(bins), list(size), list(LIMITS), None)
@@ -171,28 +171,28 @@ def _absolute_gradients(
 ) -> Tensor:
     """``Σ_pixels |∂L/∂means2d|`` of each row, ``[I * R, 2]`` (Ye et al. 2024, "AbsGS").
 
-    The rasterizer's own gradient sums over pixels with their signs, and the absolute values cannot
-    be had from those sums. So the lists are walked once more here, in torch, by README §5 of the
-    rasterizer. ``upstream`` is the gradient of the pictures and of alpha, ``[I, H, W, C + 1]``.
+    The rasterizer's own gradient sums signed values over pixels. So this traverses the lists again,
+    in torch, by README §5 of the rasterizer. ``upstream`` is the gradient of the pictures and of
+    alpha, ``[I, H, W, C + 1]``.
     """
     means2d, conics, opacities, colors = layers
     if views > 1:
         colors = colors.view(len(means2d) // views, 1, -1, colors.shape[-1])
         colors = colors.expand(-1, views, -1, -1).flatten(0, 2)
     means2d, conics, opacities = means2d.flatten(0, 1), conics.flatten(0, 1), opacities.flatten()
-    # a channel of ones stands for alpha, which is the sum of the weights
+    # A channel of ones gives alpha, the sum of the weights.
     colors = torch.cat([colors, torch.ones_like(opacities)[:, None]], -1)
     right, below = (-size % TILE for size in (tiling.width, tiling.height))
-    padded = F.pad(upstream.permute(0, 3, 1, 2), (0, right, 0, below))  # 0 beyond the picture
+    padded = F.pad(upstream.permute(0, 3, 1, 2), (0, right, 0, below))  # 0 outside the picture
     by_tile = F.pixel_unshuffle(padded, TILE).unflatten(1, (-1, TILE**2))
     by_tile = by_tile.permute(0, 3, 4, 2, 1).flatten(0, 2)  # [tiles, pixels, C + 1]
     inside = torch.arange(TILE**2, device=means2d.device)
     offsets = torch.stack([inside % TILE, inside // TILE], -1) + 0.5
     total, counts = torch.zeros_like(means2d), bins.starts.diff()
     order = counts.argsort(descending=True)[: int((counts > 0).sum())]
-    while len(order):  # those of like lengths together
+    while len(order):  # lists of similar lengths together
         longest = int(counts[order[0]])
-        some = max(1, _ROOM // (longest * len(inside)))
+        some = max(1, _BLOCK // (longest * len(inside)))
         tiles, order = order[:some], order[some:]
         place = torch.arange(longest, device=tiles.device)
         real = place < counts[tiles, None]
@@ -235,31 +235,31 @@ def rasterize_to_pixels(
     packed: bool = False,
     absgrad: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Blends the Gaussians of given lists, front to back; differentiable in all but the lists.
+    """Composite the Gaussians of given lists, front to back; differentiable in all but the lists.
 
     Args:
         means2d: ``[.., N, 2]`` pixels, or packed ``[nnz, 2]``.
-        conics: ``[.., N, 3]`` or ``[nnz, 3]``: xx, xy, yy of the inverse covariances; one that is
-            not positive definite is not drawn.
+        conics: ``[.., N, 3]`` or ``[nnz, 3]``: xx, xy, yy of the inverse covariances; only positive
+            definite ones are drawn.
         colors: ``[.., N, D]`` or ``[nnz, D]``, any D >= 1.
         opacities: ``[.., N]`` or ``[nnz]``.
         image_width: pixels.
         image_height: pixels.
-        tile_size: side of a tile, pixels. Where 16 does not divide it, each tile has copies of its
-            Gaussians: slower, and the same picture.
+        tile_size: side of a tile, pixels. Unless a multiple of 16, each tile has copies of its
+            Gaussians: slower, with the same picture.
         isect_offsets: ``[.., tile_height, tile_width]`` int32.
         flatten_ids: ``[n_isects]`` int32.
         backgrounds: ``[.., D]``, or None: black.
-        masks: ``[.., tile_height, tile_width]`` bool, or None; where False, the background is seen.
-        packed: whether the tensors are packed.
-        absgrad: in backward, set ``means2d.absgrad`` to the sum of the pixels' absolute gradients.
+        masks: ``[.., tile_height, tile_width]`` bool, or None; False shows the background.
+        packed: the tensors are packed.
+        absgrad: in backward, set ``means2d.absgrad`` to the sum of absolute gradients over pixels.
 
     Returns:
         ``[.., image_height, image_width, D]`` and alphas ``[.., image_height, image_width, 1]``.
 
     Raises:
-        TypeError: no tensor.
-        ValueError: a shape or device is not as above; the lists name rows that are not there.
+        TypeError: an argument is not a tensor.
+        ValueError: a shape or device is not as above; the lists index missing rows.
     """
     check_tensor("isect_offsets", isect_offsets, ("..", "tile_height", "tile_width"))
     *lead, grid_y, grid_x = isect_offsets.shape
@@ -288,7 +288,7 @@ def rasterize_to_pixels(
 
     # From gsplat's xx, xy, yy to (a, k, e) in float64, because e = yy - xy²/xx cancels for needles.
     xx, xy, yy = conics.reshape(total, 3).double().unbind(-1)
-    fits = (xx > 0) & (xx * yy - xy * xy > 0)  # else it is no ellipse, and not drawn
+    fits = (xx > 0) & (xx * yy - xy * xy > 0)  # else not an ellipse, and not drawn
     a = torch.where(fits, xx, 1.0)
     k = torch.where(fits, xy, 0.0) / a
     sheared = torch.stack([a, k, torch.where(fits, yy, 1.0) - a * k * k], -1)
@@ -300,8 +300,8 @@ def rasterize_to_pixels(
             values = values.new_zeros(total, 2).index_add_(0, ids, values[: len(ids)])
         means2d.absgrad = values[:total].view(means2d.shape)  # type: ignore[attr-defined]
 
-    # Each of gsplat's tiles begins at one of ours: where it needs a part of a tile, the next one is
-    # moved, and so are its Gaussians.
+    # Each of gsplat's tiles begins at one of ours. If it ends within a tile, the next one is
+    # shifted to a tile's border, with its Gaussians.
     device, parts = means2d.device, -(-tile_size // TILE)
     moved = tile_size % TILE != 0
     if moved:
@@ -318,7 +318,7 @@ def rasterize_to_pixels(
     pairs = pairs + (begins[around] - starts[:-1]).repeat_interleave(counts)
     pairs = pairs if moved else ids[pairs]
 
-    # Rows belong to all pictures: they are dealt out to them, with a few to spare.
+    # Rows are split evenly among the pictures, with a few spare ones.
     each = -(-len(layers[0]) // max(images, 1))
     spare = each * images - len(layers[0])
     layers = [F.pad(x.float(), (0, 0) * (x.dim() - 1) + (0, spare)) for x in layers]

@@ -1,4 +1,4 @@
-"""About single Gaussians in gsplat's layouts: harmonics, and the projection to the picture."""
+"""Spherical harmonics and projection in gsplat's layouts."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from ..shared import check_tensor, one_device, one_of, positive, side
 from .relocation import quat_scale_to_covar_preci
 
 MAX_SH_DEGREE = 4
-# Without opacities gsplat draws a box of 3.33 standard deviations: that of this opacity, about 1.
+# Without opacities gsplat's box has 3.33 standard deviations, that of this opacity, about 1.
 _OPAQUE = ALPHA_MIN * math.exp(0.5 * 3.33**2)
-_LARGE = 1e15  # an opacity that stays over alpha_min with every factor of antialiasing from 4e-18
-_NEARLY = 1 + 1e-5  # float32's product of an opacity and the smallest factor, a few roundings off
+_LARGE = 1e15  # stays over alpha_min with any antialiasing factor from 4e-18
+_NEARLY = 1 + 1e-5  # tolerance of a float32 product of an opacity and the smallest factor
 
 
 class Splats(NamedTuple):
-    """N Gaussians of each of B objects in C views; what is culled has extents 0.
+    """N Gaussians of each of B objects in C views; culled ones have extents 0.
 
     Attributes:
         means2d: ``[B, C, N, 2]`` pixels.
         conics: ``[B, C, N, 3]``: a, k, e of ``a (dx + k dy)² + e dy²``.
         depths: ``[B, C, N]``.
-        opacities: ``[B, C, N]``, with the factor of antialiasing.
+        opacities: ``[B, C, N]``, times the factor of antialiasing.
         extents: ``[B, C, N, 2]`` half sides of the box that is drawn, pixels; gsplat's radii are
             the same rounded up.
     """
@@ -48,7 +48,7 @@ class Splats(NamedTuple):
 
 
 def check_scene(tensors: dict[str, Any], covariance: tuple[int, ...]) -> tuple[int, ...]:
-    """Checks what a projection is given; returns the batch dimensions.
+    """Check the inputs of a projection, and return the batch dimensions.
 
     Args:
         tensors: by name ``means``, ``viewmats``, ``Ks``, and ``opacities``, ``quats`` and
@@ -56,7 +56,7 @@ def check_scene(tensors: dict[str, Any], covariance: tuple[int, ...]) -> tuple[i
         covariance: the last dimensions of ``covars``.
 
     Raises:
-        TypeError: one is no tensor.
+        TypeError: one is not a tensor.
         ValueError: one has another shape or device.
     """
     check_tensor("means", tensors["means"], ("..", "N", 3))
@@ -74,12 +74,12 @@ def check_scene(tensors: dict[str, Any], covariance: tuple[int, ...]) -> tuple[i
 
 
 def flat(x: Tensor, lead: tuple[int, ...]) -> Tensor:
-    """One batch dimension for the leading ones; contiguous float32."""
+    """Merge the leading dimensions into one; contiguous float32."""
     return x.reshape(math.prod(lead), *x.shape[len(lead) :]).float().contiguous()
 
 
 def plain_conics(conics: Tensor) -> Tensor:
-    """From (a, k, e) of ``a (dx + k dy)² + e dy²`` to gsplat's xx, xy, yy."""
+    """Convert (a, k, e) of ``a (dx + k dy)² + e dy²`` to gsplat's xx, xy, yy."""
     a, k, e = conics.unbind(-1)
     return torch.stack([a, a * k, a * k * k + e], -1)
 
@@ -87,20 +87,20 @@ def plain_conics(conics: Tensor) -> Tensor:
 def spherical_harmonics(
     degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
 ) -> Tensor:
-    """Values of real spherical harmonics, ``Σ_k Y_k(dirs) coeffs_k``; nothing is added or clamped.
+    """Evaluate real spherical harmonics, ``Σ_k Y_k(dirs) coeffs_k``, without offset or clamping.
 
     Args:
-        degrees_to_use: 0 to 4; coefficients beyond it are not used.
+        degrees_to_use: 0 to 4; further coefficients are ignored.
         dirs: ``[.., 3]``, of any length.
         coeffs: ``[.., K, D]``, K >= (degrees_to_use + 1)²; gsplat's D is 3.
         masks: ``[..]`` bool, or None; the result is 0 where it is False.
 
     Returns:
-        ``[.., D]``; NaN in all D without a gradient where a direction or a used coefficient is not
+        ``[.., D]``; NaN in all D, without a gradient, if a direction or a used coefficient is not
         finite.
 
     Raises:
-        TypeError: no tensor.
+        TypeError: an argument is not a tensor.
         ValueError: the degree or a shape is not as above.
     """
     one_of("degrees_to_use", degrees_to_use, *range(MAX_SH_DEGREE + 1))
@@ -115,7 +115,7 @@ def spherical_harmonics(
 
 
 def world_to_cam(means: Tensor, covars: Tensor, viewmats: Tensor) -> tuple[Tensor, Tensor]:
-    """Means and covariances in the frames of cameras.
+    """Transform means and covariances into camera frames.
 
     Args:
         means: ``[.., N, 3]``.
@@ -139,7 +139,7 @@ def proj(
     height: int,
     camera_model: str = "pinhole",
 ) -> tuple[Tensor, Tensor]:
-    """Means and covariances in the picture, of those in cameras' frames (EWA, a pinhole's).
+    """Project means and covariances from camera frames to the picture (EWA, pinhole).
 
     Args:
         means: ``[.., C, N, 3]``.
@@ -170,11 +170,11 @@ def proj(
 
 
 def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -> Splats:
-    """Projects each object into each of its views; all float32, contiguous.
+    """Project each object into each of its views; all float32, contiguous.
 
-    The rasterizer's projection does the work, but its factor of antialiasing ends at 0.005 where
-    gsplat's goes down to 0. The few Gaussians there are done again by their covariances, in
-    float64, and culled by their own factor.
+    The rasterizer's factor of antialiasing is at least 0.005, while gsplat's goes down to 0. The
+    few Gaussians below are projected again by their covariances, in float64, and culled by their
+    own factor.
 
     Args:
         scene: by name ``means [B, N, 3]``, ``opacities [B, N]``, ``viewmats [B, C, 4, 4]``,
@@ -216,15 +216,15 @@ def _project_covariances(
     Ks: Tensor,
     lens: LensOptions,
 ) -> Splats:
-    """What the operator gives, for covariances, in torch and float64; opacities ``[B, (C), N]``."""
+    """Project like the operator, from covariances, in float64 torch; opacities ``[B, (C), N]``."""
     finite = means.isfinite().all(-1) & covars.isfinite().flatten(-2).all(-1)
-    # what is culled is replaced before any product, so that its gradient is 0 and not NaN
+    # Culled ones are replaced before any product, so that their gradient is 0 and not NaN,
     means = torch.where(finite[..., None], means, 0.0)
     covars = torch.where(finite[..., None, None], covars, 0.0)
     turned, covars = world_to_cam(means.double(), covars.double(), viewmats.double())
     depths = turned[..., 2]
     seen = finite[:, None] & (depths >= lens.near_plane) & (depths <= lens.far_plane)
-    # and here before the division by z
+    # and here before the division by z.
     turned = torch.where(seen[..., None], turned, turned.new_tensor([0.0, 0.0, 1.0]))
     covars = torch.where(seen[..., None, None], covars, torch.eye(3).to(covars))
     centers, plane = proj(turned, covars, Ks.double(), int(lens.width), int(lens.height))
@@ -235,7 +235,7 @@ def _project_covariances(
     shown = opacities.double().expand_as(depths)
     if lens.antialiased:
         some = before > 0
-        # replaced before the root, whose slope at 0 would make NaN of a gradient of 0
+        # Replaced before the root, whose infinite slope at 0 would turn a gradient of 0 into NaN.
         factor = torch.where(some, before / det, 1.0).sqrt()
         shown = shown * torch.where(some, factor, 0.0)
     seen = seen & (det > 0) & (shown >= ALPHA_MIN)
@@ -276,7 +276,7 @@ def fully_fused_projection(
     camera_model: str = "pinhole",
     opacities: Tensor | None = None,
 ) -> tuple[Tensor | None, ...]:
-    """Projects Gaussians into each view; differentiable in means, covars, quats, scales, viewmats.
+    """Project Gaussians into each view; differentiable in means, covars, quats, scales, viewmats.
 
     Args:
         means: ``[.., N, 3]``.
@@ -291,11 +291,11 @@ def fully_fused_projection(
         near_plane: nearer Gaussians are culled; > 0.
         far_plane: farther ones are culled.
         radius_clip: ones with both radii up to this many pixels are culled.
-        packed: return only what is seen.
+        packed: return only visible ones.
         sparse_grad: False.
         calc_compensations: also return the factor of antialiasing.
         camera_model: "pinhole".
-        opacities: ``[.., N]``, to draw the boxes no larger than needed; or None.
+        opacities: ``[.., N]``, for the smallest sufficient boxes; or None.
 
     Returns:
         radii (int32), means2d, depths, conics and compensations (or None) of
@@ -303,7 +303,7 @@ def fully_fused_projection(
         ``[nnz, ..]``, with batch_ids, camera_ids and gaussian_ids (int64) before them.
 
     Raises:
-        TypeError: no tensor.
+        TypeError: an argument is not a tensor.
         ValueError: a shape, device or option is not as above.
     """
     one_of("sparse_grad", sparse_grad, False)
@@ -330,7 +330,7 @@ def fully_fused_projection(
     if opacities is not None:
         found = projected(opacity, calc_compensations)
         if calc_compensations:
-            # an opacity of 0 is culled, and its factor is 0
+            # An opacity of 0 is culled, and its factor is 0.
             compensations = found.opacities / opacity[:, None].clamp_min(ALPHA_MIN)
     else:
         found = projected(torch.full_like(opacity, _OPAQUE), False)

@@ -1,4 +1,4 @@
-"""What gsplat's strategies take from its CUDA extension, in torch: covariances and relocation."""
+"""Covariances and relocation in torch, for gsplat's strategies without its CUDA extension."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ def quat_scale_to_covar_preci(
     compute_preci: bool = True,
     triu: bool = False,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Rotations and standard deviations to covariances and their inverses.
+    """Convert rotations and standard deviations to covariances and their inverses.
 
     Args:
         quats: ``[.., 4]`` wxyz, any length.
         scales: ``[.., 3]``.
         compute_covar: if False, the first result is None.
         compute_preci: if False, the second result is None.
-        triu: the six entries xx, xy, xz, yy, yz, zz in place of the matrix.
+        triu: return the six entries xx, xy, xz, yy, yz, zz instead of the matrix.
 
     Returns:
         Covariances R diag(s²) Rᵀ and their inverses, ``[.., 3, 3]``, or ``[.., 6]``.
 
     Raises:
-        TypeError: no tensor.
+        TypeError: an argument is not a tensor.
         ValueError: the shapes do not fit.
     """
     check_tensor("scales", scales, ("..", 3))
@@ -57,7 +57,7 @@ def quat_scale_to_covar_preci(
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Opacity and size of n equal Gaussians in one place that look as one of them did.
+    """Compute opacity and size of n equal Gaussians at one place that look like a single one.
 
     ``o' = 1 - (1 - o)^(1/n)`` and
     ``s' = s o / Σ_{i=1..n} Σ_{k<i} C(i-1, k) (-1)^k o'^(k+1)/√(k+1)``: equation 9 of "3D Gaussian
@@ -73,7 +73,7 @@ def compute_relocation(
         The new opacities, of their shape, and the new scales ``[N, 3]``.
 
     Raises:
-        TypeError: no tensor.
+        TypeError: an argument is not a tensor.
         ValueError: a shape is not as above.
     """
     check_tensor("scales", scales, ("N", 3))
@@ -95,10 +95,10 @@ def compute_relocation(
 
 @contextmanager
 def torch_strategies() -> Iterator[None]:
-    """Inside, gsplat's MCMC strategy takes the functions here for two of its CUDA extension.
+    """Replace two functions of gsplat's CUDA extension in its MCMC strategy by those here.
 
     They are ``compute_relocation`` and ``quat_scale_to_covar_preci`` in ``gsplat.strategy.ops``,
-    and are put back at the end. The module is shared by all threads of the process.
+    and are restored at the end. All threads of the process share the module.
 
     Raises:
         ImportError: gsplat is not installed.

@@ -1,4 +1,4 @@
-"""gsplat's ``rasterization`` over our projection, lists and compositor."""
+"""gsplat's ``rasterization`` on our projection, tile lists and compositor."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from ..shared import check_tensor, one_device, one_of, positive, side
 from .pixels import SKIP, blend, pair_ids
 from .projection import MAX_SH_DEGREE, check_scene, flat, plain_conics, project_views
 
-# Arguments that ask for what is not here: each must have its default. ``tile_size``,
-# ``channel_chunk`` and ``segmented`` have no effect, and ``rolling_shutter`` may be gsplat's own
-# ``GLOBAL``; all others are used.
+# Unsupported arguments, which must have their defaults. ``tile_size``, ``channel_chunk`` and
+# ``segmented`` have no effect, and ``rolling_shutter`` may be gsplat's own ``GLOBAL``; all others
+# are used.
 MUST_BE_DEFAULT = (
     "sparse_grad", "distributed", "camera_model", "with_ut", "with_eval3d", "radial_coeffs",
     "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "viewmats_rs", "macro_tile",
@@ -31,7 +31,7 @@ MUST_BE_DEFAULT = (
 
 
 class RollingShutterType(Enum):
-    """The shutters of gsplat's cameras; every pixel at once, ``GLOBAL``, is the one we have."""
+    """Shutters of gsplat's cameras; only ``GLOBAL``, all pixels at once, is supported."""
 
     ROLLING_TOP_TO_BOTTOM = 0
     ROLLING_LEFT_TO_RIGHT = 1
@@ -87,12 +87,12 @@ def rasterization(
     extra_signals_sh_degree: int | None = None,
     renderer_config: Any = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Renders N Gaussians of each object in each of its C views.
+    """Render N Gaussians of each object in each of its C views.
 
     The arguments, their order and defaults are those of gsplat 1.5.3; the keywords after the star
-    came later. ``tile_size``, ``channel_chunk`` and ``segmented`` have no effect. All options that
-    the list below leaves out are accepted at their defaults alone. docs/drop-in-gsplat.md says of
-    each argument what differs.
+    came later. ``tile_size``, ``channel_chunk`` and ``segmented`` have no effect. Options that are
+    not listed below must have their defaults. docs/drop-in-gsplat.md lists the differences of each
+    argument.
 
     Args:
         means: ``[.., N, 3]``.
@@ -110,8 +110,8 @@ def rasterization(
         radius_clip: ones with both radii up to this many pixels are culled.
         eps2d: added to the diagonal of the covariance in the picture; > 0.
         sh_degree: None, or 0 to 4.
-        packed: ``meta`` has one row for each Gaussian that a view sees.
-        tile_size: no effect; ``meta["tile_size"]`` is the side of the tiles that were used.
+        packed: ``meta`` has one row for each visible Gaussian of a view.
+        tile_size: no effect; ``meta["tile_size"]`` is the side of the tiles used.
         backgrounds: ``[.., C, D]``, or None: black.
         render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
         absgrad: in backward, set ``meta["means2d"].absgrad``.
@@ -122,7 +122,7 @@ def rasterization(
         ``[.., C, H, W, X]``, alphas ``[.., C, H, W, 1]`` and ``meta``.
 
     Raises:
-        TypeError: no tensor where one is asked for.
+        TypeError: an argument is not a tensor.
         ValueError: a shape, device or option is not allowed; the message names it.
     """
     given = locals()
@@ -165,18 +165,18 @@ def rasterization(
     at = seen.nonzero(as_tuple=True) if packed else None
 
     def shown(x: Tensor) -> Tensor:
-        """What ``meta`` has of ``[B, C, N, ..]``."""
+        """Return ``[B, C, N, ..]`` in the layout of ``meta``."""
         return x.view(*lead, *x.shape[1:]) if at is None else x[at]
 
-    # What meta shows of these is on the gradient's way.
-    way = {name: shown(getattr(splats, name)) for name in ("means2d", "depths", "opacities")}
-    for name, value in way.items():
+    # In meta these are part of the graph, so that they receive gradients.
+    attached = {name: shown(getattr(splats, name)) for name in ("means2d", "depths", "opacities")}
+    for name, value in attached.items():
         x = getattr(splats, name)
         x = value.view(x.shape) if at is None else x.detach().index_put(at, value)
         splats = splats._replace(**{name: x})
     ids = dict(zip(("batch_ids", "camera_ids", "gaussian_ids"), at or (None, None, None)))
     conics = shown(plain_conics(splats.conics))
-    meta: dict[str, Any] = dict(**ids, **way, radii=shown(radii), conics=conics)
+    meta: dict[str, Any] = dict(**ids, **attached, radii=shown(radii), conics=conics)
 
     if render_mode != "RGB":  # depth comes last
         parts = [splats.depths[..., None]]
@@ -186,7 +186,7 @@ def rasterization(
         blended = torch.cat(parts, -1)
     tiling = Tiling(width, height)
     per_view = [x.flatten(0, 1).contiguous() for x in splats]
-    # of exact length, because meta shows them
+    # Of exact length, because they are in meta.
     numbers = width, height, ALPHA_MIN, SKIP, True
     bins = Bins(*bin_op(*(x.detach() for x in per_view), *numbers))
     layers = *per_view[:2], per_view[3], blended.flatten(0, -2).contiguous()
@@ -204,7 +204,7 @@ def rasterization(
     if render_mode != "RGB":
         renders = torch.cat([renders, depth], -1)
 
-    # gsplat's names of the lists; ours hold the tiles that the ellipse meets, not its box.
+    # gsplat's names of the lists. Ours hold the tiles that the ellipse meets, not its box.
     counts = torch.empty_like(bins.order)
     counts[bins.order.long()] = bins.offsets.diff()
     tile = torch.arange(len(bins.starts) - 1, device=counts.device)

@@ -1,4 +1,4 @@
-"""gsplat's own strategies, which the package gsplat must bring, so that they run on any device."""
+"""Strategies of an installed gsplat, for any device."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["DefaultStrategy", "MCMCStrategy", "Strategy"]
 class MCMCStrategy(_MCMCStrategy):
     """gsplat's ``MCMCStrategy`` without its CUDA extension: see ``relocation.torch_strategies``.
 
-    Options, state and steps are gsplat's own.
+    Options, state and steps are gsplat's.
     """
 
     def step_post_backward(self, *args: Any, **kwargs: Any) -> None:
-        """As gsplat's, with the same arguments."""
+        """Like gsplat's, with the same arguments."""
         with torch_strategies():
             super().step_post_backward(*args, **kwargs)

@@ -1,4 +1,4 @@
-// Where one looks from: an orbit about a target, in the axes of cameras.py's orbit() (x right, y
+// The camera: an orbit about a target, in the axes of cameras.py's orbit() (x right, y
 // down, z forward; the input's camera has azimuth 0).
 
 function axesOf(azimuth, elevation) {
@@ -46,7 +46,7 @@ class OrbitCamera {
     this.elevation = Math.max(-1.55, Math.min(1.55, this.elevation + dy));
   }
 
-  // By pixels of a picture of this focal length: what is at the target follows the pointer.
+  // By pixels of a picture of this focal length, so that the target follows the pointer.
   pan(dx, dy, focal) {
     this.goal = null;
     const [right, down] = this.rotation(), unit = this.distance / focal;
@@ -66,7 +66,7 @@ class OrbitCamera {
     this.goal = { from, to, start: now, time };
   }
 
-  // Moves on along the way; says whether anything moved.
+  // Advances the motion; returns true if anything moved.
   step(now) {
     if (!this.goal) return false;
     const { from, to, start, time } = this.goal;

@@ -1,10 +1,10 @@
-// Hands: mouse, fingers, wheel and keys, turned into motions of the camera.
+// Controls: mouse, touch, wheel and keys, mapped to camera motions.
 
 const TAP = { time: 300, reach: 8, between: 24 }; // milliseconds, and pixels
 
 // `act` has turn, pan, zoom (each redraws), focus(x, y) and keys: functions by the key's name.
 function takeHands(surface, act) {
-  const down = new Map(); // pointers, by id: where they are
+  const down = new Map(); // positions of pointers by id
   let tap = null, moved = 0;
 
   const middle = () => {

@@ -1,5 +1,5 @@
-// Drawing: the object into a picture of any size, and that picture onto the canvas. A picture that
-// is drawn in several pieces, over several frames, does not show until it is complete.
+// Drawing of the object into a texture of any size, and of that onto the canvas. A picture that
+// is drawn in several pieces, over several frames, is shown once it is complete.
 
 const ROW = 1024; // Gaussians in a row of the texture: pack.py's records, two texels each
 const TEXELS = [0, 2, 3, 6]; // of the harmonics, by degree
@@ -80,7 +80,7 @@ class Renderer {
       gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
   }
 
-  // Some rows of a table of words, of `unit` 0 the records, 1 the harmonics; the last row is filled up.
+  // Uploads rows of a table of words, of `unit` 0 the records, 1 the harmonics; pads the last row.
   upload(unit, words, first, rows) {
     const { gl } = this, size = 2048 * 4;
     let part = words.subarray(first * size, (first + rows) * size);
@@ -118,7 +118,7 @@ class Renderer {
     this.corners = faces.length;
   }
 
-  // The largest picture; a part of it is used while it is drawn smaller. Says whether that is new.
+  // Allocates the largest picture, of which smaller ones use a part. Returns true if it changed.
   resize(width, height) {
     if (width === this.width && height === this.height) return false;
     const { gl } = this;
@@ -190,7 +190,7 @@ class Renderer {
     gl.disable(gl.DEPTH_TEST);
   }
 
-  // Puts the picture onto the canvas, which takes the picture's size; the page stretches it.
+  // Copies the picture to the canvas, which takes the picture's size; the page scales it.
   present() {
     const { gl } = this, { canvas } = gl, [width, height] = this.part;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });

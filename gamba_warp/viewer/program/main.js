@@ -1,18 +1,18 @@
-// The viewer: loads the object, and draws when something has changed. While it moves, it draws as
-// sharply and as completely as a frame's time allows; once it rests, everything at full size.
+// The viewer: loads the object, and redraws on changes. In motion it draws as
+// sharply and completely as the frame time allows; at rest, everything at full size.
 
 const SETTLE = 160; // milliseconds after the last motion
-const SIZES = [1, 0.8, 0.64, 0.5, 0.4, 0.32]; // shares of the canvas's sides, while it moves
+const SIZES = [1, 0.8, 0.64, 0.5, 0.4, 0.32]; // shares of the canvas's sides, in motion
 const SLOW = 42, QUICK = 21; // milliseconds of a frame: above, less is drawn; below, more
-const PIECE = 131072; // Gaussians that are drawn at once at rest
-const LEAST = 40000; // Gaussians that are drawn in any case
+const PIECE = 131072; // Gaussians drawn at once at rest
+const LEAST = 40000; // Gaussians that are always drawn
 
 class Viewer {
   constructor(canvas, about) {
     Object.assign(this, { canvas, about, mode: "gaussians", showInput: true });
     this.camera = new OrbitCamera(about.home, about.home.fov);
-    this.coarse = this.quick = 0; // which of SIZES; quick frames in a row
-    this.some = about.count; // Gaussians that are drawn while it moves
+    this.coarse = this.quick = 0; // index into SIZES; quick frames in a row
+    this.some = about.count; // Gaussians drawn in motion
     this.changed = this.asked = -Infinity;
     this.sortedFor = this.askedFor = null;
     this.waiting = [];
@@ -44,7 +44,7 @@ class Viewer {
     if (!this.renderer.fits()) return say("It has more Gaussians than this graphics card takes.", "Too many");
     const text = (name) => {
       const element = byId(name), found = element ? element.textContent : "";
-      element?.remove(); // the text may be large, and is not needed any more
+      element?.remove(); // frees the text, which may be large
       return found;
     };
     const { vertices, faces } = this.about;
@@ -57,7 +57,7 @@ class Viewer {
     new ResizeObserver(() => this.redraw()).observe(this.canvas);
   }
 
-  // Words from the sorter: everything is unpacked. It goes to the card in pieces, one a frame.
+  // Unpacked words from the sorter, uploaded in pieces, one per frame.
   loaded({ records, harmonics, mesh }) {
     const { renderer } = this, parts = [];
     const cut = (unit, words, rows) => {
@@ -114,7 +114,7 @@ class Viewer {
     });
   }
 
-  // Whether the card has drawn what it was last asked to draw.
+  // True if the graphics card has finished the last draw.
   idle(now) {
     if (!this.fence) return true;
     const { gl } = this, state = gl.clientWaitSync(this.fence, 0, 0);
@@ -133,7 +133,7 @@ class Viewer {
     this.fast = fast;
   }
 
-  // First fewer pixels, then fewer Gaussians (those that cover least are last); back the other way,
+  // First fewer pixels, then fewer Gaussians (the smallest are last); the reverse
   // once several frames in a row were quick.
   adapt(cost) {
     const { count } = this.about;
@@ -164,7 +164,7 @@ class Viewer {
     const fast = now - this.changed < SETTLE && this.shownOnce;
     const ordered = this.sortNow(fast ? this.some : this.about.count);
     if (fast) {
-      // An order of all would begin with the farthest, so one of as many as are drawn is waited for.
+      // An order of all begins with the farthest, so wait for one of the drawn ones only.
       if (renderer.ordered === this.some || this.mode !== "gaussians") {
         renderer.draw(this.mode, this.camera, background(), SIZES[this.coarse], 0, this.some);
         this.show(now, true);
@@ -193,14 +193,14 @@ class Viewer {
     this.renderer.present();
     this.ask(now, fast);
     this.stats.frames++;
-    // Where frames take long, the browser shall not have to draw lines and a blur above each, too.
+    // If frames are slow, hide the lines and the blur above them.
     const slow = fast && this.coarse >= SIZES.length / 2;
     document.documentElement.classList.toggle("slow", slow);
     const { input } = this.about, visible = input && this.showInput && !slow;
     byId("lines").firstElementChild.setAttribute("d", visible ? inputLines(input, this.camera, ...this.shownSize()) : "");
   }
 
-  // Asks for the order that belongs to the camera; says whether it is there already.
+  // Requests the order for the camera; returns true if it exists already.
   sortNow(wanted) {
     if (this.mode !== "gaussians") return true;
     const forward = this.camera.rotation()[2], id = [...forward, wanted].join();
@@ -239,7 +239,7 @@ class Viewer {
     this.travel(this.about.home);
   }
 
-  // The point below comes to the middle, and a little nearer.
+  // Moves the point under the pointer to the middle, and a little nearer.
   async focus(x, y) {
     const [width, height] = this.shownSize(), { camera } = this, focal = camera.focal(width, height);
     const origin = camera.position(), ray = camera.ray(x - width / 2, y - height / 2, focal);
@@ -252,7 +252,7 @@ class Viewer {
     this.travel({ target: origin.map((value, k) => value + depth * ray[k]), distance: Math.max(0.1, 0.8 * camera.distance) });
   }
 
-  // Resolves when the picture of the camera as it is now is complete.
+  // Resolves when the picture of the current camera is complete.
   rest() {
     this.schedule();
     return new Promise((resolve) => {
@@ -267,14 +267,14 @@ class Viewer {
     savePicture(this.canvas, this.about.title);
   }
 
-  // For programs: a picture of the canvas, as an address.
+  // For programs: a picture of the canvas, as a data URL.
   async png() {
     await this.rest();
     this.renderer.present();
     return this.canvas.toDataURL("image/png");
   }
 
-  // For programs: azimuth and elevation in radians, distance, target; those left out stay.
+  // For programs: azimuth and elevation in radians, distance, target; missing values stay.
   setCamera(where) {
     this.camera.go(where, 0, 0);
     this.camera.step(1);

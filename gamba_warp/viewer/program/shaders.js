@@ -1,7 +1,7 @@
-// What runs on the graphics card. A Gaussian is two texels of 4 words: pack.py says what is in them.
+// Shaders. A Gaussian is two texels of 4 words, defined in pack.py.
 
-// Gaussians of one instance. Software draws every instance by itself, which costs more than what is
-// in it, so that an instance for each Gaussian would be fifty times as slow.
+// Gaussians per instance. Software renderers have a high cost per instance, so that
+// an instance per Gaussian would be fifty times slower.
 const BATCH = 256;
 
 const SHADER_HEAD = `#version 300 es
@@ -61,7 +61,7 @@ vec3 colour_of(uint index, vec3 mean, vec3 rgb) {
 }
 `;
 
-// Each Gaussian is a rectangle along the axes of its ellipse, as far as an alpha of 1/255 reaches.
+// Each Gaussian is a rectangle along the axes of its ellipse, up to an alpha of 1/255.
 const SPLAT_VERTEX = `${SHADER_GAUSSIAN}
 uniform usampler2D order;
 uniform uint first, last;
@@ -81,7 +81,7 @@ void main() {
   vec3 p = vec3(unpackSnorm2x16(far_words.z).y, unpackSnorm2x16(far_words.w));
   float k = 2.0 / (1.0 + dot(p, p)), w = k - 1.0, f = focal / m.z;
   vec3 q = k * p;
-  // Where the centre is far outside the picture, the Jacobian stays that of the margin.
+  // For centres far outside the picture, the Jacobian is clamped to the margin.
   vec2 slope = clamp(m.xy / m.z, -0.65 * size / focal, 0.65 * size / focal);
   vec3 u = vec3(f, 0.0, -f * slope.x) * view, v = vec3(0.0, f, -f * slope.y) * view;
   // Into the Gaussian's own axes: the inverse rotation.
@@ -150,7 +150,7 @@ void main() {
   gl_Position = vec4(flat_xy, m.z - 0.02, m.z);
 }`;
 
-// The light comes from beside the eye; both sides are lit, since a scanned mesh may be open.
+// The light is beside the camera; both sides are lit, because a scanned mesh may be open.
 const MESH_FRAGMENT = `${SHADER_HEAD}
 in vec3 facing, place;
 in vec4 colour;

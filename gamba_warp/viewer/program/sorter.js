@@ -1,6 +1,6 @@
-// The work that would make the page stutter: unpacking, sorting by depth, finding what is below a
-// point. It runs in a worker, made from this function's own text; where none can be made, it runs in
-// the page itself. So it uses nothing from outside.
+// Heavy work off the main thread: unpacking, sorting by depth, finding the object below a
+// point. It runs in a worker made from this function's text, or, without workers, in
+// the page itself. So it uses no outer names.
 function sorterProgram(post) {
   let words, means, count, mesh = null, depths, keys;
   const starts = new Uint32Array(65537);
@@ -23,7 +23,7 @@ function sorterProgram(post) {
     return bytes.buffer;
   }
 
-  // Vertex normals: the sum of those of the faces about it, each as long as the face is large.
+  // Vertex normals: sums of the adjacent faces' normals, weighted by area.
   function meshOf(base64, vertexCount, faceCount) {
     const bytes = bytesOf(base64);
     const vertices = new Float32Array(bytes, 0, 3 * vertexCount);
@@ -64,8 +64,8 @@ function sorterProgram(post) {
     post({ kind: "loaded", records: sent, harmonics, mesh }, [sent, harmonics]);
   }
 
-  // A counting sort by 16 bits of depth; the farthest comes first. The order does not depend on
-  // where the camera is, but only on where it looks to.
+  // A counting sort by 16 bits of depth, farthest first. The order depends on the
+  // direction of view only, not on the camera's position.
   function sort({ forward: [x, y, z], wanted, buffer, id }) {
     const used = Math.min(wanted, count);
     const order = buffer ? new Uint32Array(buffer) : new Uint32Array(2048 * Math.ceil(count / 2048));
@@ -88,7 +88,7 @@ function sorterProgram(post) {
     post({ kind: "sorted", buffer: order.buffer, used, id }, [order.buffer]);
   }
 
-  // Where a ray is half blocked: along it, a Gaussian blocks as much as it does at its densest.
+  // Depth where a ray is half blocked; each Gaussian counts with its maximum along the ray.
   function pickGaussian(origin, ray) {
     const hits = [];
     for (let i = 0; i < count; i++) {

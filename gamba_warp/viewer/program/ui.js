@@ -1,6 +1,6 @@
-// What is around the picture: buttons, the help, the input's camera as lines, messages.
+// User interface: buttons, help, the input's camera as lines, messages.
 
-const STEP = 26; // pixels of a drag that an arrow key is worth
+const STEP = 26; // pixels of a drag equal to an arrow key
 
 const byId = (name) => document.getElementById(name);
 
@@ -22,7 +22,7 @@ function say(text, title = "") {
   byId("message-text").textContent = text;
 }
 
-// Light or dark: what the system says, until somebody chooses.
+// Light or dark: the system's choice, until the user chooses.
 function startTheme(changed) {
   const system = matchMedia("(prefers-color-scheme: dark)");
   const set = (dark) => {
@@ -50,7 +50,7 @@ function toggleHelp() {
   else help.showModal();
 }
 
-// The input's camera: its eye, and the rectangle through which it saw, as a path of an SVG.
+// The input's camera as an SVG path: its centre, and the rectangle of its picture.
 function inputLines(input, camera, width, height) {
   const rows = axesOf(input.azimuth, input.elevation), half = Math.tan((input.fov * Math.PI) / 360), depth = 0.3 * input.distance;
   const eye = [0, 1, 2].map((k) => input.target[k] - input.distance * rows[2][k]);

@@ -1,1 +1,1 @@
-"""The layers of mamba-ssm, in files of its names."""
+"""Layers of mamba-ssm, in files of its names."""

@@ -1,4 +1,4 @@
-"""The Mamba-1 layer with mamba-ssm's arguments, attributes and names of weights."""
+"""Mamba-1 layer with mamba-ssm's arguments, attributes and names of weights."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ..utils.generation import InferenceParams
 
 
 class Mamba(nn.Module):
-    """A Mamba layer: tokens in, tokens out, each depending on itself and those before it.
+    """Mamba layer; each output token depends on the input tokens up to it.
 
-    Its state dict has mamba-ssm's names and shapes, so weights go both ways, and from one seed it
-    draws the weights that mamba-ssm draws. The projections are called as modules, so hooks and
-    adapters on ``in_proj``, ``x_proj`` and ``out_proj`` act.
+    The state dict has mamba-ssm's names and shapes, so weights are interchangeable, and the same
+    seed gives the same initial weights. The projections are called as modules, so hooks and
+    adapters on ``in_proj``, ``x_proj`` and ``out_proj`` work.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Mamba(nn.Module):
         device=None,
         dtype: torch.dtype | None = None,
     ) -> None:
-        """Builds the layer.
+        """Build the layer.
 
         Args:
             d_model: channels of a token.
@@ -52,17 +52,17 @@ class Mamba(nn.Module):
             d_conv: taps of the convolution, from 2 to 4.
             expand: inner channels over d_model.
             dt_rank: rank of the step's projection; "auto" is d_model / 16, rounded up.
-            dt_min: least step at the start; steps are drawn log-uniformly.
-            dt_max: largest step at the start.
+            dt_min: smallest initial step; steps are drawn log-uniformly.
+            dt_max: largest initial step.
             dt_init: "random" or "constant" weights of the step's projection.
             dt_scale: their scale.
-            dt_init_floor: no step is below it at the start.
-            conv_bias: whether the convolution has a bias.
-            bias: whether the first and the last projection have one.
-            use_fast_path: kept as an attribute; there is one path.
-            layer_idx: the layer's key in ``InferenceParams``; needed with one alone.
+            dt_init_floor: lower bound of initial steps.
+            conv_bias: the convolution has a bias.
+            bias: the first and the last projection have one.
+            use_fast_path: stored as an attribute, without effect.
+            layer_idx: the layer's key in ``InferenceParams``; needed only with these.
             device: of the weights.
-            dtype: of the weights, but for A_log and D, which are float32.
+            dtype: of the weights, except A_log and D, which are float32.
 
         Raises:
             ValueError: ``d_state``, ``d_conv``, ``dt_rank`` or ``dt_init`` is not one of the above.
@@ -70,7 +70,7 @@ class Mamba(nn.Module):
         super().__init__()
         if not 1 <= d_state <= 256:
             raise ValueError(f"d_state is {d_state}, allowed is 1 to 256")
-        one_of("d_conv", d_conv, 2, 3, 4)  # what the convolution's kernel has
+        one_of("d_conv", d_conv, 2, 3, 4)  # supported by the convolution's kernel
         one_of("dt_init", dt_init, "random", "constant")
         if isinstance(dt_rank, str):
             one_of("dt_rank", dt_rank, "auto")
@@ -80,7 +80,7 @@ class Mamba(nn.Module):
         self.use_fast_path, self.layer_idx = use_fast_path, layer_idx
         self.activation, self.act = "silu", nn.SiLU()
         at = {"device": device, "dtype": dtype}
-        # The order of what follows is that in which mamba-ssm draws: one seed, the same weights.
+        # In mamba-ssm's order of random draws: the same seed gives the same weights.
         self.in_proj = nn.Linear(d_model, 2 * inner, bias=bias, **at)
         self.conv1d = nn.Conv1d(
             inner, inner, d_conv, padding=d_conv - 1, groups=inner, bias=conv_bias, **at
@@ -107,19 +107,19 @@ class Mamba(nn.Module):
     def forward(
         self, hidden_states: Tensor, inference_params: InferenceParams | None = None
     ) -> Tensor:
-        """Runs over all tokens at once.
+        """Run over all tokens at once.
 
         Args:
             hidden_states: ``[B, L, d_model]`` float32, bfloat16 or float16.
             inference_params: if given, this layer's states in it are set to those after the last
-                token (no gradient flows through them). Where its ``seqlen_offset`` is over 0, the
-                tokens go on from these states, one token by ``step`` (without a gradient).
+                token (without gradients). If its ``seqlen_offset`` is over 0, the tokens continue
+                from these states, a single token by ``step`` (without a gradient).
 
         Returns:
             ``[B, L, d_model]``.
 
         Raises:
-            TypeError: the dtype is none of the above.
+            TypeError: the dtype is not one of the above.
             ValueError: the shape is another; ``layer_idx`` is None, or the states in
                 ``inference_params`` are of another batch.
         """
@@ -137,11 +137,11 @@ class Mamba(nn.Module):
         return out
 
     def _run(self, tokens: Tensor, states: tuple[Tensor, Tensor] | None = None):
-        """The output, and both states after the last token, in the layout of the cache."""
+        """Return the output, and both states after the last token, in the layout of the cache."""
         x, z = self.in_proj(tokens).chunk(2, dim=-1)
         conv_state = scan_state = None
         seen = x.new_zeros(x.shape[0], self.d_conv, self.d_inner)
-        if states is not None:  # copies: the cache is overwritten, and a gradient may need it
+        if states is not None:  # copies, because the cache is overwritten before backward
             seen, scan_state = states[0].transpose(1, 2).to(x.dtype), states[1].float().clone()
             conv_state = seen[:, 1:].clone()
         recent = torch.cat([seen, x[:, -self.d_conv :]], 1)[:, -self.d_conv :]
@@ -150,7 +150,7 @@ class Mamba(nn.Module):
         low_rank, B, C = self.x_proj(x).split([self.dt_rank, self.d_state, self.d_state], dim=-1)
         y, scan_state = selective_scan(
             x,
-            # The bias is added inside the scan, in float32: a step of 1e-3 needs it.
+            # The bias is added inside the scan, in float32, for steps of 1e-3.
             F.linear(low_rank, self.dt_proj.weight),
             -torch.exp(self.A_log.float()),
             B,
@@ -168,7 +168,7 @@ class Mamba(nn.Module):
     def step(
         self, hidden_states: Tensor, conv_state: Tensor, ssm_state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Runs over one more token; no gradient flows through it.
+        """Run over one more token, without gradients.
 
         Args:
             hidden_states: ``[B, 1, d_model]``.
@@ -200,14 +200,14 @@ class Mamba(nn.Module):
     def allocate_inference_cache(
         self, batch_size: int, max_seqlen: int, dtype: torch.dtype | None = None, **kwargs
     ) -> tuple[Tensor, Tensor]:
-        """Makes the states before the first token.
+        """Make the states before the first token.
 
         Args:
             batch_size: B.
-            max_seqlen: not needed: the states do not grow.
+            max_seqlen: unused, because the states do not grow.
             dtype: of both states; None means the convolution's for the first and float32 for the
-                second, since a slow decay is lost when a state is rounded to 8 bits at every token.
-            **kwargs: not needed.
+                second, because rounding a state to 8 bits at every token loses slow decays.
+            **kwargs: unused.
 
         Returns:
             ``[B, d_inner, d_conv]`` and ``[B, d_inner, d_state]``, zeros.
@@ -220,7 +220,7 @@ class Mamba(nn.Module):
     def _get_states_from_cache(
         self, inference_params: InferenceParams, batch_size: int
     ) -> tuple[Tensor, Tensor]:
-        """This layer's states in ``inference_params``, made if there are none."""
+        """Return this layer's states in ``inference_params``; make them if missing."""
         if self.layer_idx is None:
             raise ValueError("layer_idx is None, must be this layer's number to use a cache")
         cache = inference_params.key_value_memory_dict

@@ -1,1 +1,1 @@
-"""The functions of mamba-ssm, in files of its names."""
+"""Functions of mamba-ssm, in files of its names."""

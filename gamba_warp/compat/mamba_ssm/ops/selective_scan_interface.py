@@ -1,4 +1,4 @@
-"""The scan, and all of a Mamba block behind its first projection, in mamba-ssm's layout."""
+"""Selective scan, and a Mamba block after its first projection, in mamba-ssm's layout."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def selective_scan_ref(
     delta_softplus: bool = False,
     return_last_state: bool = False,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """The scan as a loop over tokens in float32 torch, to compare with.
+    """Compute the scan by a loop over tokens in float32 torch, as a reference.
 
     Args:
-        u: ``[B, D, L]``, any real float dtype, as ``selective_scan_fn``; likewise the others.
-        delta: a step for each token and channel.
+        u: ``[B, D, L]``, any real float dtype, as in ``selective_scan_fn``; likewise the others.
+        delta: step of each token and channel.
         A: ``[D, N]``.
         B: (D, N) constant, (B, N, L), or (B, G, N, L).
-        C: as B, on its own.
+        C: as B, independently.
         D: ``[D]``, or None.
         z: as u, or None.
         delta_bias: ``[D]``, or None.
-        delta_softplus: whether softplus is applied to delta.
+        delta_softplus: apply softplus to delta.
         return_last_state: also return ``[B, D, N]`` float32.
 
     Returns:
@@ -81,10 +81,10 @@ def mamba_inner_fn(
     dt_rms_weight: Tensor | None = None,
     b_c_dt_rms_eps: float = 1e-6,
 ) -> Tensor:
-    """A Mamba block behind its first projection: convolution, small projections, scan, output.
+    """Run a Mamba block after its first projection: convolution, small projections, scan, output.
 
     Args:
-        xz: ``[B, 2 D, L]``, the first half goes through the convolution, the second is the gate.
+        xz: ``[B, 2 D, L]``: the input of the convolution, then the gate.
         conv1d_weight: ``[D, 1, W]``, W from 2 to 4.
         conv1d_bias: ``[D]``, or None.
         x_proj_weight: ``[R + N + N, D]``: rows for the step, B and C; none for a given B or C.
@@ -98,9 +98,9 @@ def mamba_inner_fn(
         delta_bias: ``[D]``, or None for 0.
         B_proj_bias: ``[N]``, added to a B from the tokens, or None.
         C_proj_bias: as B_proj_bias.
-        delta_softplus: whether the step is a softplus.
-        checkpoint_lvl: 0 or 1; both keep the same for the gradient.
-        b_rms_weight: ``[N]``, of an RMS norm of a B from the tokens, or None for no norm.
+        delta_softplus: apply softplus to the step.
+        checkpoint_lvl: 0 or 1; without effect.
+        b_rms_weight: ``[N]``, of an RMS norm of a B from the tokens, or None without a norm.
         c_rms_weight: as b_rms_weight.
         dt_rms_weight: ``[D]``, of an RMS norm of the step before its bias, or None.
         b_c_dt_rms_eps: added to the mean squares of these norms.
@@ -127,7 +127,7 @@ def mamba_inner_fn(
         raise ValueError(f"x_proj_weight has {x_proj_weight.shape[0]} rows, must have {rows}")
 
     def normalized(x: Tensor, bias: Tensor | None, weight: Tensor | None) -> Tensor:
-        """A part of the small projection as ``[B, .., L]``, after its bias and its RMS norm."""
+        """Return a part of the small projection as ``[B, .., L]``, after its bias and RMS norm."""
         if bias is not None:
             x = x + bias.to(x.dtype)
         if weight is not None:
@@ -146,6 +146,6 @@ def mamba_inner_fn(
     return F.linear(y.transpose(1, 2), out_proj_weight, out_proj_bias)
 
 
-# mamba-ssm's own reference runs over its two kernels as well. To check the kernels, compare
+# mamba-ssm's reference runs on its two kernels as well. To check the kernels, compare
 # ``selective_scan_fn`` with ``selective_scan_ref``.
 mamba_inner_ref = mamba_inner_fn

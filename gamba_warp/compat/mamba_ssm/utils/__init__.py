@@ -1,1 +1,1 @@
-"""What generation needs, in files of mamba-ssm's names."""
+"""Parameters of generation, in files of mamba-ssm's names."""

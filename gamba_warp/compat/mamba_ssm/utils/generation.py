@@ -1,4 +1,4 @@
-"""What a model remembers between the tokens that it generates."""
+"""Caches of a model between generated tokens."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from torch import Tensor
 
 @dataclass
 class InferenceParams:
-    """The caches of all layers, and how far a generation has come.
+    """Caches of all layers, and the position of the generation.
 
     Attributes:
-        max_seqlen: number of tokens at most; nothing here needs it.
-        max_batch_size: size of the batch at most; nothing here needs it.
-        seqlen_offset: tokens seen so far; the caller raises it. At 0 a layer begins anew.
-        batch_size_offset: nothing here needs it.
-        key_value_memory_dict: by ``layer_idx`` the states of that layer.
-        lengths_per_sample: ``[B]``, or None; nothing here needs it.
+        max_seqlen: largest number of tokens; unused.
+        max_batch_size: largest batch size; unused.
+        seqlen_offset: tokens so far, advanced by the caller. At 0 a layer starts afresh.
+        batch_size_offset: unused.
+        key_value_memory_dict: states of the layers by ``layer_idx``.
+        lengths_per_sample: ``[B]``, or None; unused.
     """
 
     max_seqlen: int
@@ -28,7 +28,7 @@ class InferenceParams:
     lengths_per_sample: Tensor | None = None
 
     def reset(self, max_seqlen: int, max_batch_size: int) -> None:
-        """Goes back to the first token; the caches stay, and are overwritten by it."""
+        """Return to the first token, which overwrites the caches."""
         self.max_seqlen, self.max_batch_size = max_seqlen, max_batch_size
         self.seqlen_offset = 0
         if self.lengths_per_sample is not None:

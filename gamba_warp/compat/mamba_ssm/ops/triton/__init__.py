@@ -1,1 +1,1 @@
-"""The path under which mamba-ssm has the update of a state; there is no Triton here."""
+"""mamba-ssm's path of the state update; it does not use Triton."""

@@ -1,4 +1,4 @@
-"""One step of the selective scan, which updates the state in place."""
+"""One step of the selective scan, with an update of the state in place."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def selective_state_update(
     dt_softplus: bool = False,
     state_batch_indices: Tensor | None = None,
 ) -> Tensor:
-    """Takes the state one token further, in place, and gives that token's output.
+    """Advance the state by one token, in place, and return that token's output.
 
-    Float32 inside whatever the dtypes, so only what is stored in ``state`` is rounded. No gradient
-    flows through it. All tensors are float32, bfloat16 or float16, each on its own.
+    Computed in float32 for all dtypes; only the stored ``state`` is rounded. No gradient flows
+    through it. Tensors are float32, bfloat16 or float16, independently.
 
     Args:
         state: ``[B, D, N]``, or with heads ``[B, H, D, N]``; with ``state_batch_indices`` its first
@@ -39,9 +39,9 @@ def selective_state_update(
         D: ``[D]`` or ``[H, D]``, or None for 0.
         z: as x, or None for no gate.
         dt_bias: as D, or None for 0.
-        dt_softplus: whether the step is a softplus.
+        dt_softplus: apply softplus to the step.
         state_batch_indices: ``[B]`` int32 or int64, the state's row for each element of the batch;
-            below 0 the output is 0 and no state is touched. They may not repeat.
+            for negative ones the output is 0 and no state changes. They must not repeat.
 
     Returns:
         The shape and dtype of x.
@@ -52,7 +52,7 @@ def selective_state_update(
     """
     if state_batch_indices is None:
         done = scan_step(state, x, dt, A, B, C, D, z, dt_bias, dt_softplus)
-        if done is not None:  # None, and nothing done, also where an argument is wrong
+        if done is not None:  # None without effect also for an invalid argument
             return done
     check_tensor("state", state, ("B", "D", "N"), ("B", "H", "D", "N"), dtypes=DTYPES)
     rows, *heads, channels, states = state.shape
@@ -89,19 +89,19 @@ def selective_state_update_ref(
     dt_bias: Tensor | None = None,
     dt_softplus: bool = False,
 ) -> Tensor:
-    """The same as a plain sum in torch, to compare with; in float64 if x is, else in float32.
+    """Compute the same as a plain sum in torch, as a reference; in float64 if x is, else float32.
 
     Args:
-        state: as ``selective_state_update``, updated in place; likewise the others.
+        state: as in ``selective_state_update``, updated in place; likewise the others.
         x: the token.
         dt: its step.
         A: rates of decay.
         B: input matrix.
         C: output matrix.
-        D: the way past the state.
+        D: the skip connection.
         z: the gate.
         dt_bias: added to dt.
-        dt_softplus: whether the step is a softplus.
+        dt_softplus: apply softplus to the step.
 
     Returns:
         The shape and dtype of x.
