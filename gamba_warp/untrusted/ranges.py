@@ -46,7 +46,7 @@ Distance = Annotated[float, Meta(ge=0.05, le=1000)]  # object units
 Rate = Annotated[float, Meta(gt=0, le=1000)]  # pictures a second
 
 
-def wrong(value: float, limits: Meta) -> str | None:
+def range_error(value: float, limits: Meta) -> str | None:
     """Describe the required range of a number outside it or not finite; None if it is valid.
 
     Args:
@@ -80,7 +80,7 @@ def check_range(label: str, value: float, limits: Meta) -> None:
     Raises:
         UserError: one line, such as "--lr inf: must be above 0 and at most 10".
     """
-    reason = wrong(value, limits)
+    reason = range_error(value, limits)
     if reason:
         huge = isinstance(value, int) and abs(value) > 10**30  # one may have a million digits
         shown, mark = "huge" if huge else value, "," if label.endswith(" is") else ":"

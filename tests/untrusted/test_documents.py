@@ -15,7 +15,7 @@ from gamba_warp.untrusted.documents import (
     read_lines,
     value_of,
 )
-from gamba_warp.untrusted.ranges import Seed, check_options, ranged, wrong
+from gamba_warp.untrusted.ranges import Seed, check_options, range_error, ranged
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_only_plain_files_of_a_bounded_size_are_read(tmp_path):
     ],
 )
 def test_ranges(value, limits, words):
-    assert wrong(value, limits) == words
+    assert range_error(value, limits) == words
 
 
 def test_options_and_arguments_are_checked_by_their_declarations():
