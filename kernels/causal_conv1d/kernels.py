@@ -41,7 +41,7 @@ def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
 
 
 def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:
-    """What both kernels begin with."""
+    """Return the parameters that both kernels begin with."""
     value, rows = VALUES[device_type][0], wp.array3d(dtype=WARP_DTYPES[io])
     parameters = {"weight_in": wp.array2d(dtype=value), "bias_in": wp.array(dtype=value)}
     return {

@@ -52,7 +52,7 @@ def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list
 
 
 def _pieces(x: Tensor, rows: Tensor | None, tokens: int) -> tuple[int, Tensor]:
-    """How many pieces of so many tokens there are, and those of packed rows."""
+    """Return the number of pieces of so many tokens, and those of packed rows."""
     batch, length, _ = x.shape
     if rows is None:
         return batch * -(-length // tokens), torch.empty(0, 5, dtype=torch.int32, device=x.device)

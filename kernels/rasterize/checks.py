@@ -1,4 +1,4 @@
-"""What ``rasterization`` refuses, before any launch."""
+"""Checks of the arguments of ``rasterization``, before any launch."""
 
 from typing import Any
 

@@ -12,7 +12,7 @@ from .tiles import Bins, Limits, Size, Tiling, Walk
 
 
 class Call(NamedTuple):
-    """What was drawn, and how: enough to make the lists anew.
+    """Arguments of a call: enough to make the lists anew.
 
     Attributes:
         splats: means2d, conics, depths, opacities and extents, without gradients.

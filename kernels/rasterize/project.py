@@ -29,7 +29,7 @@ _SHORTEST = 1e-30  # the gradient of a shorter quaternion leaves float32's range
 
 
 class LensOptions(NamedTuple):
-    """What makes a ``Lens``, as numbers that fit in a list of floats.
+    """Arguments of a ``Lens``, as numbers that fit in a list of floats.
 
     Attributes:
         width: of the picture, pixels.

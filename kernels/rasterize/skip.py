@@ -1,4 +1,4 @@
-"""What the rasterizer leaves out without changing picture or gradients, each with its switch."""
+"""Work that the rasterizer skips without changing picture or gradients, each with its switch."""
 
 from __future__ import annotations
 

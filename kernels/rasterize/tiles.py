@@ -23,7 +23,7 @@ SLACK, SLACK_ABS = 1.0 + 1e-4, 1e-4
 
 
 class Tiling(NamedTuple):
-    """How a picture is cut into square tiles of ``TILE`` pixels a side.
+    """Grid of square tiles over a picture, ``TILE`` pixels a side.
 
     Attributes:
         width: of the picture, pixels.
@@ -90,7 +90,7 @@ class Lists:
 
 
 class Walk(NamedTuple):
-    """What the compositor leaves for its gradient, by tiles and by blocks of 4 x 4 pixels.
+    """Values that the compositor saves for its gradient, by tiles and by blocks of 4 x 4 pixels.
 
     Attributes:
         transmittances: ``[blocks, 16]`` final T; negative where the pixel stopped early.
@@ -128,7 +128,7 @@ class Pixels:
 
 
 class Drawn(NamedTuple):
-    """What is composited, or its gradients: of each (view, Gaussian), the sum over its pairs.
+    """Gaussians to composite, or their gradients: of each (view, Gaussian), the sum over its pairs.
 
     Attributes:
         means2d: ``[I, N, 2]``; a gradient is None if colours alone are asked for, so are the next.

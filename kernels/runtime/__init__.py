@@ -1,1 +1,1 @@
-"""What every operator stands on: views of tensors, launches, threads, memory, SIMD."""
+"""Basis of every operator: views of tensors, launches, threads, memory, SIMD."""

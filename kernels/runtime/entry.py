@@ -16,7 +16,7 @@ _MOST_EXTENTS = 1024  # that a kernel keeps
 
 
 class Entry:
-    """What launches of a kernel have in common.
+    """Compiled function and argument structures of a kernel's launches.
 
     They are attributes of Warp's that are not documented.
 

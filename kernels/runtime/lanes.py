@@ -41,7 +41,7 @@ _STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this si
 
 
 def streams(results: Sequence[Tensor]) -> bool:
-    """Whether results ``[B, L, D]`` may go past the caches: they are too large to be kept there.
+    """True if results ``[B, L, D]`` may be written past the caches: they are too large for these.
 
     Of float32 each, dense, with whole cache lines; results without elements do not count.
     """

@@ -121,7 +121,7 @@ class Pool:
 
 
 def _most() -> int:
-    """What the pool may keep: ``GAMBA_POOL`` in MiB, or a part of the memory."""
+    """Return the limit of the pool: ``GAMBA_POOL`` in MiB, or a part of the memory."""
     chosen = os.environ.get("GAMBA_POOL", "")
     if chosen.isdecimal():
         return int(chosen) << 20

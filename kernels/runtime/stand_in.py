@@ -1,4 +1,4 @@
-"""Where a tensor's work is done, and what stands in for a GPU that makes the launches on CUDA.
+"""Device of a tensor's work, and stand-ins for a GPU that take launches on CUDA.
 
 In a dry run launches are only noted: the tensors may be fake, without memory, so ``views.py`` makes
 no views. Any other stand-in executes launches on tensors of the CPU, for which the operators then
@@ -19,7 +19,7 @@ import warp as wp
 
 @dataclass(frozen=True)
 class StandIn:
-    """What is told of the launches, in place of a GPU.
+    """Receiver of launches in place of a GPU.
 
     Attributes:
         launch: called with the kernel, the dimensions of the launch, its arguments as Warp takes
@@ -50,7 +50,7 @@ def standing_in(new: StandIn | None) -> Iterator[None]:
 
 
 def is_dry() -> bool:
-    """Whether this is a dry run."""
+    """True in a dry run."""
     return (other := stand_in()) is not None and other.dry
 
 

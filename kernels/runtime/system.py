@@ -1,4 +1,4 @@
-"""What Linux, macOS and Windows do not all have, and what stands in for it where it is missing."""
+"""Functions that Linux, macOS and Windows do not all have, with substitutes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 
 
 def is_own(found: os.stat_result) -> bool:
-    """Whether a file is of this user; always on Windows, whose users have no numbers.
+    """True if a file belongs to this user; always on Windows, whose users have no numbers.
 
     Args:
         found: what ``os.stat`` says of the file.
@@ -27,7 +27,7 @@ def end_signals() -> list[signal.Signals]:
 
 
 def cores() -> int:
-    """How many cores this process may use; all of them where the system does not say."""
+    """Number of cores this process may use; all of them where the system does not say."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -89,7 +89,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def has_team() -> bool:
-    """Whether launches can go to torch's threads."""
+    """True if launches can go to torch's threads."""
     return _parallel != 0
 
 

@@ -118,7 +118,7 @@ _structs: dict[tuple, Any] = {}  # one for each struct, and its arrays' dtypes, 
 
 
 def _filled_with(cls: Any, values: tuple) -> Any:
-    """What a launch takes for a struct of these values."""
+    """Return the C structure of a struct with these values."""
     made = cls.ctype()
     for x, (name, var) in zip(values, cls.vars.items(), strict=True):
         if isinstance(x, Tensor):

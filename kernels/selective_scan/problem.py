@@ -1,4 +1,4 @@
-"""What is scanned, and the rules by which a step of the continuous state becomes f and g.
+"""Inputs of a scan, and the rules by which a step of the continuous state becomes f and g.
 
 A rule (equations 2 to 4 of README.md) is an entry here, a branch on both devices in
 ``discretize.h``, and the oracle's formula in ``reference.py``.
@@ -48,7 +48,7 @@ class Scan(NamedTuple):
 
     @property
     def sequences(self) -> int:
-        """How many there are: B, or S of packed rows."""
+        """Number of sequences: B, or S of packed rows."""
         return len(self.u if self.packed is None else self.packed)
 
 
@@ -65,7 +65,7 @@ class Discretization(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """What the kernels multiply A by: exponentials are computed as powers of two."""
+        """Factor of A in the kernels: exponentials are computed as powers of two."""
         return LOG2E if self.exponential else 1.0
 
 

@@ -189,7 +189,7 @@ def test_a_profile_of_srgb_leaves_every_bit(tmp_path):
 @pytest.mark.parametrize("columns", [None, ADOBE_RGB], ids=["grey", "rgb"])
 @pytest.mark.parametrize("mode", ["L", "LA", "I;16"])
 def test_grey_has_profiles_too(tmp_path, mode, columns):
-    """It stays grey, as masks must."""
+    """A grey picture stays grey, as masks must."""
     values = np.arange(256, dtype=np.uint8).reshape(16, 16)
     grey = Image.fromarray(257 * values.astype(np.uint16)) if mode == "I;16" else None
     if mode != "I;16":

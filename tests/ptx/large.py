@@ -1,4 +1,4 @@
-"""What takes minutes, for ``make ptx``: gpu-check's shapes, the paper's size, strides near 2^31.
+"""Tests of minutes, for ``make ptx``: gpu-check's shapes, the paper's size, strides near 2^31.
 
 Run by ``-p ptx.plugin``, which executes all of it from PTX and reports what is found.
 """

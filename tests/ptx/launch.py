@@ -1,4 +1,4 @@
-"""What Warp does for a launch on CUDA, done by the interpreter on tensors of the CPU."""
+"""Launches on CUDA by the interpreter, on tensors of the CPU."""
 
 import contextlib
 import ctypes
@@ -173,7 +173,7 @@ def _arrays(tensors):
 
 
 def _pieces(x: torch.Tensor):
-    """Where each dense piece of a tensor's memory begins and ends, and its unit."""
+    """Return the begin and end of each dense piece of a tensor's memory, and its unit."""
     size, dense, apart = x.element_size(), 1, []
     for stride, length in sorted(zip(x.stride(), x.shape)):
         if stride <= dense or length == 1:

@@ -34,7 +34,7 @@ FAULTS = (
 
 
 class Missing(Exception):
-    """What is needed to execute PTX is not on this machine; the reason."""
+    """A tool to execute PTX is missing on this machine; the message names it."""
 
 
 class Refused(Exception):

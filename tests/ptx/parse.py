@@ -78,7 +78,7 @@ def _up(at: int, align: int) -> int:
 
 
 class _Entry:
-    """What is known while an entry is read: places by names."""
+    """State while an entry is read: places by names."""
 
     def __init__(self, name: str, parameters: str, attributes: str):
         self.program = Program(name)
@@ -143,7 +143,7 @@ class _Entry:
         return self.wide[register]
 
     def _place(self, operand: str, wide: bool) -> int:
-        """Where a register, number or address lies in the file."""
+        """Return the place of a register, number or address in the file."""
         if operand.startswith("%"):
             if operand not in self.registers:
                 self.registers[operand] = self._room(self._is_wide(operand)), self._is_wide(operand)

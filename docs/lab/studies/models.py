@@ -128,8 +128,9 @@ def compiled(settings: Settings) -> list[Variant]:
 
 
 class _Pictures:
-    """The starter set's model of the paper's decoder, on some of its icons; errors are of pictures
-    from three sides. (The decoder rays computes no background at all.)
+    """The starter set's model of the paper's decoder, on some of its icons.
+
+    Errors are of pictures from three sides. (The decoder rays computes no background at all.)
     """
 
     def __init__(self, settings: Settings) -> None:

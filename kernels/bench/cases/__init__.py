@@ -1,1 +1,1 @@
-"""What is measured, one subject a file: cases, problems and knobs of each operator."""
+"""Benchmark cases, one subject a file: problems and knobs of each operator."""

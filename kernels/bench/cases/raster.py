@@ -100,7 +100,7 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
 
 
 def knobs(settings: Settings) -> list[Variant]:
-    """What may be traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
+    """Accuracy traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
     threshold of alpha or T and no radius clip. The defaults are what trained Gaussians and other
     renderers assume.
     """
@@ -132,7 +132,7 @@ def _trade(scene: Scene, name: str, **options: float) -> list[Variant]:
 
 
 def skipping(settings: Settings) -> list[Variant]:
-    """What is not computed because nobody needs it, at scale 2, against the same call that needs
+    """Work left out because no result needs it, at scale 2, against the same call that needs
     all. Skipped: share of the pairs of Gaussians and tiles, or of the gradients.
     """
     scene = make_scene(settings, 2)

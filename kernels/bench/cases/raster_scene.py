@@ -115,7 +115,7 @@ class Scene(Problem):
         return replace(self, **changes)
 
     def arguments(self) -> dict:
-        """What the operator is called with."""
+        """Arguments of the operator."""
         cameras = dict(viewmats=self.viewmats, Ks=self.Ks, width=self.size, height=self.size)
         return self.gaussians | cameras | self.options
 
@@ -150,7 +150,7 @@ class Scene(Problem):
         return counts | {"gaussians": self.gaussians["opacities"].numel()}
 
     def oracle(self, direction: str) -> str:
-        """What the check compares with, in words."""
+        """Description of the reference."""
         width, height = self.crop(direction == BOTH)[2:]
         text = f"float64, all Gaussians dense, a crop of {width} x {height} pixels"
         return text + (" without thresholds" if "t_min" in self.exact else "")

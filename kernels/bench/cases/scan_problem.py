@@ -31,7 +31,7 @@ EX2 = 2.0**-22  # the largest relative error of ex2.approx, CUDA's own figure fo
 def allowances(
     results: Callable[[Off], Mapping[str, Tensor]], exponential: float = EX2
 ) -> dict[str, float]:
-    """How far an inexact exponential may take results from float64's (CUDA.md, Exponential).
+    """Allowed error of results by an inexact exponential (CUDA.md, Exponential).
 
     Args:
         results: the formulas in float64, their results by name.

@@ -1,4 +1,4 @@
-"""What is measured: cases, each of a few variants that are timed in turn."""
+"""Benchmark cases, each of a few variants that are timed in turn."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class NotInstalled(NotMeasured):
 
 @dataclass(frozen=True)
 class Level:
-    """How long to measure.
+    """Length of a measurement.
 
     Attributes:
         seconds: time for a variant; it takes longer only to reach ``fewest``.
@@ -53,7 +53,7 @@ LEVELS = {"quick": Level(0.1, 3, 20), "normal": Level(1.0, 5, 50), "full": Level
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run was asked for.
+    """Options of a run.
 
     Attributes:
         device: device of all cases.
@@ -70,7 +70,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Error:
-    """How far a result is from the oracle.
+    """Distance of a result from the oracle.
 
     Attributes:
         rel_rms: rms of the difference over rms of the truth, of the worst tensor.

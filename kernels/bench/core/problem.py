@@ -1,4 +1,4 @@
-"""What is timed forward and with its gradients, and compared with a formula in float64 before."""
+"""Problems timed forward and with gradients, after a comparison with a formula in float64."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Operator(Problem):
     _laid: dict = field(default_factory=dict, init=False)
 
     def oracle(self, direction: str) -> str:
-        """What the check compares with, in words."""
+        """Description of the reference."""
         return self.text + (", output only" if direction == BOTH and not self.compared else "")
 
     def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
@@ -145,7 +145,7 @@ class Operator(Problem):
     def results(
         self, gradients: bool, dtype: torch.dtype = torch.float32, **options: Any
     ) -> dict[str, Tensor]:
-        """What ``truth`` has, of the operator itself."""
+        """Return the operator's results, in the form of ``truth``."""
         if not gradients:
             return {"out": self.cut("out", self.forward(dtype, **options))}
         leaves = self.leaves(dtype)

@@ -1,4 +1,4 @@
-"""What was measured, in a form for people: ratios and Markdown tables."""
+"""Reports of measurements: ratios and Markdown tables."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ More = Callable[[dict, Sequence[dict]], tuple[list[str], list[Table]]]
 
 
 class Part(NamedTuple):
-    """What a report holds below one heading.
+    """Part of a report below one heading.
 
     Attributes:
         title: the heading: a machine, or an operator and a case.
@@ -164,7 +164,7 @@ class Part(NamedTuple):
 
 
 def nothing_more(document: dict, records: Sequence[dict]) -> tuple[list[str], list[Table]]:
-    """What ``gamba bench`` adds to the table of a case."""
+    """Return the text that ``gamba bench`` adds to the table of a case: none."""
     return [], []
 
 

@@ -1,1 +1,1 @@
-"""What the CUDA kernels take of a GPU, told without one."""
+"""Resources of the CUDA kernels, found without a GPU."""

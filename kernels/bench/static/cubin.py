@@ -1,4 +1,4 @@
-"""What a compiled CUDA binary says of its kernels, read from the file itself.
+"""Reader of the kernels' resources from a compiled CUDA binary.
 
 A cubin is an ELF file. Attributes in ``.nv.info`` hold registers and stack, the sizes of
 ``.nv.shared.*`` sections the static shared memory, and ``.text.*`` the instructions, 16 bytes each
@@ -22,7 +22,7 @@ RESERVED = 1024  # bytes of shared memory that the system takes per block, from 
 
 
 class Resources(NamedTuple):
-    """What a kernel takes.
+    """Resources of a kernel.
 
     Attributes:
         registers: of a thread.

@@ -1,4 +1,4 @@
-"""Which kernels an operator launches on CUDA, found without a GPU.
+"""Lists of the kernels that operators launch on CUDA, found without a GPU.
 
 The operators run on tensors that have a shape, a dtype and the device cuda, but no memory. Their
 launches are recorded (``runtime/stand_in.py``), so the code that chooses kernels is their own.
@@ -47,7 +47,7 @@ class _Inside(TorchDispatchMode):
 
 
 def can_dry_run() -> bool:
-    """Whether torch cuts tensors of the device cuda without a GPU; its older versions do not."""
+    """True if torch slices CUDA tensors without a GPU; older versions do not."""
     with FakeTensorMode():
         try:
             torch.empty(1, device="cuda")[:]

@@ -1,4 +1,4 @@
-"""What the CUDA kernels take of a GPU, told without one: ``gamba bench --static``.
+"""Resources of the CUDA kernels, found without a GPU: ``gamba bench --static``.
 
 The operators say which kernels they would launch (``dry_run.py``), these are compiled ahead of
 time, and the binaries say what they take (``cubin.py``). Nothing runs, so no time is measured.
@@ -58,7 +58,7 @@ MACHINES = {
 
 
 class Occupancy(NamedTuple):
-    """How much of a kernel a multiprocessor holds at a time.
+    """Blocks and warps of a kernel that a multiprocessor holds at a time.
 
     Attributes:
         blocks: resident.

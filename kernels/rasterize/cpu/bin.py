@@ -33,7 +33,7 @@ _DEFINES = {"SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "TILE_TEST": TILE_TEST}
 
 @struct
 class Work:
-    """What passes between the steps: of groups of 16 Gaussians, and of the parts."""
+    """Intermediate results: of groups of 16 Gaussians, and of the parts."""
 
     corners: wp.array[wp.int32]  # [groups * 16] first tile of each window
     windows: wp.array[wp.int16]  # [groups * 16] its bits

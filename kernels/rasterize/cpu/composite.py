@@ -32,7 +32,7 @@ _DEFINES: dict[str, Any] = {
 
 @struct
 class Gaussians:
-    """What is composited: the Gaussians of I views, and their colours; or their gradients."""
+    """Gaussians of I views and their colours; or their gradients."""
 
     means2d: wp.array[wp.vec2]
     conics: wp.array[wp.vec3]
@@ -42,7 +42,7 @@ class Gaussians:
 
 @struct
 class Workers:
-    """What the workers of a launch share, the next tile to take, and what each has of its own."""
+    """State that a launch's workers share (the next tile to take), and memory of each worker."""
 
     counter: wp.array[wp.int32]
     workspace: wp.array[wp.float32]

@@ -43,7 +43,7 @@ _BLOCKS = (1 << STOP) - 1
 
 @struct
 class Rows:
-    """What a gradient's launch leaves: sums of pairs or Gaussians, and which tiles it skipped."""
+    """Outputs of a gradient's launch: sums of pairs or Gaussians, and marks of skipped tiles."""
 
     sums: wp.array2d[wp.float32]
     skipped: wp.array[wp.int32]
@@ -68,7 +68,7 @@ def _shared_size(channels: int, geometry: bool) -> int:
 
 @functools.cache
 def _completing(channels: int, geometry: bool, listed: bool):
-    """How many pairs wait for the sums of their lanes, and the functions that leave and add these.
+    """Return how many pairs' sums are stored at once, and functions to store and to add them.
 
     A row has six moments for each chunk of channels, then the channels. If ``listed``, it is a
     pair's and is written; else it is a Gaussian's, and the pair is added to it.

@@ -28,7 +28,7 @@ _MOST = 2**31 - 1  # pairs are numbered in int32
 
 @dataclass
 class Room:
-    """What is remembered of a shape.
+    """Capacity remembered for a shape.
 
     Attributes:
         place: its place in the ledger.
@@ -87,7 +87,7 @@ def wanted(count: int) -> int:
 
 
 def is_capturing(device: torch.device) -> bool:
-    """Whether launches on torch's current stream go into a CUDA graph now."""
+    """True if torch's current stream is being captured into a CUDA graph."""
     return device.type == "cuda" and not is_dry() and torch.cuda.is_current_stream_capturing()
 
 
@@ -142,7 +142,7 @@ def tell(room: Room, count: Tensor) -> None:
 
 
 def lists_outgrown() -> bool:
-    """Whether a CUDA graph was captured with room for fewer pairs than it had of late.
+    """True if a CUDA graph was captured with room for fewer pairs than it had recently.
 
     Its pictures and gradients are right all the same, but slow. A capture after this, of the same
     shapes, has room; it does not wait for the device, which may be some replays ahead or behind.

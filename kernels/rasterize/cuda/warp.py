@@ -1,4 +1,4 @@
-"""What the CUDA compositor's kernels share: a warp, its pixels, its shared memory, and the test.
+"""Common parts of the CUDA compositor's kernels: a warp, its pixels, shared memory, and the test.
 
 A tile of 16 x 16 pixels is eight sub-tiles of 8 x 4. A block is one warp and works on a tile, or on
 a half or a quarter of it: on 8, 4 or 2 sub-tiles, in each of which a lane owns one pixel. CUDA.md
@@ -120,7 +120,7 @@ def shared_memory(size: int) -> Memory:
 
 @struct
 class Place:
-    """Where a warp and a lane work."""
+    """Tile and pixels of a warp and a lane."""
 
     index: wp.int32  # of the warp's part among those of all tiles
     lane: wp.int32
@@ -206,7 +206,7 @@ def touching(parts: int):
 
 @struct
 class Gaussians:
-    """What is composited; dense arrays over view-major Gaussians."""
+    """Gaussians to composite; dense arrays in view-major order."""
 
     means2d: wp.array[wp.vec2]
     conics: wp.array[wp.vec3]

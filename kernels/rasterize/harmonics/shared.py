@@ -1,4 +1,4 @@
-"""What the kernels of both devices take."""
+"""Arguments of the kernels of both devices."""
 
 import warp as wp
 

@@ -37,7 +37,7 @@ _WORK = wp.array2d(dtype=lanes)  # a row for each piece of the launch
 
 
 class Tuning(NamedTuple):
-    """What is fixed when a kernel is compiled; ``make study WHAT=scan`` has what each choice costs.
+    """Constants of a compiled kernel; ``make study WHAT=scan`` has the cost of each choice.
 
     Attributes:
         chunk: tokens between saved states, which the gradient walks at once; a multiple of
@@ -61,7 +61,7 @@ class Tuning(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What a kernel is compiled for: the dtypes of u and delta, the rule, and the tuning."""
+    """Key of a compiled kernel: the dtypes of u and delta, the rule, and the tuning."""
 
     io: torch.dtype
     delta_io: torch.dtype
@@ -85,7 +85,7 @@ class Kind(NamedTuple):
 
 @struct
 class Sizes:
-    """What the kernels know: shapes, options, and which gradients are wanted."""
+    """Launch parameters of the kernels: shapes, options, and wanted gradients."""
 
     length: int
     segment: int  # tokens of a segment, a multiple of the chunk
@@ -123,7 +123,7 @@ def forward_kernel(kind: Kind, output: bool) -> Any:
 
 @functools.cache
 def gradient_states_kernel(kind: Kind) -> Any:
-    """What a segment's outputs send back to the state before it, and the products of the decays."""
+    """Kernel of a segment's gradient by the state before it, and of the products of the decays."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     inputs = {**_channels(kind), "c_in": _MATRIX, "dout_in": rows}
     outputs = {"work_out": _WORK, "dh_out": _STATES, "product_out": _STATES}
@@ -158,7 +158,7 @@ def backward_kernel(kind: Kind) -> Any:
 
 
 def _channels(kind: Kind) -> dict[str, Any]:
-    """What all three begin with."""
+    """Return the text that all three begin with."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     deltas = wp.array3d(dtype=WARP_DTYPES[kind.delta_io])
     channels = wp.array2d(dtype=lanes)

@@ -23,7 +23,7 @@ SEGMENT = 4  # chunks of a segment at least
 
 
 def _chunks(x: Scan, chunk: int) -> int:
-    """How many chunks of so many tokens all sequences have, at most where they are packed."""
+    """Number of chunks of so many tokens in all sequences; an upper bound where they are packed."""
     batch, length, _ = x.u.shape
     if x.packed is None:
         return batch * -(-length // chunk)
@@ -31,7 +31,7 @@ def _chunks(x: Scan, chunk: int) -> int:
 
 
 class Layout:
-    """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded.
+    """Map of channels to lanes: D = groups × group_width, each group in blocks of W, padded.
 
     A task is a segment of one sequence's tokens and a span of blocks of one group. The blocks
     of a span are walked side by side, so that rows are read in long parts. Segments are for inputs
@@ -41,11 +41,12 @@ class Layout:
     """
 
     def __init__(self, x: Scan, chunk: int, split: bool = True):
-        """
+        """Cut a scan.
+
         Args:
-            x: what is scanned.
+            x: inputs and options of the scan.
             chunk: tokens; a state is saved at the start of each chunk.
-            split: whether there may be several segments.
+            split: True to allow several segments.
         """
         self.batch, self.length, self.channels = x.u.shape
         self.states, self.groups = x.A.shape[1], x.B.shape[2]
@@ -130,7 +131,7 @@ def _rows(states: Tensor | None):
 
 
 class _Operands:
-    """What the launches of one call share."""
+    """Operands that the launches of one call share."""
 
     def __init__(self, x: Scan, split: bool = True):
         states = x.A.shape[1]

@@ -1,4 +1,4 @@
-"""How a block of threads maps to channels, states and tokens, and its shared memory.
+"""Map of a block of threads to channels, states and tokens, and its shared memory.
 
 A block holds adjacent channels of one group. For the recurrence a thread owns ``channels`` times
 ``states`` of them (an outer product, so that what it reads from shared memory is used more than
@@ -117,7 +117,7 @@ def stepping(delta_io: torch.dtype, use_softplus: bool):
 
 @struct
 class Sizes:
-    """What all kernels know: the shapes, and how block indices map to them."""
+    """Launch parameters of all kernels: shapes, and numbers that map block indices to them."""
 
     length: int
     states: int
@@ -131,7 +131,7 @@ class Sizes:
 
 @struct
 class Place:
-    """Where a thread works."""
+    """Position of a thread in the problem."""
 
     b: int
     group: int
@@ -158,7 +158,7 @@ class Place:
 # Shared memory is one tile of floats that is addressed by plain offsets, because each assignment to
 # an element of a tile has a barrier.
 def offsets(parts: dict) -> tuple[dict, int]:
-    """Where parts of so many floats begin in shared memory, and their sum."""
+    """Return the offsets of parts of so many floats in shared memory, and their sum."""
     at, size = {}, 0
     for name, count in parts.items():
         at[name] = size

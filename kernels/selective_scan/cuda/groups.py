@@ -19,7 +19,7 @@ FOUR = 4  # tokens of a vector
 
 @dataclasses.dataclass(frozen=True)
 class Groups:
-    """How the tokens of a tile are shared out among the threads of a channel."""
+    """Thread-to-token layout of a tile."""
 
     shape: BlockShape
     tokens: int  # of a tile, a multiple of FOUR and of the rows

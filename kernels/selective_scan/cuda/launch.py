@@ -218,7 +218,7 @@ class _Operands:
         return torch.empty(shape, dtype=torch.float32, device=self.device)
 
     def inputs(self, save: bool = False) -> list:
-        """What the forward and the gradient begin with."""
+        """Return the arguments that the forward and the gradient begin with."""
         sizes = Sizes()
         sizes.length, sizes.states, sizes.groups = self.length, self.states, self.groups
         sizes.group_width = self.channels // self.groups

@@ -34,7 +34,7 @@ TILE = 16  # tokens
 def summary_kernel(
     dtypes: tuple, mode: str, f: BlockShape, use_softplus: bool, use_z: bool, read: bool
 ):
-    """What each segment's own outputs send to the state it starts from, and its decay.
+    """Kernel of each segment's gradient by its first state, and of its decay.
 
     Args: as ``backward_kernel``.
     """

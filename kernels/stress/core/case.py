@@ -75,7 +75,7 @@ class Comparison:
 
 @dataclass
 class Outcome:
-    """What a case found.
+    """Result of a case.
 
     Attributes:
         comparisons: comparisons, one per result.
@@ -103,7 +103,7 @@ class Outcome:
 
     @property
     def over(self) -> bool:
-        """Whether a result is over its limit, and nothing else is wrong."""
+        """True if a result is over its limit and nothing else is wrong."""
         return (self.failure() or {}).get("what") == "limit"
 
     def failure(self) -> dict | None:
@@ -334,7 +334,7 @@ def fill(shape: Sequence[int], kind: str, g: torch.Generator) -> Tensor:
 
 
 def fits(truth: Tensor, dtype: torch.dtype) -> Tensor:
-    """Which numbers of a truth a dtype holds for sure; beyond them a result may be infinite."""
+    """Mask of a truth's numbers that a dtype holds; beyond them a result may be infinite."""
     return truth.detach().abs() < 0.99 * torch.finfo(dtype).max
 
 

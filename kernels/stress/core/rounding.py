@@ -1,4 +1,4 @@
-"""What rounding to float32 does to a formula, which every limit is based on (see README.md)."""
+"""Effect of rounding to float32 on a formula, the basis of every limit (see README.md)."""
 
 from __future__ import annotations
 

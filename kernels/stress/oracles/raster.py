@@ -21,7 +21,7 @@ _RANGE = 3.4e38  # largest float32
 
 
 class Lens(NamedTuple):
-    """What ``rasterization`` takes besides tensors and modes, under the same names."""
+    """Arguments of ``rasterization`` besides tensors and modes, under the same names."""
 
     width: int
     height: int
@@ -53,7 +53,7 @@ class View(NamedTuple):
 
 
 def _band(x: Tensor) -> Tensor:
-    """How far rounding may move ``x [SAMPLES, ..]``, ``[..]``."""
+    """Return the distance ``[..]`` that rounding may move ``x [SAMPLES, ..]``."""
     x = x.detach()
     return FACTOR * ((x[1:] - x[0]).abs().amax(0) + UNIT * x[0].abs())
 
@@ -162,7 +162,7 @@ def _splats(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -
 
 
 def _order_swaps(s: _Splats, weight: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """What a swap of depths by rounding changes: ``[P, C]`` how much, ``[P]`` whether any."""
+    """Return the change by depths that rounding swaps, ``[P, C]``, and a mask ``[P]`` of any."""
     depth, band = s.depth[0].detach(), _band(s.depth)
     behind = depth[None] - depth[:, None]
     swaps = (behind > 0) & (behind <= band[None] + band[:, None])

@@ -39,7 +39,7 @@ def test_the_counts_are_of_these_kernels(document, case):
 
 
 def test_known_counts(kernels):
-    """What the sources say of exponentials, products and bytes."""
+    """Exponentials, products and bytes are those that the sources state."""
     forward, back = (
         kernels[k, "bfloat16", "(b, "]["each"] for k in ("scan_forward", "scan_backward")
     )

@@ -1,4 +1,4 @@
-"""What the CUDA kernels take of a GPU: every kernel found, read from its binary, and in bounds."""
+"""Resources of the CUDA kernels: every kernel is found, read from its binary, and in bounds."""
 
 import ast
 import json
@@ -68,7 +68,7 @@ BOUNDS = {
 
 @pytest.fixture(scope="module")
 def listed():
-    """What needs the list of kernels is left out where torch asks the driver for a GPU."""
+    """Skip tests of the list of kernels where torch asks the driver for a GPU."""
     if not can_dry_run():
         pytest.skip(f"torch {torch.__version__} needs a GPU to list kernels")
 
@@ -208,7 +208,7 @@ def test_local_memory_is_seen():
 
 
 def test_a_disassembler_counts_the_same(entries):
-    """Where there is one: NVIDIA's own, or the one that Triton carries."""
+    """Uses a disassembler if present: NVIDIA's own, or the one that Triton carries."""
     tool = shutil.which("nvdisasm")
     if tool is None:
         triton = pytest.importorskip("triton", reason="no nvdisasm")

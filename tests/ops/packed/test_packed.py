@@ -127,7 +127,7 @@ def test_borders_that_nobody_looks_at_are_bounded(from_ptx):
 @pytest.mark.parametrize("threads", [2, 5])
 @pytest.mark.parametrize("channels, states", [(5, 4), (64, 16)])
 def test_scan_in_segments(channels, states, threads):
-    """Where a sequence alone is cut for the threads, it is cut in the same places here."""
+    """A packed sequence is cut for the threads in the same places as one alone."""
     lengths = [700, 3, 0, 300, 512, 256, 1, 1030]
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -1,4 +1,4 @@
-"""What the rasterizer's tests share: fixtures of others, and its CUDA path, executed from PTX."""
+"""Fixtures of the rasterizer's tests: those of others, and its CUDA path, executed from PTX."""
 
 import pytest
 from helpers.raster_accuracy import cuts

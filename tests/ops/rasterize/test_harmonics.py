@@ -231,7 +231,7 @@ def test_the_clamp_at_zero(device):
 
 
 def test_a_gradient_of_nan(device):
-    """It stays with its Gaussian, and a clamped channel does not see it."""
+    """NaN stays with its Gaussian, and a clamped channel does not see it."""
     inputs = make(1, 2, num=20)
     colors = colors_seen_from(3, *inputs.values())
     shown = (colors[0, 0] > 0).all(-1).nonzero()[0].item()
@@ -271,7 +271,7 @@ def test_any_number_of_threads(per_view):
 
 
 def test_strides_and_dtypes():
-    """What is not contiguous is; float64 and half precision take the formula, in their dtype."""
+    """Strided inputs become dense; float64 and half precision take the formula, in their dtype."""
     inputs = make(1, 2)
     want = colors_seen_from(3, *inputs.values())
     turned = {k: x.transpose(-1, -2).contiguous().transpose(-1, -2) for k, x in inputs.items()}

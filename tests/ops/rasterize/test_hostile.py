@@ -234,7 +234,7 @@ def test_camera_not_finite(name, entry, value):
 
 
 def test_background_not_finite():
-    """It is drawn as given, in its view and channel alone."""
+    """The background is drawn as given, in its view and channel alone."""
     scene = base()
     clean = rasterization(**scene)
     scene["backgrounds"][0, 1, 2] = math.nan

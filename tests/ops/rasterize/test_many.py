@@ -84,7 +84,7 @@ def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):
 
 
 def test_pairs_are_numbered_by_gaussian(monkeypatch):
-    """What the sums of rows rely on: the rows of a Gaussian are adjacent, from its offset on."""
+    """The rows of a Gaussian are adjacent, from its offset on; the sums of rows rely on that."""
     monkeypatch.setattr(bin_cpu, "MANY", 0)
     bins = rasterization(**make(2, 2, 150, 50, 70))[2].bins
     total = len(bins.pairs)

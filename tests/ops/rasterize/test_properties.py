@@ -1,4 +1,4 @@
-"""What the rasterizer promises beyond the oracle: known answers, culling, repeatability, errors."""
+"""Promises of the rasterizer beyond the oracle: known answers, culling, repeatability, errors."""
 
 import math
 

@@ -25,7 +25,7 @@ def crowded(channels=3, num=90):
 
 
 def the_room():
-    """What is remembered of the one shape that was rendered."""
+    """Return the capacity of the one shape that was rendered."""
     (room,) = capacity._ledgers[CPU].rooms.values()
     return room
 

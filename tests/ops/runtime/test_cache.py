@@ -49,7 +49,7 @@ print("done")
 
 
 def python(program: str, **environment: str) -> subprocess.CompletedProcess:
-    """What a new process does."""
+    """Run code in a new process."""
     return subprocess.run(
         [sys.executable, "-c", program],
         env=os.environ | environment,

@@ -1,4 +1,4 @@
-"""What users of mamba-ssm have reported of its scan does not happen here: a test for each report.
+"""Public reports of mamba-ssm's scan: a test for each shows that it does not happen here.
 
 Numbers are those of issues and pull requests of the repository state-spaces/mamba.
 """

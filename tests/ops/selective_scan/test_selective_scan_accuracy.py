@@ -114,7 +114,7 @@ def test_at_the_papers_length(kind):
 
 @pytest.mark.parametrize("kind, threads", [("random", 2), ("slow", 1), ("slow", 2)])
 def test_at_65536_tokens(kind, threads):
-    """Where a state forgets nothing, its error may not grow with the number of tokens."""
+    """The error of a state that forgets nothing does not grow with the number of tokens."""
     check(kind, 65536, threads)
 
 

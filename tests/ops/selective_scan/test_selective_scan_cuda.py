@@ -137,7 +137,7 @@ def test_tunings_differ_by_rounding_only(tuned):
 
 @pytest.mark.parametrize("name", ["C", "z", "A", "D", "initial_state"])
 def test_one_gradient_alone(name):
-    """What is not asked for is left out of the kernel, and changes nothing."""
+    """Gradients that are not asked for are left out of the kernel, and change nothing."""
     inputs = make(1, 70, 20, 3)
     v_out, v_last = cotangents(inputs)
     alone = run(inputs, "mamba", v_out, v_last, needs=[name])
