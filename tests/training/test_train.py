@@ -71,7 +71,7 @@ def test_the_bar_is_of_the_minutes_and_a_log_has_none(data, tmp_path, monkeypatc
     assert "\r" not in drawn(io.StringIO(), tmp_path / "log", steps=2)
     assert "2/2" in drawn(Terminal(), tmp_path / "steps", steps=2)
     shown = drawn(Terminal(), tmp_path / "minutes", steps=None, minutes=0.02)
-    assert "of 0.02 min, step=1, loss=" in shown and re.search(r" (9\d|100)%\|", shown), shown
+    assert "of 0.02 min, step=1, loss=" in shown and re.search(r"\b(9\d|100)%\|", shown), shown
 
 
 def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
