@@ -14,6 +14,7 @@ from .command import OccupancyRule
 from .shape import Mesh, directed_edges
 
 VOTERS = 26  # rays per point
+RAYS = 1 << 12  # of one call, while the points are fewer
 
 
 @dataclass
@@ -65,10 +66,10 @@ def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
     inside = enclosed(mesh, grid)
     if mesh.is_closed():
         return inside
-    parts = [part for part in connected_parts(mesh) if not part.is_closed()]
-    inside |= majority(mesh, grid)
+    parts = open_parts(mesh)
+    points = grid.points()
+    _add_majority(inside, mesh, points)
     if len(parts) > 1 or len(parts[0].faces) < len(mesh.faces):
-        points = grid.points()
         # More than half of the rays can cross a part only within its box.
         for part in parts:
             low, high = part.vertices.min(0), part.vertices.max(0)
@@ -76,19 +77,23 @@ def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
             last = np.floor((high - grid.origin) / grid.step).astype(int) + 1
             if (last > first).all() and not _is_flat(part):
                 box = tuple(slice(i, j) for i, j in zip(first, last))
-                inside[box] |= _majority_at(part, points[box])
+                _add_majority(inside[box], part, points[box])
     return inside
 
 
 def joint(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
     inside = enclosed(mesh, grid)
-    return inside if mesh.is_closed() else inside | majority(mesh, grid)
+    if not mesh.is_closed():
+        _add_majority(inside, mesh, grid.points())
+    return inside
 
 
 def majority(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Occupancy ``[X, Y, Z]`` bool. See ``RULES``."""
-    return _majority_at(mesh, grid.points())
+    inside = np.zeros(grid.shape, bool)
+    _add_majority(inside, mesh, grid.points())
+    return inside
 
 
 def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
@@ -140,22 +145,27 @@ def _rays(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.broadcast_to(direction.astype(np.float32), points.shape)], -1)
 
 
-def _crossings(scene, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    return scene.count_intersections(_rays(points, direction)).numpy()
+def _add_majority(inside: np.ndarray, mesh: Mesh, points: np.ndarray) -> None:
+    """Set ``inside [..]`` at the points ``[.., 3]`` for which more than half of the rays vote.
 
-
-def _majority_at(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Cast rays from points ``[.., 3]``, each until its majority is decided."""
-    scene, origins, rays = mesh.scene(), points.reshape(-1, 3), directions()
+    Points inside already, and points whose majority is decided, cast no rays.
+    """
+    at = np.flatnonzero(~inside)
+    origins, rays = points.reshape(-1, 3)[at], directions()
     # If a plane separates a point from the mesh, one ray of each opposite pair misses.
-    reach, at = mesh.vertices @ rays.T, origins @ rays.astype(np.float32).T
-    undecided = np.flatnonzero((at <= reach.max(0) + 1e-5).all(1))
-    votes = np.zeros(len(origins), np.int32)
-    for left, direction in zip(range(VOTERS - 1, -1, -1), rays):
-        votes[undecided] += _crossings(scene, origins[undecided], direction) % 2
-        found = votes[undecided]
-        undecided = undecided[(2 * found <= VOTERS) & (2 * (found + left) > VOTERS)]
-    return (2 * votes > VOTERS).reshape(points.shape[:-1])
+    reach, rays = (mesh.vertices @ rays.T).max(0), rays.astype(np.float32)
+    left = (origins @ rays.T <= reach + 1e-5).all(1)
+    at, origins = at[left], origins[left]
+    scene = mesh.scene() if len(at) else None
+    votes, cast = np.zeros(len(at), np.int64), 0
+    while cast < VOTERS and len(at):
+        now = rays[cast : cast + max(1, RAYS // len(at))]
+        both = np.concatenate(np.broadcast_arrays(origins[None], now[:, None]), -1)
+        votes += (scene.count_intersections(both).numpy() % 2).sum(0)
+        cast += len(now)
+        inside.flat[at[2 * votes > VOTERS]] = True
+        left = (2 * votes <= VOTERS) & (2 * (votes + VOTERS - cast) > VOTERS)
+        at, origins, votes = at[left], origins[left], votes[left]
 
 
 def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
@@ -225,21 +235,25 @@ def directions() -> np.ndarray:
     return np.concatenate([half, -half])
 
 
-def connected_parts(mesh: Mesh) -> list[Mesh]:
-    """Split a mesh into parts that share no edge, after merging equal vertices."""
+def open_parts(mesh: Mesh) -> list[Mesh]:
+    """Return the open ones of the parts that share no edge, after merging equal vertices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     vertices, index = merged(mesh.vertices)
     faces = index[mesh.faces]
     edges = np.sort(directed_edges(faces), axis=1)
-    edge = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)[1].reshape(-1)
-    face, size = np.repeat(np.arange(len(faces)), 3), len(faces) + edge.max() + 1
+    edge, count = np.unique(
+        edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True, return_counts=True
+    )[1:]
+    face, size = np.repeat(np.arange(len(faces)), 3), len(faces) + len(count)
     links = coo_array((np.ones(len(face), bool), (face, len(faces) + edge)), shape=(size, size))
     label = connected_components(links, directed=False)[1][: len(faces)]
-    order = np.argsort(label, kind="stable")
+    odd = (count[edge] % 2 == 1) & (edges[:, 0] != edges[:, 1])  # as in Mesh.is_closed
+    kept = np.flatnonzero(np.isin(label, label[face[odd]]))
+    kept = kept[np.argsort(label[kept], kind="stable")]
     parts = []
-    for ids in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+    for ids in np.split(kept, np.flatnonzero(np.diff(label[kept])) + 1):
         used, corners = np.unique(faces[ids], return_inverse=True)
         parts.append(Mesh(vertices[used], corners.reshape(-1, 3)))
     return parts

@@ -16,11 +16,11 @@ from gamba_warp.eval.shapes.metrics import compare, shape_iou, volume_iou
 from gamba_warp.eval.shapes.occupancy import (
     RULES,
     VOTERS,
-    connected_parts,
     directions,
     enclosed,
     grid_around,
     majority,
+    open_parts,
     solid,
     syncdreamer_grid,
 )
@@ -129,11 +129,13 @@ def test_open_sheets_hold_nothing(monkeypatch):
     sheets = [corners, corners + [0.9, 0, 0]]
     both = Mesh(np.concatenate(sheets) @ turn.T, np.concatenate([square, square + 4]))
     grid = grid_around(both, resolution=24)
-    voters, real = [], occupancy._majority_at
+    voters, real = [], occupancy._add_majority
     monkeypatch.setattr(
-        occupancy, "_majority_at", lambda mesh, points: voters.append(mesh) or real(mesh, points)
+        occupancy,
+        "_add_majority",
+        lambda inside, mesh, points: voters.append(mesh) or real(inside, mesh, points),
     )
-    assert len(connected_parts(both)) == 2 and not solid(both, grid).any()
+    assert len(open_parts(both)) == 2 and not solid(both, grid).any()
     assert voters == [both], "a flat part alone takes no rays"
     small = cube(side=0.25)
     beside = Mesh(
