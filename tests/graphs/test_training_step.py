@@ -20,7 +20,7 @@ def on_paper(monkeypatch):
     """Fake tensors on a missing GPU, where the rasterizer's capacity is known."""
     if not dry_run.can_dry_run():
         pytest.skip(f"torch {torch.__version__} needs a GPU for it")
-    room = capacity.Room(0, 1 << 20)
+    room = capacity.Capacity(0, 1 << 20)
     monkeypatch.setattr(capacity, "find", lambda key, device: room)
     with dry_run.dry_run() as launches:
         yield launches

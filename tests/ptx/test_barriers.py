@@ -24,16 +24,16 @@ def scan(states):
 
 def picture(listed):
     """Both directions; lists have room for what there is, or none at all."""
-    capacity._ledgers.clear()
+    capacity._counts.clear()
     mine = rasters.leaves(rasters.crowded(), torch.float32)
     if not listed:
         rasterization(**mine)
-        for ledger in capacity._ledgers.values():
-            for room in ledger.rooms.values():
-                ledger.told.numpy()[room.place] = room.capacity = 0
+        for counts in capacity._counts.values():
+            for room in counts.shapes.values():
+                counts.on_host.numpy()[room.slot] = room.pairs = 0
     renders, alphas, _ = rasterization(**mine)
     (renders.square().sum() + alphas.sum()).backward()
-    capacity._ledgers.clear()
+    capacity._counts.clear()
 
 
 CASES = {

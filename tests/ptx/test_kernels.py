@@ -39,12 +39,12 @@ def check(function, multiprocessors=132):
     traces = []
     for seed in (0, 1):
         torch.manual_seed(0)
-        capacity._ledgers.clear()
+        capacity._counts.clear()
         with interpreted(multiprocessors, seed=seed) as machine:
             function()
         assert not machine.findings, "\n".join(machine.findings)
         traces.append(machine.trace)
-    capacity._ledgers.clear()
+    capacity._counts.clear()
     assert traces[0] and traces[0] == traces[1], "the order of execution changes bits"
 
 
@@ -137,9 +137,9 @@ def test_without_room(needs):
             wanted = [tensors[name] for name in needs]
             grads = torch.autograd.grad((renders, alphas)[: len(v)], wanted, v)
             results.append([renders, alphas, *grads, depth_quantile(meta)])
-            (room,) = capacity._ledgers[torch.device("cpu")].rooms.values()
-            capacity._ledgers[torch.device("cpu")].told.numpy()[room.place] = 0
-            room.capacity = 0
+            (room,) = capacity._counts[torch.device("cpu")].shapes.values()
+            capacity._counts[torch.device("cpu")].on_host.numpy()[room.slot] = 0
+            room.pairs = 0
         assert meta.bins.count > meta.bins.pairs.numel()
         assert all(map(torch.equal, *results)), "with room and without"
 

@@ -1,8 +1,8 @@
 """Tile lists on CUDA: a sort by depth, then counting, writing, and a stable sort by tile.
 
-The lists have room for more pairs than there are, so that nothing waits for the count; what is left
-over sorts behind the last tile. Where the pairs have no room, none is written and all lists are
-empty: then ``composite_unlisted`` makes the pictures.
+The lists have a capacity above the number of pairs, so that nothing waits for the count; unused
+entries sort behind the last tile. If the capacity is too small, no pair is written and all lists
+are empty: then ``composite_unlisted`` makes the pictures.
 """
 
 import functools
@@ -140,7 +140,7 @@ def _tile_kernels(number: Any):
 def bin_views(
     grid: Grid, tensors: Sequence[Tensor], check: Callable[[int], None], exact: bool = False
 ) -> Bins:
-    """As ``bin_views`` of the CPU, but the lists may have room for more pairs than there are.
+    """As ``bin_views`` of the CPU, but the lists may have a capacity above the number of pairs.
 
     Args:
         grid: from ``make_grid``.
@@ -162,34 +162,34 @@ def bin_views(
     offsets = counts.cumsum(0, dtype=torch.int32)
     totals = totals.sum(1)
     count = totals[:1]
-    room = _room(grid, depths, count, check, exact)
+    size = _list_capacity(grid, depths, count, check, exact)
     tiles = images * grid.tiles_x * grid.tiles_y
     # a sort of 16 bits takes half as long as one of 32
     short = tiles < 1 << 16
     first, dtype = (-(1 << 15), torch.int16) if short else (0, torch.int32)
     emit, in_tile_order = _tile_kernels(wp.int16 if short else wp.int32)
-    tile_of, gaussians = order.new_empty(room, dtype=dtype), order.new_empty(room)
+    tile_of, gaussians = order.new_empty(size, dtype=dtype), order.new_empty(size)
     # free places have the number behind the last tile's, so that they come last
     inputs = [grid, splats, order, offsets, count, first, first + tiles]
-    launch(emit, max(num, room) if room else 0, inputs, [tile_of, gaussians], device)
+    launch(emit, max(num, size) if size else 0, inputs, [tile_of, gaussians], device)
     sorted_tiles, emitted = torch.sort(tile_of, stable=True)
-    pairs, rows, starts = order.new_empty(room), order.new_empty(room), order.new_empty(tiles + 1)
+    pairs, rows, starts = order.new_empty(size), order.new_empty(size), order.new_empty(tiles + 1)
     inputs = [sorted_tiles, emitted, gaussians, count, first]
-    launch(in_tile_order, max(room, tiles + 1), inputs, [pairs, rows, starts], device)
+    launch(in_tile_order, max(size, tiles + 1), inputs, [pairs, rows, starts], device)
     return Bins(order, offsets, pairs, rows, starts, box_pairs=totals[1].clone(), count=totals[0])
 
 
-def _room(
+def _list_capacity(
     grid: Grid, depths: Tensor, count: Tensor, check: Callable[[int], None], exact: bool
 ) -> int:
-    """The room of the lists; without a wait, unless they are ``exact`` or nothing is known yet."""
+    """Return the lists' capacity; waits for the device if ``exact`` or if the shape is new."""
     device, (images, num) = depths.device, depths.shape
-    # calls with about as many Gaussians share their room: some models give another number each time
-    shape = images, capacity.in_steps(num), grid.width, grid.height, grid.shift
+    # similar numbers of Gaussians share a capacity: some models change theirs in each call
+    shape = images, capacity.rounded_up(num), grid.width, grid.height, grid.shift
     key = (*shape, grid.skip & TILE_TEST)
-    room = None if exact else capacity.find(key, device)
+    known = None if exact else capacity.find(key, device)
     capturing = capacity.is_capturing(device)
-    if room is None:
+    if known is None:
         if capturing:
             raise RuntimeError(
                 "a CUDA graph cannot begin with shapes that were never rendered: run the same "
@@ -199,9 +199,9 @@ def _room(
         check(total)
         if exact:
             return total
-        room = capacity.remember(key, device, total)
-    size = max(room.capacity, depths.numel())
+        known = capacity.add_shape(key, device, total)
+    pairs = max(known.pairs, depths.numel())
     if capturing:
-        capacity.captured(room, size)
-    capacity.tell(room, count)
-    return size
+        capacity.add_graph(known, pairs)
+    capacity.add_count(known, count)
+    return pairs

@@ -1,9 +1,9 @@
-"""Room for the pairs of a call's lists on CUDA, remembered: so no call waits for their count.
+"""Capacity of the lists on CUDA, remembered by shape so that no call waits for its number of pairs.
 
-The first call of a shape reads its number of pairs back. From then on a call takes the room that
-the calls before it needed, and the device tells its own count later, into memory that the host
-reads without waiting. A count that has no room is no error: see ``composite_unlisted``. Pictures
-and gradients have the same bits whatever the room, so it does not matter when a count arrives.
+The first call of a shape reads its number of pairs back. Later calls allocate the capacity that
+earlier ones needed; the device copies their counts into pinned memory, which the host reads without
+waiting. A count over the capacity is no error: see ``composite_unlisted``. Pictures and gradients
+have the same bits for any capacity, so it does not matter when a count arrives.
 """
 
 from __future__ import annotations
@@ -22,136 +22,136 @@ from ...runtime.stand_in import is_dry
 
 wp.set_module_options({"enable_backward": False})
 
-_PLACES = 4096  # shapes that are remembered; then the oldest are forgotten
-_MOST = 2**31 - 1  # pairs are numbered in int32
+_SLOTS = 4096  # shapes remembered; beyond these, the oldest are dropped
+_MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 
 
 @dataclass
-class Room:
+class Capacity:
     """Capacity remembered for a shape.
 
     Attributes:
-        place: its place in the ledger.
-        capacity: pairs that the next call has room for.
-        captured: the least capacity that a CUDA graph holds; None: no graph was captured.
+        slot: index of its count in ``_Counts``.
+        pairs: number of pairs that the next call allocates.
+        in_graph: the least number that a CUDA graph allocates; None without one.
     """
 
-    place: int
-    capacity: int
-    captured: int | None = None
+    slot: int
+    pairs: int
+    in_graph: int | None = None
 
 
-class _Ledger:
-    """The counts of a device by shape, there and as they were told.
+class _Counts:
+    """The counts of a device, one per shape.
 
     Attributes:
-        highs: ``[places]`` int64 on the device, the largest count of late.
-        told: a copy on the host, made by the device when it gets there.
-        rooms: what is remembered, the oldest first.
+        on_device: ``[slots]`` int64, the largest recent count.
+        on_host: its copy, written by the device asynchronously.
+        shapes: the capacity of each shape, the oldest first.
     """
 
     def __init__(self, device: torch.device):
         pinned = device.type == "cuda" and not is_dry()
-        self.highs = torch.zeros(_PLACES, dtype=torch.int64, device=device)
-        self.told = torch.zeros(_PLACES, dtype=torch.int64, pin_memory=pinned)
-        self.rooms: dict[Hashable, Room] = {}
+        self.on_device = torch.zeros(_SLOTS, dtype=torch.int64, device=device)
+        self.on_host = torch.zeros(_SLOTS, dtype=torch.int64, pin_memory=pinned)
+        self.shapes: dict[Hashable, Capacity] = {}
 
-    def read(self, place: int) -> int:
-        """The count last told; numpy reads memory, where torch might wait for the device."""
-        return int(self.told.numpy()[place])
+    def latest(self, slot: int) -> int:
+        """Return the last count copied; numpy reads memory, torch might wait for the device."""
+        return int(self.on_host.numpy()[slot])
 
 
-_ledgers: dict[torch.device, _Ledger] = {}
+_counts: dict[torch.device, _Counts] = {}
 _lock = threading.Lock()
 
 
 @wp.kernel
 @no_type_check
 def _note(
-    offset: wp.int32, place: wp.int32, count_in: wp.array[wp.int64], highs_out: wp.array[wp.int64]
+    offset: wp.int32, slot: wp.int32, count_in: wp.array[wp.int64], highs_out: wp.array[wp.int64]
 ):
-    # a count that was large once is forgotten slowly: it has halved after 45 calls
-    high = highs_out[place]
-    highs_out[place] = wp.max(high - high / wp.int64(64), count_in[0])
+    # a large count decays slowly: it halves in 45 calls
+    high = highs_out[slot]
+    highs_out[slot] = wp.max(high - high / wp.int64(64), count_in[0])
 
 
-def in_steps(number: int) -> int:
-    """The next number, up to an eighth larger, of which there are few: eight of each length."""
+def rounded_up(number: int) -> int:
+    """Return the next number with four significant bits, at most an eighth larger."""
     step = 1 << max(0, number.bit_length() - 4)
     return -(-number // step) * step
 
 
-def wanted(count: int) -> int:
-    """Room for half as many pairs again."""
-    return min(_MOST, in_steps(count + count // 2))
+def with_reserve(count: int) -> int:
+    """Return the capacity for a count: half as many pairs again, rounded up."""
+    return min(_MAX_PAIRS, rounded_up(count + count // 2))
 
 
 def is_capturing(device: torch.device) -> bool:
-    """True if torch's current stream is being captured into a CUDA graph."""
+    """Return True if torch's current stream is being captured into a CUDA graph."""
     return device.type == "cuda" and not is_dry() and torch.cuda.is_current_stream_capturing()
 
 
-def find(key: Hashable, device: torch.device) -> Room | None:
-    """The room of a shape, changed if the counts told since then ask for it; None if unknown."""
-    ledger = _ledgers.get(device)
-    room = ledger.rooms.get(key) if ledger is not None else None
-    if ledger is None or room is None:
+def find(key: Hashable, device: torch.device) -> Capacity | None:
+    """Return the capacity of a shape, adapted to recent counts; None for an unknown shape."""
+    counts = _counts.get(device)
+    capacity = counts.shapes.get(key) if counts is not None else None
+    if counts is None or capacity is None:
         return None
-    count = ledger.read(room.place)
-    if count > _MOST:  # no list can hold them, so those that there are do
-        return room
-    fitting = wanted(count)
-    if room.capacity < fitting and 4 * room.capacity < 5 * count or room.capacity > 4 * fitting:
-        room.capacity = fitting
-    return room
+    count = counts.latest(capacity.slot)
+    if count > _MAX_PAIRS:  # no list can hold them, so the present capacity stays
+        return capacity
+    fitting = with_reserve(count)
+    if capacity.pairs < fitting and 4 * capacity.pairs < 5 * count or capacity.pairs > 4 * fitting:
+        capacity.pairs = fitting
+    return capacity
 
 
-def captured(room: Room, capacity: int) -> None:
-    """Notes the room that a CUDA graph holds."""
-    room.captured = capacity if room.captured is None else min(capacity, room.captured)
+def add_graph(capacity: Capacity, pairs: int) -> None:
+    """Record the number of pairs that a CUDA graph allocates."""
+    capacity.in_graph = pairs if capacity.in_graph is None else min(pairs, capacity.in_graph)
 
 
-def remember(key: Hashable, device: torch.device, count: int) -> Room:
-    """Makes room for a shape whose count was read back."""
+def add_shape(key: Hashable, device: torch.device, count: int) -> Capacity:
+    """Add a shape whose count was read back."""
     if is_dry():  # a dry run has no memory and leaves nothing behind
-        return Room(0, wanted(count))
+        return Capacity(0, with_reserve(count))
     with _lock:
-        if device not in _ledgers:
-            _ledgers[device] = _Ledger(device)
-        ledger = _ledgers[device]
-        if len(ledger.rooms) < _PLACES:
-            place = len(ledger.rooms)
+        if device not in _counts:
+            _counts[device] = _Counts(device)
+        counts = _counts[device]
+        if len(counts.shapes) < _SLOTS:
+            slot = len(counts.shapes)
         else:
-            place = ledger.rooms.pop(next(iter(ledger.rooms))).place
-        ledger.highs[place].fill_(count)
-        ledger.told.numpy()[place] = count
+            slot = counts.shapes.pop(next(iter(counts.shapes))).slot
+        counts.on_device[slot].fill_(count)
+        counts.on_host.numpy()[slot] = count
         if device.type == "cuda":  # the next call may be on another stream
             torch.cuda.current_stream(device).synchronize()
-        room = ledger.rooms[key] = Room(place, wanted(count))
-    return room
+        capacity = counts.shapes[key] = Capacity(slot, with_reserve(count))
+    return capacity
 
 
-def tell(room: Room, count: Tensor) -> None:
-    """Has the device note a count, ``[1]`` int64, and copy it to the host when it gets there."""
+def add_count(capacity: Capacity, count: Tensor) -> None:
+    """Add a count, ``[1]`` int64, on the device and copy the result to the host asynchronously."""
     dry = is_dry()
-    ledger = _Ledger(count.device) if dry else _ledgers[count.device]
-    launch(_note, 1, [room.place, count], [ledger.highs], count.device)
+    counts = _Counts(count.device) if dry else _counts[count.device]
+    launch(_note, 1, [capacity.slot, count], [counts.on_device], count.device)
     if not dry:
-        part = slice(room.place, room.place + 1)
-        ledger.told[part].copy_(ledger.highs[part], non_blocking=True)
+        part = slice(capacity.slot, capacity.slot + 1)
+        counts.on_host[part].copy_(counts.on_device[part], non_blocking=True)
 
 
 def lists_outgrown() -> bool:
-    """True if a CUDA graph was captured with room for fewer pairs than it had recently.
+    """Return True if a captured CUDA graph has a capacity below its recent counts.
 
-    Its pictures and gradients are right all the same, but slow. A capture after this, of the same
-    shapes, has room; it does not wait for the device, which may be some replays ahead or behind.
+    Its pictures and gradients are still right, but slow. A new capture of the same shapes has the
+    capacity. This does not wait for the device, whose counts may be some replays older or newer.
     """
-    rooms = [(ledger, room) for ledger in _ledgers.values() for room in ledger.rooms.values()]
-    return any(r.captured is not None and ledger.read(r.place) > r.captured for ledger, r in rooms)
+    shapes = [(counts, shape) for counts in _counts.values() for shape in counts.shapes.values()]
+    return any(s.in_graph is not None and c.latest(s.slot) > s.in_graph for c, s in shapes)
 
 
-def forget() -> None:
-    """Forgets all shapes, as a test needs it; CUDA graphs go on writing where they did."""
-    for ledger in _ledgers.values():
-        ledger.rooms.clear()
+def clear() -> None:
+    """Drop all shapes, for tests; CUDA graphs keep writing to their slots."""
+    for counts in _counts.values():
+        counts.shapes.clear()

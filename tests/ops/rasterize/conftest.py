@@ -17,6 +17,6 @@ def on_cuda(monkeypatch, from_ptx):
         monkeypatch.setattr(composite_cuda, "parts_of_tile", lambda tiles, device: parts)
         from_ptx()
 
-    capacity.forget()
+    capacity.clear()
     yield switch
-    capacity.forget()
+    capacity.clear()

@@ -26,15 +26,15 @@ def crowded(channels=3, num=90):
 
 def the_room():
     """Return the capacity of the one shape that was rendered."""
-    (room,) = capacity._ledgers[CPU].rooms.values()
+    (room,) = capacity._counts[CPU].shapes.values()
     return room
 
 
 def without_room():
     """Leaves the next call the least room that a call may have."""
     room = the_room()
-    capacity._ledgers[CPU].told.numpy()[room.place] = 0
-    room.capacity = 0
+    capacity._counts[CPU].on_host.numpy()[room.slot] = 0
+    room.pairs = 0
 
 
 def render(scene, mode="RGB", **options):
@@ -97,7 +97,7 @@ def test_room_grows_with_what_was_told(on_cuda):
     scene = crowded()
     on_cuda()
     render(scene)
-    first = the_room().capacity
+    first = the_room().pairs
     scene["scales"] = scene["scales"] * 4
     listed = []
     for _ in range(3):
@@ -105,27 +105,27 @@ def test_room_grows_with_what_was_told(on_cuda):
         listed.append(int(meta.bins.count) <= meta.bins.pairs.numel())
         pairs = int(meta.bins.count)
     assert listed == [False, True, True]
-    assert first < pairs < the_room().capacity <= 1.75 * pairs
+    assert first < pairs < the_room().pairs <= 1.75 * pairs
 
 
 def test_room_shrinks_slowly():
-    capacity.forget()
-    room = capacity.remember("shape", CPU, 100_000)
-    assert 150_000 <= room.capacity <= 165_000
+    capacity.clear()
+    room = capacity.add_shape("shape", CPU, 100_000)
+    assert 150_000 <= room.pairs <= 165_000
     sizes = []
     for _ in range(400):
-        capacity.tell(room, torch.tensor([1000]))
-        sizes.append(capacity.find("shape", CPU).capacity)
+        capacity.add_count(room, torch.tensor([1000]))
+        sizes.append(capacity.find("shape", CPU).pairs)
     assert sizes[44] == sizes[0] and sizes == sorted(sizes, reverse=True)
     assert 1500 <= sizes[-1] < 10_000
-    capacity.tell(room, torch.tensor([2_000_000_000]))
-    assert capacity.find("shape", CPU).capacity == 2**31 - 1
-    capacity.tell(room, torch.tensor([1000]))
-    room.capacity = sizes[-1]
-    capacity.tell(room, torch.tensor([3_000_000_000]))  # no list holds so many
-    assert capacity.find("shape", CPU).capacity == sizes[-1]
+    capacity.add_count(room, torch.tensor([2_000_000_000]))
+    assert capacity.find("shape", CPU).pairs == 2**31 - 1
+    capacity.add_count(room, torch.tensor([1000]))
+    room.pairs = sizes[-1]
+    capacity.add_count(room, torch.tensor([3_000_000_000]))  # no list holds so many
+    assert capacity.find("shape", CPU).pairs == sizes[-1]
     assert capacity.find("another shape", CPU) is None
-    capacity.forget()
+    capacity.clear()
 
 
 def test_about_as_many_gaussians_share_their_room(on_cuda):
@@ -140,9 +140,9 @@ def test_about_as_many_gaussians_share_their_room(on_cuda):
 
 
 def test_old_shapes_are_forgotten(monkeypatch):
-    monkeypatch.setattr(capacity, "_PLACES", 3)
-    monkeypatch.setattr(capacity, "_ledgers", {})
-    places = [capacity.remember(i, CPU, 10).place for i in range(5)]
+    monkeypatch.setattr(capacity, "_SLOTS", 3)
+    monkeypatch.setattr(capacity, "_counts", {})
+    places = [capacity.add_shape(i, CPU, 10).slot for i in range(5)]
     assert places == [0, 1, 2, 0, 1]
     assert [capacity.find(i, CPU) is None for i in range(5)] == [True, True, False, False, False]
 
@@ -167,7 +167,7 @@ def test_a_first_scene_may_be_empty(on_cuda):
     scene = crowded()
     on_cuda()
     want, _ = render(scene)
-    capacity.forget()
+    capacity.clear()
     rasterization(**scene | {"means": scene["means"] + 1000.0})
     got, meta = render(scene)
     assert meta.bins.pairs.numel() == 180 < int(meta.bins.count)
@@ -218,5 +218,5 @@ def test_a_graph_is_told_to_be_too_small(on_cuda, monkeypatch):
         rasterization(**scene)
     assert not lists_outgrown()
     room = the_room()
-    capacity.tell(room, torch.tensor([room.captured + 1]))
+    capacity.add_count(room, torch.tensor([room.in_graph + 1]))
     assert lists_outgrown()
