@@ -156,7 +156,9 @@ def _add_majority(inside: np.ndarray, mesh: Mesh, points: np.ndarray) -> None:
     reach, rays = (mesh.vertices @ rays.T).max(0), rays.astype(np.float32)
     left = (origins @ rays.T <= reach + 1e-5).all(1)
     at, origins = at[left], origins[left]
-    scene = mesh.scene() if len(at) else None
+    if not len(at):
+        return
+    scene = mesh.scene()
     votes, cast = np.zeros(len(at), np.int64), 0
     while cast < VOTERS and len(at):
         now = rays[cast : cast + max(1, RAYS // len(at))]
