@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import is_dataclass
 from typing import Any, get_args, get_type_hints
 
-from .devices import keep_memory, quiet_warp, share_cores
+from .devices import keep_memory, quiet_warp, share_cores, use_fastest_products
 from .errors import FileWarning, UserError
 from .files import DISK_ERRORS
 from .versions import __version__, advice, missing
@@ -48,7 +48,7 @@ COMMANDS = {
 }
 # Interactive commands (``share_cores``); training and measurements keep torch's busy-waiting.
 SHARING = {"reconstruct", "export", "render", "app"}
-# Commands that allocate and free large tensors repeatedly (``keep_memory``).
+# Commands that run the network (``keep_memory``, ``use_fastest_products``).
 KEEPING = {"reconstruct", "app", "train", "ablate", "bench", "demo", "fit", "eval-views"}
 # Commands that launch kernels (``quiet_warp``).
 LAUNCHING = KEEPING | {"export", "render", "stress", "gpu-check", "doctor"}
@@ -106,6 +106,7 @@ def run(name: str, arguments: list[str]) -> int:
             share_cores()
         if name in KEEPING:
             keep_memory()
+            use_fastest_products()
         if name in LAUNCHING and not helps:
             quiet_warp()
         command = load_command(name)

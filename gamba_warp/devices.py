@@ -7,9 +7,8 @@ import functools
 import os
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from .conventions import DeviceChoice, Precision
@@ -112,8 +111,8 @@ def pick_precision(name: Precision, device: torch.device, width: int) -> torch.d
 
     Args:
         name: ``auto`` is bfloat16 if a product of the model's size is at least 1.2 times as fast
-            as in float32 (``network_products``), else float32. The trial takes about 0.1 s, once
-            per process; a processor without bfloat16 products is far below.
+            as in float32, else float32. The trial takes about 0.1 s, once per process; a processor
+            without bfloat16 products is far below.
         device: of the model.
         width: channels of the model's tokens.
 
@@ -140,35 +139,11 @@ def _bfloat16_speedup(name: str, width: int, threads: int) -> float:
     matrix = torch.randn(width, 4 * width, generator=g).to(device)
     pairs = [(full, matrix), (full.bfloat16(), matrix.bfloat16())]
     best = []
-    with torch.no_grad(), network_products(device):
+    with torch.no_grad():
         for a, b in pairs:
             timer = Timer("a @ b", globals={"a": a, "b": b}, num_threads=threads)
             best.append(min(timer.blocked_autorange(min_run_time=_TRIAL_SECONDS).times))
     return best[0] / best[1]
-
-
-class _MatmulUsers:
-    """Number of threads inside each of the two contexts below, and torch's setting before them.
-
-    The setting is process-wide.
-    """
-
-    lock = threading.Lock()
-    network = float32 = 0
-    before = "highest"
-
-
-def _update_precision(network: int = 0, float32: int = 0) -> None:
-    """Add to the counts of threads, and set the precision that the remaining ones need."""
-    import torch
-
-    with _MatmulUsers.lock:
-        if not (_MatmulUsers.network or _MatmulUsers.float32):
-            _MatmulUsers.before = torch.get_float32_matmul_precision()
-        _MatmulUsers.network += network
-        _MatmulUsers.float32 += float32
-        wanted = "medium" if _MatmulUsers.network else _MatmulUsers.before
-        torch.set_float32_matmul_precision("highest" if _MatmulUsers.float32 else wanted)
 
 
 @contextmanager
@@ -188,63 +163,54 @@ def float32_weights() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
-@contextmanager
-def network_products(device: torch.device, precision: torch.dtype | None = None) -> Iterator[None]:
-    """Compute a network's matrix products in ``precision``, by the fastest library.
-
-    float32 products depend on the processor:
+def use_fastest_products() -> None:
+    """Let torch compute float32 matrix products by the library that is fastest on this processor.
 
     - AMD with AVX-512 and without AMX: oneDNN. By default torch calls MKL, which does not use
       AVX-512 there and takes twice as long on a Zen 5. torch selects oneDNN by the setting
       "medium", which also permits factors rounded to bfloat16; without AMX oneDNN does not round
-      them. Once per process a product is compared with float64; if its error is larger than that
-      of float32, nothing is changed.
+      them. A product is compared with float64; if its error is larger than that of float32,
+      nothing is changed.
     - Other CPUs: unchanged. MKL is made for Intel's.
-    - GPUs: unchanged. They round the factors (TF32) if the process allows it.
+    - Machines with a GPU: unchanged, since the setting would round factors there (TF32).
 
-    bfloat16 products use torch's autocast, on every processor. Inside ``float32_products`` of any
-    thread, and inside torch.compile, the library is unchanged. A later backward pass is not
-    covered, unless ``backward`` is called inside too.
-
-    Args:
-        device: of the network.
-        precision: ``torch.bfloat16``, or ``torch.float32``, which disables an outer autocast
-            inside; None leaves an autocast as it is.
+    The setting is process-wide, so only commands call this; a program may do so too.
     """
     import torch
 
-    cast = nullcontext()
-    if precision is not None:
-        cast = torch.autocast(device.type, precision, enabled=precision != torch.float32)
-    with cast:
-        if device.type != "cpu" or torch.compiler.is_compiling() or not _onednn_is_better():
-            yield
-            return
-        _update_precision(network=1)
-        try:
-            yield
-        finally:
-            _update_precision(network=-1)
+    if not torch.cuda.is_available() and _onednn_is_better():
+        torch.set_float32_matmul_precision("medium")
+
+
+def network_precision(device: torch.device, precision: torch.dtype) -> torch.autocast:
+    """Return the context in which a network's products have ``precision``.
+
+    Args:
+        device: of the network.
+        precision: ``torch.bfloat16``, or ``torch.float32``, which disables an outer autocast.
+    """
+    import torch
+
+    return torch.autocast(device.type, precision, enabled=precision != torch.float32)
 
 
 @contextmanager
 def float32_products() -> Iterator[None]:
     """Compute float32 matrix products in full precision, by torch's default library.
 
-    - A GPU does not round their factors (no TF32), whatever the process allows.
-    - A CPU uses MKL, or the library torch was built with: ``network_products`` has no effect
-      inside. That serves comparisons; it is as exact.
-
-    A later backward pass is not covered.
+    A GPU does not round their factors (no TF32), whatever the process allows. The setting is
+    process-wide. A later backward pass is not covered.
     """
-    _update_precision(float32=1)
+    import torch
+
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
     try:
         yield
     finally:
-        _update_precision(float32=-1)
+        torch.set_float32_matmul_precision(before)
 
 
-@functools.cache
 def _onednn_is_better() -> bool:
     """True on AMD with AVX-512 and without AMX, if oneDNN's products are exact to float32."""
     import torch
@@ -256,12 +222,10 @@ def _onednn_is_better() -> bool:
         return False
     a, b = torch.randn(2, 128, 128, generator=torch.Generator().manual_seed(0))
     truth = a.double() @ b.double()
-    # An outer autocast would round this product, and the cached answer would be False.
-    with _MatmulUsers.lock, torch.autocast("cpu", enabled=False):
-        before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("medium")
-        try:
-            error = (a @ b).double() - truth
-        finally:
-            torch.set_float32_matmul_precision(before)
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        error = (a @ b).double() - truth
+    finally:
+        torch.set_float32_matmul_precision(before)
     return bool(error.norm() <= _FLOAT32_ERROR * truth.norm())

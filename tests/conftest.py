@@ -17,9 +17,14 @@ from helpers.browser import browser, browser_page  # noqa: E402, F401
 from ptx.launch import interpreted  # noqa: E402
 from ptx.machine import Missing  # noqa: E402
 
+from gamba_warp.devices import use_fastest_products  # noqa: E402
+
 # No test downloads a matting model, or uses one cached by rembg on this machine.
 os.environ["GAMBA_OFFLINE"] = "1"
 os.environ["U2NET_HOME"] = os.devnull
+
+# Commands set this for their process; so results do not depend on the order of the tests.
+use_fastest_products()
 
 # A script that runs pytest in the background makes every process of a test ignore Ctrl-C, too.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -70,9 +70,10 @@ def train(config: TrainConfig, world: World) -> int:
         checkpoint = world.on_main(claim)  # the others use its result
         _refuse_newer(world, run.out if run.resume == "auto" else None, checkpoint)
         torch.manual_seed(run.seed)
-        # TF32 on a GPU; no effect on a CPU. It applies to the network's products, forward and
-        # backward; geometry has none (cameras.exact_product), and SSIM's keep full precision.
-        torch.set_float32_matmul_precision("high")
+        # TF32 applies to the network's products, forward and backward; geometry has none
+        # (cameras.exact_product), and SSIM's keep full precision.
+        if world.device.type == "cuda":
+            torch.set_float32_matmul_precision("high")
         with world.together():
             model = Gamba(config.model_config(), run.encoder_weights)
             model.recompute = run.recompute

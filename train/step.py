@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from gamba_warp.conventions import WHITE, over_another, over_background
-from gamba_warp.devices import network_products
+from gamba_warp.devices import network_precision
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import all_figures, measure
 from gamba_warp.model.gamba import Gamba
@@ -75,7 +75,7 @@ def forward(model: Callable, batch: Batch, objective: Objective) -> StepResult:
         objective: loss weights and LPIPS.
     """
     weights, lpips, crop, precision = objective
-    with network_products(batch.inputs.device, precision):
+    with network_precision(batch.inputs.device, precision):
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
@@ -157,7 +157,7 @@ def compute_gradients(
         hold = contextlib.nullcontext()
         if number < count - 1 and isinstance(model, DistributedDataParallel):
             hold = model.no_sync()
-        with hold, network_products(batch.inputs.device):
+        with hold:
             result = forward(model, batch, objective)
             (result.loss / count).backward()
         losses.append(result.loss.detach())

@@ -9,7 +9,7 @@ import torch
 
 from gamba_warp.conventions import Detail, Precision
 from gamba_warp.data.dataset import ViewDataset
-from gamba_warp.devices import network_products, pick_precision
+from gamba_warp.devices import network_precision, pick_precision
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256, sha256_of_all, visible
 from gamba_warp.formats.ply import load_ply
@@ -91,7 +91,7 @@ class ModelPredictions:
         views = dataset.load(uid, views=[reference], size=config.image_size)
         images, cameras = posed_input(views, config)
         images, cameras = images.to(self.device), cameras.to(self.device)
-        with network_products(images.device, self.precision):
+        with network_precision(images.device, self.precision):
             gaussians = self.model(images, cameras, background_margin=self.margin)[0]
         rgba = dataset.load(uid, views=[reference], size=self.size).images[0]
         detail = checked_detail(self.detail, config, len(rgba))

@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..devices import network_products
 from ..kernels.bench.core.case import (
     BOTH,
     Case,
@@ -55,9 +54,8 @@ class Backbone(Problem):
 
     def run(self, tokens: Tensor) -> Tensor:
         """Run the blocks like ``Gamba.forward``: the prefix states, then the tokens."""
-        with network_products(self.device):
-            states = prefix_states(self.blocks, self.camera, self.image)
-            return run_blocks(self.blocks, tokens, states)
+        states = prefix_states(self.blocks, self.camera, self.image)
+        return run_blocks(self.blocks, tokens, states)
 
     @torch.no_grad()
     def forward(self) -> Tensor:
@@ -68,12 +66,11 @@ class Backbone(Problem):
     def prepended(self) -> Tensor:
         """Run the paper's eq. 2 literally, prepending and dropping (timed)."""
         tokens = self.tokens
-        with network_products(self.device):
-            for block in self.blocks:
-                assert block.project_camera is not None and block.project_image is not None
-                prefix = [block.project_camera(self.camera), block.project_image(self.image)]
-                hidden, _ = block.mamba(block.norm(torch.cat([*prefix, tokens], dim=1)))
-                tokens = tokens + hidden[:, -self.length :]
+        for block in self.blocks:
+            assert block.project_camera is not None and block.project_image is not None
+            prefix = [block.project_camera(self.camera), block.project_image(self.image)]
+            hidden, _ = block.mamba(block.norm(torch.cat([*prefix, tokens], dim=1)))
+            tokens = tokens + hidden[:, -self.length :]
         return tokens
 
     def backward(self) -> tuple[Tensor, ...]:
@@ -83,8 +80,7 @@ class Backbone(Problem):
         """
         tokens = self.tokens.detach().requires_grad_()
         leaves = [tokens, *(p for block in self.blocks for p in block.parameters())]
-        with network_products(self.device):
-            return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
+        return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
 
     def oracle(self, direction: str) -> str:
         """Return a description of the check's reference."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..cameras import Cameras
 from ..conventions import over_background
-from ..devices import float32_weights, network_products
+from ..devices import float32_weights
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
@@ -86,15 +86,14 @@ class Gamba(Pretrained, nn.Module):
         planes' blocks follow. Arguments and errors are those of ``forward``.
         """
         self._check(images, cameras)
-        with network_products(images.device):
-            camera = self.camera_token(cameras) if self.camera_token else None
-            image = None
-            if self.encoder:
-                if self.config.input_channels == 4:
-                    images = over_background(images, self.config.background_color)
-                image = self.encoder(images)
-            branches = [self.blocks, *([self.planes.blocks] if self.planes else [])]
-            return [s for blocks in branches for s in prefix_states(blocks, camera, image)]
+        camera = self.camera_token(cameras) if self.camera_token else None
+        image = None
+        if self.encoder:
+            if self.config.input_channels == 4:
+                images = over_background(images, self.config.background_color)
+            image = self.encoder(images)
+        branches = [self.blocks, *([self.planes.blocks] if self.planes else [])]
+        return [s for blocks in branches for s in prefix_states(blocks, camera, image)]
 
     def forward(
         self,
@@ -129,21 +128,20 @@ class Gamba(Pretrained, nn.Module):
             ValueError: a shape does not match, or the margin is negative.
         """
         self._check(images, cameras)
-        with network_products(images.device):
-            if condition is None:
-                condition = self.condition(images, cameras)
-            if isinstance(self.decoder, RayDecoder):
-                return self._forward_rays(images, cameras, condition, background_margin or 0)
-            tokens = self.tokens(images, cameras)
-            if background_margin is not None:
-                background = self.config.background_color
-                tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
-            count = len(self.blocks)
-            states, plane_states = condition[:count], condition[count:]
-            tokens = self.norm(run_blocks(self.blocks, tokens, states, self.recompute))
-            if self.planes is None:
-                return self.decoder(tokens)
-            return self.decoder(tokens, self.planes(len(images), plane_states, self.recompute))
+        if condition is None:
+            condition = self.condition(images, cameras)
+        if isinstance(self.decoder, RayDecoder):
+            return self._forward_rays(images, cameras, condition, background_margin or 0)
+        tokens = self.tokens(images, cameras)
+        if background_margin is not None:
+            background = self.config.background_color
+            tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
+        count = len(self.blocks)
+        states, plane_states = condition[:count], condition[count:]
+        tokens = self.norm(run_blocks(self.blocks, tokens, states, self.recompute))
+        if self.planes is None:
+            return self.decoder(tokens)
+        return self.decoder(tokens, self.planes(len(images), plane_states, self.recompute))
 
     def _forward_rays(
         self, rgba: Tensor, cameras: Cameras, condition: list[Any], margin: int

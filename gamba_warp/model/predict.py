@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..conventions import Detail, Precision
 from ..data.preprocess import composite, resize_rgba
-from ..devices import network_products, pick_precision
+from ..devices import network_precision, pick_precision
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .detail import checked_detail, split_front
@@ -61,7 +61,7 @@ def reconstruct(
     images = model_input(rgba, config).to(device)
     dtype = pick_precision(precision, device, config.width)
     camera = reference_cameras(config, 1).to(device)
-    with network_products(device, dtype):
+    with network_precision(device, dtype):
         gaussians = model(images, camera)[0]
     return split_front(gaussians, images[0], rgba, config, detail, camera)
 

@@ -1,7 +1,6 @@
 """Precision of matrix products: the trial of "auto", float32 by oneDNN, and bfloat16."""
 
 import sys
-import threading
 
 import numpy as np
 import pytest
@@ -15,86 +14,39 @@ from gamba_warp.model.predict import reconstruct
 CPU = torch.device("cpu")
 
 
-@pytest.fixture
-def better(monkeypatch):
-    """Act like a processor for which oneDNN is chosen."""
-    monkeypatch.setattr(devices, "_onednn_is_better", lambda: True)
-
-
-def test_the_setting_of_products_is_put_back_also_after_an_error_and_inside_one_another(better):
+@pytest.fixture(autouse=True)
+def setting():
+    """The process-wide setting: torch's default, put back after each test."""
     before = torch.get_float32_matmul_precision()
-    with pytest.raises(KeyError), devices.network_products(CPU):
-        with devices.network_products(CPU), devices.float32_products():
-            assert torch.get_float32_matmul_precision() == "highest"
-        assert torch.get_float32_matmul_precision() == "medium"
-        raise KeyError
-    assert torch.get_float32_matmul_precision() == before
-    with devices.float32_products(), devices.network_products(CPU):
-        assert torch.get_float32_matmul_precision() == "highest"
-    with devices.network_products(torch.device("meta")):
-        assert torch.get_float32_matmul_precision() == before
+    torch.set_float32_matmul_precision("highest")
+    yield
+    torch.set_float32_matmul_precision(before)
+
+
+@pytest.mark.parametrize("better", [True, False])
+@pytest.mark.parametrize("gpu", [True, False])
+def test_the_fastest_products_are_chosen_only_without_a_gpu(monkeypatch, better, gpu):
+    monkeypatch.setattr(devices, "_onednn_is_better", lambda: better)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    devices.use_fastest_products()
+    chosen = torch.get_float32_matmul_precision()
+    assert chosen == ("medium" if better and not gpu else "highest")
 
 
 def test_float32_products_end_the_rounding_that_a_user_has_allowed():
-    before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
-    try:
-        with devices.float32_products():
-            assert torch.get_float32_matmul_precision() == "highest"
-        assert torch.get_float32_matmul_precision() == "high"
-    finally:
-        torch.set_float32_matmul_precision(before)
+    with devices.float32_products():
+        assert torch.get_float32_matmul_precision() == "highest"
+    assert torch.get_float32_matmul_precision() == "high"
 
 
-def test_a_network_keeps_the_callers_autocast_unless_it_is_given_a_precision():
+def test_a_precision_replaces_the_callers_autocast():
     a = torch.ones(2, 2)
-    with devices.network_products(CPU, torch.bfloat16):
-        with devices.network_products(CPU):
-            assert (a @ a).dtype == torch.bfloat16
-        with devices.network_products(CPU, torch.float32):
+    with devices.network_precision(CPU, torch.bfloat16):
+        assert (a @ a).dtype == torch.bfloat16
+        with devices.network_precision(CPU, torch.float32):
             assert (a @ a).dtype == torch.float32
     assert (a @ a).dtype == torch.float32
-
-
-def test_float32_products_keep_all_digits_while_another_thread_comes_and_goes(better):
-    def other() -> None:
-        with devices.network_products(CPU):
-            pass
-
-    with devices.float32_products():
-        thread = threading.Thread(target=other)
-        thread.start()
-        thread.join()
-        assert torch.get_float32_matmul_precision() == "highest"
-
-
-def test_the_last_thread_puts_the_products_back(better):
-    before = torch.get_float32_matmul_precision()
-    inside, leave = threading.Event(), threading.Event()
-
-    def other() -> None:
-        with devices.network_products(CPU):
-            inside.set()
-            leave.wait(10)
-
-    thread = threading.Thread(target=other)
-    with devices.network_products(CPU):
-        thread.start()
-        assert inside.wait(10)
-    assert torch.get_float32_matmul_precision() == "medium"
-    leave.set()
-    thread.join()
-    assert torch.get_float32_matmul_precision() == before
-
-
-def test_the_first_use_under_an_autocast_chooses_the_same_library(monkeypatch):
-    """The comparison with float64 once took the caller's autocast for the library's error."""
-    known = {"cpu_name": "AMD EPYC", "avx512_f": True}
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known, raising=False)
-    chosen = devices._onednn_is_better.__wrapped__
-    alone = chosen()
-    with torch.autocast("cpu", torch.bfloat16):
-        assert chosen() == alone
 
 
 def test_products_of_a_network_keep_all_digits():
@@ -102,8 +54,8 @@ def test_products_of_a_network_keep_all_digits():
     g = torch.Generator().manual_seed(1)
     a, b = torch.randn(300, 200, generator=g), torch.randn(200, 250, generator=g)
     truth = a.double() @ b.double()
-    with devices.network_products(CPU):
-        error = (a @ b).double() - truth
+    devices.use_fastest_products()
+    error = (a @ b).double() - truth
     assert error.norm() < 1e-6 * truth.norm()  # bfloat16 has 2e-3
 
 
@@ -118,7 +70,7 @@ def test_products_of_a_network_keep_all_digits():
 )
 def test_other_processors_keep_their_library(monkeypatch, known):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known, raising=False)
-    assert not devices._onednn_is_better.__wrapped__()
+    assert not devices._onednn_is_better()
 
 
 def test_a_library_that_rounds_is_not_taken(monkeypatch):
@@ -130,7 +82,7 @@ def test_a_library_that_rounds_is_not_taken(monkeypatch):
         return plain(a.bfloat16().float(), b) if a.dtype == torch.float32 else plain(a, b)
 
     monkeypatch.setattr(torch.Tensor, "__matmul__", rounding)
-    assert not devices._onednn_is_better.__wrapped__()
+    assert not devices._onednn_is_better()
     assert torch.get_float32_matmul_precision() != "medium"
 
 

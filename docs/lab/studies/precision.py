@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
-from gamba_warp.devices import float32_products, network_products
+from gamba_warp.devices import float32_products, network_precision
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench.core.case import Error, Settings, Variant, compare
 from gamba_warp.measure.inference import without_encoder
@@ -76,7 +76,7 @@ class _Precise:
     @torch.no_grad()
     def run(self, precision: torch.dtype) -> Gaussians:
         """Run the model; timed."""
-        with network_products(self.picture.device, precision):
+        with network_precision(self.picture.device, precision):
             return self.model(self.picture, self.camera)
 
     @torch.no_grad()

@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from ...devices import network_products
 from ...kernels.causal_conv1d import causal_conv1d
 from ...kernels.selective_scan import selective_scan, selective_scan_state
 from ..config import GambaConfig
@@ -291,21 +290,10 @@ def run_blocks(
         for i, block in enumerate(blocks):
             run = block
             if recompute and gradients:
-                run = partial(checkpoint, _RecomputedBlock(block), use_reentrant=False)
+                run = partial(checkpoint, block, use_reentrant=False)
             segment, states[i] = run(segment, states[i], borders)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
-
-
-class _RecomputedBlock:
-    """Block under activation checkpointing, recomputed with the same matmul precision."""
-
-    def __init__(self, block: nn.Module) -> None:
-        self._block = block
-
-    def __call__(self, tokens: Tensor, *others: Any) -> tuple[Tensor, Any]:
-        with network_products(tokens.device):
-            return self._block(tokens, *others)
 
 
 def prefix_states(blocks: Blocks, camera: Tensor | None, image: Tensor | None) -> list[Any]:
