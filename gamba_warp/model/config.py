@@ -23,9 +23,6 @@ PositionWeights = Literal["softmax", "unit"]
 Resize = Literal["bicubic", "bilinear"]
 Back = Literal["learned", "opaque"]
 
-# Numbers of a ray's Gaussian: depth, offset, opacity, scales, colour.
-RAY_CHANNELS = (1, 3, 1, 3, 3)
-RAY_STEM = 32  # channels after the first convolution of the decoder ``rays``
 # Fields missing in older files; the defaults describe their models.
 _ADDED_LATER = {
     "decoder",
@@ -39,8 +36,6 @@ _ADDED_LATER = {
 # Far above any trained model; files with larger values are rejected.
 MAX_GAUSSIANS = 1 << 20
 MAX_INNER_WIDTH = 1 << 15
-MAX_PARAMETERS = 4 * 10**9  # 16 GB
-_IMAGE_CHANNELS = 2048  # upper bound for an image token, to estimate the size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +177,6 @@ class GambaConfig:
             "num_gaussians": MAX_GAUSSIANS,
             "inner_width": MAX_INNER_WIDTH,
             "mlp_width": MAX_INNER_WIDTH,
-            "num_parameters": MAX_PARAMETERS,
         }
         for name, limit in limits.items():
             if getattr(self, name) > limit:
@@ -267,58 +261,6 @@ class GambaConfig:
     def step_rank(self) -> int:
         """``dt_rank`` with its default filled in."""
         return self.dt_rank or -(-self.width // 16)
-
-    @property
-    def num_parameters(self) -> int:
-        """Number of parameters, without the image encoder's; with an encoder an upper bound.
-
-        Computed before anything is allocated: a file may state any size.
-        """
-        image = _IMAGE_CHANNELS if self.prepend and self.encoder != "none" else 0
-        camera = (image or self.width) if self.prepend and self.camera_token else 0
-        norm = self.width * (2 if self.norm == "layer" else 1)
-        projections = sum((channels + 1) * self.width for channels in (camera, image) if channels)
-        block = norm + projections + self._mixer_parameters(norm)
-        patchify = (
-            (self.pixel_channels * self.token_patch**2 + 1) * self.width
-            if self.additive_image_tokens
-            else 0
-        )
-        token = 17 * camera + (camera + 1) * camera
-        embedding = self.num_tokens * self.width
-        branch = self.depth * block + norm
-        planes = 0
-        if self.decoder == "triplane":
-            tokens = 3 * self.triplane_size**2
-            planes = branch + tokens * self.width + (self.width + 1) * self.triplane_features
-        return branch + planes + self._decoder_parameters() + patchify + token + embedding
-
-    def _mixer_parameters(self, norm: int) -> int:
-        """Parameters of a block after its norm: a Mamba block, or attention, a norm and an MLP."""
-        if self.mixer == "attention":
-            inside = self.mlp_width
-            return norm + 4 * (self.width + 1) * self.width + (2 * inside + 1) * self.width + inside
-        inner, rank, states = self.inner_width, self.step_rank, self.state_size
-        scan = inner * (self.conv_size + rank + 2 * states + rank + states + 3)
-        return scan + 3 * self.width * inner
-
-    def _decoder_parameters(self) -> int:
-        """Parameters of the decoder."""
-        if self.decoder != "rays":
-            hidden = self.decoder_width or self.width
-            heads = 3 * self.position_bins + (11 if self.predict_rotation else 7)
-            planes = 3 * self.triplane_features + hidden + 2 if self.decoder == "triplane" else 0
-            return (self.width + 1 + planes) * hidden + (hidden + 1) * (hidden + heads)
-        features, side = self.ray_features, self.patch_size // self.ray_cells + 2
-        up = (
-            (self.num_orders * self.width + 1) * (self.ray_coarse or self.ray_cells) ** 2 * features
-        )
-        stem = (side**2 * self.pixel_channels + 1) * RAY_STEM
-        stem += (9 * RAY_STEM + 1 + 9 * features + 1) * features
-        each = sum(RAY_CHANNELS) + (4 if self.predict_rotation else 0)
-        mix = (features + 1) * self.ray_hidden
-        last = self.ray_hidden or features
-        return up + stem + mix + ((last + 1) * each + 3) * self.ray_layers
 
     @property
     def background_color(self) -> float:

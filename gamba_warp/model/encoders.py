@@ -15,10 +15,12 @@ from torch.nn import functional as F
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from ..errors import UserError, first_line
 from ..untrusted.torch_files import read_torch
-from .config import MAX_PARAMETERS, GambaConfig
+from .config import GambaConfig
 
 if TYPE_CHECKING:
     from timm.models.vision_transformer import VisionTransformer
+
+MAX_PARAMETERS = 4 * 10**9  # 16 GB, far above any network of ``timm``
 
 
 class ImageEncoder(nn.Module):

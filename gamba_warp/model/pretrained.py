@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from ..errors import UserError, first_line
 from ..files import atomic_path, output_folder, write_text
@@ -33,7 +34,6 @@ FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
 ENCODER_NAME = "encoder.safetensors"  # a frozen encoder's weights, in the same folder
 MAX_HEADER = 16 << 20  # bytes; that of a model of 256 blocks takes 1 MB
-_SMALL = 10_000_000  # parameters of a model built at once, as torch's meta device is slow
 _DTYPES = ("F32", "BF16", "F16")  # allowed in a file; all become float32
 
 CONFIG_NAME, CARD_NAME = "config.json", "README.md"
@@ -220,14 +220,15 @@ def read_model(
     beside = path.parent / ENCODER_NAME
     if encoder_weights is None and config.encoder not in ("none", "vgg16") and beside.is_file():
         encoder_weights = beside
-    model = None
-    if config.num_parameters <= _SMALL and (not config.prepend or config.encoder == "none"):
-        model = kind(config)
     try:
-        state = read_weights(path, model or _outline(kind, config, path))
+        expected = outline(kind, config)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    try:
+        state = read_weights(path, expected)
     except ValueError as error:
         raise UserError(f"{path}: does not fit its own configuration: {error}") from error
-    model = model or kind(config, encoder_weights)
+    model = kind(config, encoder_weights)
     model.load_stored_state(state)
     if model.encoder and model.encoder.frozen:
         if model.encoder.fingerprint != encoder_sha256:
@@ -237,13 +238,21 @@ def read_model(
     return model.to(device).eval()
 
 
-def _outline(kind: type[Gamba], config: GambaConfig, path: Path) -> Gamba:
-    """Build the model of a file's configuration on the meta device, without memory."""
-    try:
-        with torch.device("meta"):
-            return kind(config, encoder=outline_encoder(config))
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+class _Outline(TorchFunctionMode):
+    """Skip random initialization, whose first use on the meta device takes seconds."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return None if func is nn.init.normal_ else func(*args, **(kwargs or {}))
+
+
+def outline(kind: type[Gamba], config: GambaConfig) -> Gamba:
+    """Build the model of a configuration on the meta device, without memory.
+
+    Raises:
+        UserError: the encoder is unknown or too large.
+    """
+    with torch.device("meta"), _Outline():
+        return kind(config, encoder=outline_encoder(config))
 
 
 def read_config(path: Path) -> tuple[GambaConfig, str | None]:

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from ..errors import UserError
 from .config import PRESETS, GambaConfig
-from .encoders import Weights, outline_encoder, read_state
+from .encoders import Weights, read_state
 from .gamba import Gamba
+from .pretrained import outline
 
 DEPTH = PRESETS["released"].depth  # blocks of the published network
 _ROOT, _ENCODER = "model.", "model.map_image.model."
@@ -136,9 +137,8 @@ def convert_released(
                 f"network, which --depth {config.depth} accepts"
             )
         weights = _rename(found, config.depth)
-        with torch.device("meta"):  # check before allocating memory
-            outline = Gamba(config, encoder=outline_encoder(config))
-        outline.check_stored_state({name: value.shape for name, value in weights.items()})
+        shapes = {name: value.shape for name, value in weights.items()}
+        outline(Gamba, config).check_stored_state(shapes)  # before allocating memory
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except KeyError as error:

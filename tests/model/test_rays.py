@@ -307,7 +307,6 @@ def test_other_shapes_and_recompute(changes):
         grads.append(model.decoder.up.weight.grad.clone())
         model.zero_grad()
     torch.testing.assert_close(*grads)
-    assert sum(p.numel() for p in model.parameters() if p.requires_grad) <= config.num_parameters
 
 
 def test_the_margin_lets_the_network_see_more_patches():

@@ -80,6 +80,8 @@ class Mamba(nn.Module):
     @torch.no_grad()
     def _init_weights(self, config: GambaConfig) -> None:
         """Draw the weights like mamba-ssm by default (version 2.2)."""
+        if self.A_log.is_meta:  # torch would load its compiler for this arithmetic, for seconds
+            return
         bound = config.conv_size**-0.5
         nn.init.uniform_(self.conv_weight, -bound, bound)
         nn.init.uniform_(self.conv_bias, -bound, bound)

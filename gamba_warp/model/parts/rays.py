@@ -27,7 +27,7 @@ from torch.nn import functional as F
 
 from ...cameras import Cameras, exact_product
 from ...gaussians import Gaussians
-from ..config import RAY_CHANNELS, RAY_STEM, GambaConfig
+from ..config import GambaConfig
 from .patches import Cells, Patches, foreground_cells
 
 FRONT_OPACITY = 3.0  # logit; overlapping neighbours are opaque together
@@ -37,6 +37,7 @@ FRONT_SIZE, HIDDEN_SIZE, BACK_SIZE = 0.25, 0.6, 0.4  # standard deviations, in s
 LAST_DEPTH = 0.7  # initial depth of the last hidden layer behind the middle, in ``ray_depth``
 COLOR_MARGIN = 0.01  # keeps the logit of a cell's colour finite
 EMPTY = 10.0  # difference of the opacity's logit between a full and an empty cell
+STEM_WIDTH = 32  # channels after the first convolution of the stem
 STEM_REACH = 3  # receptive field of the stem in neighbouring cells, one per convolution
 SIZE_LIMITS = (-4.0, 3.0)  # of the logarithm of a size, in sides of a cell
 
@@ -53,11 +54,12 @@ class RayDecoder(nn.Module):
         step = config.patch_size // cells  # pixels a side of a cell
         coarse = config.ray_coarse or cells
         self.up = nn.Linear(config.num_orders * config.width, coarse**2 * features)
-        self.register_buffer("upsampling", _interpolation(coarse, cells), persistent=False)
+        upsampling = _interpolation(coarse, cells).to(self.up.weight.device)
+        self.register_buffer("upsampling", upsampling, persistent=False)
         self.stem = nn.Sequential(
-            nn.Conv2d(config.pixel_channels, RAY_STEM, step + 2, step, padding=1),
+            nn.Conv2d(config.pixel_channels, STEM_WIDTH, step + 2, step, padding=1),
             nn.SiLU(),
-            nn.Conv2d(RAY_STEM, features, 3, padding=1),
+            nn.Conv2d(STEM_WIDTH, features, 3, padding=1),
             nn.SiLU(),
             nn.Conv2d(features, features, 3, padding=1),
         )
@@ -74,13 +76,18 @@ class RayDecoder(nn.Module):
         opacities = [FRONT_OPACITY] + [HIDDEN_OPACITY] * hidden
         if config.ray_back == "opaque":
             sizes[-1], opacities[-1] = BACK_SIZE, BACK_OPACITY
-        self.depth_bias = nn.Parameter(torch.tensor(depths).atanh())
-        self.scale_bias = nn.Parameter(torch.tensor(sizes).log())
-        self.opacity_bias = nn.Parameter(torch.tensor(opacities))
+        with torch.device("cpu"):  # see ``_interpolation``
+            biases = (
+                torch.tensor(depths).atanh(),
+                torch.tensor(sizes).log(),
+                torch.tensor(opacities),
+            )
+        biases = (nn.Parameter(bias.to(self.head.weight.device)) for bias in biases)
+        self.depth_bias, self.scale_bias, self.opacity_bias = biases
 
     def _parts(self) -> list[int]:
         """Channels of depth, offset, opacity, scales, colour and rotation."""
-        return [*RAY_CHANNELS, 4] if self.rotates else [*RAY_CHANNELS]
+        return [1, 3, 1, 3, 3, *([4] if self.rotates else [])]
 
     def forward(
         self, tokens: Tensor, pixels: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
@@ -184,7 +191,10 @@ def _padded(made: Gaussians, cells: Cells) -> Gaussians:
 
 
 def _interpolation(coarse: int, fine: int) -> Tensor:
-    """Weights ``[fine², coarse²]`` of bilinear interpolation from a coarse to a fine grid."""
-    each = torch.eye(coarse**2).view(1, coarse**2, coarse, coarse)
+    """Weights ``[fine², coarse²]`` of bilinear interpolation from a coarse to a fine grid.
+
+    On the CPU: for a model on the meta device torch would load its compiler, for seconds.
+    """
+    each = torch.eye(coarse**2, device="cpu").view(1, coarse**2, coarse, coarse)
     finer = F.interpolate(each, (fine, fine), mode="bilinear", align_corners=False)
     return finer.view(coarse**2, fine**2).T.contiguous()

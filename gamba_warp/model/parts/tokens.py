@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -29,10 +30,10 @@ def scan_orders(height: int, width: int, orders: Orders = "backward", count: int
     Returns:
         ``[count, height·width]`` int64 positions in the row-major map; each row is a permutation.
     """
-    rows = torch.arange(height * width).reshape(height, width)
-    flipped = (0, 1) if orders == "backward" else (1,)
-    passes = [rows, rows.T, rows.flip(flipped), rows.T.flip(flipped)]
-    return torch.stack([order.flatten() for order in passes[:count]])
+    rows = np.arange(height * width).reshape(height, width)
+    flipped = (0, 1) if orders == "backward" else 1
+    passes = [rows, rows.T, np.flip(rows, flipped), np.flip(rows.T, flipped)]
+    return torch.from_numpy(np.stack([order.flatten() for order in passes[:count]]))
 
 
 class CameraToken(nn.Module):
@@ -84,11 +85,8 @@ class SplatTokens(nn.Module):
         # tokens, and the positions start spread out only if the tokens differ.
         nn.init.normal_(self.embedding, std=config.embedding_init)
         vars(self.embedding)["_no_weight_decay"] = True
-        self.register_buffer(
-            "orders",
-            scan_orders(grid, grid, config.scan_orders, config.num_orders).flatten(),
-            persistent=False,
-        )
+        orders = scan_orders(grid, grid, config.scan_orders, config.num_orders).flatten()
+        self.register_buffer("orders", orders.to(self.embedding.device), persistent=False)
 
     def forward(self, images: Tensor, cameras: Cameras) -> Tensor:
         """Map ``images [B, H, W, 3]`` in [0, 1] and one camera each to ``[B, L, width]``."""

@@ -61,7 +61,6 @@ ABLATIONS = [
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_store_what_they_stored(preset, monkeypatch):
-    """The sizes are the same; the number of parameters is known before a model is built."""
     trunk = VGG16Trunk
     monkeypatch.setattr(
         "gamba_warp.vision.vgg.vgg16_features", lambda path: VGG16Features(trunk().state_dict())
@@ -76,10 +75,6 @@ def test_presets_store_what_they_stored(preset, monkeypatch):
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == STORED[preset]
     assert (config.num_gaussians, image_tokens) == LENGTHS[preset]
     assert model.tokens.orders.shape == (config.num_tokens,)
-    own = [p for name, p in model.named_parameters() if not name.startswith("encoder.")]
-    count = sum(p.numel() for p in own)
-    assert count <= config.num_parameters < 2.5 * count
-    assert config.encoder != "none" or count == config.num_parameters
     if preset == "paper":  # whose own figure is "about 10 %" of 500 M parameters of an LRM
         assert 40e6 < sum(value.numel() for value in state.values()) < 55e6
         assert config.step_rank == 32 and model.encoder.channels == 768
@@ -114,12 +109,8 @@ def test_files_hold_a_variant(tmp_path, changes):
     [{"encoder": name} | x for x in VARIANTS for name in ("none", "gamba_test_vit")] + ABLATIONS,
     ids=str,
 )
-def test_every_parameter_of_a_variant_is_counted_and_learns(changes):
+def test_every_parameter_of_a_variant_learns(changes):
     model = Gamba(micro(**changes), "random")
-    own = {n: p for n, p in model.named_parameters() if not n.startswith("encoder.")}
-    count = sum(p.numel() for p in own.values())
-    assert count <= model.config.num_parameters
-    assert model.encoder or count == model.config.num_parameters
     images, cameras = inputs(2, model.config.image_size)
     if model.config.input_channels == 4:
         images = torch.cat([images, 0.2 + 0.6 * torch.rand_like(images[..., :1])], -1)
@@ -128,7 +119,8 @@ def test_every_parameter_of_a_variant_is_counted_and_learns(changes):
     parts += [] if made.quats is None else [made.quats]
     sum((part * torch.randn_like(part)).sum() for part in parts).backward()
     for name, parameter in model.named_parameters():
-        assert parameter.requires_grad == (name in own or not model.config.encoder_frozen), name
+        frozen = name.startswith("encoder.") and model.config.encoder_frozen
+        assert parameter.requires_grad != frozen, name
         if parameter.requires_grad:
             assert parameter.grad is not None, name
             assert parameter.grad.isfinite().all() and parameter.grad.abs().max() > 0, name
