@@ -121,7 +121,8 @@ def rasterization(
     tiles, compiling = bins.starts.numel() - 1, torch.compiler.is_compiling()
     skipped = None if compiling else bins.starts.new_zeros(tiles)
     drawn = projected.means2d, projected.conics, projected.view_opacities, channels
-    renders, alphas, *walk = composite(*drawn, list(bins), list(size), list(limits), skipped)
+    lists = list(bins), list(size), list(limits)
+    renders, alphas, *walk = composite(*drawn, *lists, skipped, None)
     renders = _finish(render_mode, renders, alphas, backgrounds)
     meta = Meta(Call(splats, size, limits), bins, Walk(*walk), status, skipped)
     # under gsplat's names

@@ -36,7 +36,7 @@ class Call(NamedTuple):
         bins = bin_op(means2d, conics, depths, opacities, extents, *picture, True)
         color = torch.ones_like(depths)[..., None]
         splats = means2d, conics, opacities, color
-        _, _, *walk = composite(*splats, list(bins), list(size), list(self.limits), None)
+        _, _, *walk = composite(*splats, list(bins), list(size), list(self.limits), None, None)
         return Bins(*bins), Walk(*walk)
 
 

@@ -207,13 +207,16 @@ def composite(
     size: List[int],
     limits: List[float],
     skipped: Tensor | None,
+    absolute: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Blend the pairs: pictures, alphas and the fields of a ``Walk``.
 
     ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
     Gaussians or, shared by the views, one for each of an object's. The lists hold the values of
     ``Bins``, ``Size`` and ``Limits``. Backward raises the numbers of tiles in ``skipped``, ``[I *
-    tiles]`` int32, to 1 if it skips a tile and to 2 if it walks it.
+    tiles]`` int32, to 1 if it skips a tile and to 2 if it walks it. Where it has a gradient of the
+    geometry, it sets ``absolute``, ``[.., N, 2]``, to the sums over pixels of the absolute values
+    of their gradients of ``means2d``.
     """
     splats = Drawn(means2d, conics, view_opacities, colors.flatten(0, -2))
     given = splats, Bins(*bins), _picture(means2d, size, limits)
@@ -241,7 +244,8 @@ def _(means2d, conics, view_opacities, colors, bins, size, *rest):
     return renders, colors.new_empty(*images, height, width, 1), *walk
 
 
-# It changes ``skipped``, which is not declared: compilers, which would have to know, pass None.
+# It changes ``skipped`` and ``absolute``, which is not declared: compilers, which would have to
+# know, pass None.
 @torch.library.custom_op(_OP + "composite_vjp", mutates_args=())
 def _composite_vjp(
     splats: List[Tensor],
@@ -252,6 +256,7 @@ def _composite_vjp(
     v_pixels: List[Tensor],
     skipped: Tensor | None,
     geometry: bool,
+    absolute: Tensor | None,
 ) -> List[Tensor]:
     if skipped is None:
         skipped = torch.zeros_like(Walk(*walk).walked)
@@ -259,18 +264,19 @@ def _composite_vjp(
     drawn = drawn._replace(colors=drawn.colors.flatten(0, -2))
     given = drawn, Bins(*bins), _picture(splats[0], size, limits), Walk(*walk)
     backward = _compositor(splats[0].device).composite_backward
-    return [g for g in backward(*given, v_pixels, skipped, geometry) if g is not None]
+    grads = backward(*given, v_pixels, skipped, geometry, absolute if geometry else None)
+    return [g for g in grads if g is not None]
 
 
 @_composite_vjp.register_fake
-def _(splats, bins, size, limits, walk, v_pixels, skipped, geometry):
+def _(splats, bins, size, limits, walk, v_pixels, skipped, geometry, absolute):
     *geometries, colors = splats
     v_colors = colors.new_empty(*splats[2].shape, colors.shape[-1])
     return [*(map(torch.empty_like, geometries) if geometry else ()), v_colors]
 
 
 def _composite_setup(ctx, inputs, output):
-    *splats, bins, ctx.size, ctx.limits, ctx.skipped = inputs
+    *splats, bins, ctx.size, ctx.limits, ctx.skipped, ctx.absolute = inputs
     renders, alphas, *walk = output
     ctx.mark_non_differentiable(*walk)
     ctx.set_materialize_grads(False)
@@ -288,7 +294,7 @@ def _composite_backward(ctx, *cotangents):
     ]
     geometry = any(needs[:3]) or not size.skip & UNASKED
     given = splats, bins, ctx.size, ctx.limits, walk, v_pixels, ctx.skipped, geometry
-    *grads, v_colors = _composite_vjp(*given)
+    *grads, v_colors = _composite_vjp(*given, ctx.absolute)
     if not size.colors_per_view and size.views > 1:
         *images, num, channels = v_colors.shape
         objects = math.prod(images) // size.views
@@ -297,7 +303,7 @@ def _composite_backward(ctx, *cotangents):
     v_colors = v_colors.reshape(colors.shape) if v_colors.numel() else torch.zeros_like(colors)
     grads = [*(grads or [None] * 3), v_colors]
     grads = (x if need else None for x, need in zip(grads, needs))
-    return *grads, [None] * len(bins), None, None, None
+    return *grads, [None] * len(bins), None, None, None, None
 
 
 composite = operator(composite, "rasterization", _composite_setup, _composite_backward)

@@ -110,6 +110,19 @@ def test_rasterizer(channels, mode, parts):
     check(run, PARTS[parts])
 
 
+@pytest.mark.parametrize("channels", [3, 5])
+def test_absolute_gradients(monkeypatch, channels):
+    """Also of more channels than a launch has."""
+    found = rasters.absolute_gradients(monkeypatch)
+    with standing_in(None):
+        rasters.compare(rasters.crowded(channels))
+    (want,) = found
+    check(lambda: rasters.compare(rasters.crowded(channels)), PARTS[2])
+    assert want.any()
+    for got in found[1:]:
+        assert_rel_rms(got, want, rasters.GRADIENT, "absolute")
+
+
 def test_sizes():
     def run():
         for width, height, num in ((16, 16, 33), (17, 15, 9), (3, 1, 60)):

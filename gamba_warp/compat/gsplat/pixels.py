@@ -18,7 +18,6 @@ from ..shared import check_tensor, one_device, positive, side
 
 LIMITS = Limits(ALPHA_MIN, 0.999, T_MIN)  # gsplat 1.5.3 clamps alpha at 0.999
 SKIP = Skip().bits()
-_BLOCK = 2**19  # (tile, pair, pixel) elements processed at once, which fit a cache
 
 
 def pair_ids(images: Tensor, tiles: Tensor, depths: Tensor, count: int) -> Tensor:
@@ -152,72 +151,18 @@ def blend(
         bins: the tile lists.
         tiling: the division into tiles.
         views: pictures per object that share the colours; 1 if none do.
-        keep: called in backward with the absolute gradients ``[I * R, 2]`` of the centres; or None.
+        keep: called in backward with the absolute gradients ``[I * R, 2]`` of the centres, summed
+            over the pixels (Ye et al. 2024, "AbsGS"), if these need a gradient; or None.
     """
     size = Size(tiling.width, tiling.height, views, int(views == 1), SKIP)
-    renders, alphas, *_ = composite(*layers, list(bins), list(size), list(LIMITS), None)
-    if keep is None or not renders.requires_grad:
-        return renders, alphas
-    both = torch.cat([renders, alphas], -1)
-    drawn = [x.detach() for x in layers]
-    both.register_hook(lambda v: keep(_absolute_gradients(drawn, bins, tiling, views, v)))
-    renders, alphas = both.split([renders.shape[-1], 1], -1)
+    means2d, sums = layers[0], None
+    if keep is not None and means2d.requires_grad:
+        sums = torch.zeros_like(means2d)
+        means2d = means2d.view_as(means2d)  # it has no other gradient than the compositor's
+        means2d.register_hook(lambda _: keep(sums.flatten(0, 1).clone()))
+    given = list(bins), list(size), list(LIMITS), None, sums
+    renders, alphas, *_ = composite(means2d, *layers[1:], *given)
     return renders, alphas
-
-
-@torch.no_grad()
-def _absolute_gradients(
-    layers: Sequence[Tensor], bins: Bins, tiling: Tiling, views: int, upstream: Tensor
-) -> Tensor:
-    """``Σ_pixels |∂L/∂means2d|`` of each row, ``[I * R, 2]`` (Ye et al. 2024, "AbsGS").
-
-    The rasterizer's own gradient sums signed values over pixels. So this traverses the lists again,
-    in torch, by README §5 of the rasterizer. ``upstream`` is the gradient of the pictures and of
-    alpha, ``[I, H, W, C + 1]``.
-    """
-    means2d, conics, opacities, colors = layers
-    if views > 1:
-        colors = colors.view(len(means2d) // views, 1, -1, colors.shape[-1])
-        colors = colors.expand(-1, views, -1, -1).flatten(0, 2)
-    means2d, conics, opacities = means2d.flatten(0, 1), conics.flatten(0, 1), opacities.flatten()
-    # A channel of ones gives alpha, the sum of the weights.
-    colors = torch.cat([colors, torch.ones_like(opacities)[:, None]], -1)
-    right, below = (-size % TILE for size in (tiling.width, tiling.height))
-    padded = F.pad(upstream.permute(0, 3, 1, 2), (0, right, 0, below))  # 0 outside the picture
-    by_tile = F.pixel_unshuffle(padded, TILE).unflatten(1, (-1, TILE**2))
-    by_tile = by_tile.permute(0, 3, 4, 2, 1).flatten(0, 2)  # [tiles, pixels, C + 1]
-    inside = torch.arange(TILE**2, device=means2d.device)
-    offsets = torch.stack([inside % TILE, inside // TILE], -1) + 0.5
-    total, counts = torch.zeros_like(means2d), bins.starts.diff()
-    order = counts.argsort(descending=True)[: int((counts > 0).sum())]
-    while len(order):  # lists of similar lengths together
-        longest = int(counts[order[0]])
-        some = max(1, _BLOCK // (longest * len(inside)))
-        tiles, order = order[:some], order[some:]
-        place = torch.arange(longest, device=tiles.device)
-        real = place < counts[tiles, None]
-        rows = bins.pairs[(bins.starts[tiles, None] + place).clamp_max(len(bins.pairs) - 1)]
-        column, line = tiles % tiling.tiles_x, tiles // tiling.tiles_x % tiling.tiles_y
-        corners = torch.stack([column, line], -1) * TILE
-        d = corners[:, None, None] + offsets - means2d[rows][:, :, None]
-        a, k, e = conics[rows][:, :, None].unbind(-1)
-        dy = d[..., 1]
-        u = d[..., 0] + k * dy
-        alpha = opacities[rows][..., None] * torch.exp(-0.5 * (a * u * u + e * dy * dy))
-        alpha = torch.where(real[..., None] & (alpha >= LIMITS.alpha_min), alpha, 0.0)
-        clamped = alpha >= LIMITS.alpha_max
-        alpha = alpha.clamp_max(LIMITS.alpha_max)
-        after = (1 - alpha).cumprod(1)
-        live = (after > LIMITS.t_min) & ~clamped
-        before = after / (1 - alpha)
-        worth = torch.einsum("tlc,tpc->tlp", colors[rows], by_tile[tiles])
-        part = torch.where(after > LIMITS.t_min, before * alpha * worth, 0.0)
-        behind = part.flip(1).cumsum(1).flip(1) - part
-        h = torch.where(live, alpha * (before * worth - behind / (1 - alpha)), 0.0)
-        x, y = a * h * u, a * k * h * u + e * h * dy
-        sums = torch.stack([x.abs().sum(-1), y.abs().sum(-1)], -1)
-        total.index_add_(0, rows.flatten(), sums.flatten(0, 1))
-    return total
 
 
 def rasterize_to_pixels(

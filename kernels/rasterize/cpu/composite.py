@@ -15,7 +15,7 @@ from torch import Tensor
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.native import native, native_kernel
-from ...runtime.views import Packed, struct
+from ...runtime.views import Packed, struct, view
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
 from ..tiles import SLACK, SLACK_ABS, Bins, Drawn, Lists, Picture, Pixels, Walk, Walked
@@ -50,9 +50,9 @@ class Workers:
 
 @struct
 class Rows:
-    """The sums of each intersection: six moments of h (README eq. 11) and the colours."""
+    """The sums of each intersection: moments of h (README eq. 11, 14) and the colours."""
 
-    sums: wp.array2d[wp.float32]  # [P, 6 + C]
+    sums: wp.array2d[wp.float32]  # [P, 6 + C], or with the absolute ones [P, 8 + C]
     written: wp.array[wp.uint8]  # [P], 0 where a row was not written and is not read
     skipped: wp.array[wp.int32]  # [tiles], raised to 1 where a tile is skipped, to 2 where walked
     geometry: int  # whether anything but colours is asked for
@@ -67,17 +67,21 @@ _composite = native_kernel(
     inputs=_SPLATS,
     outputs={**_WALK, "workers": Workers},
 )
-_composite_vjp = native_kernel(
-    "composite_vjp",
-    native(_HERE / "composite_vjp.inl", **_DEFINES),
-    inputs={**_SPLATS, **_WALK},
-    outputs={"workers": Workers, "rows": Rows},
+# without and with the sums of absolute values, which cost nothing where they are not asked for
+_composite_vjp, _composite_vjp_absolute = (
+    native_kernel(
+        name,
+        native(_HERE / "composite_vjp.inl", **_DEFINES, ABSOLUTE=absolute),
+        inputs={**_SPLATS, **_WALK},
+        outputs={"workers": Workers, "rows": Rows},
+    )
+    for name, absolute in (("composite_vjp", False), ("composite_vjp_absolute", True))
 )
 _sum_rows = native_kernel(
     "sum_rows",
     native(_HERE / "sums.inl", RUN=_RUN),
     inputs={"splats": Gaussians, "lists": Lists, "rows": Rows},
-    outputs={"v": Gaussians},
+    outputs={"v": Gaussians, "absolute": wp.array[wp.vec2]},
 )
 
 
@@ -130,6 +134,7 @@ def composite_backward(
     v_pixels: list[Tensor],
     skipped: Tensor,
     geometry: bool,
+    absolute: Tensor | None = None,
 ) -> Drawn:
     """Gradients of ``composite_forward`` by (view, Gaussian), from a row of sums for each pair.
 
@@ -141,9 +146,12 @@ def composite_backward(
         v_pixels: gradients of the renders ``[.., H, W, C]`` and the alphas ``[.., H, W, 1]``.
         skipped: ``[tiles]`` int32, raised to 1 for a tile that is skipped and 2 for one walked.
         geometry: True to compute more than the gradient of the colours.
+        absolute: ``[.., N, 2]``, set to the pixels' absolute gradients of means2d, summed; or None.
+            With it ``geometry`` is True.
     """
     channels = splats.colors.shape[1]
-    sums = empty([bins.pairs.numel(), 6 + channels], torch.float32)
+    moments = 6 if absolute is None else 8
+    sums = empty([bins.pairs.numel(), moments + channels], torch.float32)
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     arguments = [
         picture,
@@ -154,22 +162,31 @@ def composite_backward(
         _workers(channels + BLOCKS * (channels + 1)),
         Packed(Rows, sums, written, skipped, int(geometry)),
     ]
-    parallel_launch(_composite_vjp, torch.get_num_threads(), arguments)
-    return reduce_rows(sums, written, splats, bins, geometry)
+    kernel = _composite_vjp if absolute is None else _composite_vjp_absolute
+    parallel_launch(kernel, torch.get_num_threads(), arguments)
+    return reduce_rows(sums, written, splats, bins, geometry, absolute)
 
 
-def reduce_rows(sums: Tensor, written: Tensor, splats: Drawn, bins: Bins, geometry: bool) -> Drawn:
+def reduce_rows(
+    sums: Tensor,
+    written: Tensor,
+    splats: Drawn,
+    bins: Bins,
+    geometry: bool,
+    absolute: Tensor | None,
+) -> Drawn:
     """Sums rows by (view, Gaussian), in the order in which intersections are numbered.
 
     Args:
-        sums: ``[P, 6 + C]``: six moments of h (README eq. 11), then the colours.
+        sums: ``[P, 6 + C]``, or with ``absolute`` ``[P, 8 + C]``: moments of h, then the colours.
         written: ``[P]`` uint8, 0 where a row was not written and is not read.
         splats: as forward, like the lists.
         bins: of the intersections.
         geometry: whether anything but colours is asked for.
+        absolute: as backward.
     """
     _, conics, view_opacities, _ = splats
-    lead, channels = view_opacities.shape, sums.shape[1] - 6
+    lead, channels = view_opacities.shape, sums.shape[1] - (6 if absolute is None else 8)
     v_means2d, v_conics, v_opacities = (
         empty([*lead, *size], torch.float32) if geometry else None for size in ((2,), (3,), ())
     )
@@ -179,6 +196,7 @@ def reduce_rows(sums: Tensor, written: Tensor, splats: Drawn, bins: Bins, geomet
         Packed(Lists, *bins),
         Packed(Rows, sums, written, None, int(geometry)),
         Packed(Gaussians, *v),
+        None if absolute is None else view(absolute.view(-1, 2), wp.vec2),
     ]
     tasks = -(-bins.order.numel() // _RUN)
     pieces = min(tasks, _PIECES_PER_THREAD * torch.get_num_threads())

@@ -1,7 +1,9 @@
 // The gradient of the blending: a worker walks the lists of tile after tile back to front, and
-// writes a row of sums for each intersection: six moments of h (README eq. 11), then the colours.
+// writes a row of sums for each intersection: six moments of h (README eq. 11), if ABSOLUTE the two
+// sums of eq. 14, then the colours.
 #include "tile.h"
 
+constexpr int MOMENTS = ABSOLUTE ? 8 : 6;
 const int row_length = rows.sums.shape[1];
 F* const v_colors =
     (F*)workers.workspace.data + (size_t)task * (channels + BLOCKS * (channels + 1));
@@ -54,7 +56,9 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
         int bits = picture.skip & UNUSED ? walk.blocks.data[k] : every;
         if (!bits) continue;
         const Splat s = splat_of(lists.pairs.data[k], tile);
-        F h0 = {}, hu = {}, hy = {}, huu = {}, huy = {}, hyy = {};
+        F h0 = {}, hu = {}, hy = {}, huu = {}, huy = {}, hyy = {}, across = {}, along = {};
+        const float* const conic = (const float*)(splats.conics.data + lists.pairs.data[k]);
+        const F ak = splat(conic[0] * conic[1]), e = splat(conic[2]);
         for (int c = 0; c < channels; ++c) v_colors[c] = F{};
         for (; bits; bits &= bits - 1) {
             const int b = __builtin_ctz(bits);
@@ -83,6 +87,10 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
                 huu = fma_(u, U, huu);
                 huy = fma_(u, V, huy);
                 hyy = fma_(w, V, hyy);
+                if (ABSOLUTE) {
+                    across += abs_(u);
+                    along += abs_(fma_(ak, u, e * w));
+                }
             }
         }
         const int row = lists.rows.data[k];
@@ -93,7 +101,11 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
         out[3] = total_(huu);
         out[4] = total_(huy);
         out[5] = total_(hyy);
-        for (int c = 0; c < channels; ++c) out[6 + c] = total_(v_colors[c]);
+        if (ABSOLUTE) {
+            out[6] = total_(across);
+            out[7] = total_(along);
+        }
+        for (int c = 0; c < channels; ++c) out[MOMENTS + c] = total_(v_colors[c]);
         rows.written.data[row] = 1;
     }
 }

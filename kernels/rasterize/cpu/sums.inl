@@ -2,7 +2,8 @@
 // numbers. What is past the end of a row is not read but for a last row, which is read by number.
 #include "lanes.h"
 
-const int width = rows.sums.shape[1], channels = width - 6, count = lists.order.shape[0];
+const int moments = absolute.data ? 8 : 6, count = lists.order.shape[0];
+const int width = rows.sums.shape[1], channels = width - moments;
 const int begin = task * RUN, end = begin + RUN < count ? begin + RUN : count;
 const long long all = (long long)rows.sums.shape[0] * width;
 for (int j = begin; j < end; ++j) {
@@ -22,14 +23,14 @@ for (int j = begin; j < end; ++j) {
             }
         }
         *(F*)sums = sum;
-        for (int c = 0; c < channels; ++c) colors[c] = sums[6 + c];
+        for (int c = 0; c < channels; ++c) colors[c] = sums[moments + c];
     } else {
         for (int c = 0; c < channels; ++c) colors[c] = 0.0f;
         for (int p = from; p < to; ++p) {
             if (!rows.written.data[p]) continue;
             const float* const row = rows.sums.data + (size_t)p * width;
-            for (int c = 0; c < 6; ++c) sums[c] += row[c];
-            for (int c = 0; c < channels; ++c) colors[c] += row[6 + c];
+            for (int c = 0; c < moments; ++c) sums[c] += row[c];
+            for (int c = 0; c < channels; ++c) colors[c] += row[moments + c];
         }
     }
     if (!rows.geometry) continue;
@@ -45,4 +46,9 @@ for (int j = begin; j < end; ++j) {
     v_conic[1] = -a * sums[4];
     v_conic[2] = -0.5f * sums[5];
     v.opacities.data[i] = to > from ? sums[0] / splats.opacities.data[i] : 0.0f;
+    if (absolute.data) {  // README eq. 14
+        float* const both = (float*)(absolute.data + i);
+        both[0] = a * sums[6];
+        both[1] = sums[7];
+    }
 }

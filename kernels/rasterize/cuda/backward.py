@@ -6,13 +6,13 @@ and adds their sums in rows of Gaussians: in the order in which ``reduce.py`` ad
 """
 
 import functools
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import warp as wp
 
 from ...runtime.views import struct
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import Lists, Picture, Pixels, Walked
+from ..tiles import Lists, Picture, Pixels, Walked, color_row
 from . import leaves as L
 from .warp import (
     CHUNK,
@@ -55,30 +55,54 @@ def columns_of_moments(channels: int) -> int:
     return (channels + wp.static(CHUNK - 1)) / wp.static(CHUNK) * 6
 
 
-def row_length(channels: int) -> int:
-    """Values in a row: the moments of each chunk, then the channels."""
-    return -(-channels // CHUNK) * 6 + channels
+@wp.func
+def _columns_with_absolute(channels: int) -> int:
+    # eight in all: absolute values do not add up over chunks, so one launch has all channels
+    return wp.where(channels > 0, 8, 0)
 
 
-def _shared_size(channels: int, geometry: bool) -> int:
-    """Floats of a warp's shared memory: records, rows, and sums of the pairs of a completion."""
-    values = channels + (6 if geometry else 0)
-    return WARP * RECORD + WARP + WARP // values * values * PITCH
+def moments_of(channels: int, absolute: bool) -> tuple[int, int]:
+    """Number of sets of moments before a row's channels, and of moments in each set."""
+    return (1, 8) if absolute else (-(-channels // CHUNK), 6)
+
+
+class Sums(NamedTuple):
+    """The sums of a kernel.
+
+    Attributes:
+        channels: of colours, at most 4; 0 for the moments alone, of however many channels.
+        geometry: moments of h (README eq. 11).
+        absolute: rows with the two sums of absolute values (eq. 14) after the six moments.
+    """
+
+    channels: int
+    geometry: bool
+    absolute: bool
+
+    def moments(self) -> int:
+        """Number of moments of a pair."""
+        return (8 if self.absolute else 6) if self.geometry else 0
+
+    def shared(self) -> int:
+        """Floats of a warp's shared memory: records, rows, sums of the pairs of a completion."""
+        values = self.moments() + self.channels
+        return WARP * RECORD + WARP + WARP // values * values * PITCH
 
 
 @functools.cache
-def _completing(channels: int, geometry: bool, listed: bool):
+def _completing(asked: Sums, listed: bool):
     """Return how many pairs' sums are stored at once, and functions to store and to add them.
 
-    A row has six moments for each chunk of channels, then the channels. If ``listed``, it is a
-    pair's and is written; else it is a Gaussian's, and the pair is added to it.
+    A row has six moments for each chunk of channels, or eight in all, then the channels. If
+    ``listed``, it is a pair's and is written; else it is a Gaussian's, and the pair is added to it.
     """
-    moments = 6 if geometry else 0
-    values = moments + channels  # how many sums a pair has
+    moments = asked.moments()
+    columns = _columns_with_absolute if asked.absolute else columns_of_moments
+    values = moments + asked.channels  # how many sums a pair has
     slots = WARP // values  # pairs whose sums are completed at once, with a lane for each sum
     rows_at = WARP * RECORD
     sums_at = rows_at + WARP
-    memory = shared_memory(_shared_size(channels, geometry))
+    memory = shared_memory(asked.shared())
     arena_type = memory.arena
     values_type = wp.types.vector(values, wp.float32)
 
@@ -106,13 +130,13 @@ def _completing(channels: int, geometry: bool, listed: bool):
                 total += memory.get4(arena, at + 4 * i)
             value = (total[0] + total[1]) + (total[2] + total[3])
             row = wp.int64(memory.get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
-            before = columns_of_moments(gaussians.channels)
+            before = columns(gaussians.channels)
             row *= wp.int64(before + gaussians.channels)
             column = lane % wp.static(values)
             if column >= wp.static(moments):
                 column += before - wp.static(moments) + gaussians.first
             else:
-                column += columns_of_moments(gaussians.first)
+                column += columns(gaussians.first)
             if wp.static(not listed):
                 value += L.load(v_pairs, row, column)
             L.store(v_pairs, row, column, value)
@@ -121,24 +145,25 @@ def _completing(channels: int, geometry: bool, listed: bool):
 
 
 @functools.cache
-def _walking(channels: int, geometry: bool, parts: int, listed: bool):
+def _walking(asked: Sums, parts: int, listed: bool):
     """The function that walks a part of a tile.
 
     Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
     its pairs; what a tile's own test rules out is taken away from these.
     """
-    moments = 6 if geometry else 0
-    size = _shared_size(channels, geometry)
+    (channels, geometry, absolute), moments, size = asked, asked.moments(), asked.shared()
     memory = shared_memory(size)
     arena_type = memory.arena
-    slots, leave, complete = _completing(channels, geometry, listed)
+    slots, leave, complete = _completing(asked, listed)
+    every = channels == 0  # channels are read one by one, from the tensors
+    absolute = absolute and geometry
     touched, stage = touching(parts), staging(channels, size)
     pixels = SUB_TILES // parts  # how many a lane has
     part_blocks = (1 << 16 // parts) - 1
     part_stops = (1 << pixels) - 1
     pixels_type = wp.types.vector(pixels, wp.float32)
     values_type = wp.types.vector(moments + channels, wp.float32)
-    upstream_type = wp.types.matrix((pixels, channels), wp.float32)
+    upstream_type = wp.types.matrix((pixels, max(channels, 1)), wp.float32)
 
     @wp.func
     def of_part(bits: wp.int32, part: wp.int32, wanted: wp.int32) -> wp.int32:
@@ -213,6 +238,9 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                 for c in range(wp.static(channels)):
                     upstream[j, c] = L.load(v_pixels_in.renders, first, step + c)
                     largest += wp.abs(upstream[j, c])
+                if wp.static(every):
+                    for c in range(gaussians.channels):
+                        largest += wp.abs(L.load(v_pixels_in.renders, first, step + c))
                 # NaN is not taken for zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
@@ -243,6 +271,8 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                         g = L.load_int(lists.order, k)
                     row = row * wp.static(parts) + p.part
                     stage(arena, picture, gaussians, p.lane, g, bits, row)
+                    if wp.static(every):
+                        memory.put_int(arena, p.lane * RECORD + 8, color_row(picture, g))
             todo = ballot(bits)
             sync()
             while todo != 0:
@@ -268,6 +298,14 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                                 diff = -R[j]
                                 for c in range(wp.static(channels)):
                                     diff += color[c] * upstream[j, c]
+                                if wp.static(every):
+                                    step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
+                                    step *= gaussians.channels
+                                    row = memory.get_int(arena, i * RECORD + 8)
+                                    source = wp.int64(row) * wp.int64(gaussians.channels)
+                                    for c in range(gaussians.channels):
+                                        v = L.load(v_pixels_in.renders, first, step + c)
+                                        diff += L.load(gaussians.colors, source, c) * v
                                 R[j] = R[j] + clamped * diff
                                 if alpha < picture.alpha_max:
                                     h = weight * diff
@@ -279,6 +317,9 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                                     sums[3] += hu * u
                                     sums[4] += hu * dy
                                     sums[5] += hy * dy
+                                    if wp.static(absolute):
+                                        sums[6] += wp.abs(hu)
+                                        sums[7] += wp.abs(shape[2] * shape[3] * hu + level[0] * hy)
                 if (bits & wp.static(_BLOCKS)) != 0:
                     leave(arena, p.lane, waiting, memory.get_int(arena, i * RECORD + 7), sums)
                     waiting += 1
@@ -302,17 +343,16 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
 
 
 @functools.cache
-def backward_kernels(channels: int, geometry: bool, parts: int):
-    """The kernels for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
+def backward_kernels(asked: Sums, parts: int):
+    """The kernels for these sums and parts of a tile: 1, 2 or 4.
 
-    Without ``geometry`` they are for colours alone. ``composite_vjp`` has a warp for each part of a
+    ``composite_vjp`` has a warp for each part of a
     tile, and rows of pairs; ``composite_vjp_unlisted`` one for a part of each tile of a view, and
     rows of Gaussians, numbered as ``lists_in.order``.
     """
-    size, place = _shared_size(channels, geometry), placing(parts)
-    options = kernel_options(20 if channels < 4 else 16)  # warps that there are registers for
-    walk = _walking(channels, geometry, parts, True)
-    walk_unlisted = _walking(channels, geometry, parts, False)
+    size, place = asked.shared(), placing(parts)
+    options = kernel_options(20 if asked.channels < 4 else 16)  # as there are registers for
+    walk, walk_unlisted = (_walking(asked, parts, listed) for listed in (True, False))
 
     @wp.kernel(enable_backward=False, **options)
     @no_type_check

@@ -17,7 +17,7 @@ from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import Packed
 from ..constants import BLOCKS
 from ..tiles import Bins, Drawn, Lists, Picture, Pixels, Walk, Walked
-from .backward import Rows, backward_kernels, row_length
+from .backward import Rows, Sums, backward_kernels, moments_of
 from .forward import forward_kernels
 from .reduce import reduce_rows
 from .warp import CHUNK, WARP, Gaussians
@@ -41,13 +41,14 @@ def _launch(
     splats: Drawn,
     inputs: list,
     outputs: list,
+    chunk: int = CHUNK,
 ) -> None:
     """Launches both ``kernels`` of each chunk of channels, with so many warps."""
     colors = splats.colors
     channels = colors.shape[1]
-    for first in range(0, channels if warps[0] else 0, CHUNK):
+    for first in range(0, channels if warps[0] else 0, chunk):
         gaussians = Packed(Gaussians, *splats, channels, first)
-        for kernel, count in zip(kernels(min(CHUNK, channels - first)), warps):
+        for kernel, count in zip(kernels(min(chunk, channels - first)), warps):
             arguments = [picture, gaussians, *inputs]
             cuda_launch(
                 kernel, (count, WARP), arguments, outputs, device=colors.device, block_dim=WARP
@@ -92,18 +93,25 @@ def composite_backward(
     v_pixels: list[Tensor],
     skipped: Tensor,
     geometry: bool,
+    absolute: Tensor | None = None,
 ) -> Drawn:
     """As ``composite_backward`` of the CPU."""
     colors = splats.colors
     tiles, channels = walk.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
-    v_pairs = colors.new_zeros(bins.pairs.numel(), parts, row_length(channels))
-    _launch(
-        lambda count: backward_kernels(count, geometry, parts),
+    sets, moments = moments_of(channels, absolute is not None)
+    v_pairs = colors.new_zeros(bins.pairs.numel(), parts, sets * moments + channels)
+    # a pixel's absolute gradient is of all channels: several chunks leave it to another launch
+    apart = absolute is not None and channels > CHUNK
+    given = (
         (tiles * parts, splats.means2d.shape[:-2].numel() * parts),
         picture,
         splats,
         [Packed(Lists, *bins), Packed(Walked, *walk), Packed(Pixels, *v_pixels)],
         [Packed(Rows, v_pairs, skipped)],
     )
-    return reduce_rows(v_pairs, splats, bins, geometry)
+    flags = geometry and not apart, absolute is not None
+    _launch(lambda count: backward_kernels(Sums(count, *flags), parts), *given)
+    if apart:
+        _launch(lambda _: backward_kernels(Sums(0, True, True), parts), *given, channels)
+    return reduce_rows(v_pairs, splats, bins, geometry, absolute)

@@ -10,11 +10,12 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.views import Packed
+from ...runtime.views import Packed, view
 from ..project import Splats
 from ..tiles import Bins, Drawn
 from . import leaves as L
-from .backward import columns_of_moments, row_length
+from .backward import moments_of
+from .warp import LOG2_E_HALF
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,13 +63,16 @@ def _finish(
     order_in: wp.array[wp.int32],
     offsets_in: wp.array[wp.int32],
     sums_in: wp.array3d[wp.float32],
+    sets: wp.int32,
+    moments: wp.int32,
     splats_in: Splats,
     v_splats_out: Splats,
     v_colors_out: wp.array2d[wp.float32],
+    absolute_out: wp.array[wp.vec2],
 ):
     j = offset + wp.tid()
     i = order_in[j]
-    first = columns_of_moments(v_colors_out.shape[1])
+    first = sets * moments
     for c in range(v_colors_out.shape[1]):
         v_colors_out[i, c] = _over_parts(sums_in, j, first + c)
     if v_splats_out.means2d:
@@ -78,7 +82,7 @@ def _finish(
         huu = wp.float32(0.0)
         huy = wp.float32(0.0)
         hyy = wp.float32(0.0)
-        for at in range(0, first, 6):
+        for at in range(0, first, moments):
             h += _over_parts(sums_in, j, at)
             hu += _over_parts(sums_in, j, at + 1)
             hy += _over_parts(sums_in, j, at + 2)
@@ -94,17 +98,24 @@ def _finish(
         if offsets_in[j + 1] != offsets_in[j]:
             v_opacity = h / splats_in.opacities[i]
         v_splats_out.opacities[i] = v_opacity
+        if absolute_out:
+            # README eq. 14, of which the compositor has the second times a factor
+            along = _over_parts(sums_in, j, 7) / LOG2_E_HALF
+            absolute_out[i] = wp.vec2(a * _over_parts(sums_in, j, 6), along)
 
 
-def reduce_rows(v_pairs: Tensor, splats: Drawn, bins: Bins, geometry: bool) -> Drawn:
+def reduce_rows(
+    v_pairs: Tensor, splats: Drawn, bins: Bins, geometry: bool, absolute: Tensor | None
+) -> Drawn:
     """Sums rows by (view, Gaussian), as the CPU's; all rows are written.
 
     Args:
-        v_pairs: ``[P, parts, 6 · chunks + C]``, or where the lists had no room, rows of Gaussians
-            in the order of ``bins.order``.
+        v_pairs: ``[P, parts, columns of moments + C]``, or where the lists had no room, rows of
+            Gaussians in the order of ``bins.order``.
         splats: as forward, like the lists.
         bins: of the pairs.
         geometry: whether anything but colours is asked for.
+        absolute: as backward.
     """
     _, conics, view_opacities, _ = splats
     v_means2d = v_conics = v_opacities = None
@@ -113,7 +124,8 @@ def reduce_rows(v_pairs: Tensor, splats: Drawn, bins: Bins, geometry: bool) -> D
         v_conics = conics.new_empty(conics.shape)
         v_opacities = conics.new_empty(conics.shape[:-1])
     count, (_, parts, columns) = bins.order.numel(), v_pairs.shape
-    channels = next(c for c in range(columns) if row_length(c) == columns)
+    channels = splats.colors.shape[1]
+    sets, moments = moments_of(channels, absolute is not None)
     v_colors = conics.new_empty(*conics.shape[:-1], channels)
     sums = conics.new_empty(count, parts, columns)
     launch(
@@ -127,12 +139,13 @@ def reduce_rows(v_pairs: Tensor, splats: Drawn, bins: Bins, geometry: bool) -> D
         _finish,
         count,
         [
-            *(bins.order, bins.offsets, sums),
+            *(bins.order, bins.offsets, sums, sets, moments),
             Packed(Splats, None, conics, None, view_opacities, None, None),
         ],
         [
             Packed(Splats, v_means2d, v_conics, None, v_opacities, None, None),
             v_colors.view(-1, channels),
+            None if absolute is None else view(absolute.view(-1, 2), wp.vec2),
         ],
         conics.device,
     )

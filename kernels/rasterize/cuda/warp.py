@@ -29,7 +29,7 @@ CHUNK = 4  # a launch has at most so many channels
 # An integer that branches change in place; Warp would keep a copy of a plain one for each branch.
 word = wp.types.vector(1, wp.int32)
 
-_LOG2_E_HALF = 0.72134752044  # exp(-q/2) = 2^(-this q)
+LOG2_E_HALF = 0.72134752044  # exp(-q/2) = 2^(-this q)
 # The rounding of a position: the test of a sub-tile may keep too much, never too little.
 _SLACK_PIXELS = 0.01
 
@@ -239,8 +239,8 @@ def staging(channels: int, size: int):
         at = lane * RECORD
         mean = L.load2(gaussians.means2d, g)
         conic = L.load3(gaussians.conics, g)
-        memory.put4(arena, at, wp.vec4(mean[0], mean[1], -_LOG2_E_HALF * conic[0], conic[1]))
-        memory.put(arena, at + 4, -_LOG2_E_HALF * conic[2])
+        memory.put4(arena, at, wp.vec4(mean[0], mean[1], -LOG2_E_HALF * conic[0], conic[1]))
+        memory.put(arena, at + 4, -LOG2_E_HALF * conic[2])
         memory.put(arena, at + 5, wp.log2(L.load1(gaussians.opacities, g)))
         memory.put_int(arena, at + 6, bits)
         memory.put_int(arena, at + 7, row)

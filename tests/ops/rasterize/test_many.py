@@ -152,7 +152,7 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     assert len(got.status.unique()) >= (5 if num > 500 else 3)
 
 
-def sums_one_by_one(v_pairs, written, splats, bins, geometry):
+def sums_one_by_one(v_pairs, written, splats, bins, geometry, absolute):
     """Row after row in float32, and README eq. 11 with every product rounded."""
     _, conics, view_opacities, _ = splats
     sums = torch.zeros(bins.order.numel(), v_pairs.shape[1])
@@ -167,7 +167,7 @@ def sums_one_by_one(v_pairs, written, splats, bins, geometry):
     v_means2d = torch.stack([a * hu, a * k * hu + e * hy], -1)
     v_conics = torch.stack([-0.5 * huu, -a * huy, -0.5 * hyy], -1)
     v_opacities = torch.where(h != 0, h / view_opacities, 0.0)
-    assert geometry
+    assert geometry and absolute is None
     return Drawn(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
 
 

@@ -185,7 +185,7 @@ def test_fake_results_have_the_real_shapes():
     size = Size(width=width, height=height, views=views, colors_per_view=0, skip=127)
     limits = Limits(alpha_min=1 / 255, alpha_max=0.99, t_min=1e-4)
     lists = list(meta.bins), list(size), list(limits)
-    arguments = (means2d, conics, opacities, torch.rand(num, 3), *lists, None)
+    arguments = (means2d, conics, opacities, torch.rand(num, 3), *lists, None, None)
     torch.library.opcheck(
         torch.ops.gamba_warp.rasterize_composite.default, arguments, test_utils=checks
     )

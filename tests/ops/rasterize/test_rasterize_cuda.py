@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 from helpers import assert_rel_rms
-from helpers.raster import crowded, leaves, make
+from helpers.raster import absolute_gradients, crowded, leaves, make
 
 from gamba_warp.kernels.rasterize import Skip, ops, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
@@ -79,6 +79,23 @@ def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
     # a sub-tile is two blocks
     assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
     assert block_counts == lane_counts and lane_counts["tiles_skipped"] >= 2
+
+
+@pytest.mark.parametrize("channels, parts", [(3, 1), (4, 2), (1, 4), (5, 1), (11, 2)])
+def test_absolute_gradients(monkeypatch, on_cuda, channels, parts):
+    """Also with more channels than one launch has."""
+    scene = crowded(channels)
+    given = scene, *upstream(channels)
+    plain, _ = run(*given)
+    found = absolute_gradients(monkeypatch)
+    lanes, _ = run(*given)
+    for name, value in plain.items():
+        assert torch.equal(lanes[name], value), f"{name} is that without absolute values"
+    on_cuda(parts)
+    blocks, _ = run(*given)
+    assert_same(blocks, lanes)
+    assert_rel_rms(found[-1], found[0], SAME, "absolute")
+    assert (found[0] > 0).all(-1).float().mean() > 0.5
 
 
 @pytest.mark.parametrize("parts", [1, 2])

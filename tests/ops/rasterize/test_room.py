@@ -78,6 +78,17 @@ def test_without_room_the_bits_are_the_same(on_cuda, channels, mode, parts, skip
     assert without.bins.pairs.numel() == meta["pairs"]  # made once more for the counts
 
 
+@pytest.mark.parametrize("channels", [3, 6])
+def test_absolute_gradients_without_room(monkeypatch, on_cuda, channels):
+    scene = crowded(channels)
+    found = raster.absolute_gradients(monkeypatch)
+    on_cuda(2)
+    render(scene)
+    without_room()
+    _, meta = render(scene)
+    assert not meta.bins.starts.any() and found[0].any() and torch.equal(*found)
+
+
 def test_colours_alone_without_room(on_cuda):
     """Another kernel, without moments."""
     scene = {k: v for k, v in crowded().items() if k != "backgrounds"}
