@@ -15,7 +15,10 @@ from typing import Any
 # Versions of the interfaces.
 VERSIONS = {"mamba_ssm": "2.3.2", "causal_conv1d": "1.7.0", "gsplat": "1.5.3"}
 # Modules replaced in an installed gsplat; the others need only torch.
-_OF_GSPLAT = ("gsplat", "gsplat.cuda._wrapper", "gsplat.relocation", "gsplat.rendering")
+_OF_GSPLAT = (
+    *("gsplat", "gsplat.cuda._wrapper", "gsplat.relocation", "gsplat.rendering"),
+    *("gsplat.cuda_legacy", "gsplat.cuda_legacy._torch_impl", "gsplat.cuda_legacy._wrapper"),
+)
 _HERE = __name__
 __all__ = ["take_names"]
 

@@ -12,6 +12,8 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any, NoReturn
 
+from . import VERSIONS
+
 
 class _Absent(type):
     """Metaclass of placeholders, which are classes so that annotations may use them."""
@@ -30,7 +32,7 @@ class _Absent(type):
 def complete(
     package: str, original: str, why: str, names: dict[str, str], found: tuple[str, ...] = ()
 ) -> dict[str, list[str]]:
-    """Add placeholders for the names and modules of the original that a package lacks.
+    """Add the version, and placeholders for the names and modules that a package lacks.
 
     Calling or subclassing a placeholder, an instance check against it, or access to an attribute
     raises ``NotImplementedError`` with one line.
@@ -47,6 +49,7 @@ def complete(
         The missing names by module.
     """
     root = sys.modules[package]
+    vars(root)["__version__"] = VERSIONS[package.rpartition(".")[2]]
     own = {name for name, value in vars(root).items() if not isinstance(value, _Absent)} | {*found}
     missing = {}
     for path, text in names.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -81,15 +82,33 @@ def positive(**numbers: float) -> None:
             raise ValueError(f"{name} is {value}, allowed is > 0")
 
 
-def side(**pixels: int) -> None:
-    """Refuse sizes of a picture that are not integers from 1 to 32,768.
+def at_least_0(**numbers: float) -> None:
+    """Refuse numbers that are below 0, by name.
 
     Raises:
-        ValueError: one is not.
+        ValueError: one is.
     """
+    for name, value in numbers.items():
+        if not value >= 0:
+            raise ValueError(f"{name} is {value}, allowed is >= 0")
+
+
+def side(**pixels: Any) -> list[int]:
+    """Return sizes of pictures or tiles as ints, given as any integers from 1 to 32,768.
+
+    Raises:
+        ValueError: one is not; numpy's integers and 0-d tensors of integers are.
+    """
+    sizes = []
     for name, value in pixels.items():
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE:
+        try:
+            number = 0 if isinstance(value, bool) else operator.index(value)
+        except TypeError:
+            number = 0
+        if not 1 <= number <= MAX_SIDE:
             raise ValueError(f"{name} is {value!r}, allowed are integers from 1 to {MAX_SIDE}")
+        sizes.append(number)
+    return sizes
 
 
 def one_device(tensors: dict[str, Any]) -> None:

@@ -23,9 +23,10 @@ def _check_options(options: dict) -> None:
         value = options[name]
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
             raise ValueError(f"{name} is {value!r}, allowed are integers from 1 to {_MAX_SIDE}")
-    for name in ("near_plane", "eps2d"):
-        if not options[name] > 0:
-            raise ValueError(f"{name} is {options[name]}, allowed is > 0")
+    if not options["near_plane"] > 0:
+        raise ValueError(f"near_plane is {options['near_plane']}, allowed is > 0")
+    if not options["eps2d"] >= 0:
+        raise ValueError(f"eps2d is {options['eps2d']}, allowed is >= 0")
     low, high = options["alpha_min"], options["alpha_max"]
     if not 0 < low <= high < 1:
         raise ValueError(f"alpha_min, alpha_max are {low}, {high}, allowed is 0 < min <= max < 1")

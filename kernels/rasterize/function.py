@@ -67,7 +67,7 @@ def rasterization(
         far_plane: Gaussians whose centre is farther are culled.
         radius_clip: Gaussians whose box is not larger than this many pixels from the centre are
             culled.
-        eps2d: added to the diagonal of the projected covariance, square pixels, > 0.
+        eps2d: added to the diagonal of the projected covariance, square pixels, >= 0.
         sh_degree: None or 0 to 3.
         backgrounds: ``[.., V, C]`` (without the depth channel), or None: black.
         render_mode: "RGB", "D" (Σ w z), "ED" (Σ w z / Σ w), "RGB+D" or "RGB+ED", with the weights

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..runtime.launch import launch
 from ..runtime.memory import empty
 from ..runtime.views import Packed, filled, struct
-from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
+from .constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -263,9 +263,14 @@ def _project(
     sxx = wp.dot(m0, m0) + lens.eps2d
     sxy = wp.dot(m0, m1)
     syy = wp.dot(m1, m1) + lens.eps2d
+    if not (wp.isfinite(det) and det > 0.0 and syy > 0.0):
+        splats_out.status[i] = NOT_FINITE
+        return
     a = syy / det
+    e = 1.0 / syy
     center = wp.vec2(K[0, 0] * t[0] / t[2] + K[0, 2], K[1, 1] * t[1] / t[2] + K[1, 2])
-    if not (wp.isfinite(det) and a > 0.0 and wp.isfinite(center[0]) and wp.isfinite(center[1])):
+    sound = a > 0.0 and a <= CONIC_MAX and e <= CONIC_MAX
+    if not (sound and wp.isfinite(center[0]) and wp.isfinite(center[1])):
         splats_out.status[i] = NOT_FINITE
         return
     if lens.antialiased != 0:
@@ -288,7 +293,7 @@ def _project(
         return
     splats_out.status[i] = VISIBLE
     splats_out.means2d[i] = center
-    splats_out.conics[i] = wp.vec3(a, -sxy / syy, 1.0 / syy)
+    splats_out.conics[i] = wp.vec3(a, -sxy / syy, e)
     splats_out.depths[i] = t[2]
     splats_out.opacities[i] = opacity
     splats_out.extents[i] = extent

@@ -9,7 +9,15 @@ import math
 import torch
 from torch import Tensor
 
-from .constants import ALPHA_MAX, ALPHA_MIN, COMPENSATION_MIN, EPS2D, FRUSTUM_MARGIN, T_MIN
+from .constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    COMPENSATION_MIN,
+    CONIC_MAX,
+    EPS2D,
+    FRUSTUM_MARGIN,
+    T_MIN,
+)
 
 _CHUNK = 4096  # pixels at once
 
@@ -106,6 +114,14 @@ def render_view(
     M = (M if quats is None else M @ _rotations(quats[order])) * scales[:, None]
     cov0 = M @ M.mT
     cov = cov0 + eps2d * torch.eye(2, dtype=cov0.dtype)
+    with torch.no_grad():  # a determinant without cancellation
+        det = torch.linalg.cross(M[:, 0], M[:, 1]).square().sum(-1)
+        det = det + eps2d * cov0.diagonal(dim1=-2, dim2=-1).sum(-1) + eps2d**2
+        yy = cov[:, 1, 1]
+        solid = (det > 0) & (yy <= CONIC_MAX * det) & (yy * CONIC_MAX >= 1)
+    # replaced before they are inverted: a gradient of 0 is 0 then, and not NaN
+    cov = torch.where(solid[:, None, None], cov, torch.eye(2, dtype=cov0.dtype))
+    opacity = torch.where(solid, opacity, 0.0)
     if antialiased:
         ratio = torch.linalg.det(cov0) / torch.linalg.det(cov)
         opacity = opacity * ratio.clamp_min(COMPENSATION_MIN**2).sqrt()

@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.raster import leaves, make, nerfacc, visible_pairs
+from helpers.raster import leaves, make, nerfacc, visible_pairs, weights_by_pixel
 
 from gamba_warp.compat import gsplat as compat
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN
@@ -253,16 +253,8 @@ def test_absolute_gradients(tile):
     given = means2d, conics, colors, opacities, width, height, tile, offsets, rows
     torch.autograd.backward(compat.rasterize_to_pixels(*given, absgrad=True), v)
 
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    each = means2d.detach().double().expand(height * width, num, 2).clone().requires_grad_()
-    d = torch.stack([x, y], -1).view(-1, 1, 2) - each
-    xx, xy, yy = conics[0].double().unbind(-1)
-    q = xx * d[..., 0] ** 2 + 2 * xy * d[..., 0] * d[..., 1] + yy * d[..., 1] ** 2
-    alpha = (opacities[0].double() * torch.exp(-0.5 * q)).clamp_max(0.999)
-    alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
-    after = (1 - alpha).cumprod(1)
-    weights = torch.where(after > 1e-4, after / (1 - alpha) * alpha, 0.0)
-    assert (after <= 1e-4).any() and (alpha >= 0.999).any()
+    each, weights = weights_by_pixel(means2d[0], conics[0], opacities[0], width, height)
+    assert weights.max() > 0.9989, "some are clamped"
     upstream = (weights @ colors[0].double(), weights.sum(1, keepdim=True))
     torch.autograd.backward(upstream, [x.double().flatten(0, 2) for x in v])
     assert_rel_rms(means2d.grad[0], each.grad.sum(0), GRADIENT, "means2d")

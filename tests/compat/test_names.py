@@ -23,6 +23,9 @@ assert selective_scan_fn is mamba_ssm.selective_scan_fn
 assert causal_conv1d_fn is causal_conv1d.causal_conv1d_fn
 assert rasterization is gsplat.rasterization
 assert wrapper.isect_tiles is gsplat.isect_tiles
+from gsplat.cuda_legacy._wrapper import num_sh_bases
+from gsplat.optimizers import SelectiveAdam
+assert gsplat.__version__ == "1.5.3" and num_sh_bases(2) == 9
 ours = selective_scan_fn, selective_state_update, causal_conv1d_fn, rasterization
 assert all(x.__module__.startswith("gamba_warp.") for x in ours)
 try:

@@ -117,6 +117,23 @@ def absolute_gradients(monkeypatch):
     return found
 
 
+def weights_by_pixel(means2d, conics, opacities, width, height):
+    """Centres of every pixel by itself ``[H W, N, 2]`` and their weights ``[H W, N]``, in float64.
+
+    Gaussians come front to back; conics are gsplat's xx, xy, yy. The gradient of the centres, a
+    leaf, has a row for each pixel.
+    """
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    each = means2d.detach().double().expand(height * width, *means2d.shape).clone().requires_grad_()
+    d = torch.stack([x, y], -1).view(-1, 1, 2) - each
+    xx, xy, yy = conics.double().unbind(-1)
+    q = xx * d[..., 0] ** 2 + 2 * xy * d[..., 0] * d[..., 1] + yy * d[..., 1] ** 2
+    alpha = (opacities.double() * torch.exp(-0.5 * q)).clamp_max(0.999)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    after = (1 - alpha).cumprod(1)
+    return each, torch.where(after > 1e-4, after / (1 - alpha) * alpha, 0.0)
+
+
 def nerfacc():
     """The two functions of nerfacc that gsplat's ``accumulate`` asks for; pairs come ray by ray."""
 

@@ -9,18 +9,29 @@ import importlib
 from typing import Any
 
 from ..absent import complete
+from .optimizer import SelectiveAdam, adam
 from .pixels import isect_offset_encode, isect_tiles, rasterize_to_pixels
-from .projection import fully_fused_projection, proj, spherical_harmonics, world_to_cam
-from .relocation import quat_scale_to_covar_preci
+from .projection import (
+    fully_fused_projection,
+    num_sh_bases,
+    proj,
+    spherical_harmonics,
+    world_to_cam,
+)
+from .relocation import quat_scale_to_covar_preci, quat_to_rotmat
 from .rendering import RollingShutterType, rasterization
 
 __all__ = [
     "RollingShutterType",
+    "SelectiveAdam",
+    "adam",
     "fully_fused_projection",
     "isect_offset_encode",
     "isect_tiles",
+    "num_sh_bases",
     "proj",
     "quat_scale_to_covar_preci",
+    "quat_to_rotmat",
     "rasterization",
     "rasterize_to_pixels",
     "spherical_harmonics",
@@ -35,7 +46,7 @@ ABSENT = complete(
     "gsplat",
     "only its pinhole path of 3DGS is",
     {
-        "": "SelectiveAdam accumulate accumulate_2dgs fully_fused_projection_2dgs "
+        "": "accumulate accumulate_2dgs fully_fused_projection_2dgs "
         "fully_fused_projection_with_ut rasterization_2dgs rasterization_2dgs_inria_wrapper "
         "rasterization_inria_wrapper rasterize_to_indices_in_range "
         "rasterize_to_indices_in_range_2dgs rasterize_to_pixels_2dgs rasterize_to_pixels_eval3d "
@@ -60,6 +71,8 @@ ABSENT = complete(
         "compression.sort": "sort_splats",
         "cuda._torch_impl": "accumulate",
         "cuda._torch_impl_2dgs": "accumulate_2dgs",
+        "cuda_legacy._torch_impl": "quat_to_rotmat",
+        "cuda_legacy._wrapper": "num_sh_bases",
         "cuda._wrapper": "FThetaCameraDistortionParameters FThetaPolynomialType RollingShutterType "
         "UnscentedTransformParameters adam fully_fused_projection fully_fused_projection_2dgs "
         "fully_fused_projection_with_ut isect_offset_encode isect_tiles persp_proj proj "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Sequence
 
 import torch
@@ -14,7 +15,7 @@ from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, T_MIN, TILE
 from gamba_warp.kernels.rasterize.ops import composite
 from gamba_warp.kernels.rasterize.tiles import Bins, Limits, Size, Tiling
 
-from ..shared import check_tensor, one_device, positive, side
+from ..shared import check_tensor, one_device, side
 
 LIMITS = Limits(ALPHA_MIN, 0.999, T_MIN)  # gsplat 1.5.3 clamps alpha at 0.999
 SKIP = Skip().bits()
@@ -79,12 +80,14 @@ def isect_tiles(
     lead = means2d.shape[:-1]
     check_tensor("radii", radii, (*lead, 2))
     check_tensor("depths", depths, (*lead,))
-    positive(tile_size=tile_size, tile_width=tile_width, tile_height=tile_height)
+    tile_size, tile_width, tile_height = side(
+        tile_size=tile_size, tile_width=tile_width, tile_height=tile_height
+    )
     if packed:
         if n_images is None or image_ids is None:
             raise ValueError("n_images and image_ids are None: packed tensors need them")
         check_tensor("image_ids", image_ids, (*lead,))
-        count, images = n_images, image_ids.long()
+        count, images = operator.index(n_images), image_ids.long()
     else:
         count, num = math.prod(lead[:-1]), lead[-1]
         images = torch.arange(count, device=means2d.device).repeat_interleave(num)
@@ -128,6 +131,8 @@ def isect_offset_encode(
         ValueError: ``isect_ids`` is not one-dimensional.
     """
     check_tensor("isect_ids", isect_ids, ("P",))
+    tile_width, tile_height = side(tile_width=tile_width, tile_height=tile_height)
+    n_images = operator.index(n_images)
     tiles = tile_width * tile_height
     image, tile = torch.arange(n_images), torch.arange(tiles)
     keys = ((image[:, None] << tiles.bit_length()) | tile).to(isect_ids.device)
@@ -194,7 +199,7 @@ def rasterize_to_pixels(
             Gaussians: slower, with the same picture.
         isect_offsets: ``[.., tile_height, tile_width]`` int32.
         flatten_ids: ``[n_isects]`` int32.
-        backgrounds: ``[.., D]``, or None: black.
+        backgrounds: ``[.., D]`` or ``[D]``, or None: black.
         masks: ``[.., tile_height, tile_width]`` bool, or None; False shows the background.
         packed: the tensors are packed.
         absgrad: in backward, set ``means2d.absgrad`` to the sum of absolute gradients over pixels.
@@ -214,11 +219,13 @@ def rasterize_to_pixels(
     check_tensor("opacities", opacities, (*rows,))
     check_tensor("colors", colors, (*rows, "D >= 1"))
     check_tensor("flatten_ids", flatten_ids, ("P",))
-    check_tensor("backgrounds", backgrounds, (*lead, colors.shape[-1]), optional=True)
+    shape = *lead, colors.shape[-1]
+    check_tensor("backgrounds", backgrounds, shape, shape[-1:], optional=True)
     check_tensor("masks", masks, (*lead, grid_y, grid_x), optional=True)
     one_device(dict(means2d=means2d, conics=conics, colors=colors, opacities=opacities))
-    side(image_width=image_width, image_height=image_height)
-    positive(tile_size=tile_size)
+    image_width, image_height, tile_size = side(
+        image_width=image_width, image_height=image_height, tile_size=tile_size
+    )
     if grid_y * tile_size < image_height or grid_x * tile_size < image_width:
         need = f"{image_height} x {image_width} pixels"
         raise ValueError(
@@ -289,5 +296,5 @@ def rasterize_to_pixels(
         found.append(whole.reshape(*lead, *whole.shape[1:]))
     renders, alphas = found
     if backgrounds is not None:
-        renders = renders + (1 - alphas) * backgrounds[..., None, None, :]
+        renders = renders + (1 - alphas) * backgrounds.expand(shape)[..., None, None, :]
     return renders, alphas

@@ -11,6 +11,7 @@ from torch import Tensor
 from gamba_warp.kernels.rasterize.constants import (
     ALPHA_MIN,
     COMPENSATION_MIN,
+    CONIC_MAX,
     EPS2D,
     FRUSTUM_MARGIN,
 )
@@ -18,7 +19,7 @@ from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 from gamba_warp.kernels.rasterize.ops import project
 from gamba_warp.kernels.rasterize.project import LensOptions
 
-from ..shared import check_tensor, one_device, one_of, positive, side
+from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side
 from .relocation import quat_scale_to_covar_preci
 
 MAX_SH_DEGREE = 4
@@ -82,6 +83,11 @@ def plain_conics(conics: Tensor) -> Tensor:
     """Convert (a, k, e) of ``a (dx + k dy)² + e dy²`` to gsplat's xx, xy, yy."""
     a, k, e = conics.unbind(-1)
     return torch.stack([a, a * k, a * k * k + e], -1)
+
+
+def num_sh_bases(degree: int) -> int:
+    """Return the number of spherical harmonics up to a degree, (degree + 1)², at most 25."""
+    return (min(degree, MAX_SH_DEGREE) + 1) ** 2
 
 
 def spherical_harmonics(
@@ -156,7 +162,7 @@ def proj(
         ValueError: another camera, or a size that is not allowed.
     """
     one_of("camera_model", camera_model, "pinhole")
-    side(width=width, height=height)
+    width, height = side(width=width, height=height)
     focal = torch.stack([Ks[..., 0, 0], Ks[..., 1, 1]], -1)[..., None, :]
     center = Ks[..., None, :2, 2]
     size = Ks.new_tensor([width, height])
@@ -232,13 +238,15 @@ def _project_covariances(
     before = xx * yy - xy * xy
     xx, yy = xx + lens.eps2d, yy + lens.eps2d
     det = xx * yy - xy * xy
+    solid = (det > 0) & (yy <= CONIC_MAX * det) & (yy * CONIC_MAX >= 1)
+    xx, yy, det = (torch.where(solid, x, 1.0) for x in (xx, yy, det))
     shown = opacities.double().expand_as(depths)
     if lens.antialiased:
         some = before > 0
         # Replaced before the root, whose infinite slope at 0 would turn a gradient of 0 into NaN.
         factor = torch.where(some, before / det, 1.0).sqrt()
         shown = shown * torch.where(some, factor, 0.0)
-    seen = seen & (det > 0) & (shown >= ALPHA_MIN)
+    seen = seen & solid & (shown >= ALPHA_MIN)
     with torch.no_grad():
         cut = (2 * (shown / ALPHA_MIN).clamp_min(1).log()).sqrt()
         extents = cut[..., None] * torch.stack([xx, yy], -1).clamp_min(0).sqrt()
@@ -287,7 +295,7 @@ def fully_fused_projection(
         Ks: ``[.., C, 3, 3]`` pixels; skew is ignored.
         width: pixels.
         height: pixels.
-        eps2d: added to the diagonal of the covariance in the picture; > 0.
+        eps2d: added to the diagonal of the covariance in the picture; >= 0.
         near_plane: nearer Gaussians are culled; > 0.
         far_plane: farther ones are culled.
         radius_clip: ones with both radii up to this many pixels are culled.
@@ -308,8 +316,9 @@ def fully_fused_projection(
     """
     one_of("sparse_grad", sparse_grad, False)
     one_of("camera_model", camera_model, "pinhole")
-    positive(eps2d=eps2d, near_plane=near_plane)
-    side(width=width, height=height)
+    positive(near_plane=near_plane)
+    at_least_0(eps2d=eps2d)
+    width, height = side(width=width, height=height)
     tensors: dict[str, Any] = dict(means=means, viewmats=viewmats, Ks=Ks)
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
     lead = check_scene({**tensors, **({} if opacities is None else {"opacities": opacities})}, (6,))

@@ -12,6 +12,18 @@ from torch.nn import functional as F
 from ..shared import check_tensor
 
 
+def quat_to_rotmat(quats: Tensor) -> Tensor:
+    """Convert quaternions ``[.., 4]``, wxyz of any length, to rotations ``[.., 3, 3]``."""
+    check_tensor("quats", quats, ("..", 4))
+    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
 def quat_scale_to_covar_preci(
     quats: Tensor,
     scales: Tensor,
@@ -37,13 +49,7 @@ def quat_scale_to_covar_preci(
     """
     check_tensor("scales", scales, ("..", 3))
     check_tensor("quats", quats, (*scales.shape[:-1], 4))
-    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    rotation = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    rotation = quat_to_rotmat(quats)
 
     def product(lengths: Tensor) -> Tensor:
         root = rotation * lengths[..., None, :]

@@ -15,7 +15,7 @@ from gamba_warp.kernels.rasterize.ops import bin_op
 from gamba_warp.kernels.rasterize.project import LensOptions
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 
-from ..shared import check_tensor, one_device, one_of, positive, side
+from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side
 from .pixels import SKIP, blend, pair_ids
 from .projection import MAX_SH_DEGREE, check_scene, flat, plain_conics, project_views
 
@@ -108,11 +108,11 @@ def rasterization(
         near_plane: nearer Gaussians are culled; > 0.
         far_plane: farther ones are culled.
         radius_clip: ones with both radii up to this many pixels are culled.
-        eps2d: added to the diagonal of the covariance in the picture; > 0.
+        eps2d: added to the diagonal of the covariance in the picture; >= 0.
         sh_degree: None, or 0 to 4.
         packed: ``meta`` has one row for each visible Gaussian of a view.
         tile_size: no effect; ``meta["tile_size"]`` is the side of the tiles used.
-        backgrounds: ``[.., C, D]``, or None: black.
+        backgrounds: ``[.., C, D]``, ``[C, D]`` or ``[D]``, or None: black.
         render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
         absgrad: in backward, set ``meta["means2d"].absgrad``.
         rasterize_mode: "classic" or "antialiased".
@@ -132,8 +132,9 @@ def rasterization(
     one_of("render_mode", render_mode, "RGB", "D", "ED", "RGB+D", "RGB+ED")
     one_of("rasterize_mode", rasterize_mode, "classic", "antialiased")
     one_of("sh_degree", sh_degree, None, *range(MAX_SH_DEGREE + 1))
-    positive(near_plane=near_plane, eps2d=eps2d)
-    side(width=width, height=height)
+    positive(near_plane=near_plane)
+    at_least_0(eps2d=eps2d)
+    width, height = side(width=width, height=height)
     tensors: dict[str, Any] = dict(means=means, viewmats=viewmats, Ks=Ks, opacities=opacities)
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
     lead = check_scene(tensors, (3, 3))
@@ -143,7 +144,9 @@ def rasterization(
         shapes = ((*lead, *rows, *least, "D >= 1") for rows in ((num,), (views, num)))
         check_tensor("colors", colors, *shapes)
     if colored and colors is not None:
-        check_tensor("backgrounds", backgrounds, (*lead, views, colors.shape[-1]), optional=True)
+        shape = *lead, views, colors.shape[-1]
+        check_tensor("backgrounds", backgrounds, shape, shape[-2:], shape[-1:], optional=True)
+        backgrounds = None if backgrounds is None else backgrounds.expand(shape)
     one_device({"means": means, "colors": colors, "backgrounds": backgrounds})
 
     given = {name: flat(x, lead) for name, x in tensors.items()}

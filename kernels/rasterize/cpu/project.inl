@@ -60,12 +60,17 @@ for (int i0 = begin; i0 < end; i0 += 16) {
             cross_(m0[0], m0[1], m1[0], m1[1])};
         const F det0 = dot_(across, across), d00 = dot_(m0, m0), d11 = dot_(m1, m1);
         const F eps = splat(lens.eps2d);
-        const F det = add_(add_(det0, mul_(eps, add_(d00, d11))), mul_(eps, eps));
-        const F sxx = add_(d00, eps), sxy = dot_(m0, m1), syy = add_(d11, eps);
-        const F a = syy / det;
+        F det = add_(add_(det0, mul_(eps, add_(d00, d11))), mul_(eps, eps));
+        F syy = add_(d11, eps);
+        const F sxx = add_(d00, eps), sxy = dot_(m0, m1);
+        const I solid = finite_(det) & (I)(det > 0.0f) & (I)(syy > 0.0f);
+        det = solid ? det : splat(1.0f);
+        syy = solid ? syy : splat(1.0f);
+        const F a = syy / det, e = splat(1.0f) / syy;
         const F x = add_(mul_(splat(K[0]), t[0]) / z, splat(K[2]));
         const F y = add_(mul_(splat(K[4]), t[1]) / z, splat(K[5]));
-        const I sound = finite_(det) & (I)(a > 0.0f) & finite_(x) & finite_(y);
+        const I thick = (I)(a > 0.0f) & (I)(a <= CONIC_MAX) & (I)(e <= CONIC_MAX);
+        const I sound = solid & thick & finite_(x) & finite_(y);
         shown = opacity;
         I faint = I{};
         if (lens.antialiased) {
@@ -95,7 +100,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         center[1] = keep_(y, 0.0f);
         conic[0] = keep_(a, 1.0f);
         conic[1] = keep_(-sxy / syy, 0.0f);
-        conic[2] = keep_(1.0f / syy, 1.0f);
+        conic[2] = keep_(e, 1.0f);
         extent[0] = keep_(extent[0], 0.0f);
         extent[1] = keep_(extent[1], 0.0f);
         depth = keep_(z, 0.0f);

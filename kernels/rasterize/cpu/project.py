@@ -10,7 +10,7 @@ import warp as wp
 
 from ...runtime.launch import parallel_launch
 from ...runtime.native import native, native_kernel
-from ..constants import COMPENSATION_MIN, FRUSTUM_MARGIN
+from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN
 from ..project import STATUS_NAMES, Lens, Scene, Splats
 
 _RUN = 512  # Gaussians of a task, a multiple of 16
@@ -20,6 +20,7 @@ _HERE = Path(__file__).parent
 _DEFINES = {
     **{name.upper(): number for number, name in enumerate(STATUS_NAMES)},
     **{"RUN": _RUN, "MARGIN": FRUSTUM_MARGIN, "COMPENSATION_MIN": COMPENSATION_MIN},
+    "CONIC_MAX": CONIC_MAX,
 }
 
 

@@ -67,9 +67,27 @@ def test_wide_view_clamps_the_jacobian():
     assert meta["culled"]["near"] > 0
 
 
-@pytest.mark.parametrize("option", [{"eps2d": 0.1}, {"alpha_min": 0.02}, {"alpha_max": 0.7}])
+@pytest.mark.parametrize(
+    "option", [{"eps2d": 0.1}, {"eps2d": 0.0}, {"alpha_min": 0.02}, {"alpha_max": 0.7}]
+)
 def test_options(option):
     compare(make(), **option)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_without_dilation(antialiased):
+    """Lines, points and specks have determinant 0: they are culled, and what is flat is not."""
+    scene = make(1, 2, num=80)
+    for i, scales in enumerate(((0.1, 0, 0), (0, 0, 0), (1e-13,) * 3, (0.1, 0.08, 0), (1e-9,) * 3)):
+        scene["scales"][:, i::8] = torch.tensor(scales)
+    scene["quats"][:, ::3] = torch.tensor([1.0, 0, 0, 0])
+    meta = compare(scene, eps2d=0.0, antialiased=antialiased)
+    assert meta["culled"]["not_finite"] == 2 * (10 + 10 + 10)
+    got = leaves(scene, torch.float32)
+    renders, alphas, _ = rasterization(**got, eps2d=0.0, render_mode="RGB+D")
+    (renders.sum() + alphas.sum()).backward()
+    for name in ("means", "quats", "scales", "opacities"):
+        assert (got[name].grad[:, 1::8] == 0).all() and got[name].grad.isfinite().all(), name
 
 
 def test_planes():
