@@ -110,6 +110,23 @@ def test_colours_alone(on_cuda, parts):
     assert_same(blocks, lanes)
 
 
+def test_without_dilation(on_cuda):
+    """What has determinant 0 is culled on both devices, before it is divided by."""
+    scene = crowded(3)
+    scene["scales"][:, ::6] = torch.tensor([0.1, 0, 0])
+    scene["scales"][:, 1::6] = 1e-13
+    scene["scales"][:, 2::6, 1] = 0
+    v = upstream()
+    lanes, lane_counts = run(scene, *v, eps2d=0.0)
+    on_cuda()
+    blocks, block_counts = run(scene, *v, eps2d=0.0)
+    assert all(x.isfinite().all() for x in blocks.values())
+    assert all((blocks[name][:, k::6] == 0).all() for name in ("means", "scales") for k in (0, 1))
+    assert blocks["alphas"].mean() > 0.3 and block_counts["pairs_walked"] > 0
+    assert_same(blocks, lanes)
+    assert block_counts["pairs_walked"] == lane_counts["pairs_walked"]
+
+
 def test_a_first_gaussian_may_stop_a_pixel(on_cuda):
     """Then its transmittance is still 1, as that of no pixel outside the picture may be."""
     scene = make(1, 1, num=40, width=21, height=19, channels=3, size=60.0)
