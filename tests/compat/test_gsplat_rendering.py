@@ -78,17 +78,20 @@ def test_harmonics(per_view, degree):
     assert (got["viewmats"].grad != 0).any()
 
 
-@pytest.mark.parametrize("kind", ["classic", "antialiased"])
-def test_covariances(kind):
+@pytest.mark.parametrize("kind, eps2d", [("classic", 0.3), ("classic", 0.0), ("antialiased", 0.3)])
+def test_covariances(kind, eps2d):
     """Covariances are projected by other code, in float64."""
     scene = scene_of()
     scene["means"][:, :5] *= 9
     scene["means"][:, 5] = float("nan")
+    scene["scales"][:, 6] = 0  # a point, which has no footprint without eps2d
     got, want = asking(scene), asking(scene)
     covars = quat_scale_to_covar_preci(got["quats"], got["scales"], True, False)[0]
     given = {**got, "quats": None, "scales": None, "covars": covars}
-    renders, _, meta = rasterization(**given, rasterize_mode=kind, packed=False)
-    expected, _, theirs = rasterization(**want, rasterize_mode=kind, packed=False)
+    options = dict(rasterize_mode=kind, packed=False, eps2d=eps2d)
+    renders, _, meta = rasterization(**given, **options)
+    expected, _, theirs = rasterization(**want, **options)
+    assert eps2d or not (theirs["radii"][..., 6, :].any() or meta["radii"][..., 6, :].any())
     assert (renders - expected).abs().max() < 1e-4 and torch.isfinite(renders).all()
     assert (meta["radii"] - theirs["radii"]).abs().max() <= 1
     v = torch.randn_like(renders)
