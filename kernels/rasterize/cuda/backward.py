@@ -346,9 +346,9 @@ def _walking(asked: Sums, parts: int, listed: bool):
 def backward_kernels(asked: Sums, parts: int):
     """The kernels for these sums and parts of a tile: 1, 2 or 4.
 
-    ``composite_vjp`` has a warp for each part of a
-    tile, and rows of pairs; ``composite_vjp_unlisted`` one for a part of each tile of a view, and
-    rows of Gaussians, numbered as ``lists_in.order``.
+    ``composite_vjp`` has a warp for each part of a tile, and rows of pairs;
+    ``composite_vjp_unlisted`` one for a part of each tile of a view, and rows of Gaussians,
+    numbered as ``lists_in.order``.
     """
     size, place = asked.shared(), placing(parts)
     options = kernel_options(20 if asked.channels < 4 else 16)  # as there are registers for
