@@ -60,7 +60,7 @@ def take_names(*packages: str) -> None:
 
 def _overlay(own: ModuleType, name: str, folders: Any) -> ModuleType:
     """Make a package with our names that finds its other modules in the given folders."""
-    made = ModuleType(name, own.__doc__)
+    made = type(own)(name, own.__doc__)
     kept = {"__name__", "__package__", "__loader__", "__spec__"}
     vars(made).update({key: value for key, value in vars(own).items() if key not in kept})
     made.__path__ = list(folders)

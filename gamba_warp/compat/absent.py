@@ -1,18 +1,23 @@
 """Placeholders for missing names of another package: importable, but they raise when used.
 
-Programs import more than they call, so a missing name should not fail at the import.
+Most programs import more than they call, so a missing name does not fail at the import. Only inside
+a ``try`` that catches ImportError it does: there the program has another way.
 """
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
+import linecache
 import sys
 from importlib.machinery import ModuleSpec
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import Any, NoReturn
 
 from . import VERSIONS
+
+_CATCHES = {"ImportError", "ModuleNotFoundError", "Exception", "BaseException"}
 
 
 class _Absent(type):
@@ -27,6 +32,40 @@ class _Absent(type):
         if name.startswith("_"):  # probed by Python and its tools in any class
             raise AttributeError(f"{cls.__name__} has no attribute {name!r}")
         raise NotImplementedError(cls.__doc__)
+
+
+class _Module(ModuleType):
+    """Module with placeholders, found after its own names and those of its ``__getattr__``."""
+
+    _absent: dict[str, _Absent]
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._absent:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        if _caught(sys._getframe(1)):
+            raise ModuleNotFoundError(self._absent[name].__doc__, name=self.__name__)
+        return self._absent[name]
+
+
+def _caught(frame: FrameType | None) -> bool:
+    """Return whether the line of a frame is in a ``try`` that catches ImportError."""
+    while frame and frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    if frame is None:
+        return False
+    try:
+        tree = ast.parse("".join(linecache.getlines(frame.f_code.co_filename, frame.f_globals)))
+    except SyntaxError:  # the file has changed
+        return False
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Try):
+            inside = node.body[0].lineno <= frame.f_lineno <= (node.body[-1].end_lineno or 0)
+            types = [
+                x.type and {getattr(y, "id", "") for y in ast.walk(x.type)} for x in node.handlers
+            ]
+            if inside and any(names is None or names & _CATCHES for names in types):
+                return True
+    return False
 
 
 def complete(
@@ -50,15 +89,16 @@ def complete(
     """
     root = sys.modules[package]
     vars(root)["__version__"] = VERSIONS[package.rpartition(".")[2]]
-    own = {name for name, value in vars(root).items() if not isinstance(value, _Absent)} | {*found}
+    own = {*vars(root), *found}
     missing = {}
     for path, text in names.items():
         module, listed = _module(f"{package}.{path}".rstrip(".")), set(text.split())
         if listed & own:
             vars(module)["__getattr__"] = _of_root(root, listed & own)
-        missing[path] = sorted(listed - own)
-        for name in missing[path]:
-            vars(module)[name] = _absent(name, module, f"{original}'s {name} is not here: {why}")
+        missing[path] = sorted(listed - own - {*vars(module)})
+        lines = {name: f"{original}'s {name} is not here: {why}" for name in missing[path]}
+        vars(module)["_absent"] = {x: _absent(x, module, line) for x, line in lines.items()}
+        module.__class__ = _Module
     return {path: lacking for path, lacking in missing.items() if lacking}
 
 

@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -56,6 +57,62 @@ def test_each_is_imported_and_says_so_when_used(package, path, names):
 def test_what_the_original_lacks_too_is_an_import_error(line):
     with pytest.raises(ImportError):
         exec(line)
+
+
+GUARDED = """
+def late():
+    {head}
+        from {package} import {name}
+    {handler}
+        {name} = None
+    return {name}
+{body}
+"""
+BODY = "{head}\n    from {package} import {name}\n{handler}\n    {name} = None"
+
+
+@pytest.mark.parametrize(
+    "path, name",
+    [
+        ("mamba_ssm", "Mamba2"),
+        ("mamba_ssm.modules.mamba2", "Mamba2"),
+        ("gsplat", "accumulate_2dgs"),
+    ],
+)
+@pytest.mark.parametrize(
+    "head, handler, missing",
+    [
+        ("try:", "except ImportError:", True),
+        ("try:", "except (AttributeError, ModuleNotFoundError) as error:", True),
+        ("try:", "except Exception:", True),
+        ("try:", "except:", True),
+        ("try:", "except AttributeError:", False),
+        ("try:", "finally:", None),
+        ("if True:", "else:", False),
+    ],
+)
+def test_a_name_is_an_import_error_where_the_program_catches_it(
+    tmp_path, path, name, head, handler, missing
+):
+    """At a module's top and in a function, from a package and from a module."""
+    words = {"head": head, "handler": handler, "package": f"gamba_warp.compat.{path}", "name": name}
+    client = tmp_path / "client.py"
+    client.write_text(GUARDED.format(**words, body=BODY.format(**words)))
+    space = runpy.run_path(str(client))
+    for found in (space[name], space["late"]()):
+        if missing is None:
+            assert found is None, "the finally clause follows an import that worked"
+        else:
+            assert (found is None) == missing
+
+
+def test_the_import_error_says_what_is_missing(tmp_path):
+    client, package = tmp_path / "client.py", mamba_ssm.__name__
+    client.write_text(
+        f"try:\n from {package} import (Mamba,\n  Mamba2)\nexcept ImportError as e:\n text = str(e)"
+    )
+    space = runpy.run_path(str(client))
+    assert space["text"] == "mamba-ssm's Mamba2 is not here: only its Mamba-1 is"
 
 
 def test_names_that_are_here_are_so_under_every_path():

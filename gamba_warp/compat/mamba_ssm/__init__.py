@@ -50,8 +50,8 @@ ABSENT = complete(
         "ops.selective_scan_interface": "MambaInnerFn SelectiveScanFn rms_norm_forward",
         "ops.tilelang.mamba3.mamba3_mimo": "mamba3_mimo",
         "ops.triton.k_activations": "SwiGLU swiglu",
-        "ops.triton.layer_norm": "LayerNormFn LayerNormLinearFn RMSNorm layer_norm_fn "
-        "layer_norm_linear_fn layer_norm_ref rms_norm_fn rms_norm_ref",
+        "ops.triton.layer_norm": "LayerNormFn LayerNormLinearFn layer_norm_linear_fn",
+        "ops.triton.layernorm": "LayerNormFn",
         "ops.triton.layernorm_gated": "LayerNorm LayerNormFn RMSNorm layernorm_fn rms_norm_ref "
         "rmsnorm_fn",
         "ops.triton.mamba3.mamba3_mimo_rotary_step": "apply_rotary_qk_inference_fwd",

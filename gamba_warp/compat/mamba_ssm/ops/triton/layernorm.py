@@ -1,0 +1,3 @@
+"""``layer_norm`` under the path of mamba-ssm 1."""
+
+from .layer_norm import *  # noqa: F403
