@@ -26,23 +26,31 @@ __all__ = ["take_names"]
 def take_names(*packages: str) -> None:
     """Make ``import mamba_ssm``, ``causal_conv1d`` and ``gsplat`` load the modules of this folder.
 
+    The same holds for their extension modules. A fork of one of the packages runs over these alone.
+
     Call it once, before the first of these imports; it holds for the whole process.
     ``importlib.metadata`` reports their versions. An installed gsplat keeps its parts without CUDA
     (strategies, exporters, helpers), which then call our functions.
 
     Args:
-        packages: some of ``VERSIONS``; all by default.
+        packages: some of ``VERSIONS`` and ``extensions.EXTENSIONS``; all by default.
 
     Raises:
         ImportError: a package of that name has been imported already.
         ValueError: another name.
     """
-    for name in packages or VERSIONS:
-        if name not in VERSIONS:
-            raise ValueError(f"the package {name!r} is not here, allowed: {', '.join(VERSIONS)}")
+    from .extensions import EXTENSIONS, extension
+
+    known = *VERSIONS, *EXTENSIONS
+    for name in packages or known:
+        if name not in known:
+            raise ValueError(f"the package {name!r} is not here, allowed: {', '.join(known)}")
         if name in sys.modules:
             raise ImportError(f"{name} is imported already: its names are taken before that")
-    for name in packages or VERSIONS:
+    for name in packages or known:
+        if name in EXTENSIONS:
+            sys.modules[name] = extension(name)
+            continue
         own = importlib.import_module(f"{_HERE}.{name}")
         theirs = importlib.util.find_spec(name) if name == "gsplat" else None
         for _, path, _ in pkgutil.walk_packages(own.__path__, f"{own.__name__}."):

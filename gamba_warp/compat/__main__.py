@@ -1,4 +1,7 @@
-"""``python -m gamba_warp.compat SCRIPT …`` or ``-m MODULE …``: run a program on our kernels."""
+"""``python -m gamba_warp.compat SCRIPT …`` or ``-m MODULE …``: run a program on our kernels.
+
+``--take NAME,NAME`` before these takes only some of the names.
+"""
 
 import runpy
 import sys
@@ -9,19 +12,22 @@ from . import take_names
 
 def main(arguments: list[str]) -> None:
     """Call ``take_names``, then run a program like ``python``."""
+    names = []
+    if arguments[:1] == ["--take"] and len(arguments) > 1:
+        names, arguments = arguments[1].split(","), arguments[2:]
     if arguments[:1] == ["-m"] and len(arguments) > 1:
         sys.argv = arguments[1:]
-        take_names()
+        take_names(*names)
         sys.path[0] = ""
         runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
     elif arguments and Path(arguments[0]).is_file():
         sys.argv = arguments
-        take_names()
+        take_names(*names)
         sys.path[0] = str(Path(arguments[0]).resolve().parent)
         runpy.run_path(arguments[0], run_name="__main__")
     else:
         named = f": there is no file {arguments[0]!r}" if arguments else ""
-        sys.exit(f"python -m gamba_warp.compat SCRIPT … or -m MODULE …{named}")
+        sys.exit(f"python -m gamba_warp.compat [--take NAMES] SCRIPT … or -m MODULE …{named}")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from examples import char_mamba
 from helpers import assert_default_dtype_changes_nothing, assert_rel_rms, in_default_float64
+from helpers.mamba import block_in_float64, run, scan_in_float64
 
 from gamba_warp.compat import mamba_ssm
 from gamba_warp.compat.mamba_ssm import (
@@ -50,41 +51,6 @@ def inputs(B, C, dtype=torch.float32, without=()):
         "delta_bias": 0.5 * torch.rand(CHANNELS),
     }
     return {name: x for name, x in made.items() if name not in without}
-
-
-def scan_in_float64(u, delta, A, B, C, D=None, z=None, delta_bias=None, softplus=False):
-    """The scan written out, channel by channel, for any shapes of B and C."""
-
-    def at(matrix, t):  # [B or 1, D, N]
-        if matrix.dim() == 2:
-            return matrix[None]
-        if matrix.dim() == 3:
-            return matrix[:, None, :, t]
-        return matrix[..., t].repeat_interleave(u.shape[1] // matrix.shape[1], dim=1)
-
-    if delta_bias is not None:
-        delta = delta + delta_bias[:, None]
-    if softplus:
-        delta = torch.log1p(delta.exp())
-    h, rows = u.new_zeros(*u.shape[:2], A.shape[1]), []
-    for t in range(u.shape[2]):
-        step = delta[:, :, t, None]
-        h = (step * A).exp() * h + step * at(B, t) * u[:, :, t, None]
-        rows.append((h * at(C, t)).sum(-1))
-    y = torch.stack(rows, -1)
-    if D is not None:
-        y = y + D[:, None] * u
-    return (y if z is None else y * z * torch.sigmoid(z)), h
-
-
-def run(function, tensors, dtype=None, **options):
-    """Outputs, and gradients by name for one cotangent of the output."""
-    leaves = {k: x.detach().to(dtype or x.dtype).requires_grad_() for k, x in tensors.items()}
-    out = function(**leaves, **options)
-    out, last = out if isinstance(out, tuple) else (out, torch.zeros(()))
-    generator = torch.Generator().manual_seed(1)
-    out.backward(torch.randn(out.shape, generator=generator).to(out.dtype))
-    return {"out": out, "last": last} | {name: x.grad for name, x in leaves.items()}
 
 
 @pytest.mark.parametrize("dtype", SCAN_LIMITS, ids=str)
@@ -147,26 +113,6 @@ def block(constant_B, constant_C, taps=4):
         "B_proj_bias": None if constant_B else torch.randn(STATES),
         "C_proj_bias": None if constant_C else torch.randn(STATES),
     }
-
-
-def norm(x, weight, eps=1e-6):
-    """RMS norm, or x itself without a weight."""
-    return x if weight is None else x * weight / (x.square().mean(-1, keepdim=True) + eps).sqrt()
-
-
-def block_in_float64(**g):
-    """Compute mamba_inner_fn from its arguments by name."""
-    x, z = g["xz"].chunk(2, 1)
-    padded = F.pad(x, (g["conv1d_weight"].shape[2] - 1, 0))
-    x = F.silu(F.conv1d(padded, g["conv1d_weight"], g["conv1d_bias"], groups=x.shape[1]))
-    low, rank = x.mT @ g["x_proj_weight"].T, g["delta_proj_weight"].shape[1]
-    delta = norm(low[..., :rank] @ g["delta_proj_weight"].T, g.get("dt_rms_weight")).mT
-    states, matrices = g["A"].shape[1], []
-    for name, part in (("B", low[..., rank : rank + states]), ("C", low[..., -states:])):
-        part = norm(part + g.get(f"{name}_proj_bias", 0), g.get(f"{name.lower()}_rms_weight")).mT
-        matrices.append(g.get(name, part))
-    y, _ = scan_in_float64(x, delta, g["A"], *matrices, g["D"], z, g["delta_bias"], True)
-    return y.mT @ g["out_proj_weight"].T + g["out_proj_bias"]
 
 
 @pytest.mark.parametrize("taps", [3, 4])

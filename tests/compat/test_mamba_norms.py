@@ -51,7 +51,7 @@ def test_the_norms_are_those_of_float64(function, names, dtype):
         named["rows"] = wide["rowscale"][..., None]
     wanted = written_out(function != "layer_norm_fn", 1e-3, **named)
     assert len(found) == len(wanted)
-    kept = dtype if "residual" not in names or function.endswith("ref") else torch.float32
+    kept = dtype if "residual" not in names else torch.float32
     assert [y.dtype for y in found] == [dtype] * (len(found) - 1) + [kept]
     cotangents = [torch.randn(SHAPE).to(y.dtype) for y in found]
     for place, (got, want) in enumerate(zip(found, wanted)):
@@ -77,9 +77,8 @@ def test_the_dtype_of_the_sum(residual, in_fp32):
     ):
         default = torch.float32 if in_fp32 else torch.bfloat16
         assert out.dtype == torch.bfloat16 and total.dtype == (residual or default)
-    for upcast in (False, True):
-        total = norms.rms_norm_ref(x, weight, None, given, prenorm=True, upcast=upcast)[1]
-        assert total.dtype == (torch.float32 if upcast else torch.bfloat16)
+    total = norms.rms_norm_ref(x, weight, None, given, prenorm=True, upcast=True)[1]
+    assert total.dtype == (residual or torch.float32)
 
 
 def test_dropout_is_that_of_its_masks():

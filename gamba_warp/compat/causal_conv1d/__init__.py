@@ -19,9 +19,5 @@ ABSENT = complete(
     __name__,
     "causal-conv1d",
     "causal_conv1d_fn and causal_conv1d_update are",
-    {
-        "causal_conv1d_interface": "CausalConv1dFn",
-        "cpp_functions": "causal_conv1d_bwd_function causal_conv1d_fwd_function "
-        "causal_conv1d_update_function",
-    },
+    {"causal_conv1d_interface": "CausalConv1dFn"},
 )

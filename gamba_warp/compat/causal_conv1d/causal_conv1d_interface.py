@@ -52,9 +52,11 @@ def causal_conv1d_update(
         ValueError: a shape or ``activation`` is not one of the above.
     """
     if cache_seqlens is None and conv_state_indices is None and activation in ACTIVATIONS:
-        out = conv_step(x, weight, bias, conv_state, activation is not None)
+        one = isinstance(x, Tensor) and x.dim() == 3 and x.shape[2] == 1
+        token = x[..., 0] if one else x
+        out = conv_step(token, weight, bias, conv_state, activation is not None)
         if out is not None:  # None without effect also for an invalid argument
-            return out
+            return out[..., None] if one else out
     check_tensor("x", x, ("B", "D"), ("B", "D", "L"), dtypes=DTYPES)
     batch, channels = x.shape[:2]
     check_tensor("weight", weight, (channels, "W >= 1"), dtypes=DTYPES)
@@ -81,20 +83,10 @@ def causal_conv1d_ref(
     activation: str | None = None,
     seq_idx: None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """Compute the convolution in plain torch and the dtype of ``weight``, as a reference.
+    """Compute ``causal_conv1d_fn`` in plain torch and the dtype of ``weight``, as a reference.
 
-    Args:
-        x: ``[B, D, L]``, any real float dtype, as in ``causal_conv1d_fn``; likewise the others.
-        weight: ``[D, W]``, any W.
-        bias: ``[D]``, or None for 0.
-        initial_states: ``[B, D, W-1]``, or None for 0.
-        return_final_states: also return the last W - 1 tokens, ``[B, D, W-1]``.
-        final_states_out: output tensor for them, or None.
-        activation: None, "silu" or "swish" (the same).
-        seq_idx: must be None.
-
-    Returns:
-        The shape and dtype of x, and the final states if requested.
+    The arguments and results are the same, in any real float dtype and with any number of taps;
+    ``seq_idx`` must be None.
 
     Raises:
         ValueError: another ``activation``, or a ``seq_idx``.
@@ -120,17 +112,7 @@ def causal_conv1d_update_ref(
 ) -> Tensor:
     """Compute ``causal_conv1d_update`` in plain torch and the dtype of ``weight``, as a reference.
 
-    Args:
-        x: ``[B, D]`` or ``[B, D, L]``, any real float dtype.
-        conv_state: ``[B, D, S]``, S at least W - 1; the tokens are written into it.
-        weight: ``[D, W]``, any W.
-        bias: ``[D]``, or None for 0.
-        activation: None, "silu" or "swish" (the same).
-        cache_seqlens: ``[B]`` integers; with it the state is a ring buffer, as in
-            ``causal_conv1d_update``.
-
-    Returns:
-        The shape and dtype of x.
+    The arguments and results are the same, in any real float dtype.
 
     Raises:
         ValueError: another ``activation``.

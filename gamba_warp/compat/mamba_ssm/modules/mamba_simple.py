@@ -15,6 +15,7 @@ from ...causal_conv1d import causal_conv1d_update
 from ...shared import DTYPES, check_tensor, one_of
 from ..ops.triton.selective_state_update import selective_state_update
 from ..utils.generation import InferenceParams
+from . import block
 
 
 class Mamba(nn.Module):
@@ -43,6 +44,7 @@ class Mamba(nn.Module):
         layer_idx: int | None = None,
         device=None,
         dtype: torch.dtype | None = None,
+        bimamba_type: str = "none",
     ) -> None:
         """Build the layer.
 
@@ -63,15 +65,18 @@ class Mamba(nn.Module):
             layer_idx: the layer's key in ``InferenceParams``; needed only with these.
             device: of the weights.
             dtype: of the weights, except A_log and D, which are float32.
+            bimamba_type: "none"; the forks' other layers run from their own files.
 
         Raises:
-            ValueError: ``d_state``, ``d_conv``, ``dt_rank`` or ``dt_init`` is not one of the above.
+            ValueError: ``d_state``, ``d_conv``, ``dt_rank``, ``dt_init`` or ``bimamba_type`` is not
+                one of the above.
         """
         super().__init__()
         if not 1 <= d_state <= 256:
             raise ValueError(f"d_state is {d_state}, allowed is 1 to 256")
         one_of("d_conv", d_conv, 2, 3, 4)  # supported by the convolution's kernel
         one_of("dt_init", dt_init, "random", "constant")
+        one_of("bimamba_type", bimamba_type, "none")
         if isinstance(dt_rank, str):
             one_of("dt_rank", dt_rank, "auto")
         self.d_model, self.d_state, self.d_conv, self.expand = d_model, d_state, d_conv, expand
@@ -233,3 +238,13 @@ class Mamba(nn.Module):
                 f"the cache of layer {self.layer_idx} one of {len(states[0])}"
             )
         return states
+
+
+class Block(block.Block):
+    """Block of mamba-ssm 1, without an MLP."""
+
+    def __init__(
+        self, dim: int, mixer_cls, norm_cls=nn.LayerNorm, fused_add_norm=False,
+        residual_in_fp32=False,
+    ) -> None:  # fmt: skip
+        super().__init__(dim, mixer_cls, nn.Identity, norm_cls, fused_add_norm, residual_in_fp32)

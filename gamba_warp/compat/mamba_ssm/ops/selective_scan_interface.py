@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import torch.nn.functional as F
 from torch import Tensor
@@ -13,7 +13,15 @@ from ....kernels.selective_scan.function import input_matrix
 from ....kernels.selective_scan.reference import selective_scan_reference
 from ...shared import check_tensor, one_of
 
-__all__ = ["mamba_inner_fn", "mamba_inner_ref", "selective_scan_fn", "selective_scan_ref"]
+__all__ = [
+    "bimamba_inner_fn",
+    "bimamba_inner_ref",
+    "mamba_inner_fn",
+    "mamba_inner_fn_no_out_proj",
+    "mamba_inner_ref",
+    "selective_scan_fn",
+    "selective_scan_ref",
+]
 
 
 def selective_scan_ref(
@@ -28,25 +36,10 @@ def selective_scan_ref(
     delta_softplus: bool = False,
     return_last_state: bool = False,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """Compute the scan by a loop over tokens in float32 torch, as a reference.
+    """Compute ``selective_scan_fn`` by a loop over tokens in float32 torch, as a reference.
 
-    Args:
-        u: ``[B, D, L]``, any real float dtype, as in ``selective_scan_fn``; likewise the others.
-        delta: step of each token and channel.
-        A: ``[D, N]``.
-        B: (D, N) constant, (B, N, L), or (B, G, N, L).
-        C: as B, independently.
-        D: ``[D]``, or None.
-        z: as u, or None.
-        delta_bias: ``[D]``, or None.
-        delta_softplus: apply softplus to delta.
-        return_last_state: also return ``[B, D, N]`` float32.
-
-    Returns:
-        ``[B, D, L]`` in u's dtype.
-
-    Raises:
-        TypeError: A, B or C is complex.
+    The arguments and results are the same, in any real float dtype; complex A, B or C is a
+    ``TypeError``.
     """
     if A.is_complex():
         raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
@@ -59,14 +52,12 @@ def selective_scan_ref(
     return (out, last) if return_last_state else out
 
 
-def mamba_inner_fn(
+def mamba_inner_fn_no_out_proj(
     xz: Tensor,
     conv1d_weight: Tensor,
     conv1d_bias: Tensor | None,
     x_proj_weight: Tensor,
     delta_proj_weight: Tensor,
-    out_proj_weight: Tensor,
-    out_proj_bias: Tensor | None,
     A: Tensor,
     B: Tensor | None = None,
     C: Tensor | None = None,
@@ -80,8 +71,10 @@ def mamba_inner_fn(
     c_rms_weight: Tensor | None = None,
     dt_rms_weight: Tensor | None = None,
     b_c_dt_rms_eps: float = 1e-6,
+    *,
+    A_b: Tensor | None = None,
 ) -> Tensor:
-    """Run a Mamba block after its first projection: convolution, small projections, scan, output.
+    """Run a Mamba block between its first and its last projection, as the forks Vim and SegMamba.
 
     Args:
         xz: ``[B, 2 D, L]``: the input of the convolution, then the gate.
@@ -89,8 +82,6 @@ def mamba_inner_fn(
         conv1d_bias: ``[D]``, or None.
         x_proj_weight: ``[R + N + N, D]``: rows for the step, B and C; none for a given B or C.
         delta_proj_weight: ``[D, R]``.
-        out_proj_weight: ``[M, D]``.
-        out_proj_bias: ``[M]``, or None.
         A: ``[D, N]`` float32, real.
         B: ``[D, N]`` constant, or None: from the tokens.
         C: as B.
@@ -104,9 +95,10 @@ def mamba_inner_fn(
         c_rms_weight: as b_rms_weight.
         dt_rms_weight: ``[D]``, of an RMS norm of the step before its bias, or None.
         b_c_dt_rms_eps: added to the mean squares of these norms.
+        A_b: as A, of a second scan from the last token to the first, which is added; or None.
 
     Returns:
-        ``[B, L, M]``.
+        ``[B, D, L]``.
 
     Raises:
         TypeError: as ``selective_scan_fn``, also for complex A.
@@ -143,9 +135,40 @@ def mamba_inner_fn(
     if C is None:
         C = normalized(low[..., -states:], C_proj_bias, c_rms_weight)
     y = cast(Tensor, selective_scan_fn(x, delta, A, B, C, D, z, delta_bias, delta_softplus))
+    if A_b is not None:
+        x, delta, z = (part.flip(-1) for part in (x, delta, z))
+        B, C = (part if part.dim() == 2 else part.flip(-1) for part in (B, C))
+        back = selective_scan_fn(x, delta, A_b, B, C, D, z, delta_bias, delta_softplus)
+        y = y + cast(Tensor, back).flip(-1)
+    return y
+
+
+def mamba_inner_fn(
+    xz: Tensor, conv1d_weight: Tensor, conv1d_bias: Tensor | None, x_proj_weight: Tensor,
+    delta_proj_weight: Tensor, out_proj_weight: Tensor, out_proj_bias: Tensor | None, A: Tensor,
+    *args: Any, **options: Any,
+) -> Tensor:  # fmt: skip
+    """Run a Mamba block after its first projection: convolution, small projections, scan, output.
+
+    The arguments are those of ``mamba_inner_fn_no_out_proj``, with a last projection
+    ``out_proj_weight [M, D]`` and ``out_proj_bias [M]`` or None. Returns ``[B, L, M]``.
+    """
+    given = xz, conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight, A
+    y = mamba_inner_fn_no_out_proj(*given, *args, **options)
     return F.linear(y.transpose(1, 2), out_proj_weight, out_proj_bias)
 
 
-# mamba-ssm's reference runs on its two kernels as well. To check the kernels, compare
+def bimamba_inner_fn(
+    xz: Tensor, conv1d_weight: Tensor, conv1d_bias: Tensor | None, x_proj_weight: Tensor,
+    delta_proj_weight: Tensor, out_proj_weight: Tensor, out_proj_bias: Tensor | None, A: Tensor,
+    A_b: Tensor, *args: Any, **options: Any,
+) -> Tensor:  # fmt: skip
+    """Add a scan from the last token to the first, with ``A_b``, to ``mamba_inner_fn``."""
+    given = xz, conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight
+    of_output = out_proj_weight, out_proj_bias
+    return mamba_inner_fn(*given, *of_output, A, *args, A_b=A_b, **options)
+
+
+# mamba-ssm's references run on its two kernels as well. To check the kernels, compare
 # ``selective_scan_fn`` with ``selective_scan_ref``.
-mamba_inner_ref = mamba_inner_fn
+mamba_inner_ref, bimamba_inner_ref = mamba_inner_fn, bimamba_inner_fn

@@ -17,19 +17,19 @@ __all__ = ["RMSNorm", "layer_norm_fn", "layer_norm_ref", "rms_norm_fn", "rms_nor
 def layer_norm_fn(
     x: Tensor, weight: Tensor, bias: Tensor | None, residual: Tensor | None = None,
     x1: Tensor | None = None, weight1: Tensor | None = None, bias1: Tensor | None = None,
-    eps: float = 1e-6, dropout_p: float = 0.0, rowscale: Tensor | None = None,
-    prenorm: bool = False, residual_in_fp32: bool = False, is_rms_norm: bool = False,
-    return_dropout_mask: bool = False,
+    eps: float = 1e-6, dropout_p: float = 0.0, rowscale: Tensor | None = None, prenorm=False,
+    residual_in_fp32=False, is_rms_norm=False, return_dropout_mask=False, *, upcast=False,
+    dropout_mask: Tensor | None = None, dropout_mask1: Tensor | None = None,
 ) -> Any:  # fmt: skip
     """Add up dropout(x · rowscale), dropout(x1) and the residual, and normalize the sum.
 
-    Computed in float32 for smaller dtypes. ``x``, ``x1`` and ``residual`` are ``[.., D]``,
-    ``rowscale`` ``[..]`` (not beside ``x1``), weights and biases ``[D]``.
+    Computed in float32 for smaller dtypes. ``x``, ``x1``, ``residual`` and the masks (True for
+    kept; drawn where None) are ``[.., D]``, ``rowscale`` is ``[..]``, weights and biases ``[D]``.
 
     Returns:
         The norm in x's dtype; with ``weight1`` a second one of the same sum; with ``prenorm`` the
-        sum, in the residual's dtype or, without one, float32 (``residual_in_fp32``) or x's; with
-        ``return_dropout_mask`` the masks of x and x1, True for kept, or None. Several as a tuple.
+        sum, in the residual's dtype or, without one, float32 (``residual_in_fp32``, ``upcast``) or
+        x's; with ``return_dropout_mask`` both masks, or None. Several as a tuple.
 
     Raises:
         TypeError: an argument is not a tensor.
@@ -40,58 +40,38 @@ def layer_norm_fn(
         check_tensor(name, value, tuple(x.shape), optional=True)
     for name, value in {"weight": weight, "bias": bias, "weight1": weight1, "bias1": bias1}.items():
         check_tensor(name, value, (x.shape[-1],), optional=name != "weight")
+    check_tensor("rowscale", rowscale, tuple(x.shape[:-1]), optional=True)
     if rowscale is not None and x1 is not None:
         raise ValueError("rowscale is given beside x1, allowed is one of them")
-    check_tensor("rowscale", rowscale, tuple(x.shape[:-1]), optional=True)
     wide = torch.promote_types(x.dtype, torch.float32)
     total, masks = x.to(wide) if rowscale is None else x.to(wide) * rowscale[..., None], []
-    for part in (total, x1):
-        drops = part is not None and dropout_p > 0
-        masks.append(torch.rand(x.shape, device=x.device) >= dropout_p if drops else None)
-    if masks[0] is not None:
-        total = total * masks[0] / (1 - dropout_p)
-    if x1 is not None:
-        total = total + (x1 if masks[1] is None else x1 * masks[1] / (1 - dropout_p))
-    if residual is not None:
-        total = total + residual
-    outs: list[Tensor | None] = []
+    for part, mask in ((total, dropout_mask), (x1, dropout_mask1)):
+        if part is not None and dropout_p > 0:
+            mask = torch.rand(x.shape, device=x.device) >= dropout_p if mask is None else mask
+            part = part * mask / (1 - dropout_p)
+        total = part if not masks else total if part is None else total + part
+        masks.append(mask)
+    total = total if residual is None else total + residual
+    outs, shape = [], x.shape[-1:]
     for scale, shift in ((weight, bias), (weight1, bias1)):
         if scale is not None:
-            shift = None if shift is None else shift.to(wide)
+            scale, shift = scale.to(wide), None if shift is None else shift.to(wide)
             if is_rms_norm:
-                out = F.rms_norm(total, total.shape[-1:], scale.to(wide), eps)
+                out = F.rms_norm(total, shape, scale, eps)
                 out = out if shift is None else out + shift
             else:
-                out = F.layer_norm(total, total.shape[-1:], scale.to(wide), shift, eps)
+                out = F.layer_norm(total, shape, scale, shift, eps)
             outs.append(out.to(x.dtype))
     if prenorm:
-        small = torch.float32 if residual_in_fp32 else x.dtype
+        small = torch.float32 if residual_in_fp32 or upcast else x.dtype
         outs.append(total.to(small if residual is None else residual.dtype))
     outs += masks if return_dropout_mask else []
     return outs[0] if len(outs) == 1 else tuple(outs)
 
 
-def layer_norm_ref(
-    x: Tensor, weight: Tensor, bias: Tensor | None, residual: Tensor | None = None,
-    x1: Tensor | None = None, *, dropout_p: float = 0.0, dropout_mask: Tensor | None = None,
-    dropout_mask1: Tensor | None = None, upcast: bool = False, **options: Any,
-) -> Any:  # fmt: skip
-    """Compute ``layer_norm_fn`` with given dropout masks ``[.., D]``, True for kept.
-
-    Returns:
-        As ``layer_norm_fn``; the sum in x's dtype, with ``upcast`` in float32.
-    """
-    if dropout_mask is not None:
-        x, dropout_p, kept = x * dropout_mask / (1 - dropout_p), 0.0, 1 - dropout_p
-        x1 = x1 if x1 is None or dropout_mask1 is None else x1 * dropout_mask1 / kept
-    out = layer_norm_fn(x, weight, bias, residual, x1, dropout_p=dropout_p, **options)
-    if not options.get("prenorm"):
-        return out
-    return *out[:-1], out[-1].to(torch.float32 if upcast else x.dtype)
-
-
 rms_norm_fn = partial(layer_norm_fn, is_rms_norm=True)
-rms_norm_ref = partial(layer_norm_ref, is_rms_norm=True)
+# References in plain torch, as these are.
+layer_norm_ref, rms_norm_ref = layer_norm_fn, rms_norm_fn
 
 
 class RMSNorm(nn.Module):

@@ -89,23 +89,7 @@ def selective_state_update_ref(
     dt_bias: Tensor | None = None,
     dt_softplus: bool = False,
 ) -> Tensor:
-    """Compute the same as a plain sum in torch, as a reference; in float64 if x is, else float32.
-
-    Args:
-        state: as in ``selective_state_update``, updated in place; likewise the others.
-        x: the token.
-        dt: its step.
-        A: rates of decay.
-        B: input matrix.
-        C: output matrix.
-        D: the skip connection.
-        z: the gate.
-        dt_bias: added to dt.
-        dt_softplus: apply softplus to the step.
-
-    Returns:
-        The shape and dtype of x.
-    """
+    """Compute the same in plain torch, as a reference; in float64 if x is, else float32."""
     dtype = torch.promote_types(x.dtype, torch.float32)
     token = (x.shape[0], state.shape[1] if state.dim() == 4 else 1, x.shape[-1])
 

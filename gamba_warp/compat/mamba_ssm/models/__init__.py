@@ -1,0 +1,1 @@
+"""Language models of mamba-ssm, in files of its names."""
