@@ -22,14 +22,10 @@ ACTIVATIONS = (None, "silu", "swish")
 
 
 def causal_conv1d_update(
-    x: Tensor,
-    conv_state: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    activation: str | None = None,
-    cache_seqlens: Tensor | None = None,
+    x: Tensor, conv_state: Tensor, weight: Tensor, bias: Tensor | None = None,
+    activation: str | None = None, cache_seqlens: Tensor | None = None,
     conv_state_indices: Tensor | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Convolve the next tokens, and update the state in place, without gradients.
 
     Args:
@@ -74,15 +70,10 @@ def causal_conv1d_update(
 
 
 def causal_conv1d_ref(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    initial_states: Tensor | None = None,
-    return_final_states: bool = False,
-    final_states_out: Tensor | None = None,
-    activation: str | None = None,
-    seq_idx: None = None,
-) -> Tensor | tuple[Tensor, Tensor]:
+    x: Tensor, weight: Tensor, bias: Tensor | None = None, initial_states: Tensor | None = None,
+    return_final_states: bool = False, final_states_out: Tensor | None = None,
+    activation: str | None = None, seq_idx: None = None,
+) -> Tensor | tuple[Tensor, Tensor]:  # fmt: skip
     """Compute ``causal_conv1d_fn`` in plain torch and the dtype of ``weight``, as a reference.
 
     The arguments and results are the same, in any real float dtype and with any number of taps;
@@ -103,13 +94,9 @@ def causal_conv1d_ref(
 
 
 def causal_conv1d_update_ref(
-    x: Tensor,
-    conv_state: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    activation: str | None = None,
-    cache_seqlens: Tensor | None = None,
-) -> Tensor:
+    x: Tensor, conv_state: Tensor, weight: Tensor, bias: Tensor | None = None,
+    activation: str | None = None, cache_seqlens: Tensor | None = None,
+) -> Tensor:  # fmt: skip
     """Compute ``causal_conv1d_update`` in plain torch and the dtype of ``weight``, as a reference.
 
     The arguments and results are the same, in any real float dtype.

@@ -1,11 +1,7 @@
 """Calls of the extension module, under causal-conv1d's path."""
 
-from ..extensions import conv_bwd as causal_conv1d_bwd_function
-from ..extensions import conv_fwd as causal_conv1d_fwd_function
-from ..extensions import conv_update as causal_conv1d_update_function
+from .. import extensions
 
-__all__ = [
-    "causal_conv1d_bwd_function",
-    "causal_conv1d_fwd_function",
-    "causal_conv1d_update_function",
-]
+causal_conv1d_fwd_function = extensions.conv_fwd
+causal_conv1d_bwd_function = extensions.conv_bwd
+causal_conv1d_update_function = extensions.conv_update

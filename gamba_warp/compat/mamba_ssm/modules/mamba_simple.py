@@ -27,25 +27,13 @@ class Mamba(nn.Module):
     """
 
     def __init__(
-        self,
-        d_model: int,
-        d_state: int = 16,
-        d_conv: int = 4,
-        expand: int = 2,
-        dt_rank: int | str = "auto",
-        dt_min: float = 0.001,
-        dt_max: float = 0.1,
-        dt_init: str = "random",
-        dt_scale: float = 1.0,
-        dt_init_floor: float = 1e-4,
-        conv_bias: bool = True,
-        bias: bool = False,
-        use_fast_path: bool = True,
-        layer_idx: int | None = None,
-        device=None,
-        dtype: torch.dtype | None = None,
+        self, d_model: int, d_state: int = 16, d_conv: int = 4, expand: int = 2,
+        dt_rank: int | str = "auto", dt_min: float = 0.001, dt_max: float = 0.1,
+        dt_init: str = "random", dt_scale: float = 1.0, dt_init_floor: float = 1e-4,
+        conv_bias: bool = True, bias: bool = False, use_fast_path: bool = True,
+        layer_idx: int | None = None, device=None, dtype: torch.dtype | None = None,
         bimamba_type: str = "none",
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Build the layer.
 
         Args:

@@ -25,17 +25,10 @@ __all__ = [
 
 
 def selective_scan_ref(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None = None,
-    z: Tensor | None = None,
-    delta_bias: Tensor | None = None,
-    delta_softplus: bool = False,
+    u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None,
+    z: Tensor | None = None, delta_bias: Tensor | None = None, delta_softplus: bool = False,
     return_last_state: bool = False,
-) -> Tensor | tuple[Tensor, Tensor]:
+) -> Tensor | tuple[Tensor, Tensor]:  # fmt: skip
     """Compute ``selective_scan_fn`` by a loop over tokens in float32 torch, as a reference.
 
     The arguments and results are the same, in any real float dtype; complex A, B or C is a
@@ -53,49 +46,26 @@ def selective_scan_ref(
 
 
 def mamba_inner_fn_no_out_proj(
-    xz: Tensor,
-    conv1d_weight: Tensor,
-    conv1d_bias: Tensor | None,
-    x_proj_weight: Tensor,
-    delta_proj_weight: Tensor,
-    A: Tensor,
-    B: Tensor | None = None,
-    C: Tensor | None = None,
-    D: Tensor | None = None,
-    delta_bias: Tensor | None = None,
-    B_proj_bias: Tensor | None = None,
-    C_proj_bias: Tensor | None = None,
-    delta_softplus: bool = True,
-    checkpoint_lvl: int = 1,
-    b_rms_weight: Tensor | None = None,
-    c_rms_weight: Tensor | None = None,
-    dt_rms_weight: Tensor | None = None,
-    b_c_dt_rms_eps: float = 1e-6,
-    *,
-    A_b: Tensor | None = None,
-) -> Tensor:
+    xz: Tensor, conv1d_weight: Tensor, conv1d_bias: Tensor | None, x_proj_weight: Tensor,
+    delta_proj_weight: Tensor, A: Tensor, B: Tensor | None = None, C: Tensor | None = None,
+    D: Tensor | None = None, delta_bias: Tensor | None = None, B_proj_bias: Tensor | None = None,
+    C_proj_bias: Tensor | None = None, delta_softplus: bool = True, checkpoint_lvl: int = 1,
+    b_rms_weight: Tensor | None = None, c_rms_weight: Tensor | None = None,
+    dt_rms_weight: Tensor | None = None, b_c_dt_rms_eps: float = 1e-6, *, A_b: Tensor | None = None,
+) -> Tensor:  # fmt: skip
     """Run a Mamba block between its first and its last projection, as the forks Vim and SegMamba.
 
     Args:
         xz: ``[B, 2 D, L]``: the input of the convolution, then the gate.
-        conv1d_weight: ``[D, 1, W]``, W from 2 to 4.
-        conv1d_bias: ``[D]``, or None.
+        conv1d_weight: ``[D, 1, W]``, W from 2 to 4; ``conv1d_bias`` is ``[D]``, or None.
         x_proj_weight: ``[R + N + N, D]``: rows for the step, B and C; none for a given B or C.
-        delta_proj_weight: ``[D, R]``.
-        A: ``[D, N]`` float32, real.
-        B: ``[D, N]`` constant, or None: from the tokens.
-        C: as B.
-        D: ``[D]``, or None for 0.
-        delta_bias: ``[D]``, or None for 0.
-        B_proj_bias: ``[N]``, added to a B from the tokens, or None.
-        C_proj_bias: as B_proj_bias.
-        delta_softplus: apply softplus to the step.
+        delta_proj_weight: ``[D, R]``; D and ``delta_bias`` are ``[D]``, or None for 0.
+        A: ``[D, N]`` float32, real. ``A_b`` is that of a second scan, added, from the last token
+            to the first, or None.
+        B: ``[D, N]`` constant, or None: from the tokens, with ``B_proj_bias [N]`` added and an RMS
+            norm with ``b_rms_weight [N]``, where these are given. C is as B; ``dt_rms_weight [D]``
+            is that of the step before its bias.
         checkpoint_lvl: 0 or 1; without effect.
-        b_rms_weight: ``[N]``, of an RMS norm of a B from the tokens, or None without a norm.
-        c_rms_weight: as b_rms_weight.
-        dt_rms_weight: ``[D]``, of an RMS norm of the step before its bias, or None.
-        b_c_dt_rms_eps: added to the mean squares of these norms.
-        A_b: as A, of a second scan from the last token to the first, which is added; or None.
 
     Returns:
         ``[B, D, L]``.

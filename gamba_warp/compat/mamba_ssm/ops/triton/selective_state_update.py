@@ -11,18 +11,10 @@ from ....shared import DTYPES, INDEX_DTYPES, check_tensor, of_rows
 
 
 def selective_state_update(
-    state: Tensor,
-    x: Tensor,
-    dt: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None = None,
-    z: Tensor | None = None,
-    dt_bias: Tensor | None = None,
-    dt_softplus: bool = False,
+    state: Tensor, x: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None,
+    z: Tensor | None = None, dt_bias: Tensor | None = None, dt_softplus: bool = False,
     state_batch_indices: Tensor | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Advance the state by one token, in place, and return that token's output.
 
     Computed in float32 for all dtypes; only the stored ``state`` is rounded. No gradient flows
@@ -78,17 +70,9 @@ def selective_state_update(
 
 
 def selective_state_update_ref(
-    state: Tensor,
-    x: Tensor,
-    dt: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None = None,
-    z: Tensor | None = None,
-    dt_bias: Tensor | None = None,
-    dt_softplus: bool = False,
-) -> Tensor:
+    state: Tensor, x: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None,
+    z: Tensor | None = None, dt_bias: Tensor | None = None, dt_softplus: bool = False,
+) -> Tensor:  # fmt: skip
     """Compute the same in plain torch, as a reference; in float64 if x is, else float32."""
     dtype = torch.promote_types(x.dtype, torch.float32)
     token = (x.shape[0], state.shape[1] if state.dim() == 4 else 1, x.shape[-1])
