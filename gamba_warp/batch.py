@@ -135,7 +135,10 @@ def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: P
     """
     for item, reason in failures:
         print(f"gamba: failed: {item}: {reason}", file=sys.stderr)
-    print(f"{counted(count, unit)}, {counted(len(failures), 'failure')}, results in {out}")
+    # An input that is a folder holds none of the counted ones.
+    lost = sum(not (isinstance(item, Path) and item.is_dir()) for item, _ in failures)
+    where = f", results in {out}" if lost < count else ""
+    print(f"{counted(count, unit)}, {counted(len(failures), 'failure')}{where}")
     return 1 if failures else 0
 
 

@@ -446,12 +446,15 @@ def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
         Image.fromarray(pixels).save(temporary, **options)
 
 
-def find_pictures(images: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
+def find_pictures(
+    images: Sequence[Path], recursive: bool = False
+) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Resolve files and folders to picture files.
 
     Args:
         images: files, which are kept as they are, and folders, whose files with a picture's suffix
-            follow in sorted order, without sub-folders.
+            follow in sorted order.
+        recursive: also take those in their sub-folders; links to folders are not followed.
 
     Returns:
         The files, each once; and the folders without pictures, with the reason.
@@ -463,11 +466,43 @@ def find_pictures(images: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, 
             pictures[path] = None
             continue
         try:
-            inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() in PICTURE_SUFFIXES)
+            inside = sorted(p for p in _inside(path, recursive)[0] if _is_picture(p))
         except OSError as error:
             failures.append((path, error.strerror))
             continue
         pictures.update(dict.fromkeys(inside))
         if not inside:
-            failures.append((path, "the folder holds no pictures"))
+            more = passed_over(path, recursive)
+            failures.append((path, "the folder holds no pictures" + (f" ({more})" if more else "")))
     return list(pictures), failures
+
+
+def passed_over(path: Path, recursive: bool = False) -> str:
+    """Return what ``find_pictures`` leaves out of a folder; empty if nothing, or for a file."""
+    try:
+        files, folders = _inside(path, recursive) if path.is_dir() else ([], [])
+    except OSError:
+        return ""
+    others = sum(not _is_picture(file) for file in files)
+    counts = [f"{others} file{'s' * (others != 1)} of other kinds"] * (others > 0)
+    number = 0 if recursive else len(folders)
+    counts += [f"{number} folder{'s' * (number != 1)}"] * (number > 0)
+    if not counts:
+        return ""
+    return f"{', '.join(counts)} passed over" + ("; --recursive takes the folders" * (number > 0))
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in PICTURE_SUFFIXES
+
+
+def _inside(path: Path, recursive: bool) -> tuple[list[Path], list[Path]]:
+    """Return the files and folders of a folder without hidden ones. Raises OSError."""
+    files, folders = [], []
+    for found in sorted(path.iterdir()):
+        if not found.name.startswith("."):
+            (folders if found.is_dir() else files).append(found)
+    for folder in folders if recursive else ():
+        if not folder.is_symlink():
+            files += _inside(folder, True)[0]
+    return files, folders

@@ -54,6 +54,8 @@ def test_the_report_names_failures_and_gives_the_exit_code(capsys):
     assert report(2, "file", [(Path("a.ply"), "empty")], Path("out")) == 1
     said = capsys.readouterr()
     assert said.err == "gamba: failed: a.ply: empty\n" and "2 files, 1 failure, results" in said.out
+    assert report(1, "file", [(Path("a.ply"), "empty")], Path("out")) == 1
+    assert capsys.readouterr().out == "1 file, 1 failure\n"
 
 
 def planned(inputs, suffixes, folder, reads=()):
