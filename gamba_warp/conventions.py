@@ -29,6 +29,9 @@ Precision = Literal["float32", "bfloat16", "auto"]
 Detail = Literal[1, 2, 4]
 DETAILS: tuple[Detail, ...] = get_args(Detail)
 
+# Values of --cutout: the method that cuts the object out; "auto" is the first that finds one.
+Cutout = Literal["auto", "alpha", "plain", "matte", "grabcut", "none"]
+
 
 def over_background(rgba, background):
     """Composite straight-alpha RGBA, an array or a tensor, over a colour.

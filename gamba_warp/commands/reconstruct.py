@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from ..batch import STAGES, check_not_read, for_each, plan_outputs, report, say
-from ..conventions import Detail, DeviceChoice, Precision
+from ..batch import STAGES, check_not_read, counted, for_each, plan_outputs, report, say, warn
+from ..conventions import Cutout, Detail, DeviceChoice, Precision
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
@@ -44,6 +44,9 @@ def reconstruct_command(
     mask: Path | None = None,
     matte_model: Annotated[str | None, tyro.conf.arg(metavar="FILE|URL")] = None,
     sam: Path | None = None,
+    cutout: Cutout = "auto",
+    keep_holes: bool = False,
+    recursive: bool = False,
     recenter: bool = True,
     detail: Detail | None = None,
     save_inputs: bool = False,
@@ -63,6 +66,10 @@ def reconstruct_command(
         mask: Picture that is white on the object (for a single image).
         matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or a URL of one of rembg's.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
+        cutout: How the object is cut out; auto is the first that finds one. none takes the whole
+            picture.
+        keep_holes: Keep areas of a plain background's colour that the object encloses.
+        recursive: Also take the pictures in the folders of a folder.
         recenter: Centre the object, at the size of training; else it keeps its position and size in
             a square picture.
         detail: Number of Gaussians per side that each of the front may split into, for the
@@ -80,7 +87,7 @@ def reconstruct_command(
     from ..pages.sheet import Sheet
     from ..photo.cutout import Ways, cut_out
 
-    pictures, failures = _find_pictures(images, mask)
+    pictures, failures = _find_pictures(images, mask, recursive)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
     if not checkpoint.exists():
         raise UserError(
@@ -105,13 +112,19 @@ def reconstruct_command(
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     checked_detail(detail, model.config, 0)  # before any cut-out
-    ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
+    ways = Ways(mask, matte_model, sam, recenter, cutout, keep_holes, chosen).checked()
     output_folder(files.out)
+    targets = [files.out / (name + suffix) for name in names for suffix in outputs.suffixes()]
+    if older := sum(target.exists() for target in targets):
+        say(f"{files.out}: {counted(older, 'file')} of an earlier run will be replaced")
+    places = {name: f"[{n}/{len(names)}] " for n, name in enumerate(names, 1)}
 
     def one(name: str, path: Path) -> None:
         STAGES.begin("cutting out")
         cut = cut_out(path, ways)
-        say(f"{path}: {cut.how}")
+        say(f"{places[name] if len(names) > 1 else ''}{path}: {cut.how}")
+        if cut.warning:
+            warn(path, [f"{cut.warning} --save-inputs writes the cut-out for a picture editor."])
         STAGES.begin("network")
         started = time.perf_counter()
         made = reconstruct(model, cut.rgba, precision, detail)
@@ -129,17 +142,20 @@ def reconstruct_command(
 
 
 def _find_pictures(
-    images: tuple[Path, ...], mask: Path | None
+    images: tuple[Path, ...], mask: Path | None, recursive: bool
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Return picture files, and failures with reasons. Raises UserError without a file."""
-    from ..images import find_pictures
+    from ..images import find_pictures, passed_over
 
     if not images:
         example = next(iter(sorted((STARTER / "icons").glob("*.png"))), "photo.png")
         raise UserError(f"give at least one picture or folder, such as {example}")
-    pictures, failures = find_pictures(images)
+    pictures, failures = find_pictures(images, recursive)
     if mask is not None and len(pictures) != 1:
         raise UserError(f"--mask goes with one picture, {len(pictures)} are given")
     if not pictures:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
+    for folder in images:
+        if line := passed_over(folder, recursive):
+            say(f"{folder}: {line}")
     return pictures, failures

@@ -1,4 +1,4 @@
-"""Steps from a picture to the model's input: masks, plain backgrounds, centring, compositing.
+"""Steps from a picture to the model's input: masks, centring, compositing.
 
 ``photo/cutout.py`` chooses the steps for a picture.
 """
@@ -29,8 +29,6 @@ SAM_FILES = (
 
 _TRANSPARENT = 0.5  # a picture with any alpha below this has a cut-out object
 PRESENT = 0.05  # least alpha of a pixel within the object's bounds
-_PLAIN_TOLERANCE = 0.07  # largest colour difference within a plain background
-_PLAIN_SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
 _MIN_OBJECT = 16  # least size of an object, pixels
 
 
@@ -51,42 +49,6 @@ def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
         raise UserError(f"{mask}: the mask is {stated[0]} but {path} is {stated[1]}")
     values = load_rgba(mask, longest=WORKING_SIZE)
     return values[..., :3].mean(-1) * values[..., 3]
-
-
-def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
-    """Remove a plain background, which has the colour of most of the picture's border.
-
-    The background is filled from the border, so areas of its colour inside the object stay. Along
-    the edge alpha is fractional, and the background's share is removed from the colour, so no
-    fringe is left on another background.
-
-    Args:
-        rgb: ``[H, W, 3]`` in [0, 1].
-
-    Returns:
-        ``[H, W, 4]`` float32 RGBA, or None if the background is not plain. A picture of one colour
-        is all background.
-    """
-    from skimage.measure import label
-    from skimage.morphology import dilation, disk
-
-    edge = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
-    colour = np.median(edge, axis=0)
-    if (np.abs(edge - colour).max(-1) < _PLAIN_TOLERANCE).mean() < _PLAIN_SHARE:
-        return None
-    difference = np.abs(rgb - colour).max(-1)
-    areas = cast(np.ndarray, label(difference < _PLAIN_TOLERANCE, connectivity=1))
-    at_edge = np.unique(np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]]))
-    background = np.isin(areas, at_edge[at_edge > 0])
-    rim = dilation(background, disk(2)) & ~background
-    # A rim pixel mixes background and object; the largest difference nearby is the object's.
-    full = dilation(np.where(background, 0.0, difference), np.ones((5, 5)))
-    share = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
-    alpha = np.where(background, 0.0, np.where(rim, share, 1.0))
-    alpha = without_specks(alpha)
-    weight = np.maximum(alpha, 1e-3)[..., None]
-    inside = np.clip((rgb - (1 - weight) * colour) / weight, 0.0, 1.0)
-    return np.dstack([inside, alpha]).astype(np.float32)
 
 
 def without_specks(alpha: np.ndarray) -> np.ndarray:

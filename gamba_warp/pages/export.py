@@ -307,6 +307,8 @@ def write_outputs(
     took = ("Forward pass", f"{seconds:.2f} s on {device.type}")
     table = [("Gaussians", f"{gaussians.num:,}"), took, *outputs.about]
     section = Section(name, cut.note, cut.rgba, table=table, **asdict(view))
+    if cut.warning:
+        section.strip = cut.beside()
     comments = [f"from {name} by {outputs.checkpoint.name}"]
     lost, turn = outputs.write(gaussians, None, view, section, device, comments)
     for line in lost:

@@ -1,7 +1,7 @@
-"""Cut out the object of a photograph; tries mask, alpha, plain background, SAM, matting, GrabCut.
+"""Cut out the object of a photograph; tries mask, alpha, networks, plain background, GrabCut.
 
-Masks and transparency from the user are used unchanged. Results of the other methods are checked,
-and the next method is tried if they cannot be an object.
+Masks and transparency from the user are used unchanged. Results of the other methods are checked:
+the next method is tried if they cannot be an object, and reasons to doubt them are said.
 """
 
 from __future__ import annotations
@@ -10,17 +10,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 
+from ..batch import counted
+from ..conventions import GREY, Cutout, over_background
 from ..data.preprocess import (
     BORDER_RATIO,
     WORKING_SIZE,
     SamSegmenter,
     has_alpha,
-    plain_matte,
     read_mask,
     recenter,
     shrink,
@@ -28,10 +29,11 @@ from ..data.preprocess import (
 )
 from ..errors import UserError
 from ..images import load_rgba
+from . import models
 from .grabcut import grabcut
 from .matte import Matte, NoMatte, to_stderr
 
-Method = Literal["alpha", "mask", "plain", "matte", "sam", "grabcut"]
+Method = Literal["alpha", "mask", "plain", "matte", "sam", "grabcut", "none"]
 
 MEND = (
     "If it is wrong: gamba reconstruct --save-inputs writes the cut-out as NAME-input.png; erase "
@@ -40,15 +42,27 @@ MEND = (
 _HOW: dict[str, str] = {
     "alpha": "The picture's own transparency is the cut-out.",
     "mask": "The mask {mask} cut the object out.",
-    "plain": "The plain background was removed.",
+    "plain": "The plain background was removed{holes}{why}.",
     "matte": "The matting model {model} cut the object out.",
     "sam": "Segment Anything cut the object out, expected in the middle.",
     "grabcut": "GrabCut cut the object out by colours alone, expected in the middle{why}.",
+    "none": "The whole picture is the object.",
 }
+_NAMES = {"sam": "Segment Anything", "matte": "matting model", "grabcut": "GrabCut"}
 _LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the picture covered by an object
 _MOST_EDGE = 0.7  # share of the picture's border that an object may cover
 _UNSURE = 0.4  # largest share of alpha's sum in pixels that are neither object nor background
 
+# A result is doubted if the object
+_BORDER = 0.02  # covers more than this share of the picture's border,
+_PART = 0.15  # has further parts of at least this share of its largest,
+_ALIKE, _ALIKE_SHARE = (
+    0.06,
+    0.3,
+)  # differs by less from what is beside it along more of its outline,
+_VAGUE = 0.03  # has more than this share of its alpha in wide areas that are neither 0 nor 1
+
+_BESIDE = 360  # longer side of each picture of ``CutOut.beside``
 _HAZE = 0.1  # lower alpha is set to 0
 _OPAQUE = 0.5  # a warning is given if alpha is lower everywhere
 
@@ -62,6 +76,8 @@ class Ways:
         matte_model: an ISNet or U2-Net in ONNX, or the URL of a copy of one of rembg's; None: one
             of rembg's, from its cache or fetched.
         sam: a checkpoint of Segment Anything, used instead of the matting model.
+        cutout: the only method to use; auto: the first that finds an object.
+        keep_holes: keep enclosed areas of a plain background's colour.
         recenter: centre the object, its longer side ``0.8`` of the square; else the picture keeps
             its frame, padded to a square.
         device: device of Segment Anything; the matting model runs on the CPU.
@@ -73,6 +89,8 @@ class Ways:
     matte_model: str | Path | None = None
     sam: str | Path | None = None
     recenter: bool = True
+    cutout: Cutout = "auto"
+    keep_holes: bool = False
     device: str | torch.device = "cpu"
     fetch: bool = True
     say: Callable[[str], None] = to_stderr
@@ -84,14 +102,24 @@ class Ways:
         """Open the given files, so that errors come before any picture; return ``self``.
 
         Raises:
-            UserError: a file is missing, or of another kind.
+            UserError: a file is missing, of another kind, or not used by the chosen method.
             ModuleNotFoundError: a required library is not installed.
         """
+        networks = {"--sam": self.sam, "--matte-model": self.matte_model}
+        files = {"--mask": self.mask} | (networks if self.cutout != "matte" else {})
+        for option, file in files.items() if self.cutout != "auto" else ():
+            if file is not None:
+                raise UserError(f"{option} is not used by --cutout {self.cutout}")
         if self.sam is not None:
             self.segmenter()
         if self.matte_model is not None:
             self.matte()
         return self
+
+    @property
+    def without_network(self) -> bool:
+        """True once the matting model was found to be unavailable, which ``say`` has reported."""
+        return self._no_matte
 
     def segmenter(self) -> SamSegmenter | None:
         """Return Segment Anything, opened once; None if not requested."""
@@ -123,6 +151,8 @@ class CutOut:
         mask: alpha of the object in it, ``[H, W]`` float32 in [0, 1].
         editable: ``[H, W, 4]`` float32: the whole picture, with colours in transparent parts too,
             so that an editor can restore them in a PNG, which may be used as input again.
+        warning: why the cut-out may be wrong, and what else to try; empty without a doubt.
+        areas: ``[H, W]`` bool, enclosed areas of a plain background's colour, kept or removed.
     """
 
     rgba: np.ndarray
@@ -131,18 +161,38 @@ class CutOut:
     source_rgb: np.ndarray
     mask: np.ndarray
     editable: np.ndarray
+    warning: str
+    areas: np.ndarray
 
     @property
     def note(self) -> str:
-        """The method, and how to correct the result."""
-        return f"{self.how} {MEND}"
+        """The method, doubts, and how to correct the result."""
+        return " ".join(filter(None, (self.how, self.warning, MEND)))
+
+    def beside(self) -> np.ndarray:
+        """Return the picture and beside it what was kept, on grey, ``[H, 2 W, 3]``."""
+        whole = np.ones_like(self.editable[..., :1])
+        both = np.dstack([self.source_rgb, whole]), self.editable
+        small = np.hstack([shrink(half, _BESIDE) for half in both])
+        return over_background(small, GREY)
+
+
+class _Found(NamedTuple):
+    """A result of a method: ``[H, W, 4]``, enclosed areas ``[H, W]``, and words for ``_HOW``."""
+
+    method: Method
+    rgba: np.ndarray
+    areas: np.ndarray | None = None
+    holes: str = ""
+    why: str = ""
 
 
 def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     """Read a picture and cut its object out.
 
-    A given mask comes first; then the picture's own transparency, a plain background, Segment
-    Anything if given, the matting model, and GrabCut.
+    A given mask comes first; then the picture's own transparency, Segment Anything or a matting
+    model if given or in the cache, a plain background, a matting model that is fetched, and
+    GrabCut.
 
     Args:
         path: any picture that ``load_rgba`` reads.
@@ -153,64 +203,127 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         ModuleNotFoundError: a library for a file of ``ways`` is not installed.
     """
     ways = Ways() if ways is None else ways
-    rgba, why = load_rgba(path, WORKING_SIZE, ways.say), ""
+    rgba = load_rgba(path, WORKING_SIZE, ways.say)
     method: Method | None = None
     if ways.mask is not None:
         rgba[..., 3] = read_mask(ways.mask, path)
         method = "mask"
-    elif has_alpha(rgba):
+    elif ways.cutout == "none":
+        rgba[..., 3] = 1
+        method = "none"
+    elif ways.cutout in ("auto", "alpha") and has_alpha(rgba):
         method = "alpha"
+    elif ways.cutout == "alpha":
+        raise UserError(f"{path}: has no transparency, which --cutout alpha uses")
     rgba = shrink(rgba, WORKING_SIZE)
     source = rgba[..., :3].copy()
-    if method is None:
-        method, rgba, why = _cut_by_methods(path, source, ways)
+    found = _cut_by_methods(path, source, ways) if method is None else _Found(method, rgba)
+    method, rgba = found.method, found.rgba
     try:
         centred = recenter(rgba, BORDER_RATIO if ways.recenter else None)
     except ValueError as error:
         raise UserError(f"{ways.mask or path}: {error}") from error
     model = ways.matte() if method == "matte" else None
     how = _HOW[method].format(
-        mask=Path(ways.mask or "").name, model=model and model.path.name, why=why
+        mask=Path(ways.mask or "").name,
+        model=model and model.path.name,
+        holes=found.holes,
+        why=found.why,
     )
     if (most := rgba[..., 3].max()) < _OPAQUE:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
+    warning, own = "", method in ("mask", "alpha", "none")
+    doubts = [] if own else doubts_of(source, rgba[..., 3])
+    if method == "grabcut":  # docs/photo.md has the figure
+        doubts.append("colours alone fail for more than half of photographs")
+    if doubts:
+        warning = f"The cut-out may be wrong: {'; '.join(doubts)}."
+        if method in ("plain", "grabcut") and not ways.without_network:
+            size = models.PUBLISHED[0].megabytes
+            warning += f" Try a network: --cutout matte ({size} MB, fetched once)."
     colors = np.where(rgba[..., 3:] > 0, rgba[..., :3], source)
     editable = np.dstack([colors, rgba[..., 3]])
-    return CutOut(centred, method, how, source, rgba[..., 3], editable)
+    areas = np.zeros(rgba.shape[:2], bool) if found.areas is None else found.areas > 0
+    return CutOut(centred, method, how, source, rgba[..., 3], editable, warning, areas)
 
 
-def _cut_by_methods(
-    path: str | Path, rgb: np.ndarray, ways: Ways
-) -> tuple[Method, np.ndarray, str]:
-    """Return the first successful method, its ``[H, W, 4]``, and the failures of earlier ones."""
-    if find_spec("skimage") is not None:
-        rgba = plain_matte(rgb)
-        if rgba is not None:
-            return "plain", rgba, ""
-    reasons = []
-    those: list[tuple[Method, str, Callable[[], Callable | None]]] = [
-        ("sam", "Segment Anything", ways.segmenter),
-        ("matte", "matting model", ways.matte),
-        ("grabcut", "GrabCut", lambda: grabcut),
-    ]
-    for method, name, opened in those:
+def _methods(ways: Ways) -> list[Method]:
+    """Return the methods to try, in order: networks that are here come before colours."""
+    networks: list[Method] = ["matte"] if ways.sam is None else ["sam", "matte"]
+    if ways.cutout == "matte":
+        return networks if ways.sam is None or ways.matte_model is not None else ["sam"]
+    if ways.cutout == "plain" or ways.cutout == "grabcut":
+        return [ways.cutout]
+    here = find_spec("onnxruntime") is not None and models.cached() is not None
+    if ways.sam is not None or ways.matte_model is not None or here:
+        return [*networks, "plain", "grabcut"]
+    return ["plain", "matte", "grabcut"]
+
+
+def _cut_by_methods(path: str | Path, rgb: np.ndarray, ways: Ways) -> _Found:
+    """Return the result of the first successful method, with the failures of earlier ones."""
+    reasons: list[str] = []
+    for method in _methods(ways):
+        why = f" ({'; '.join(reasons)})" if reasons else ""
+        if method == "plain":
+            if find_spec("skimage") is not None:
+                from .plain import plain_matte
+
+                if (plain := plain_matte(rgb, ways.keep_holes)) is not None:
+                    holes = counted(len(plain.holes), "enclosed area")
+                    said = f", with {holes} of it (--keep-holes keeps them)" if plain.holes else ""
+                    return _Found("plain", plain.rgba, plain.areas, said, why)
+            if ways.cutout == "plain":
+                reasons.append("its border is not plain")
+            continue
         try:
-            cut = opened()
+            cut = {"sam": ways.segmenter, "matte": ways.matte}.get(method, lambda: grabcut)()
             alpha = None if cut is None else cut(rgb)
         except NoMatte as error:
             reasons.append(str(error))
             continue
         if alpha is None:
-            reasons += ["no matting model"] if method == "matte" else []
+            reasons.append("no matting model")
             continue
         fault = fault_of(alpha)
         if fault is None:
-            return method, _blended(rgb, alpha), f" ({'; '.join(reasons)})"
-        reasons.append(f"{name}: {fault}")
+            return _Found(method, _blended(rgb, alpha), why=why)
+        reasons.append(f"{_NAMES[method]}: {fault}")
     raise UserError(
         f"{path}: cannot tell object from background ({'; '.join(reasons)}); give a picture with a "
         "transparent or plain background, --mask FILE, --matte-model FILE or --sam FILE"
     )
+
+
+def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
+    """Return reasons to doubt a cut-out that may be right.
+
+    Args:
+        rgb: the picture, ``[H, W, 3]`` in [0, 1].
+        alpha: ``[H, W]`` in [0, 1].
+    """
+    inside, found = alpha > 0.5, []
+    edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
+    if edge.mean() > _BORDER:
+        found.append("it touches the picture's border")
+    if find_spec("skimage") is not None:
+        from skimage.measure import label
+
+        sizes = np.bincount(np.asarray(label(inside)).ravel())[1:]
+        if (parts := int((sizes >= _PART * sizes.max(initial=1)).sum())) > 1:
+            found.append(f"it has {parts} separate parts")
+    planes = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
+    grown = torch.nn.functional.max_pool2d(planes, 3, 1, 1)[0, 0].numpy() > 0.5
+    outline = grown & ~inside
+    ours, theirs = (x[0].permute(1, 2, 0).numpy() for x in _local_colors(rgb, alpha, 3))
+    alike = (np.abs(ours - theirs).max(-1)[outline] < _ALIKE).mean() if outline.any() else 0.0
+    if alike > _ALIKE_SHARE:
+        found.append(f"along {alike:.0%} of its outline it looks like the background")
+    unsure = ((planes > 0.1) & (planes < 0.9)).float()
+    wide = -torch.nn.functional.max_pool2d(-unsure, 5, 1, 2)
+    if float((wide * planes).sum()) > _VAGUE * float(planes.sum()):
+        found.append("parts of it are half transparent")
+    return found
 
 
 def fault_of(alpha: np.ndarray) -> str | None:
@@ -243,14 +356,22 @@ def _blended(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     alpha = without_specks(alpha) if find_spec("skimage") is not None else alpha
     picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
     share = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
-    size = 2 * max(2, max(rgb.shape[:2]) // 64) + 1
-
-    def around(weight: torch.Tensor) -> torch.Tensor:
-        planes = torch.cat([picture * weight, weight], 1)
-        mean = torch.nn.functional.avg_pool2d(planes, size, 1, size // 2)
-        return mean[:, :3] / mean[:, 3:].clamp(min=1e-5)
-
-    ours, theirs = around(share), around(1 - share)
+    ours, theirs = _local_colors(rgb, alpha, max(2, max(rgb.shape[:2]) // 64))
     colors = ours + share * (picture - share * ours - (1 - share) * theirs)
     colors = torch.where(share > 0.99, picture, colors).clamp(0, 1)
     return np.dstack([colors[0].permute(1, 2, 0).numpy(), alpha]).astype(np.float32)
+
+
+def _local_colors(
+    rgb: np.ndarray, alpha: np.ndarray, radius: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mean colours ``[1, 3, H, W]`` of object and of background around each pixel."""
+    picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
+    share = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
+
+    def around(weight: torch.Tensor) -> torch.Tensor:
+        planes = torch.cat([picture * weight, weight], 1)
+        mean = torch.nn.functional.avg_pool2d(planes, 2 * radius + 1, 1, radius)
+        return mean[:, :3] / mean[:, 3:].clamp(min=1e-5)
+
+    return around(share), around(1 - share)

@@ -272,7 +272,33 @@ def test_folders_are_searched(tmp_path, checkpoint, capsys):
     assert find_pictures([folder, folder / "b.png"]) == ([folder / "a.PNG", folder / "b.png"], [])
     assert run_reconstruct(*quick(checkpoint, tmp_path / "out"), folder, empty) == 1
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.ply", "b.ply"]
-    assert f"{empty}: the folder holds no pictures" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert f"{empty}: the folder holds no pictures" in said.err
+    assert f"{folder}: 1 file of other kinds passed over\n" in said.out
+    assert (
+        f"[2/2] {folder / 'b.png'}: " in said.out and f"results in {tmp_path / 'out'}" in said.out
+    )
+    (folder / "more").mkdir(), (folder / ".hidden").mkdir()
+    cut_out(folder / "more" / "c.png")
+    assert run_reconstruct(*quick(checkpoint, tmp_path / "out"), folder) == 0
+    said = capsys.readouterr().out
+    assert "1 file of other kinds, 1 folder passed over; --recursive takes the folders\n" in said
+    assert f"{tmp_path / 'out'}: 2 files of an earlier run will be replaced\n" in said
+    assert run_reconstruct(*quick(checkpoint, tmp_path / "all"), folder, "--recursive") == 0
+    assert sorted(p.name for p in (tmp_path / "all").iterdir()) == ["a.ply", "b.ply", "c.ply"]
+    assert "--recursive" not in capsys.readouterr().out
+
+
+def test_a_doubtful_cut_out_is_said_and_shown(tmp_path, checkpoint, capsys):
+    rgb = np.ones((60, 80, 3))
+    rgb[20:, 30:50] = 0.8, 0.2, 0.1  # down to the lower edge
+    save_image(tmp_path / "post.png", rgb)
+    options = ["--checkpoint", checkpoint, "--out", tmp_path / "out", "--turntable", "none"]
+    assert run_reconstruct(tmp_path / "post.png", *options, "--size", 16, "--frames", 2) == 0
+    said = capsys.readouterr().err
+    assert "may be wrong: it touches the picture's border." in said and "--save-inputs" in said
+    page = (tmp_path / "out" / "post.html").read_text()
+    assert "may be wrong: it touches" in page and 'class="strip"' in page
 
 
 @pytest.mark.parametrize("which", ["picture", "mask", "checkpoint"])

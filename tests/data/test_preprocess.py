@@ -11,13 +11,13 @@ from PIL import Image
 from gamba_warp.data.preprocess import (
     SamSegmenter,
     composite,
-    plain_matte,
     recenter,
     shrink,
 )
 from gamba_warp.errors import UserError
 from gamba_warp.images import save_image
 from gamba_warp.photo.cutout import Ways, cut_out
+from gamba_warp.photo.plain import plain_matte
 
 
 def disc(size=(60, 80), centre=(30, 45), radius=14.3, soft=True):
@@ -49,7 +49,7 @@ def test_plain_backgrounds_are_taken_away(tmp_path, background):
     alpha = disc()
     noise = np.random.default_rng(0).normal(0, 0.008, (60, 80, 3))
     rgb = (scene(alpha, RED, background) + noise).clip(0, 1).astype(np.float32)
-    rgba = plain_matte(rgb)
+    rgba = plain_matte(rgb).rgba
     # 1.5 % of the disc's pixels: the noise, and edge pixels within the tolerance
     assert np.abs(rgba[..., 3] - alpha).sum() < 0.04 * alpha.sum()
     assert np.abs(rgba[..., 3] - alpha).max() < 0.35
@@ -62,7 +62,7 @@ def test_plain_backgrounds_are_taken_away(tmp_path, background):
 def test_on_its_own_background_the_matte_changes_nothing():
     """White stays white: removing the background and compositing on it again is the identity."""
     rgb = scene(disc(), RED, (1, 1, 1))
-    rgba = plain_matte(rgb)
+    rgba = plain_matte(rgb).rgba
     alpha = rgba[..., 3:]
     back = rgba[..., :3] * alpha + 1 - alpha
     # cut pixels may differ by the tolerance of "plain"
@@ -71,18 +71,20 @@ def test_on_its_own_background_the_matte_changes_nothing():
 
 def test_enclosed_background_and_touching_objects():
     alpha = disc(radius=25, centre=(30, 40)) - disc(radius=10, centre=(30, 40))
-    rgba = plain_matte(scene(alpha, RED, (1, 1, 1)))
-    assert rgba[30, 40, 3] == 1  # a hole cannot be distinguished from a white spot
-    rgba = plain_matte(scene(disc(centre=(55, 40), radius=14), RED, (1, 1, 1)))
+    found = plain_matte(scene(alpha, RED, (1, 1, 1)))
+    assert found.rgba[30, 40, 3] == 0 and len(found.holes) == 1
+    found = plain_matte(scene(alpha, RED, (1, 1, 1)), keep_holes=True)
+    assert found.rgba[30, 40, 3] == 1 and not found.holes and found.areas[30, 40]
+    rgba = plain_matte(scene(disc(centre=(55, 40), radius=14), RED, (1, 1, 1))).rgba
     assert rgba[59, 40, 3] == 1 and rgba[0, 0, 3] == 0  # it reaches over the lower edge
 
 
 def test_dust_does_not_move_the_object():
     alpha = disc()
     rgb = scene(alpha, RED, (1, 1, 1))
-    clean = recenter(plain_matte(rgb))
+    clean = recenter(plain_matte(rgb).rgba)
     rgb[2, 2] = 0
-    np.testing.assert_array_equal(recenter(plain_matte(rgb)), clean)
+    np.testing.assert_array_equal(recenter(plain_matte(rgb).rgba), clean)
 
 
 def test_busy_backgrounds_are_not_plain():

@@ -55,15 +55,16 @@ def test_each_way_in_its_order(tmp_path, network, busy):
     ways = Ways(matte_model=network)
     for file, how, want in (
         (transparent, "alpha", alpha),
-        (plain, "plain", alpha),
         (path, "matte", alpha),
+        (plain, "matte", alpha),  # a given network comes before colours
+        (plain, "plain", alpha),
     ):
-        found = cut_out(file, ways)
+        found = cut_out(file, Ways() if how == "plain" else ways)
         assert found.method == how and iou(found.mask, want) > 0.93
         assert found.source_rgb.shape == (*SIZE, 3) and found.mask.shape == SIZE
         assert found.rgba.shape[0] == found.rgba.shape[1] and found.rgba.dtype == np.float32
         assert found.note.startswith(found.how) and "--save-inputs" in found.note
-    assert "red.onnx" in found.how
+    assert "red.onnx" in cut_out(path, ways).how
     said: list[str] = []
     found = cut_out(path, Ways(say=said.append))  # conftest.py forbids the network; none is kept
     assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85
@@ -72,6 +73,76 @@ def test_each_way_in_its_order(tmp_path, network, busy):
     for file in (path, transparent, plain):  # a mask is somebody's word
         found = cut_out(file, Ways(mask=mask, matte_model=network))
         assert found.method == "mask" and iou(found.mask, half) > 0.99 and "mask.png" in found.how
+
+
+def test_the_chosen_method_is_used(tmp_path, network, busy):
+    path, alpha = busy
+    rgba = load_rgba(path)
+    plain = np.where(alpha[..., None] > 0.5, 0.2, 1)
+    for name, rgb in (("noise", rgba[..., :3]), ("plain", plain)):
+        save_image(tmp_path / f"{name}.png", np.dstack([rgb * np.ones(3), alpha]))
+    for name, method, way in (
+        ("noise", "alpha", Ways(matte_model=network)),
+        ("noise", "matte", Ways(cutout="matte", matte_model=network)),
+        ("noise", "grabcut", Ways(cutout="grabcut")),
+        ("plain", "plain", Ways(cutout="plain")),
+        ("plain", "none", Ways(cutout="none")),
+    ):
+        found = cut_out(tmp_path / f"{name}.png", way.checked())
+        assert found.method == method, name
+        assert iou(found.mask, np.ones(SIZE) if method == "none" else alpha) > 0.85
+    for only, reason in (
+        ("alpha", "has no transparency"),
+        ("plain", "its border is not plain"),
+        ("matte", "no matting model"),
+    ):
+        with pytest.raises(UserError, match=reason):
+            cut_out(path, Ways(cutout=only, say=lambda line: None))
+    with pytest.raises(UserError, match="--matte-model is not used by --cutout plain"):
+        Ways(cutout="plain", matte_model=network).checked()
+
+
+def test_a_cached_network_comes_before_colours(tmp_path, monkeypatch, network, busy):
+    path, alpha = busy
+    save_image(tmp_path / "plain.png", np.where(alpha[..., None] > 0.5, [0.9, 0.1, 0.1], 1))
+    (tmp_path / "u2net.onnx").write_bytes(network.read_bytes())
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+    assert cut_out(tmp_path / "plain.png").method == "matte"
+
+
+def box(top, bottom, left, right, value=1.0):
+    alpha = np.zeros((100, 120), np.float32)
+    alpha[top:bottom, left:right] = value
+    return alpha
+
+
+@pytest.mark.parametrize(
+    "alpha, color, reason",
+    [
+        (box(20, 80, 20, 100), 0.2, None),
+        (box(0, 80, 20, 100), 0.2, "touches the picture's border"),
+        (box(20, 80, 20, 50) + box(20, 80, 70, 100), 0.2, "2 separate parts"),
+        (box(20, 80, 20, 100), 0.77, "along 100% of its outline it looks like"),
+        (box(20, 80, 20, 100) - box(30, 70, 30, 60, 0.4), 0.2, "half transparent"),
+    ],
+)
+def test_doubts_are_said(alpha, color, reason):
+    rgb = np.where(alpha[..., None] > 0, color, 0.8) * np.ones(3)
+    found = cutout.doubts_of(rgb.astype(np.float32), alpha)
+    assert not found if reason is None else len(found) == 1 and reason in found[0]
+
+
+def test_a_doubt_names_the_way_to_a_network_unless_it_is_refused(tmp_path, monkeypatch):
+    rgb = np.ones((60, 80, 3))
+    rgb[20:, 30:50] = 0.8, 0.2, 0.1  # down to the lower edge
+    save_image(tmp_path / "post.png", rgb)
+    ways = Ways(say=lambda line: None)
+    assert "--cutout matte (179 MB, fetched once)" in cut_out(tmp_path / "post.png", ways).warning
+    assert ways.matte() is None
+    found = cut_out(tmp_path / "post.png", ways)
+    assert (
+        found.warning.endswith("it touches the picture's border.") and found.warning in found.note
+    )
 
 
 def test_a_matte_without_an_object_gives_way(tmp_path, busy):

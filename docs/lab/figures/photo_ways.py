@@ -19,12 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gamba_warp.data.preprocess import plain_matte, shrink
+from gamba_warp.data.preprocess import shrink
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.photo.cutout import fault_of
 from gamba_warp.photo.grabcut import grabcut
 from gamba_warp.photo.matte import Matte
+from gamba_warp.photo.plain import plain_matte
 
 # Package (by its import name, or a folder), and the picture in it.
 PICTURES = (
@@ -69,8 +70,8 @@ def find(folder: Path | None) -> Iterator[tuple[str, Path | None]]:
 
 def plain(rgb: np.ndarray) -> np.ndarray | None:
     """Alpha after removal of a plain background, or None without one."""
-    rgba = plain_matte(rgb)
-    return None if rgba is None else rgba[..., 3]
+    found = plain_matte(rgb)
+    return None if found is None else found.rgba[..., 3]
 
 
 def cell(picture: np.ndarray) -> np.ndarray:

@@ -1,0 +1,182 @@
+"""Plain backgrounds: their removal, with enclosed areas of background and soft shadows.
+
+The background's colour is a smooth function of the position, fitted to what is flooded from the
+border. An enclosed area is background too if it has exactly that colour: the matter of an object is
+lighter or darker by its shading. docs/photo.md has the figures.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.measure import label
+
+from ..data.preprocess import without_specks
+
+_TOLERANCE = 0.07  # largest colour difference within a plain background
+_TIGHT = 0.025  # ... if it is exact; four times the noise are added
+_FRINGE = (
+    3  # pixels; areas of other colours between the two are matter if they are wider than twice
+)
+_SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
+_SAMPLES = 20_000  # pixels of a fit
+_FITS = 3
+_RIM = 2  # pixels along the border whose alpha is fractional
+# An enclosed area is background if
+_HOLE = 0.0003  # it has at least this share of the picture, and
+_LEAST_HOLE = 12  # pixels,
+_BIAS = 0.006  # its median differs by at most this, or by a third of the noise, and
+_ISLANDS = 0.03  # at most this share of it is text or pictures on it, and
+_FAINT, _FAINT_SHARE = 0.15, 0.2  # at most this share of its surroundings differs by less
+# A pixel may be shadow if it has
+_DARKEST = 0.45  # at least this share of the background's light,
+_HUE = 0.025  # its hue within this, and
+_SLOPE = 0.02  # at most this change from pixel to pixel. Areas of such pixels are shadow if
+_STRIP = 0.001, 0.35  # they have at least this share of the picture, at most this of the object,
+_FOOT = 0.8  # lie this far down the object (nine of ten pixels), and
+_CONTACT = 0.25  # border on background along this share of their border
+
+
+class Plain(NamedTuple):
+    """A picture without its plain background.
+
+    Attributes:
+        rgba: ``[H, W, 4]`` float32, straight alpha.
+        areas: ``[H, W]`` int32, numbers of enclosed areas of about the background's colour, large
+            enough for a hole; 0 elsewhere.
+        holes: numbers of those that were removed.
+    """
+
+    rgba: np.ndarray
+    areas: np.ndarray
+    holes: list[int]
+
+
+def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
+    """Remove a plain background, which has the colour of most of the picture's border.
+
+    Along the edge alpha is fractional, and the background's share is removed from the colour, so no
+    fringe is left on another background.
+
+    Args:
+        rgb: ``[H, W, 3]`` in [0, 1].
+        keep_holes: keep enclosed areas of the background's colour.
+
+    Returns:
+        None if the background is not plain. A picture of one colour is all background.
+    """
+    edge = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
+    color = np.median(edge, axis=0)
+    if (np.abs(edge - color).max(-1) < _TOLERANCE).mean() < _SHARE:
+        return None
+    ground, noise = _fitted(rgb, _outer(np.abs(rgb - color).max(-1) < _TOLERANCE)[1])
+    residual = rgb - ground
+    areas, background = _outer(np.abs(residual).max(-1) < _TOLERANCE)
+    sizes = np.bincount(areas.ravel())
+    small = np.flatnonzero(sizes < max(_LEAST_HOLE, _HOLE * areas.size))
+    areas = np.where(background | np.isin(areas, small), 0, areas)
+    holes = [] if keep_holes else _holes(areas, residual, noise)
+    background = _exact(background, residual, noise)
+    background |= _shadow(rgb, ground, noise, background) | np.isin(areas, holes)
+    rgba = _without(rgb, background)
+    return Plain(rgba, areas, holes)
+
+
+def _outer(same: np.ndarray) -> tuple[np.ndarray, NDArray[np.bool_]]:
+    """Return the numbered areas ``[H, W]`` of a mask, and those that touch the border."""
+    areas = cast(np.ndarray, label(same, connectivity=1))
+    at_edge = np.unique(np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]]))
+    return areas, np.isin(areas, at_edge[at_edge > 0])
+
+
+def _fitted(rgb: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fit a quadratic of the position to the background's colours; return it and the noise."""
+    height, width = background.shape
+    y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)[None]
+    terms = np.broadcast_arrays(1.0, x, y, x * x, x * y, y * y)
+    used, ground, noise = background, np.zeros_like(rgb), 0.0
+    for _ in range(_FITS):
+        rows, columns = np.nonzero(used)
+        some = slice(None, None, max(1, len(rows) // _SAMPLES))
+        rows, columns = rows[some], columns[some]
+        sampled = np.stack([term[rows, columns] for term in terms], -1)
+        factors = np.linalg.lstsq(sampled, rgb[rows, columns], rcond=None)[0]
+        ground = sum(term[..., None] * row for term, row in zip(terms, factors, strict=True))
+        ground = np.clip(ground, 0, 1)
+        off = np.abs(rgb - ground).max(-1)
+        noise = 1.48 * float(np.median(off[used]))
+        used = background & (off <= max(3 * noise, 2 / 255))
+    return ground.astype(np.float32), noise
+
+
+def _exact(background: np.ndarray, residual: np.ndarray, noise: float) -> np.ndarray:
+    """Return a background without wide areas of another colour, which are light matter."""
+    exact = _outer(background & (np.abs(residual).max(-1) < _TIGHT + 4 * noise))[1]
+    other = background & ~exact
+    wide = ndimage.binary_opening(other, iterations=_FRINGE)
+    return background & ~ndimage.binary_dilation(wide, iterations=_FRINGE, mask=other)
+
+
+def _shadow(
+    rgb: np.ndarray, ground: np.ndarray, noise: float, background: np.ndarray
+) -> np.ndarray:
+    """Return soft shadows on the floor: the background's hue, darker, at the object's foot."""
+    light = (rgb * ground).sum(-1) / np.maximum((ground * ground).sum(-1), 1e-6)
+    hue = np.abs(rgb - light[..., None] * ground).max(-1)
+    slope = ndimage.gaussian_gradient_magnitude(light, 1.0)
+    may = (light > _DARKEST) & (light < 1) & (hue < _HUE + 2 * noise) & (slope < _SLOPE)
+    parts = cast(np.ndarray, label(may & ~background, connectivity=1))
+    rows = np.nonzero(~background & (np.abs(rgb - ground).max(-1) > 2 * _TOLERANCE))[0]
+    shadow = np.zeros_like(background)
+    if not len(rows):
+        return shadow
+    top, foot = np.quantile(rows, (0.02, 0.98))
+    least, most = _STRIP[0] * parts.size, _STRIP[1] * (~background).sum()
+    sizes = np.bincount(parts.ravel())
+    for number in np.flatnonzero((sizes >= least) & (sizes <= most)):
+        part = parts == number
+        outside = ndimage.binary_dilation(part) & ~part
+        high = np.quantile(np.nonzero(part)[0], 0.1)
+        if number and high >= top + _FOOT * (foot - top) and background[outside].mean() >= _CONTACT:
+            shadow |= part
+    return shadow
+
+
+def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> list[int]:
+    """Return the numbers of the enclosed areas that are background."""
+    difference = np.abs(residual).max(-1)
+    widest = ndimage.maximum_filter(difference, 3)
+    found = []
+    for number, box in enumerate(ndimage.find_objects(areas), 1):
+        if box is None:
+            continue
+        wide = tuple(slice(max(0, part.start - 4), part.stop + 4) for part in box)
+        area = areas[wide] == number
+        inner = ndimage.binary_erosion(area)
+        inner = inner if inner.any() else area
+        bias = np.abs(np.median(residual[wide][inner], axis=0)).max()
+        ring = ndimage.binary_dilation(area, iterations=2) & ~ndimage.binary_dilation(area)
+        text = ndimage.binary_fill_holes(area) & (difference[wide] > 2 * _TOLERANCE)
+        islands = text.sum() / area.sum()
+        faint = (widest[wide][ring] < _FAINT).mean()
+        if bias <= max(_BIAS, noise / 3) and islands <= _ISLANDS and faint <= _FAINT_SHARE:
+            found.append(number)
+    return found
+
+
+def _without(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Return ``[H, W, 4]`` without a background, which keeps its colour on the object's edge."""
+    distance, (rows, columns) = ndimage.distance_transform_edt(~background, return_indices=True)
+    rim = ~background & (distance <= _RIM)
+    near = rgb[rows, columns]  # the background's colour beside each pixel
+    difference = np.abs(rgb - near).max(-1)
+    # A rim pixel mixes background and object; the largest difference nearby is the object's.
+    full = ndimage.maximum_filter(np.where(background, 0.0, difference), 5)
+    share = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
+    alpha = without_specks(np.where(background, 0.0, np.where(rim, share, 1.0)))
+    weight = np.maximum(alpha, 1e-3)[..., None]
+    inside = np.clip((rgb - (1 - weight) * near) / weight, 0.0, 1.0)
+    return np.dstack([inside, alpha]).astype(np.float32)

@@ -1,0 +1,43 @@
+"""Enclosed background, shadows and white matter on plain backgrounds, with their right masks."""
+
+import numpy as np
+import pytest
+from helpers.cutouts import cases, iou
+
+pytest.importorskip("skimage")
+from gamba_warp.photo.plain import plain_matte
+
+
+@pytest.fixture(scope="module")
+def scores():
+    pytest.importorskip("manifold3d")
+    return [(case, iou(plain_matte(case.rgb).rgba[..., 3], case.alpha)) for case in cases()]
+
+
+def test_enclosed_background_and_shadows_go_and_white_matter_stays(scores):
+    """Means of docs/photo.md, less a hundredth for other versions of the libraries."""
+    means = {}
+    for case, score in scores:
+        means.setdefault(case.white, []).append(score)
+        if case.shadow:
+            means.setdefault("shadow", []).append(score)
+    assert len(scores) == 40 and len(means[True]) == 20
+    floors = {False: 0.95, True: 0.77, "shadow": 0.87}
+    for group, floor in floors.items():
+        assert np.mean(means[group]) > floor, group
+
+
+def test_text_on_white_and_shading_save_an_area(scores):
+    kept = ("bottle", "monitor", "telephone", "letter", "dice", "plate", "cup", "clock", "panda")
+    for case, score in scores:
+        if case.name.split(",")[0] in kept:
+            assert score > 0.98, case.name
+
+
+def test_holes_may_be_kept(scores):
+    case = next(case for case, _ in scores if case.name.startswith("headphones"))
+    found, kept = plain_matte(case.rgb), plain_matte(case.rgb, keep_holes=True)
+    assert len(found.holes) == 1 and not kept.holes
+    hole = found.areas == found.holes[0]
+    assert not found.rgba[hole, 3].any() and kept.rgba[hole, 3].all()
+    np.testing.assert_array_equal(found.areas, kept.areas)
