@@ -22,6 +22,7 @@ from .cutting import (
     examples,
     read_strokes,
     reset_mask,
+    switch_areas,
 )
 from .guard import VISITOR
 from .server import MainThread
@@ -84,7 +85,7 @@ class Actions:
         self._ways = ways
         self._files = files
         self._device = device
-        for name in ("take", "leave", "example", "mend", "restart", "make"):
+        for name in ("take", "leave", "example", "mend", "restart", "areas", "make"):
             setattr(self, name, with_page_errors(getattr(self, name)))
 
     def take(
@@ -126,6 +127,14 @@ class Actions:
     def restart(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Reset the mask, without strokes."""
         cut = reset_mask(_given(cut))
+        return cut, self._editor(cut, request)
+
+    def areas(self, cut: Cut | None, request: gr.Request) -> tuple:
+        """Clear the enclosed areas of a plain background's colour, or fill them."""
+        cut = _given(cut)
+        if not cut.areas.any():
+            raise UserError("the object encloses no area of a plain background's colour")
+        cut = switch_areas(cut)
         return cut, self._editor(cut, request)
 
     def make(

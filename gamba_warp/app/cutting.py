@@ -41,7 +41,8 @@ class Cut:
         found: ``[S, S, 4]`` float32, the object cut out and centred before any stroke, without
             background colour along its edge; None if no object was found.
         ghost: True if the picture has colours where the mask is 0.
-        note: method of the cut-out, for the page.
+        note: method of the cut-out and doubts, for the page.
+        areas: ``[H, W]`` bool, enclosed areas of a plain background's colour.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Cut:
     found: np.ndarray | None
     ghost: bool
     note: str
+    areas: np.ndarray
 
 
 def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
@@ -79,10 +81,12 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
         reason = str(error).removeprefix(f"{path}: ")
         mask = np.zeros(rgba.shape[:2], np.float32)
         note = f"No object was found ({reason}). Paint over the object with the blue brush."
-        return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note)
+        nothing = np.zeros(mask.shape, bool)
+        return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note, nothing)
     ghost = cut.method != "alpha"  # colours of transparent pixels are arbitrary
     rgb = _clean_edge(cut.source_rgb, cut.mask, cut.rgba)
-    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, cut.how)
+    note = f"{cut.how} {cut.warning}".strip()
+    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, note, cut.areas)
 
 
 def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -171,6 +175,13 @@ def apply_strokes(cut: Cut, layers: Sequence[np.ndarray]) -> Cut:
 def reset_mask(cut: Cut) -> Cut:
     """Return the cut-out with its first mask."""
     return replace(cut, mask=cut.first)
+
+
+def switch_areas(cut: Cut) -> Cut:
+    """Return the cut-out with all enclosed areas cleared; filled if none of them is left."""
+    cleared = np.where(cut.areas, 0.0, cut.mask).astype(np.float32)
+    left = cut.mask[cut.areas].any()
+    return replace(cut, mask=cleared if left else np.maximum(cleared, cut.areas))
 
 
 def model_picture(cut: Cut) -> np.ndarray:

@@ -99,6 +99,9 @@ def build(actions: Actions) -> gr.Blocks:
                     with gr.Row():
                         mend = gr.Button("Apply strokes", size="md", min_width=120)
                         restart = gr.Button("Start over", size="md", min_width=120)
+                        areas = gr.Button(
+                            "Clear or fill holes", size="md", min_width=120, elem_id="areas"
+                        )
                     elevation = gr.Slider(
                         -30,
                         90,
@@ -163,6 +166,7 @@ def build(actions: Actions) -> gr.Blocks:
                 **one,
             )
             written.success(None, made_files, None, js=_FETCH, api_visibility="private")
+        areas.click(actions.areas, cut, mask, **quick)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
 

@@ -94,6 +94,21 @@ def test_strokes_keep_and_remove(two, size):
     assert cutting.apply_strokes(cut, [np.zeros((*size, 4), np.uint8)]) is cut
 
 
+def test_enclosed_areas_are_cleared_and_filled(tmp_path):
+    rgb = np.ones((60, 80, 3))
+    rgb[10:50, 20:60] = 0.8, 0.2, 0.1
+    rgb[20:40, 30:50] = 1  # a hole
+    rgb[42:46, 30:50] = 0.95  # of another white: matter
+    save_image(tmp_path / "ring.png", rgb)
+    cut = cutting.cut_picture(tmp_path / "ring.png", "ring.png", Ways())
+    assert cut.mask[30, 40] == 0 and cut.mask[44, 40] == 1 and "1 enclosed area" in cut.note
+    cleared = cutting.switch_areas(cut)
+    assert cleared.mask[30, 40] == 0 and cleared.mask[44, 40] == 0 and cleared.mask[15, 40] == 1
+    filled = cutting.switch_areas(cleared)
+    assert filled.mask[30, 40] == 1 and filled.mask[44, 40] == 1 and filled.mask[5, 5] == 0
+    np.testing.assert_array_equal(cutting.reset_mask(filled).mask, cut.mask)
+
+
 def test_a_mended_object_has_no_fringe(tmp_path):
     """Along a smoothed edge the picture mixes object and background; the found colours do not."""
     picture = Image.new("RGB", (400, 400), "white")
