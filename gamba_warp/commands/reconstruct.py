@@ -112,7 +112,8 @@ def reconstruct_command(
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     checked_detail(detail, model.config, 0)  # before any cut-out
-    ways = Ways(mask, matte_model, sam, recenter, cutout, keep_holes, chosen).checked()
+    ways = Ways(mask, matte_model, sam, recenter, chosen, cutout=cutout, keep_holes=keep_holes)
+    ways.checked()
     output_folder(files.out)
     targets = [files.out / (name + suffix) for name in names for suffix in outputs.suffixes()]
     if older := sum(target.exists() for target in targets):

@@ -76,24 +76,24 @@ class Ways:
         matte_model: an ISNet or U2-Net in ONNX, or the URL of a copy of one of rembg's; None: one
             of rembg's, from its cache or fetched.
         sam: a checkpoint of Segment Anything, used instead of the matting model.
-        cutout: the only method to use; auto: the first that finds an object.
-        keep_holes: keep enclosed areas of a plain background's colour.
         recenter: centre the object, its longer side ``0.8`` of the square; else the picture keeps
             its frame, padded to a square.
         device: device of Segment Anything; the matting model runs on the CPU.
         fetch: allow fetching a matting model.
         say: called with a line before anything is fetched, and if the matting model is missing.
+        cutout: the only method to use; auto: the first that finds an object.
+        keep_holes: keep enclosed areas of a plain background's colour.
     """
 
     mask: str | Path | None = None
     matte_model: str | Path | None = None
     sam: str | Path | None = None
     recenter: bool = True
-    cutout: Cutout = "auto"
-    keep_holes: bool = False
     device: str | torch.device = "cpu"
     fetch: bool = True
     say: Callable[[str], None] = to_stderr
+    cutout: Cutout = "auto"
+    keep_holes: bool = False
     _segmenter: SamSegmenter | None = field(default=None, init=False, repr=False)
     _matte: Matte | None = field(default=None, init=False, repr=False)
     _no_matte: bool = field(default=False, init=False, repr=False)
