@@ -7,20 +7,21 @@ lighter or darker by its shading. docs/photo.md has the figures.
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+import scipy.ndimage
 from numpy.typing import NDArray
-from scipy import ndimage
 from skimage.measure import label
 
 from ..data.preprocess import without_specks
 
+ndimage: Any = scipy.ndimage  # its annotations do not say which results are arrays
+
 _TOLERANCE = 0.07  # largest colour difference within a plain background
-_TIGHT = 0.025  # ... if it is exact; four times the noise are added
-_FRINGE = (
-    3  # pixels; areas of other colours between the two are matter if they are wider than twice
-)
+# Areas within the tolerance are light matter if
+_TIGHT = 0.025  # they differ by more than this and four times the noise, and
+_FRINGE = 3  # are wider than twice this, pixels: JPEG makes narrow ones
 _SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
 _SAMPLES = 20_000  # pixels of a fit
 _FITS = 3
