@@ -79,7 +79,8 @@ endurance: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench
 
-# What the project asks of itself (docs/lab/studies): make study WHAT="growth --quick".
+# Choices inside the kernels, times of a scan, a training step by parts, the loader
+# (docs/lab/studies): make study WHAT="scan --quick".
 study: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ..kernels.bench.core.report import EXPLANATION, More, nothing_more, parts
@@ -18,7 +18,6 @@ _AXES = {
     "side": "side of the picture, pixels",
     "views": "views",
     "spacing": "tokens between kept states",
-    "share": "share of the picture that the object covers, %",
 }
 
 
@@ -33,35 +32,24 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
         return [_error_chart([r for r in done if r["direction"] == d], d) for d in directions]
     if axis == "skipped":
         return [_skip_chart(done)]
-    return [line_chart(case, done, axis, "ms_p50", "milliseconds")]
+    return [_line_chart(case, done, axis)]
 
 
-def line_chart(
-    case: str, records: Sequence[dict], axis: str, figure: str, label: str, scale: float = 1.0
-) -> str:
-    """Draw a figure of the record or of its work against a parameter.
-
-    Args:
-        case: its name.
-        records: the measured ones.
-        axis: name of the parameter.
-        figure: key of the record or of its work.
-        label: of the figure, with its unit.
-        scale: factor of the figure.
-    """
+def _line_chart(case: str, records: Sequence[dict], axis: str) -> str:
+    """Draw the time against a parameter, with a line for each series or direction."""
     lines: dict[str, list[Point]] = {}
     for r in records:
-        x, y = r["parameters"].get(axis), r.get(figure) or r["work"].get(figure)
+        x, y = r["parameters"].get(axis), r["ms_p50"]
         if y and type(x) in (int, float) and x > 0:
             name = r["parameters"].get("series") or r["direction"]
-            lines.setdefault(name, []).append(Point(x, scale * y))
+            lines.setdefault(name, []).append(Point(x, y))
     series = [
         Series(name, sorted(points, key=lambda p: p.x), "straight")
         for name, points in lines.items()
     ]
     ticks = sorted({point.x for points in lines.values() for point in points})
     axis_label = case if axis == "N" else _AXES.get(axis, axis)
-    return chart(series, Axis(axis_label, values=ticks), Axis(label))
+    return chart(series, Axis(axis_label, values=ticks), Axis("milliseconds"))
 
 
 def _error_chart(records: Sequence[dict], direction: str) -> str:
@@ -70,7 +58,7 @@ def _error_chart(records: Sequence[dict], direction: str) -> str:
     bottom = min(errors, default=0.0) / 3  # position of an error of 0, which is labelled
     points = []
     for r in records:
-        point = marked(r, r["rel_rms_error"] or 0.0)
+        point = _marked(r, r["rel_rms_error"] or 0.0)
         if r["rel_rms_error"] == 0:
             point = replace(point, y=bottom, label=f"{point.label} (error 0)")
         points.append(point)
@@ -79,7 +67,7 @@ def _error_chart(records: Sequence[dict], direction: str) -> str:
     return chart(series, Axis("milliseconds"), Axis("relative rms error"))
 
 
-def marked(record: dict, y: float) -> Point:
+def _marked(record: dict, y: float) -> Point:
     """Return a record's point at a height, marked as a peer or a default."""
     mark = "peer" if record["is_peer"] else "default" if record["is_default"] else ""
     return Point(record["ms_p50"], y, record["variant"], mark)
@@ -98,16 +86,12 @@ def _skip_chart(records: Sequence[dict]) -> str:
     return chart(series, Axis("work skipped, %", False), Axis("time saved, %", False))
 
 
-def page(
-    documents: Sequence[dict],
-    more: More = nothing_more,
-    charts: Callable[[str, Sequence[dict]], list[str]] = charts_of,
-) -> str:
+def page(documents: Sequence[dict], more: More = nothing_more) -> str:
     """Return a self-contained HTML page with the tables and charts."""
     sections = []
     for part in parts(documents, more):
         case = part.title.partition(": ")[2]
-        drawn = [svg for svg in charts(case, part.records) if svg] if part.records else []
+        drawn = [svg for svg in charts_of(case, part.records) if svg] if part.records else []
         (header, rows), *others = part.tables or [((), ())]
         text = "\n\n".join(part.texts)
         sections.append(Section(part.title, text, charts=drawn, header=header, table=rows))

@@ -113,11 +113,11 @@ class Gamba(Pretrained, nn.Module):
                 computed.
             background_margin: drop the 3DGS tokens of patches that are plain background in every
                 picture, except within this many patches of another one; 0 keeps only the object's
-                own patches. This is faster, but the model was not trained for it:
-                ``make study WHAT=model`` measures the error. None drops nothing. On CUDA it reads
-                one number back. The decoder ``rays`` is trained on, and always uses, only the
-                object's own patches, per picture; None is 0 there. A margin adds patches to its
-                network, but no Gaussians.
+                own patches. This is faster, but the model was not trained for it
+                (docs/lab/benchmarks.md, "background tokens", has the error). None drops nothing.
+                On CUDA it reads one number back. The decoder ``rays`` is trained on, and always
+                uses, only the object's own patches, per picture; None is 0 there. A margin adds
+                patches to its network, but no Gaussians.
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or

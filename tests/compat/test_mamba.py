@@ -1,4 +1,4 @@
-"""mamba-ssm's names: the scan, the block and the layer, each against float64; its example."""
+"""mamba-ssm's names: the scan, the block and the layer, each against float64."""
 
 import importlib
 from itertools import product
@@ -6,7 +6,6 @@ from itertools import product
 import pytest
 import torch
 import torch.nn.functional as F
-from examples import char_mamba
 from helpers import assert_default_dtype_changes_nothing, assert_rel_rms, in_default_float64
 from helpers.mamba import block_in_float64, run, scan_in_float64
 
@@ -332,23 +331,28 @@ def test_paths_of_the_original(path, names):
     assert list(mamba_ssm.__all__) == sorted(mamba_ssm.__all__)
 
 
-def test_the_example_learns_and_writes(capsys):
-    loss = char_mamba.main(["--steps", "25", "--letters", "9", "--length", "32"])
-    out = capsys.readouterr().out
-    first = float(out.split("loss ")[1].split()[0])
-    assert loss < first - 0.3, "the average of the loss falls"
-    assert out.rpartition("letters/s:\n")[2].startswith("The statement ")
+def test_generation_letter_by_letter_gives_what_the_whole_text_gives():
+    """A small language model: the prompt at once, then each letter from the states."""
+    prompt = torch.tensor([[3, 1, 4, 1, 5]])
+    embedding, head = torch.nn.Embedding(11, 16), torch.nn.Linear(16, 11, bias=False)
+    layers = [Mamba(16, layer_idx=i) for i in range(2)]
 
+    def model(letters, cache=None):
+        hidden = embedding(letters)
+        for layer in layers:
+            hidden = hidden + layer(hidden, inference_params=cache)
+        return head(hidden)
 
-def test_the_example_writes_the_letters_that_the_whole_text_gives():
-    model, prompt = char_mamba.CharModel(11, width=16), torch.tensor([3, 1, 4, 1, 5])
+    cache = InferenceParams(max_seqlen=17, max_batch_size=1)
+    given, written = prompt, [prompt]
     with torch.no_grad():
-        model.head.weight *= 1e4  # so that each letter is certain
-        model.head.bias *= 0
-        written = char_mamba.write(model, prompt, 12)
-        logits = model(written[None])[0]
-    assert torch.equal(written[:5], prompt)
-    assert torch.equal(logits[4:-1].argmax(-1), written[5:])
+        for _ in range(12):
+            letter = model(given, cache)[:, -1].argmax(-1, keepdim=True)
+            cache.seqlen_offset += given.shape[1]
+            given = letter
+            written.append(letter)
+        text = torch.cat(written, 1)
+        assert torch.equal(model(text)[0, 4:-1].argmax(-1), text[0, 5:])
 
 
 def test_layers_of_one_kind_have_one_result(capsys):

@@ -3,8 +3,7 @@
 import pytest
 import torch
 from helpers import micro
-from lab.studies import StudySettings
-from lab.studies.training import loader
+from lab.studies import StudySettings, loader
 
 from gamba_warp.kernels.bench.core.measure import measure
 

@@ -1,1 +1,1 @@
-"""Tables and pictures of the pages, written from stored results: ``make figures``."""
+"""Tables of the pages, written from stored results: ``make figures``."""

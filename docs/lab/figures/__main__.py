@@ -9,13 +9,13 @@ import tyro
 
 from gamba_warp.errors import UserError
 
-from . import growth, model_card, step, times
+from . import model_card, times
 
 
 def figures(
     views: Path | None = None, geometry: Path | None = None, retrieval: Path | None = None
 ) -> None:
-    """Rewrite the tables and pictures of the pages from the stored results.
+    """Rewrite the tables of the pages from the stored results.
 
     Args:
         views: report of eval-views, whose figures are first written into the shipped model's card.
@@ -23,8 +23,6 @@ def figures(
         retrieval: likewise, report of eval-geometry of the retrieval.
     """
     model_card.main(views, geometry, retrieval)
-    growth.main()
-    step.main()
     times.main()
 
 

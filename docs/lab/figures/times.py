@@ -21,7 +21,7 @@ from .parts import with_parts
 DOCS = Path(__file__).parents[2]
 PAGE, TIMES = DOCS / "scan-times.md", DOCS / "lab" / "benchmarks" / "cpu-times.json"
 _HEADER = ("tokens", "channels", "dtype", "forward, ms", "error")
-_HEADER += ("with gradients, ms", "worst error", "bare loop, ms", "torch loop, ms", "mambapy, ms")
+_HEADER += ("with gradients, ms", "worst error", "torch loop, ms", "mambapy, ms")
 
 
 def main() -> None:
@@ -43,7 +43,6 @@ def page_of(text: str, document: dict) -> str:
     found = {(r["case"], r["variant"], r["direction"]): r for r in document["records"]}
     rows = []
     for case in dict.fromkeys(r["case"] for r in document["records"]):
-        probe = next(r for (c, v, _), r in found.items() if c == case and v.startswith("probe"))
 
         def both(name: str, case: str = case) -> str:
             pair = [found.get((case, name, d)) for d in ("forward", "forward+backward")]
@@ -52,10 +51,10 @@ def page_of(text: str, document: dict) -> str:
         for dtype in ("float32", "bfloat16"):
             one, two = (found[case, dtype, d] for d in ("forward", "forward+backward"))
             sizes = [f"{one['parameters'][name]:,}" for name in "LD"]
-            others = [_ms(probe["ms_p50"]), both("torch loop"), both("mambapy")]
+            others = [both("torch loop"), both("mambapy")]
             cells = [_ms(one["ms_p50"]), f"{one['rel_rms_error']:.1e}"]
             cells += [_ms(two["ms_p50"]), f"{two['rel_rms_error']:.1e}"]
-            rows.append([*sizes, dtype, *cells, *(others if dtype == "float32" else [""] * 3)])
+            rows.append([*sizes, dtype, *cells, *(others if dtype == "float32" else [""] * 2)])
     table = "\n\n".join([markdown([*_HEADER], rows), machine_line(document)])
     return with_parts(text, "make figures", {"times": table})
 

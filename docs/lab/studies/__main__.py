@@ -16,23 +16,10 @@ from gamba_warp.files import output_folder
 from gamba_warp.measure import suites
 from gamba_warp.untrusted.ranges import Threads, ranged
 
-from . import StudySettings, drift, show, targets
+from . import StudySettings, show, targets
 
 # Name of a study -> the module with ``cases(settings)`` and optionally ``targets(settings)``.
-STUDIES = {
-    "scan": ".scan",
-    "times": ".times",
-    "raster": ".raster",
-    "lengths": ".lengths",
-    "step": ".training.step",
-    "block": ".models",
-    "model": ".models",
-    "growth-scan": ".growth",
-    "growth-raster": ".growth",
-    "growth-errors": ".growth_errors",
-    "loader": ".training.loader",
-}
-GROUPS = {"growth": ("growth-scan", "growth-raster", "growth-errors")}
+STUDIES = {name: f".{name}" for name in ("scan", "times", "raster", "step", "loader")}
 
 
 def load_study(op: str):
@@ -58,40 +45,35 @@ def study(
     Writes bench.json, bench.md and bench.html. Ctrl-C keeps the results so far.
 
     Args:
-        what: scan and raster (choices inside the kernels), times (of a layer's scan, by length,
-            width and dtype), block and model (compiled, in both precisions, without background),
-            lengths (a Mamba block against a transformer block
-            over the number of tokens), step (of training, by parts), growth (time, memory and
-            errors over every size, with slopes; growth-scan, growth-raster and growth-errors are
-            its parts), loader; drift, alone, prints how rules of occupancy drift on damaged shapes.
+        what: scan and raster (choices inside the kernels, large scenes), times (of a layer's scan,
+            by length, width and dtype), step (of training, by parts), loader.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes and many rounds.
         out: Folder for the results. With --render it may be a .md or .html file.
         threads: Number of CPU threads; torch's own number if not given.
         render: Measure nothing; make the tables and the page of these JSON files, of gamba bench
-            too. With an --out that ends in .svg it draws their charts of growth, with .json it
-            joins them.
+            too.
         data: Folder of posed views for step and loader; made-up views if not given.
         only: Measure only these cases, by their full names, as L or "random, float32".
     """
     if render:
-        paths = show.write_pages([suites.read_document(path) for path in render], out)
+        documents = [suites.read_document(path) for path in render]
+        paths = suites.write_pages(documents, out, show.markdown, show.page)
         print(f"wrote {', '.join(map(str, paths))}")
         return 0
-    chosen = suites.choose(what, STUDIES, GROUPS)
+    chosen = suites.choose(what, STUDIES, {})
     if not chosen:
-        raise UserError(f"name what to study: {', '.join((*STUDIES, *GROUPS))}")
+        raise UserError(f"name what to study: {', '.join(STUDIES)}")
     if data is not None and not data.is_dir():
         raise UserError(f"--data {data}: no such folder")
     given = suites.make_settings(pick_device(device), quick, full, False, threads)
     settings = StudySettings(**vars(given), data=data)
     folder = output_folder(out)
     modules = {op: load_study(op) for op in chosen}
-    found = suites.run_suites(modules, settings, only)
+    document = suites.run_suites(modules, settings, only)
     wanted = [t for m in modules.values() if hasattr(m, "targets") for t in m.targets(settings)]
-    found["targets"] = targets.judge(dict.fromkeys(wanted), found["records"])
-    document = show.with_crossings(found)
+    document["targets"] = targets.judge(dict.fromkeys(wanted), document["records"])
     suites.write_document(document, folder, show.markdown, show.page)
     print(f"{show.summary(document)}; wrote {folder / 'bench.json'}, bench.md and bench.html")
     return 130 if document["interrupted"] else int(bool(suites.failed_records(document)))
@@ -99,8 +81,6 @@ def study(
 
 if __name__ == "__main__":
     try:
-        if sys.argv[1:2] == ["drift"]:  # prints its table, and takes options of its own
-            sys.exit(tyro.cli(drift.main, prog="make study WHAT=drift", args=sys.argv[2:]))
         sys.exit(tyro.cli(study, prog="make study"))
     except UserError as error:
         sys.exit(f"study: {error}")

@@ -1,4 +1,4 @@
-"""Studies of the scan: its internal choices, and a bare loop for comparison."""
+"""Studies of the scan: its internal choices."""
 
 from __future__ import annotations
 
@@ -6,28 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from unittest.mock import patch
 
-import torch
-import torch.nn.functional as F
-
-from gamba_warp.kernels.bench.cases.scan_problem import (
-    count_memory,
-    make_problem,
-    scan_problem,
-)
-from gamba_warp.kernels.bench.core.case import (
-    BOTH,
-    Case,
-    Settings,
-    Variant,
-    compare,
-    make_cases,
-)
+from gamba_warp.kernels.bench.cases.scan_problem import count_memory, make_problem
+from gamba_warp.kernels.bench.core.case import BOTH, Case, Settings, Variant, make_cases
 from gamba_warp.kernels.bench.core.problem import Operator
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
-
-from .probe import probe_rate, probe_scan
-from .targets import Key, Target
 
 on_cpu, on_cuda = partial(patch.object, cpu, "TUNING"), partial(patch.object, cuda, "FORCED")
 _TRADE_LIMIT = 1.0  # where accuracy is the knob
@@ -38,29 +21,11 @@ def cases(settings: Settings) -> list[Case]:
     if settings.device.type != "cpu":
         return make_cases("scan", settings, [("chunk size", cuda_tunings, "error")])
     builders = [
-        ("bare loop", bare_loop, None),
         ("exponential", exponential, "error"),
-        ("boundary spacing", spacings, "error,memory,spacing"),
+        ("boundary spacing", spacings, "spacing"),
         ("chunk size", chunks, "error"),
     ]
     return make_cases("scan", settings, builders)
-
-
-def targets(settings: Settings) -> list[Target]:
-    """Return the targets; none at a quick run's sizes."""
-    if settings.level == "quick" or settings.device.type != "cpu":
-        return []
-    ours, probe = (Key("scan", "bare loop", name) for name in ("default", "probe, 2 threads"))
-    return [Target("forward over the bare probe, 2 threads", (ours,), (probe,), at_most=1.3)]
-
-
-def bare(problem: Operator) -> Operator:
-    """The same problem with given steps, and without gate, skip or bias."""
-    x = problem.inputs
-    step = F.softplus(x["delta"] + x["delta_bias"])
-    inputs = {"u": x["u"], "delta": step, "A": x["A"], "B": x["B"], "C": x["C"]}
-    tokens = problem.corner["u"][1].stop
-    return scan_problem(inputs, problem.device, tokens, softplus=False)
 
 
 def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Variant]:
@@ -80,37 +45,6 @@ def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Varia
         if variant.work is not None:
             variant.work = inside(variant.work)
     return made
-
-
-def bare_loop(settings: Settings) -> list[Variant]:
-    """The whole operator (softplus, bias, skip and gate) beside a bare probe: a native loop over
-    given steps, without gate, skip or gradient, into a given output.
-    """
-    problem = make_problem(settings)
-    given = bare(problem)
-    made = [problem.variant("default", default=True)]
-    made.append(given.variant("given steps, no gate or skip"))
-    return [*made, *(probe(given, threads) for threads in sorted({1, settings.threads}))]
-
-
-def probe(bare: Operator, threads: int) -> Variant:
-    """The bare loop of ``probe.py`` on the inputs of ``bare``."""
-    x = bare.inputs
-    out = torch.empty_like(x["u"][0])
-    run = partial(
-        probe_scan, *(x["u"][0], x["delta"][0], probe_rate(x["A"]), x["B"][0], x["C"][0], out)
-    )
-    _, length, width = x["u"].shape
-    return Variant(
-        f"probe, {threads} thread{'s' * (threads > 1)}",
-        run,
-        lambda: compare({"out": bare.cut("out", run()[None])}, bare.truth(False)),
-        1e-5,
-        bare.text,
-        peer=True,
-        threads=threads,
-        parameters={"B": 1, "L": length, "D": width, "N": 16},
-    )
 
 
 def _shorter(settings: Settings) -> Operator:

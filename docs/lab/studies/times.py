@@ -15,8 +15,6 @@ from gamba_warp.kernels.bench.cases.scan import peer
 from gamba_warp.kernels.bench.cases.scan_problem import make_inputs, scan_problem
 from gamba_warp.kernels.bench.core.case import Case, Settings, Variant
 
-from .scan import bare, probe
-
 LENGTHS, WIDTHS = (512, 2048, 8192), (512, 1536, 5120)
 _SLOW = 2048 * 1536  # tokens times channels up to which others' code in torch is timed
 _COMPARED = 512  # tokens compared with the oracle
@@ -34,12 +32,10 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def layer(settings: Settings, length: int, width: int) -> list[Variant]:
-    """One sequence, 16 states: both dtypes, and beside them a bare loop and others' code."""
+    """One sequence, 16 states: both dtypes, and beside them others' code."""
     problem = scan_problem(make_inputs(1, length, width), settings.device, min(length, _COMPARED))
     made = problem.pair("float32", default=True)
     made += problem.pair("bfloat16", {"dtype": torch.bfloat16})
-    if settings.device.type == "cpu":
-        made.append(probe(bare(problem), settings.threads))
     if settings.device.type == "cuda":
         return made + peer(problem, peers.mamba_ssm_scan).pair("mamba-ssm", peer=True)
     if length * width <= _SLOW:

@@ -147,9 +147,8 @@ class Case:
         name: unique within the op.
         text: one sentence on what is compared.
         build: function that makes the inputs and the variants; they are freed after the case.
-        axis: parameter along which cost is drawn; "error" draws time against error, "parts" the
-            parts that a variant's work names, "lengths" time and memory against L with the
-            crossing of two series, and None draws no chart.
+        axis: parameter along which cost is drawn; "error" draws time against error, "skipped"
+            skipped work against saved time, and None draws no chart.
     """
 
     op: str

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from gamba_warp.cameras import orbit
 from gamba_warp.data.dataset import ViewDataset, open_dataset
-from gamba_warp.images import save_image
 from gamba_warp.kernels.bench.core.case import Case, Settings, Variant
 from gamba_warp.train.batches import Batches, TrainingData
 from gamba_warp.train.config import DataConfig, TrainConfig
 from gamba_warp.train.ddp import World
 from gamba_warp.train.sources.pack import PackSettings, write_pack
 
-from .. import data_of
-from ..targets import Key, Target
+from . import data_of
+from .made_up import write_views
+from .targets import Key, Target
 
 OP = "loader"
 _BATCH, _NOVEL, _SIZE = 4, 3, 128  # as in the cases of a step
@@ -97,8 +94,7 @@ def _build(settings: Settings) -> list[Variant]:
     data = data_of(settings)
     if data is None:
         data = root / "views"
-        for number in range(4 if settings.level == "quick" else _OBJECTS):
-            _write_object(data / f"object{number:02d}", number)
+        write_views(data, 4 if settings.level == "quick" else _OBJECTS, _VIEWS, _SIZE)
     files, cached = open_dataset(data), open_dataset(data, cache=True)
     objects = list(range(min(_OBJECTS, len(files))))
     for index in objects:
@@ -124,22 +120,3 @@ def _build(settings: Settings) -> list[Variant]:
             )
         )
     return variants
-
-
-def _write_object(folder: Path, seed: int) -> None:
-    """An object of smooth colours behind an ellipse, in the layout ``transforms``, as WebP."""
-    rng = np.random.default_rng(seed)
-    folder.mkdir(parents=True)
-    x = np.linspace(-1, 1, _SIZE)
-    inside = (x[:, None] / 0.7) ** 2 + (x / 0.5) ** 2 < 1
-    frames = []
-    for view in range(_VIEWS):
-        waves = np.sin(rng.uniform(2, 20, (2, 3)) @ rng.uniform(-1, 1, (3, 3)))
-        color = np.sin(9 * waves[0] * x[:, None, None] + 9 * waves[1] * x[None, :, None])
-        rgba = np.dstack([(0.5 + 0.5 * color) * inside[..., None], inside])
-        save_image(folder / f"{view}.webp", rgba, lossless=True)
-        pose = torch.linalg.inv(orbit(torch.tensor([15.0 * view]), 20.0, 1.8)[0].double())
-        pose[:, 1:3] *= -1  # OpenCV to OpenGL
-        frames.append({"file_path": f"{view}.webp", "transform_matrix": pose.tolist()})
-    values = {"w": _SIZE, "h": _SIZE, "fl_x": 1.1 * _SIZE, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(values), encoding="utf-8")

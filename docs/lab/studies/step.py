@@ -1,50 +1,42 @@
-"""Benchmark cases of the training: a step by parts, its batch, and the dropped background."""
+"""A training step by parts, and against the number of objects of a batch."""
 
 from __future__ import annotations
 
 import math
+import tempfile
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cosine_similarity
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.devices import float32_products
+from gamba_warp.data.dataset import open_dataset
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench.core.case import Case, Error, Settings, Variant, compare
+from gamba_warp.kernels.bench.core.case import BOTH, Case, Settings, Variant
+from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.train.config import OptimConfig
+from gamba_warp.train.batches import Batches, TrainingData
+from gamba_warp.train.config import DataConfig, OptimConfig, TrainConfig
+from gamba_warp.train.ddp import World
 from gamba_warp.train.optim import Ema, build_optimizer
 from gamba_warp.train.step import Objective, compute_gradients
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from ..parts import measure_parts
-from ..targets import Key, Target
-from . import losses, optimizer
-from .background import background
-from .made_up import (
-    BATCH,
-    BOTH,
-    LOWER,
-    NOVEL,
-    OP,
-    SIZE,
-    SLIM,
-    WEIGHTS,
-    step_config,
-    step_model,
-    step_source,
-)
+from . import data_of
+from .made_up import write_views
+from .parts import measure_parts
+from .targets import Key, Target
 
-_CROP = 64
-_COMPARED = ("tiny", f"tiny{LOWER}", "rays", f"rays{LOWER}", SLIM)
+OP, BATCH, NOVEL, SIZE, _CROP = "step", 4, 3, 128, 64
+_SLIM = "rays, slim"  # as wide and deep as preset tiny
+_LOWER = ", bfloat16"  # products of the network and of LPIPS in bfloat16
+_COMPARED = ("tiny", f"tiny{_LOWER}", "rays", f"rays{_LOWER}", _SLIM)
 _BATCHES = {"quick": (1,), "normal": (1, 2, 4), "full": (1, 2, 4, 8)}
 _WITH_LPIPS = "LPIPS of crops"
-# Allowed errors of the whole gradient; a bfloat16 has 8 binary digits, and errors add up.
-_ROUNDED = {torch.float32: 1e-3, torch.bfloat16: 0.3}
 # Separate parts by region of the step: text in an operator's name -> part.
 _PRODUCTS = dict.fromkeys(("aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm"), "products")
 _KINDS = {
@@ -79,32 +71,9 @@ def cases(settings: Settings) -> list[Case]:
         "trained. The only check is that the gradient is finite."
     )
     batch = "Cost of that step without LPIPS against the number of objects."
-    precision = (
-        "The gradient of a step without data and optimizer, in both precisions of the products, "
-        "the shipped models' weights where a preset has them. Error: of the whole gradient to "
-        "float32's with MKL's products; and the PSNR of the rendered pictures to its pictures."
-    )
-    text = (
-        "Preset rays computes the patches that see the object; here also all patches, against the "
-        "share of the picture that the object covers in the mean of a batch of 4. Forward is the "
-        "network alone without gradients, forward+backward a step without data and optimizer. "
-        "Error: a batch padded to its largest object must give the Gaussians, and the gradient, "
-        "that each object gives alone. All patches is another function, since the network then "
-        "sees tokens of the background, which it was not trained with; how far its pictures are is "
-        "a PSNR. Weights: the shipped model's, or fresh ones."
-    )
-    builders = {
-        "parts": (parts, _parts, "parts"),
-        "batch": (batch, _batches, "B"),
-        "background": (text, background, "share"),
-        "precision": (precision, _precisions, "error"),
-        "SSIM": (losses.SSIM_TEXT, losses.ssim_variants, None),
-        "LPIPS": (losses.LPIPS_TEXT, losses.lpips_variants, "error"),
-        "optimizer": (optimizer.TEXT, optimizer.variants, None),
-    }
     return [
-        Case(op=OP, name=name, text=text, build=partial(build, settings), axis=axis)
-        for name, (text, build, axis) in builders.items()
+        Case(OP, "parts", parts, partial(_parts, settings)),
+        Case(OP, "batch", batch, partial(_batches, settings), "B"),
     ]
 
 
@@ -113,7 +82,7 @@ def targets(settings: Settings) -> list[Target]:
     if settings.level == "quick":
         return []
     ends = ["", *([f", {_WITH_LPIPS}"] if lpips_available() else [])]
-    faster = [
+    return [
         Target(
             text=f"samples a second, {name} over tiny{end}",
             times=(Key(OP, "parts", f"tiny{end}", BOTH),),
@@ -121,9 +90,19 @@ def targets(settings: Settings) -> list[Target]:
             at_least=4.0,
         )
         for end in ends
-        for name in ("rays", f"rays{LOWER}", SLIM)
+        for name in ("rays", f"rays{_LOWER}", _SLIM)
     ]
-    return [*faster, *losses.ssim_targets(settings)]
+
+
+def _config(name: str, settings: Settings) -> GambaConfig:
+    """Return the configuration of a variant, by its name; a quick run's is small."""
+    name = name.removesuffix(_LOWER)
+    tiny, config = PRESETS["tiny"], PRESETS["tiny" if name == "tiny" else "rays"]
+    if name == _SLIM:
+        config = replace(config, width=tiny.width, depth=tiny.depth)
+    if settings.level == "quick":
+        config = replace(config, image_size=32, width=16, depth=1)
+    return config
 
 
 class _Step:
@@ -133,9 +112,9 @@ class _Step:
         self, settings: Settings, name: str, batch: int = BATCH, lpips: bool = False
     ) -> None:
         torch.manual_seed(0)
-        config = step_config(name, settings)
+        config = _config(name, settings)
         self.device, self.number = settings.device, 0
-        self.precision = torch.bfloat16 if name.endswith(LOWER) else torch.float32
+        self.precision = torch.bfloat16 if name.endswith(_LOWER) else torch.float32
         self.model = Gamba(config).to(settings.device)
         options = OptimConfig()
         self.clip = options.clip
@@ -144,8 +123,21 @@ class _Step:
             group["lr"] = 1e-6  # the weights hardly move, so every round does the same work
         self.ema = Ema(self.model, options.ema)
         self.lpips = load_lpips().to(settings.device) if lpips else None
-        self.weights = WEIGHTS | {"lpips": 0.2 if lpips else 0.0}
-        self.source = step_source(config, settings, batch)
+        self.weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "rdist": 0.0}
+        self.weights["lpips"] = 0.2 if lpips else 0.0
+        size = min(SIZE, config.image_size)
+        folder = data_of(settings)
+        if folder is None:
+            self.folder = tempfile.TemporaryDirectory(prefix="gamba-bench-")  # as long as the step
+            folder = Path(self.folder.name) / "views"
+            write_views(folder, batch, NOVEL + 3, size)
+        data = open_dataset(folder, cache=True)
+        self.source = Batches(
+            TrainingData(data, list(range(len(data.uids))), batch_size=batch),
+            TrainConfig(data=folder, views=DataConfig(size=size, mirror=0.5, recolor=0.3)),
+            World(0, 1, torch.device("cpu")),
+        )
+        self.source.model = config
 
     def _network(self, images: Tensor, cameras: Cameras) -> Gaussians:
         with record_function("rest of the network"):
@@ -198,7 +190,7 @@ def _parts(settings: Settings) -> list[Variant]:
                     run=step.step,
                     check=step.check,
                     direction=BOTH,
-                    dtype="bfloat16" if name.endswith(LOWER) else "float32",
+                    dtype="bfloat16" if name.endswith(_LOWER) else "float32",
                     default=name == "rays" and not lpips,
                     rounds=7,
                     parameters={"B": BATCH, "views": NOVEL + 1, "side": SIZE},
@@ -221,63 +213,6 @@ def _batches(settings: Settings) -> list[Variant]:
                     direction=BOTH,
                     rounds=5,
                     parameters={"B": batch, "views": NOVEL + 1, "side": SIZE, "series": name},
-                )
-            )
-    return made
-
-
-class _Precise:
-    """Model and batch, for gradients in a precision of the products."""
-
-    def __init__(self, settings: Settings, name: str) -> None:
-        self.model, self.trained = step_model(name, settings)
-        self.batch = step_source(self.model.config, settings, BATCH).batch(0, NOVEL)
-        self.batch = self.batch.to(settings.device)
-        self.optimizer = torch.optim.SGD(self.model.parameters(), lr=0.0)
-        with float32_products():
-            self.truth = self.gradient(torch.float32)
-
-    def gradient(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Make the gradient of all weights, and the pictures; timed."""
-        objective = Objective(WEIGHTS, precision=precision)
-        made = compute_gradients(self.model, self.optimizer, [self.batch], objective, clip=math.inf)
-        grads = [p.grad.flatten() for p in self.model.parameters() if p.grad is not None]
-        return torch.cat(grads), made.result.rendering.rgb.detach()
-
-    def check(self, precision: torch.dtype) -> Error:
-        """Measure the error of the gradient to the truth."""
-        return compare({"gradient": self.gradient(precision)[0]}, {"gradient": self.truth[0]})
-
-    def work(self, precision: torch.dtype) -> dict[str, float]:
-        """Measure the errors of the gradient and of the pictures."""
-        gradient, pictures = self.gradient(precision)
-        cosine = 1 - cosine_similarity(gradient.double(), self.truth[0].double(), 0)
-        error = (pictures - self.truth[1]).square().mean().clamp_min(1e-12)
-        return {
-            "gradient_angle": float(f"{cosine:.2g}"),
-            "psnr_to_float32": round(-10 * error.log10().item(), 1),
-        }
-
-
-def _precisions(settings: Settings) -> list[Variant]:
-    made = []
-    for name in ("tiny", "rays"):
-        precise = _Precise(settings, name)
-        for precision in (torch.float32, torch.bfloat16):
-            kind = str(precision).removeprefix("torch.")
-            made.append(
-                Variant(
-                    name=f"{name}, {kind}",
-                    run=partial(precise.gradient, precision),
-                    check=partial(precise.check, precision),
-                    limit=_ROUNDED[precision],
-                    oracle="float32",
-                    direction=BOTH,
-                    dtype=kind,
-                    default=precision == torch.float32,
-                    rounds=5,
-                    parameters={"B": BATCH, "weights": "shipped" if precise.trained else "fresh"},
-                    work=partial(precise.work, precision),
                 )
             )
     return made

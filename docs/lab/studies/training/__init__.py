@@ -1,1 +1,0 @@
-"""Studies of the training: a step by parts, and the loader."""
