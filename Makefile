@@ -35,7 +35,7 @@ demo: $(STAMP)
 # Two processes share the tests, a file each at a time, in the order of their names: by the number of
 # its tests the demo, the longest file, would come last, and one process would wait for it. Each
 # computes with the threads that a user's would, so waiting threads must let go of the core
-# (docs/pace.md).
+# (docs/reconstruct.md, "Shared cores").
 test: $(STAMP)
 	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder
 

@@ -46,8 +46,8 @@ def share_cores() -> None:
 
     By default the threads of torch's CPU operators spin for milliseconds while they wait for each
     other. On a busy core that takes time from the thread they wait for: a mesh took five times as
-    long beside a training on two cores (docs/pace.md). Call it before torch is imported. Variables
-    that the user has set win.
+    long beside a training on two cores (docs/reconstruct.md). Call it before torch is imported.
+    Variables that the user has set win.
     """
     chosen = {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & {*os.environ}
     if chosen or "torch" in sys.modules or not hasattr(os, "getloadavg"):

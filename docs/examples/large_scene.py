@@ -7,7 +7,7 @@ The objects of a folder of meshes stand on a square floor. Each gets the same nu
 at random places of its surface: flat ones along the surface, as wide as their distance from each
 other, in the colour of the texture there. The same folder and options give the same bytes. Views
 are timed from inside the hall, where most Gaussians are beside or behind the camera, and from
-above, where all are in sight. The figures of docs/large-scenes.md are its output.
+above, where all are in sight. The figures of docs/kernels-alone.md are its output.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Draws docs/pictures/frames.webp: the frames of docs/frames.md, by the project's own renderer.
+"""Draws docs/pictures/frames.webp: the frames of docs/cameras.md, by the project's own renderer.
 
     python docs/website/frames.py
 

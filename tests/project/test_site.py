@@ -146,7 +146,7 @@ def test_the_picture_moves():
 
 
 def test_each_mark_beside_others_has_its_proof():
-    page = (ROOT / "docs" / "beside-others.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "faq.md").read_text(encoding="utf-8")
     lines = [line for line in page.split("\n") if line.startswith("| ")]
     named = dict(re.findall(r"^\[(\w+)\]: (https://\S+)$", page, re.MULTILINE))
     assert len(lines) > 8

@@ -1,4 +1,4 @@
-"""Writes the table of docs/scan-times.md from cpu-times.json.
+"""Writes the table of docs/kernels-alone.md from cpu-times.json.
 
 After the measurement, with mambapy installed:
 
@@ -19,7 +19,7 @@ from gamba_warp.measure.suites import read_document
 from .parts import with_parts
 
 DOCS = Path(__file__).parents[2]
-PAGE, TIMES = DOCS / "scan-times.md", DOCS / "lab" / "benchmarks" / "cpu-times.json"
+PAGE, TIMES = DOCS / "kernels-alone.md", DOCS / "lab" / "benchmarks" / "cpu-times.json"
 _HEADER = ("tokens", "channels", "dtype", "forward, ms", "error")
 _HEADER += ("with gradients, ms", "worst error", "torch loop, ms", "mambapy, ms")
 

@@ -1,4 +1,4 @@
-"""Cost of a layer's scan by length, width and dtype: the table of docs/scan-times.md.
+"""Cost of a layer's scan by length, width and dtype: the table of docs/kernels-alone.md.
 
 Widths are the inner ones of published models: 512 of this project's ``rays``, 1,536 of mamba-130m,
 5,120 of mamba-2.8b.

@@ -1,4 +1,4 @@
-"""docs/scan-times.md shows the results of the study, and the study gives what the page needs."""
+"""docs/kernels-alone.md shows the results of the study, and the study gives what the page needs."""
 
 import torch
 from lab.figures import times as writer
