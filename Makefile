@@ -123,7 +123,7 @@ figures: $(STAMP)
 scanned: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m lab.scanned $(MESHES) $(OPTIONS)
 
-# docs/architecture.svg and the table of docs/architecture.md, from today's imports.
+# The table of docs/architecture.md, from today's imports.
 architecture: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m architecture
 

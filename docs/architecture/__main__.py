@@ -1,4 +1,4 @@
-"""``make architecture``: write docs/architecture.svg and the table of docs/architecture.md."""
+"""``make architecture``: write the table of docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -9,15 +9,8 @@ from lab.figures.parts import with_parts
 
 from .imports import Import, read_imports
 from .packages import PACKAGES, edges, refused
-from .picture import arrows, draw
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def picture(entries: list[Import]) -> str:
-    """Return the text of docs/architecture.svg."""
-    at_once = edges([entry for entry in entries if not entry.lazy], by_package=True)
-    return draw(arrows(at_once, edges(entries, by_package=True)))
 
 
 def table(entries: list[Import]) -> str:
@@ -47,6 +40,5 @@ if __name__ == "__main__":
         sys.exit(
             "\n".join([*reasons, "fix these imports first: see docs/architecture/packages.py"])
         )
-    (ROOT / "docs" / "architecture.svg").write_text(picture(found))
     document = ROOT / "docs" / "architecture.md"
     document.write_text(page(document.read_text(), found))

@@ -11,6 +11,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 
 from .imports import Import
 
@@ -26,123 +27,90 @@ class Package:
     """
 
     holds: str
-    may: tuple[str, ...] = ()
-    later: tuple[str, ...] = ()
+    may: tuple[str, ...]
+    later: tuple[str, ...]
 
 
-_OPS = (
-    *("kernels.selective_scan", "kernels.causal_conv1d", "kernels.rasterize", "kernels.ssim"),
-    "kernels.triangles",
-)
-_KERNELS = ("versions", "kernels.runtime", *_OPS, "kernels")
-_BENCH = tuple(f"kernels.bench{part}" for part in ("", ".core", ".cases", ".static"))
-_STRESS = tuple(f"kernels.stress{part}" for part in ("", ".core", ".oracles", ".cases"))
-_CORE = (*_KERNELS, "core")
-_READERS = (*_CORE, "untrusted")
-_MODEL = ("model.config", "model.parts", "model")
-_LIBRARY = (*_READERS, "data", "formats", "vision", *_MODEL)
-_RESULTS = (
-    *(*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
-    "pages",
-)
-_MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
-_TRAIN_DATA = ("train.data", "train.data.made", "train.sources")
-_TRAIN = ("train.config", "train.objective", "train", *_TRAIN_DATA)
-_EVAL = ("eval", "eval.views", "eval.shapes")
-
-PACKAGES = {
-    "versions": Package("versions of this package and the libraries"),
-    "kernels.runtime": Package("views of tensors, launches, threads, lanes", ("versions",)),
-    "kernels.selective_scan": Package("Mamba's scan", ("versions", "kernels.runtime")),
-    "kernels.causal_conv1d": Package(
-        "the convolution before the scan", ("versions", "kernels.runtime")
-    ),
-    "kernels.ssim": Package(
-        "1 - SSIM of pictures and its gradient", ("versions", "kernels.runtime")
-    ),
-    "kernels.triangles": Package("intersecting faces", ("versions", "kernels.runtime")),
-    "kernels.rasterize": Package("Gaussians to pictures", ("versions", "kernels.runtime")),
-    "kernels": Package("the public operators, loaded when used", ("versions",), _OPS),
-    "kernels.bench.core": Package(
-        "definition of a case, the clock, reports", ("versions", "kernels.runtime")
-    ),
-    "kernels.bench": Package("comparisons with other packages", (*_KERNELS, "kernels.bench.core")),
-    "kernels.bench.cases": Package(
-        "one file per subject", (*_KERNELS, "kernels.bench.core", "kernels.bench")
-    ),
-    "kernels.bench.static": Package(
-        "registers and stack of the CUDA kernels, without a GPU", (*_KERNELS, "kernels.bench.core")
-    ),
-    "kernels.stress.core": Package(
-        "definition of a case, the runner, reports", ("versions", "kernels.runtime")
-    ),
-    "kernels.stress.oracles": Package(
-        "the formulas in float64", ("kernels.stress.core", "kernels.rasterize")
-    ),
-    "kernels.stress.cases": Package(
-        "one file per subject", (*_KERNELS, "kernels.stress.core", "kernels.stress.oracles")
-    ),
-    "kernels.stress": Package("parent of its three packages"),
-    "core": Package("Gaussians, cameras, images, rendering, files, errors", _KERNELS),
-    "compat": Package("other packages' interfaces over our kernels", _CORE),
-    "untrusted": Package("validation of untrusted files", _CORE),
-    "data": Package("datasets and preprocessing", _READERS),
-    "formats": Package(".ply, .splat, .glb, meshes, their headers", _READERS),
-    "vision": Package("VGG16, LPIPS, and the download of their weights", _READERS),
-    "model.config": Package("every option of the network", _READERS),
-    "model.parts": Package("tokens, blocks, decoders", (*_READERS, "model.config")),
-    "model": Package(
-        "the network, its encoders and its files",
-        (*_READERS, "data", "formats", "vision", "model.config", "model.parts"),
-        ("photo",),
-    ),
-    "photo": Package("cut-outs of photographs", (*_READERS, "data", "vision")),
-    "trajectories": Package("camera paths, their files, movies", (*_READERS, "data")),
-    "surfaces": Package("Gaussians to meshes", (*_LIBRARY, "trajectories")),
-    "viewer": Package("the 3D viewer and its pages", (*_READERS, "formats")),
-    "fitting": Package("one object by optimisation", (*_LIBRARY, "compat")),
-    "pages": Package(
-        "pages, charts, turntables",
-        (*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
-    ),
-    "measure": Package("benchmark and stress cases that need the model", _MEASURES),
-    "train.data.made": Package("procedural objects, made from a seed", _LIBRARY),
-    "train.data": Package("furniture, rendering of meshes", (*_LIBRARY, "train.data.made")),
-    "train.sources": Package(
-        "published datasets, packs; commands of data",
-        (*_LIBRARY, "train.data", "train.data.made"),
-    ),
-    "train.config": Package("the options of a run", _LIBRARY),
-    "train.objective": Package("the losses", (*_LIBRARY, "train.config")),
-    "train": Package(
-        "batches, loop, checkpoints",
-        (*_LIBRARY, "train.config", "train.objective", *_TRAIN_DATA),
-        ("pages",),
-    ),
-    "eval": Package("the report that both evaluations share", _RESULTS),
-    "eval.views": Package("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
-    "eval.shapes": Package("Chamfer, IoU, F-score", (*_RESULTS, "eval")),
-    "gpu_check": Package("the checks on a CUDA machine", (*_MEASURES, "measure")),
-    "ablation": Package(
-        "rows trained and evaluated alike",
-        _RESULTS,
-        ("measure", *_TRAIN, *_EVAL),
-    ),
-    "commands": Package(
-        "commands, by subject",
-        (*_MEASURES, "measure", "ablation", "gpu_check"),
-        (*_TRAIN, *_EVAL),
-    ),
-    "app": Package("the local web app", _RESULTS),
-    "cli": Package(
-        "finds the command, parses, calls",
-        ("versions", "core"),
-        ("commands", "app", "gpu_check", "ablation", *_TRAIN, *_EVAL),
-    ),
-    "public": Package(
-        "import gamba_warp: names loaded when used", ("versions", "kernels"), _RESULTS
-    ),
+# Names for several packages in the table below.
+_GROUPS = {
+    "OPS": "kernels.selective_scan kernels.causal_conv1d kernels.rasterize "
+    "kernels.ssim kernels.triangles",
+    "KERNELS": "versions kernels.runtime OPS kernels",
+    "BENCH": "kernels.bench kernels.bench.core kernels.bench.cases kernels.bench.static",
+    "STRESS": "kernels.stress kernels.stress.core kernels.stress.oracles kernels.stress.cases",
+    "READERS": "KERNELS core untrusted",
+    "MODEL": "model.config model.parts",
+    "LIBRARY": "READERS data formats vision MODEL model",
+    "RESULTS": "LIBRARY photo trajectories surfaces viewer fitting pages",
+    "MEASURES": "RESULTS BENCH STRESS",
+    "TRAIN_DATA": "train.data train.data.made train.sources",
+    "TRAIN": "train.config train.objective train TRAIN_DATA",
+    "EVAL": "eval eval.views eval.shapes",
 }
+# package | holds | may import | may import inside functions
+_TABLE = """
+versions | versions of this package and the libraries | |
+kernels.runtime | views of tensors, launches, threads, lanes | versions |
+kernels.selective_scan | Mamba's scan | versions kernels.runtime |
+kernels.causal_conv1d | the convolution before the scan | versions kernels.runtime |
+kernels.ssim | 1 - SSIM of pictures and its gradient | versions kernels.runtime |
+kernels.triangles | intersecting faces | versions kernels.runtime |
+kernels.rasterize | Gaussians to pictures | versions kernels.runtime |
+kernels | the public operators, loaded when used | versions | OPS
+kernels.bench.core | definition of a case, the clock, reports | versions kernels.runtime |
+kernels.bench | comparisons with other packages | KERNELS kernels.bench.core |
+kernels.bench.cases | one file per subject | KERNELS kernels.bench.core kernels.bench |
+kernels.bench.static | registers and stack of the CUDA kernels | KERNELS kernels.bench.core |
+kernels.stress.core | definition of a case, the runner, reports | versions kernels.runtime |
+kernels.stress.oracles | the formulas in float64 | kernels.stress.core kernels.rasterize |
+kernels.stress.cases | one file per subject | KERNELS kernels.stress.core kernels.stress.oracles |
+kernels.stress | parent of its three packages | |
+core | Gaussians, cameras, images, rendering, files, errors | KERNELS |
+compat | other packages' interfaces over our kernels | KERNELS core |
+untrusted | validation of untrusted files | KERNELS core |
+data | datasets and preprocessing | READERS |
+formats | .ply, .splat, .glb, meshes, their headers | READERS |
+vision | VGG16, LPIPS, and the download of their weights | READERS |
+model.config | every option of the network | READERS |
+model.parts | tokens, blocks, decoders | READERS model.config |
+model | the network, its encoders and its files | READERS data formats vision MODEL | photo
+photo | cut-outs of photographs | READERS data vision |
+trajectories | camera paths, their files, movies | READERS data |
+surfaces | Gaussians to meshes | LIBRARY trajectories |
+viewer | the 3D viewer and its pages | READERS formats |
+fitting | one object by optimisation | LIBRARY compat |
+pages | pages, charts, turntables | LIBRARY photo trajectories surfaces viewer fitting |
+measure | benchmark and stress cases that need the model | MEASURES |
+train.data.made | procedural objects, made from a seed | LIBRARY |
+train.data | furniture, rendering of meshes | LIBRARY train.data.made |
+train.sources | published datasets, packs; commands of data | LIBRARY train.data train.data.made |
+train.config | the options of a run | LIBRARY |
+train.objective | the losses | LIBRARY train.config |
+train | batches, loop, checkpoints | LIBRARY train.config train.objective TRAIN_DATA | pages
+eval | the report that both evaluations share | RESULTS |
+eval.views | PSNR, SSIM, LPIPS; baselines | RESULTS eval |
+eval.shapes | Chamfer, IoU, F-score | RESULTS eval |
+gpu_check | the checks on a CUDA machine | MEASURES measure |
+ablation | rows trained and evaluated alike | RESULTS | measure TRAIN EVAL
+commands | commands, by subject | MEASURES measure ablation gpu_check | TRAIN EVAL
+app | the local web app | RESULTS |
+cli | finds the command, parses, calls | versions core | commands app gpu_check ablation TRAIN EVAL
+public | import gamba_warp: names loaded when used | versions kernels | RESULTS
+"""
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Return the packages of a cell, its groups resolved."""
+    names = text.split()
+    return tuple(p for n in names for p in (_names(_GROUPS[n]) if n in _GROUPS else (n,)))
+
+
+def _package(row: str) -> tuple[str, Package]:
+    name, holds, may, later = (cell.strip() for cell in row.split("|"))
+    return name, Package(holds, _names(may), _names(later))
+
+
+PACKAGES = dict(map(_package, _TABLE.strip().split("\n")))
 
 # ``gamba`` and the equivalent ``python -m`` commands. (gpu_check has its own: it needs no tyro.)
 ENTRY_POINTS = ("cli", "__main__", "train.__main__", "eval.__main__", "kernels.bench.__main__")
@@ -239,18 +207,8 @@ def edges(entries: Iterable[Import], by_package: bool) -> dict[str, set[str]]:
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
     """Return a cycle of the graph, or an empty list."""
-    done: set[str] = set()
-
-    def walk(node: str, path: list[str]) -> list[str]:
-        if node in path:
-            return [*path[path.index(node) :], node]
-        if node in done:
-            return []
-        for following in sorted(graph.get(node, ())):
-            found = walk(following, [*path, node])
-            if found:
-                return found
-        done.add(node)
-        return []
-
-    return next(filter(None, (walk(node, []) for node in sorted(graph))), [])
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []

@@ -17,8 +17,3 @@ class StudySettings(Settings):
     """
 
     data: Path | None = None
-
-
-def data_of(settings: Settings) -> Path | None:
-    """Return the folder of posed views; None for a run without this setting."""
-    return getattr(settings, "data", None)

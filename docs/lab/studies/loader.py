@@ -17,15 +17,12 @@ from gamba_warp.train.config import DataConfig, TrainConfig
 from gamba_warp.train.ddp import World
 from gamba_warp.train.sources.pack import PackSettings, write_pack
 
-from . import data_of
 from .made_up import write_views
-from .targets import Key, Target
 
-OP = "loader"
 _BATCH, _NOVEL, _SIZE = 4, 3, 128  # as in the cases of a step
 _VIEWS, _OBJECTS = 24, 24  # of a made-up folder, and used of another
 _BATCHES = {"quick": 2, "normal": 24, "full": 96}
-_PACK, _WORKERS = "pack", 2
+_WORKERS = 2
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -38,22 +35,7 @@ def cases(settings: Settings) -> list[Case]:
         "pictures are decoded, or were decoded before: into memory, into a pack, onto the device. "
         "There is no oracle: a test holds the batches to be the same to the bit."
     )
-    return [Case(op=OP, name="views", text=text, build=partial(_build, settings), axis=None)]
-
-
-def targets(settings: Settings) -> list[Target]:
-    """Return the target; none at a quick run's sizes."""
-    if settings.level == "quick":
-        return []
-    return [
-        Target(
-            text="samples a second, pack alone over a step of rays (step)",
-            times=(Key("step", "parts", "rays", "forward+backward"),),
-            over=(Key(OP, "views", _PACK),),
-            scale=_BATCHES[settings.level],
-            at_least=20.0,
-        )
-    ]
+    return [Case(op="loader", name="views", text=text, build=partial(_build, settings), axis=None)]
 
 
 @dataclass
@@ -91,7 +73,7 @@ class _Loader:
 def _build(settings: Settings) -> list[Variant]:
     folder = tempfile.TemporaryDirectory(prefix="gamba-bench-")
     root = Path(folder.name)
-    data = data_of(settings)
+    data = getattr(settings, "data", None)
     if data is None:
         data = root / "views"
         write_views(data, 4 if settings.level == "quick" else _OBJECTS, _VIEWS, _SIZE)
@@ -103,7 +85,7 @@ def _build(settings: Settings) -> list[Variant]:
     pack, resident = open_dataset(root / "pack"), open_dataset(root / "pack")
     resident.preload(objects, [_SIZE], settings.device, _WORKERS)
     made: dict[str, ViewDataset] = {"files": files, "files, --cache": cached}
-    made |= {_PACK: pack, "pack, --cache-device": resident}
+    made |= {"pack": pack, "pack, --cache-device": resident}
     world, batches = World(0, 1, settings.device), _BATCHES[settings.level]
     variants = []
     for name, dataset in made.items():

@@ -26,10 +26,8 @@ from gamba_warp.train.step import Objective, compute_gradients
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from . import data_of
 from .made_up import write_views
 from .parts import measure_parts
-from .targets import Key, Target
 
 OP, BATCH, NOVEL, SIZE, _CROP = "step", 4, 3, 128, 64
 _SLIM = "rays, slim"  # as wide and deep as preset tiny
@@ -77,23 +75,6 @@ def cases(settings: Settings) -> list[Case]:
     ]
 
 
-def targets(settings: Settings) -> list[Target]:
-    """Return the targets; none at a quick run's sizes."""
-    if settings.level == "quick":
-        return []
-    ends = ["", *([f", {_WITH_LPIPS}"] if lpips_available() else [])]
-    return [
-        Target(
-            text=f"samples a second, {name} over tiny{end}",
-            times=(Key(OP, "parts", f"tiny{end}", BOTH),),
-            over=(Key(OP, "parts", f"{name}{end}", BOTH),),
-            at_least=4.0,
-        )
-        for end in ends
-        for name in ("rays", f"rays{_LOWER}", _SLIM)
-    ]
-
-
 def _config(name: str, settings: Settings) -> GambaConfig:
     """Return the configuration of a variant, by its name; a quick run's is small."""
     name = name.removesuffix(_LOWER)
@@ -126,7 +107,7 @@ class _Step:
         self.weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "rdist": 0.0}
         self.weights["lpips"] = 0.2 if lpips else 0.0
         size = min(SIZE, config.image_size)
-        folder = data_of(settings)
+        folder = getattr(settings, "data", None)
         if folder is None:
             self.folder = tempfile.TemporaryDirectory(prefix="gamba-bench-")  # as long as the step
             folder = Path(self.folder.name) / "views"
