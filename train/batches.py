@@ -31,6 +31,7 @@ from .data.poses import front_views
 from .data.samples import Batch, choose_views, draw_change, join, load_sample
 from .data.settings import VARIED_CAMERAS, Settings
 from .ddp import World
+from .optim import NewBatch
 
 _TRIES = 100  # objects tried in turn until one can be read
 # With --overfit all views share one forward pass of the network; rendering them is cheap beside it.
@@ -148,7 +149,7 @@ def _open_all(config: TrainConfig) -> TrainingData:
         train,
         objects,
         reference=0 if views.reference == "first" else None,
-        batch_size=views.batch_size or 8,
+        batch_size=views.objects,
         novel=views.views_per_object,
         held_out=[part for part in held_out if part.objects],
         val_views=config.run.val_views,
@@ -178,7 +179,7 @@ def _open_one(config: TrainConfig, name: str) -> TrainingData:
         dataset,
         objects=[index] * dataset.num_views(index),
         reference=None if views.reference == "random" else 0,
-        batch_size=views.batch_size or 1,
+        batch_size=views.objects,
         novel=_OVERFIT_VIEWS if views.views_per_object is None else views.views_per_object,
         held_out=[HeldOut("", dataset, [index])],
     )
@@ -206,6 +207,7 @@ class Batches:
         failures: reasons by uid, of the objects that could not be read so far.
         waited: seconds spent in ``take``, until it is set to 0.
         model: configuration of the model.
+        since: last change of the number of objects a step.
     """
 
     def __init__(
@@ -229,7 +231,7 @@ class Batches:
         self.data, self.config, self.model = data, config, config.model_config()
         self.world, self.novel, self.last = world, novel, last
         self.failures: dict[str, str] = {}
-        self.waited = 0.0
+        self.waited, self.since = 0.0, NewBatch()
         self._made: Pool | None = None  # started with the first batch
         self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # epoch and its permutation
         self._pool = ThreadPoolExecutor(config.views.workers, thread_name_prefix="batches")
@@ -361,8 +363,9 @@ class Batches:
 
     def _numbers(self, number: int) -> range:
         """Samples of the ``number``-th batch for this process."""
-        share = self.data.batch_size
-        first = (number * self.world.size + self.world.rank) * share
+        share, since = self.data.batch_size, self.since
+        number -= since.step * self.config.views.accumulate
+        first = since.samples + (number * self.world.size + self.world.rank) * share
         return range(first, first + share)
 
     def _join_samples(self, parts: list[Future[Prepared]]) -> Prepared:

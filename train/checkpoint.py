@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import torch
@@ -26,8 +26,15 @@ from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 from gamba_warp.untrusted.torch_files import read_torch
 
-from .config import LengthConfig, TrainConfig, config_differences
-from .optim import NewLength
+from .config import (
+    STEP_SIZE,
+    DataConfig,
+    LengthConfig,
+    OptimConfig,
+    TrainConfig,
+    config_differences,
+)
+from .optim import NewBatch, NewLength
 
 STATE_VERSION = 1
 CHECKSUMS = "checksums.json"
@@ -52,8 +59,10 @@ class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     optimizer: dict[str, Any]
     rng: Any
     rng_cuda: list[Any]
-    new_length: NewLength = NewLength()  # missing in older versions
-    best: float = -math.inf
+    new_length: NewLength = NewLength()  # missing in older versions, like those below
+    new_batch: NewBatch = NewBatch()
+    scores: dict[str, tuple[_Count, float]] = {}  # values of Trainer.scores, by name
+    best: float = -math.inf  # of older versions, a PSNR, without its step
 
 
 def step_of(checkpoint: Path) -> int:
@@ -211,38 +220,76 @@ def check_state(state: dict[str, Any], source: str) -> State:
     return fields
 
 
-def read_run(
-    checkpoint: Path, config: TrainConfig, others: dict[str, Any]
-) -> tuple[State, LengthConfig]:
-    """Read and check the ``state.pt`` of a resumed run; also return its planned length.
+class StoredRun(NamedTuple):
+    """State of a resumed run, and what it was made with.
+
+    Attributes:
+        state: content of ``state.pt``.
+        length: the planned length.
+        optim: the optimizer's options.
+        step_size: objects per optimizer step, over all processes.
+        changed: a line for each option that ``--override`` changes.
+    """
+
+    state: State
+    length: LengthConfig
+    optim: OptimConfig
+    step_size: int
+    changed: list[str]
+
+
+def read_run(checkpoint: Path, config: TrainConfig, objects: str, processes: int) -> StoredRun:
+    """Read and check the ``state.pt`` of a resumed run.
 
     Args:
         checkpoint: the checkpoint's folder.
-        config: options of the resumed run.
-        others: further fields of the state that must have these values.
+        config: options of the resumed run, with those of ``--override``.
+        objects: ``TrainingData.fingerprint`` of the resumed run.
+        processes: their number in the resumed run.
 
     Raises:
-        UserError: the state is damaged, or of a run with other options, data or number of
-            processes; the message names the differences, and how to continue nevertheless.
+        UserError: the state is damaged, or of a run with other options, data or number of objects
+            a step; the message names the differences, and how to continue nevertheless.
     """
     stored, source = read_state(checkpoint), str(checkpoint / "state.pt")
     version = stored.get("version")
     if type(version) is not int or version != STATE_VERSION:  # a tensor's comparison may raise
         raise UserError(f"{checkpoint}: state of version {str(version)[:40]!r}")
     state = check_state(stored, source)
-    differing = config_differences(state.config, config.to_dict())
-    for name, value in others.items():
-        if getattr(state, name) != value:
-            differing.append(f"{name} ({str(getattr(state, name))[:80]} there, {value} here)")
+    there, here = state.config, config.to_dict()
+    try:
+        kinds = {"length": LengthConfig, "optim": OptimConfig, "views": DataConfig}
+        groups = {
+            name: msgspec.convert(there.get(name), kind, dec_hook=lambda kind, value: kind(value))
+            for name, kind in kinds.items()
+        }
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{source}: damaged, {first_line(error)}") from error
+    views, overridden = groups["views"], {*config.changes()}
+    step_size = views.objects * views.accumulate * state.world_size
+    if bool(groups["optim"].ema) != bool(config.optim.ema):
+        overridden -= {"optim.ema"}  # there is no average to continue, or it would be lost
+    free = overridden if config.views.made else overridden | STEP_SIZE
+    differing = config_differences(there, here, ignored=free)
+    if state.objects != objects:
+        differing.append(f"objects ({state.objects[:80]} there, {objects} here)")
+    if config.views.made and state.world_size != processes:
+        differing.append(f"world_size ({state.world_size} there, {processes} here)")
+    mine = config.views.objects * config.views.accumulate * processes
+    if mine != step_size and not STEP_SIZE & overridden:
+        way = f"--override batch_size={config.views.objects} changes it"
+        each, rest = divmod(step_size, config.views.accumulate * processes)
+        if not rest:
+            way = f"--batch-size {each} keeps it, {way}"
+        differing.append(f"objects a step ({step_size} there, {mine} here: {way})")
     if differing:
         raise UserError(
             f"{checkpoint}: belongs to another run: {', '.join(differing[:20])}; to start from its "
             f"weights alone: --init {checkpoint}, and another --out"
         )
-    try:
-        return state, msgspec.convert(state.config.get("length"), LengthConfig)
-    except ValueError as error:
-        raise UserError(f"{source}: damaged, {first_line(error)}") from error
+    kept = config_differences(there, here, ignored=overridden)
+    changed = [f"--override: {d}" for d in config_differences(there, here) if d not in kept]
+    return StoredRun(state, groups["length"], groups["optim"], step_size, changed)
 
 
 def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from gamba_warp.conventions import DeviceChoice, Precision
 from gamba_warp.errors import UserError
+from gamba_warp.image_metrics import METRICS
 from gamba_warp.model.config import PRESETS, GambaConfig, Preset
 from gamba_warp.untrusted.documents import value_of
 from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options, option
@@ -25,6 +26,7 @@ _Views = Annotated[int, Meta(ge=0, le=1000)]
 _Weight = Annotated[float, Meta(ge=0, le=1e6)]
 _Every = Annotated[int, Meta(ge=0, le=10**12)]
 RecipeName = Literal["paper", "tiny", "rays"]
+BestBy = Literal["psnr", "ssim", "lpips", "mask_iou"]  # of image_metrics.METRICS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +108,11 @@ class DataConfig:
     cache: bool = False
     cache_device: bool = False
     workers: Annotated[int, Meta(ge=1, le=1024)] = 1
+
+    @property
+    def objects(self) -> int:
+        """Objects per batch and process."""
+        return self.batch_size or (8 if self.overfit is None else 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +204,10 @@ class RunConfig:
             processes; "tiny" or "rays" is that of the shipped model, at its size. Further options
             override it; with --help it shows the recipe's options and their sources.
         resume: "auto" resumes from the newest checkpoint of the run folder; else "never", or the
-            path of a checkpoint.
+            path of a checkpoint. The number of processes may be another one, if --batch-size and
+            --accumulate keep the number of objects a step.
+        override: Options that a resumed run changes, e.g. lr=1e-4,batch_size=4: rates, losses,
+            batches and pictures. The optimizer's moments, the step and the order of the data stay.
         init: Start from the weights of this model file, checkpoint or run folder (same
             architecture; the averaged weights if there are any), with a fresh optimizer. Use it
             with another --out to continue with other losses or data.
@@ -207,8 +217,9 @@ class RunConfig:
         val_objects: Held-out objects of each dataset to validate on.
         val_views: Novel views of each, evenly spaced in the list; --overfit takes all.
         val_extra: More datasets, whose held-out objects are validated separately, under their
-            folder's name. OUT/best.safetensors is of the validation with the best PSNR of novel
-            views, the unweighted mean over DATA and these.
+            folder's name.
+        best_by: Figure of the best validation, whose weights are OUT/best.safetensors: of novel
+            views (of inputs without novel ones), the unweighted mean over DATA and --val-extra.
         save_every: Steps between two checkpoints; one is always saved at the end.
         keep: Number of checkpoints kept; the oldest are removed first.
         tensorboard: Write TensorBoard files, if it is installed.
@@ -225,6 +236,7 @@ class RunConfig:
     config: Path | None = None
     recipe: RecipeName | None = None
     resume: str = "auto"
+    override: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OPTION=VALUE ...")] = ()
     init: Path | None = None
     encoder_weights: str | None = None
     log_every: _Count = 10
@@ -232,6 +244,7 @@ class RunConfig:
     val_objects: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
     val_views: Annotated[int, Meta(ge=0, le=100_000)] = 4
     val_extra: tuple[Path, ...] = ()
+    best_by: BestBy = "psnr"
     save_every: _Count = 500
     keep: _Count = 2
     tensorboard: bool = True
@@ -275,6 +288,10 @@ class TrainConfig:
             raise UserError(
                 f"--lpips-crop {self.loss.lpips_crop}: must be 0, or 16 to --size {self.views.size}"
             )
+        if self.run.best_by == "lpips" and self.loss.lpips == "off":
+            raise UserError("--best-by lpips: --lpips off leaves it out")
+        if self.run.best_by == "ssim" and self.views.size < METRICS["ssim"].least_side:
+            raise UserError(f"--best-by ssim: needs --size {METRICS['ssim'].least_side} or more")
         if self.views.made and self.views.overfit is not None:
             raise UserError("--made: --overfit trains on one object; leave one of them out")
         if self.run.val_extra and self.views.overfit is not None:
@@ -303,6 +320,40 @@ class TrainConfig:
         except UserError as error:
             raise UserError(f"--set: {error}") from error
 
+    def overridden(self) -> TrainConfig:
+        """Return the options with those of ``--override``.
+
+        Raises:
+            UserError: an option of ``--override`` is unknown or cannot change, or its value is
+                invalid.
+        """
+        values = self.to_dict()
+        del values["model"]
+        for name, text in self.changes().items():
+            group, _, field_name = name.partition(".")
+            values[group][field_name] = value_of(text)
+        return config_of(values, "--override") if self.run.override else self
+
+    def changes(self) -> dict[str, str]:
+        """Return the values of ``--override``, as text, by name with the group.
+
+        Raises:
+            UserError: as ``overridden``.
+        """
+        found: dict[str, str] = {}
+        for change in ",".join(self.run.override).split(",") if self.run.override else ():
+            name, equals, text = change.strip().partition("=")
+            full = _OVERRIDABLE.get(name.lstrip("-").replace("-", "_"))
+            if not equals or full is None:
+                raise UserError(
+                    f"--override {change[:60]}: a resumed run cannot change it, only "
+                    f"{', '.join(_OVERRIDABLE)}"
+                )
+            if self.views.made and full in STEP_SIZE:
+                raise UserError(f"--override {name}: a run with --made cannot change it")
+            found[full] = text
+        return found
+
     def to_dict(self) -> dict:
         """Return JSON-ready values, with the model's full configuration under ``model``."""
         values = json.loads(json.dumps(asdict(self), default=str))
@@ -316,6 +367,16 @@ _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers"}
 _MAY_CHANGE |= {"views.cache", "views.cache_device", "views.made_workers"}
 _MUST_STAY = {"run.seed"}
 _COMPARED_IF_FREE = {"data", "length.steps", "length.epochs", "length.minutes"}
+# Those of ``--override``, by name. The order of the data follows from the seed, and the model from
+# its configuration, so these stay.
+_OVERRIDABLE = {
+    f.name: f"{group}.{f.name}"
+    for group, kind in (("views", DataConfig), ("loss", LossConfig), ("optim", OptimConfig))
+    for f in fields(kind)
+    if f.name not in {*("extra", "overfit", "train_on_gso", "cache", "cache_device", "workers")}
+    and not f.name.startswith("made")
+}
+STEP_SIZE = {"views.batch_size", "views.accumulate"}
 # These may differ between the processes of one run; files are compared by content.
 _PER_MACHINE = {
     *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
@@ -353,13 +414,21 @@ def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:
     return config
 
 
-def config_differences(stored: dict, current: dict, free: bool = False) -> list[str]:
+def stored_option(stored: dict, name: str) -> object:
+    """Return an option of a ``to_dict`` value by its name with the group, or its default."""
+    return {**_flatten(_defaults()), **_flatten(stored)}.get(name)
+
+
+def config_differences(
+    stored: dict, current: dict, free: bool = False, ignored: Container[str] = ()
+) -> list[str]:
     """Compare two ``to_dict`` values; a missing option counts as its default.
 
     Args:
         stored: of the resumed run; an older version may have fewer options.
         current: of this run.
         free: also compare the data and the length, which may change when a run is resumed.
+        ignored: names of options that are not compared.
 
     Returns:
         The differing fields, each with both values.
@@ -370,7 +439,7 @@ def config_differences(stored: dict, current: dict, free: bool = False) -> list[
     for name in sorted(old.keys() | new.keys()):
         may_change = name in _MAY_CHANGE or name.split(".")[0] in _MAY_CHANGE
         compared = not may_change or name in _MUST_STAY or (free and name in _COMPARED_IF_FREE)
-        if old.get(name) != new.get(name) and compared:
+        if old.get(name) != new.get(name) and compared and name not in ignored:
             there, here = (str(values.get(name))[:80] for values in (old, new))
             differing.append(f"{name} ({there} there, {here} here)")
     return differing

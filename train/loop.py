@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import torch
@@ -16,18 +16,31 @@ from tqdm import tqdm
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json
+from gamba_warp.image_metrics import METRICS
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.processes import stop_requests
 
 from .batches import Batches, HeldOut, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
-from .config import LengthConfig, TrainConfig, command_line
+from .config import LengthConfig, TrainConfig, command_line, stored_option
 from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Progress, term_weights
-from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
+from .optim import Ema, NewBatch, Schedule, build_optimizer, checked_moments, novel_views
 from .step import Objective, collapse_reason, compute_gradients, health, validate
+
+
+class Score(NamedTuple):
+    """Result of a validation.
+
+    Attributes:
+        step: optimizer steps done; None if unknown.
+        value: the figure of ``--best-by``, the mean over the datasets.
+    """
+
+    step: int | None
+    value: float
 
 
 class Trainer:
@@ -56,12 +69,13 @@ class Trainer:
         self.step = self.skipped = self.skipped_in_row = 0
         self.elapsed = 0.0  # seconds of training, resumed parts included
         self._collapsed = False
-        self._best = -math.inf  # PSNR of the best validation
+        self.scores: dict[str, Score] = {}  # of the "first", "best" and "last" validation
         self._unread: dict[str, str] = {}  # reasons by uid, of validation objects
         self._named: set[str] = set()  # uids whose failure was reported
         self._saved = self._validated = -1  # step of the last checkpoint and validation
-        self.steps_per_epoch = len(data.objects) / (data.batch_size * world.size * self.accumulate)
-        self.schedule = self._schedule(config.length)
+        self.step_size = data.batch_size * world.size * self.accumulate
+        self.steps_per_epoch = len(data.objects) / self.step_size
+        self.schedule = self._schedule(config.length, NewBatch())
         self.total = total = self.schedule.total
         self._batches = Batches(
             data,
@@ -71,11 +85,19 @@ class Trainer:
             last=None if total is None else total * self.accumulate,
         )
 
-    def _schedule(self, length: LengthConfig) -> Schedule:
+    def _schedule(self, length: LengthConfig, since: NewBatch) -> Schedule:
         total = length.steps
         if total is None and (length.epochs or not length.minutes):
-            total = math.ceil((length.epochs or 400) * self.steps_per_epoch)
+            left = (length.epochs or 400) - since.samples / len(self.data.objects)
+            total = since.step + math.ceil(left * self.steps_per_epoch)
         return Schedule(self.config.optim, total, length.minutes)
+
+    @property
+    def epochs(self) -> float:
+        """Passes over the objects so far."""
+        since = self._batches.since
+        before = since.samples / len(self.data.objects)
+        return before + (self.step - since.step) / self.steps_per_epoch
 
     @property
     def failures(self) -> dict[str, str]:
@@ -98,9 +120,8 @@ class Trainer:
         return novel_views(done, views.views_first, views.views_last)
 
     def _weights(self, validates: bool = False) -> dict[str, float]:
-        epochs = self.step / self.steps_per_epoch
         done = self.schedule.progress(self.step, self.elapsed)
-        return term_weights(self.config.loss, Progress(self.step, epochs, done, validates))
+        return term_weights(self.config.loss, Progress(self.step, self.epochs, done, validates))
 
     def train_step(self) -> dict[str, float]:
         """Make one optimizer step; return its figures, some of them of the last batch only.
@@ -175,6 +196,8 @@ class Trainer:
         bar = run_bar(self.total, minutes, self.step, self.elapsed / 60, self.world.main)
         began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
+        if self.step == 0 and self.config.run.init is not None:
+            self._validate()
         try:
             with stop_requests(insist=True) as received:
                 while True:
@@ -191,6 +214,7 @@ class Trainer:
                     self._after_step(self.train_step(), bar)
                 if not stop:
                     self._validate()
+                    self._compare_ends()
                 self.save()
         finally:
             self._batches.close()
@@ -235,8 +259,7 @@ class Trainer:
             if minutes is not None:
                 shown = {"step": self.step, **shown}
             bar.set_postfix(shown)
-            epoch = self.step / self.steps_per_epoch
-            done = {"minutes": self.elapsed / 60, "epoch": epoch, "skipped": self.skipped}
+            done = {"minutes": self.elapsed / 60, "epoch": self.epochs, "skipped": self.skipped}
             self.log.write("train", self.step, **done, **figures)
             reason = collapse_reason(figures)
             if reason and not self._collapsed:
@@ -257,7 +280,7 @@ class Trainer:
             if self.log is None or not self.data.held_out:
                 return
             objective = Objective(self._weights(validates=True), self.lpips)
-            psnr, rows = [], []
+            scores, rows = [], []
             for part in self.data.held_out:
                 figures, pictures = self._validate_on(part, objective)
                 if not pictures:
@@ -265,10 +288,11 @@ class Trainer:
                     reason = "none of its objects can be read"
                     self.log.warn(self.step, f"no validation{about}: {reason}")
                     continue
-                psnr.append(figures.get("psnr_novel", figures["psnr_input"]))
+                by = self.config.run.best_by
+                scores.append(figures.get(f"{by}_novel", figures[f"{by}_input"]))
                 rows += pictures
-            if len(psnr) == len(self.data.held_out):  # else not comparable with earlier ones
-                self._keep_best(sum(psnr) / len(psnr))
+            if len(scores) == len(self.data.held_out):  # else not comparable with earlier ones
+                self._keep_best(Score(self.step, sum(scores) / len(scores)))
             if rows:
                 path = self.config.run.out / "samples" / f"step_{self.step:06d}.png"
                 self.log.sample(self.step, path, rows)
@@ -292,14 +316,21 @@ class Trainer:
             say(f"step {self.step}: validation{name} {text}")
         return figures, rows
 
-    def _keep_best(self, psnr: float) -> None:
-        """Write ``best.safetensors`` if a validation is better than all before.
+    def _better(self, score: Score, name: str) -> bool:
+        """True if a score is better than that of ``name``, or there is none; False for NaN."""
+        other = self.scores.get(name)
+        sign = 1 if METRICS[self.config.run.best_by].more_is_better else -1
+        return score.value == score.value and (
+            other is None or sign * score.value > sign * other.value
+        )
 
-        Args:
-            psnr: dB, of novel views (of inputs without novel ones), the mean over datasets.
-        """
+    def _keep_best(self, score: Score) -> None:
+        """Write ``best.safetensors`` if a validation is better than all before."""
         assert self.log is not None
-        if not psnr > self._best:  # also for NaN
+        if math.isfinite(score.value):
+            self.scores.setdefault("first", score)
+            self.scores["last"] = score
+        if not self._better(score, "best"):
             return
         path = self.config.run.out / "best.safetensors"
         try:
@@ -307,10 +338,32 @@ class Trainer:
         except UserError as error:  # the run continues; a later write may succeed
             self.log.warn(self.step, str(error))
             return
-        self._best = psnr
-        self.log.write("best", self.step, minutes=self.elapsed / 60, psnr=psnr)
+        self.scores["best"] = score
+        by = self.config.run.best_by
+        self.log.write("best", self.step, minutes=self.elapsed / 60, **{by: score.value})
         if len(self.data.held_out) > 1:
-            say(f"step {self.step}: best so far, mean PSNR of the datasets {psnr:.4g} -> {path}")
+            text = f"best so far, mean {METRICS[by].title} of the datasets {score.value:.4g}"
+            say(f"step {self.step}: {text} -> {path}")
+
+    def _compare_ends(self) -> None:
+        """Name the best validation; warn if the last is worse than the first."""
+        if self.log is None or "best" not in self.scores:
+            return
+        metric = METRICS[self.config.run.best_by]
+
+        def shown(name: str) -> str:
+            step, value = self.scores[name]
+            where = "" if step is None else f" at step {step}"
+            return f"{value:.4g}{f' {metric.unit}' if metric.unit else ''}{where}"
+
+        if {"first", "last"} <= self.scores.keys() and self._better(self.scores["first"], "last"):
+            self.log.warn(
+                self.step,
+                f"the last validation is worse than the first: {metric.title} {shown('last')}, "
+                f"{shown('first')}; best.safetensors has {shown('best')}",
+            )
+        else:
+            say(f"best.safetensors: {metric.title} {shown('best')}; the last has {shown('last')}")
 
     def save(self) -> None:
         """Write a checkpoint on the main process, once per step; the others wait."""
@@ -335,36 +388,46 @@ class Trainer:
             "elapsed": self.elapsed,
             "world_size": self.world.size,
             "ema_updates": self.ema.updates if self.ema else 0,
-            "best": self._best,
+            "scores": {name: tuple(score) for name, score in self.scores.items()},
             "new_length": asdict(self.schedule.since),
+            "new_batch": asdict(self._batches.since),
             "optimizer": self.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
             "rng_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         }
 
-    def restore(self, checkpoint: Path) -> str | None:
+    def restore(self, checkpoint: Path) -> list[str]:
         """Continue from a checkpoint, bit-identically on one device.
 
         Returns:
-            A line about the learning rate if the run's length has changed, else None.
+            Lines about what has changed: options of ``--override``, and the learning rate if the
+            run has another length.
 
         Raises:
             UserError: the checkpoint is damaged, or belongs to a run with another configuration,
-                data or number of processes; the message names the differing fields.
+                data or number of objects a step; the message names the differing fields.
         """
 
         def read() -> tuple[Any, ...]:
-            mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
-            state, length = read_run(checkpoint, self.config, mine)
+            stored = read_run(checkpoint, self.config, self.data.fingerprint, self.world.size)
+            state = stored.state
             moments = checked_moments(self.optimizer, state.optimizer, checkpoint / "state.pt")
             files = {name: checkpoint / f"{name}.safetensors" for name in self.models}
             weights = {n: read_weights_of(files[n], model) for n, model in self.models.items()}
-            return state, length, moments, weights
+            return stored, moments, weights
 
         # Everything is read and checked before anything is loaded. Only the main process reads, so
         # no shared disk is needed.
-        state, length, moments, weights = self.world.on_main(read)
-        old = replace(self._schedule(length), since=state.new_length)
+        stored, moments, weights = self.world.on_main(read)
+        state = stored.state
+        since = state.new_batch
+        self.steps_per_epoch = len(self.data.objects) / stored.step_size
+        old = self._schedule(stored.length, since)
+        old = replace(old, optim=stored.optim, since=state.new_length)
+        if stored.step_size != self.step_size:
+            since = NewBatch(state.step, since.taken(state.step, stored.step_size))
+        self.steps_per_epoch = len(self.data.objects) / self.step_size
+        self.schedule = self._schedule(self.config.length, since)
         for name, model in self.models.items():
             model.load_stored_state(weights[name])
         if self.ema is not None:
@@ -372,10 +435,16 @@ class Trainer:
         self.optimizer.load_state_dict(moments)
         self.step, self.skipped = state.step, state.skipped
         self.skipped_in_row, self.elapsed = state.skipped_in_row, state.elapsed
-        self._best = state.best
+        if stored_option(state.config, "run.best_by") == self.config.run.best_by:
+            self.scores = {name: Score(*score) for name, score in state.scores.items()}
+            if state.best > -math.inf:
+                self.scores["best"] = Score(None, state.best)
         self.schedule, note = self.schedule.after(old, self.step, self.elapsed)
+        self.total = self.schedule.total
+        self._batches.since = since
+        self._batches.last = None if self.total is None else self.total * self.accumulate
         self._saved = self.step if checkpoint.parent.parent == self.config.run.out else -1
         torch.set_rng_state(state.rng)
         if len(state.rng_cuda) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state.rng_cuda)
-        return note
+        return [*stored.changed, *filter(None, [note])]

@@ -142,6 +142,23 @@ class NewLength:
 
 
 @dataclass(frozen=True)
+class NewBatch:
+    """State of a run when it was last resumed with another number of objects a step.
+
+    Attributes:
+        step: optimizer steps done; 0 if the number never changed.
+        samples: samples taken by all processes in these steps.
+    """
+
+    step: Annotated[int, Meta(ge=0, le=10**12)] = 0
+    samples: Annotated[int, Meta(ge=0, le=10**15)] = 0
+
+    def taken(self, step: int, size: int) -> int:
+        """Return the samples taken after ``step`` steps, of ``size`` samples each since then."""
+        return self.samples + (step - self.step) * size
+
+
+@dataclass(frozen=True)
 class Schedule:
     """Learning rate over a run; continuous even if the run's length changes.
 

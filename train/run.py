@@ -61,11 +61,17 @@ def train(config: TrainConfig, world: World) -> int:
             check_boards(run.log)
             if there:
                 held.enter_context(only_process(run.out, "trains"))
-            return find_checkpoint(run.out, run.resume, notes.append)
+            found = find_checkpoint(run.out, run.resume, notes.append)
+            if run.override and found is None:
+                raise UserError(f"--override: {run.out} has no checkpoint to resume from")
+            return found
 
         with world.together():
+            config = config.overridden()
             data = open_data(config, world.device)
             lpips, warning = open_lpips(config, world.device.type)
+            if run.best_by == "lpips" and lpips is None:
+                raise UserError(f"--best-by lpips: {warning or 'the run has no LPIPS'}")
         world.agree(lambda: _facts(config, data, world, lpips is not None))
         checkpoint = world.on_main(claim)  # the others use its result
         _refuse_newer(world, run.out if run.resume == "auto" else None, checkpoint)
@@ -90,7 +96,7 @@ def train(config: TrainConfig, world: World) -> int:
             if lpips is not None:
                 lpips.to(world.device)
         trainer = Trainer(config, model, data, world, lpips)
-        changed = None if checkpoint is None else trainer.restore(checkpoint)
+        changed = [] if checkpoint is None else trainer.restore(checkpoint)
         with world.together():  # all checks have passed: from here on files are written
             if world.main:
                 output_folder(run.out / "samples")
@@ -105,7 +111,7 @@ def train(config: TrainConfig, world: World) -> int:
                 log = held.enter_context(contextlib.closing(RunLog(run.out, run.boards)))
         trainer.log = log
         if log is not None:
-            notes = [*data.notes, *notes, *filter(None, (warning, changed))]
+            notes = [*data.notes, *notes, *filter(None, (warning,)), *changed]
             _announce(trainer, log, checkpoint, notes)
             if started:
                 say(started)

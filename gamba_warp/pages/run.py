@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import UserError
+from ..image_metrics import METRICS
 from ..images import load_rgba
 from .card import OF_PICTURES
 from .curves import curves_section
@@ -138,13 +139,15 @@ def _validation(record: RunRecord) -> list[Section]:
         return []
     step = max(s.steps[-1] for n, s in record.series.items() if n.startswith("val"))
     text = f"Means over the held-out objects at step {step:,.0f}."
-    best = record.series.get("best.psnr")
-    if best and best.steps:
-        where = " over the datasets" if record.validated else ""
-        text += (
-            f" The best validation, by the mean PSNR of novel views{where}, is that of step "
-            f"{best.steps[-1]:,.0f} ({best.values[-1]:.4g} dB): best.safetensors."
-        )
+    for name, metric in METRICS.items():
+        best = record.series.get(f"best.{name}")
+        if best and best.steps:
+            where = " over the datasets" if record.validated else ""
+            unit = f" {metric.unit}" if metric.unit else ""
+            text += (
+                f" The best validation, by the mean {metric.title} of novel views{where}, is that "
+                f"of step {best.steps[-1]:,.0f} ({best.values[-1]:.4g}{unit}): best.safetensors."
+            )
     return [Section("Last validation", text, header=["", *OF_PICTURES.values()], table=rows)]
 
 

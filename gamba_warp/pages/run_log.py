@@ -57,8 +57,8 @@ class RunRecord:
 
     Attributes:
         series: figures by name, such as ``train.loss``, ``val.psnr_novel`` and, for a further
-            dataset NAME, ``val/NAME.psnr_novel``; ``best.psnr`` has a point for each
-            validation that was the best so far, by its mean over the datasets.
+            dataset NAME, ``val/NAME.psnr_novel``; ``best.psnr`` (or another
+            figure of ``--best-by``) has a point for each validation that was the best so far.
         step: the last step.
         minutes: training time, resumed parts included.
         start: the last line of the event ``start``, or empty.

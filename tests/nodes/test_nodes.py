@@ -7,6 +7,7 @@ import torch
 from helpers import micro, on_threads
 from helpers.micro import lines, run
 from helpers.nodes.processes import train_all, words
+from helpers.refusals import refused
 from safetensors.torch import load_file
 
 from gamba_warp.train.checkpoint import list_checkpoints
@@ -71,6 +72,29 @@ def test_two_processes_with_half_the_batch_are_one_to_rounding(runs):
             # each by its own size: an entry a thousandth of those moves by 1e-3 * 1e-4 a step more
             # or less. Found: 1.2e-7 after four steps, in which weights moved by up to 3e-3.
             torch.testing.assert_close(two[name], value, atol=1e-6, rtol=0, msg=name)
+
+
+def test_two_processes_become_one_and_one_becomes_two(data, runs, tmp_path):
+    """The number of objects a step stays: the batches do, and by halves in turn the bits too."""
+    halves = {**VIEWS, "batch_size": 2, "accumulate": 2}
+    options = {"length": {"steps": STEPS}, "views": halves}
+    step = "checkpoints/step_000002"
+    with on_threads(1):
+        resumed = {"resume": str(runs / "two" / step), "threads": 1}
+        assert run(data, tmp_path / "one", run=resumed, **options) == 0
+    resume = ["--resume", runs / "halves" / step]
+    two = [words(data, tmp_path / name, *OPTIONS, *resume) for name in ("two", "not-there")]
+    assert [end.code for end in train_all(two)] == [0, 0]
+    want = weights(runs / "halves", STEPS)
+    for name in ("one", "two"):
+        got = weights(tmp_path / name, STEPS)
+        assert all(torch.equal(got[key], value) for key, value in want.items()), name
+    refused(
+        r"objects a step \(4 there, 2 here: --batch-size 4 keeps it, --override batch_size=2",
+        *(run, data, tmp_path / "other"),
+        run=resumed,
+        **options | {"views": {**VIEWS, "batch_size": 2}},
+    )
 
 
 def test_the_run_is_one_of_all_processes(runs):
