@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 Item = TypeVar("Item")
+LINE_SECONDS = 10.0  # between two lines of progress in a log
+_LINE = "{desc} {n_fmt}/{total_fmt} {unit}s [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 # Errors that one bad input may raise. Any other is a bug, and stops the program.
 EXPECTED = (UserError, ValueError, ArithmeticError, OSError, RuntimeError, MemoryError)
 
@@ -52,15 +54,47 @@ def for_each(
     return failures
 
 
-def progress_bar(items: Iterable[Item] | None = None, **options: Any) -> tqdm[Item]:
+def progress_bar(
+    items: Iterable[Item] | None = None, lines: bool = False, **options: Any
+) -> tqdm[Item]:
     """Return a tqdm bar on stderr; nothing is drawn unless stderr is a terminal.
 
     A log or a pipe would collect every state of the bar on one long line.
+
+    Args:
+        items: wrapped by the bar, or None.
+        lines: without a terminal print the state as a line, at most one in ``LINE_SECONDS``.
+        options: of tqdm.
     """
     from tqdm import tqdm
 
+    stream = options.get("file") or sys.stderr
+    if lines and not stream.isatty():
+        form = options.get("bar_format", _LINE).replace("|{bar}|", "")
+        options |= {"file": _Lines(stream), "disable": False, "bar_format": form}
+        return tqdm(items, **options)
     bar: Any = tqdm(items, disable=None, **options)  # without items its type is unknown
     return bar
+
+
+class _Lines:
+    """Text stream that turns the states of a bar into lines, and leaves most of them out."""
+
+    encoding = "utf-8"
+
+    def __init__(self, stream: Any) -> None:
+        self._stream, self._last = stream, time.monotonic()
+
+    def write(self, text: str) -> None:
+        """Write a state as a line, if the last one was long ago."""
+        text, now = text.strip(), time.monotonic()
+        if text and now - self._last >= LINE_SECONDS:
+            self._last = now
+            self._stream.write(f"{text}\n")
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        self._stream.flush()
 
 
 def say(line: str) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json
@@ -65,6 +66,10 @@ class TensorBoard:
         for name, value in _scalars(event, values).items():
             self.writer.add_scalar(name, value, step)
 
+    def picture(self, name: str, step: int, pixels: np.ndarray) -> None:
+        """Write a picture ``[H, W, 3]`` uint8."""
+        self.writer.add_image(name, pixels, step, dataformats="HWC")
+
     def close(self) -> None:
         """Close the files."""
         self.writer.close()
@@ -109,6 +114,12 @@ class Wandb:
         if event == "end":
             self._code = values.get("code", 1)
         self.run.log({"step": step, **_scalars(event, values)})
+
+    def picture(self, name: str, step: int, pixels: np.ndarray) -> None:
+        """Send a picture ``[H, W, 3]`` uint8."""
+        import wandb  # pyright: ignore[reportMissingImports]: optional
+
+        self.run.log({"step": step, name: wandb.Image(pixels)})
 
     def close(self) -> None:
         """Finish the run; otherwise wandb marks it as crashed."""

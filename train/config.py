@@ -225,6 +225,8 @@ class RunConfig:
         tensorboard: Write TensorBoard files, if it is installed.
         log: Boards beside TensorBoard: "wandb" is Weights & Biases, configured by its own settings
             (WANDB_PROJECT, WANDB_MODE=offline).
+        profile: Profile ten steps, after the first three, with torch's profiler: OUT/profile has
+            trace.json for a browser and table.txt.
         device: Device to train on; "auto" is the GPU if there is one.
         threads: Number of CPU threads; all cores if not given.
         recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
@@ -249,6 +251,7 @@ class RunConfig:
     keep: _Count = 2
     tensorboard: bool = True
     log: tuple[Literal["wandb"], ...] = ()
+    profile: bool = False
     device: DeviceChoice = "auto"
     threads: Threads | None = None
     recompute: bool = False

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -21,7 +22,7 @@ from tqdm import tqdm
 from gamba_warp.batch import progress_bar
 from gamba_warp.errors import UserError
 from gamba_warp.files import reason_of
-from gamba_warp.images import save_image
+from gamba_warp.images import save_image, to_uint8
 
 from .boards import TensorBoard, Wandb, open_board
 
@@ -100,11 +101,15 @@ class RunLog:
         self.write("warning", step, message=message)
 
     def sample(self, step: int, path: Path, rows: list[Tensor]) -> None:
-        """Write sample pictures, see ``save_strip``; warn if that fails."""
+        """Write sample pictures, see ``strip_of``, also on the boards; warn if that fails."""
+        strip = strip_of(rows)
         try:
-            save_strip(path, rows)
+            save_image(path, strip)
         except UserError as error:
             self.warn(step, str(error))
+        for name, board in [*self._boards.items()]:
+            with self._guarded(name):
+                board.picture("val/pictures", step, to_uint8(strip))
 
     def page(self) -> None:
         """Write the run's page, ``RUN/index.html``, from the log so far."""
@@ -159,16 +164,18 @@ def _to_json(value: Any) -> Any:
     return value
 
 
-def save_strip(path: Path, rows: list[Tensor]) -> None:
-    """Write pictures as one PNG: each of ``rows`` is ``[V, H, W, 3]`` in [0, 1], left to right."""
+def strip_of(rows: list[Tensor]) -> np.ndarray:
+    """Join pictures to one: each of ``rows`` is ``[V, H, W, 3]`` in [0, 1], left to right."""
     strips = [torch.cat(list(row), dim=1) for row in rows]
     width = max(strip.shape[1] for strip in strips)
     padded = [torch.nn.functional.pad(s, (0, 0, 0, width - s.shape[1]), value=1.0) for s in strips]
-    save_image(path, torch.cat(padded).cpu().numpy())
+    return torch.cat(padded).cpu().numpy()
 
 
 def run_bar(total: int | None, minutes: float | None, step: int, spent: float, main: bool) -> tqdm:
     """Progress bar of a run: of its minutes if they are limited, else of its steps.
+
+    Without a terminal it prints lines, see ``progress_bar``.
 
     Args:
         total: steps of the run, or None if only minutes limit it.
@@ -179,6 +186,7 @@ def run_bar(total: int | None, minutes: float | None, step: int, spent: float, m
     """
     file = SafeStream(sys.stderr if main else io.StringIO())
     if minutes is None:
-        return progress_bar(total=total, initial=step, unit="step", file=file)
+        return progress_bar(total=total, initial=step, unit="step", file=file, lines=main)
     form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:g} min{postfix}"
-    return progress_bar(total=minutes, initial=min(minutes, spent), bar_format=form, file=file)
+    about = {"total": minutes, "initial": min(minutes, spent), "bar_format": form}
+    return progress_bar(**about, file=file, lines=main)

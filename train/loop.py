@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +29,7 @@ from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Progress, term_weights
 from .optim import Ema, NewBatch, Schedule, build_optimizer, checked_moments, novel_views
+from .profiler import STEPS, WARM_STEPS, profiled
 from .step import Objective, collapse_reason, compute_gradients, health, validate
 
 
@@ -199,7 +201,7 @@ class Trainer:
         if self.step == 0 and self.config.run.init is not None:
             self._validate()
         try:
-            with stop_requests(insist=True) as received:
+            with stop_requests(insist=True) as received, self._profiled() as profile_step:
                 while True:
                     # Elapsed seconds and signal are the same on all processes.
                     clock = (before + time.monotonic() - began) / self.world.size
@@ -212,6 +214,7 @@ class Trainer:
                     if stop or late or (self.total is not None and self.step >= self.total):
                         break
                     self._after_step(self.train_step(), bar)
+                    profile_step()
                 if not stop:
                     self._validate()
                     self._compare_ends()
@@ -224,6 +227,18 @@ class Trainer:
         if self.world.main:
             self._save_model(self.config.run.out / "model.safetensors")
         return 0
+
+    @contextmanager
+    def _profiled(self) -> Iterator[Callable[[], None]]:
+        """Profile steps of the main process, if ``--profile`` is given."""
+        if self.log is None or not self.config.run.profile:
+            yield lambda: None
+            return
+        folder, began = self.config.run.out / "profile", self.step
+        with profiled(folder, self.world.device) as profile_step:
+            yield profile_step
+        steps = min(STEPS, self.step - began - WARM_STEPS)
+        say(f"profile of {steps} steps: {folder}" if steps > 0 else "--profile: too few steps")
 
     def _save_model(self, path: Path) -> None:
         """Write the result's weights, with a card if scanned objects must not judge them."""

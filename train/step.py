@@ -220,7 +220,7 @@ def validate(
         pictures on white; ``psnr_black`` and ``psnr_grey`` on these backgrounds (LPIPS on them
         would nearly triple the time). All but ``loss`` end in ``_input`` for the input view and
         ``_novel`` for the mean over the others, if any; pictures under 11x11 have no ``ssim``.
-        And rows ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the first objects.
+        And rows ``[V, H, W, 3]`` for ``strip_of``, true above predicted for the first objects.
     """
     was_training = model.training
     model.eval()

@@ -27,6 +27,9 @@ def note(name):
 def Settings(**options):
     return options
 
+def Image(pixels):
+    return ("picture", pixels.shape, str(pixels.dtype))
+
 class config:
     update = note("config")
 
@@ -76,9 +79,22 @@ def test_wandb_gets_the_lines_of_the_log_and_goes_on_with_the_same_run(data, tmp
     wanted = {line["step"]: line["loss"] for line in lines(out, "train")}
     assert losses == pytest.approx(wanted, rel=1e-5) and set(losses) == {1, 2}
     assert any("val/psnr_novel" in values and values["step"] == 2 for values in got)
+    (picture,) = [values for values in got if "val/pictures" in values]
+    # True views above the predicted ones, the input and three others of 16 pixels (fewer exist).
+    assert picture == {"step": 2, "val/pictures": ("picture", (32, 80, 3), "uint8")}
     assert [how for _, how in called(fake, "finish")] == [{"exit_code": 0}]
     assert run(data, out, run=with_it, length={"steps": 3}) == 0
     assert [how["id"] for _, how in called(fake, "init")] == [options["id"]] * 2
+
+
+def test_tensorboard_gets_the_pictures(data, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    options = {"tensorboard": True, "val_every": 2}
+    assert run(data, tmp_path, run=options, length={"steps": 2}) == 0
+    board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    (picture,) = board.Images("val/pictures")
+    assert (picture.step, picture.height, picture.width) == (2, 32, 80)
 
 
 def test_a_damaged_number_begins_another_run(data, tmp_path, fake):

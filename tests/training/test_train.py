@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 import torch
 from helpers import micro
-from helpers.micro import lines, run
+from helpers.micro import lines, run, same_weights
 from helpers.model import micro as small
 from helpers.refusals import refused
 from PIL import Image
 from safetensors.torch import load_file
 from torch.utils.checkpoint import checkpoint
 
-from gamba_warp import cli
+from gamba_warp import batch, cli
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
 from gamba_warp.model.gamba import Gamba
@@ -72,6 +72,45 @@ def test_the_bar_is_of_the_minutes_and_a_log_has_none(data, tmp_path, monkeypatc
     assert "2/2" in drawn(Terminal(), tmp_path / "steps", steps=2)
     shown = drawn(Terminal(), tmp_path / "minutes", steps=None, minutes=0.02)
     assert "of 0.02 min, step=1, loss=" in shown and re.search(r"\b(9\d|100)%\|", shown), shown
+
+
+def test_a_log_gets_lines_of_progress(data, tmp_path, monkeypatch):
+    def logged(out, **length):
+        monkeypatch.setattr(sys, "stderr", io.StringIO())
+        assert run(data, out, length=length) == 0
+        return sys.stderr.getvalue()
+
+    assert logged(tmp_path / "quick", steps=3) == ""  # ends within ten seconds
+    monkeypatch.setattr(batch, "LINE_SECONDS", 0.0)
+    text = logged(tmp_path / "steps", steps=3)
+    assert "3/3 steps [00:0" in text and "loss=" in text and "psnr=" in text
+    assert "\r" not in text and all(text.splitlines())
+    assert "of 0.02 min, step=1, loss=" in logged(tmp_path / "time", steps=None, minutes=0.02)
+
+
+def test_lines_of_progress_are_seconds_apart(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(batch.time, "monotonic", lambda: now[0])
+    stream = io.StringIO()
+    with batch.progress_bar(total=100, lines=True, file=stream, unit="step", mininterval=0) as bar:
+        for _ in range(100):
+            now[0] += 1.0
+            bar.update(1)
+    counts = [int(line.split("/")[0]) for line in stream.getvalue().splitlines()]
+    assert counts == list(range(10, 101, 10))
+
+
+def test_ten_steps_are_profiled_and_change_no_bit(data, tmp_path, capsys):
+    for name, on in (("plain", False), ("profiled", True)):
+        assert run(data, tmp_path / name, run={"profile": on}, length={"steps": 14}) == 0
+    models = [tmp_path / name / "model.safetensors" for name in ("plain", "profiled")]
+    assert same_weights(*models) and not (tmp_path / "plain" / "profile").exists()
+    folder = tmp_path / "profiled" / "profile"
+    assert f"profile of 10 steps: {folder}" in capsys.readouterr().out
+    trace = json.loads((folder / "trace.json").read_text())["traceEvents"]
+    steps = {event["name"] for event in trace if event["name"].startswith("ProfilerStep")}
+    assert steps == {f"ProfilerStep#{n}" for n in range(3, 13)}
+    assert "MSE and mask" in (folder / "table.txt").read_text()
 
 
 def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
