@@ -29,6 +29,7 @@ COMMANDS = {
     "data made": "Make models: toys, shoes, tools, boxes.",
     "data render": "Meshes to posed views.",
     "data pack": "Posed views to a few large files.",
+    "data index": "Check a dataset once, for all later starts.",
     "data objaverse": "Objaverse, and its G-Objaverse views.",
     "data gso": "Google Scanned Objects, for evaluation.",
     "eval-views": "PSNR, SSIM, LPIPS of views.",

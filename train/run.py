@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import socket
 import sys
 from collections.abc import Mapping
@@ -37,6 +38,7 @@ from .objective.losses import open_lpips
 _COMPUTE = ("torch", "warp-lang", "numpy", "pillow", "kornia", "timm")
 _PYTHON = ".".join(map(str, sys.version_info[:2]))
 _PICTURES = 16  # objects whose first picture is compared between processes
+_DIGESTS = 4096  # compared between processes: of one object each, or of several in a large set
 
 
 def train(config: TrainConfig, world: World) -> int:
@@ -127,20 +129,21 @@ def _facts(
 ) -> Mapping[str, dict[str, object]]:
     """Facts that all processes must have in common, see ``World.agree``.
 
-    For the data: a hash per object of its cameras and, for some objects, of the first picture.
+    For the data: a hash per object, or of several, of the cameras and, for some objects, of the
+    first picture.
     """
     chosen, contents = sorted(set(data.objects)), {}
-    read = evenly(chosen, _PICTURES)
-    for index in chosen:
-        files = data.train.files(index)
-        kinds = f"{len(files.images)} {files.depths is None} {files.backs is None}"
-        digest = hashlib.sha256(kinds.encode())
-        for numbers in (files.camera_to_world, files.Ks):
-            digest.update(numbers.tobytes())
-        if index in read:
-            with contextlib.suppress(*EXPECTED):  # the training reports it when it matters
-                digest.update(data.train.load(index, [0], depths=0).images.numpy().tobytes())
-        contents[data.train.uids[index]] = digest.hexdigest()[:16]
+    read, size = evenly(chosen, _PICTURES), max(1, math.ceil(len(chosen) / _DIGESTS))
+    for part in (chosen[at : at + size] for at in range(0, len(chosen), size)):
+        digest = hashlib.sha256()
+        for index in part:
+            digest.update(data.train.digest(index).encode())
+            if index in read:
+                with contextlib.suppress(*EXPECTED):  # the training reports it when it matters
+                    picture = data.train.load(index, [0], depths=0).images
+                    digest.update(picture.numpy().tobytes())
+        names = dict.fromkeys(data.train.uids[index] for index in (part[0], part[-1]))
+        contents[" to ".join(names)] = digest.hexdigest()[:16]
     known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
     return {
         "options": {**options_of_all(config.to_dict()), **known},

@@ -1,6 +1,7 @@
 """Posed views on disk; ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
 
-Layouts are described in ``layouts.py``, packs in ``packs.py``. ``split.json`` in the root lists the
+Layouts are described in ``layouts.py``, packs in ``packs.py``, lists of checked objects in
+``manifest.py``. ``split.json`` in the root lists the
 uids of ``train``, ``val`` and ``test``; ``split_of`` places other uids by the hash of the name.
 """
 
@@ -8,7 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
@@ -25,16 +27,35 @@ from torch import Tensor
 
 from ..batch import EXPECTED, progress_bar
 from ..cameras import Cameras, from_opengl
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..files import write_json
 from ..images import check_size, load_rgba8, open_picture
 from ..untrusted.documents import read_document
-from .layouts import LAYOUTS, DecodedPicture, ObjectFiles, find_objects
+from .layouts import (
+    GOBJAVERSE,
+    GOBJAVERSE_DEPTH,
+    LAYOUTS,
+    DecodedPicture,
+    ObjectFiles,
+    find_objects,
+    one_line,
+)
+from .manifest import (
+    MANIFEST,
+    Entry,
+    Manifest,
+    list_of,
+    marks_of,
+    read_manifest,
+    write_manifest,
+)
 from .packs import INDEX, open_pack, read_index, read_packed
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of written files; version 1 had fewer objects in one group
 Item = TypeVar("Item")
+Reader = Callable[[str], ObjectFiles]  # reads the files of an object, by its uid
+KEPT = 1024  # objects whose files are kept: 30 kB each with 40 views
 MAX_LOADED = 128 << 20  # pixels of all loaded views of an object: 2 GB
 
 
@@ -155,24 +176,123 @@ def open_dataset(
         chosen = [values for values in pack.objects if split in ("all", values.get("split"))]
         if not chosen:
             raise UserError(f"{root}: none of its {len(pack.objects)} objects is in split {split}")
-        readers = {values["uid"]: partial(read_packed, root, values) for values in chosen}
-        return ViewDataset(readers, "pack", cache, pack.split_version, pack.size)
-    layout, folders = find_objects(root, layout)
-    if not folders:
-        marks = ", ".join(mark for mark, _ in LAYOUTS.values())
-        raise UserError(f"{root}: no objects found (none of {marks} in any folder)")
-    if folders == [root]:
-        objects = {root.resolve().name: root}
+        read = partial(_read_packed, root, {values["uid"]: values for values in chosen})
+        packed = dict.fromkeys((values["uid"] for values in chosen), read)
+        return ViewDataset(packed, "pack", cache, pack.split_version, pack.size)
+    manifest = None
+    if layout == "auto" and (root / MANIFEST).exists():
+        manifest = read_manifest(root)
+        layout, uids = manifest.layout, list(manifest.digests)
     else:
-        objects = {folder.relative_to(root).as_posix(): folder for folder in folders}
+        layout, folders, _ = find_objects(root, layout)
+        if not folders:
+            marks = ", ".join(mark for mark, _ in LAYOUTS.values())
+            raise UserError(f"{root}: no objects found (none of {marks} in any folder)")
+        uids = [folder.relative_to(root).as_posix() for folder in folders]
+    count, read = len(uids), partial(_read_folder, root, layout)
+    if uids == ["."]:  # the root is an object
+        uids, read = [root.resolve().name], partial(_read_root, root, layout)
     version = SPLIT_VERSION
     if split != "all":
         version, stated = _read_split(root)
-        objects = {u: f for u, f in objects.items() if stated.get(u, split_of(u)) == split}
-        if not objects:
-            raise UserError(f"{root}: none of its {len(folders)} objects is in the {split} split")
-    readers = {uid: partial(LAYOUTS[layout][1], folder) for uid, folder in objects.items()}
-    return ViewDataset(readers, layout, cache, version)
+        uids = [uid for uid in uids if stated.get(uid, split_of(uid)) == split]
+        if not uids:
+            raise UserError(f"{root}: none of its {count} objects is in the {split} split")
+    return ViewDataset(dict.fromkeys(uids, read), layout, cache, version, manifest=manifest)
+
+
+def _read_packed(root: Path, entries: Mapping[str, dict], uid: str) -> ObjectFiles:
+    return read_packed(root, entries[uid])
+
+
+def _read_folder(root: Path, layout: str, uid: str) -> ObjectFiles:
+    return LAYOUTS[layout][1](root / uid)
+
+
+def _read_root(root: Path, layout: str, uid: str) -> ObjectFiles:
+    return LAYOUTS[layout][1](root)
+
+
+def _read_renamed(read: Reader, prefix: int, uid: str) -> ObjectFiles:
+    """Read the object of a joined dataset, whose name has ``prefix`` letters more."""
+    return read(uid[prefix:])
+
+
+def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
+    """Check every object of a dataset, and write its manifest (``manifest.py``).
+
+    Args:
+        folder: the dataset; an older manifest is replaced.
+
+    Returns:
+        The file, the number of objects, and the reasons by uid of those that cannot be read.
+
+    Raises:
+        UserError: the folder is a pack or one object, has no objects, or cannot be written.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder")
+    if (root / INDEX).exists():
+        raise UserError(f"{root}: is a pack, which has its own index")
+    layout, folders, others = find_objects(root, "auto")
+    if not folders or folders == [root]:
+        raise UserError(f"{root}: {'is one object' if folders else 'no objects found'}")
+    lists = {p.relative_to(root).as_posix().removeprefix("."): list_of(str(p)) for p in others}
+    bad: dict[str, str] = {}
+
+    def entries() -> Iterator[Entry]:
+        named = progress_bar(folders, lines=True, delay=2.0, desc="checking", unit="object")
+        for path in named:
+            uid = path.relative_to(root).as_posix()
+            # Before anything is read: what changes meanwhile makes the manifest an old one.
+            marks, digest = marks_of(path, (*_CAMERA_FILES.get(layout, ()), ".")), "0" * 16
+            files = None
+            try:
+                files = _read_folder(root, layout, uid)
+                _check_pictures(files)
+                digest = content_digest(files)
+            except (UserError, OSError) as error:
+                bad[uid] = one_line(first_line(error))
+            if files is not None and layout == "transforms" and isinstance(files.images[0], Path):
+                pictures = files.images[0].parent.relative_to(path).as_posix()
+                marks = [*marks, *marks_of(path, [pictures])] if pictures != "." else marks
+            yield Entry(uid, digest, bad.get(uid, ""), marks)
+
+    return write_manifest(root, layout, lists, entries(), len(folders)), len(folders), bad
+
+
+# In an object's folder: files and folders whose size and time a manifest compares.
+_CAMERA_FILES = {
+    "transforms": ("transforms.json",),
+    "nerf": ("transforms_train.json", "transforms_val.json", "transforms_test.json"),
+    "gobjaverse": (GOBJAVERSE, GOBJAVERSE_DEPTH),
+    "openlrm": ("intrinsics.npy", "rgba", "pose"),
+}
+
+
+def content_digest(files: ObjectFiles) -> str:
+    """Return 16 hexadecimal digits of an object's cameras and kinds of pictures."""
+    kinds = f"{len(files.images)} {files.depths is None} {files.backs is None}"
+    digest = hashlib.sha256(kinds.encode())
+    for numbers in (files.camera_to_world, files.Ks):
+        digest.update(numbers.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _check_pictures(files: ObjectFiles) -> None:
+    """Raise UserError if a picture is missing; folders with many pictures are listed once."""
+    kinds = filter(None, (files.images, files.masks, files.depths, files.backs))
+    # Pictures in a pack are checked when its cameras are read.
+    paths = [path for path in chain.from_iterable(kinds) if isinstance(path, Path)]
+    parents = Counter(path.parent for path in paths)
+    plain: dict[Path, set[str]] = {}
+    for parent in (parent for parent, number in parents.items() if number > 2):
+        with suppress(OSError), os.scandir(parent) as found:
+            plain[parent] = {entry.name for entry in found if not entry.is_symlink()}
+    for path in paths:
+        if path.name not in plain.get(path.parent, ()) and not os.path.exists(path):  # never raises
+            raise UserError(f"{path}: no such file")
 
 
 class ViewDataset:
@@ -187,17 +307,21 @@ class ViewDataset:
 
     def __init__(
         self,
-        readers: Mapping[str, Callable[[], ObjectFiles]],
+        readers: Mapping[str, Reader],
         layout: str,
         cache: bool,
         split_version: int = SPLIT_VERSION,
         packed_size: int | None = None,
+        manifest: Manifest | None = None,
     ) -> None:
-        """Make a dataset of one file reader per uid; ``cache`` as for ``open_dataset``."""
+        """Make a dataset of the reader of each uid; ``cache`` as for ``open_dataset``."""
         self.uids = list(readers)
         self.layout, self.split_version, self.packed_size = layout, split_version, packed_size
         self._readers = dict(readers)
-        self._files: dict[str, ObjectFiles] = {}
+        # Of objects that were checked before; by uid.
+        self._digests: dict[str, str] = {} if manifest is None else manifest.digests
+        self._bad: dict[str, str] = {} if manifest is None else manifest.bad
+        self._files: dict[str, ObjectFiles] = {}  # the last ones used
         # By path and size: the picture, and the (width, height) of the file.
         self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
         self._pictures = {} if cache else None
@@ -212,31 +336,54 @@ class ViewDataset:
         Raises:
             UserError: such a name already exists.
         """
-        added = {f"{name}/{uid}": reader for uid, reader in other._readers.items()}
+        renamed = {
+            id(read): partial(_read_renamed, read, len(name) + 1)
+            for read in other._readers.values()
+        }
+        added = {f"{name}/{uid}": renamed[id(read)] for uid, read in other._readers.items()}
         if twice := sorted(added.keys() & self._readers.keys()):
             raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
         sizes = [size for size in (self.packed_size, other.packed_size) if size is not None]
-        return ViewDataset(
+        both = ViewDataset(
             self._readers | added,
             self.layout,
             self._pictures is not None,
             self.split_version,
             min(sizes, default=None),
         )
+        for known, mine, theirs in (
+            (both._digests, self._digests, other._digests),
+            (both._bad, self._bad, other._bad),
+        ):
+            known |= mine
+            known |= {f"{name}/{uid}": value for uid, value in theirs.items()}
+        return both
 
     def files(self, index: int | str) -> ObjectFiles:
-        """Return paths, poses and intrinsics of one object, which are read once.
+        """Return paths, poses and intrinsics of one object.
+
+        The last ``KEPT`` objects are kept.
 
         Raises:
             UserError: the object's camera files are missing or invalid; the message names the file.
         """
         uid = self._uid(index)
-        if uid not in self._files:
+        files = self._files.get(uid)
+        if files is None:
             try:
-                self._files[uid] = self._readers[uid]()
+                files = self._readers[uid](uid)
             except OSError as error:  # of a folder; for files the readers raise UserError
                 raise UserError(f"{error.filename or uid}: {error.strerror or error}") from error
-        return self._files[uid]
+            with suppress(RuntimeError, StopIteration):  # other threads change it, too
+                while len(self._files) >= KEPT:
+                    self._files.pop(next(iter(self._files)), None)
+            self._files[uid] = files
+        return files
+
+    def digest(self, index: int | str) -> str:
+        """Return 16 hexadecimal digits of the cameras of an object; raises as ``files``."""
+        uid = self._uid(index)
+        return self._digests.get(uid) or content_digest(self.files(uid))
 
     def _uid(self, index: int | str) -> str:
         if not isinstance(index, str):
@@ -250,17 +397,15 @@ class ViewDataset:
         return len(self.files(index).images)
 
     def check(self) -> dict[str, str]:
-        """Return reasons by uid, for objects with invalid cameras or missing pictures."""
-        bad = {}
-        for uid in self.uids:
+        """Return reasons by uid, for objects with invalid cameras or missing pictures.
+
+        Objects of a manifest were checked before; the others are read, with a progress bar.
+        """
+        bad = {uid: self._bad[uid] for uid in self.uids if uid in self._bad}
+        unknown = [uid for uid in self.uids if uid not in self._digests]
+        for uid in progress_bar(unknown, lines=True, delay=2.0, desc="checking", unit="object"):
             try:
-                files = self.files(uid)
-                for path in chain(
-                    files.images, *filter(None, (files.masks, files.depths, files.backs))
-                ):
-                    # Pictures in a pack were checked above.
-                    if isinstance(path, Path) and not os.path.exists(path):  # never raises
-                        raise UserError(f"{path}: no such file")
+                _check_pictures(self.files(uid))
             except UserError as error:
                 bad[uid] = str(error)
         return bad

@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -35,7 +35,7 @@ from ..files import walk
 from ..images import PICTURE_SUFFIXES, picture_size
 from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
-from ..untrusted.names import inside
+from ..untrusted.names import Within, inside
 
 GOBJAVERSE = "campos_512_v4"
 GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON states no x_fov
@@ -351,13 +351,14 @@ _PATHS = ("file_path", "mask_path", "depth_file_path", "back_file_path")
 def _pictures(path: Path, frames: list[dict]) -> dict[str, list[Path]]:
     """Files named by the frames, by the name of the field."""
     files: dict[str, list[Path]] = {key: [] for key in _PATHS}
+    within = Within(path.parent)
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
         if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise UserError(f"{source}: no file_path")
         for key, paths in files.items():
             if frame.get(key):
-                paths.append(inside(path.parent, frame[key], source))
+                paths.append(within.path(frame[key], source))
         picture = files["file_path"][-1]
         # Blender omits the suffix; a dot may then be part of the name.
         if picture.suffix.lower() not in PICTURE_SUFFIXES and not os.path.lexists(picture):
@@ -476,7 +477,9 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
     check_cameras(np.stack(poses), np.stack(Ks), [None] * len(views), names)
     depths = None
     if (folder / GOBJAVERSE_DEPTH).is_dir():
-        depths = [inside(folder, f"{GOBJAVERSE_DEPTH}/{v.name}.png", str(folder)) for v in views]
+        within = Within(folder)
+        names = (f"{GOBJAVERSE_DEPTH}/{view.name}.png" for view in views)
+        depths = [within.path(name, str(folder)) for name in names]
     return ObjectFiles(
         [inside(view, f"{view.name}.png", str(view)) for view in views],
         np.stack(poses),
@@ -492,7 +495,8 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
     if not names:
         raise UserError(f"{folder / 'rgba'}: no views")
     _check_count(len(names), folder)
-    images = [inside(folder, f"rgba/{name}", str(folder)) for name in names]
+    within = Within(folder)
+    images = [within.path(f"rgba/{name}", str(folder)) for name in names]
     lens = folder / "intrinsics.npy"
     focal, center, size = read_array(lens, (3, 2))
     values = {"width": float(size[0]), "height": float(size[1])}
@@ -515,8 +519,22 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
 }
 
 
-def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
-    """Find the layout's name and the objects' folders, sorted, at any depth.
+class Found(NamedTuple):
+    """Objects under a folder.
+
+    Attributes:
+        layout: name of their layout.
+        objects: their folders, sorted.
+        others: the other folders that were searched.
+    """
+
+    layout: str
+    objects: list[Path]
+    others: list[Path]
+
+
+def find_objects(root: Path, layout: str) -> Found:
+    """Find the objects' folders at any depth.
 
     ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
     Folders with a leading dot are skipped; linked folders are entered (``files.walk``).
@@ -525,7 +543,7 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
         UserError: the folders are nested too deep.
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
-    found = []
+    found, others = [], []
     for folder, subfolders, files in walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _MAX_DEPTH:
             raise UserError(f"{root}: its folders are nested deeper than {_MAX_DEPTH}")
@@ -533,4 +551,6 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
             subfolders.clear()  # objects are not nested
             marks, layout = {mark: marks[mark]}, marks[mark]
             found.append(Path(folder))
-    return layout, sorted(found)
+        else:
+            others.append(Path(folder))
+    return Found(layout, sorted(found), others)

@@ -43,6 +43,37 @@ def inside(folder: str | Path, name: object, source: str) -> Path:
     return path
 
 
+class Within:
+    """``inside`` for many names of one folder: each of its subfolders is listed once.
+
+    A listed name that is no link needs no further system call; others are followed by ``inside``.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Nothing is read yet."""
+        self._folder = Path(folder)
+        self._plain: dict[tuple[str, ...], set[str]] = {}
+
+    def path(self, name: object, source: str) -> Path:
+        """Return the path of a name. Arguments, result and errors are those of ``inside``."""
+        parts = parts_of(name, source)
+        above = parts[:-1]
+        if above not in self._plain:
+            self._plain[above] = self._list(above, source)
+        if parts[-1] in self._plain[above]:
+            return self._folder.joinpath(*parts)
+        return inside(self._folder, name, source)
+
+    def _list(self, above: tuple[str, ...], source: str) -> set[str]:
+        """Names in a subfolder that are no links; none if it is missing or leaves the folder."""
+        try:
+            folder = inside(self._folder, "/".join(above), source) if above else self._folder
+            with os.scandir(folder) as found:
+                return {entry.name for entry in found if not entry.is_symlink()}
+        except (UserError, OSError):
+            return set()
+
+
 def plain_name(name: object, source: str) -> str:
     """Check a name for a new file or folder: a single part of a path.
 

@@ -83,8 +83,8 @@ def test_a_pool_that_begins_later_goes_on_with_the_same_pictures(slots, opened, 
 def test_other_processes_make_the_same_pictures(slots, opened):
     made = opened().take(0)
     number = int(made.uids[0].removeprefix("made-3-"))
-    expected = pools._files(made.uids[0], views_of(number, 3, VIEWS))
-    ours = ViewDataset({made.uids[0]: lambda: expected}, "made", cache=False)
+    expected = pools._files(views_of(number, 3, VIEWS), made.uids[0])
+    ours = ViewDataset({made.uids[0]: lambda uid: expected}, "made", cache=False)
     assert_same(made.load(0), ours.load(0))
 
 

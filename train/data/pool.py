@@ -152,7 +152,7 @@ class Pool:
                 failed[numbers[index]] = result.reason
                 continue
             uid = f"made-{self.options.seed}-{numbers[index]}"
-            dataset = ViewDataset({uid: partial(_files, uid, result)}, "made", cache=False)
+            dataset = ViewDataset({uid: partial(_files, result)}, "made", cache=False)
             with self._changed:
                 self._ready[numbers[index]] = dataset
                 self._untaken.add(numbers[index])
@@ -188,7 +188,7 @@ class _Picture(DecodedPicture):
         return self.values
 
 
-def _files(uid: str, views: Views) -> ObjectFiles:
+def _files(views: Views, uid: str) -> ObjectFiles:
     number, size = views.images.shape[:2]
     near, far = (
         None if steps is None else [_Picture(each.astype(np.float32)) for each in steps]
