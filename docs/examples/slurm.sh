@@ -28,5 +28,5 @@ port=$((20000 + SLURM_JOB_ID % 20000))
 srun --kill-on-bad-exit=1 torchrun \
     --nnodes "$SLURM_NNODES" --nproc-per-node 8 --max-restarts 10 \
     --rdzv-id "$SLURM_JOB_ID" --rdzv-backend c10d --rdzv-endpoint "$first:$port" \
-    -m gamba_warp.train "$data" --out "$run" --preset paper --epochs 400 \
-    --batch-size 16 --recompute --precision bfloat16 --workers 8 "$@"
+    -m gamba_warp.train "$data" --out "$run" --recipe paper \
+    --recompute --workers 8 "$@"
