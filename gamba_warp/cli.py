@@ -111,6 +111,8 @@ def run(name: str, arguments: list[str]) -> int:
         if name in LAUNCHING and not helps:
             quiet_warp()
         command = load_command(name)
+        if name != "train":  # which has the option itself, and records it
+            arguments = _load_plugins(arguments)
         arguments = _merge_repeated(arguments, command)
         expand = getattr(sys.modules.get(command.__module__), "expand", None)
         arguments = expand(arguments) if expand else arguments
@@ -128,6 +130,22 @@ def run(name: str, arguments: list[str]) -> int:
             raise
         _print_error(reason)
         return 2
+
+
+def _load_plugins(arguments: list[str]) -> list[str]:
+    """Load the plugins of ``--plugin``; return the other arguments. Raises UserError."""
+    if "--plugin" not in arguments:
+        return arguments
+    at = arguments.index("--plugin")
+    end = at + 2
+    while end < len(arguments) and re.match(r"[A-Za-z_]\w*=|.*\.py$", arguments[end]):
+        end += 1
+    if end > len(arguments):
+        raise UserError("--plugin: expected a .py file or an installed plugin")
+    from .plugins import load
+
+    load(arguments[at + 1 : end])
+    return arguments[:at] + arguments[end:]
 
 
 def _merge_repeated(arguments: list[str], command: Callable) -> list[str]:
@@ -240,6 +258,7 @@ def _main(arguments: list[str]) -> int:
         for name, text in COMMANDS.items():
             print(f"  gamba {name:<14} {text}")
         print("\ngamba COMMAND --help shows the options of one.")
+        print("gamba COMMAND ... --plugin my.py [NAME=VALUE ...] loads a plugin first.")
         return 0
     if arguments[0] in ("-V", "--version"):
         print(__version__)

@@ -24,6 +24,7 @@ from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_d
 from gamba_warp.data.gso import scanned
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
+from gamba_warp.plugins import added
 
 from .config import TrainConfig
 from .data.pool import Pool, PoolOptions
@@ -357,9 +358,25 @@ class Batches:
         known, order = self._order  # read both at once: other threads replace them
         if known != epoch:
             rng = np.random.default_rng([self.config.run.seed, 1, epoch])
-            order = rng.permutation(len(objects))
+            order = self._epoch(rng)
             self._order = epoch, order
         return objects[order[position]]
+
+    def _epoch(self, rng: np.random.Generator) -> np.ndarray:
+        """Positions of an epoch in the list of objects."""
+        count, name = len(self.data.objects), self.config.views.sampler
+        if name == "shuffled":
+            return rng.permutation(count)
+        order = np.asarray(
+            added("sampler")[name](rng, [self.data.train.uids[i] for i in self.data.objects])
+        )
+        if (
+            order.shape != (count,)
+            or order.dtype.kind not in "iu"
+            or not 0 <= order.min() <= order.max() < count
+        ):
+            raise UserError(f"--sampler {name}: expected {count} positions from 0 to {count - 1}")
+        return order
 
     def _numbers(self, number: int) -> range:
         """Samples of the ``number``-th batch for this process."""

@@ -365,3 +365,33 @@ def load_weights(path: Path, model: Gamba) -> None:
         UserError: as for ``read_weights_of``; the model is then unchanged.
     """
     model.load_stored_state(read_weights_of(path, model))
+
+
+def load_partial(path: Path, model: Gamba) -> dict[str, list[str]]:
+    """Load those tensors of a model file that have the name and shape of the model's.
+
+    Returns:
+        Names: ``taken``; ``other shape``, in both; ``not in the model``; ``not in the file``, which
+        keep their fresh values, like those of another shape.
+
+    Raises:
+        UserError: the file is missing or damaged, has non-finite numbers, or no tensor fits; the
+            model is then unchanged.
+    """
+    config, _ = read_config(path)
+    encoder = None if model.encoder is None else model.encoder
+    try:
+        theirs = read_weights(path, Gamba(config, encoder=encoder))
+    except ValueError as error:
+        raise UserError(f"{path}: does not fit its own configuration: {error}") from error
+    ours = model.stored_state()
+    same = {name for name in ours.keys() & theirs.keys() if ours[name].shape == theirs[name].shape}
+    if not same:
+        raise UserError(f"--init-partial {path}: none of its tensors fits this model")
+    model.load_stored_state({name: theirs[name] if name in same else ours[name] for name in ours})
+    return {
+        "taken": sorted(same),
+        "other shape": sorted((ours.keys() & theirs.keys()) - same),
+        "not in the model": sorted(theirs.keys() - ours.keys()),
+        "not in the file": sorted(ours.keys() - theirs.keys()),
+    }

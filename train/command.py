@@ -11,7 +11,7 @@ import tyro
 
 from gamba_warp.errors import UserError
 
-from .config import TrainConfig, command_line, config_of
+from .config import FOLLOWING, TrainConfig, command_line, config_of
 from .recipes import announce, recipe_words, table_of
 
 _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 4,000
@@ -88,7 +88,8 @@ def _options_of(path: Path) -> list[str]:
         values = read_document(path, dict[str, Any], _MAX_CONFIG)
     except UserError as error:
         raise UserError(f"{error}; this is not the config.json of a run") from error
-    values.pop("model", None)  # follows from the preset and --set
+    for name in FOLLOWING:
+        values.pop(name, None)
     parts = [part for part in values.values() if not isinstance(part, dict)]
     parts += [v for part in values.values() if isinstance(part, dict) for v in part.values()]
     for value in (v for part in parts for v in (part if isinstance(part, list) else [part])):

@@ -14,6 +14,7 @@ import msgspec
 import tyro
 from msgspec import Meta
 
+from gamba_warp import plugins
 from gamba_warp.conventions import DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.image_metrics import METRICS
@@ -83,6 +84,7 @@ class DataConfig:
         cache: Keep decoded pictures in memory.
         cache_device: Decode all pictures at the start and keep them on the training device, with
             8 bits a channel. Depth pictures are read when they are used.
+        sampler: Order of the objects: "shuffled" anew for each epoch, or that of a plugin.
         workers: Threads that decode pictures ahead of the training; also the largest number of
             batches kept ready. The number does not change the result.
     """
@@ -107,6 +109,7 @@ class DataConfig:
     overfit: str | None = None
     cache: bool = False
     cache_device: bool = False
+    sampler: str = "shuffled"
     workers: Annotated[int, Meta(ge=1, le=1024)] = 1
 
     @property
@@ -166,7 +169,8 @@ class OptimConfig:
     Attributes:
         lr: Peak learning rate; after a warm-up it falls to 0 according to --schedule.
         schedule: "cosine" falls along half a cosine from the end of the warm-up; "trapezoid" stays
-            at the peak and falls linearly at the end, so runs of different lengths begin alike.
+            at the peak and falls linearly at the end, so runs of different lengths begin alike; or
+            that of a plugin.
         decay_share: Share of the run in which "trapezoid" falls.
         warmup_steps: Steps of the linear warm-up, a tenth of the run at most.
         weight_decay: Weight decay of matrices, except those flagged by a module.
@@ -177,10 +181,15 @@ class OptimConfig:
             rendering stay float32. "auto" is bfloat16 if a trial of 50 ms finds it faster on all
             processes, else float32; a resumed run chooses again.
         max_skipped: Give up after this many non-finite steps in a row.
+        optimizer: Name of any optimizer of torch.optim, such as SGD or RAdam.
+        optimizer_options: Its options, NAME=VALUE with values in JSON; with AdamW they replace
+            --beta2: betas=[0.9,0.99].
+        lr_of: Factors of the learning rate by parameter name or its beginning, NAME=FACTOR:
+            encoder=0.1 decoder=2; 0 freezes.
     """
 
     lr: Annotated[float, Meta(gt=0, le=10)] = 1e-3
-    schedule: Literal["cosine", "trapezoid"] = "cosine"
+    schedule: str = "cosine"
     decay_share: Annotated[float, Meta(gt=0, le=1)] = 0.2
     warmup_steps: _Every = 100
     weight_decay: Annotated[float, Meta(ge=0, le=100)] = 0.05
@@ -189,6 +198,9 @@ class OptimConfig:
     ema: Annotated[float, Meta(ge=0, lt=1)] = 0.999
     precision: Precision = "float32"
     max_skipped: _Count = 20
+    optimizer: str = "AdamW"
+    optimizer_options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
+    lr_of: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FACTOR ...")] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,6 +223,8 @@ class RunConfig:
         init: Start from the weights of this model file, checkpoint or run folder (same
             architecture; the averaged weights if there are any), with a fresh optimizer. Use it
             with another --out to continue with other losses or data.
+        init_partial: As --init, from a model of another architecture: tensors of the same name and
+            shape are taken; OUT/init.json lists those that were and were not.
         encoder_weights: File of the image encoder's weights, or "random" to train one from scratch.
         log_every: Steps between two lines of the log.
         val_every: Steps between two validations (and sample pictures); 0 for none.
@@ -231,6 +245,8 @@ class RunConfig:
         threads: Number of CPU threads; all cores if not given.
         recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
             same result in less memory and more time.
+        plugin: Plugins, each a .py file or the name of an installed one, followed by its options:
+            my.py scale=2 (docs/change-the-training.md).
         seed: Seed of the initial weights and of the order of the data.
     """
 
@@ -240,6 +256,7 @@ class RunConfig:
     resume: str = "auto"
     override: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OPTION=VALUE ...")] = ()
     init: Path | None = None
+    init_partial: Path | None = None
     encoder_weights: str | None = None
     log_every: _Count = 10
     val_every: _Every = 500
@@ -255,6 +272,7 @@ class RunConfig:
     device: DeviceChoice = "auto"
     threads: Threads | None = None
     recompute: bool = False
+    plugin: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE [NAME=VALUE ...]")] = ()
     seed: Seed = 0
 
     @property
@@ -283,8 +301,15 @@ class TrainConfig:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
+        plugins.load(self.run.plugin)
         for group in (self.length, self.views, self.loss, self.optim, self.run):
             check_options(group)
+        for kind, chosen, own in (
+            ("scheduler", self.optim.schedule, ("cosine", "trapezoid")),
+            ("sampler", self.views.sampler, ("shuffled",)),
+        ):
+            if chosen not in (names := (*own, *plugins.added(kind))):
+                raise UserError(f"{kind} {chosen[:60]!r}: expected one of {', '.join(names)}")
         if self.loss.lpips == "on" and self.views.size < 16:
             raise UserError(f"--lpips on: needs --size 16 or more, it is {self.views.size}")
         if self.loss.lpips_crop and not 16 <= self.loss.lpips_crop <= self.views.size:
@@ -295,6 +320,8 @@ class TrainConfig:
             raise UserError("--best-by lpips: --lpips off leaves it out")
         if self.run.best_by == "ssim" and self.views.size < METRICS["ssim"].least_side:
             raise UserError(f"--best-by ssim: needs --size {METRICS['ssim'].least_side} or more")
+        if self.run.init is not None and self.run.init_partial is not None:
+            raise UserError("--init and --init-partial: give one of them")
         if self.views.made and self.views.overfit is not None:
             raise UserError("--made: --overfit trains on one object; leave one of them out")
         if self.run.val_extra and self.views.overfit is not None:
@@ -331,7 +358,8 @@ class TrainConfig:
                 invalid.
         """
         values = self.to_dict()
-        del values["model"]
+        for name in FOLLOWING & values.keys():
+            del values[name]
         for name, text in self.changes().items():
             group, _, field_name = name.partition(".")
             values[group][field_name] = value_of(text)
@@ -361,6 +389,8 @@ class TrainConfig:
         """Return JSON-ready values, with the model's full configuration under ``model``."""
         values = json.loads(json.dumps(asdict(self), default=str))
         values["model"] = json.loads(self.model_config().to_json())
+        if self.run.plugin:
+            values["plugins"] = plugins.records(self.run.plugin)
         return values
 
 
@@ -377,14 +407,17 @@ _OVERRIDABLE = {
     for group, kind in (("views", DataConfig), ("loss", LossConfig), ("optim", OptimConfig))
     for f in fields(kind)
     if f.name not in {*("extra", "overfit", "train_on_gso", "cache", "cache_device", "workers")}
+    and f.name not in {*("optimizer", "optimizer_options", "lr_of", "sampler")}
     and not f.name.startswith("made")
 }
 STEP_SIZE = {"views.batch_size", "views.accumulate"}
+FOLLOWING = {"model", "plugins"}  # of a config.json: they follow from the options
 # These may differ between the processes of one run; files are compared by content.
 _PER_MACHINE = {
     *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
     *("run.init", "run.encoder_weights", "run.device", "run.threads", "run.keep", "run.log"),
-    *("run.tensorboard", "run.val_extra", "views.cache_device", "views.made_workers"),
+    "run.init_partial",
+    *("run.plugin", "run.tensorboard", "run.val_extra", "views.cache_device", "views.made_workers"),
 }
 # Groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {

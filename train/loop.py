@@ -28,7 +28,15 @@ from .config import LengthConfig, TrainConfig, command_line, stored_option
 from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Progress, term_weights
-from .optim import Ema, NewBatch, Schedule, build_optimizer, checked_moments, novel_views
+from .optim import (
+    Ema,
+    NewBatch,
+    Schedule,
+    build_optimizer,
+    checked_moments,
+    novel_views,
+    rate_factors,
+)
 from .profiler import STEPS, WARM_STEPS, profiled
 from .step import Objective, collapse_reason, compute_gradients, health, validate
 
@@ -60,7 +68,8 @@ class Trainer:
         self.config, self.data, self.world, self.lpips = config, data, world, lpips
         self.log: RunLog | None = None  # set on the main process before it runs
         self.model = model
-        self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
+        factors = rate_factors(model, config.optim.lr_of)
+        self.optimizer = build_optimizer(model, config.optim, factors)
         self.ema = Ema(model, config.optim.ema) if config.optim.ema else None
         # By file stem; the last one is used for validation and as the result.
         self.models = {"model": model} | ({"ema": self.ema.model} if self.ema else {})
@@ -139,7 +148,7 @@ class Trainer:
         config, batches, first = self.config, self._batches, self.step * self.accumulate
         rate = config.optim.lr * self.schedule.share(self.step, self.elapsed)
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group["factor"]
         batches.waited = 0.0
         made = compute_gradients(
             self.wrapped,
@@ -198,7 +207,7 @@ class Trainer:
         bar = run_bar(self.total, minutes, self.step, self.elapsed / 60, self.world.main)
         began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
-        if self.step == 0 and self.config.run.init is not None:
+        if self.step == 0 and (self.config.run.init or self.config.run.init_partial):
             self._validate()
         try:
             with stop_requests(insist=True) as received, self._profiled() as profile_step:

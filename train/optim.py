@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,8 +14,10 @@ from msgspec import Meta
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from gamba_warp.errors import UserError
+from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.plugins import added
+from gamba_warp.untrusted.documents import value_of
 
 from .config import OptimConfig
 
@@ -23,23 +26,89 @@ from .config import OptimConfig
 _LOW, _RISE = 0.1, 0.1
 
 
-def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.optim.AdamW:
-    """Make AdamW with weight decay on the matrices that are not flagged ``_no_weight_decay``.
+def rate_factors(model: Gamba, lr_of: Sequence[str]) -> dict[str, float]:
+    """Return the factors of ``--lr-of`` by parameter name, and freeze the parameters of factor 0.
 
-    The loop sets the learning rate before each step.
+    Args:
+        model: the model.
+        lr_of: each NAME=FACTOR; NAME is a parameter or the beginning of some, up to a dot. The
+            longest counts.
+
+    Raises:
+        UserError: a name is that of no parameter, a factor no number from 0 to 1,000, or all
+            parameters are frozen.
     """
-    trained = [p for p in model.parameters() if p.requires_grad]
-    decayed = [p for p in trained if p.ndim >= 2 and not getattr(p, "_no_weight_decay", False)]
-    chosen = {id(p) for p in decayed}
-    groups = [
-        {"params": decayed, "weight_decay": weight_decay},
-        {"params": [p for p in trained if id(p) not in chosen], "weight_decay": 0.0},
+    given: dict[str, float] = {}
+    for text in lr_of:
+        name, _, value = text.partition("=")
+        try:
+            given[name] = float(value)
+        except ValueError:
+            given[name] = math.nan
+        if not 0 <= given[name] <= 1000:
+            raise UserError(f"--lr-of {text[:80]}: expected NAME=FACTOR, FACTOR from 0 to 1000")
+    factors, used = {}, set()
+    for name, parameter in model.named_parameters():
+        fits = [part for part in given if name == part or name.startswith(f"{part}.")]
+        used |= {*fits}
+        factors[name] = given[max(fits, key=len)] if fits else 1.0
+        if factors[name] == 0:
+            parameter.requires_grad_(False)
+    if unknown := [name for name in given if name not in used]:
+        parts = dict.fromkeys(name.split(".")[0] for name in factors)
+        raise UserError(
+            f"--lr-of {unknown[0][:80]}: no such parameter; there are {', '.join(parts)}"
+        )
+    if not any(parameter.requires_grad for parameter in model.parameters()):
+        raise UserError("--lr-of: all parameters are frozen")
+    return factors
+
+
+def build_optimizer(
+    model: Gamba, optim: OptimConfig, factors: Mapping[str, float] = {}
+) -> torch.optim.Optimizer:
+    """Make the optimizer, with weight decay on the matrices not flagged ``_no_weight_decay``.
+
+    The loop sets the learning rate of each group before each step: its ``factor`` times the rate.
+
+    Args:
+        model: the model; parameters without gradient are left out.
+        optim: the options.
+        factors: result of ``rate_factors``; missing names have 1.
+
+    Raises:
+        UserError: torch has no such optimizer, or it rejects the options.
+    """
+    parts: dict[tuple[float, bool], list[Tensor]] = {}
+    for factor in dict.fromkeys((1.0, *factors.values())):
+        parts |= {(factor, True): [], (factor, False): []}
+    for name, p in model.named_parameters():
+        if p.requires_grad:
+            decays = p.ndim >= 2 and not getattr(p, "_no_weight_decay", False)
+            parts[factors.get(name, 1.0), decays].append(p)
+    groups: list[dict[str, Any]] = [
+        {"params": params, "weight_decay": optim.weight_decay if decays else 0.0, "factor": factor}
+        for (factor, decays), params in parts.items()
+        if params
     ]
-    return torch.optim.AdamW(groups, lr=0.0, betas=(0.9, beta2), fused=True)
+    if optim.optimizer == "AdamW" and not optim.optimizer_options:
+        return torch.optim.AdamW(groups, lr=0.0, betas=(0.9, optim.beta2), fused=True)
+    kind = getattr(torch.optim, optim.optimizer, None)
+    if not (isinstance(kind, type) and issubclass(kind, torch.optim.Optimizer)):
+        raise UserError(f"--optimizer {optim.optimizer[:60]}: not one of torch.optim")
+    options = {}
+    for text in optim.optimizer_options:
+        name, _, value = text.partition("=")
+        found = value_of(value)
+        options[name] = tuple(found) if isinstance(found, list) else found
+    try:
+        return kind(groups, lr=0.0, **options)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"--optimizer {optim.optimizer}: {first_line(error)}") from error
 
 
 def checked_moments(
-    optimizer: torch.optim.AdamW, stored: dict[str, Any], source: Path
+    optimizer: torch.optim.Optimizer, stored: dict[str, Any], source: Path
 ) -> dict[str, Any]:
     """Check the stored ``state_dict`` of an optimizer against the optimizer itself.
 
@@ -64,6 +133,10 @@ def checked_moments(
             if type(index) is not int or not 0 <= index < len(parameters):
                 raise ValueError(f"the optimizer has a state of parameter {str(index)[:40]!r}")
             names = set(entry) if isinstance(entry, dict) else set()
+            if type(optimizer) is not torch.optim.AdamW:
+                if not all(map(_plain_moment, entry.values())):
+                    raise ValueError(f"the optimizer's state of parameter {index} is not finite")
+                continue
             if names != {"step", "exp_avg", "exp_avg_sq"}:
                 raise ValueError(f"the optimizer's state of parameter {index} has other fields")
             for name, value in entry.items():
@@ -77,6 +150,13 @@ def checked_moments(
     except ValueError as error:
         raise UserError(f"{source}: damaged, {error}") from error
     return {"state": moments, "param_groups": optimizer.state_dict()["param_groups"]}
+
+
+def _plain_moment(value: object) -> bool:
+    """True for what the optimizers of torch keep: finite tensors and numbers, or nothing."""
+    if isinstance(value, Tensor):
+        return bool(value.isfinite().all())
+    return value is None or (isinstance(value, (int, float)) and math.isfinite(value))
 
 
 class Ema:
@@ -197,6 +277,8 @@ class Schedule:
             return self._planned(step, total)
         if total <= began:
             return self.since.share
+        if self.optim.schedule in added("scheduler"):
+            return self._planned(step, total)
         if not self.since.rises:  # the rest of the fall, to 0 at the new end
             share, left = self.since.share, (total - step) / (total - began)
             if self.optim.schedule == "trapezoid":
@@ -216,6 +298,8 @@ class Schedule:
             return (step + 1) / (warmup + 1)
         if self.optim.schedule == "trapezoid":
             return _clamped((total - step) / (self.optim.decay_share * total))
+        if (share := added("scheduler").get(self.optim.schedule)) is not None:
+            return share(_clamped((step - warmup) / max(1e-12, total - warmup)))
         return _half_cosine((step - warmup) / max(1e-12, total - warmup))
 
     def after(self, old: Schedule, step: int, elapsed: float) -> tuple[Schedule, str | None]:

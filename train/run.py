@@ -26,6 +26,7 @@ from .checkpoint import (
     find_initial,
     initial_differences,
     list_checkpoints,
+    load_partial,
     load_weights,
     step_of,
 )
@@ -55,7 +56,7 @@ def train(config: TrainConfig, world: World) -> int:
         UserError: invalid data, options or run folder, or they differ between processes.
     """
     run, notes, started = config.run, [], ""
-    log = None
+    log, partial = None, {}
     there = run.out.is_dir()  # a missing folder is made only after all checks
     with contextlib.ExitStack() as held:
 
@@ -94,6 +95,11 @@ def train(config: TrainConfig, world: World) -> int:
                     others = f"other {', '.join(differing[:20])}"
                     whose = f", of a run with {others if differing else 'the same options'}"
                 started = f"starts from the weights of {path}{whose}"
+            if run.init_partial is not None and checkpoint is None and world.main:
+                path = find_initial(run.init_partial, notes.append)
+                partial = load_partial(path, model)
+                counts = ", ".join(f"{len(names)} {what}" for what, names in partial.items())
+                started = f"starts from tensors of {path}: {counts}; {run.out / 'init.json'}"
             model.to(world.device)
             if lpips is not None:
                 lpips.to(world.device)
@@ -117,6 +123,8 @@ def train(config: TrainConfig, world: World) -> int:
             _announce(trainer, log, checkpoint, notes)
             if started:
                 say(started)
+            if partial:
+                write_json(run.out / "init.json", partial)
         code = trainer.run()
         failures = {u: why for each in world.gather(trainer.failures) for u, why in each.items()}
         if log is not None:

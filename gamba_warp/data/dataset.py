@@ -246,7 +246,8 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
         for path in named:
             uid = path.relative_to(root).as_posix()
             # Before anything is read: what changes meanwhile makes the manifest an old one.
-            marks, digest = marks_of(path, (*_CAMERA_FILES.get(layout, ()), ".")), "0" * 16
+            names = _CAMERA_FILES.get(layout, LAYOUTS[layout][:1])
+            marks, digest = marks_of(path, (*names, ".")), "0" * 16
             files = None
             try:
                 files = _read_folder(root, layout, uid)

@@ -33,6 +33,7 @@ from msgspec import Meta, Struct
 from ..errors import UserError
 from ..files import walk
 from ..images import PICTURE_SUFFIXES, picture_size
+from ..plugins import extensible
 from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
 from ..untrusted.names import Within, inside
@@ -517,6 +518,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
     "gobjaverse": (GOBJAVERSE, _read_gobjaverse),
     "openlrm": ("intrinsics.npy", _read_openlrm),
 }
+extensible("dataset layout", LAYOUTS)
 
 
 class Found(NamedTuple):

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..errors import UserError
+from ..plugins import added
 from ..untrusted.ranges import Meta, check_kind, check_values
 
 Norm = Literal["layer", "rms"]
@@ -167,7 +168,8 @@ class GambaConfig:
 
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
-            check_kind(f"config: {name} is", getattr(self, name), kind)
+            if not (name == "decoder" and self.decoder in added("decoder")):
+                check_kind(f"config: {name} is", getattr(self, name), kind)
         hints = get_type_hints(type(self), include_extras=True)
         check_values(vars(self), hints, lambda name: f"config: {name} is")
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):

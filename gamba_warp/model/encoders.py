@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from ..errors import UserError, first_line
+from ..plugins import added
 from ..untrusted.torch_files import read_torch
 from .config import GambaConfig
 
@@ -122,6 +123,8 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
     """
     if config.encoder == "none":
         return None
+    if config.encoder in added("encoder"):
+        return ImageEncoder(*added("encoder")[config.encoder](config, weights), config)
     if config.encoder == "vgg16":
         from ..vision.vgg import vgg16_features
 
@@ -161,6 +164,9 @@ def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
     """
     if config.encoder == "none" or not config.prepend:
         return None
+    if config.encoder in added("encoder"):
+        with torch.device("meta"):
+            return build_encoder(config, "random")
     if config.encoder == "vgg16":
         from ..vision.weights import WIDTHS
 

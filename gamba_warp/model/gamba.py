@@ -12,6 +12,7 @@ from ..cameras import Cameras
 from ..conventions import over_background
 from ..devices import float32_weights
 from ..gaussians import Gaussians
+from ..plugins import extensible
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
 from .parts.attention import AttentionBlock
@@ -22,6 +23,10 @@ from .parts.rays import RayDecoder
 from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
 from .pretrained import Pretrained
+
+DECODERS: dict[str, Any] = extensible(
+    "decoder", {"bins": GaussianDecoder, "rays": RayDecoder, "triplane": TriplaneDecoder}
+)
 
 
 def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) -> nn.ModuleList:
@@ -69,8 +74,7 @@ class Gamba(Pretrained, nn.Module):
         self.tokens = SplatTokens(config)
         self.blocks = make_blocks(config, camera_channels, image_channels)
         self.norm = make_norm(config, final=True)
-        kinds = {"bins": GaussianDecoder, "rays": RayDecoder, "triplane": TriplaneDecoder}
-        self.decoder = kinds[config.decoder](config)
+        self.decoder = DECODERS[config.decoder](config)
         self.planes = None
         if config.decoder == "triplane":
             blocks = make_blocks(config, camera_channels, image_channels)

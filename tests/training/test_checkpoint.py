@@ -28,6 +28,7 @@ from gamba_warp.train.checkpoint import (
     read_state,
     save_checkpoint,
 )
+from gamba_warp.train.config import OptimConfig
 from gamba_warp.train.optim import build_optimizer, checked_moments
 
 
@@ -268,7 +269,7 @@ def test_fields_of_a_state_are_checked(field, value):
     ],
 )
 def test_moments_of_a_state_are_checked(model, change, words):
-    optimizer = build_optimizer(model, 0.05, 0.95)
+    optimizer = build_optimizer(model, OptimConfig())
     for parameter in model.parameters():
         parameter.grad = torch.ones_like(parameter)
     optimizer.step()

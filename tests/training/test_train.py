@@ -31,6 +31,7 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.train import loop, step
 from gamba_warp.train.batches import choose_views
 from gamba_warp.train.checkpoint import list_checkpoints
+from gamba_warp.train.config import OptimConfig
 from gamba_warp.train.objective import losses
 from gamba_warp.train.optim import Ema, build_optimizer
 from gamba_warp.vision.lpips import LPIPS
@@ -454,7 +455,7 @@ def test_auto_is_the_precision_that_the_trial_finds(data, tmp_path, monkeypatch,
 
 def test_decay_is_on_matrices_that_are_not_flagged(data):
     model = Gamba(micro.options(data, data).model_config())
-    decayed, plain = build_optimizer(model, 0.05, 0.95).param_groups
+    decayed, plain = build_optimizer(model, OptimConfig()).param_groups
     assert decayed["weight_decay"] == 0.05 and plain["weight_decay"] == 0
     names = {id(p): name for name, p in model.named_parameters()}
     without = {names[id(p)] for p in plain["params"]}

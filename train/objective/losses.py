@@ -19,6 +19,7 @@ from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import psnr
 from gamba_warp.kernels.ssim import dissimilarity
+from gamba_warp.plugins import extensible
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available
 
@@ -274,6 +275,16 @@ TERMS: dict[str, Term] = {
         "radial mask",
     ),
 }
+
+
+def _added_term(given: tuple[Callable, float | Callable[[Progress], float]]) -> Term:
+    """Term of a plugin, of its value and weight."""
+    value, weight = given
+    own = weight if callable(weight) else lambda at: weight
+    return Term(lambda loss, at: own(at), value, "plugin")
+
+
+extensible("loss term", TERMS, _added_term)
 
 
 def term_weights(loss: LossConfig, at: Progress) -> dict[str, float]:

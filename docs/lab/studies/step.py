@@ -99,7 +99,7 @@ class _Step:
         self.model = Gamba(config).to(settings.device)
         options = OptimConfig()
         self.clip = options.clip
-        self.optimizer = build_optimizer(self.model, options.weight_decay, options.beta2)
+        self.optimizer = build_optimizer(self.model, options)
         for group in self.optimizer.param_groups:
             group["lr"] = 1e-6  # the weights hardly move, so every round does the same work
         self.ema = Ema(self.model, options.ema)
