@@ -66,6 +66,7 @@ class TrainingData:
         held_out: validation objects by dataset; datasets without any are left out.
         val_views: novel views per object in a validation; None means all.
         notes: lines for the user.
+        weights: for each of ``objects``, how often it is taken relative to others; None: alike.
     """
 
     train: ViewDataset
@@ -76,6 +77,7 @@ class TrainingData:
     held_out: list[HeldOut] = field(default_factory=list)
     val_views: int | None = None
     notes: list[str] = field(default_factory=list)
+    weights: np.ndarray | None = None
 
     @property
     def scanned(self) -> list[str]:
@@ -123,8 +125,10 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
 def _open_all(config: TrainConfig) -> TrainingData:
     views = config.views
     train = open_dataset(config.data, "train", cache=views.cache)
+    ends = [len(train)]
     for folder in views.extra:
         train = train.joined(folder.resolve().name, open_dataset(folder, "train"))
+        ends.append(len(train))
     bad = train.check()
     objects = [i for i, uid in enumerate(train.uids) if uid not in bad]
     notes = [f"{uid} is left out: {reason}" for uid, reason in bad.items()]
@@ -133,7 +137,10 @@ def _open_all(config: TrainConfig) -> TrainingData:
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
     notes += filter(None, [background_note(train)])
-    held_out = []
+    weights, held_out = None, []
+    if views.extra_weights:
+        each = np.array([1.0, *views.extra_weights])
+        weights = each[np.searchsorted(ends, objects, side="right")]
     try:
         held_out.append(_held_out("", config.data, config.run.val_objects))
     except UserError as error:
@@ -155,6 +162,7 @@ def _open_all(config: TrainConfig) -> TrainingData:
         held_out=[part for part in held_out if part.objects],
         val_views=config.run.val_views,
         notes=notes,
+        weights=weights,
     )
 
 
@@ -365,6 +373,13 @@ class Batches:
     def _epoch(self, rng: np.random.Generator) -> np.ndarray:
         """Positions of an epoch in the list of objects."""
         count, name = len(self.data.objects), self.config.views.sampler
+        weights = self.data.weights
+        if weights is not None:
+            # Systematic sampling: an object comes its expected number of times, rounded up or down.
+            order = rng.permutation(count)
+            edges = weights[order].cumsum()
+            taken = np.searchsorted(edges, (np.arange(count) + rng.random()) * edges[-1] / count)
+            return rng.permutation(order[np.minimum(taken, count - 1)])
         if name == "shuffled":
             return rng.permutation(count)
         order = np.asarray(

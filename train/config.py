@@ -66,6 +66,8 @@ class DataConfig:
             object and step. The input picture always has the model's own background.
         reference: Input view: any, or always the first; "auto" is first with --overfit.
         extra: More datasets, whose training objects are added to those of DATA.
+        extra_weights: For each of these, how often one of its objects is taken, relative to one of
+            DATA; all 1 if not given.
         front_share: Share of the samples whose input is a view from the front: the object's first,
             or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation. The other
             samples take any view.
@@ -98,6 +100,7 @@ class DataConfig:
     background: Literal["white", "black", "random"] = "white"
     reference: Literal["auto", "random", "first"] = "auto"
     extra: tuple[Path, ...] = ()
+    extra_weights: tuple[Annotated[float, Meta(gt=0, le=1e6)], ...] = ()
     front_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
     mirror: Annotated[float, Meta(ge=0, le=1)] = 0.0
     recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
@@ -320,6 +323,11 @@ class TrainConfig:
             raise UserError("--best-by lpips: --lpips off leaves it out")
         if self.run.best_by == "ssim" and self.views.size < METRICS["ssim"].least_side:
             raise UserError(f"--best-by ssim: needs --size {METRICS['ssim'].least_side} or more")
+        given, wanted = len(self.views.extra_weights), len(self.views.extra)
+        if given not in (0, wanted):
+            raise UserError(f"--extra-weights: {given} numbers for {wanted} of --extra")
+        if given and self.views.sampler != "shuffled":
+            raise UserError("--extra-weights and --sampler: give one of them")
         if self.run.init is not None and self.run.init_partial is not None:
             raise UserError("--init and --init-partial: give one of them")
         if self.views.made and self.views.overfit is not None:
@@ -407,7 +415,7 @@ _OVERRIDABLE = {
     for group, kind in (("views", DataConfig), ("loss", LossConfig), ("optim", OptimConfig))
     for f in fields(kind)
     if f.name not in {*("extra", "overfit", "train_on_gso", "cache", "cache_device", "workers")}
-    and f.name not in {*("optimizer", "optimizer_options", "lr_of", "sampler")}
+    and f.name not in {*("optimizer", "optimizer_options", "lr_of", "sampler", "extra_weights")}
     and not f.name.startswith("made")
 }
 STEP_SIZE = {"views.batch_size", "views.accumulate"}
