@@ -39,6 +39,9 @@ class ShapesOptions:
         gt: A mesh or a point cloud; or a folder, paired with PRED by name.
         out: Folder for report.json, objects.csv, table.md and table.tex. An interrupted evaluation
             resumes there.
+        limit: Number of objects, evenly spaced in the order of names; all by default.
+        objects: Text file of the objects of --protocol gso in place of its own list, one name a
+            line; the report states that.
         baseline: Folders of other predictions of the same objects: PRED is compared with each,
             object by object. Rows are named by the folders.
         protocol: default, gso (the objects of "gamba data gso", in the input camera's frame), a
@@ -80,6 +83,8 @@ class ShapesOptions:
     pred: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PRED")] = None
     gt: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="GT")] = None
     out: Path | None = None
+    limit: Annotated[int, Meta(ge=1)] | None = None
+    objects: Path | None = None
     baseline: tuple[Path, ...] = ()
     protocol: str = "default"
     explain: bool = False

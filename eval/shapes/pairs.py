@@ -129,10 +129,18 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     """
     if (protocol.frame == "reference") != (options.data is not None):
         raise UserError("--frame reference and --data: give both or neither")
-    listed = gso.NAMES if protocol.name == "gso" else ()
+    listed = gso.names_of(options.objects) if protocol.name == "gso" else ()
+    if options.objects is not None and not listed:
+        raise UserError("--objects: needs --protocol gso")
+    if options.limit is not None and listed:
+        raise UserError("--limit: --protocol gso has its own objects; --objects names others")
     assert options.pred is not None and options.gt is not None  # checked by the command
     dataset, known = open_objects(options.data)
     found = find_all(options.pred, options.baseline, options.gt, listed, known)
+    if options.limit is not None:
+        names = {pair.name for pairs, _ in found.values() for pair in pairs}
+        names |= {each["name"] for _, failures in found.values() for each in failures}
+        found = {name: limited(*each, names, options.limit) for name, each in found.items()}
     if options.paint and options.out is None:
         raise UserError("--paint: needs --out")
     folder = output_folder(options.out) if options.out is not None else None
@@ -169,7 +177,7 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         report["differences"][name] = differences_of(report["objects"], other["objects"])
     if listed:
         done = [record["name"] for record in report["objects"] if record["status"] == OK]
-        report["evaluation"] = gso.protocol_of(done)
+        report["evaluation"] = gso.protocol_of(done, listed)
     if folder is not None:
         save_report(report, folder)
         write_text(folder / "table.md", page(report))
@@ -261,6 +269,16 @@ def find_all(
     expected = {name for path in folders.values() for name in _shapes_in(path)} if baselines else ()
     wanted = {*expected, *listed}
     return {name: find_pairs(path, gt, wanted, known) for name, path in folders.items()}
+
+
+def limited(
+    pairs: list[Pair], failures: list[dict[str, str]], names: Iterable[str], limit: int
+) -> PairsAndFailures:
+    """Keep the objects that are among ``limit`` of the names, evenly spaced in their order."""
+    from gamba_warp.data.dataset import evenly
+
+    kept = {*evenly(sorted(names), limit)}
+    return [p for p in pairs if p.name in kept], [f for f in failures if f["name"] in kept]
 
 
 def find_pairs(

@@ -43,8 +43,12 @@ class ViewsOptions:
         views: Number of views of an object, input included, evenly spaced; all by default.
         size: Height of the pictures compared; the files' own by default.
         limit: Number of objects, evenly spaced in the order of names; all by default.
+        objects: Text file of the objects of --protocol gso in place of its own list, one name a
+            line; the report states that.
         baselines: Also score an empty picture, a copy of the input, the input as a billboard, and
             the nearest training object.
+        retrieval_data: Datasets whose training objects the nearest one is taken from; by default
+            DATA.
         ceiling: Also score Gaussians fitted to all views: a number of objects to fit (18 s each on
             two cores, written into OUT/ceiling), or a folder that gamba fit wrote.
         ceiling_steps: Steps of each fit.
@@ -81,7 +85,9 @@ class ViewsOptions:
     views: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     size: Annotated[int, Meta(ge=16, le=4096)] | None = None
     limit: Annotated[int, Meta(ge=1)] | None = None
+    objects: Path | None = None
     baselines: bool = True
+    retrieval_data: tuple[Path, ...] = ()
     ceiling: str | None = None
     ceiling_steps: Steps = FitConfig.steps
     lpips: bool = True
@@ -110,6 +116,10 @@ class ViewsOptions:
             for name in ("split", "reference", "views", "size", "limit"):
                 if getattr(self, name) != getattr(ViewsOptions, name):
                     raise UserError(f"--protocol gso: has its own {option(name)}")
+        elif self.objects is not None:
+            raise UserError("--objects: needs --protocol gso")
+        if self.retrieval_data and not self.baselines:
+            raise UserError("--retrieval-data: needs the baselines")
         for name in ("save_gaussians", "save_pictures"):
             if getattr(self, name) and self.out is None:
                 raise UserError(f"{option(name)}: needs --out")

@@ -84,6 +84,7 @@ class Job:
         failures: ``{name, reason}`` of failed baselines.
         retrieval: the baseline of this name, if used.
         meshes: of the training objects, for the retrieval's shapes; or None.
+        retrieval_data: names of the datasets of the retrieval, if they are others.
         time_printed: True once the time of LPIPS was estimated.
     """
 
@@ -99,6 +100,7 @@ class Job:
     failures: list[dict[str, str]] = field(default_factory=list)
     retrieval: Retrieval | None = None
     meshes: TrainingMeshes | None = None
+    retrieval_data: list[str] = field(default_factory=list)
     time_printed: bool = False
 
     def predict(self, truth: Truth) -> Gaussians | Pictures:
@@ -134,9 +136,10 @@ def open_job(options: ViewsOptions) -> Job:
     device = str(pick_device(options.device))
     dataset = open_dataset(options.data, options.split)
     uids = choose_objects(dataset.uids, (), options.limit)
-    evaluation = gso.protocol_of(uids) if options.protocol == "gso" else None
-    if evaluation is not None:
-        uids = [uid for uid in uids if uid in gso.NAMES]
+    evaluation = None
+    if options.protocol == "gso":
+        names = gso.names_of(options.objects)
+        evaluation, uids = gso.protocol_of(uids, names), [uid for uid in uids if uid in names]
         if not uids:
             raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
     _check_outputs(options, uids)
@@ -180,6 +183,7 @@ def open_job(options: ViewsOptions) -> Job:
         **rendered,
     )
     job = Job(predictions, dataset, uids, protocol, network, device)
+    job.retrieval_data = [folder.resolve().name for folder in options.retrieval_data]
     reason = f"an object of --protocol gso that is not in {options.data}"
     job.missing = [failure(name, reason) for name in (evaluation or {"missing": ()})["missing"]]
     folder = None if options.out is None else output_folder(options.out)
@@ -225,11 +229,16 @@ def _add_baselines(job: Job, options: ViewsOptions) -> None:
     """
     job.baselines |= {"background": background, "input_copy": input_copy, "billboard": billboard}
     try:
-        training = open_dataset(options.data, "train")
+        first, *others = options.retrieval_data or (options.data,)
+        training = open_dataset(first, "train")
+        for folder in others:
+            training = training.joined(folder.resolve().name, open_dataset(folder, "train"))
         if options.save_retrieval:
             job.meshes = TrainingMeshes(options.save_retrieval, training)
         job.baselines["retrieval"] = job.retrieval = Retrieval(training)
     except UserError as error:
+        if options.retrieval_data:
+            raise UserError(f"--retrieval-data: {error}") from error
         if options.save_retrieval:
             raise UserError(f"--save-retrieval: {error}") from error
         job.left_out["retrieval"] = str(error)
@@ -440,6 +449,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         "uids_sha256": hashlib.sha256(os.fsencode("\n".join(job.uids))).hexdigest(),
         "baselines": {name: MEANING[name] for name in job.baselines},
         "contact_sheet": RULE,
+        **({"retrieval_data": job.retrieval_data} if job.retrieval_data else {}),
     }
     report = make_report(
         protocol,

@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -138,6 +139,23 @@ def test_retrieval_finds_the_twin_and_its_views(data):
     assert (uid, view) == ("seen", 4) and distance < 0.01
     shown = retrieval(truth)
     assert (shown.rgb - truth.rgb).abs().max() < 0.02 and (shown.mask() == truth.mask).all()
+
+
+def test_retrieval_takes_the_objects_of_other_datasets(data, tmp_path):
+    bare = tmp_path / "bare"
+    shutil.copytree(data / "twin", bare / "twin")
+    write_split(bare, train=[], test=["twin"])
+    options = ["--strips", 0, "--sheet", 0]
+    _, without = eval_views(data.parent / "pred", bare, tmp_path / "a", *options)
+    assert "retrieval" in without["left_out_baselines"]
+    chosen = ["--retrieval-data", data]
+    _, report = eval_views(data.parent / "pred", bare, tmp_path / "b", *options, *chosen)
+    (record,) = report["objects"]
+    assert (record["retrieval"]["uid"], record["retrieval"]["view"]) == ("seen", 4)
+    assert report["protocol"]["retrieval_data"] == ["data"]
+    assert "retrieval_data" not in without["protocol"]
+    words = ["--checkpoint", data.parent / "pred", "--data", bare, "--retrieval-data", bare]
+    assert run("eval-views", [*map(str, words)]) == 2
 
 
 def test_retrieval_leaves_out_the_object_itself(data):

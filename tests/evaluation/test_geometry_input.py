@@ -362,3 +362,16 @@ def test_what_of_a_shape_is_not_read_is_in_the_report(tmp_path, capfd):
         "1 of 1 predictions: the statement l is not read",
         "1 of 1 predictions: the statement vp is not read",
     ]
+
+
+def test_a_limit_takes_the_same_objects_of_every_row(tmp_path, capsys):
+    for folder, names in (("pred", "abcdef"), ("gt", "abcdef"), ("other", "abcde")):
+        for name in names:
+            (tmp_path / folder).mkdir(exist_ok=True)
+            trimesh.creation.box().export(tmp_path / folder / f"{name}.ply")
+    words = [tmp_path / "pred", tmp_path / "gt", "--baseline", tmp_path / "other", "--limit", 2]
+    words += ["--points", 50, "--up", "z", "--json"]
+    run("eval-geometry", [*map(str, words)])
+    report = json.loads(capsys.readouterr().out)
+    for part in (report, report["baselines"]["other"]):
+        assert [record["name"] for record in part["objects"]] == ["a", "d"]

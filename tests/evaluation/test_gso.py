@@ -5,6 +5,7 @@ import json
 import pytest
 import trimesh
 from helpers import micro
+from helpers.refusals import refused
 from helpers.views import eval_views, evaluated
 
 from gamba_warp.cli import run
@@ -48,6 +49,36 @@ def test_views(data, tmp_path, monkeypatch, capsys):
     assert printed.err.count("failed: ") == report["num_failed"] == 58
     assert "\n2 evaluated, 58 failed;" in printed.out
     assert [r["status"] for r in report["objects"]].count("failed") == 58
+
+
+def test_another_list_of_objects(data, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(gso, "SIZE", 24)
+    own = tmp_path / "own.txt"
+    own.write_text(f"not of the list\n\n{THERE[1]}\nabsent\n")
+    options = ["--protocol", "gso", "--objects", own, "--no-baselines", "--sheet", 0, "--strips", 0]
+    code, report = eval_views(data / "pred", data / "views", tmp_path / "out", *options)
+    said = report["protocol"]["evaluation"]
+    assert code == 1 and said["missing"] == ["absent"] and said["objects"] == 3
+    assert report["protocol"]["uids"] == [THERE[1], "not of the list"]
+    assert said["list"] == "given by --objects" and said["others"] == [THERE[0]]
+    words = [data / "pred", data / "meshes", "--protocol", "gso", "--data", data / "views"]
+    own.write_text(f"{THERE[0]}\n")
+    more = ["--objects", own, "--out", tmp_path / "shapes", "--points", 256]
+    more += ["--views", 8, "--pixels", 32, "--voxels", 24]
+    code = run("eval-geometry", [*map(str, [*words, *more])])
+    found = json.loads((tmp_path / "shapes" / "report.json").read_text())
+    assert (found["evaluation"]["objects"], found["evaluation"]["evaluated"]) == (1, 1)
+    capsys.readouterr()
+    refusals = {b"": "has no names", b"a\na\n": "a occurs twice", b"\xff": "not UTF-8"}
+    refusals |= {b"../x\n": "leaves its folder", b"a/b\n": "not that of one file"}
+    for text, reason in refusals.items():
+        own.write_bytes(text)
+        refused(reason, gso.names_of, own)
+    assert run("eval-geometry", [*map(str, words), "--limit", "1"]) == 2
+    assert "--limit: --protocol gso has its own objects" in capsys.readouterr().err
+    words = ["--checkpoint", str(data / "pred"), "--data", str(data / "views")]
+    assert run("eval-views", [*words, "--objects", str(own)]) == 2
+    assert "--objects: needs --protocol gso" in capsys.readouterr().err
 
 
 def test_its_options_are_its_own(data, capsys):

@@ -306,6 +306,7 @@ def data_gso_command(
     up: Up = "auto",
     size: Annotated[int, Meta(ge=8, le=4096)] = 512,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
+    objects: Path | None = None,
 ) -> int:
     """Make the evaluation "gso" from a copy of Google Scanned Objects: 60 objects, 24 views each.
 
@@ -321,13 +322,15 @@ def data_gso_command(
             for other formats. Those of the Fuel server have z.
         share: selection of objects.
         size: pixels a side; the evaluation's are 512.
+        objects: text file of other objects, one name a line: the same poses, another list.
         workers: number of processes that render; 0 means one per core.
     """
-    from gamba_warp.data.gso import NAMES, UP
+    from gamba_warp.data.gso import UP, names_of
 
     from .gso import find_meshes_of, make_views, others_of, take_models, taken, up_of
 
-    names = share.of(NAMES)
+    listed = names_of(objects)
+    names = share.of(listed)
     meshes, truths, axis = find_meshes_of(source, names), source, ""
     if meshes:
         up = up_of(meshes, up)
@@ -342,7 +345,7 @@ def data_gso_command(
         meshes = taken(out, names)
     failures = {name: why for name, why in failures.items() if name not in {m.uid for m in meshes}}
     print(f"{len(meshes)} of {len(names)} found: {', '.join(mesh.uid for mesh in meshes)}")
-    if others := others_of(source):
+    if others := others_of(source, listed):
         left = f"{counted(others, 'other object')} of the set outside the evaluation"
         print(f"{left}: gamba data render {source} --out DATA")
     made, warnings, failed = make_views(out, meshes, size, workers, up)
@@ -350,7 +353,9 @@ def data_gso_command(
     code = _report(failures, "missing", warnings)
     views, missing = out / "views", f"{len(failures)} of {len(names)} missing"
     print(f"rendered {counted(made, 'object')} into {views}, {missing}")
-    print(f"next: gamba eval-views --protocol gso --checkpoint MODEL --data {views} --out EVAL")
+    own = "" if objects is None else f" --objects {objects}"
+    evaluation = f"--protocol gso{own} --checkpoint MODEL --data {views} --out EVAL"
+    print(f"next: gamba eval-views {evaluation}")
     geometry = f"gamba eval-geometry EVAL/gaussians {truths}"
-    print(f"      {geometry} --protocol gso{axis} --data {views}")
+    print(f"      {geometry} --protocol gso{own}{axis} --data {views}")
     return code

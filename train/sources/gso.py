@@ -87,9 +87,9 @@ def find_meshes_of(source: Path, names: Sequence[str]) -> list[Mesh]:
     return []
 
 
-def others_of(source: Path) -> int:
-    """Number of the set's models in a folder that are outside the evaluation."""
-    others = sorted(gso.all_names() - {*gso.NAMES})
+def others_of(source: Path, names: Sequence[str] = gso.NAMES) -> int:
+    """Number of the set's models in a folder that are outside the evaluation's ``names``."""
+    others = sorted(gso.all_names() - {*names})
     with suppress(UserError):
         return len(find_models(source, others))
     return len(find_meshes_of(source, others))
@@ -205,7 +205,7 @@ def take_models(source: Path, out: Path, names: Sequence[str]) -> dict[str, str]
             "group": name,
             "attribution": attribution_of(meshes / name),
         }
-        for name in gso.NAMES
+        for name in sorted({*gso.NAMES, *names})
         if (meshes / name / "model.obj").is_file()
     ]
     write_json(meshes / CATALOGUE, {"objects": entries})
