@@ -10,7 +10,7 @@ from torch import Tensor
 from ..runtime.packed import sequences
 from ..runtime.views import tokens_first
 from . import ops
-from .problem import DISCRETIZATIONS, Scan
+from .problem import DISCRETIZATIONS, Inputs, Options
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 MAX_STATES = 256
@@ -73,11 +73,10 @@ def _check_common(
     return states, packed
 
 
-def _run(x: Scan) -> tuple[Tensor, Tensor]:
-    """Output and last state; keeps the states between if a gradient may be asked for."""
-    tensors = (v for v in x if isinstance(v, Tensor))
-    save = torch.is_grad_enabled() and any(v.requires_grad for v in tensors)
-    out, last, _ = ops.scan(*x._replace(save=save))
+def _run(x: Inputs, options: Options) -> tuple[Tensor, Tensor]:
+    """Output and last state; saves the states between them if a gradient may follow."""
+    save = torch.is_grad_enabled() and any(v is not None and v.requires_grad for v in x)
+    out, last, _ = ops.scan(*x, *options._replace(save=save))
     return out, last
 
 
@@ -185,7 +184,7 @@ def selective_scan(
     Raises:
         TypeError: an argument is not a tensor or has another dtype.
         ValueError: a shape, a device or ``discretization`` is not one of the above, or
-            ``cu_seqlens`` or ``seq_idx`` is none (``runtime.packed.sequences``).
+            ``cu_seqlens`` or ``seq_idx`` is invalid (``runtime.packed.sequences``).
     """
     states, packed = _check_common(
         u, delta, A, delta_bias, initial_state, discretization, cu_seqlens, seq_idx
@@ -197,8 +196,8 @@ def selective_scan(
         _check("D", D, (u.shape[2],), DTYPES, u.device)
     if z is not None:
         _check("z", z, tuple(u.shape), (u.dtype,), u.device)
-    tensors = (u, delta, A, B, C, D, z, delta_bias, initial_state, packed)
-    out, last = _run(Scan(*tensors, delta_softplus, discretization, False))
+    inputs = Inputs(u, delta, A, B, C, D, z, delta_bias, initial_state)
+    out, last = _run(inputs, Options(packed, delta_softplus, discretization, save=False))
     return (out, last) if return_last_state else out
 
 
@@ -240,8 +239,10 @@ def selective_scan_state(
         u, delta, A, delta_bias, initial_state, discretization, cu_seqlens, seq_idx
     )
     B = _check_groups("B", B, u, states)
-    tensors = (u, delta, A, B, None, None, None, delta_bias, initial_state, packed)  # no C, D, z
-    return _run(Scan(*tensors, delta_softplus, discretization, False))[1]
+    inputs = Inputs(
+        u, delta, A, B, C=None, D=None, z=None, delta_bias=delta_bias, initial_state=initial_state
+    )
+    return _run(inputs, Options(packed, delta_softplus, discretization, save=False))[1]
 
 
 def input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:

@@ -8,8 +8,9 @@ from torch import Tensor
 from ..runtime.operator import operator
 from ..runtime.stand_in import kind_of
 from .cpu import launch as cpu
-from .problem import Scan
+from .problem import Inputs, Options, Scan
 
+# the fields of ``Inputs``, then those of ``Options``
 _SCAN = (
     "Tensor u, Tensor delta, Tensor A, Tensor B, Tensor? C, Tensor? D, Tensor? z, "
     "Tensor? delta_bias, Tensor? initial_state, Tensor? packed, bool softplus, "
@@ -17,8 +18,8 @@ _SCAN = (
 )
 
 
-def _implementation(x: Scan):
-    if kind_of(x.u.device) == "cpu":
+def _implementation(u: Tensor):
+    if kind_of(u.device) == "cpu":
         return cpu
     from .cuda import launch as cuda
 
@@ -30,19 +31,20 @@ def _implementation(x: Scan):
     mutates_args=(),
     schema=f"({_SCAN}) -> (Tensor, Tensor, Tensor)",
 )
-def scan(*args) -> tuple[Tensor, Tensor, Tensor]:
-    """``(out, last state, saved states)`` of the fields of a ``Scan``; without C, out is empty."""
-    x = Scan(*args)
-    return _implementation(x).forward(x)
+def scan(*arguments) -> tuple[Tensor, Tensor, Tensor]:
+    """``(out, last state, saved states)`` of ``Scan.of(*arguments)``; without C, out is empty."""
+    x = Scan.of(*arguments)
+    return _implementation(x.inputs.u).forward(x)
 
 
 @scan.register_fake
-def _(*args):
-    x = Scan(*args)
-    out = torch.empty_like(x.u, memory_format=torch.contiguous_format)
-    last = x.A.new_empty(x.sequences, *x.A.shape)
-    saved = x.A.new_empty(_implementation(x).saved_shape(x))
-    return out if x.C is not None else out.new_empty(x.u.shape[0], 0, x.u.shape[2]), last, saved
+def _(*arguments):
+    x = Scan.of(*arguments)
+    u, A, C = x.inputs.u, x.inputs.A, x.inputs.C
+    out = torch.empty_like(u, memory_format=torch.contiguous_format)
+    last = A.new_empty(x.sequences, *A.shape)
+    saved = A.new_empty(_implementation(u).saved_shape(x))
+    return out if C is not None else out.new_empty(u.shape[0], 0, u.shape[2]), last, saved
 
 
 @torch.library.custom_op(
@@ -50,44 +52,46 @@ def _(*args):
     mutates_args=(),
     schema=f"(Tensor? dout, Tensor? dlast, Tensor saved, bool[] needs, {_SCAN}) -> Tensor[]",
 )
-def _scan_backward(dout, dlast, saved, needs, *args) -> list[Tensor]:
-    x = Scan(*args)
-    grads = _implementation(x).backward(dout, dlast, x, saved, needs)
-    return [grad for grad in grads if grad is not None]
+def _scan_backward(dout, dlast, saved, needs, *arguments) -> list[Tensor]:
+    x = Scan.of(*arguments)
+    backward = _implementation(x.inputs.u).backward
+    return [g for g in backward(dout, dlast, x, saved, Inputs(*needs)) if g is not None]
 
 
 @_scan_backward.register_fake
-def _(dout, dlast, saved, needs, *args):
-    x = Scan(*args)
-    state = x.A.new_empty(x.sequences, *x.A.shape)
+def _(dout, dlast, saved, needs, *arguments):
+    x = Scan.of(*arguments)
+    A = x.inputs.A
+    like = x.inputs._replace(initial_state=A.new_empty(x.sequences, *A.shape))
     return [
         torch.empty_like(tensor, memory_format=torch.contiguous_format)
-        for tensor, needed in zip((*x[:8], state), needs)
+        for tensor, needed in zip(like, needs)
         if needed and tensor is not None
     ]
 
 
 def _setup_context(ctx, inputs, output):
-    x = Scan(*inputs)
+    x = Scan.of(*inputs)
     _, _, saved = output
     ctx.mark_non_differentiable(saved)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*x[:8], x.packed, saved)
-    ctx.options = x[10:]
+    # a gradient does not read the first state
+    ctx.save_for_backward(*x.inputs._replace(initial_state=None), x.options.packed, saved)
+    ctx.options = x.options._replace(packed=None)
 
 
 def _gradient(ctx, dout, dlast, _):
     *tensors, packed, saved = ctx.saved_tensors
-    x = Scan._make((*tensors, None, packed, *ctx.options))
-    if not x.save:
+    x = Scan(Inputs(*tensors), ctx.options._replace(packed=packed))
+    if not x.options.save:
         raise RuntimeError("selective_scan: this call kept nothing for a gradient")
-    needs = list(ctx.needs_input_grad[:9])
-    if x.C is None:
+    needs = Inputs(*ctx.needs_input_grad[: len(Inputs._fields)])
+    if x.inputs.C is None:
         dout = None
     elif dout is None:
-        dout = x.u.new_zeros(1, 1, x.u.shape[2]).expand_as(x.u)
-    grads = iter(_scan_backward(dout, dlast, saved, needs, *x))
-    return (*(next(grads) if needed else None for needed in needs), *[None] * 4)
+        dout = x.inputs.u.new_zeros(1, 1, x.inputs.u.shape[2]).expand_as(x.inputs.u)
+    grads = iter(_scan_backward(dout, dlast, saved, [*needs], *x.inputs, *x.options))
+    return *(next(grads) if needed else None for needed in needs), *[None] * len(Options._fields)
 
 
 def _no_second_gradient(ctx, *grads):

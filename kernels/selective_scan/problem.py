@@ -6,50 +6,86 @@ A rule (equations 2 to 4 of README.md) is an entry here, a branch on both device
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from ..runtime.scalars import LOG2E
 
 
-class Scan(NamedTuple):
-    """The arguments of a scan, checked: the tensors of ``selective_scan`` and its options.
+class Inputs(NamedTuple):
+    """Tensors of a scan, their gradients, or a bool for each: True to compute its gradient.
 
     Attributes:
-        u: ``[B, L, D]``.
+        u: ``[B, L, D]``. A gradient that is not needed is None.
         delta: as u.
-        A: ``[D, N]``.
+        A: ``[D, N]`` float32.
         B: ``[B, L, G, N]``.
-        C: as B; None where the last state alone is asked for.
+        C: as B; None to compute only the last state.
         D: ``[D]``, or None.
         z: as u, or None.
         delta_bias: ``[D]``, or None.
-        initial_state: ``[B, D, N]``, or None; of packed rows ``[S, D, N]``.
-        packed: the sequences of packed rows (``runtime.packed``), or None.
-        softplus: whether δ is a softplus.
-        discretization: one of ``DISCRETIZATIONS``.
-        save: whether the states are kept that a gradient starts from.
+        initial_state: ``[B, D, N]`` float32, or None; of packed rows ``[S, D, N]``.
     """
 
-    u: Tensor
-    delta: Tensor
-    A: Tensor
-    B: Tensor
-    C: Tensor | None
-    D: Tensor | None
-    z: Tensor | None
-    delta_bias: Tensor | None
-    initial_state: Tensor | None
+    u: Any
+    delta: Any
+    A: Any
+    B: Any
+    C: Any
+    D: Any
+    z: Any
+    delta_bias: Any
+    initial_state: Any
+
+
+class Options(NamedTuple):
+    """Arguments of a scan without a gradient.
+
+    Attributes:
+        packed: the sequences of packed rows (``runtime.packed``), or None.
+        softplus: True if δ is a softplus.
+        discretization: one of ``DISCRETIZATIONS``.
+        save: True to save the states from which a gradient starts.
+    """
+
     packed: Tensor | None
     softplus: bool
     discretization: str
     save: bool
 
+
+class Scan(NamedTuple):
+    """A scan with checked arguments."""
+
+    inputs: Inputs
+    options: Options
+
+    @classmethod
+    def of(cls, *arguments: Any) -> Scan:
+        """Return the scan of an operator's arguments: the inputs, then the options."""
+        count = len(Inputs._fields)
+        return cls(Inputs(*arguments[:count]), Options(*arguments[count:]))
+
     @property
     def sequences(self) -> int:
         """Number of sequences: B, or S of packed rows."""
-        return len(self.u if self.packed is None else self.packed)
+        return len(self.inputs.u if self.options.packed is None else self.options.packed)
+
+
+def in_dtypes(gradients: Inputs, inputs: Inputs, needs: Inputs) -> Inputs:
+    """Return the needed gradients, dense and in the dtypes of their inputs.
+
+    That of ``initial_state``, which a backward pass does not have, is float32 as ``A``.
+    """
+    dtypes = inputs._replace(initial_state=inputs.A)
+    return Inputs(
+        *(
+            x.to(like.dtype, memory_format=torch.contiguous_format) if needed else None
+            for x, like, needed in zip(gradients, dtypes, needs)
+        )
+    )
 
 
 class Discretization(NamedTuple):

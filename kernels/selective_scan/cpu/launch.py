@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -14,7 +11,7 @@ from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.packed import count_slots, slots
 from ...runtime.views import filled, lane_contiguous, view
-from ..problem import DISCRETIZATIONS, Scan, sum_parts
+from ..problem import DISCRETIZATIONS, Inputs, Scan, in_dtypes, sum_parts
 from . import kernels
 from .kernels import BLOCKS, FEW, NEEDS, SPAN, Kind, Sizes, Tuning
 
@@ -24,10 +21,10 @@ SEGMENT = 4  # chunks of a segment at least
 
 def _chunks(x: Scan, chunk: int) -> int:
     """Number of chunks of so many tokens in all sequences; an upper bound where they are packed."""
-    batch, length, _ = x.u.shape
-    if x.packed is None:
+    (batch, length, _), packed = x.inputs.u.shape, x.options.packed
+    if packed is None:
         return batch * -(-length // chunk)
-    return count_slots(x.packed, batch, length, chunk)
+    return count_slots(packed, batch, length, chunk)
 
 
 class Layout:
@@ -48,9 +45,9 @@ class Layout:
             chunk: tokens; a state is saved at the start of each chunk.
             split: True to allow several segments.
         """
-        self.batch, self.length, self.channels = x.u.shape
-        self.states, self.groups = x.A.shape[1], x.B.shape[2]
-        self.sequences = x.sequences
+        self.batch, self.length, self.channels = x.inputs.u.shape
+        self.states, self.groups = x.inputs.A.shape[1], x.inputs.B.shape[2]
+        self.sequences, packed = x.sequences, x.options.packed
         self.group_width = self.channels // self.groups
         self.group_blocks = -(-self.group_width // W)
         self.blocks = self.groups * self.group_blocks
@@ -61,7 +58,7 @@ class Layout:
             span = min(SPAN, -(-per_thread // BLOCKS) * BLOCKS)
             return span, sequences * self.groups * -(-self.group_blocks // span)
 
-        _, alone = spans(self.batch if x.packed is None else 1)
+        _, alone = spans(self.batch if packed is None else 1)
         self.span, count = spans(self.sequences)
         most = -(-threads // alone) if split and 0 < alone < threads else 1
 
@@ -70,19 +67,19 @@ class Layout:
             return max(1, -(-length // (cuts * chunk))) * chunk
 
         self.chunks = _chunks(x, chunk)
-        if x.packed is None:
+        if packed is None:
             self.segment = segment(self.length)
             self.segments = max(1, -(-self.length // self.segment))
             self.rows, self.last = torch.empty(0, 4, dtype=torch.int32), -1
         else:
             self.segment = self.length
-            b, begin, end = x.packed.unbind(1)
+            b, begin, end = packed.unbind(1)
             own = torch.tensor([*map(segment, (end - begin).tolist())], dtype=torch.int32)
             counts = (-(-(end - begin) // own)).clamp(min=1)
             self.segments = int(counts.max()) if len(counts) else 1
             step = torch.arange(self.segments, dtype=torch.int32)[:, None]
             first = torch.minimum(begin + step * own, end)
-            place = slots(x.packed, self.length, chunk) + step * (own // chunk)
+            place = slots(packed, self.length, chunk) + step * (own // chunk)
             rows = b.expand_as(first), first, torch.minimum(first + own, end), place
             self.rows = torch.stack(rows, 2).flatten(0, 1)
             self.last = -1
@@ -133,12 +130,13 @@ def _rows(states: Tensor | None):
 class _Operands:
     """Operands that the launches of one call share."""
 
-    def __init__(self, x: Scan, split: bool = True):
+    def __init__(self, scan: Scan, split: bool = True):
+        x, options = scan
         states = x.A.shape[1]
         tuning = TUNING._replace(walked=TUNING.walked or (2 if states <= FEW else 4))
-        self.layout = y = Layout(x, tuning.chunk, split)
-        self.kind = Kind(x.u.dtype, x.delta.dtype, x.discretization, tuning)
-        self.options = int(x.softplus), int(x.z is not None)
+        self.layout = y = Layout(scan, tuning.chunk, split)
+        self.kind = Kind(x.u.dtype, x.delta.dtype, options.discretization, tuning)
+        self.options = int(options.softplus), int(x.z is not None)
         u, delta = lane_contiguous(x.u), lane_contiguous(x.delta)
         zero = x.A.new_zeros(y.channels, 1)
         skip, bias = (zero if v is None else v.float()[:, None] for v in (x.D, x.delta_bias))
@@ -179,21 +177,22 @@ class _Operands:
 
 def saved_shape(x: Scan) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    groups = x.B.shape[2]
-    blocks = groups * -(-(x.u.shape[2] // groups) // W)
-    return (_chunks(x, TUNING.chunk) if x.save else 0, blocks, x.A.shape[1], W)
+    channels, groups = x.inputs.u.shape[2], x.inputs.B.shape[2]
+    blocks = groups * -(-(channels // groups) // W)
+    return _chunks(x, TUNING.chunk) if x.options.save else 0, blocks, x.inputs.A.shape[1], W
 
 
-def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
+def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
     """Runs the scan on the CPU.
 
     Returns:
         ``out [B, L, D]``, without tokens where there is no C, the last state ``[B, D, N]``, and
         the saved states that ``backward`` starts from (a private layout).
     """
+    x, options = scan
     read = x.C is not None
-    s = _Operands(x, split=read or not x.save)
-    y, starts = s.layout, empty(saved_shape(x), torch.float32)
+    s = _Operands(scan, split=read or not options.save)
+    y, starts = s.layout, empty(saved_shape(scan), torch.float32)
     out = empty(x.u.shape if read else (y.batch, 0, y.channels), x.u.dtype)
     first, last = x.initial_state, s.states()
     if y.segments > 1:
@@ -212,25 +211,22 @@ def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def backward(
-    dout: Tensor | None, dlast: Tensor | None, x: Scan, starts: Tensor, needs: Sequence[bool]
-) -> list[Tensor | None]:
+    dout: Tensor | None, dlast: Tensor | None, scan: Scan, starts: Tensor, needs: Inputs
+) -> Inputs:
     """Gradients of ``forward`` from those of its output and last state.
 
     Args:
         dout: of the output; None for 0.
         dlast: of the last state; None for 0.
-        x: the arguments of ``forward``, of which the first state is not read.
+        scan: the argument of ``forward``, of which the first state is not read.
         starts: the saved states.
-        needs: nine booleans for the tensors of ``x`` in their order.
-
-    Returns:
-        Nine tensors, None where not needed.
+        needs: True where a gradient is needed; the others are None.
     """
-    s = _Operands(x)
+    x, options = scan
+    s = _Operands(scan)
     y, chunk = s.layout, s.kind.tuning.chunk
-    need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
-    through = need_u or need_delta or need_A or need_B or need_bias or need_h
-    wanted = dict(zip(NEEDS, (need_z, need_C, need_B, through)))
+    through = any(needs._replace(C=False, D=False, z=False))  # gradients of the states
+    wanted = {"NEED_DZ": needs.z, "NEED_DC": needs.C, "NEED_DB": needs.B, "NEED_DH": through}
     flags = sum(NEEDS[name] for name, need in wanted.items() if need)
     dout = x.u.new_zeros(1, 1, y.channels).expand_as(x.u) if dout is None else dout
     dout = lane_contiguous(dout)
@@ -249,35 +245,30 @@ def backward(
         s.run(kernel, [s.c, dout], [s.work(4 * y.span), _rows(local), _rows(product)])
         dlast = _carry(dlast, local.flip(0), product.flip(0)).flip(0)
     dh, da = s.states(), s.states()
-    du, ddelta, dz = like(x.u, need_u), like(x.delta, need_delta), like(x.u, need_z)
-    db, dc = parts(need_B), parts(need_C)
-    make = torch.empty if x.packed is None else torch.zeros  # some have no chunk
+    du, ddelta, dz = like(x.u, needs.u), like(x.delta, needs.delta), like(x.u, needs.z)
+    db, dc = parts(needs.B), parts(needs.C)
+    make = torch.empty if options.packed is None else torch.zeros  # some have no chunk
     dchannel = make(y.chunks, 2, y.blocks, W, dtype=torch.float32)
     s.run(
         kernels.backward_kernel(s.kind),
         [s.b, s.c, view(starts, lanes), dout, _rows(dlast if through else None)],
         [
-            s.work(3 * y.span), s.work(2 * chunk), _rows(dh if need_h else None), du, ddelta, dz,
-            _rows(da if need_A else None), db, dc, view(dchannel, lanes),
+            s.work(3 * y.span), s.work(2 * chunk), _rows(dh if needs.initial_state else None),
+            du, ddelta, dz, _rows(da if needs.A else None), db, dc, view(dchannel, lanes),
         ],
         flags,
         [du, ddelta, dz],
     )  # fmt: skip
-    scale = DISCRETIZATIONS[x.discretization].scale
-    values = (
-        lambda: du,
-        lambda: ddelta,
-        lambda: da.sum((0, 1)) / scale,
-        lambda: y.total(db),
-        lambda: y.total(dc),
-        lambda: y.unpack(dchannel[:, 0].sum(0)),
-        lambda: dz,
-        lambda: y.unpack(dchannel[:, 1].sum(0)),
-        lambda: dh[0],
+    scale = DISCRETIZATIONS[options.discretization].scale
+    gradients = Inputs(
+        u=du,
+        delta=ddelta,
+        A=da.sum((0, 1)) / scale if needs.A else None,
+        B=y.total(db) if needs.B else None,
+        C=y.total(dc) if needs.C else None,
+        D=y.unpack(dchannel[:, 0].sum(0)) if needs.D else None,
+        z=dz,
+        delta_bias=y.unpack(dchannel[:, 1].sum(0)) if needs.delta_bias else None,
+        initial_state=dh[0],
     )
-    tensors: tuple[Any, ...] = (*x[:8], x.A)
-    dense = torch.contiguous_format
-    return [
-        value().to(tensor.dtype, memory_format=dense) if needed else None
-        for value, tensor, needed in zip(values, tensors, needs)
-    ]
+    return in_dtypes(gradients, x, needs)

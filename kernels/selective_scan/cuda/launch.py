@@ -21,7 +21,7 @@ from ...runtime.packed import count_slots
 from ...runtime.scalars import LOG2E, exp2
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
-from ..problem import DISCRETIZATIONS, Scan
+from ..problem import DISCRETIZATIONS, Inputs, Scan, in_dtypes
 from .backward import backward_kernel
 from .blocks import MARK, RUN, Sizes, block_shape
 from .forward import forward_kernel
@@ -175,7 +175,8 @@ class _Operands:
     waits for these.
     """
 
-    def __init__(self, x: Scan, state: Tensor | None, back: bool):
+    def __init__(self, scan: Scan, state: Tensor | None, back: bool):
+        x, options = scan
         self.batch, self.length, self.channels = x.u.shape
         self.states, self.groups, self.device = x.A.shape[1], x.B.shape[2], x.u.device
         tuning = scan_tuning(x.u.shape, self.states, self.groups, self.device)
@@ -183,21 +184,21 @@ class _Operands:
         if back:
             per_thread = (tuning.back_channels, tuning.back_states)
             segments = tuning.back_segments
-        if x.packed is not None:
+        if options.packed is not None:
             segments = 1
         self.shape = block_shape(tuning.block, *per_thread, self.states)
         self.marks = -(-self.length // MARK)
         self.segment = -(-max(self.marks, 1) // segments) * MARK
         self.segments = -(-self.length // self.segment)
         self.parts = -(-(self.channels // self.groups) // self.shape.span)
-        self.sequences = x.sequences
-        self.packed = x.packed
-        if x.packed is None:
+        self.sequences, self.packed = scan.sequences, options.packed
+        if self.packed is None:
             self.packed = torch.empty(0, 3, dtype=torch.int32, device=self.device)
 
         C = x.B if x.C is None else x.C
         matrix = x.B.dtype if x.B.dtype == C.dtype else torch.float32
-        self.mode, self.softplus, self.use_z = x.discretization, x.softplus, x.z is not None
+        self.mode, self.softplus = options.discretization, options.softplus
+        self.use_z = x.z is not None
         self.exponential = DISCRETIZATIONS[self.mode].exponential
         self.dtypes = (x.u.dtype, x.delta.dtype, matrix)
         self.u, self.delta = lane_contiguous(x.u), lane_contiguous(x.delta)
@@ -217,15 +218,18 @@ class _Operands:
     def empty(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=torch.float32, device=self.device)
 
-    def inputs(self, save: bool = False) -> list:
-        """Return the arguments that the forward and the gradient begin with."""
+    def sizes(self, save: bool = False) -> Sizes:
         sizes = Sizes()
         sizes.length, sizes.states, sizes.groups = self.length, self.states, self.groups
         sizes.group_width = self.channels // self.groups
         sizes.parts, sizes.segments, sizes.segment = self.parts, self.segments, self.segment
         sizes.save = int(save)
+        return sizes
+
+    def inputs(self, save: bool = False) -> list:
+        """Return the arguments that the forward and the gradient begin with."""
         tensors = self.u, self.delta, self.z, self.A[None], self.B, self.C, self.skip, self.bias
-        return [sizes, self.packed, *tensors]
+        return [self.sizes(save), self.packed, *tensors]
 
     def launch(self, kernel: Any, inputs: list, outputs: list) -> None:
         blocks = self.sequences * self.segments * self.groups * self.parts
@@ -254,20 +258,21 @@ class _Operands:
 
 def saved_shape(x: Scan) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns, whatever the tuning."""
-    batch, length, _ = x.u.shape
+    (batch, length, _), packed = x.inputs.u.shape, x.options.packed
     rows = batch * -(-length // MARK)
-    if x.packed is not None:
-        rows = count_slots(x.packed, batch, length, MARK)
-    return (rows if x.save else 0, *x.A.shape)
+    if packed is not None:
+        rows = count_slots(packed, batch, length, MARK)
+    return (rows if x.options.save else 0, *x.inputs.A.shape)
 
 
-def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
+def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
     """Runs the scan on CUDA; results as those of the CPU's."""
+    x, options = scan
     read = x.C is not None
-    o = _Operands(x, x.initial_state, back=False)
+    o = _Operands(scan, x.initial_state, back=False)
     shape = (o.batch, o.length if read else 0, o.channels)
     out = torch.empty(shape, dtype=o.u.dtype, device=o.device)
-    saved = o.empty(*saved_shape(x))
+    saved = o.empty(*saved_shape(scan))
     if not o.u.numel():
         return out, o.state, saved
     first, none = o.state, o.empty(0, 0, 0)
@@ -278,26 +283,26 @@ def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
     last = torch.empty_like(o.state)
     outputs = [last, none, saved, out]
     chosen = kernel(read, False, o.softplus, o.use_z and read)
-    o.launch(chosen, [*o.inputs(x.save), first], outputs)
+    o.launch(chosen, [*o.inputs(options.save), first], outputs)
     return out, last, saved
 
 
 def backward(
-    dout: Tensor | None, dlast: Tensor | None, x: Scan, saved: Tensor, needs: Sequence[bool]
-) -> list[Tensor | None]:
+    dout: Tensor | None, dlast: Tensor | None, scan: Scan, saved: Tensor, needs: Inputs
+) -> Inputs:
     """Gradients of ``forward``; arguments and results as those of the CPU's."""
-    o = _Operands(x, dlast, back=True)
+    x, options = scan
+    o = _Operands(scan, dlast, back=True)
     read = dout is not None
-    need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
     wanted = {
         "read": read,
-        "du": need_u,
-        "ddelta": need_delta,
-        "dz": need_z,
-        "y": need_z and o.use_z and read,
-        "dB": need_B,
-        "dC": need_C and read,
-        "through": need_u or need_delta or need_A or need_B or need_bias or need_h,
+        "du": needs.u,
+        "ddelta": needs.delta,
+        "dz": needs.z,
+        "y": needs.z and o.use_z and read,
+        "dB": needs.B,
+        "dC": needs.C and read,
+        "through": any(needs._replace(C=False, D=False, z=False)),  # anything that needs dh
     }
     flags = frozenset(name for name, on in wanted.items() if on)
 
@@ -319,8 +324,8 @@ def backward(
     du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
     db, dc = sums("dB"), sums("dC")
     runs = o.batch * o.segments * -(-o.segment // (RUN * MARK))
-    if x.packed is not None:
-        runs = count_slots(x.packed, o.batch, o.length, RUN * MARK)
+    if options.packed is not None:
+        runs = count_slots(options.packed, o.batch, o.length, RUN * MARK)
     dfirst = torch.empty_like(o.state)
     da = o.state.new_zeros(runs, o.channels, o.states)
     dskip, dbias = o.state.new_zeros(2, runs, o.shape.rows, o.channels)
@@ -328,9 +333,9 @@ def backward(
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state
         if o.segments > 1:  # the gradient of the state after each segment
-            sizes, packed, _, delta, z, A, _, C, _, bias = o.inputs()
             kernel = summary_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, read)
-            last = o.carried(kernel, [sizes, packed, delta, z, A, C, bias, dout], [], True)
+            inputs = [o.sizes(), o.packed, o.delta, o.z, o.A[None], o.C, o.bias, dout]
+            last = o.carried(kernel, inputs, [], True)
         kernel = backward_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, flags)
         o.launch(
             kernel,
@@ -339,19 +344,15 @@ def backward(
         )
     else:
         dfirst = o.state
-    values = (
-        lambda: du,
-        lambda: ddelta,
-        lambda: da.sum(0),
-        lambda: total(db),
-        lambda: total(dc),
-        lambda: dskip.sum((0, 1)),
-        lambda: dz,
-        lambda: dbias.sum((0, 1)),
-        lambda: dfirst,
+    gradients = Inputs(
+        u=du,
+        delta=ddelta,
+        A=da.sum(0) if needs.A else None,
+        B=total(db) if needs.B else None,
+        C=total(dc) if needs.C else None,
+        D=dskip.sum((0, 1)) if needs.D else None,
+        z=dz,
+        delta_bias=dbias.sum((0, 1)) if needs.delta_bias else None,
+        initial_state=dfirst,
     )
-    tensors: tuple[Any, ...] = (*x[:8], x.A)
-    return [
-        value().to(tensor.dtype) if needed else None
-        for value, tensor, needed in zip(values, tensors, needs)
-    ]
+    return in_dtypes(gradients, x, needs)

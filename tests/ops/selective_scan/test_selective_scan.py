@@ -17,7 +17,7 @@ from helpers.scan import (
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_fn
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu
-from gamba_warp.kernels.selective_scan.problem import Scan
+from gamba_warp.kernels.selective_scan.problem import Inputs, Options, Scan
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 
 
@@ -100,11 +100,11 @@ def test_one_gradient_alone(name):
 
 
 def test_unneeded_gradients_are_not_computed():
-    x = Scan(*make(1, 10, 5, 2).values(), None, True, "mamba", True)
+    x = Scan(Inputs(**make(1, 10, 5, 2)), Options(None, True, "mamba", save=True))
     out, _, saved = cpu.forward(x)
-    needs = [name == "C" for name in x._fields[:9]]
+    needs = Inputs(*(name == "C" for name in Inputs._fields))
     grads = cpu.backward(torch.ones_like(out), None, x, saved, needs)
-    assert [g is not None for g in grads] == needs
+    assert Inputs(*(g is not None for g in grads)) == needs
 
 
 @every_discretization
@@ -260,9 +260,10 @@ def test_no_second_derivative():
 @pytest.mark.parametrize("read", [True, False])
 def test_operator_contract(read):
     """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
-    x = Scan(*leaves(make(2, 7, 5, 2)).values(), None, True, "mamba", True)
+    x = Inputs(**leaves(make(2, 7, 5, 2)))
     x = x if read else x._replace(C=None, D=None, z=None)
-    torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, tuple(x))
+    arguments = *x, *Options(None, True, "mamba", save=True)
+    torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, arguments)
 
 
 def test_a_compiled_scan_is_the_scan():

@@ -8,9 +8,9 @@ from helpers.scan import STATE, leaves, make, oracle
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning, choose
-from gamba_warp.kernels.selective_scan.problem import Scan
+from gamba_warp.kernels.selective_scan.problem import Inputs, Options, Scan
 
-NAMES = Scan._fields[:9]
+NAMES = Inputs._fields
 LIMIT = 2e-6  # float32 sums of a few hundred terms; measured below 6e-7
 
 
@@ -28,11 +28,13 @@ def tuned(monkeypatch):
 
 def run(inputs, discretization, v_out, v_last, softplus=True, needs=None):
     """Outputs, last state and the gradients that are needed (of all inputs), by name."""
-    x = Scan(*(inputs.get(k) for k in NAMES), None, softplus, discretization, True)
+    options = Options(None, softplus, discretization, save=True)
+    x = Scan(Inputs(*(inputs.get(k) for k in NAMES)), options)
     out, last, saved = cuda.forward(x)
-    grads = cuda.backward(v_out, v_last, x, saved, [k in (needs or inputs) for k in NAMES])
+    needed = Inputs(*(k in (needs or inputs) for k in NAMES))
+    grads = cuda.backward(v_out, v_last, x, saved, needed)._asdict()
     got = {"out": out} if v_out is not None else {}
-    return got | {"last": last} | {k: g for k, g in zip(NAMES, grads) if g is not None}
+    return got | {"last": last} | {k: g for k, g in grads.items() if g is not None}
 
 
 def exact(inputs, discretization, v_out, v_last, softplus=True):

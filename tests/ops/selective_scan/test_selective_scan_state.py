@@ -17,7 +17,7 @@ from helpers.scan import (
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.cpu.launch import Layout
-from gamba_warp.kernels.selective_scan.problem import Scan
+from gamba_warp.kernels.selective_scan.problem import Inputs, Options, Scan
 
 
 def state_of(*shape):
@@ -76,7 +76,8 @@ def test_state_refuses_bad_input():
 def test_segments_match_oracle(threads, discretization):
     """Too few channels for the threads: the tokens are cut, and states carried over the cuts."""
     inputs = make(1, 1111, 21, 3)
-    layout = Layout(Scan(*inputs.values(), None, True, discretization, True), 64)
+    options = Options(None, True, discretization, save=True)
+    layout = Layout(Scan(Inputs(**inputs), options), 64)
     assert layout.segments == {2: 2, 5: 4}[threads]
     compare(inputs, alone=True, discretization=discretization)
 
