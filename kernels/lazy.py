@@ -13,7 +13,7 @@ def load_when_used(package: str, sources: dict[str, str]) -> None:
     The names become properties of the package's class. A module's ``__getattr__`` (PEP 562) would
     not do, because it is asked only where there is no attribute: importing the module
     ``gamba_warp.render`` would set the attribute ``render`` to the module, and the function of
-    that name could not be reached any more. A property stays what it is.
+    that name could not be reached any more. A property is unchanged.
 
     Args:
         package: the package's ``__name__``.

@@ -1,3 +1,5 @@
+// needs: kernels.py: dout_in, dx_out, dstate_out, use_silu, RUN, AHEAD, dweight_out, task, k
+// gives: the body of conv_backward
 // Equation 2 for a chunk of tokens. dx of token t needs the gradients g of t to t + 3: the loop
 // runs three tokens behind.
 #include "window.h"

@@ -1,3 +1,5 @@
+// needs: kernels.py: y_out, use_silu, stream, AHEAD, WIDTH, x_in
+// gives: the body of conv_forward
 // Equation 1 for a strip of tokens.
 #include "window.h"
 const auto ys = rows_(y_out, b, 0, d, width);
@@ -9,7 +11,7 @@ auto step = [&](int t, F x3) {
 };
 int t = t0;
 #if defined(__CUDA_ARCH__)
-// No load can pass a store, which might write what it reads: so those of some tokens come first.
+// No load can pass a store, which might write its address: so the loads of some tokens come first.
 for (; xs.whole && ys.whole && t + AHEAD <= end; t += AHEAD) {
     F ahead[AHEAD];
 #pragma unroll

@@ -81,7 +81,7 @@ def causal_conv1d(
     Raises:
         TypeError: an argument is not a tensor or has another dtype.
         ValueError: a shape, a device or ``activation`` is not one of the above, or
-            ``cu_seqlens`` or ``seq_idx`` is none (``runtime.packed.sequences``).
+            ``cu_seqlens`` or ``seq_idx`` is invalid (``runtime.packed.sequences``).
     """
     tensors = {"x": x, "weight": weight, "bias": bias, "initial_state": initial_state}
     for name, value in tensors.items():
@@ -153,7 +153,7 @@ def causal_conv1d_fn(
     final_states_out: Tensor | None = None,
     activation: str | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """Does what causal-conv1d's ``causal_conv1d_fn`` does, with the same arguments and layout.
+    """Convolve with the arguments and layout of causal-conv1d's ``causal_conv1d_fn``.
 
     Args:
         x: ``[B, D, L]`` float32, bfloat16 or float16.

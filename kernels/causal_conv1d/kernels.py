@@ -11,8 +11,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from ..runtime.lanes import PRELUDE, ROWS, WARP_DTYPES, W, lanes
-from ..runtime.native import native, native_kernel
+from ..runtime.native import PRELUDE, WARP_DTYPES, W, lanes, native, native_kernel
 from ..runtime.scalars import BITS, EXP2, RECIPROCAL
 
 TAPS = 4
@@ -29,7 +28,7 @@ VALUES = {"cpu": (lanes, W), "cuda": (wp.vec4, 4)}  # type of a value, and its c
 
 def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
     on_cpu = device_type == "cpu"
-    head = PRELUDE + ROWS if on_cpu else EXP2 + RECIPROCAL
+    head = PRELUDE if on_cpu else EXP2 + RECIPROCAL
     return head + native(
         Path(__file__).with_name(file),
         ELEMENT=BITS[io]["ELEMENT"],

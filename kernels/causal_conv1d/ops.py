@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from ..runtime.lanes import streams
 from ..runtime.launch import launch
 from ..runtime.memory import empty
+from ..runtime.native import streams
 from ..runtime.operator import operator
 from ..runtime.packed import count_slots, pieces
 from ..runtime.stand_in import kind_of

@@ -1,4 +1,8 @@
-// What both kernels begin with. A value F is WIDTH channels, from the head of kernels.py: sixteen
+// needs: kernels.py: WIDTH, x_in, PIECE, pieces_in, task, k, state_in, weight_in, bias_in;
+//     scalars.py: reciprocal_, exp2_, ELEMENT; lanes.h: rows_, read_, write_, put_, fma_, sigmoid_
+// gives: F, each_, fma_, sigmoid_, one, rows_, b, t0, d, width, read_, write_, put_, next_, pieces,
+//     begin, stop, own, end, xs, before, w, taps, w0, w1, w2, w3, bias, x0, x1, x2
+// The beginning of both kernels. A value F is WIDTH channels, from the head of kernels.py: sixteen
 // lanes on a CPU, a few numbers on CUDA.
 #if defined(__CUDA_ARCH__)
 struct F {
@@ -80,7 +84,7 @@ auto put_ = [&](const auto& rows, int t, F f, bool) { write_(rows, t, f); };
 auto next_ = [](const auto&, int) {};
 #else
 const F one = F{} + 1.0f;
-// Each row lies in another page, so no processor foresees that the next task wants its next lanes.
+// Each row is in another page, so no processor prefetches the next lanes for the next task.
 auto next_ = [](const auto& rows, int t) { __builtin_prefetch(rows.row(t) + WIDTH); };
 #endif
 const int pieces = (x_in.shape[1] + PIECE - 1) / PIECE;

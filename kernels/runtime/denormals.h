@@ -1,3 +1,5 @@
+// needs: nothing
+// gives: FlushDenormals
 // Until it goes out of scope, numbers below 2^-126 count as 0: a state that decays towards zero
 // passes through them, which slows x86 down a hundredfold.
 struct FlushDenormals {

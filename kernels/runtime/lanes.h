@@ -1,19 +1,27 @@
-// Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_rise_; TABLE:
-// whether a table takes its place where the processor has AVX-512.
-#include "vectors.h"
+// needs: native.py: TABLE, DEGREE
+// gives: F, I, splat, fma_, max_abs_, in_range_, LOG2E, shifter, POWER_2, POWER_3, POWER_4,
+//     POWER_5, POWER_6, horner_, exp2_clamped_, exp2_, decay_, exp2_parts_, exp2_fm1_,
+//     softplus_of_, softplus_, sigmoid_, rows_, H, S, Line, narrow_, read_, write_, put_
+// Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_fm1_; TABLE:
+// true to take a table instead where the processor has AVX-512.
+typedef float F __attribute__((vector_size(64), aligned(4)));
+typedef int I __attribute__((vector_size(64), aligned(4)));
+auto splat = [](float x) -> F { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; };
 #if TABLE && defined(__AVX512F__)
 #define TABLED true
 #else
 #define TABLED false
 #endif
 auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
-// max(top, |x|) by their bits, so that NaN is the greatest
-auto wider_ = [](F top, F x) -> F {
+// max(most, |x|) by their bits, so that NaN is the greatest
+auto max_abs_ = [](F most, F x) -> F {
     I i = (I)x & 0x7fffffff;
-    return (F)(i > (I)top ? i : (I)top);
+    return (F)(i > (I)most ? i : (I)most);
 };
-// whether |x| <= 125 in all lanes
-auto tame_ = [](F x) -> bool { return !__builtin_reduce_or(~((x <= 125.0f) & (x >= -125.0f))); };
+// true if |x| <= 125 in all lanes
+auto in_range_ = [](F x) -> bool {
+    return !__builtin_reduce_or(~((x <= 125.0f) & (x >= -125.0f)));
+};
 const float LOG2E = 1.44269504088896341f;
 const F shifter = splat(12583039.0f);
 
@@ -51,17 +59,17 @@ auto decay_ = [&](F x) -> F {
     return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
 };
 // p for |x| <= 125 and no NaN, of another degree: 2^x is near (1 + low) (1 + f p), where near is a
-// float32 and low what that rounds away. If |x| < 1/32, near is 1, low is 0 and f is x.
+// float32 and low its rounding error. If |x| < 1/32, near is 1, low is 0 and f is x.
 auto exp2_parts_ = [&](F x, F& near, F& low, F& f) -> F {
 #if TABLED
-    // From a table of 2^(i/16), which one instruction reads, and a cubic of what is left, |f| <=
-    // 1/32: one multiplication less than degree 5, and a smaller error. What the index adds to the
-    // exponent is taken from the table beforehand. 786432 = 1.5 * 2^19 rounds to sixteenths.
+    // From a table of 2^(i/16), which one instruction reads, and a cubic of the rest, |f| <=
+    // 1/32: one multiplication less than degree 5, and a smaller error. The table has the index's
+    // part of the exponent subtracted. 786432 = 1.5 * 2^19 rounds to sixteenths.
     const F plain = splat(786432.0f);
     const I table = {1065353216, 1065200323, 1065063874, 1064944595, 1064843248, 1064760626,
         1064697559, 1064654911, 1064633587, 1064634532, 1064658730, 1064707212, 1064781053,
         1064881375, 1065009351, 1065166205};
-    // what float32 rounds away of 2^(i/16), relative to it
+    // the rounding error of 2^(i/16) in float32, relative to it
     const F lows = {0.0f, 4.628547078944223e-08f, -1.199215704517087e-08f, 4.7297823435599184e-08f,
         3.193418085523092e-08f, 3.621057320657428e-08f, -3.099072076739873e-08f,
         -7.475213226193489e-09f, 1.7114271333440456e-08f, -3.047683416745883e-08f,
@@ -86,13 +94,13 @@ auto exp2_parts_ = [&](F x, F& near, F& low, F& f) -> F {
     else return horner_(f, POWER_6);
 #endif
 };
-// 2^x of the same x. Where |x| < 1/32, rise is 2^x - 1 and keeps what 2^x rounds away; elsewhere it
-// is some number.
-auto exp2_rise_ = [&](F x, F& rise) -> F {
+// 2^x of the same x. Where |x| < 1/32, fm1 is 2^x - 1 and keeps the digits that 2^x rounds away;
+// elsewhere it is any number.
+auto exp2_fm1_ = [&](F x, F& fm1) -> F {
     F near, low, f;
     const F p = exp2_parts_(x, near, low, f);
-    rise = f * p;
-    if constexpr (TABLED) return fma_(near, rise, near);
+    fm1 = f * p;
+    if constexpr (TABLED) return fma_(near, fm1, near);
     else return (F)((I)fma_(p, f, splat(1.0f)) + ((I)near - 0x3f800000));
 };
 
@@ -117,3 +125,78 @@ auto sigmoid_ = [&](F v) -> F {
     return (v < 0.0f ? e : splat(1.0f)) / (e + 1.0f);
 };
 #undef TABLED
+
+// Rows of a tensor [B, L, D] as lanes. A row is dense in D; tokens and batch elements may be
+// strided.
+
+// The rows from batch element b, token t0 and channel d on: lanes past the width are read as 0 and
+// not written.
+auto rows_ = [](auto& array, int b, int t0, int d, int width) __attribute__((always_inline)) {
+    auto* at = array.data;
+    struct Rows {
+        decltype(at) first;
+        size_t step;  // bytes
+        int width;
+        decltype(at) row(int t) const { return (decltype(at))((char*)first + t * step); }
+    };
+    at = (decltype(at))((char*)at + (size_t)b * array.strides[0] + (size_t)t0 * array.strides[1]);
+    return Rows{at + d, (size_t)array.strides[1], width};
+};
+
+typedef _Float16 H __attribute__((vector_size(32), aligned(2)));
+typedef unsigned short S __attribute__((vector_size(32), aligned(2)));
+typedef float Line __attribute__((vector_size(64), aligned(64)));
+// bfloat16 to nearest, ties to even; NaN stays a NaN
+auto narrow_ = [](I i) -> I {
+    I is_nan = (i & 0x7fffffff) > 0x7f800000;
+    I rounded = (i + 0x7fff + ((i >> 16) & 1)) >> 16;
+    return (is_nan ? (i >> 16) | 0x40 : rounded) & 0xffff;
+};
+
+auto read_ = [&](const auto& rows, int t) __attribute__((always_inline)) -> F {
+    auto* const row = rows.row(t);
+    F v = F{};
+    if constexpr (__is_same(decltype(row), float* const)) {
+        if (rows.width >= 16) return *(const F*)row;
+        for (int i = 0; i < rows.width; ++i) v[i] = row[i];
+    } else if constexpr (__is_same(decltype(row), wp::half* const)) {
+        if (rows.width >= 16) return __builtin_convertvector(*(const H*)row, F);
+        for (int i = 0; i < rows.width; ++i) v[i] = (float)((const _Float16*)row)[i];
+    } else {
+        if (rows.width >= 16) return (F)(__builtin_convertvector(*(const S*)row, I) << 16);
+        I wide = I{};
+        for (int i = 0; i < rows.width; ++i) wide[i] = (int)((const unsigned short*)row)[i] << 16;
+        v = (F)wide;
+    }
+    return v;
+};
+
+auto write_ = [&](const auto& rows, int t, F v) __attribute__((always_inline)) {
+    auto* const row = rows.row(t);
+    if constexpr (__is_same(decltype(row), float* const)) {
+        if (rows.width >= 16) *(F*)row = v;
+        else
+            for (int i = 0; i < rows.width; ++i) row[i] = v[i];
+    } else if constexpr (__is_same(decltype(row), wp::half* const)) {
+        if (rows.width >= 16) *(H*)row = __builtin_convertvector(v, H);
+        else
+            for (int i = 0; i < rows.width; ++i) ((_Float16*)row)[i] = (_Float16)v[i];
+    } else if (rows.width >= 16) {
+#if defined(__AVX512BF16__)  // one instruction: the same bits, but a result below 2^-126 becomes 0
+        typedef __bf16 N __attribute__((vector_size(32), aligned(2)));
+        *(N*)row = __builtin_convertvector(v, N);
+#else
+        *(S*)row = __builtin_convertvector(narrow_((I)v), S);
+#endif
+    } else {
+        const I narrow = narrow_((I)v);
+        for (int i = 0; i < rows.width; ++i) ((unsigned short*)row)[i] = (unsigned short)narrow[i];
+    }
+};
+
+// Large results bypass the caches: their lines need not be read before they are written, and would
+// evict data that is used soon. ``stream``: do so; all lines are whole, of float32.
+auto put_ = [&](const auto& rows, int t, F v, bool stream) __attribute__((always_inline)) {
+    if (stream) __builtin_nontemporal_store((Line)v, (Line*)rows.row(t));
+    else write_(rows, t, v);
+};

@@ -6,7 +6,7 @@ the result is freed, so every call would pay anew. Here it goes to a pool instea
 tensor holds its storage any more, and the next result of about that size is taken from there.
 
 Only our operators' results come from here. For those of torch's operators a command can tell the C
-library to keep what is freed (``gamba_warp.devices.keep_memory``); that is a setting of the whole
+library to keep freed memory (``gamba_warp.devices.keep_memory``); that is a setting of the whole
 process, which a library must not change, and it reaches no block of 256 MiB and more, as each
 result of a scan of 65,536 tokens and 1,024 channels is.
 """
@@ -34,7 +34,7 @@ _LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of a container, in /
 
 
 class _Block(mmap.mmap):
-    """Memory; ``lent`` says whether the system may take its pages."""
+    """Memory; ``lent``: the system may take its pages."""
 
     lent = False
 
@@ -66,9 +66,9 @@ class Pool:
         Its storage cannot be resized.
         """
         block = self._find(size)
-        if block is None:  # rounded up, and room to begin at a huge page
-            room = -(-size // _PAGE) * _PAGE + _PAGE
-            block = _Block(-1, room, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        if block is None:  # rounded up, and a page to begin at a huge page
+            rounded = -(-size // _PAGE) * _PAGE + _PAGE
+            block = _Block(-1, rounded, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
             with contextlib.suppress(OSError, AttributeError):  # a kernel without huge pages
                 block.madvise(mmap.MADV_HUGEPAGE)
         block.lent = False
@@ -112,11 +112,11 @@ class Pool:
                 self._free.insert(place, block)
 
     def size(self) -> int:
-        """Bytes that lie in the pool."""
+        """Bytes in the pool."""
         return sum(map(len, self._free[:]))
 
     def clear(self) -> None:
-        """Gives all that lies in the pool back to the system."""
+        """Give all memory of the pool back to the system."""
         self._free.clear()
 
 
@@ -153,6 +153,6 @@ def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
 
 
 def release() -> None:
-    """Gives the memory that waits for the next result back to the system."""
+    """Give unused memory of the pool back to the system."""
     if pool is not None:
         pool.clear()

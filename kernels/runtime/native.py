@@ -1,14 +1,20 @@
-"""C++ of the kernels: whole files beside an operator, as text of functions and CPU kernels."""
+"""C++ of the kernels: files beside an operator, as the text of native functions and CPU kernels.
+
+The kernels of ``[B, L, D]`` hold sixteen adjacent channels as one SIMD value, in the compiler's
+vector types, which become AVX-512, AVX2 or NEON instructions (``lanes.h``).
+"""
 
 from __future__ import annotations
 
 import linecache
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 import warp as wp
+from torch import Tensor
 
 _INCLUDE = re.compile(r'^[ \t]*#include "(.+)"[ \t]*\n', re.MULTILINE)
 
@@ -17,7 +23,7 @@ def native(path: Path, **defines: object) -> str:
     """The text of a C++ file whose parameters are macros, defined before it and undefined after it.
 
     Files that it includes stand in their place, so that the text holds all that is compiled: the
-    hash of a Warp module, by which compiled kernels are kept, follows every file's contents.
+    hash of a Warp module, by which compiled kernels are saved, follows every file's contents.
 
     Args:
         path: of the file; an ``#include "..."`` in it is relative to it.
@@ -66,7 +72,7 @@ def native_kernel(
         f"    {indices} = wp.tid()\n"
         f"    {name}_task(offset + {indices}, {names})\n"
     )
-    # Warp reads the source of what it compiles, and finds it there, as debuggers do.
+    # Warp reads the source of a kernel, and finds it there, as debuggers do.
     file = f"<{name}({names})>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file
     made: dict[str, Any] = {"__name__": __name__, "wp": wp}
@@ -76,3 +82,44 @@ def native_kernel(
     kernel.__annotations__ = {"offset": int, **arguments}
     made[f"{name}_task"] = wp.func_native(text)(task)
     return wp.kernel(kernel, enable_backward=False, module="unique")
+
+
+W = 16  # channels of a lane group: one cache line of float32
+lanes = wp.types.vector(W, wp.float32)
+WARP_DTYPES = {
+    torch.float32: wp.float32,
+    torch.float16: wp.float16,
+    torch.bfloat16: wp.bfloat16,
+}
+
+_HERE = Path(__file__).parent
+
+
+def prelude(degree: int, table: bool = False) -> str:
+    """C++ text of ``lanes.h``: arithmetic on lanes, and rows of tensors as lanes.
+
+    Args:
+        degree: of the polynomial in ``exp2_parts_`` and ``exp2_fm1_``, 2 to 6.
+        table: True to use a table instead where the processor has AVX-512.
+    """
+    return native(_HERE / "lanes.h", DEGREE=degree, TABLE=table)
+
+
+PRELUDE = prelude(5)
+
+_STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
+
+
+def streams(results: Sequence[Tensor]) -> bool:
+    """True if results ``[B, L, D]`` may be written past the caches: they are too large for these.
+
+    Of float32 each, dense, with whole cache lines; results without elements do not count.
+    """
+    written = [x for x in results if x.numel()]
+    return bool(written) and all(
+        x.dtype == torch.float32
+        and x.shape[-1] % W == 0
+        and x.data_ptr() % 64 == 0
+        and 4 * x.numel() >= _STREAMED
+        for x in written
+    )

@@ -1,4 +1,4 @@
-"""Packed rows: several sequences one after the other in a row of tokens, as the kernels know them.
+"""Packed rows: several sequences one after the other in a row of tokens, as the kernels take them.
 
 A list of sequences is an int32 tensor ``[S, 3]`` on the tokens' device: for each its row of the
 batch, its first token, and the token behind its last. They follow one another and leave no token
@@ -81,10 +81,10 @@ def _runs(seq_idx: Tensor) -> Tensor:
 
 
 def slots(rows: Tensor, length: int, tokens: int) -> Tensor:
-    """Before each sequence, how many slots of so many tokens those before it take at most: ``[S]``.
+    """Upper bounds of the slots, of ``tokens`` tokens each, before each sequence: ``[S]``.
 
-    Sequence s needs a slot for each ``tokens`` of its own, from its first token on. There are
-    ``count_slots`` in all, whatever the values, so that nobody waits for these.
+    Sequence s needs a slot for each ``tokens`` tokens, from its first token on. There are
+    ``count_slots`` in all, whatever the values, so no call waits for these.
 
     Args:
         rows: the sequences.

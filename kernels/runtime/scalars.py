@@ -1,4 +1,4 @@
-"""The leaves of ``lanes.py`` for one channel per thread, for CUDA kernels."""
+"""The arithmetic of ``lanes.h`` for one channel per thread, for CUDA kernels."""
 
 import torch
 import warp as wp
@@ -62,7 +62,7 @@ def reciprocal(x: float) -> float: ...
 
 @wp.func_native('asm volatile("" : "+r"(x)); return x;')
 def anew(x: int) -> int:
-    """Returns x; what was computed from x before is not kept in registers for its sake."""
+    """Return x, so that values computed from it before need not stay in registers."""
     ...
 
 
@@ -71,7 +71,7 @@ def sigmoid(x: float) -> float:
     return reciprocal(1.0 + exp2(-wp.static(LOG2E) * x))  # 0 where the power is infinite
 
 
-# It has no branch and is relatively accurate for x << 0, as the one in lanes.py.
+# It has no branch and is relatively accurate for x << 0, as the one in lanes.h.
 @wp.func
 def softplus(x: float) -> float:
     e = exp2(-wp.static(LOG2E) * wp.abs(x))

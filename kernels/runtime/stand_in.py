@@ -1,8 +1,8 @@
 """Device of a tensor's work, and stand-ins for a GPU that take launches on CUDA.
 
-In a dry run launches are only noted: the tensors may be fake, without memory, so ``views.py`` makes
-no views. Any other stand-in executes launches on tensors of the CPU, for which the operators then
-take their CUDA path. What is asked of the device is answered for one that is imagined.
+In a dry run launches are only recorded: the tensors may be fake, without memory, so ``views.py``
+makes no views. Any other stand-in executes launches on tensors of the CPU, for which the operators
+then take their CUDA path. Queries of the device are answered for an imagined one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class StandIn:
         launch: called with the kernel, the dimensions of the launch, its arguments as Warp takes
             them, and the threads of a block; all is done when it returns.
         multiprocessors: of the imagined device.
-        dry: whether it only notes launches.
+        dry: True to only record launches.
     """
 
     launch: Callable[[wp.Kernel, tuple[int, ...], list, int], None]
@@ -55,7 +55,7 @@ def is_dry() -> bool:
 
 
 def kind_of(device: torch.device) -> str:
-    """Whose kernels work on a device's tensors, "cpu" or "cuda" (or what else the device is)."""
+    """Device type whose kernels a tensor takes, "cpu" or "cuda" (or another type)."""
     return device.type if stand_in() is None or is_dry() else "cuda"
 
 

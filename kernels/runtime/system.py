@@ -16,7 +16,7 @@ def is_own(found: os.stat_result) -> bool:
 
 
 def end_signals() -> list[signal.Signals]:
-    """The signals by which others ask this process to end: SIGTERM, and SIGHUP where there is one.
+    """Signals that ask this process to end: SIGTERM, and SIGHUP where it exists.
 
     A SIGHUP that is ignored, as below nohup, is left out: it is to stay so.
     """

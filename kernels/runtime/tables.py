@@ -11,7 +11,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]], aligned: bool
     Args:
         header: names of the columns.
         rows: cells of each row, as many as there are columns.
-        aligned: whether the columns stand below each other in plain text too.
+        aligned: True to align the columns in plain text too.
     """
     lines = [[cell.replace("|", "\\|") for cell in line] for line in (header, *rows)]
     widths = [max(map(len, column)) if aligned else 0 for column in zip(*lines)]
@@ -28,7 +28,7 @@ def cell(
         value: a mean, a median or the like.
         interval: its ends.
         digits: number of decimals.
-        signed: whether a positive value gets a plus sign.
+        signed: True to give a positive value a plus sign.
     """
     if value is None:
         return "absent"

@@ -84,8 +84,7 @@ class Packed:
     """A Warp struct as a launch takes it, made of tensors and numbers.
 
     An instance of the struct itself would take 10 µs for each array that it is given; this takes
-    what ``view`` does, so that kernels may have structs of arrays. What it is made of is kept, in
-    ``values``.
+    what ``view`` does, so that kernels may have structs of arrays. Its parts stay in ``values``.
 
     Args:
         cls: from ``struct``.
@@ -145,7 +144,7 @@ def filled(cls: type[_Class], *values: float) -> _Class:
 
 
 def struct(cls: type[_Class]) -> type[_Class]:
-    """``wp.struct``, which to a type checker leaves the class what it is."""
+    """``wp.struct``; a type checker sees the class unchanged."""
     return cast(type[_Class], wp.struct(cls))
 
 
@@ -159,7 +158,7 @@ def tokens_first(x: Tensor, name: str) -> Tensor: ...
 @overload
 def tokens_first(x: Tensor | None, name: str) -> Tensor | None: ...
 def tokens_first(x: Tensor | None, name: str) -> Tensor | None:
-    """A view ``[B, L, D]`` of mamba-ssm's layout ``[B, D, L]``; what is no tensor is returned.
+    """A view ``[B, L, D]`` of mamba-ssm's layout ``[B, D, L]``; other values are returned.
 
     Raises:
         ValueError: the tensor, called ``name``, has not three dimensions.

@@ -1,39 +1,42 @@
+// needs: problem.py: ON_CPU, MODE, MAMBA, BILINEAR; lanes.h: F, splat, exp2_fm1_, exp2_, fma_,
+//     exp2_parts_, LOG2E, I; scalars.py: reciprocal_
+// gives: InRange, AnyRange, LN2, within_, factors_, slopes_, PHI, exact_
 // A step's decay f and weight g of x = δA, and their slopes: equations 2 to 4 and 10. A holds
 // log2(e) as well if f is an exponential.
 #if ON_CPU  // on the CPU: x = rate A, where the rate holds SCALE
 
-// rise is f - 1, exact where f is slow, and any number elsewhere. Tame: |x| <= 125.
-struct Tame {
-    enum { TAME = true };
+// fm1 is f - 1, exact where f is slow, and any number elsewhere. InRange: |x| <= 125 in all lanes.
+struct InRange {
+    enum { IN_RANGE = true };
 };
-struct Wild {
-    enum { TAME = false };
+struct AnyRange {
+    enum { IN_RANGE = false };
 };
 const float LN2 = 0.6931471805599453f;
 auto within_ = [&](F x, float most) -> I { return (x <= most) & (x >= -most); };
-auto factors_ = [&](F x, auto range, F& rise, F& g) __attribute__((always_inline)) -> F {
-    constexpr bool TAME = decltype(range)::TAME;
+auto factors_ = [&](F x, auto range, F& fm1, F& g) __attribute__((always_inline)) -> F {
+    constexpr bool IN_RANGE = decltype(range)::IN_RANGE;
     if constexpr (MODE == MAMBA) {
         g = splat(1.0f);
-        if constexpr (TAME) return exp2_rise_(x, rise);
-        return rise = exp2_(x);
+        if constexpr (IN_RANGE) return exp2_fm1_(x, fm1);
+        return fm1 = exp2_(x);
     } else if constexpr (MODE == BILINEAR) {
-        g = 1.0f / (1.0f - 0.5f * x), rise = x * g;
+        g = 1.0f / (1.0f - 0.5f * x), fm1 = x * g;
         return fma_(x, g, splat(1.0f));
     } else {  // g = (f - 1) / (x ln 2), where f - 1 is summed without the rounding of f
-        auto tamed = [&](F x) __attribute__((always_inline)) -> F {
+        auto near_zero_ = [&](F x) __attribute__((always_inline)) -> F {
             F near, low, part;
             const F p = exp2_parts_(x, near, low, part);
-            rise = part * p;
-            const F less = fma_(near, rise + low, near - 1.0f);
+            fm1 = part * p;
+            const F less = fma_(near, fm1 + low, near - 1.0f);
             g = within_(x, 0.03125f) ? p * LOG2E : less / (x * LN2);  // |x| <= 1/32: f - 1 = x p
-            return fma_(near, rise, near);
+            return fma_(near, fm1, near);
         };
-        if constexpr (TAME) return tamed(x);
-        const I calm = within_(x, 125.0f);
-        const F near = tamed(calm ? x : F{}), far = exp2_(x);
-        g = calm ? g : (far - 1.0f) / (x * LN2);
-        return rise = calm ? near : far;
+        if constexpr (IN_RANGE) return near_zero_(x);
+        const I inside = within_(x, 125.0f);
+        const F near = near_zero_(inside ? x : F{}), far = exp2_(x);
+        g = inside ? g : (far - 1.0f) / (x * LN2);
+        return fm1 = inside ? near : far;
     }
 };
 // The slopes of f and g, where WEIGHTED: for zoh dg is a polynomial where f - g would cancel.

@@ -48,7 +48,7 @@ def _check_groups(name: str, x: Tensor, u: Tensor, states: int) -> Tensor:
 def _check_common(
     u, delta, A, delta_bias, initial_state, discretization, cu_seqlens, seq_idx
 ) -> tuple[int, Tensor | None]:
-    """Checks what both functions take, except B and C; returns N and the packed sequences."""
+    """Check the arguments of both functions, except B and C; returns N and the packed sequences."""
     if not isinstance(u, Tensor):
         raise TypeError(f"u is {type(u).__name__}, must be a tensor")
     if u.dim() != 3 or u.shape[2] == 0:
@@ -166,7 +166,7 @@ def selective_scan(
         D: ``[D]`` float dtype, or None for 0.
         z: ``[B, L, D]`` in u's dtype, or None for no gate.
         delta_bias: ``[D]`` float dtype, or None for 0.
-        delta_softplus: whether δ is a softplus.
+        delta_softplus: True to apply softplus to delta.
         initial_state: ``[B, D, N]`` float32, h before the first token; None for 0. Of packed
             rows ``[S, D, N]``, one for each sequence.
         return_last_state: also return h after the last token, of each sequence.
@@ -222,7 +222,7 @@ def selective_scan_state(
         A: rates of decay.
         B: input matrix.
         delta_bias: added to delta.
-        delta_softplus: whether δ is a softplus.
+        delta_softplus: True to apply softplus to delta.
         initial_state: h before the first token.
         discretization: as ``selective_scan``.
         cu_seqlens: as ``selective_scan``.
@@ -282,18 +282,18 @@ def selective_scan_fn(
     delta_softplus: bool = False,
     return_last_state: bool = False,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """Does what mamba-ssm's ``selective_scan_fn`` does, with the same arguments and layout.
+    """Run the scan with the arguments and layout of mamba-ssm's ``selective_scan_fn``.
 
     Args:
         u: ``[B, D, L]`` float32, bfloat16 or float16; likewise delta and z.
         delta: as u.
         A: ``[D, N]`` float32.
         B: (D, N) constant, (B, N, L), or (B, G, N, L).
-        C: as B, on its own.
+        C: as B; each has its own layout.
         D: ``[D]``, or None.
         z: as u, or None.
         delta_bias: ``[D]``, or None.
-        delta_softplus: whether softplus is applied to delta.
+        delta_softplus: True to apply softplus to delta.
         return_last_state: also return ``[B, D, N]`` float32 (its gradient flows here).
 
     Returns:

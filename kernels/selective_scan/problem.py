@@ -1,4 +1,4 @@
-"""Inputs of a scan, and the rules by which a step of the continuous state becomes f and g.
+"""Arguments of a scan, and the rules that discretize a step of the state to f and g.
 
 A rule (equations 2 to 4 of README.md) is an entry here, a branch on both devices in
 ``discretize.h``, and the oracle's formula in ``reference.py``.
@@ -92,8 +92,8 @@ class Discretization(NamedTuple):
     """A rule.
 
     Attributes:
-        exponential: whether f is e^x: then a product of f is one exponential of a sum.
-        weighted: whether g is not 1.
+        exponential: True if f is e^x: then a product of f is one exponential of a sum.
+        weighted: True if g is not 1.
     """
 
     exponential: bool = True

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Off(NamedTuple):
-    """Relative errors put into the formulas, to see what they do to the results.
+    """Relative errors of the formulas, to measure their effect on the results.
 
     Attributes:
         decay: of every f.

@@ -1,3 +1,5 @@
+// needs: lanes.py: maps, task
+// gives: the body of across
 // The four maps' means along a row of two pictures: hor [P, 4 H, E - 10 C].
 const int numbers = maps.hor.shape[2], height = maps.got.shape[1];
 #include "rows.h"

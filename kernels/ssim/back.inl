@@ -1,3 +1,5 @@
+// needs: lanes.py: maps, task
+// gives: the body of back
 // The slope [P, H, E], from transposed means along a row.
 const int numbers = maps.got.shape[2], height = maps.got.shape[1];
 #include "rows.h"

@@ -1,4 +1,6 @@
-// Means along columns, the values of a strip of rows of windows, and what the slope is made of:
+// needs: lanes.py: maps, task, STRIP, TWO_C1, TWO_C2
+// gives: the body of down
+// Means along columns, the values of a strip of rows of windows, and the parts of the slope:
 // values [P, strips, E - 10 C], each the sum of its strip, and by [P, 3 (H - 10), E - 10 C].
 const int numbers = maps.hor.shape[2], rows = maps.hor.shape[1] / 4 - 10;
 #include "rows.h"

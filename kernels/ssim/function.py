@@ -14,14 +14,14 @@ def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tenso
     """Computes 1 - SSIM of pictures, and its derivative by ``got`` (README).
 
     A picture's value depends on no other picture. Windows in which two pictures are equal, as they
-    are on the background, add 0 and have no slope; a CPU leaves out what lies in no other window.
+    are on the background, add 0 and have no slope; a CPU skips pixels of no other window.
     float32 on a CPU has kernels; other dtypes and devices take matrix products, which have to keep
     all digits: where the process lets them round, the caller has to switch that off.
 
     Args:
         got: ``[P, H, W, C]`` of a floating dtype, H and W at least 11.
         want: the same shape, dtype and device, values in [0, 1].
-        slope: whether the derivative is wanted.
+        slope: True to compute the derivative.
 
     Returns:
         Values ``[P]``, means over channels and whole windows, and the slope ``[P, H, W, C]``, both

@@ -1,6 +1,6 @@
 """1 - SSIM of float32 pictures on a CPU: sixteen adjacent numbers of a row at a time.
 
-Four kernels, each a file of C++ with what they share in ``rows.h``; README.md has the formulas.
+Four kernels, each a file of C++; they share ``rows.h``. README.md has the formulas.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from .reference import C1, C2, EDGE, SIGMA, WINDOW
 
 _LANES = 16
 _STRIP = 8  # rows of windows of a task, whose values are summed before they are stored
-# Pictures of a launch have at most so many numbers: what lies between two launches is some ten
+# Pictures of a launch have at most so many numbers: data between two launches is some ten
 # times as large, and should stay in the cache.
 _TOGETHER = 1 << 18
 
 
 @struct
 class Maps:
-    """Pictures and what lies between the launches; without a slope the last three are none."""
+    """Pictures and the data between the launches; without a slope the last three are empty."""
 
     channels: int
     scale: float  # 1 / windows of a picture, all channels
     got: wp.array3d[wp.float32]
     want: wp.array3d[wp.float32]
-    shift: wp.array3d[wp.float32]  # [P, 1, E], what is taken off the sums
+    shift: wp.array3d[wp.float32]  # [P, 1, E], subtracted from the sums
     hor: wp.array3d[wp.float32]
     values: wp.array3d[wp.float32]
     by: wp.array3d[wp.float32]
@@ -67,7 +67,7 @@ def dissimilarity_on_lanes(got: Tensor, want: Tensor, slope: bool) -> tuple[Tens
     Args:
         got: ``[P, H, W, C]`` without a gradient.
         want: the same shape.
-        slope: whether the derivative is wanted.
+        slope: True to compute the derivative.
 
     Returns:
         Values ``[P]`` and the slope ``[P, H, W, C]`` or None.
@@ -85,7 +85,7 @@ def dissimilarity_on_lanes(got: Tensor, want: Tensor, slope: bool) -> tuple[Tens
 def _between(
     count: int, height: int, width: int, channels: int, slope: bool
 ) -> list[tuple[int, int, int]]:
-    """The shapes of what lies between launches: ``hor, values``, and for a slope ``by, col``."""
+    """Shapes of the data between launches: ``hor, values``, and for a slope ``by, col``."""
     rows, inner = height - EDGE, (width - EDGE) * channels
     shapes = [(count, 4 * height, inner), (count, -(-rows // _STRIP), inner)]
     if not slope:

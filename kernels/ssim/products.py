@@ -29,7 +29,7 @@ def groups(
 
 
 def box_of_windows(unequal: Tensor) -> tuple[slice, slice] | None:
-    """The rows and columns of all windows that hold a True of ``[H, W]``; None if there is none."""
+    """The rows and columns of all windows that hold a True of ``[H, W]``; or None."""
     sides = []
     for axis in (1, 0):
         found = unequal.any(axis).nonzero()[:, 0].tolist()
@@ -47,7 +47,7 @@ def dissimilarity_by_products(
     Args:
         got: ``[P, H, W, C]`` without a gradient.
         want: the same shape.
-        slope: whether the derivative is wanted.
+        slope: True to compute the derivative.
 
     Returns:
         Values ``[P]`` and the slope ``[P, H, W, C]`` or None.

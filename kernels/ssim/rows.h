@@ -1,3 +1,5 @@
+// needs: lanes.py: WEIGHTS, maps, group, numbers
+// gives: F, weights, channels, d, width, splat, fma_, at, read, write
 // Sixteen adjacent numbers of a picture's row, or fewer at its end, with WINDOW as weights.
 // Pictures are [P, H, E], E = W * C. Maps between two launches have their rows side by side: row 4
 // y + i is map i of row y, and 3 y + i where there are three. README.md has the formulas.

@@ -1,4 +1,6 @@
-// Transposed means along columns: col [P, 3 H, E + 10 C], with room at both sides.
+// needs: lanes.py: maps, task
+// gives: the body of up
+// Transposed means along columns: col [P, 3 H, E + 10 C], padded on both sides.
 const int numbers = maps.by.shape[2], rows = maps.by.shape[1] / 3, height = rows + 10;
 #include "rows.h"
 

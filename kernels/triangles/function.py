@@ -1,4 +1,4 @@
-"""The test whether a mesh cuts itself, by a tree of boxes (README)."""
+"""Test for self-intersections of a mesh, by a tree of boxes (README)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PIECES = 64  # of a launch, so that no thread waits long for another
 
 
 def cuts_itself(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Return whether two faces of a mesh cut each other; see README for what that means.
+    """Return True if two faces of a mesh intersect, as README defines.
 
     Args:
         vertices: ``[V, 3]``, finite, within 1e37 of the origin; those of one place are one.
@@ -33,7 +33,7 @@ def cuts_itself(vertices: np.ndarray, faces: np.ndarray) -> bool:
             raise ValueError(f"{name} has shape {array.shape}, must be [N, 3]")
     if len(faces) < 2:
         return False
-    # The tree's boxes are of float32. What is next to a rounded number is on its number's far side.
+    # The tree's boxes are of float32. A neighbour of a rounded number lies beyond the number.
     rounded = np.asarray(vertices, np.float32)
     below, above = (np.nextafter(rounded, np.float32(end)) for end in (-np.inf, np.inf))
     first, second, third = faces.T
@@ -101,7 +101,7 @@ def _span(t: wp.mat33d, heights: wp.vec3d, along: wp.vec3d):
 @wp.func
 @no_type_check
 def _meet(a: wp.mat33d, b: wp.mat33d):
-    """Return whether two triangles have a point in common (Möller 1997)."""
+    """Return True if two triangles have a point in common (Möller 1997)."""
     zero = wp.float64(0.0)
     of_a = _normal(a)
     heights_b = _heights(b, a[0], of_a)
@@ -122,7 +122,7 @@ def _meet(a: wp.mat33d, b: wp.mat33d):
 @wp.func
 @no_type_check
 def _cross_behind(a1: wp.vec3d, a2: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return whether two triangles with a corner at the origin have a ray from it in common.
+    """Return True if two triangles with a corner at the origin have a ray from it in common.
 
     Within both angles, not along an edge; triangles of one plane have none.
     """

@@ -22,7 +22,7 @@ import gamba_warp.measure.stress_run  # noqa: F401 (loaded before a test takes s
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, STARTER, atomic_folder, only_process, sweep, write_json
 from gamba_warp.kernels.bench.core.measure import peak_bytes
-from gamba_warp.kernels.runtime import memory, system, team
+from gamba_warp.kernels.runtime import launch, memory, system
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.processes import stop_requests
 from gamba_warp.untrusted import children
@@ -107,7 +107,7 @@ def windows(monkeypatch, no_users):
     monkeypatch.setattr(os, "open", open_file)
     monkeypatch.setattr(os, "fsync", sync)
     monkeypatch.setattr(Path, "rename", rename)
-    monkeypatch.setattr(team.ctypes, "CDLL", library)
+    monkeypatch.setattr(launch.ctypes, "CDLL", library)
 
 
 def test_folders_are_written_on_windows(windows, tmp_path):
@@ -146,12 +146,12 @@ def test_launches_without_openmp_and_huge_pages(windows, monkeypatch):
     A, B = -torch.rand(35, 2), torch.randn(1, 7, 2)
     try:
         before = selective_scan(u, delta, A, B, B)
-        team._find()
-        assert not team.has_team()
+        launch._find_team()
+        assert not launch.has_team()
         assert torch.equal(selective_scan(u, delta, A, B, B), before)
     finally:
         monkeypatch.undo()
-        team._find()
+        launch._find_team()
 
 
 def test_memory_is_not_measured_where_it_cannot_be(windows):

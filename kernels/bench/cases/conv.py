@@ -54,8 +54,8 @@ def conv_problem(
         device: where the operator runs.
         sizes: batch, tokens, channels and taps.
         function: the operator, or another package's.
-        turned: whether that wants ``x [B, D, L]``.
-        state: whether ``initial_state`` is an input too.
+        turned: True if it takes ``x [B, D, L]``.
+        state: True if ``initial_state`` is an input too.
     """
     batch, length, width, taps = sizes
     tokens = min(length, _TOKENS)

@@ -101,8 +101,8 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
 
 def knobs(settings: Settings) -> list[Variant]:
     """Accuracy traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
-    threshold of alpha or T and no radius clip. The defaults are what trained Gaussians and other
-    renderers assume.
+    threshold of alpha or T and no radius clip. The defaults are those of trained Gaussians and
+    other renderers.
     """
     scene = make_scene(settings, 2).changed(exact=_NO_THRESHOLDS)
     made = scene.pair("default: alpha 1/255, T 1e-4", limit=TRADE_LIMIT, default=True)

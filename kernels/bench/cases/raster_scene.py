@@ -65,7 +65,7 @@ def orbit_cameras(views: int, size: int) -> tuple[Tensor, Tensor]:
 class Scene(Problem):
     """Gaussians and cameras, run and checked in several ways.
 
-    The dense oracle sees all Gaussians in a small crop of the first view, as a camera of its own
+    The dense oracle sees all Gaussians in a small crop of the first view, as a separate camera
     with the principal point moved; the operator renders the same crop for the check.
 
     Attributes:
@@ -75,7 +75,7 @@ class Scene(Problem):
         size: side of the picture, pixels.
         device: of the operator.
         options: of ``rasterization``.
-        wanted: what gradients are asked for.
+        wanted: names of the needed gradients.
         exact: options of the oracle where it shall not have ours, as ``alpha_min``.
         truth: Gaussians of the oracle, where ours are others; where fewer, without gradients.
         cotangent: of the picture, ``[.., V, H, W, 3]``; None: drawn at random, as for the alphas.

@@ -92,7 +92,7 @@ def knobs(settings: Settings) -> list[Variant]:
 
 
 def lengths(settings: Settings) -> list[Variant]:
-    """Cost and memory against the number of tokens. Saved: what the forward pass keeps beside its
+    """Cost and memory against the number of tokens. Saved: tensors of the forward pass beside its
     inputs; history: the states of all tokens; peak: growth of memory in forward and backward.
     """
     lengths = {"quick": (256, 1024)}.get(settings.level, (4096, 16384, 65536))

@@ -18,7 +18,7 @@ from ..core.problem import Operator
 # The relative rms errors to float64 that are allowed. Those of half precision are explained by the
 # rounding of inputs and output.
 LIMITS = {"forward": 1e-6, BOTH: 1e-5}
-# With what ex2.approx may add at 16,961 tokens (CUDA.md): 1.9e-6 of the output, 3.3e-5 of dA.
+# With the error of ex2.approx at 16,961 tokens (CUDA.md): 1.9e-6 of the output, 3.3e-5 of dA.
 CUDA_LIMITS = {"forward": 3e-6, BOTH: 4.5e-5}
 HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
 # Tokens, channels, and tokens that the oracle looks at.
@@ -97,7 +97,7 @@ def scan_problem(
         tokens: that the oracle sees.
         channels: likewise.
         initial_state: ``[B, D, N]``, or None.
-        softplus: whether δ is one.
+        softplus: True to apply softplus to delta.
     """
     batch, length, width = inputs["u"].shape
     tokens, step = min(tokens, length), max(1, width // channels)
@@ -144,7 +144,7 @@ def make_problem(settings: Settings, channels_seen: int = 32, **changes) -> Oper
 
 
 def count_memory(problem: Operator, direction: str) -> dict[str, int]:
-    """Bytes: of all states, of what is kept for the gradient, and the peak."""
+    """Bytes of all states, of those saved for the gradient, and at the peak."""
     run = problem.forward if direction == "forward" else problem.backward
     counts = {"state_history_bytes": 4 * math.prod(problem.sizes.values())}
     if direction == BOTH:

@@ -58,7 +58,7 @@ class Settings:
     Attributes:
         device: device of all cases.
         level: key of ``LEVELS``; cases also choose their sizes by it.
-        peers: whether other people's packages are measured too, if they are installed.
+        peers: True to measure other packages too, if they are installed.
         threads: number of torch's threads on the CPU; a variant may ask for another number.
     """
 
@@ -112,13 +112,13 @@ class Variant:
         check: function that computes the error before the clock starts, or raises; None, or a
             function that returns None, if there is no oracle.
         limit: largest ``rel_rms`` of the check; above it no time is printed.
-        oracle: what the error is measured against, and on which part of the input, in words.
+        oracle: the reference of the error, and the part of the input, in words.
         direction: "forward" or "forward+backward".
         dtype: dtype of the inputs and outputs.
-        peer: whether it is other people's code; ours is compared with the fastest of these.
-        default: whether it is what a caller gets who asks for nothing.
+        peer: True for another package's code; ours is compared with the fastest of these.
+        default: True for the default of a caller.
         threads: number of torch's threads on the CPU, or None for the run's.
-        rounds: greatest number of rounds, for what is slow.
+        rounds: greatest number of rounds, for slow variants.
         parameters: sizes (numbers or text), for the tables and charts.
         work: function that counts work after the clock has stopped.
     """
@@ -145,7 +145,7 @@ class Case:
     Attributes:
         op: scan, conv, raster, block, model or step.
         name: unique within the op.
-        text: one sentence on what is compared.
+        text: one sentence on the comparison.
         build: function that makes the inputs and the variants; they are freed after the case.
         axis: parameter along which cost is drawn; "error" draws time against error, "skipped"
             skipped work against saved time, and None draws no chart.

@@ -1,4 +1,4 @@
-"""Runs cases: first call, check, clock, counts. What fails its check gets no time."""
+"""Runs cases: first call, check, clock, counts. Results that fail their check get no time."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def measure(
     """Measures cases and returns the document: machine, settings and records.
 
     A variant that raises, and a check that fails, are recorded in ``status``; the rest goes on.
-    Ctrl-C ends the run: ``interrupted`` is set and what was measured is kept.
+    Ctrl-C ends the run: ``interrupted`` is set and the measurements are kept.
 
     Args:
         cases: cases in the order of their measuring.
@@ -70,7 +70,7 @@ def measure(
         case, variant, device, dtype, direction, ms_p20, ms_p50, ms_p80`` (milliseconds, quantiles
         of ``rounds`` runs), ``jit_ms`` (the first call, compilation or its cache included),
         ``rel_rms_error, max_error`` (see ``Error``), ``peer, peer_ms`` (the fastest peer of the
-        same case, direction and sizes), ``work`` (counts); and ``status`` ("ok" or what is wrong),
+        same case, direction and sizes), ``work`` (counts); and ``status`` ("ok" or the failure),
         ``is_peer, is_default, oracle, limit, parameters, threads, rounds, axis``. Times are None
         unless the status is "ok".
     """
@@ -112,7 +112,7 @@ def _run_case(case: Case, settings: Settings, records: list[dict], say: Callable
             if t.variant.work is not None and t.record["status"] == "ok":
                 torch.set_num_threads(t.variant.threads or settings.threads)
                 t.record["work"] = t.variant.work()
-    finally:  # an interrupt keeps what there is
+    finally:  # an interrupt keeps the results so far
         _summarize(timed)
         records += [t.record for t in timed if t.record["status"] != "not measured"]
 
@@ -222,7 +222,7 @@ def _reason(error: Exception) -> str:
 
 
 def machine(settings: Settings) -> dict:
-    """Returns what decides the figures: processor, threads, versions and day, but no names."""
+    """Return the conditions of the figures: processor, threads, versions and day, but no names."""
     gpu = torch.cuda.get_device_name(settings.device) if settings.device.type == "cuda" else None
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -280,7 +280,7 @@ def _small_pages() -> Iterator[None]:
     """Keeps Linux from using huge pages for this process.
 
     numpy asks for huge pages under each array of 4 MiB or more, and the heap keeps this mark after
-    the array is freed. What lies there later would be counted in steps of 2 MiB.
+    the array is freed. Later allocations there would be counted in steps of 2 MiB.
 
     Raises:
         AttributeError: the system is not Linux; TypeError on Windows.

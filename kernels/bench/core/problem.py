@@ -14,7 +14,7 @@ from .case import BOTH, DIRECTIONS, Error, Variant, compare, dtype_name
 
 
 class Problem:
-    """Something that runs in both directions; a subclass gives what a variant is made of.
+    """Something that runs in both directions; a subclass gives the parts of a variant.
 
     It has ``sizes`` for tables and charts; ``forward`` and ``backward``, which are timed; and
     ``check``, ``oracle`` and ``limit`` of a direction (see ``Variant``).
@@ -58,7 +58,7 @@ class Operator(Problem):
 
     The oracle may see a corner of the problem, as the first tokens and a few channels, if the
     operator's results there depend on nothing else. For gradients the cotangent is 0 outside the
-    corner, so that gradients of what all share are exact as well.
+    corner, so that gradients of shared inputs are exact as well.
 
     Attributes:
         function: of the inputs by name and of options; the output.
@@ -74,7 +74,7 @@ class Operator(Problem):
         corner: index of the corner by name of an input, or "out".
         turned: inputs, and "out", of which ``function`` wants the last two dimensions exchanged.
         fixed: inputs without a gradient.
-        compared: whether gradients are compared too, and not the output alone.
+        compared: True to compare gradients too, not only the output.
     """
 
     function: Callable[..., Tensor]

@@ -142,7 +142,7 @@ EXPLANATION = (
 
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # header and rows
-# What a study says beside the common table, of a document and the records of one of its cases, or
+# Text of a study beside the common table, from a document and the records of one of its cases, or
 # of the whole document where there are no records: sentences, and tables.
 More = Callable[[dict, Sequence[dict]], tuple[list[str], list[Table]]]
 
@@ -173,13 +173,13 @@ def parts(documents: Sequence[dict], more: More = nothing_more) -> Iterator[Part
     for document in documents:
         texts, tables = more(document, [])
         if document["interrupted"]:
-            texts = ["The run was interrupted; what was measured is here.", *texts]
+            texts = ["The run was interrupted; these are its measurements.", *texts]
         yield Part(machine_line(document), texts, tables)
         yield from case_parts(document, more)
 
 
 def case_parts(document: dict, more: More = nothing_more) -> Iterator[Part]:
-    """Yields a part for each case of a document, with what its errors are measured against."""
+    """Yields a part for each case of a document, with the oracle of its errors."""
     for op, cases in groups(document).items():
         for case, records in cases.items():
             texts, tables = more(document, records)

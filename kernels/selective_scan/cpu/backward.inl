@@ -1,15 +1,18 @@
+// needs: lanes.h: F, fma_, splat, put_; kernels.py: work_out, sums_out, sizes, dlast_in, TOKENS,
+//     starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB, NEED_DC, NEED_DZ,
+//     NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out; problem.py: WEIGHTED
+// gives: the body of scan_backward
 // Equation 1 again, keeping decay and state of every token, and the sums of equation 8; then
 // backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums begin anew in the first of the
-// BLOCKS lane groups that share them. What is not in ``needs`` is not computed.
+// BLOCKS lane groups that share them. Gradients that are not in ``needs`` are not computed.
 #include "task.h"
 F *const work = row_(work_out, piece_(work_out)), *const sums = row_(sums_out, piece_(sums_out));
-auto work_of = [&](const Place& p) { return work + p.j * 3 * sizes.states; };
-auto enter = [&](const Place& p) {
+auto work_of = [&](const Position& p) { return work + p.j * 3 * sizes.states; };
+auto enter = [&](const Position& p) {
     load_(dlast_in, p, work_of(p)), fill_(work_of(p) + 2 * sizes.states, 0.0f);
 };
-auto walk = [&](const Place p) __attribute__((always_inline)) {
+auto walk = [&](const Position p) __attribute__((always_inline)) {
 #include "prepare.h"
-#include "states.h"
     F *const dh_of = work_of(p), *const da_of = dh_of + 2 * states;
     const int chunk = p.chunk + (p.t0 - p.begin) / TOKENS;
     const F* const start = row_(starts_in, chunk, p.k);
@@ -30,7 +33,7 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
         State hs[K], dhs[K];
         F das[K];
 #pragma unroll
-        for (int k = 0; k < K; ++k) hs[k] = State(start[n + k], F{}, at.quiet[k]);
+        for (int k = 0; k < K; ++k) hs[k] = State(start[n + k], F{}, at.slow[k]);
         Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
             fetch.next();
@@ -40,14 +43,14 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
 #pragma unroll
             for (int k = 0; k < K; ++k) {
                 State& h = hs[k];
-                Kept& own = kept[t * K + k];
-                F rise, g;
-                const F f = factors_(rate * at.a[k], range, rise, g);
-                own.m = State::one_of(f, rise, at.quiet[k]), own.h = h.value();
+                Saved& own = saved[t * K + k];
+                F fm1, g;
+                const F f = factors_(rate * at.a[k], range, fm1, g);
+                own.m = State::saved_of(f, fm1, at.slow[k]), own.h = h.value();
 #if WEIGHTED
                 own.g = g;
 #endif
-                h.step(f, rise, g * (du * bt[k]));
+                h.step(f, fm1, g * (du * bt[k]));
                 if (needs & NEED_DZ) y = fma_(h.value(), splat(ct[k]), y);
                 if (needs & NEED_DC) dc[k * TOKENS + t] = fma_(dy, h.value(), dc[k * TOKENS + t]);
             }
@@ -56,7 +59,7 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
         if (!(needs & NEED_DH)) return;
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            dhs[k] = State(dh_of[n + k], dh_of[states + n + k], at.quiet[k]);
+            dhs[k] = State(dh_of[n + k], dh_of[states + n + k], at.slow[k]);
             das[k] = F{};
         }
         fetch = fetch_();
@@ -68,7 +71,7 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
 #pragma unroll
             for (int k = 0; k < K; ++k) {
                 State& dh = dhs[k];
-                const Kept& own = kept[t * K + k];
+                const Saved& own = saved[t * K + k];
                 const float b_t = bt[k];
                 dh.add(dy, splat(ct[k]));
                 const F v = dh.value();
@@ -81,7 +84,7 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
                 s = fma_(gv, splat(b_t), s);
 #if WEIGHTED
                 F df, dg;
-                slopes_(rate * at.a[k], State::decay_of(own.m, at.quiet[k]), g, df, dg);
+                slopes_(rate * at.a[k], State::decay_of(own.m, at.slow[k]), g, df, dg);
                 const F q = v * (own.h * df + du * b_t * dg);
                 dh.decay(own.m);
 #else
@@ -95,7 +98,7 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
         }
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            dhs[k].keep(dh_of[n + k], dh_of[states + n + k]);
+            dhs[k].store(dh_of[n + k], dh_of[states + n + k]);
             da_of[n + k] += das[k];
         }
     };
@@ -115,9 +118,9 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
     F dskip = F{}, dbias = F{}, skips = F{}, biases = F{};
     for (int t = 0; t < count; ++t) {
         const Token& own = token[t];
-        const F u = late[t].u;
+        const F u = per_token[t].u;
         skips = fma_(own.dy, u, skips);
-        const F d = fma_(u, own.s, own.p) * late[t].slope;
+        const F d = fma_(u, own.s, own.p) * per_token[t].slope;
         biases += d;
         if ((t & 7) == 7 || t == count - 1) {
             dskip += skips, dbias += biases;
@@ -125,11 +128,36 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
         }
         if (need_u) put_(du, t, fma_(own.rate * (1.0f / SCALE), own.s, skip * own.dy), stream);
         if (need_delta) put_(ddelta, t, d, stream);
-        if (need_z) put_(dz, t, own.y * late[t].gate, stream);
+        if (need_z) put_(dz, t, own.y * per_token[t].gate, stream);
     }
     *row_(dchannel_out, chunk, 0, p.k) = dskip;
     *row_(dchannel_out, chunk, 1, p.k) = dbias;
-#include "sum_lanes.h"
+    // Adds the lanes of sums [states, TOKENS, 2], eight rows at a time, into [states, length].
+    typedef float E __attribute__((vector_size(32), aligned(4)));
+    auto pair_ = [](E a, E b) -> E {
+        return __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13)
+            + __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
+    };
+    auto quad_ = [](E a, E b) -> E {
+        return __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13)
+            + __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
+    };
+    auto sum_lanes_ = [&](const E* rows, float* total) {
+        for (int n = 0; n < sizes.states; ++n)
+            for (int t = 0; t < p.count; t += 8) {
+                const E* const r = rows + 2 * (n * TOKENS + t);
+                E v[8];
+                for (int i = 0; i < 8; ++i) v[i] = r[2 * i] + r[2 * i + 1];
+                const E low = quad_(pair_(v[0], v[1]), pair_(v[2], v[3]));
+                const E high = quad_(pair_(v[4], v[5]), pair_(v[6], v[7]));
+                const E all = __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11)
+                    + __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15);
+                float* const out = total + n * (size_t)sizes.length + p.t0 + t;
+                if (t + 8 <= p.count) *(E*)out = all;
+                else
+                    for (int i = 0; i < p.count - t; ++i) out[i] = all[i];
+            }
+    };
     if (p.j % BLOCKS == BLOCKS - 1 || p.j == p.blocks - 1) {
         const size_t part = p.part + p.j / BLOCKS, size = (size_t)states * sizes.length;
         if (sizes.needs & NEED_DB) sum_lanes_((const E*)sums, db_out.data + part * size);
@@ -137,6 +165,6 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
             sum_lanes_((const E*)(sums + states * TOKENS), dc_out.data + part * size);
     }
 };
-each_(true, enter, walk, [&](const Place& p) {
+each_(true, enter, walk, [&](const Position& p) {
     store_(dfirst_out, p, work_of(p)), store_(da_out, p, work_of(p) + 2 * sizes.states);
 });

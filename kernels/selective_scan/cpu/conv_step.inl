@@ -1,3 +1,6 @@
+// needs: native.py: task; step.py: blocks, x_in, weight_in, taps, state_out, bias_in, y_out,
+//     use_silu; lanes.h: F, sigmoid_
+// gives: the body of conv_step
 // Sixteen channels of one token: each is convolved with the tokens seen, which are then shifted.
 const int b = task / blocks, d = task % blocks * 16, channels = blocks * 16;
 const float* x = (const float*)((const char*)x_in.data + (size_t)b * x_in.strides[0]) + d;

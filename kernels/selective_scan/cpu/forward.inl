@@ -1,22 +1,25 @@
+// needs: lanes.h: F, read_, splat, softplus_, sigmoid_, max_abs_, in_range_, fma_, put_;
+//     kernels.py: work_out, OUTPUT, sizes, first_in, starts_out, CHUNK, delta_in, u_in, z_in,
+//     y_out, SCALE, b_in, c_in, last_out, product_out
+// gives: the body of scan_forward
 // A strip of a lane group: equation 1 over its tokens, with equation 5 and the gate, or without
 // OUTPUT with the product of the decays.
 #include "task.h"
 F* const work = row_(work_out, piece_(work_out));
-auto work_of = [&](const Place& p) { return work + p.j * (OUTPUT ? 2 : 4) * sizes.states; };
-auto enter = [&](const Place& p) {
+auto work_of = [&](const Position& p) { return work + p.j * (OUTPUT ? 2 : 4) * sizes.states; };
+auto enter = [&](const Position& p) {
     load_(first_in, p, work_of(p));
     if (!OUTPUT) pairs_(work_of(p) + 2 * sizes.states, 1.0f);
 };
-auto walk = [&](const Place p) __attribute__((always_inline)) {
-#include "tokens.h"
-#include "states.h"
+auto walk = [&](const Position p) __attribute__((always_inline)) {
+#include "strip.h"
     F *const h_of = work_of(p), *const product_of = h_of + 2 * states;
     if (starts_out.shape[0] > 0 && (p.t0 - p.begin) % CHUNK == 0) {
         F* const start = row_(starts_out, p.chunk + (p.t0 - p.begin) / CHUNK, p.k);
         for (int n = 0; n < states; ++n) start[n] = h_of[n];
     }
 
-    // what does not depend on the state n: step, input, D u and gate
+    // independent of the state n: step, input, D u and gate
     const bool use_z = OUTPUT && sizes.use_z;
     read_soon_(delta_in), read_soon_(u_in);
     if (use_z) read_soon_(z_in);
@@ -33,14 +36,14 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
                 gate = z * sigmoid_(z);
             }
             const F u = read_(us, t), rate = step * SCALE;
-            top = wider_(top, rate);
+            max_rate = max_abs_(max_rate, rate);
             token[t] = {rate, step * u, skip * u, gate};
         }
     };
     if (p.width >= 16 && use_softplus && use_z)
-        prepare(16, true, true);  // usual: compiled by itself
+        prepare(16, true, true);  // usual: compiled separately
     else prepare(p.width, use_softplus, use_z);
-    tame = tame_(top * widest);
+    in_range = in_range_(max_rate * max_a);
 
     visit_(true, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
         using State = decltype(kind);
@@ -50,9 +53,9 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
         State hs[K], products[K];
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            hs[k] = State(h_of[n + k], h_of[states + n + k], at.quiet[k]);
+            hs[k] = State(h_of[n + k], h_of[states + n + k], at.slow[k]);
             if constexpr (!OUTPUT)
-                products[k] = State(product_of[n + k], product_of[states + n + k], at.quiet[k]);
+                products[k] = State(product_of[n + k], product_of[states + n + k], at.slow[k]);
         }
         Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
@@ -62,18 +65,18 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
             F y = token[t].y;
 #pragma unroll
             for (int k = 0; k < K; ++k) {
-                F rise, g;
-                const F f = factors_(rate * at.a[k], range, rise, g);
-                hs[k].step(f, rise, g * (du * bt[k]));
+                F fm1, g;
+                const F f = factors_(rate * at.a[k], range, fm1, g);
+                hs[k].step(f, fm1, g * (du * bt[k]));
                 if constexpr (OUTPUT) y = fma_(hs[k].value(), splat(ct[k]), y);
-                else products[k].decay(State::one_of(f, rise, at.quiet[k]));
+                else products[k].decay(State::saved_of(f, fm1, at.slow[k]));
             }
             if constexpr (OUTPUT) token[t].y = y;
         }
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            hs[k].keep(h_of[n + k], h_of[states + n + k]);
-            if constexpr (!OUTPUT) products[k].keep(product_of[n + k], product_of[states + n + k]);
+            hs[k].store(h_of[n + k], h_of[states + n + k]);
+            if constexpr (!OUTPUT) products[k].store(product_of[n + k], product_of[states + n + k]);
         }
     });
     if constexpr (OUTPUT) {
@@ -81,7 +84,7 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
         for (int t = 0; t < count; ++t) put_(y, t, token[t].y * token[t].gate, stream);
     }
 };
-each_(false, enter, walk, [&](const Place& p) {
+each_(false, enter, walk, [&](const Position& p) {
     store_(last_out, p, work_of(p));
     if (!OUTPUT) store_(product_out, p, work_of(p) + 2 * sizes.states);
 });

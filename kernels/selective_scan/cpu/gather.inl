@@ -1,13 +1,14 @@
-// What the outputs send back to the state before the first token, and the product of the decays.
+// needs: lanes.h: F; kernels.py: work_out, sizes, c_in, dh_out, product_out
+// gives: the body of scan_gradient_states
+// The gradient of the outputs by the state before the first token, and the product of the decays.
 #include "task.h"
 F* const work = row_(work_out, piece_(work_out));
-auto work_of = [&](const Place& p) { return work + p.j * 4 * sizes.states; };
-auto enter = [&](const Place& p) {
+auto work_of = [&](const Position& p) { return work + p.j * 4 * sizes.states; };
+auto enter = [&](const Position& p) {
     pairs_(work_of(p), 0.0f), pairs_(work_of(p) + 2 * sizes.states, 1.0f);
 };
-auto walk = [&](const Place p) __attribute__((always_inline)) {
+auto walk = [&](const Position p) __attribute__((always_inline)) {
 #include "prepare.h"
-#include "states.h"
     F *const dh_of = work_of(p), *const product_of = dh_of + 2 * states;
     visit_(true, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
         using State = decltype(kind);
@@ -17,8 +18,8 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
         State dhs[K], products[K];
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            dhs[k] = State(dh_of[n + k], dh_of[states + n + k], at.quiet[k]);
-            products[k] = State(product_of[n + k], product_of[states + n + k], at.quiet[k]);
+            dhs[k] = State(dh_of[n + k], dh_of[states + n + k], at.slow[k]);
+            products[k] = State(product_of[n + k], product_of[states + n + k], at.slow[k]);
         }
         Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
@@ -26,19 +27,19 @@ auto walk = [&](const Place p) __attribute__((always_inline)) {
             const float* const ct = c.row(t);
 #pragma unroll
             for (int k = 0; k < K; ++k) {
-                F rise, g;
-                const F f = factors_(token[t].rate * at.a[k], range, rise, g);
-                products[k].decay(State::one_of(f, rise, at.quiet[k]));
+                F fm1, g;
+                const F f = factors_(token[t].rate * at.a[k], range, fm1, g);
+                products[k].decay(State::saved_of(f, fm1, at.slow[k]));
                 dhs[k].add(products[k].value(), token[t].dy * ct[k]);
             }
         }
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            dhs[k].keep(dh_of[n + k], dh_of[states + n + k]);
-            products[k].keep(product_of[n + k], product_of[states + n + k]);
+            dhs[k].store(dh_of[n + k], dh_of[states + n + k]);
+            products[k].store(product_of[n + k], product_of[states + n + k]);
         }
     });
 };
-each_(false, enter, walk, [&](const Place& p) {
+each_(false, enter, walk, [&](const Position& p) {
     store_(dh_out, p, work_of(p)), store_(product_out, p, work_of(p) + 2 * sizes.states);
 });

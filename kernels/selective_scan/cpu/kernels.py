@@ -1,9 +1,9 @@
 """The CPU kernels: lanes are adjacent channels, tokens run in strips, states a few at a time.
 
 A task is one batch element, a segment of its tokens, and lane groups of one channel group. In a
-strip it holds what does not depend on the state n, and walks the tokens once per few n and lane
-group: their h_n live in registers and N is free. The loops are C++ in the files beside this one.
-Equations are those of README.md.
+strip it holds values that do not depend on the state n, and walks the tokens once per few n and
+lane group: their h_n live in registers and N is free. The loops are C++ in the files beside this
+one. Equations are those of README.md.
 """
 
 import functools
@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from ...runtime.lanes import ROWS, WARP_DTYPES, lanes, prelude
-from ...runtime.native import native, native_kernel
+from ...runtime.native import WARP_DTYPES, lanes, native, native_kernel, prelude
 from ...runtime.views import struct
 from ..problem import DISCRETIZATIONS, macros
 
@@ -45,7 +44,7 @@ class Tuning(NamedTuple):
         strip: tokens that the forward walks at once for one state.
         degree: of the polynomial for the decays' 2^x, 2 to 6; the relative error of a decay is
             at most 2e-3, 1e-4, 3e-6, 3e-7 and 7.5e-9.
-        table: whether a table of 16 and a cubic make 2^x in place of the polynomial where the
+        table: True to compute 2^x by a table of 16 and a cubic, not the polynomial, where the
             processor has AVX-512; the relative error of a decay is then at most 6e-8.
         walked: states that the forward walks at once; 0 for 2 where there are FEW, else 4. A walk
             fetches one tensor's rows of the next strip, so few states need shorter walks.
@@ -80,7 +79,7 @@ class Kind(NamedTuple):
             GRADIENT=gradient, OUTPUT=output, TOKENS=tokens, CHUNK=tuning.chunk, AT_ONCE=at_once,
             BLOCKS=BLOCKS,
         )  # fmt: skip
-        return prelude(tuning.degree, tuning.table) + ROWS + text
+        return prelude(tuning.degree, tuning.table) + text
 
 
 @struct
@@ -99,16 +98,16 @@ class Sizes:
     use_softplus: int
     use_z: int
     needs: int
-    stream: int  # whether results go past the caches
+    stream: int  # 1 if results bypass the caches
 
 
 @functools.cache
 def forward_kernel(kind: Kind, output: bool) -> Any:
-    """Brings the states from before each segment, ``first_in``, to after it, ``last_out``.
+    """Brings the states before each segment, ``first_in``, to those after it, ``last_out``.
 
     ``channel_in`` has for each lane group the N rates of A, then the greatest |A|, D and the bias;
-    ``task.h`` tells of states. With ``output`` it computes y; else the products of the decays, and
-    z, C and D are not used.
+    ``task.h`` has the layout of states. With ``output`` it computes y; else the products of the
+    decays, and z, C and D are not used.
     """
     inputs = {**_channels(kind), "b_in": _MATRIX, "c_in": _MATRIX, "first_in": _STATES}
     outputs = {

@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...runtime.lanes import W, lanes, streams
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
+from ...runtime.native import W, lanes, streams
 from ...runtime.packed import count_slots, slots
 from ...runtime.views import filled, lane_contiguous, view
 from ..problem import DISCRETIZATIONS, Inputs, Scan, in_dtypes, sum_parts

@@ -1,6 +1,9 @@
-// What does not depend on the state n in the gradient: as in forward.inl, with dy = dout silu(z),
-// and for later the slopes of the step and of the gate.
-#include "tokens.h"
+// needs: kernels.py: sizes, delta_in, u_in, dout_in, z_in, SCALE; lanes.h: F, read_, splat, decay_,
+//     fma_, softplus_of_, sigmoid_, softplus_, max_abs_, in_range_; gather.inl: p
+// gives: use_z, prepare
+// The part of the gradient that does not depend on the state n: as in forward.inl, with
+// dy = dout silu(z), and the slopes of the step and of the gate.
+#include "strip.h"
 const bool use_z = sizes.use_z;
 read_soon_(delta_in), read_soon_(u_in), read_soon_(dout_in);
 if (use_z) read_soon_(z_in);
@@ -31,11 +34,11 @@ auto prepare = [&](int width, bool use_softplus, bool use_z) __attribute__((alwa
             }
         }
         const F u = read_(us, t), rate = step * SCALE;
-        top = wider_(top, rate);
+        max_rate = max_abs_(max_rate, rate);
         token[t] = {rate, step * u, dy, skip * u, F{}, F{}};
-        late[t] = {u, slope, gate};
+        per_token[t] = {u, slope, gate};
     }
 };
 if (p.width >= 16 && use_softplus && use_z) prepare(16, true, true);  // usual: compiled by itself
 else prepare(p.width, use_softplus, use_z);
-tame = tame_(top * widest);
+in_range = in_range_(max_rate * max_a);

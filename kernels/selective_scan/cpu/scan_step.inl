@@ -1,3 +1,7 @@
+// needs: native.py: task; step.py: blocks, dt_in, bias_in, use_softplus, x_in, skip_in, states,
+//     b_in, c_in, a_in, state_out, logs, z_in, y_out; lanes.h: F, softplus_, LOG2E, exp2_, fma_,
+//     sigmoid_
+// gives: the body of scan_step
 // Sixteen channels of one token; a state of sixteen numbers is one value.
 const int b = task / blocks, d = task % blocks * 16, channels = blocks * 16;
 #include "../../runtime/denormals.h"

@@ -1,8 +1,8 @@
 """One token through the convolution and through the scan on a CPU: a kernel each, no gradient.
 
 A state of sixteen numbers is one SIMD value here, so the lanes are the states of a channel and not
-channels as in ``kernels.py``. Everything else is done for sixteen channels at once. What these
-kernels do not take is left to the caller: both functions then return None and touch nothing.
+channels as in ``kernels.py``. Everything else is done for sixteen channels at once. For
+arguments that the kernels do not take, both functions return None and change nothing.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ...runtime.lanes import PRELUDE, W
 from ...runtime.launch import parallel_launch
-from ...runtime.native import native, native_kernel
+from ...runtime.native import PRELUDE, W, native, native_kernel
 from ...runtime.operator import has_tangent
 
 _PLAIN = (Tensor, torch.nn.Parameter)  # no fake tensor, which has no memory
@@ -57,7 +56,7 @@ def conv_step(
         weight: ``[D, W]``, contiguous.
         bias: ``[D]``, or None for 0.
         state: ``[B, D, W]``, contiguous, updated in place.
-        silu: whether SiLU follows.
+        silu: True to apply SiLU.
 
     Returns:
         ``[B, D]``; None, and nothing done, where an argument is not as above.
@@ -96,8 +95,8 @@ def scan_step(
         D: ``[D]``, or None for 0.
         z: as x, or None for no gate.
         dt_bias: ``[D]``, or None for 0.
-        dt_softplus: whether the step is a softplus.
-        logs: whether ``A`` holds the logarithms of -A, as a layer's ``A_log``.
+        dt_softplus: True to apply softplus to the step.
+        logs: True if ``A`` holds the logarithms of -A, as a layer's ``A_log``.
 
     Returns:
         ``[B, D]``; None, and nothing done, where an argument is not as above.

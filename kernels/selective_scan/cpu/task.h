@@ -1,10 +1,12 @@
+// needs: kernels.py: sizes, BLOCKS, task, rows_in, CHUNK, TOKENS; lanes.h: F, splat
+// gives: Position, position_of, row_, states_, fill_, pairs_, load_, store_, piece_, each_
 // A task: a segment of the tokens of one sequence, and lane groups of one channel group. Tasks that
-// follow one another have the same lane groups and adjacent tokens, also in the backward order: so
-// the rows that one fetches beyond its own tokens are those of the next.
-struct Place {
+// follow one another have the same lane groups and adjacent tokens, also in the backward order: the
+// rows that one prefetches beyond its tokens are those of the next.
+struct Position {
     int b, row, group;  // ``row``: of the segment, which are ordered by number, then sequence
     int begin, end;     // tokens
-    int chunk;          // row of what is kept of chunks, of the segment's first
+    int chunk;          // row of arrays by chunks, of the segment's first
     int first, blocks;  // first lane group, and how many
     int part;           // row of the partial sums of dB and dC
     // then of a lane group and TOKENS tokens, or fewer at the end
@@ -12,12 +14,12 @@ struct Place {
     int j, k;      // lane group of the task, and of all
     int d, width;  // channels
 };
-auto place_of = [&](bool backwards) -> Place {
+auto position_of = [&](bool backwards) -> Position {
     const int spans = (sizes.group_blocks + sizes.span - 1) / sizes.span;
     const int parts = (sizes.group_blocks + BLOCKS - 1) / BLOCKS;
     const int rows = sizes.segments * sizes.batch, share = task / rows;
     const int row = backwards ? rows - 1 - task % rows : task % rows;
-    Place p = {};
+    Position p = {};
     p.first = share % spans * sizes.span, p.group = share / spans;
     p.row = row;
     if (rows_in.shape[0] > 0) {
@@ -33,7 +35,7 @@ auto place_of = [&](bool backwards) -> Place {
     p.blocks = sizes.span < left ? sizes.span : left;
     return p;
 };
-// what a dense array of lanes has below these first indices
+// the part of a dense array of lanes at these first indices
 auto row_ = [](auto& array, auto... indices) -> F* {
     size_t at = 0;
     int dim = 0;
@@ -41,11 +43,10 @@ auto row_ = [](auto& array, auto... indices) -> F* {
     for (; dim < array.ndim; ++dim) at *= array.shape[dim];
     return (F*)array.data + at;
 };
-// States, gradients of states and products of decays lie in the caller's order, [rows, D, N]; one
-// without rows is not there: zeros, or not asked for. While a task walks its tokens they are lanes,
-// in the workspace of the launch's piece: pairs, N values, then for each what it has rounded away
-// (states.h).
-auto states_ = [&](const auto& array, const Place& p) -> float* {
+// States, gradients of states and products of decays lie in the caller's order, [rows, D, N]; an
+// array without rows is zeros, or not needed. While a task walks its tokens they are lanes in the
+// workspace of the launch's piece: pairs, N values, then the rounding error of each (strip.h).
+auto states_ = [&](const auto& array, const Position& p) -> float* {
     const size_t channels = (size_t)sizes.groups * sizes.group_width;
     return (float*)array.data + (p.row * channels + p.d) * sizes.states;
 };
@@ -55,14 +56,14 @@ auto fill_ = [&](F* values, float value) {
 auto pairs_ = [&](F* pairs, float value) {
     fill_(pairs, value), fill_(pairs + sizes.states, 0.0f);
 };
-auto load_ = [&](const auto& array, const Place& p, F* pairs) {
+auto load_ = [&](const auto& array, const Position& p, F* pairs) {
     pairs_(pairs, 0.0f);
     if (array.shape[0] == 0) return;
     const float* const from = states_(array, p);
     for (int n = 0; n < sizes.states; ++n)
         for (int i = 0; i < p.width; ++i) ((float*)(pairs + n))[i] = from[i * sizes.states + n];
 };
-auto store_ = [&](auto& array, const Place& p, const F* values) {
+auto store_ = [&](auto& array, const Position& p, const F* values) {
     if (array.shape[0] == 0) return;
     float* const to = states_(array, p);
     for (int i = 0; i < p.width; ++i)
@@ -79,7 +80,7 @@ auto piece_ = [&](const auto& array) -> int {
 // before it ``enter``, and after it ``leave`` with each lane group.
 auto each_ = [&](bool backwards, auto enter, auto walk, auto leave) __attribute__((always_inline)) {
 #include "../../runtime/denormals.h"
-    Place p = place_of(backwards);
+    Position p = position_of(backwards);
     auto groups = [&](auto act) __attribute__((always_inline)) {
         for (p.j = 0; p.j < p.blocks; ++p.j) {
             const int own = p.first + p.j, left = sizes.group_width - own * 16;
@@ -97,6 +98,6 @@ auto each_ = [&](bool backwards, auto enter, auto walk, auto leave) __attribute_
     }
     groups(leave);
 #if defined(__x86_64__)
-    __builtin_ia32_sfence();  // what was written past the caches is seen by other threads
+    __builtin_ia32_sfence();  // other threads see writes past the caches
 #endif
 };

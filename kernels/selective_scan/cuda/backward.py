@@ -1,7 +1,7 @@
 """The gradient kernel of the CUDA scan: a segment of the sequence backwards, chunk by chunk.
 
 A chunk starts from the state that the forward saved. It is walked once to mark the state before
-every few tokens, then in tiles, last first: what belongs to a channel alone is turned into operands
+every few tokens, then in tiles, last first: values of a channel are turned into operands
 in shared memory, the recurrence walks them a few tokens at a time, forwards again, holding decays
 and states in registers, and backwards. Sums over states and over the block's channels go through
 shared memory, so that dB and dC leave a block once per token and state.
@@ -12,7 +12,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from ...runtime.lanes import WARP_DTYPES
+from ...runtime.native import WARP_DTYPES
 from ...runtime.scalars import anew, sigmoid, softplus, softplus_slope
 from ...runtime.views import struct
 from ..problem import DISCRETIZATIONS, macros
@@ -59,7 +59,7 @@ def backward_kernel(
     Args:
         dtypes: of u, delta, and of B and C.
         mode: the discretization.
-        flags: of ``read`` (there are outputs) and of what is wanted: ``du``, ``ddelta``, ``dz``,
+        flags: of ``read`` (there are outputs) and of needed gradients: ``du``, ``ddelta``, ``dz``,
             ``dB``, ``dC``, ``y`` (for dz), ``through`` (anything that needs dh).
     """
     io, delta_io, matrix = dtypes
@@ -134,7 +134,9 @@ def backward_kernel(
         dc_out: wp.array3d(dtype=float),
     ) -> pair: ...
 
-    @wp.func_native(g.text("total.inl", **back))
+    # The sums for dB and dC where ``reverse`` does not make them state block by block: separate, so
+    # that the next tile's loads, which would cost ``reverse`` registers, can run meanwhile.
+    @wp.func_native(g.text("total.h", **back) + ("total_(0);" if wanted and f.walks == 1 else ""))
     def total(
         arena: arena_type,
         tile: Tile,
@@ -149,7 +151,7 @@ def backward_kernel(
         p: Place, arena: arena_type, left: int, bias: float,
         u_raw: raw, delta_raw: raw, dout_raw: raw, z_raw: raw,
     ):  # fmt: skip
-        # what belongs to a channel alone: operands of the walk, and what ``finish`` needs
+        # values of a channel: operands of the walk, and of the gradients after it
         steps = own()
         inputs = own()
         u = own()

@@ -1,8 +1,8 @@
 """Map of a block of threads to channels, states and tokens, and its shared memory.
 
 A block holds adjacent channels of one group. For the recurrence a thread owns ``channels`` times
-``states`` of them (an outer product, so that what it reads from shared memory is used more than
-once), and ``lanes`` threads share a channel; for loads, stores and what depends on a channel alone,
+``states`` of them (an outer product, so that values from shared memory are used more than
+once), and ``lanes`` threads share a channel; for loads, stores and values of a channel,
 a thread owns one channel and every ``rows``-th token, so that a warp touches adjacent addresses.
 The loops are C++ in the files beside this one, for a CPU as well, where the tests run it.
 """
@@ -15,8 +15,7 @@ from typing import no_type_check
 import torch
 import warp as wp
 
-from ...runtime.lanes import WARP_DTYPES
-from ...runtime.native import native
+from ...runtime.native import WARP_DTYPES, native
 from ...runtime.scalars import BITS, EXP2, RECIPROCAL, WIDE, softplus
 from ...runtime.views import struct
 from ..problem import macros
@@ -79,7 +78,8 @@ class BlockShape:
 
     def text(self, file: str, **macros: object) -> str:
         """C++ of a file beside this one for blocks of this shape."""
-        shape = {name.upper(): value for name, value in vars(self).items()}
+        names = (*vars(self), "width", "padded", "slots", "span", "rows", "held", "pad")
+        shape = {name.upper(): getattr(self, name) for name in names}
         return _HEAD + native(_HERE / file, **shape, **macros)
 
 
@@ -235,10 +235,10 @@ def states_io(f: BlockShape):
     """
     vec = wp.types.vector(f.walks * f.held, wp.float32)
 
-    @wp.func_native(f.text("states.inl", LOAD=True))
+    @wp.func_native(f.text("io.inl", READ_STATES=True))
     def read(states: wp.array3d(dtype=float), i: int, p: Place) -> vec: ...
 
-    @wp.func_native(f.text("states.inl", LOAD=False))
+    @wp.func_native(f.text("io.inl", WRITE_STATES=True))
     def write(states: wp.array3d(dtype=float), i: int, p: Place, h: vec): ...
 
     return vec, read, write
@@ -278,7 +278,7 @@ def channel_io(f: BlockShape, io: torch.dtype, tokens: int):
     count = tokens // f.rows
     raw = wp.types.vector(count, wp.uint32)
 
-    @wp.func_native(f.text("load_channel.inl", COUNT=count, **BITS[io]))
+    @wp.func_native(f.text("io.inl", LOAD_CHANNEL=True, COUNT=count, **BITS[io]))
     def load(x_in: wp.array3d(dtype=scalar), p: Place, t: int, left: int) -> raw: ...
 
     @wp.func
@@ -286,7 +286,7 @@ def channel_io(f: BlockShape, io: torch.dtype, tokens: int):
         left = wp.where(t0 < 0, 0, end - t0 - p.row)  # there is no tile before the first
         return load(x_in, p, t0 + p.row, left)
 
-    @wp.func_native(f.text("store_channel.inl", **BITS[io]))
+    @wp.func_native(f.text("io.inl", STORE_CHANNEL=True, **BITS[io]))
     def store(x_out: wp.array3d(dtype=scalar), b: int, d: int, t: int, v: float): ...
 
     return count, raw, fetch, store
@@ -302,7 +302,7 @@ def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
     arena_type, put, _ = arena_io(arena_size)
     widen = widening(io)
 
-    @wp.func_native(f.text("load_matrix.inl", COUNT=count, TOKENS=tokens, **BITS[io]))
+    @wp.func_native(f.text("io.inl", LOAD_MATRIX=True, COUNT=count, TOKENS=tokens, **BITS[io]))
     def load(x_in: wp.array4d(dtype=scalar), p: Place, t0: int, left: int) -> raw: ...
 
     @wp.func
@@ -326,7 +326,7 @@ def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
 def recurrence(
     f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int, read: bool, reverse: bool
 ):
-    """The recurrence over a tile, and for rules whose decays are no exponentials their product.
+    """The recurrence over a tile, and for rules whose decays are not exponentials their product.
 
     Equations are those of README.md. The operands of a tile are floats in shared memory, channels
     or states adjacent. Tokens past the end have δ = 0 and change nothing. Forward it is equation 1,
@@ -342,10 +342,10 @@ def recurrence(
     offset = {"AT_C": 0, "AT_Y": 0} | {f"AT_{name}": place for name, place in at}
     text = functools.partial(f.text, TOKENS=tokens, **macros(mode, False), **offset)
 
-    @wp.func_native(text("advance.inl", UNROLL=UNROLL, READ=read, REVERSE=reverse))
+    @wp.func_native(text("recurrence.inl", UNROLL=UNROLL, READ=read, REVERSE=reverse))
     def advance(arena: arena_type, base: int, p: Place, a: vec, h: vec) -> vec: ...
 
-    @wp.func_native(text("decay.inl"))
+    @wp.func_native(text("recurrence.inl", DECAY=True))
     def decay(arena: arena_type, base: int, p: Place, a: vec, h: vec) -> vec: ...
 
     return advance, decay

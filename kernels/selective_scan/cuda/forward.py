@@ -11,7 +11,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from ...runtime.lanes import WARP_DTYPES
+from ...runtime.native import WARP_DTYPES
 from ...runtime.scalars import sigmoid
 from ..problem import DISCRETIZATIONS
 from .blocks import (
@@ -52,7 +52,7 @@ def forward_kernel(
     Args:
         dtypes: of u, delta, and of B and C.
         mode: the discretization.
-        read: with outputs; without, C and what follows it are left out.
+        read: with outputs; without, C and the output are left out.
         summary: from h = 0, giving the last state and the decay of the segment.
     """
     io, delta_io, matrix = dtypes

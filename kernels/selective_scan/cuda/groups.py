@@ -10,7 +10,7 @@ import functools
 import torch
 import warp as wp
 
-from ...runtime.lanes import WARP_DTYPES
+from ...runtime.native import WARP_DTYPES
 from ...runtime.scalars import BITS
 from .blocks import BlockShape, Place, arena_io
 
@@ -70,13 +70,13 @@ def group_io(g: Groups, io: torch.dtype):
     scalar = WARP_DTYPES[io]
     raw = wp.types.vector(g.count, wp.uint32)
 
-    @wp.func_native(g.text("origin.inl", FROM=f"(({BITS[io]['ELEMENT']}*)x_in.data + d)"))
+    @wp.func_native(g.text("io.inl", ORIGIN=True, FROM=f"(({BITS[io]['ELEMENT']}*)x_in.data + d)"))
     def origin(x_in: wp.array3d(dtype=scalar), b: int, d: int) -> wp.uint64: ...
 
-    @wp.func_native(g.text("fetch_channel.inl", **BITS[io]))
+    @wp.func_native(g.text("io.inl", FETCH_CHANNEL=True, **BITS[io]))
     def fetch(x_in: wp.array3d(dtype=scalar), origin: wp.uint64, t: int, last: int) -> raw: ...
 
-    @wp.func_native(g.text("store_origin.inl", **BITS[io]))
+    @wp.func_native(g.text("io.inl", STORE_FROM_ORIGIN=True, **BITS[io]))
     def store(
         x_out: wp.array3d(dtype=scalar), origin: wp.uint64, t: int, inside: bool, v: float
     ): ...
@@ -91,10 +91,12 @@ def row_io(f: BlockShape, io: torch.dtype, tokens: int):
     count = -(-tokens * f.padded // f.block)
     raw = wp.types.vector(count, wp.uint32)
 
-    @wp.func_native(f.text("origin.inl", FROM="((char*)x_in.data + wide_(g, x_in.strides[2]))"))
+    of_group = "((char*)x_in.data + wide_(g, x_in.strides[2]))"
+
+    @wp.func_native(f.text("io.inl", ORIGIN=True, FROM=of_group))
     def origin(x_in: wp.array4d(dtype=scalar), b: int, g: int) -> wp.uint64: ...
 
-    @wp.func_native(f.text("fetch_matrix.inl", COUNT=count, TOKENS=tokens, **BITS[io]))
+    @wp.func_native(f.text("io.inl", FETCH_MATRIX=True, COUNT=count, TOKENS=tokens, **BITS[io]))
     def fetch(
         x_in: wp.array4d(dtype=scalar), origin: wp.uint64, p: Place, t0: int, last: int
     ) -> raw: ...
@@ -108,13 +110,13 @@ def group_shared(g: Groups, arena_size: int):
     own = wp.types.vector(g.count, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
 
-    @wp.func_native(g.text("put.inl"))
+    @wp.func_native(g.text("io.inl", PUT=True))
     def put(arena: arena_type, at: int, p: Place, x: own): ...
 
-    @wp.func_native(g.text("get.inl"))
+    @wp.func_native(g.text("io.inl", GET=True))
     def get(arena: arena_type, at: int, p: Place) -> own: ...
 
-    @wp.func_native(g.text("sum_lanes.inl"))
+    @wp.func_native(g.text("io.inl", SUM_LANES=True))
     def sum_lanes(arena: arena_type, at: int, p: Place) -> own: ...
 
     return own, put, get, sum_lanes

@@ -3,7 +3,7 @@
 All runs on torch's current stream, without synchronisation, in memory from torch's allocator. One
 pass over the whole sequence computes each exponential once, but gives the machine only batch x
 channels to do at once. Cut into segments, all run at once, and each but the last is walked twice:
-first from zero for what it adds, then from its right state.
+first from zero, then from its first state.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Tuning(NamedTuple):
     block: int = 128
 
 
-FORCED: Tuning | None = None  # what every scan on CUDA runs on, for tests and studies to set
+FORCED: Tuning | None = None  # overrides the choice, for tests and studies
 
 
 @functools.cache
@@ -167,12 +167,12 @@ def _sum_parts(
 
 
 class _Operands:
-    """The tensors of one scan as the kernels take them, and how it is cut.
+    """Tensors of one scan as the kernels take them, and its segments.
 
     ``state`` is new and dense, ``[B, D, N]`` or of packed rows ``[S, D, N]``: the first state, or
     the gradient of the last. ``shape`` is the block shape; ``back`` says that the gradient runs.
-    Packed sequences are not cut: into how many parts, only their lengths could say, and nobody
-    waits for these.
+    Packed sequences are not cut: the number of parts would follow from their lengths, which are
+    on the device.
     """
 
     def __init__(self, scan: Scan, state: Tensor | None, back: bool):
@@ -238,7 +238,7 @@ class _Operands:
         cuda_launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
 
     def carried(self, kernel: Any, inputs: list, outputs: list, reverse: bool):
-        """The state that enters each segment, from a kernel of what each adds and its decay."""
+        """The state before each segment, from the last state from zero and the decay of each."""
         rows, width = self.batch * self.segments, self.channels * self.states
         local = self.empty(rows, self.channels, self.states)
         decay = torch.empty_like(local)

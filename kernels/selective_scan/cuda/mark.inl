@@ -1,6 +1,9 @@
+// needs: backward.py: marks_out, arena, base, p, CHANNELS, WALKS, WIDTH, STATES, HELD, a, TOKENS,
+//     SUB, tile, count, MARK, AT_STEP, AT_DU, AT_B, PADDED, h; blocks.py: SPAN
+// gives: the body of mark
 // Walks the recurrence over a tile and keeps the state before every SUB tokens. δ and δu are
 // ``[token / 4, channel, 4]``, as in groups.py.
-#include "shape.h"
+#include "io.inl"
 #include "../discretize.h"
 // Local memory, up to 1 KB per channel: too much for registers, and left to the cache where shared
 // memory would limit the number of blocks.

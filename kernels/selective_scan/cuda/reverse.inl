@@ -1,8 +1,13 @@
+// needs: backward.py: marks_in, arena, p, CHANNELS, STATES, WALKS, WIDTH, HELD, a, both, tile,
+//     AT_B, SUB, PADDED, READ, LANE_STRIDE, STEP, AT_STEP, AT_DU, AT_DY, MARK, NEED_DC, NEED_Y,
+//     AT_DC, THROUGH, NEED_DB, AT_DB, AT_S, AT_P; blocks.py: AT_C, SPAN, AT_Y; problem.py: MODE,
+//     MAMBA, ZOH
+// gives: the body of reverse
 // Equations 6 to 12 over the tokens of a tile, SUB at a time, last first: forwards again, holding
 // their decays and states in registers, then backwards. ``both`` is dh and the sum of dA, from
 // after the tokens to before them. Sums over states leave the threads as partial sums of the lanes,
 // SUB tokens as one vector; sums over channels are completed over the block and stored.
-#include "shape.h"
+#include "io.inl"
 #include "../discretize.h"
 #include "total.h"
 float* const marks = (float*)(((size_t)marks_in.data + 15) & ~(size_t)15);
@@ -97,7 +102,7 @@ for (int walk = 0; walk < WALKS; ++walk) {
                     rt[i] = r[i][t], xt[i] = x[i][t];
                     if constexpr (READ) dyt[i] = dy[i][t];
                     if constexpr (MODE == ZOH) {
-                        // its slopes need the registers: what can be loaded again is not held
+                        // its slopes need the registers, so these are loaded again
                         const int own = (sub * SPAN + channel + i) * SUB + t;
                         xt[i] = s[AT_DU + own];
                         if constexpr (READ) dyt[i] = s[AT_DY + own];

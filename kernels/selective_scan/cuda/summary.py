@@ -1,4 +1,4 @@
-"""The first kernel of a gradient in segments: what a segment's own outputs send back through it.
+"""First kernel of a gradient in segments: a segment's gradient from its outputs alone.
 
 It is computed for all segments but the first at once; ``carry`` then gives each segment the
 gradient of the state after it, and ``backward.py`` walks them all.
@@ -9,7 +9,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from ...runtime.lanes import WARP_DTYPES
+from ...runtime.native import WARP_DTYPES
 from ...runtime.scalars import sigmoid
 from ..problem import DISCRETIZATIONS
 from .blocks import (

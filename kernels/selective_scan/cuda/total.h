@@ -1,3 +1,6 @@
+// needs: backward.py: SLOTS, WIDTH, TOKENS, TAKEN, NEED_DB, NEED_DC, arena, AT_DB, AT_DC, db_out,
+//     dc_out, tile, p, BLOCK; scalars.py: wide_
+// gives: STRIDE, total_
 // Sums the products for dB and dC over the block's channels, in a fixed order: a thread takes
 // TAKEN sums at a time. Where only one of them is wanted, the other's is not there.
 constexpr int STRIDE = (SLOTS + 1) * WIDTH;  // between the products of two tokens, half the banks

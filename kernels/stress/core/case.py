@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .rounding import UNDERFLOW, UNIT
 
-FACTOR = 8.0  # largest error, as a multiple of what rounding does to the formula
+FACTOR = 8.0  # largest error, as a multiple of the effect of rounding on the formula
 TRIALS = 5  # evaluations of a case that is over its limit, an odd number; most of them decide
 STEEP_TRIALS = 50  # evaluations of a steep case
 STEEP_RANGE = 8.0  # how far apart the limits of one result are by trial in such a case
@@ -40,7 +40,7 @@ class Case:
 
     Attributes:
         op: name of an ``Op``.
-        kind: one of the op's kinds, which says what is hostile about the values.
+        kind: one of the op's kinds of extreme values.
         seed: seed of the values.
         options: sizes, dtype and switches as JSON values by name; the keys of the op's ``plain``.
     """
@@ -60,9 +60,10 @@ class Comparison:
         error: rms of the difference over rms of the truth, of the whole tensor.
         ratio: error of the worst part over its limit; above 1 the result fails.
         nonfinite: count of numbers that are NaN or infinite although the truth fits in the dtype.
-        counts: whether ``error`` is shown. It is shown for a float32 result whose truth is well
-            above what may count as 0, and is not itself the rounding error of a sum that cancels.
-        noise: whether rounding changes the worst part by more than half of its truth.
+        counts: True to show ``error``, as for a float32 result whose truth is well
+            above numbers that may count as 0, and not itself the rounding error of a sum that
+            cancels.
+        noise: True if rounding changes the worst part by more than half of its truth.
     """
 
     name: str
@@ -82,7 +83,7 @@ class Outcome:
         faults: everything else that is wrong, such as an exception or two runs that differ.
         pixels: number of pixels that were compared (rasterizer).
         undecided: number of those pixels in which rounding decides a cut or an order.
-        steep: whether each result is judged by the widest limit of many trials.
+        steep: True to judge each result by the widest limit of many trials.
     """
 
     comparisons: list[Comparison] = field(default_factory=list)
@@ -107,7 +108,7 @@ class Outcome:
         return (self.failure() or {}).get("what") == "limit"
 
     def failure(self) -> dict | None:
-        """Returns the failure's ``what``, ``name``, ``error`` and ``ratio``, or None.
+        """Return the failure's ``what``, ``name``, ``error`` and ``ratio``, or None.
 
         ``what`` is "fault", "not finite" or "limit".
         """
@@ -155,7 +156,7 @@ class Op:
 
     Attributes:
         name: name of the op.
-        fixed: what each kind of values asks of options, a tuple being drawn from; the first kind is
+        fixed: options of each kind of values, drawn where they are a tuple; the first kind is
             the plain one.
         options: its options, drawn and shrunk in this order.
         fit: function that returns the nearest options that make sense together.
@@ -410,7 +411,7 @@ class Runs:
     Args:
         case: its option "cotangent" names the range of the cotangents.
         run: returns the results by name.
-        leaves: what gradients are asked of, by name.
+        leaves: tensors that need a gradient, by name.
         truths: the formula's results, and perhaps more, ``[SAMPLES, ..]``.
         samples: the formula's leaves.
         without: mask of the results of which no gradient is asked.
@@ -447,7 +448,7 @@ class Runs:
         """Judges all results, then all gradients.
 
         Args:
-            parts: of ``judge`` by name; () where there is none.
+            parts: of ``judge`` by name; () without parts.
             extra: further arguments of ``judge`` by name of the result.
         """
         made = [

@@ -17,7 +17,7 @@ UNDERFLOW = 2.0**-124
 
 
 class _Step(torch.autograd.Function):
-    """A function of one tensor, and what makes its gradient."""
+    """A function of one tensor, and its gradient."""
 
     @staticmethod
     def forward(ctx, x: Tensor, function: Callable, back: Callable) -> Tensor:
@@ -127,7 +127,7 @@ class Rounding:
         return out
 
     def added(self, x: Tensor, dims: tuple[int, ...]) -> Tensor:
-        """Adds up dimensions two by two, with what rounding the partial sums does; no gradient.
+        """Add dimensions two by two, with the rounding of the partial sums; no gradient.
 
         Each addition in float32 is off by up to half the last bit of its result, evenly spread, but
         exact where a term is 0. n additions are independent, so they are off by the root of a third
@@ -156,7 +156,7 @@ class Rounding:
         return total
 
     def underflow(self, x: Tensor, up: bool = False) -> Tensor | float:
-        """Draws what may be lost where ``x`` is tiny; ``up`` is that of ``rounded``."""
+        """Draw the error where ``x`` is tiny; ``up`` is that of ``rounded``."""
         small = x[1:-1].abs() < 2.0**-100
         if not small.any():
             return 0.0

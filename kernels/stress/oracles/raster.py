@@ -122,7 +122,7 @@ class _Splats(NamedTuple):
 
 
 def _splats(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -> _Splats:
-    """Projects what may be seen: leaves ``[SAMPLES, N, ..]`` of one object, colours of one view."""
+    """Project Gaussians that may be visible: ``[SAMPLES, N, ..]`` of one object, of one view."""
     t = r(_product(W[:, None], x["means"][..., None], r)[..., 0] + w[:, None])
     z, opacity = t[..., 2], x["opacities"]
     unsure = _near(z, lens.near_plane) | _near(z, lens.far_plane) | _near(opacity, lens.alpha_min)
@@ -209,22 +209,22 @@ def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
     left = torch.cumprod(torch.where(on & going, r(1 - alpha), 1.0), -1)[..., -1]
     alphas = alphas + (r(1 - left) - alphas).detach()
     blended = torch.cat([blended, alphas[..., None]], -1)
-    with torch.no_grad():  # what rounding decides, and what may come of it
+    with torch.no_grad():  # decisions that depend on rounding, and their effect
         stops = (on & ~going).any(-1)
         reached = before[0] > T_MIN * (1 - FACTOR * len(s.seen) * UNIT) - _band(after).amax()
         cut = (value - lens.alpha_min).abs() <= band
         cut |= s.unsure & (value >= lens.alpha_min - band)
         cut &= reached & (s.seen | s.unsure)
         stop = on & reached & ((after[0] - T_MIN).abs() <= _band(after))
-        # a Gaussian that comes or goes changes what it covers by its own share, and shows or hides
-        # what lies behind; so does a stop with all the light that is left
+        # a Gaussian that appears or vanishes changes its pixels by its share, and shows or hides
+        # those behind it; so does a stop with all the light that is left
         share = (before[0] * value * cut).sum(-1) + (before[0] * stop).amax(-1)
         top = torch.cat([s.channels[0].abs().amax(0), torch.ones(1, dtype=share.dtype)])
         allowance = 2 * share[:, None] * top
         swap, swapped = _order_swaps(s, before[0] * value.clamp_max(lens.alpha_max), on & reached)
         allowance[:, :-1] += 2 * swap
         undecided = cut.any(-1) | stop.any(-1) | swapped
-        # what is undecided before a stop may move the stop: this light at most is then left
+        # undecided Gaussians before a stop may move the stop: this light at most is then left
         elsewhere = undecided & (stops | stop.any(-1))
         allowance[elsewhere] += 2 * T_MIN / (1 - lens.alpha_max) * top
         bend = on & ((value - lens.alpha_max).abs() <= band) | (on & s.loose)

@@ -57,7 +57,7 @@ def _walk(f: Tensor, w: Tensor, first: Tensor) -> Tensor:
 def _walk_rounded(f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> tuple[Tensor, Tensor]:
     """The states of ``_walk`` with product and sum rounded at each token, and those before them.
 
-    What a token rounds goes on to the next with the state, as another input does. So it is found
+    The rounding of a token enters the next with the state, as another input does. So it is found
     for all tokens of the exact walk at once, and a second walk takes it along.
     """
 

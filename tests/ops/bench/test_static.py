@@ -97,7 +97,7 @@ def test_a_kernel_is_in_its_bounds(entries, key):
 
 
 ON_THE_HOST = {
-    "runtime/team.py",
+    "runtime/launch.py",
     "ssim/lanes.py",
     "triangles/function.py",
 }  # a CPU launches these; no path says so

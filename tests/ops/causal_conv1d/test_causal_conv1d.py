@@ -8,7 +8,7 @@ from helpers.scan import assert_gradient_alone, assert_gradients, leaves
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
-from gamba_warp.kernels.runtime.lanes import streams
+from gamba_warp.kernels.runtime.native import streams
 from gamba_warp.kernels.runtime.stand_in import kind_of
 
 FORWARD = 2e-7  # float32 rounding of four products and a SiLU

@@ -8,8 +8,8 @@ import torch
 import warp as wp
 from helpers import on_threads
 
-from gamba_warp.kernels.runtime import team
-from gamba_warp.kernels.runtime.launch import parallel_launch
+from gamba_warp.kernels.runtime import launch as launches
+from gamba_warp.kernels.runtime.launch import has_team, parallel_launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,10 +48,10 @@ def mix(a, b, pieces=None):
 @pytest.mark.parametrize("with_team", [True, False])
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_every_place_once(monkeypatch, with_team, threads):
-    if with_team and not team.has_team():
+    if with_team and not has_team():
         pytest.skip("torch has no OpenMP runtime with GNU's interface here")
     if not with_team:
-        monkeypatch.setattr(team, "_parallel", 0)
+        monkeypatch.setattr(launches, "_parallel", 0)
     with on_threads(threads):
         for size, pieces in ((1, None), (2, 7), (1001, 13)):
             a, b = torch.randn(2, size)
@@ -65,7 +65,7 @@ def test_team_is_found_on_linux():
         pytest.skip("torch without OpenMP")
     import sys
 
-    assert team.has_team() or sys.platform != "linux"
+    assert has_team() or sys.platform != "linux"
 
 
 class _Other:
@@ -78,7 +78,7 @@ class _Other:
 @pytest.mark.parametrize("lacks", ["hooks", "params", "bounds", "module_exec"])
 def test_another_warp_has_no_team_and_says_so_once(monkeypatch, lacks):
     """The launches go to Python's threads, with the same results."""
-    if not team.has_team():
+    if not has_team():
         pytest.skip("torch has no OpenMP runtime with GNU's interface here")
     launch = wp.launch
 
@@ -87,19 +87,19 @@ def test_another_warp_has_no_team_and_says_so_once(monkeypatch, lacks):
         return _Other(made, lacks) if record_cmd else made
 
     monkeypatch.setattr(wp, "launch", other)
-    monkeypatch.setattr(team, "_entries", {})
-    monkeypatch.setattr(team, "_parallel", team._parallel)  # comes back after the test
+    monkeypatch.setattr(launches, "_entries", {})
+    monkeypatch.setattr(launches, "_parallel", launches._parallel)  # comes back after the test
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     with pytest.warns(RuntimeWarning, match="keeps launches in another form") as said:
         got, want = mix(torch.randn(100), None)
-    assert torch.equal(got, want) and len(said) == 1 and not team.has_team()
+    assert torch.equal(got, want) and len(said) == 1 and not has_team()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert torch.equal(*mix(*torch.randn(2, 33)))
 
 
 def _child(queue):
-    queue.put(team.has_team())
+    queue.put(has_team())
     got, want = mix(torch.ones(50), None)
     queue.put(torch.equal(got, want))
 

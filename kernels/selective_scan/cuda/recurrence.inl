@@ -1,9 +1,22 @@
+// needs: blocks.py: arena, base, p, CHANNELS, DECAY, TOKENS, WALKS, HELD, AT_STEP, SPAN, STATES, a,
+//     WIDTH, UNROLL, REVERSE, AT_IN, AT_W, PADDED, READ, AT_C, AT_Y, PAD, h
+// gives: the body of advance and of decay
 // The recurrence over a tile: equation 1, and with READ the sums of equation 5 as partial sums of
 // the lanes. In REVERSE it is equation 6, dh from after a tile to before it.
-#include "shape.h"
+#include "io.inl"
 #include "../discretize.h"
 float* const s = arena.data.ptr + base;
 const int channel = p.slot * CHANNELS;
+#if DECAY
+// Multiplies a tile's decays into ``h``, for rules whose decays are not exponentials.
+for (int t = 0; t < TOKENS; ++t) WP_PRAGMA_UNROLL
+for (int k = 0; k < WALKS * HELD; ++k) {
+    float f, g;
+    factors_(s[AT_STEP + t * SPAN + channel + k % HELD / STATES], a.c[k], f, g);
+    h.c[k] *= f;
+}
+return h;
+#else
 WP_PRAGMA_NO_UNROLL
 for (int walk = 0; walk < WALKS; ++walk) {  // the state blocks, over the same tile
     const int state = walk * WIDTH + p.q * STATES;
@@ -50,3 +63,4 @@ for (int walk = 0; walk < WALKS; ++walk) {  // the state blocks, over the same t
     for (int k = 0; k < HELD; ++k) h.c[walk * HELD + k] = hn[k];
 }
 return h;
+#endif
