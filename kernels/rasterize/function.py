@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,13 +11,26 @@ from .checks import check_inputs
 from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN, TILE
 from .harmonics import colors_from_harmonics
 from .meta import Call, Meta
-from .ops import bin_op, composite, project
-from .project import LensOptions, Projected
+from .ops import composite, project
+from .projection import LensOptions, Projected
 from .skip import Skip
-from .tiles import Bins, Limits, Size, Walk
+from .tiles import Limits, Size, Walk
 
 EVERYTHING = Skip()
 _WEIGHT_EPS = 1e-10  # a sum of weights below this has no expected depth
+
+
+class Inputs(NamedTuple):
+    """The tensors of a call of ``rasterization``."""
+
+    means: Any
+    quats: Any
+    scales: Any
+    opacities: Any
+    colors: Any
+    viewmats: Any
+    Ks: Any
+    backgrounds: Any
 
 
 def rasterization(
@@ -76,7 +89,7 @@ def rasterization(
         alpha_min: fainter contributions are skipped; > 0.
         alpha_max: alpha is clamped here, and has zero gradient then; < 1.
         t_min: a pixel stops before its transmittance would fall to this; 1e-30 to < 1.
-        skip: what work to leave out; changes neither picture nor gradients.
+        skip: work to leave out; changes neither picture nor gradients.
 
     Returns:
         ``renders [.., V, H, W, C]``, ``alphas [.., V, H, W, 1]`` and ``meta``, a dict with
@@ -89,42 +102,38 @@ def rasterization(
             over 2^31 pairs of tiles and Gaussians, and this is not CUDA, or the first such call.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered before.
     """
-    tensors = dict(
-        means=means, quats=quats, scales=scales, opacities=opacities, colors=colors,
-        viewmats=viewmats, Ks=Ks, backgrounds=backgrounds,
-    )  # fmt: skip
+    given = Inputs(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
     options = dict(
         width=width, height=height, near_plane=near_plane, eps2d=eps2d, alpha_min=alpha_min,
         alpha_max=alpha_max, t_min=t_min, sh_degree=sh_degree, render_mode=render_mode,
         rasterize_mode=rasterize_mode,
     )  # fmt: skip
-    check_inputs(tensors, options)
-    given: tuple[Any, ...] = tuple(map(_dense, tensors.values()))
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = given
+    check_inputs(given._asdict(), options)
+    x = Inputs(*map(_dense, given))
+    colors = x.colors
     if sh_degree is not None:
-        colors = colors_from_harmonics(sh_degree, colors, means, viewmats).contiguous()
+        colors = colors_from_harmonics(sh_degree, colors, x.means, x.viewmats).contiguous()
     lens = LensOptions(
         width=width, height=height, near_plane=near_plane, far_plane=far_plane,
         radius_clip=radius_clip, eps2d=eps2d, alpha_min=alpha_min,
         antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
     ).numbers()  # fmt: skip
     # colours only cull here, so their gradient is no reason to compute that of the geometry
-    projected = Projected(
-        *project(means, quats, scales, opacities, colors.detach(), viewmats, Ks, lens)
-    )
+    gaussians = x.means, x.quats, x.scales, x.opacities
+    projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, lens))
     channels = _channels(render_mode, colors, projected.depths)
-    colors_per_view = int(channels.dim() > means.dim())
-    size = Size(width, height, viewmats.shape[-3], colors_per_view, skip.bits())
+    colors_per_view = int(channels.dim() > x.means.dim())
+    size = Size(width, height, x.viewmats.shape[-3], colors_per_view, skip.bits())
     limits = Limits(alpha_min, alpha_max, t_min)
-    *splats, status = (x.detach() for x in projected)
-    bins = Bins(*bin_op(*splats, width, height, alpha_min, size.skip))
+    call = Call(Projected(*(x.detach() for x in projected)), size, limits)
+    bins = call.bins(exact=False)
     tiles, compiling = bins.starts.numel() - 1, torch.compiler.is_compiling()
     skipped = None if compiling else bins.starts.new_zeros(tiles)
     drawn = projected.means2d, projected.conics, projected.view_opacities, channels
     lists = list(bins), list(size), list(limits)
     renders, alphas, *walk = composite(*drawn, *lists, skipped, None)
-    renders = _finish(render_mode, renders, alphas, backgrounds)
-    meta = Meta(Call(splats, size, limits), bins, Walk(*walk), status, skipped)
+    renders = _finish(render_mode, renders, alphas, x.backgrounds)
+    meta = Meta(call, bins, Walk(*walk), skipped)
     # under gsplat's names
     meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
     meta.update(opacities=projected.view_opacities, width=width, height=height, tile_size=TILE)

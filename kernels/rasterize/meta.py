@@ -1,13 +1,13 @@
 """Counts of the work that a call did, computed only when somebody looks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .ops import bin_op, composite
-from .project import STATUS_NAMES
+from .projection import STATUS_NAMES, Projected
 from .tiles import Bins, Limits, Size, Tiling, Walk
 
 
@@ -15,12 +15,12 @@ class Call(NamedTuple):
     """Arguments of a call: enough to make the lists anew.
 
     Attributes:
-        splats: means2d, conics, depths, opacities and extents, without gradients.
-        size: what ``composite`` was given, like the limits.
-        limits: what ``composite`` was given.
+        splats: the projection, without gradients.
+        size: argument of ``composite``.
+        limits: argument of ``composite``.
     """
 
-    splats: Sequence[Tensor]
+    splats: Projected
     size: Size
     limits: Limits
 
@@ -28,16 +28,20 @@ class Call(NamedTuple):
         """The cut into tiles."""
         return Tiling(self.size.width, self.size.height)
 
-    def listed(self) -> tuple[Bins, Walk]:
-        """The lists with room for all pairs, whose number is read back, and what the walk left."""
-        means2d, conics, depths, opacities, extents = self.splats
-        size = self.size._replace(colors_per_view=1)
+    def bins(self, exact: bool) -> Bins:
+        """The lists; if ``exact`` as long as there are pairs, whose number is read back."""
+        s, size = self.splats, self.size
+        splats = s.means2d, s.conics, s.depths, s.view_opacities, s.extents
         picture = size.width, size.height, self.limits.alpha_min, size.skip
-        bins = bin_op(means2d, conics, depths, opacities, extents, *picture, True)
-        color = torch.ones_like(depths)[..., None]
-        splats = means2d, conics, opacities, color
-        _, _, *walk = composite(*splats, list(bins), list(size), list(self.limits), None, None)
-        return Bins(*bins), Walk(*walk)
+        return Bins(*bin_op(*splats, *picture, exact))
+
+    def listed(self) -> tuple[Bins, Walk]:
+        """The lists with all pairs, whose number is read back, and the walk of the compositor."""
+        bins, s = self.bins(exact=True), self.splats
+        size = self.size._replace(colors_per_view=1)
+        drawn = s.means2d, s.conics, s.view_opacities, torch.ones_like(s.depths)[..., None]
+        _, _, *walk = composite(*drawn, list(bins), list(size), list(self.limits), None, None)
+        return bins, Walk(*walk)
 
 
 class Meta(dict):
@@ -51,8 +55,8 @@ class Meta(dict):
     without upstream gradient. The last one is None before a backward and under torch.compile.
     ``radii``, a tensor, is computed at the first look too.
 
-    On CUDA, where the lists of a call had no room for its pairs, they are made once more for these
-    counts, with room. A key keeps its first value; after the replay of a CUDA graph
+    On CUDA, where the lists of a call could not hold its pairs, they are made once more for these
+    counts, with enough capacity. A key keeps its first value; after the replay of a CUDA graph
     ``bins.count``, a tensor, has the graph's number of pairs.
 
     Attributes:
@@ -60,24 +64,24 @@ class Meta(dict):
         bins: the lists themselves.
     """
 
-    def __init__(self, drawn: Call, bins: Bins, walk: Walk, status: Tensor, skipped: Tensor | None):
+    def __init__(self, call: Call, bins: Bins, walk: Walk, skipped: Tensor | None):
         super().__init__()
-        self.tiling, self.bins, self._drawn = drawn.tiling(), bins, drawn
-        self._walk, self._status, self._skipped = walk, status, skipped
+        self.tiling, self.bins, self._call = call.tiling(), bins, call
+        self._walk, self._skipped = walk, skipped
 
     def __missing__(self, key: str):
         if key == "tiles_skipped":
             skipped = 0 if self._skipped is None else int((self._skipped == 1).sum())
             return skipped if skipped or self._skipped is not None and self._skipped.any() else None
         if key == "radii":
-            self[key] = self._drawn.splats[-1].ceil().int()
+            self[key] = self._call.splats.extents.ceil().int()
             return self[key]
         if key not in _COUNTS:
             raise KeyError(key)
         walks = key not in ("culled", "pairs_box", "pairs", "tiles")
-        if walks and int(self.bins.count) > self.bins.pairs.numel():  # there was no room
-            self.bins, self._walk = self._drawn.listed()
-        self[key] = _COUNTS[key](self.bins, self._walk, self._status)
+        if walks and int(self.bins.count) > self.bins.pairs.numel():  # the lists were too short
+            self.bins, self._walk = self._call.listed()
+        self[key] = _COUNTS[key](self.bins, self._walk, self._call.splats.status)
         return self[key]
 
 

@@ -20,14 +20,14 @@ from .cpu import composite as composite_cpu
 from .cpu.project import project_on_lanes, vjp_on_lanes
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
-from .project import (
+from .cuda.project import project_on_threads, vjp_on_threads
+from .projection import (
     PROJECTED_SIZES,
     LensOptions,
     Projected,
     make_lens,
     project_backward,
     project_forward,
-    project_on_threads,
 )
 from .skip import UNASKED
 from .tiles import Bins, Drawn, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
@@ -77,9 +77,10 @@ def _project_vjp(
     cotangents: List[Tensor],
     wanted: List[bool],
 ) -> List[Tensor]:
-    on_lanes = vjp_on_lanes if kind_of(conics.device) == "cpu" else None
-    kept = make_lens(LensOptions(*lens)), conics, status
-    grads = project_backward(inputs, *kept, cotangents, wanted, on_lanes)
+    options, viewmats = LensOptions(*lens), wanted[4]
+    on_lanes = kind_of(conics.device) == "cpu" and not (viewmats or options.antialiased)
+    run = vjp_on_lanes if on_lanes else vjp_on_threads
+    grads = project_backward(inputs, make_lens(options), conics, status, cotangents, wanted, run)
     return [g for g in grads if g is not None]
 
 
@@ -140,10 +141,10 @@ def bin_op(
     skip: int,
     exact: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Makes the tile lists of all views, ``Bins``; on CUDA without waiting for the number of pairs.
+    """Make the tile lists of all views, ``Bins``; on CUDA without waiting for the number of pairs.
 
-    There the first call of a shape reads that number back, and later ones take the room that was
-    needed before: ``cuda/capacity.py``. The length of the lists is known only at run time.
+    There the first call of a shape reads that number back, and later ones take the capacity that
+    was needed before: ``cuda/capacity.py``. The length of the lists is known only at run time.
 
     Args:
         means2d: ``[.., N, 2]``, and so on as ``project_forward`` returns them, of I views.
@@ -153,7 +154,7 @@ def bin_op(
         extents: ``[.., N, 2]``, zero where culled.
         width: pixels.
         height: pixels.
-        alpha_min: what is fainter than this is not drawn.
+        alpha_min: fainter contributions are not drawn.
         skip: from ``Skip.bits``.
         exact: lists as long as there are pairs; on CUDA the number is read back for that.
 
@@ -162,9 +163,9 @@ def bin_op(
             that is not read back is not refused: the pictures are then made without lists.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
     """
-    splats = means2d, conics, depths, view_opacities, extents
-    splats = [x.flatten(0, depths.dim() - 2) for x in splats]
-    images, num = splats[2].shape
+    given = means2d, conics, depths, view_opacities, extents
+    splats = Projected(*(x.flatten(0, depths.dim() - 2) for x in given))
+    images, num = splats.depths.shape
     tiling = Tiling(width, height)
     if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
         raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")

@@ -11,11 +11,11 @@ import warp as wp
 from torch import Tensor
 
 from ..runtime.launch import launch
-from ..runtime.views import Packed
+from ..runtime.views import as_struct, struct_of
 from .constants import ALPHA_MAX, ALPHA_MIN
 from .meta import Meta
-from .project import Splats
-from .tiles import Grid, Lists, make_grid
+from .projection import Projected
+from .tiles import Bins, Grid, make_grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,8 +28,8 @@ def _quantile(
     transmittance: wp.float32,
     limit: wp.float32,
     alpha_max: wp.float32,
-    splats_in: Splats,
-    lists_in: Lists,
+    splats_in: struct_of(Projected),
+    lists_in: struct_of(Bins),
     depths_out: wp.array[wp.float32],
 ):
     pixel = offset + wp.tid()
@@ -43,7 +43,7 @@ def _quantile(
     depth = wp.float32(0.0)
     k = lists_in.starts[tile]
     end = lists_in.starts[tile + 1]
-    # where the pairs had no room, the list is that of all Gaussians of the view
+    # where the lists were too short, the list is that of all Gaussians of the view
     listed = lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0])
     if not listed:
         k = image * grid.num
@@ -62,7 +62,7 @@ def _quantile(
         dx = float(x) + 0.5 - splats_in.means2d[g][0] + conic[1] * dy
         q = conic[0] * dx * dx + conic[2] * dy * dy
         if q <= limit:
-            alpha = wp.min(alpha_max, splats_in.opacities[g] * wp.exp(-0.5 * q))
+            alpha = wp.min(alpha_max, splats_in.view_opacities[g] * wp.exp(-0.5 * q))
             if alpha >= grid.alpha_min:
                 clear *= 1.0 - alpha
                 if clear <= transmittance:
@@ -104,7 +104,7 @@ def depth_quantile(
     limit = 2 * math.log(1 / alpha_min) + 1e-3  # where q is larger, no opacity reaches alpha_min
     grid = make_grid(cut, num=centers.shape[-1], alpha_min=alpha_min, skip=0)
     of = (meta[name].detach().contiguous() for name in ("means2d", "conics", "depths", "opacities"))
-    splats, lists = Packed(Splats, *of, None, None), Packed(Lists, *meta.bins)
-    inputs = [grid, transmittance, limit, alpha_max, splats, lists]
+    splats = as_struct(Projected(*of))
+    inputs = [grid, transmittance, limit, alpha_max, splats, as_struct(meta.bins)]
     launch(_quantile, depths.numel(), inputs, [depths.view(-1)], depths.device)
     return depths

@@ -9,14 +9,14 @@ from dataclasses import dataclass, fields
 class Skip:
     """Work to be left out. Every choice gives the same picture and gradients; all are on.
 
-    README.md, "What is skipped", has the proofs; the counts are keys of ``meta``.
+    README.md, "Skipped work", has the proofs; the counts are keys of ``meta``.
 
     Attributes:
         tile_test: tiles that the box of a Gaussian meets and its ellipse does not (``pairs_box``
             without, ``pairs`` with the test).
         block_test: of a tile, the parts that the ellipse misses: 4 x 4 pixels on the CPU, 8 x 4 on
             CUDA (``blocks_walked``; without the test, all of ``pairs_walked``).
-        stopped: what lies behind a tile or part whose pixels have all stopped (``pairs`` without,
+        stopped: Gaussians behind a tile or part whose pixels have all stopped (``pairs`` without,
             ``pairs_walked`` with it).
         empty_tiles: setting up tiles that no Gaussian touches (``tiles_empty``).
         zero_upstream: in backward, tiles whose upstream gradient is all zero (``tiles_skipped``).

@@ -1,16 +1,14 @@
 """Tiles: how a picture is cut into them, their lists, and which of them an ellipse touches.
 
-In this order: ``Tiling``, the cut; ``Bins`` and ``Walk``, what binning and compositing leave to the
-steps after them; ``Drawn``, what is composited; ``Grid`` and ``Picture``,
-the scalars that the launches of these two steps take; the test of an ellipse, row by row of tiles,
-by exact intervals of columns. README.md §2 proves the test. Counting and writing call the same
-functions.
+In this order: ``Tiling``, the cut; ``Bins`` and ``Walk``, the results of binning and compositing
+for later steps; ``Drawn``, the Gaussians to composite; ``Grid`` and ``Picture``, the scalars that
+the launches of these two steps take; the test of an ellipse, row by row of tiles, by exact
+intervals of columns. README.md §2 proves the test. Counting and writing call the same functions.
 """
 
-from typing import Any, NamedTuple, no_type_check
+from typing import Annotated, Any, NamedTuple, no_type_check
 
 import warp as wp
-from torch import Tensor
 
 from ..runtime.views import filled, struct
 from .constants import TILE
@@ -52,8 +50,8 @@ class Tiling(NamedTuple):
 class Bins(NamedTuple):
     """The lists of tiles: P pairs of (tile, Gaussian) in I views; int32 unless it is said.
 
-    On CUDA there may be room for more: ``count`` says how many pairs there are, and what follows
-    them belongs to no tile. If they are more than P, all lists are empty, and pictures are made of
+    On CUDA the lists may be longer: ``count`` says how many pairs there are, and entries behind
+    them belong to no tile. If they are more than P, all lists are empty, and pictures are made of
     ``order``, in which only Gaussians count that have pairs by ``offsets``. Then P >= I * N.
 
     Attributes:
@@ -67,26 +65,13 @@ class Bins(NamedTuple):
         count: ``[]`` int64, number of pairs.
     """
 
-    order: Tensor
-    offsets: Tensor
-    pairs: Tensor
-    rows: Tensor
-    starts: Tensor
-    box_pairs: Tensor
-    count: Tensor
-
-
-@struct
-class Lists:
-    """``Bins`` as a launch takes them."""
-
-    order: wp.array[wp.int32]
-    offsets: wp.array[wp.int32]
-    pairs: wp.array[wp.int32]
-    rows: wp.array[wp.int32]
-    starts: wp.array[wp.int32]
-    box_pairs: wp.array[wp.int64]
-    count: wp.array[wp.int64]
+    order: Annotated[Any, wp.array[wp.int32]] = None
+    offsets: Annotated[Any, wp.array[wp.int32]] = None
+    pairs: Annotated[Any, wp.array[wp.int32]] = None
+    rows: Annotated[Any, wp.array[wp.int32]] = None
+    starts: Annotated[Any, wp.array[wp.int32]] = None
+    box_pairs: Annotated[Any, wp.array[wp.int64]] = None
+    count: Annotated[Any, wp.array[wp.int64]] = None
 
 
 class Walk(NamedTuple):
@@ -97,26 +82,15 @@ class Walk(NamedTuple):
         stops: ``[blocks, 16]`` int32, the pair at which the pixel stopped.
         blocks: ``[P]`` int32, one bit for each block of the tile to which the pair contributed.
         walked: ``[tiles]`` int32, pairs walked until every pixel had stopped; on CUDA, where the
-            lists had no room, with a minus, and of all Gaussians of the view.
+            lists were too short, with a minus, and of all Gaussians of the view.
         blocks_walked: ``[tiles]`` int64, blocks evaluated for these pairs.
     """
 
-    transmittances: Tensor
-    stops: Tensor
-    blocks: Tensor
-    walked: Tensor
-    blocks_walked: Tensor
-
-
-@struct
-class Walked:
-    """``Walk`` as a launch takes it."""
-
-    transmittances: wp.array2d[wp.float32]
-    stops: wp.array2d[wp.int32]
-    blocks: wp.array[wp.int32]
-    walked: wp.array[wp.int32]
-    blocks_walked: wp.array[wp.int64]
+    transmittances: Annotated[Any, wp.array2d[wp.float32]]
+    stops: Annotated[Any, wp.array2d[wp.int32]]
+    blocks: Annotated[Any, wp.array[wp.int32]]
+    walked: Annotated[Any, wp.array[wp.int32]]
+    blocks_walked: Annotated[Any, wp.array[wp.int64]]
 
 
 @struct
@@ -138,10 +112,10 @@ class Drawn(NamedTuple):
             ``[I, N, C]``.
     """
 
-    means2d: Any
-    conics: Any
-    view_opacities: Any
-    colors: Tensor
+    means2d: Annotated[Any, wp.array[wp.vec2]] = None
+    conics: Annotated[Any, wp.array[wp.vec3]] = None
+    view_opacities: Annotated[Any, wp.array[wp.float32]] = None
+    colors: Annotated[Any, wp.array2d[wp.float32]] = None
 
 
 @struct
@@ -164,7 +138,7 @@ def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
     Args:
         tiling: the cut of each view's picture.
         num: Gaussians of a view.
-        alpha_min: what is fainter is not drawn.
+        alpha_min: fainter contributions are not drawn.
         skip: from ``Skip.bits``.
     """
     sizes = tiling.width, tiling.height, tiling.tiles_x, tiling.tiles_y, TILE.bit_length() - 1
@@ -238,7 +212,7 @@ def color_row(picture: Picture, g: int) -> int:
 
 @struct
 class Ellipse:
-    """The set q <= limit around a mean, with what the rows of tiles share."""
+    """The set q <= limit around a mean, with values that the rows of tiles share."""
 
     mean: wp.vec2
     k: wp.float32

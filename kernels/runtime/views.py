@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, TypeVar, cast, overload
+from typing import Any, TypeVar, cast, get_type_hints, overload
 
 import warp as wp
 from torch import Tensor
@@ -146,6 +146,20 @@ def filled(cls: type[_Class], *values: float) -> _Class:
 def struct(cls: type[_Class]) -> type[_Class]:
     """``wp.struct``; a type checker sees the class unchanged."""
     return cast(type[_Class], wp.struct(cls))
+
+
+@functools.cache
+def struct_of(record: type) -> Any:
+    """The Warp struct of a record: a NamedTuple of tensors, each ``Annotated`` with its array."""
+    hints = get_type_hints(record, include_extras=True)
+    fields = {name: hint.__metadata__[0] for name, hint in hints.items()}
+    names = {"__module__": record.__module__, "__doc__": record.__doc__}
+    return wp.struct(type(record.__name__, (), {"__annotations__": fields, **names}))
+
+
+def as_struct(record: Any) -> Packed:
+    """A record of tensors, or None, as a launch takes it; kernels call its type ``struct_of``."""
+    return Packed(struct_of(type(record)), *record)
 
 
 def lane_contiguous(tensor: Tensor) -> Tensor:

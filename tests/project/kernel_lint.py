@@ -41,16 +41,17 @@ def findings(sources: dict[str, str]) -> list[str]:
         if isinstance(node, ast.ClassDef):
             fields = [ast.unparse(x.annotation) for x in node.body if isinstance(x, ast.AnnAssign)]
             structs[node.name] = structs.get(node.name, False) or "array" in " ".join(fields)
-    inputs: dict[str, set[str]] = {}  # of native kernels, by their files
+    kernels: dict[str, list] = {}  # of a C++ file: macros that choose its parts, and its inputs
     for name, tree in trees.items():
-        for file, names in _native(tree):
-            inputs.setdefault(str(Path(name).parent / file), set()).update(names)
+        for file, *kernel in _native(tree):
+            kernels.setdefault(str(Path(name).parent / file), []).append(kernel)
     found = []
     for name, text in sources.items():
         if name in trees:
             of_file = [*_python(trees[name], structs)]
         else:
-            of_file = [*_cpp(text, inputs.get(name, set()))]
+            of_kernels = ((_chosen(text, m), names) for m, names in kernels.get(name, []))
+            of_file = {x for part in ((text, set()), *of_kernels) for x in _cpp(*part)}
         found += [f"{name}:{line}: {rule}: {what}" for line, rule, what in sorted(of_file)]
     return found
 
@@ -82,7 +83,7 @@ def _arguments(kernel: ast.FunctionDef, structs: dict[str, bool]) -> Found:
     outputs = False
     for arg in kernel.args.args:
         name, kind = arg.arg, ast.unparse(arg.annotation) if arg.annotation else ""
-        arrays = "array" in kind or structs.get(kind, False)
+        arrays = "array" in kind or kind.startswith("struct_of(") or structs.get(kind, False)
         if not (arrays or kind in structs or _NUMBER.fullmatch(kind)):
             yield arg.lineno, "types", f"{name} of {kernel.name} does not say its type"
         if arrays and not name.endswith(("_in", "_out")):
@@ -126,8 +127,30 @@ def _narrow(node: ast.AST) -> Iterator[ast.AST]:
             yield from _narrow(child)
 
 
-def _native(tree: ast.Module) -> Iterator[tuple[str, set[str]]]:
-    """The file of each native kernel whose inputs are written out, and their names."""
+def _chosen(text: str, macros: set[str]) -> str:
+    """A C++ text without the lines that a kernel with these macros leaves out.
+
+    Only conditions on one name are decided, as ``native_kernel`` gives them; of others all stays.
+    """
+    lines, open_parts = [], []  # of each open #if: whether its part stays, and may another
+    for text_line in text.split("\n"):
+        if m := re.match(r"#(if|elif|else|endif)\b *(\w*) *(//.*)?$", text_line):
+            word, name = m[1], m[2]
+            if word == "endif":
+                open_parts.pop()
+            else:
+                others = word == "if" or open_parts.pop()[1]
+                stays = others and (word == "else" or name in macros)
+                open_parts.append((stays, others and not stays))
+        elif re.match(r"#if", text_line):
+            open_parts.append((True, True))
+        stays = all(part for part, _ in open_parts)
+        lines.append(text_line if stays else "")
+    return "\n".join(lines)
+
+
+def _native(tree: ast.Module) -> Iterator[tuple[str, set[str], set[str]]]:
+    """The file of each native kernel, its macros that are True, and inputs that are written out."""
     known = {ast.unparse(x.targets[0]): x.value for x in tree.body if isinstance(x, ast.Assign)}
 
     def keys(node: ast.AST) -> set[str]:
@@ -139,7 +162,7 @@ def _native(tree: ast.Module) -> Iterator[tuple[str, set[str]]]:
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "native_kernel":
             names = {y for k in node.keywords if k.arg == "inputs" for y in keys(k.value)}
             for file in re.findall(r"'([\w/]+\.inl)'", ast.unparse(node)):
-                yield file, names
+                yield file, set(re.findall(r"(\w+)=True", ast.unparse(node))), names
 
 
 def _cpp(text: str, inputs: set[str]) -> Found:

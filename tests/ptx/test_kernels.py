@@ -18,6 +18,7 @@ from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.kernels.rasterize.cuda.bin import bin_views
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
+from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
 from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
 from gamba_warp.kernels.runtime.stand_in import standing_in
@@ -186,7 +187,7 @@ def test_only_one_kernel_contracts():
     grid = make_grid(Tiling(width, height), num=num, alpha_min=1 / 255, skip=TILE_TEST)
     # slanting needles, of many rows of tiles: at each row's ends rounding may decide upon a tile
     heights = 400 + 400 * torch.rand(1, num, 1)
-    splats = (
+    splats = Projected(
         torch.rand(1, num, 2) * torch.tensor([width, height]),
         torch.cat([0.1 + torch.rand(1, num, 1), 8 * torch.randn(1, num, 1), heights**-2], -1),
         torch.rand(1, num),

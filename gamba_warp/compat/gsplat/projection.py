@@ -17,7 +17,7 @@ from gamba_warp.kernels.rasterize.constants import (
 )
 from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 from gamba_warp.kernels.rasterize.ops import project
-from gamba_warp.kernels.rasterize.project import LensOptions
+from gamba_warp.kernels.rasterize.projection import LensOptions
 
 from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side
 from .relocation import quat_scale_to_covar_preci

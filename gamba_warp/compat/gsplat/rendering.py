@@ -12,7 +12,7 @@ from torch import Tensor
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, TILE
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.ops import bin_op
-from gamba_warp.kernels.rasterize.project import LensOptions
+from gamba_warp.kernels.rasterize.projection import LensOptions
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 
 from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side

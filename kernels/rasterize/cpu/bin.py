@@ -8,21 +8,20 @@ for memory: those go as they lie, and each list, which fits the nearest cache, i
 README.md §2 holds the maths.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
-from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.native import native, native_kernel
-from ...runtime.views import Packed, struct
-from ..project import Splats
+from ...runtime.views import Packed, as_struct, struct, struct_of
+from ..projection import Projected
 from ..skip import TILE_TEST
-from ..tiles import SLACK, SLACK_ABS, Bins, Grid, Lists
+from ..tiles import SLACK, SLACK_ABS, Bins, Grid
 
 MANY = 1 << 15  # Gaussians of a view from which sorting each list is quicker
 _PARTS_PER_THREAD = 4  # more than 1, since Gaussians differ in size, and so do parts
@@ -46,31 +45,31 @@ class Work:
 # a task is a worker; ``counter`` is the next list, ``workspace`` holds two of a worker
 _sort = native_kernel(
     "sort",
-    native(_HERE / "sort.inl"),
-    inputs={"count": int, "splats": Splats, "staged": wp.array2d[wp.int32]},
+    native(_HERE / "bin.inl", SORT=True),
+    inputs={"count": int, "splats": struct_of(Projected), "staged": wp.array2d[wp.int32]},
     outputs={
         "counter": wp.array[wp.int32],
         "workspace": wp.array2d[wp.int64],
-        "lists": Lists,
+        "lists": struct_of(Bins),
     },
 )
 _count = native_kernel(
     "count",
-    native(_HERE / "count.inl", **_DEFINES),
-    inputs={"parts": int, "grid": Grid, "splats": Splats, "lists": Lists},
+    native(_HERE / "bin.inl", COUNT=True, **_DEFINES),
+    inputs={"parts": int, "grid": Grid, "splats": struct_of(Projected), "lists": struct_of(Bins)},
     outputs={"work": Work},
 )
 _offsets = native_kernel(
     "offsets",
-    native(_HERE / "offsets.inl"),
+    native(_HERE / "bin.inl", OFFSETS=True),
     inputs={"parts": int},
-    outputs={"work": Work, "lists": Lists},
+    outputs={"work": Work, "lists": struct_of(Bins)},
 )
 _scatter = native_kernel(
     "scatter",
-    native(_HERE / "scatter.inl", **_DEFINES),
-    inputs={"parts": int, "grid": Grid, "splats": Splats},
-    outputs={"work": Work, "lists": Lists, "staged": wp.array2d[wp.int32]},
+    native(_HERE / "bin.inl", SCATTER=True, **_DEFINES),
+    inputs={"parts": int, "grid": Grid, "splats": struct_of(Projected)},
+    outputs={"work": Work, "lists": struct_of(Bins), "staged": wp.array2d[wp.int32]},
 )
 
 
@@ -81,22 +80,22 @@ def _sort_lists(count: int, longest: int, splats: Packed, staged: Any, lists: Pa
     parallel_launch(_sort, workers, [count, splats, staged, counter, workspace, lists])
 
 
-def bin_views(grid: Grid, tensors: Sequence[Tensor], check: Callable[[int], None]) -> Bins:
-    """Makes the lists; ``check`` is given the number of intersections before they are made.
+def bin_views(grid: Grid, projected: Projected, check: Callable[[int], None]) -> Bins:
+    """Make the lists; ``check`` gets the number of intersections before they are made.
 
     Args:
         grid: from ``make_grid``.
-        tensors: means2d, conics, depths (not negative), opacities and extents, ``[I, N, ..]``.
+        projected: without status, of I views, ``[I, N, ..]``; depths are not negative.
         check: raises if there are too many.
     """
-    images, num = tensors[2].shape
+    images, num = projected.depths.shape
     tiles, most = grid.tiles_x * grid.tiles_y, _PARTS_PER_THREAD * torch.get_num_threads()
     parts = 1 if images >= most else most
     tasks, groups, by_depth = images * parts, images * -(-num // 16), num < MANY
     order, offsets = (empty([images * num + i], torch.int32) for i in range(2))
     starts = order.new_empty(images * tiles + 1)
     count, box_count = (torch.empty((), dtype=torch.int64) for _ in range(2))
-    splats = Packed(Splats, *tensors, None)
+    splats = as_struct(projected)
     work = Packed(
         Work,
         empty([groups * 16], torch.int32),
@@ -109,7 +108,8 @@ def bin_views(grid: Grid, tensors: Sequence[Tensor], check: Callable[[int], None
     if not by_depth:
         torch.arange(images * num, out=order)
     ordered = order if by_depth else None  # none: by index
-    lists = Packed(Lists, ordered, offsets, None, None, starts, box_count, count)
+    made = dict(offsets=offsets, starts=starts, box_pairs=box_count, count=count)
+    lists = as_struct(Bins(order=ordered, **made))
     if by_depth and images:
         _sort_lists(images, num, splats, None, lists)
     parallel_launch(_count, tasks, [parts, grid, splats, lists, work], pieces=tasks)
@@ -117,8 +117,8 @@ def bin_views(grid: Grid, tensors: Sequence[Tensor], check: Callable[[int], None
     total = int(count)
     check(total)
     intersections, rows = (empty([total], torch.int32) for _ in range(2))
-    bins = Bins(order, offsets, intersections, rows, starts, box_count, count)
-    lists = Packed(Lists, ordered, *bins[1:])
+    bins = Bins(order=order, pairs=intersections, rows=rows, **made)
+    lists = as_struct(bins._replace(order=ordered))
     staged = None if by_depth else empty([total, 3], torch.int32)
     parallel_launch(_scatter, tasks, [parts, grid, splats, work, lists, staged], pieces=tasks)
     if total and not by_depth:

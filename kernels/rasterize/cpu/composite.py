@@ -15,10 +15,10 @@ from torch import Tensor
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.native import native, native_kernel
-from ...runtime.views import Packed, struct, view
+from ...runtime.views import Packed, as_struct, struct, struct_of, view
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
-from ..tiles import SLACK, SLACK_ABS, Bins, Drawn, Lists, Picture, Pixels, Walk, Walked
+from ..tiles import SLACK, SLACK_ABS, Bins, Drawn, Picture, Pixels, Walk
 
 _HERE = Path(__file__).parent
 _RUN = 1024  # Gaussians of a task of the sums
@@ -28,16 +28,6 @@ _DEFINES: dict[str, Any] = {
     **{"STOPPED": STOPPED, "EMPTY_TILES": EMPTY_TILES, "ZERO_UPSTREAM": ZERO_UPSTREAM},
     "UNUSED": UNUSED,
 }
-
-
-@struct
-class Gaussians:
-    """Gaussians of I views and their colours; or their gradients."""
-
-    means2d: wp.array[wp.vec2]
-    conics: wp.array[wp.vec3]
-    opacities: wp.array[wp.float32]
-    colors: wp.array2d[wp.float32]
 
 
 @struct
@@ -55,11 +45,11 @@ class Rows:
     sums: wp.array2d[wp.float32]  # [P, 6 + C], or with the absolute ones [P, 8 + C]
     written: wp.array[wp.uint8]  # [P], 0 where a row was not written and is not read
     skipped: wp.array[wp.int32]  # [tiles], raised to 1 where a tile is skipped, to 2 where walked
-    geometry: int  # whether anything but colours is asked for
+    geometry: int  # 0 for the gradient of the colours alone
 
 
-_SPLATS = {"picture": Picture, "splats": Gaussians, "lists": Lists}
-_WALK = {"walk": Walked, "pixels": Pixels}
+_SPLATS = {"picture": Picture, "splats": struct_of(Drawn), "lists": struct_of(Bins)}
+_WALK = {"walk": struct_of(Walk), "pixels": Pixels}
 
 _composite = native_kernel(
     "composite",
@@ -71,7 +61,7 @@ _composite = native_kernel(
 _composite_vjp, _composite_vjp_absolute = (
     native_kernel(
         name,
-        native(_HERE / "composite_vjp.inl", **_DEFINES, ABSOLUTE=absolute),
+        native(_HERE / "composite.inl", GRADIENT=True, **_DEFINES, ABSOLUTE=absolute),
         inputs={**_SPLATS, **_WALK},
         outputs={"workers": Workers, "rows": Rows},
     )
@@ -79,9 +69,9 @@ _composite_vjp, _composite_vjp_absolute = (
 )
 _sum_rows = native_kernel(
     "sum_rows",
-    native(_HERE / "sums.inl", RUN=_RUN),
-    inputs={"splats": Gaussians, "lists": Lists, "rows": Rows},
-    outputs={"v": Gaussians, "absolute": wp.array[wp.vec2]},
+    native(_HERE / "composite.inl", SUM_ROWS=True, RUN=_RUN),
+    inputs={"splats": struct_of(Drawn), "lists": struct_of(Bins), "rows": Rows},
+    outputs={"v": struct_of(Drawn), "absolute": wp.array[wp.vec2]},
 )
 
 
@@ -95,7 +85,7 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
     """Blend I views; float32, contiguous tensors on the CPU.
 
     Args:
-        splats: what is drawn.
+        splats: Gaussians to draw.
         bins: from ``bin_views``.
         picture: from ``make_picture``.
 
@@ -116,9 +106,9 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
     )
     arguments = [
         picture,
-        Packed(Gaussians, *splats),
-        Packed(Lists, *bins),
-        Packed(Walked, *walk),
+        as_struct(splats),
+        as_struct(bins),
+        as_struct(walk),
         Packed(Pixels, renders, alphas),
         _workers(BLOCKS * channels),
     ]
@@ -155,9 +145,9 @@ def composite_backward(
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     arguments = [
         picture,
-        Packed(Gaussians, *splats),
-        Packed(Lists, *bins),
-        Packed(Walked, *walk),
+        as_struct(splats),
+        as_struct(bins),
+        as_struct(walk),
         Packed(Pixels, *v_pixels),
         _workers(channels + BLOCKS * (channels + 1)),
         Packed(Rows, sums, written, skipped, int(geometry)),
@@ -175,14 +165,14 @@ def reduce_rows(
     geometry: bool,
     absolute: Tensor | None,
 ) -> Drawn:
-    """Sums rows by (view, Gaussian), in the order in which intersections are numbered.
+    """Sum rows by (view, Gaussian), in the order in which intersections are numbered.
 
     Args:
         sums: ``[P, 6 + C]``, or with ``absolute`` ``[P, 8 + C]``: moments of h, then the colours.
         written: ``[P]`` uint8, 0 where a row was not written and is not read.
         splats: as forward, like the lists.
         bins: of the intersections.
-        geometry: whether anything but colours is asked for.
+        geometry: True to compute more than the gradient of the colours.
         absolute: as backward.
     """
     _, conics, view_opacities, _ = splats
@@ -192,10 +182,10 @@ def reduce_rows(
     )
     v = Drawn(v_means2d, v_conics, v_opacities, empty([*lead, channels], torch.float32))
     arguments = [
-        Packed(Gaussians, None, conics, view_opacities, None),
-        Packed(Lists, *bins),
+        as_struct(Drawn(conics=conics, view_opacities=view_opacities)),
+        as_struct(bins),
         Packed(Rows, sums, written, None, int(geometry)),
-        Packed(Gaussians, *v),
+        as_struct(v),
         None if absolute is None else view(absolute.view(-1, 2), wp.vec2),
     ]
     tasks = -(-bins.order.numel() // _RUN)

@@ -1,7 +1,260 @@
-// Projects a run of an object's Gaussians into an image, sixteen at a time, to the bits of the
-// kernel of ../project.py, whose operations are done here in the same order.
-#include "pinhole.h"
+// needs: project.py: num, RUN, task, scene, MARGIN, lens, GRADIENT, views, v_splats, splats,
+//     v_scene, colors, colors_per_view, COMPENSATION_MIN, CONIC_MAX;
+//     projection.py: VISIBLE, TRANSPARENT, FAR,
+//     NEAR, NOT_FINITE, OUTSIDE, SMALL
+// gives: the bodies of project and project_vjp
+// The projection on the CPU (README.md §1), and with GRADIENT its gradient (§4). A sum of products
+// in one expression becomes fused operations, as it does in Warp's own functions; other sums are
+// functions, so that they do not.
+#include "sixteen.h"
 
+const int runs = (num + RUN - 1) / RUN, begin = task % runs * RUN;
+const int end = begin + RUN < num ? begin + RUN : num;
+auto add_ = [](F a, F b) -> F { return a + b; };
+auto minus_ = [](F a, F b) -> F { return a - b; };
+auto mul_ = [](F a, F b) -> F { return a * b; };
+auto greater_ = [](F a, F b) -> F { return __builtin_elementwise_max(a, b); };
+auto less_ = [](F a, F b) -> F { return __builtin_elementwise_min(a, b); };
+auto cross_ = [](F a, F b, F c, F d) -> F { return a * d - b * c; };
+
+// reads n rows of `size` numbers as lanes; loops of constant length become loads and shuffles
+auto read_ = [](const void* from, int size, int n, F* v) {
+    const float* const p = (const float*)from;
+    float part[4][16] = {};
+    auto fill = [&](int count, int numbers) {
+        for (int l = 0; l < count; ++l)
+            for (int k = 0; k < numbers; ++k) part[k][l] = p[numbers * l + k];
+    };
+    if (n == 16 && size == 3) fill(16, 3);
+    else if (n == 16 && size == 4) fill(16, 4);
+    else fill(n, size);
+    for (int k = 0; k < size; ++k) v[k] = *(const F*)part[k];
+};
+auto write_ = [](void* to, int size, int n, const F* v) {
+    float* const p = (float*)to;
+    float part[4][16];
+    for (int k = 0; k < size; ++k) *(F*)part[k] = v[k];
+    auto spill = [&](int count, int numbers) {
+        for (int l = 0; l < count; ++l)
+            for (int k = 0; k < numbers; ++k) p[numbers * l + k] = part[k][l];
+    };
+    if (n == 16 && size == 2) spill(16, 2);
+    else if (n == 16 && size == 3) spill(16, 3);
+    else spill(n, size);
+};
+
+// the length of quaternions, in numbers that do not leave float32's range
+auto length_ = [&](const F* q) -> F {
+    const F m = greater_(greater_(abs_(q[0]), abs_(q[1])), greater_(abs_(q[2]), abs_(q[3])));
+    F sum = F{};
+    for (int k = 0; k < 4; ++k) {
+        const F part = q[k] / m;
+        sum += part * part;
+    }
+    return m > 0.0f ? m * root_(sum) : F{};
+};
+// makes quaternions unit ones, and R their rotations
+auto rotate_ = [&](F* q, F size, F (*R)[3]) {
+    const I some = size > 0.0f;
+    for (int k = 0; k < 4; ++k) q[k] = some ? q[k] / size : splat(k == 0);
+    const F w = q[0], x = q[1], y = q[2], z = q[3], one = splat(1.0f), two = one + one;
+    auto plus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), mul_(c, d)); };
+    auto minus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), -mul_(c, d)); };
+    R[0][0] = add_(one, -mul_(two, plus(y, y, z, z)));
+    R[0][1] = mul_(two, minus(x, y, w, z));
+    R[0][2] = mul_(two, plus(x, z, w, y));
+    R[1][0] = mul_(two, plus(x, y, w, z));
+    R[1][1] = add_(one, -mul_(two, plus(x, x, z, z)));
+    R[1][2] = mul_(two, minus(y, z, w, x));
+    R[2][0] = mul_(two, minus(x, z, w, y));
+    R[2][1] = mul_(two, plus(y, z, w, x));
+    R[2][2] = add_(one, -mul_(two, plus(x, x, y, y)));
+};
+auto turned_ = [&](const F* row, const F (*R)[3], F* out) {
+    for (int k = 0; k < 3; ++k)
+        out[k] = fma_(row[2], R[2][k], fma_(row[1], R[1][k], mul_(row[0], R[0][k])));
+};
+
+// A camera: its numbers, and README eq. 2's bounds of the slopes, the picture and a margin around.
+struct Camera {
+    const float *V, *K;
+    float left, right, top, bottom;
+};
+auto camera_of = [&](size_t image) -> Camera {
+    const float* const V = (const float*)(scene.viewmats.data + image);
+    const float* const K = (const float*)(scene.Ks.data + image);
+    const float half = MARGIN * 0.5f;
+    const float across = half * lens.width / K[0], along = half * lens.height / K[4];
+    const float left = K[2] / K[0] + across, top = K[5] / K[4] + along;
+    return {V, K, -left, (lens.width - K[2]) / K[0] + across, -top,
+        (lens.height - K[5]) / K[4] + along};
+};
+auto to_camera_ = [&](const Camera& camera, const F* mean, F* t) {
+    for (int r = 0; r < 3; ++r) {
+        const float* const row = camera.V + 4 * r;
+        F sum = mul_(mean[0], splat(row[0]));
+        sum = add_(sum, mul_(mean[1], splat(row[1])));
+        sum = add_(sum, mul_(mean[2], splat(row[2])));
+        t[r] = add_(sum, splat(row[3]));
+    }
+};
+// (x, y)/z, clamped, and the rows of J W: those of J are (fx, 0, -fx sx) and (0, fy, -fy sy)
+auto jacobian_ = [&](const Camera& camera, const F* t, F* slopes, F (*rows)[3]) {
+    const float *V = camera.V, *K = camera.K;
+    const F fx = K[0] / t[2], fy = K[4] / t[2];
+    slopes[0] = t[0] / t[2], slopes[1] = t[1] / t[2];
+    const F sx = less_(greater_(splat(camera.left), slopes[0]), splat(camera.right));
+    const F sy = less_(greater_(splat(camera.top), slopes[1]), splat(camera.bottom));
+    const F jx = -fx * sx, jy = -fy * sy;
+    for (int k = 0; k < 3; ++k) {
+        rows[0][k] = fma_(jx, splat(V[8 + k]), mul_(fx, splat(V[k])));
+        rows[1][k] = fma_(jy, splat(V[8 + k]), mul_(fy, splat(V[4 + k])));
+    }
+};
+
+#if GRADIENT
+// The gradient of a run of an object's Gaussians, over its views in their order, to the bits of the
+// kernel of ../cuda/project.py. Gradients of antialiasing and of viewmats are that kernel's alone.
+// gradient of j = -focal slope(x/z)/z to (x, z), p = x/z; a clamped slope is a constant
+auto slope_ = [&](F p, F z, float low, float high, float focal, F v, F& vx, F& vz) {
+    const F s = less_(greater_(splat(low), p), splat(high));
+    const F f = mul_(v, splat(focal)) / mul_(z, z);
+    const I free = p == s;
+    vx = free ? -f : F{};
+    vz = free ? mul_(mul_(splat(2.0f), f), s) : mul_(f, s);
+};
+const int object = task / runs;
+for (int i0 = begin; i0 < end; i0 += 16) {
+    const int n = end - i0 < 16 ? end - i0 : 16;
+    const size_t g = (size_t)object * num + i0;
+    F v_mean[3] = {}, v_scale[3] = {}, v_opacity = F{}, v_R[3][3] = {};
+    F mean[3], scale[3], q[4], R[3][3] = {}, size = F{};
+    I ever = I{};
+    for (int view = 0; view < views; ++view) {
+        const size_t image = (size_t)object * views + view, i = image * num + i0;
+        F v_u[2], v_conic[3], v_z, v_o;
+        read_(v_splats.means2d.data + i, 2, n, v_u);
+        read_(v_splats.conics.data + i, 3, n, v_conic);
+        read_(v_splats.depths.data + i, 1, n, &v_z);
+        read_(v_splats.view_opacities.data + i, 1, n, &v_o);
+        I seen = I{};
+        for (int l = 0; l < n; ++l) seen[l] = splats.status.data[i + l] == VISIBLE ? -1 : 0;
+        if (lens.skip_unused)
+            seen &= (I)(v_u[0] != 0.0f) | (I)(v_u[1] != 0.0f) | (I)(v_conic[0] != 0.0f)
+                | (I)(v_conic[1] != 0.0f) | (I)(v_conic[2] != 0.0f) | (I)(v_z != 0.0f)
+                | (I)(v_o != 0.0f);
+        if (!any_(seen)) continue;
+        if (!any_(ever)) {
+            read_(scene.means.data + g, 3, n, mean);
+            read_(scene.scales.data + g, 3, n, scale);
+            if (scene.quats.data) {
+                read_(scene.quats.data + g, 4, n, q);
+                size = length_(q);
+                rotate_(q, size, R);
+            }
+        }
+        ever |= seen;
+        const Camera camera = camera_of(image);
+        const float *V = camera.V, *K = camera.K;
+        F t[3], slopes[2], P[2][3], N[2][3], m0[3], m1[3], conic[3];
+        to_camera_(camera, mean, t);
+        jacobian_(camera, t, slopes, P);
+        for (int r = 0; r < 2; ++r)
+            if (scene.quats.data) turned_(P[r], R, N[r]);
+            else
+                for (int k = 0; k < 3; ++k) N[r][k] = P[r][k];
+        for (int k = 0; k < 3; ++k) {
+            m0[k] = mul_(N[0][k], scale[k]);
+            m1[k] = mul_(N[1][k], scale[k]);
+        }
+
+        // README eq. 8: the conic's gradient to the covariance's
+        read_(splats.conics.data + i, 3, n, conic);
+        const F a = conic[0], k = conic[1], e = conic[2], two = splat(2.0f);
+        const F c[3] = {cross_(m0[1], m0[2], m1[1], m1[2]), cross_(m0[2], m0[0], m1[2], m1[0]),
+            cross_(m0[0], m0[1], m1[0], m1[1])};
+        const F d[3] = {cross_(m1[1], m1[2], c[1], c[2]), cross_(m1[2], m1[0], c[2], c[0]),
+            cross_(m1[0], m1[1], c[0], c[1])};
+        const F v_across = mul_(mul_(mul_(-two, a), a), v_conic[0]);
+        const F shear = mul_(e, v_conic[1]);
+        const F along = minus_(mul_(v_across, k), shear);
+        const F whole = mul_(e, add_(mul_(v_conic[1], k), mul_(mul_(two, e), v_conic[2])));
+        F v_m[2][3], v_N[2][3], v_P[2][3];
+        for (int j = 0; j < 3; ++j) {
+            const F across = mul_(e, add_(mul_(splat(lens.eps2d), m0[j]), d[j]));
+            v_m[0][j] = minus_(mul_(v_across, across), mul_(shear, m1[j]));
+            v_m[1][j] = minus_(mul_(along, across), mul_(whole, m1[j]));
+        }
+        auto gather_ = [&](F& to, F value) { to = seen ? add_(to, value) : to; };
+        gather_(v_opacity, v_o);
+        for (int j = 0; j < 3; ++j)
+            gather_(v_scale[j], add_(mul_(N[0][j], v_m[0][j]), mul_(N[1][j], v_m[1][j])));
+        for (int r = 0; r < 2; ++r)
+            for (int j = 0; j < 3; ++j) v_N[r][j] = mul_(v_m[r][j], scale[j]);
+        for (int r = 0; r < 3; ++r)
+            for (int j = 0; j < 3; ++j)
+                gather_(v_R[r][j], fma_(P[1][r], v_N[1][j], mul_(P[0][r], v_N[0][j])));
+        for (int r = 0; r < 2; ++r)
+            for (int j = 0; j < 3; ++j)
+                v_P[r][j] = scene.quats.data
+                    ? fma_(v_N[r][2], R[j][2], fma_(v_N[r][1], R[j][1], mul_(v_N[r][0], R[j][0])))
+                    : v_N[r][j];
+        auto v_J = [&](int r, int j) -> F {  // times the transpose of W
+            return fma_(v_P[r][2], splat(V[4 * j + 2]),
+                fma_(v_P[r][1], splat(V[4 * j + 1]), mul_(v_P[r][0], splat(V[4 * j]))));
+        };
+        const F z = t[2];
+        F xx, xz, yy, yz;
+        slope_(slopes[0], z, camera.left, camera.right, K[0], v_J(0, 2), xx, xz);
+        slope_(slopes[1], z, camera.top, camera.bottom, K[4], v_J(1, 2), yy, yz);
+        const F zz = mul_(z, z), ux = mul_(v_u[0], splat(K[0])), uy = mul_(v_u[1], splat(K[4]));
+        const F focal = add_(mul_(v_J(0, 0), splat(K[0])), mul_(v_J(1, 1), splat(K[4])));
+        const F center = add_(mul_(ux, t[0]), mul_(uy, t[1]));
+        const F v_t[3] = {add_(xx, ux / z), add_(yy, uy / z),
+            minus_(minus_(add_(add_(xz, yz), v_z), focal / zz), center / zz)};
+        for (int j = 0; j < 3; ++j) {
+            F sum = mul_(splat(V[j]), v_t[0]);
+            sum = add_(sum, mul_(splat(V[4 + j]), v_t[1]));
+            gather_(v_mean[j], add_(sum, mul_(splat(V[8 + j]), v_t[2])));
+        }
+    }
+    if (v_scene.means.data) write_(v_scene.means.data + g, 3, n, v_mean);
+    if (v_scene.scales.data) write_(v_scene.scales.data + g, 3, n, v_scale);
+    if (v_scene.opacities.data) write_(v_scene.opacities.data + g, 1, n, &v_opacity);
+    if (!v_scene.quats.data) continue;
+    F v_q[4] = {};
+    if (any_(ever)) {
+        const F w = q[0], x = q[1], y = q[2], u = q[3], two = splat(2.0f);
+        const auto& v = v_R;
+        auto plus = [&](int r, int c) { return add_(v[r][c], v[c][r]); };
+        auto less = [&](int r, int c) { return minus_(v[r][c], v[c][r]); };
+        auto both = [&](int r, int c) { return add_(v[r][r], v[c][c]); };
+        F s[4];
+        s[0] = add_(add_(mul_(x, less(2, 1)), mul_(y, less(0, 2))), mul_(u, less(1, 0)));
+        s[1] = add_(
+            add_(add_(mul_(mul_(-two, x), both(1, 2)), mul_(y, plus(0, 1))), mul_(u, plus(0, 2))),
+            mul_(w, less(2, 1)));
+        s[2] = add_(
+            add_(minus_(mul_(x, plus(0, 1)), mul_(mul_(two, y), both(0, 2))), mul_(u, plus(1, 2))),
+            mul_(w, less(0, 2)));
+        s[3] = add_(
+            minus_(add_(mul_(x, plus(0, 2)), mul_(y, plus(1, 2))), mul_(mul_(two, u), both(0, 1))),
+            mul_(w, less(1, 0)));
+        F dot = F{};
+        for (int j = 0; j < 4; ++j) {
+            s[j] = mul_(two, s[j]);
+            dot += q[j] * s[j];
+        }
+        // the gradient of a shorter one leaves float32's range
+        const I some = ever & (I)(size > 1e-30f);
+        for (int j = 0; j < 4; ++j) v_q[j] = some ? minus_(s[j], mul_(q[j], dot)) / size : F{};
+    }
+    write_(v_scene.quats.data + g, 4, n, v_q);
+}
+
+#else
+// Projects a run of an object's Gaussians into an image, sixteen at a time, to the bits of the
+// kernel of ../cuda/project.py, whose operations are done here in the same order.
 const int image = task / runs, object = image / views, channels = colors.shape[1];
 const Camera camera = camera_of(image);
 const float* const K = camera.K;
@@ -110,8 +363,9 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     write_(splats.conics.data + i, 3, n, conic);
     write_(splats.extents.data + i, 2, n, extent);
     write_(splats.depths.data + i, 1, n, &depth);
-    write_(splats.opacities.data + i, 1, n, &shown);
+    write_(splats.view_opacities.data + i, 1, n, &shown);
     if (n == 16) *(I*)(splats.status.data + i) = status;
     else
         for (int l = 0; l < n; ++l) splats.status.data[i + l] = status[l];
 }
+#endif

@@ -1,5 +1,5 @@
 """The projection and its gradient on the CPU: sixteen Gaussians as lanes. README.md §1 and §4 have
-the maths; the bits are those of the kernels of ``../project.py``.
+the maths; the bits are those of the kernels of ``../cuda/project.py``.
 """
 
 from pathlib import Path
@@ -10,8 +10,9 @@ import warp as wp
 
 from ...runtime.launch import parallel_launch
 from ...runtime.native import native, native_kernel
+from ...runtime.views import struct_of
 from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN
-from ..project import STATUS_NAMES, Lens, Scene, Splats
+from ..projection import STATUS_NAMES, Lens, Projected, Scene
 
 _RUN = 512  # Gaussians of a task, a multiple of 16
 _PIECES_PER_THREAD = 8  # those that are culled cost less
@@ -30,12 +31,12 @@ _project = native_kernel(
     "project",
     native(_HERE / "project.inl", **_DEFINES),
     inputs={**_SCENE, "colors_per_view": int, "colors": wp.array2d[wp.float32]},
-    outputs={"splats": Splats},
+    outputs={"splats": struct_of(Projected)},
 )
 _project_vjp = native_kernel(
     "project_vjp",
-    native(_HERE / "project_vjp.inl", **_DEFINES),
-    inputs={**_SCENE, "splats": Splats, "v_splats": Splats},
+    native(_HERE / "project.inl", GRADIENT=True, **_DEFINES),
+    inputs={**_SCENE, "splats": struct_of(Projected), "v_splats": struct_of(Projected)},
     outputs={"v_scene": Scene},
 )
 
@@ -48,10 +49,10 @@ def _launch(kernel: Any, rows: int, num: int, arguments: list) -> None:
 
 
 def project_on_lanes(images: int, num: int, arguments: list, device: torch.device) -> None:
-    """Does what ``project_on_threads`` does, with the same arguments, on the lanes of a CPU."""
+    """Run the projection as ``project_on_threads``, with the same arguments, on a CPU's lanes."""
     _launch(_project, images, num, arguments)
 
 
-def vjp_on_lanes(batch: int, num: int, arguments: list) -> None:
-    """Runs the gradient for B objects; not by viewmats, and not of antialiasing."""
+def vjp_on_lanes(batch: int, num: int, arguments: list, v_viewmats: None) -> None:
+    """Run the gradient for B objects; not by viewmats, and not of antialiasing."""
     _launch(_project_vjp, batch, num, arguments)

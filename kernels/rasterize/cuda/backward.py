@@ -1,7 +1,7 @@
 """The CUDA compositor's gradient kernels: back to front over the pairs of a tile (README §5).
 
 ``composite_vjp`` leaves a row of sums for each pair. ``composite_vjp_unlisted`` does nothing unless
-the lists had no room for all pairs; then a warp walks all tiles of its view, one after the other,
+the lists could not hold all pairs; then a warp walks all tiles of its view, one after the other,
 and adds their sums in rows of Gaussians: in the order in which ``reduce.py`` adds up rows of pairs.
 """
 
@@ -10,9 +10,9 @@ from typing import NamedTuple, no_type_check
 
 import warp as wp
 
-from ...runtime.views import struct
+from ...runtime.views import struct, struct_of
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import Lists, Picture, Pixels, Walked, color_row
+from ..tiles import Bins, Picture, Pixels, Walk, color_row
 from . import leaves as L
 from .warp import (
     CHUNK,
@@ -149,7 +149,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
     """The function that walks a part of a tile.
 
     Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
-    its pairs; what a tile's own test rules out is taken away from these.
+    its pairs; pairs that a tile's own test excludes are removed from these.
     """
     (channels, geometry, absolute), moments, size = asked, asked.moments(), asked.shared()
     memory = shared_memory(size)
@@ -176,12 +176,12 @@ def _walking(asked: Sums, parts: int, listed: bool):
     def of_tile(
         picture: Picture,
         gaussians: Gaussians,
-        lists: Lists,
+        lists: struct_of(Bins),
         corner: wp.vec2,
         k: wp.int32,
         bits: wp.int32,
     ):
-        # of a pair's bits, which are those of all tiles together, what this tile's test leaves
+        # of a pair's bits, which are those of all tiles together, those within this tile's test
         left = wp.int32(0)
         if L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1):
             g = L.load_int(lists.order, k)
@@ -202,7 +202,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
     def walk(
         picture: Picture,
         gaussians: Gaussians,
-        lists: Lists,
+        lists: struct_of(Bins),
         transmittances: wp.array2d[wp.float32],  # in one struct, these four would spill registers
         stops: wp.array2d[wp.int32],
         blocks: wp.array[wp.int32],
@@ -329,7 +329,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                         sync()
                         waiting = 0
                 if (bits >> STOP) != 0:
-                    # what stopped here takes part from the next pair on
+                    # pixels that stopped here take part from the next pair on
                     k = begin + walked - 1 - done - i
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
@@ -359,8 +359,8 @@ def backward_kernels(asked: Sums, parts: int):
     def composite_vjp(
         picture: Picture,
         gaussians_in: Gaussians,
-        lists_in: Lists,
-        walked_in: Walked,
+        lists_in: struct_of(Bins),
+        walked_in: struct_of(Walk),
         v_pixels_in: Pixels,
         rows_out: Rows,
     ):
@@ -386,8 +386,8 @@ def backward_kernels(asked: Sums, parts: int):
     def composite_vjp_unlisted(
         picture: Picture,
         gaussians_in: Gaussians,
-        lists_in: Lists,
-        walked_in: Walked,
+        lists_in: struct_of(Bins),
+        walked_in: struct_of(Walk),
         v_pixels_in: Pixels,
         rows_out: Rows,
     ):

@@ -6,7 +6,7 @@ are empty: then ``composite_unlisted`` makes the pictures.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, no_type_check
 
 import torch
@@ -14,8 +14,8 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.views import Packed
-from ..project import Splats
+from ...runtime.views import as_struct, struct_of
+from ..projection import Projected
 from ..skip import TILE_TEST
 from ..tiles import Bins, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
 from . import capacity
@@ -29,7 +29,7 @@ wp.set_module_options({"enable_backward": False})
 def _count(
     offset: wp.int32,
     grid: Grid,
-    splats_in: Splats,
+    splats_in: struct_of(Projected),
     nearest_in: wp.array[wp.int64],
     order_out: wp.array[wp.int32],
     counts_out: wp.array[wp.int32],
@@ -42,7 +42,7 @@ def _count(
     count = wp.int32(0)
     box_count = wp.int64(0)
     if extent[0] > 0.0:
-        limit = q_limit(splats_in.opacities[i], grid.alpha_min)
+        limit = q_limit(splats_in.view_opacities[i], grid.alpha_min)
         ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
         rows = tile_rows(grid, ellipse.mean[1], extent[1])
         for ty in range(rows[0], rows[1] + 1):
@@ -65,7 +65,7 @@ def _tile_kernels(number: Any):
     def emit(
         offset: wp.int32,
         grid: Grid,
-        splats_in: Splats,
+        splats_in: struct_of(Projected),
         order_in: wp.array[wp.int32],
         offsets_in: wp.array[wp.int32],
         count_in: wp.array[wp.int64],
@@ -84,7 +84,7 @@ def _tile_kernels(number: Any):
             end = offsets_in[j + 1]
             extent = splats_in.extents[i]
             if extent[0] > 0.0:
-                limit = q_limit(splats_in.opacities[i], grid.alpha_min)
+                limit = q_limit(splats_in.view_opacities[i], grid.alpha_min)
                 ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
                 rows = tile_rows(grid, ellipse.mean[1], extent[1])
                 for ty in range(rows[0], rows[1] + 1):
@@ -138,17 +138,17 @@ def _tile_kernels(number: Any):
 
 
 def bin_views(
-    grid: Grid, tensors: Sequence[Tensor], check: Callable[[int], None], exact: bool = False
+    grid: Grid, projected: Projected, check: Callable[[int], None], exact: bool = False
 ) -> Bins:
     """As ``bin_views`` of the CPU, but the lists may have a capacity above the number of pairs.
 
     Args:
         grid: from ``make_grid``.
-        tensors: means2d, conics, depths (not negative), opacities and extents, ``[I, N, ..]``.
+        projected: as the CPU's.
         check: raises if there are too many; it is called only where the number is read back.
-        exact: whether to read the number of pairs back and to make the lists as long.
+        exact: True to read the number of pairs back and to make the lists as long.
     """
-    depths = tensors[2]
+    depths = projected.depths
     device, images = depths.device, len(depths)
     # stable: equal depths stay in the order of the Gaussians
     nearest = torch.argsort(depths, dim=1, stable=True)
@@ -157,7 +157,7 @@ def bin_views(
     make = torch.empty if num else torch.zeros
     counts = make(num + 1, dtype=torch.int32, device=device)
     totals = torch.empty(2, num, dtype=torch.int64, device=device)
-    splats = Packed(Splats, *tensors, None)
+    splats = as_struct(projected)
     launch(_count, num, [grid, splats, nearest.view(-1)], [order, counts, totals], device)
     offsets = counts.cumsum(0, dtype=torch.int32)
     totals = totals.sum(1)

@@ -2,7 +2,7 @@
 
 Channels go in chunks of at most four: a chunk is a launch, and has its own sums for the geometry's
 gradient. Sums are written per pair and reduced by Gaussian afterwards: no atomics. A second launch
-of each makes what the lists had no room for, and else ends at once. README.md §3 and §5 hold the
+of each replaces lists that were too short, and else ends at once. README.md §3 and §5 hold the
 maths, CUDA.md the design.
 """
 
@@ -14,9 +14,9 @@ from torch import Tensor
 
 from ...runtime.launch import cuda_launch
 from ...runtime.stand_in import multiprocessors_of
-from ...runtime.views import Packed
+from ...runtime.views import Packed, as_struct
 from ..constants import BLOCKS
-from ..tiles import Bins, Drawn, Lists, Picture, Pixels, Walk, Walked
+from ..tiles import Bins, Drawn, Picture, Pixels, Walk
 from .backward import Rows, Sums, backward_kernels, moments_of
 from .forward import forward_kernels
 from .reduce import reduce_rows
@@ -27,7 +27,7 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
     """Into how many warps' work a tile is cut: 1, or where tiles are few, 2 or 4.
 
     A few views do not fill the machine: the tile with the longest list sets the time, and its parts
-    run side by side. With more views, parts would only repeat what a Gaussian costs each warp.
+    run side by side. With more views, parts would only repeat the work of a Gaussian for each warp.
     CUDA.md has the estimate behind the limits.
     """
     few = 10 * multiprocessors_of(device)
@@ -79,8 +79,8 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         (tiles * parts, tiles * parts),
         picture,
         splats,
-        [Packed(Lists, *bins)],
-        [Packed(Walked, *walk), Packed(Pixels, renders, alphas)],
+        [as_struct(bins)],
+        [as_struct(walk), Packed(Pixels, renders, alphas)],
     )
     return renders, alphas, walk
 
@@ -107,7 +107,7 @@ def composite_backward(
         (tiles * parts, splats.means2d.shape[:-2].numel() * parts),
         picture,
         splats,
-        [Packed(Lists, *bins), Packed(Walked, *walk), Packed(Pixels, *v_pixels)],
+        [as_struct(bins), as_struct(walk), Packed(Pixels, *v_pixels)],
         [Packed(Rows, v_pairs, skipped)],
     )
     flags = geometry and not apart, absolute is not None

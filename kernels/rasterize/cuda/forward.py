@@ -1,7 +1,7 @@
 """The CUDA compositor's forward kernels: front to back over the pairs of a tile (README §3).
 
-``composite`` walks the lists of the tiles. ``composite_unlisted`` does nothing unless these had no
-room for all pairs; then it walks all Gaussians of the view for each tile, in the same order.
+``composite`` walks the lists of the tiles. ``composite_unlisted`` does nothing unless these could
+not hold all pairs; then it walks all Gaussians of the view for each tile, in the same order.
 """
 
 import functools
@@ -9,8 +9,9 @@ from typing import no_type_check
 
 import warp as wp
 
+from ...runtime.views import struct_of
 from ..skip import BLOCK_TEST, STOPPED
-from ..tiles import Lists, Picture, Pixels, Walked
+from ..tiles import Bins, Picture, Pixels, Walk
 from . import leaves as L
 from .warp import (
     HEIGHT,
@@ -41,8 +42,8 @@ def _walking(channels: int, parts: int, listed: bool):
     """The function that walks the pairs of a tile's part.
 
     Unless ``listed``, the tiles of a view share one list of all its Gaussians, in which ``offsets``
-    says where the pairs of each would begin, if there were room. Bits of tiles are then joined, and
-    numbers of walked pairs are stored with a minus, so that the gradient knows them.
+    says where the pairs of each would begin, if the lists held them. Bits of tiles are then joined,
+    and numbers of walked pairs are stored with a minus, so that the gradient knows them.
     """
     memory = shared_memory(_SIZE)
     arena_type = memory.arena
@@ -69,8 +70,8 @@ def _walking(channels: int, parts: int, listed: bool):
     def walk(
         picture: Picture,
         gaussians: Gaussians,
-        lists: Lists,
-        walked_out: Walked,
+        lists: struct_of(Bins),
+        walked_out: struct_of(Walk),
         pixels_out: Pixels,
         arena: arena_type,
         p: Place,
@@ -195,7 +196,7 @@ def forward_kernels(channels: int, parts: int):
     """The kernels for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
 
     ``composite`` walks the lists of tiles; ``composite_unlisted`` makes the pictures where the
-    lists have no room.
+    lists are too short.
     """
     options = kernel_options(24 if channels < 4 else 20)  # warps that there are registers for
     place = placing(parts)
@@ -206,8 +207,8 @@ def forward_kernels(channels: int, parts: int):
     def composite(
         picture: Picture,
         gaussians_in: Gaussians,
-        lists_in: Lists,
-        walked_out: Walked,
+        lists_in: struct_of(Bins),
+        walked_out: struct_of(Walk),
         pixels_out: Pixels,
     ):
         index, lane = wp.tid()
@@ -220,8 +221,8 @@ def forward_kernels(channels: int, parts: int):
     def composite_unlisted(
         picture: Picture,
         gaussians_in: Gaussians,
-        lists_in: Lists,
-        walked_out: Walked,
+        lists_in: struct_of(Bins),
+        walked_out: struct_of(Walk),
         pixels_out: Pixels,
     ):
         index, lane = wp.tid()

@@ -1,7 +1,7 @@
 """Sums of rows by Gaussian on CUDA: bitwise repeatable, no atomics, the same without lists.
 
-Rows are added up first, then the parts of a tile and the chunks of channels: so it makes no
-difference whether the rows of a Gaussian were written pair by pair or added by the compositor.
+Rows are added up first, then the parts of a tile and the chunks of channels: so the bits are
+the same for rows written pair by pair and for rows that the compositor has added.
 """
 
 from typing import no_type_check
@@ -10,8 +10,8 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.views import Packed, view
-from ..project import Splats
+from ...runtime.views import as_struct, struct_of, view
+from ..projection import Projected
 from ..tiles import Bins, Drawn
 from . import leaves as L
 from .backward import moments_of
@@ -65,8 +65,8 @@ def _finish(
     sums_in: wp.array3d[wp.float32],
     sets: wp.int32,
     moments: wp.int32,
-    splats_in: Splats,
-    v_splats_out: Splats,
+    splats_in: struct_of(Projected),
+    v_splats_out: struct_of(Projected),
     v_colors_out: wp.array2d[wp.float32],
     absolute_out: wp.array[wp.vec2],
 ):
@@ -96,8 +96,8 @@ def _finish(
         v_splats_out.conics[i] = wp.vec3(-0.5 * huu, -a * huy, -0.5 * hyy)
         v_opacity = wp.float32(0.0)
         if offsets_in[j + 1] != offsets_in[j]:
-            v_opacity = h / splats_in.opacities[i]
-        v_splats_out.opacities[i] = v_opacity
+            v_opacity = h / splats_in.view_opacities[i]
+        v_splats_out.view_opacities[i] = v_opacity
         if absolute_out:
             # README eq. 14, of which the compositor has the second times a factor
             along = _over_parts(sums_in, j, 7) / LOG2_E_HALF
@@ -107,14 +107,14 @@ def _finish(
 def reduce_rows(
     v_pairs: Tensor, splats: Drawn, bins: Bins, geometry: bool, absolute: Tensor | None
 ) -> Drawn:
-    """Sums rows by (view, Gaussian), as the CPU's; all rows are written.
+    """Sum rows by (view, Gaussian), as the CPU's; all rows are written.
 
     Args:
-        v_pairs: ``[P, parts, columns of moments + C]``, or where the lists had no room, rows of
+        v_pairs: ``[P, parts, columns of moments + C]``, or where the lists were too short, rows of
             Gaussians in the order of ``bins.order``.
         splats: as forward, like the lists.
         bins: of the pairs.
-        geometry: whether anything but colours is asked for.
+        geometry: True to compute more than the gradient of the colours.
         absolute: as backward.
     """
     _, conics, view_opacities, _ = splats
@@ -140,10 +140,10 @@ def reduce_rows(
         count,
         [
             *(bins.order, bins.offsets, sums, sets, moments),
-            Packed(Splats, None, conics, None, view_opacities, None, None),
+            as_struct(Projected(conics=conics, view_opacities=view_opacities)),
         ],
         [
-            Packed(Splats, v_means2d, v_conics, None, v_opacities, None, None),
+            as_struct(Projected(v_means2d, v_conics, view_opacities=v_opacities)),
             v_colors.view(-1, channels),
             None if absolute is None else view(absolute.view(-1, 2), wp.vec2),
         ],

@@ -1,4 +1,6 @@
-#include "lanes.h"
+// needs: cpu.py: seen, v_seen, D, UNROLL, SHORTEST, task
+// gives: the body of harmonics_vjp
+#include "gather.h"
 const float *const colors = seen.colors.data, *const v_colors = v_seen.colors.data;
 float *const v_coefficients = v_seen.coefficients.data, *const v_means = (float*)v_seen.means.data;
 float* const v_centers = (float*)v_seen.centers.data;
@@ -52,7 +54,7 @@ for (int first = begin; first < end; first += 16) {
         }
         F t[3], Y[COUNT];
         const F size = direction_(centers + image * 3, mean, t);
-        // what passes no gradient on may hold NaN, which must not meet a zero
+        // channels that pass no gradient on may hold NaN, which must not meet a zero
         for (int i = 0; i < 3; ++i) t[i] = alive ? t[i] : F{};
         basis_(t[0], t[1], t[2], Y);
         if (v_coefficients) {

@@ -1,3 +1,5 @@
+// needs: cuda.py: F, x, y, z, Y; cpu.py: DEGREE
+// gives: xx, yy, zz
 // Fills Y[k], k < (DEGREE + 1)^2, at the direction x, y, z; F is a float, or lanes of floats.
 const F xx = x * x, yy = y * y, zz = z * z;
 

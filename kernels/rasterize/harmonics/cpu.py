@@ -1,4 +1,4 @@
-"""The harmonics on the CPU: sixteen Gaussians as lanes, told in C++.
+"""The harmonics on the CPU: sixteen Gaussians as lanes, in C++.
 
 A thread takes chunks of Gaussians with all views of them, so that no two add to the same place.
 README.md §6 of the rasterizer holds the maths.

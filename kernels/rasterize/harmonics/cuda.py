@@ -1,7 +1,7 @@
 """The harmonics on CUDA: one thread a Gaussian, which loops over its views.
 
 So the gradients by coefficients and by the mean are summed by one thread, without atomics. Sums of
-views go channel by channel: what a thread holds at a time is one column of coefficients, whatever
+views go channel by channel: a thread holds one column of coefficients at a time, whatever
 the number of channels. README.md §6 of the rasterizer holds the maths.
 """
 
@@ -129,7 +129,7 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
                 for view in range(views):
                     image = b * views + view
                     at = image * num + i % num
-                    # what passes no gradient on may hold NaN, which must not meet a zero
+                    # channels that pass no gradient on may hold NaN, which must not meet a zero
                     if seen_in.colors[at, d] > wp.static(above):
                         t = _direction(mean, seen_in.centers[image])
                         v_column += v_seen_out.colors[at, d] * basis(t[0], t[1], t[2])

@@ -1,6 +1,6 @@
 """Real spherical harmonics up to degree 4, in torch (autograd gives the gradients).
 
-The operator of ``ops.py`` takes this for what its kernels do not: other dtypes than float32,
+The operator of ``ops.py`` takes this where it has no kernel: for other dtypes than float32,
 other devices, very many channels. In float64 it is the oracle of the kernels.
 """
 
@@ -78,7 +78,7 @@ def sums_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers: T
     """As ``colors_by_formula``, of ``sums_seen_from``."""
     used = coefficients[..., : (degree + 1) ** 2, :]
     used = used if used.dim() == 5 else used[:, None]
-    # what is not finite must not meet a zero gradient: 0 * NaN would spread to the whole view
+    # no NaN or infinity may meet a zero gradient: 0 * NaN would spread to the whole view
     finite = means.isfinite().all(-1)[:, None] & used.isfinite().flatten(-2).all(-1)
     means = torch.where(means.isfinite().all(-1, keepdim=True), means, 0.0)
     used = torch.where(finite[..., None, None], used, 0.0)

@@ -1,4 +1,6 @@
-#include "lanes.h"
+// needs: cpu.py: seen, D, UNROLL
+// gives: the body of harmonics
+#include "gather.h"
 float* const colors = seen.colors.data;
 for (int first = begin; first < end; first += 16) {
     const int live = end - first < 16 ? end - first : 16;

@@ -9,7 +9,7 @@ from ...runtime.launch import launch
 from ...runtime.operator import operator
 from ...runtime.stand_in import kind_of
 from ...runtime.views import Packed
-from ..project import empty_on
+from ..projection import empty_on
 from . import cpu, cuda
 from .formula import colors_by_formula, sums_by_formula
 from .shared import Seen, Size
@@ -23,7 +23,7 @@ def _kernels(device: torch.device):
 
 
 def _launch(kernel, chunk: int, tensors: list, outputs: list) -> None:
-    """Runs a kernel on chunks of Gaussians; ``tensors`` are those of ``Seen``."""
+    """Run a kernel on chunks of Gaussians; ``tensors`` are those of ``Seen``."""
     coefficients, means, centers, _ = tensors
     size = Packed(Size, means.shape[1], centers.shape[1], int(coefficients.dim() == 5))
     tasks = means.shape[0] * -(-means.shape[1] // chunk)

@@ -9,7 +9,7 @@ SHORTEST = 1e-12  # a vector that is shorter is divided by this in place of its 
 
 @struct
 class Size:
-    """Gaussians and points of an object, and whether each point has coefficients of its own."""
+    """Gaussians and points of an object; ``per_view``: each point has its own coefficients."""
 
     num: int
     views: int

@@ -1,3 +1,5 @@
+// needs: cuda.py: F, x, y, z, v_x, v_y, v_z; cpu.py: DEGREE, s
+// gives: xx, yy, zz
 // Adds the gradient of the sum of s[k] Y[k] by x, y, z to v_x, v_y, v_z.
 const F xx = x * x, yy = y * y, zz = z * z;
 if constexpr (DEGREE >= 1) {

@@ -7,12 +7,13 @@ import torch
 from helpers import on_threads
 from helpers.raster import NAMES, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, ops, project, rasterization
+from gamba_warp.kernels.rasterize import Skip, ops, projection, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
-from gamba_warp.kernels.rasterize.project import LensOptions, make_lens
+from gamba_warp.kernels.rasterize.cuda.project import project_on_threads
+from gamba_warp.kernels.rasterize.projection import LensOptions, make_lens
 from gamba_warp.kernels.rasterize.tiles import Drawn
 
 LISTS = ("pairs", "starts", "box_pairs")
@@ -145,8 +146,8 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=antialiased, rounded=rounded)
     lens = make_lens(LensOptions(skip_unused=1, **options))
     inputs = means, quats if rotated else None, scales, opacities, colors
-    got = project.project_forward([*inputs, viewmats, Ks], lens, project_on_lanes)
-    want = project.project_forward([*inputs, viewmats, Ks], lens)
+    got = projection.project_forward([*inputs, viewmats, Ks], lens, project_on_lanes)
+    want = projection.project_forward([*inputs, viewmats, Ks], lens, project_on_threads)
     for name, value in want._asdict().items():
         assert torch.equal(getattr(got, name), value), name
     assert len(got.status.unique()) >= (5 if num > 500 else 3)

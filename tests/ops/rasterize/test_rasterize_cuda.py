@@ -111,7 +111,7 @@ def test_colours_alone(on_cuda, parts):
 
 
 def test_without_dilation(on_cuda):
-    """A determinant of 0 is culled on both devices, before the division."""
+    """Gaussians of determinant 0 are culled on both devices, before the division by it."""
     scene = crowded(3)
     scene["scales"][:, ::6] = torch.tensor([0.1, 0, 0])
     scene["scales"][:, 1::6] = 1e-13

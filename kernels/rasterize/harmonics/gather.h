@@ -1,3 +1,7 @@
+// needs: cpu.py: DEGREE, D, seen, SHORTEST, CLAMPED, CHUNK, task
+// gives: F, I, COUNT, FLOATS, PADDED, fma_, b, any_, wild_, turn_, num, views, per_view,
+//     coefficients, centers, K_D, stop, load_rows_, direction_, basis_, shown_, passes_, chunks,
+//     begin, end, means_
 // Sixteen Gaussians as the lanes of one SIMD value. Rows of coefficients are turned, 16 x 16 floats
 // at a time, so that a lane holds those of one Gaussian; the gradient is turned back. A row is K_D
 // floats, of which FLOATS are used. Lanes beyond the last Gaussian hold the last one again.

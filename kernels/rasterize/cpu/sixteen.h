@@ -1,3 +1,5 @@
+// needs: nothing
+// gives: F, I, lane, splat, max_, min_, fma_, abs_, root_, any_, all_
 // Sixteen numbers as one value, which becomes AVX-512, AVX2 or NEON instructions.
 typedef float F __attribute__((vector_size(64), aligned(4)));
 typedef int I __attribute__((vector_size(64), aligned(4)));

@@ -1,127 +1,36 @@
-"""3D Gaussians to 2D: culling, the EWA projection, and its gradient.
+"""Kernels of the projection and of its gradient, a thread each (README.md §1 and §4).
 
 Forward has a thread for each (view, Gaussian). The gradient has one for each Gaussian, which loops
-over its views: sums over views are then in a fixed order. README.md §1 and §4 hold the maths.
+over its views: sums over views are then in a fixed order. A CPU runs the gradient here as well
+where that of viewmats or of antialiasing is needed; else both run in ``../cpu/project.py``.
 """
 
-import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, no_type_check
+from typing import no_type_check
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from ..runtime.launch import launch
-from ..runtime.memory import empty
-from ..runtime.views import Packed, filled, struct
-from .constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN
+from ...runtime.launch import launch
+from ...runtime.views import struct_of
+from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN
+from ..projection import (
+    FAR,
+    NEAR,
+    NOT_FINITE,
+    OUTSIDE,
+    SMALL,
+    TRANSPARENT,
+    VISIBLE,
+    Lens,
+    Projected,
+    Scene,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 mat23 = wp.types.matrix((2, 3), wp.float32)
-
-# What becomes of a (view, Gaussian).
-VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
-STATUS_NAMES = ("visible", "near", "far", "not_finite", "transparent", "outside", "small")
-
 _SHORTEST = 1e-30  # the gradient of a shorter quaternion leaves float32's range
-
-
-class LensOptions(NamedTuple):
-    """Arguments of a ``Lens``, as numbers that fit in a list of floats.
-
-    Attributes:
-        width: of the picture, pixels.
-        height: of the picture, pixels.
-        near_plane: as ``rasterization``, like the following three.
-        far_plane: as ``rasterization``.
-        radius_clip: as ``rasterization``.
-        eps2d: as ``rasterization``.
-        alpha_min: as ``rasterization``.
-        antialiased: not 0 for ``rasterize_mode="antialiased"``.
-        skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
-        rounded: not 0 to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
-            does; a Gaussian that this keeps beside the picture has no pair.
-    """
-
-    width: float
-    height: float
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
-    alpha_min: float
-    antialiased: float
-    skip_unused: float
-    rounded: float = 0.0
-
-    def numbers(self) -> list[float]:
-        """The attributes in their order; ``LensOptions(*numbers)`` is the way back."""
-        return [float(x) for x in self]
-
-
-class Projected(NamedTuple):
-    """N Gaussians of each of B objects in V views; one that is culled has opacity and extents 0.
-
-    Attributes:
-        means2d: ``[B, V, N, 2]`` centres in pixels.
-        conics: ``[B, V, N, 3]``: a, k, e of README eq. 4.
-        depths: ``[B, V, N]`` along the camera's axis, world units.
-        view_opacities: ``[B, V, N]``, with the factor of antialiasing.
-        extents: ``[B, V, N, 2]`` half sides of the box around alpha >= alpha_min, pixels.
-        status: ``[B, V, N]`` int32, an index of ``STATUS_NAMES``.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    depths: Tensor
-    view_opacities: Tensor
-    extents: Tensor
-    status: Tensor
-
-
-PROJECTED_SIZES = ((2,), (3,), (), (), (2,))  # of ``Projected``'s floats, after [B, V, N]
-
-
-@struct
-class Lens:
-    """The scalars of a projection's launch: picture size and thresholds."""
-
-    width: float
-    height: float
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
-    alpha_min: float
-    antialiased: int
-    skip_unused: int
-    rounded: int
-
-
-@struct
-class Scene:
-    """Gaussians and cameras as a launch takes them, or their gradients."""
-
-    means: wp.array[wp.vec3]
-    quats: wp.array[wp.vec4]
-    scales: wp.array[wp.vec3]
-    opacities: wp.array[wp.float32]
-    viewmats: wp.array[wp.mat44]
-    Ks: wp.array[wp.mat33]
-
-
-@struct
-class Splats:
-    """``Projected`` as a launch takes it, by view-major Gaussians, or its gradients."""
-
-    means2d: wp.array[wp.vec2]
-    conics: wp.array[wp.vec3]
-    depths: wp.array[wp.float32]
-    opacities: wp.array[wp.float32]
-    extents: wp.array[wp.vec2]
-    status: wp.array[wp.int32]
 
 
 @wp.func
@@ -211,7 +120,7 @@ def _project(
     scene_in: Scene,
     colors_per_view: wp.int32,
     colors_in: wp.array2d[wp.float32],
-    splats_out: Splats,
+    splats_out: struct_of(Projected),
 ):
     i = offset + wp.tid()
     image = i // num
@@ -219,7 +128,7 @@ def _project(
     splats_out.means2d[i] = wp.vec2(0.0, 0.0)
     splats_out.conics[i] = wp.vec3(1.0, 0.0, 1.0)
     splats_out.depths[i] = 0.0
-    splats_out.opacities[i] = 0.0
+    splats_out.view_opacities[i] = 0.0
     splats_out.extents[i] = wp.vec2(0.0, 0.0)
 
     mean = scene_in.means[g]
@@ -295,7 +204,7 @@ def _project(
     splats_out.means2d[i] = center
     splats_out.conics[i] = wp.vec3(a, -sxy / syy, e)
     splats_out.depths[i] = t[2]
-    splats_out.opacities[i] = opacity
+    splats_out.view_opacities[i] = opacity
     splats_out.extents[i] = extent
 
 
@@ -342,13 +251,13 @@ def _rotation_vjp(q: wp.vec4, v: wp.mat33) -> wp.vec4:
 
 @wp.func
 @no_type_check
-def _all_zero(v: Splats, i: wp.int32) -> bool:
+def _all_zero(v: struct_of(Projected), i: wp.int32) -> bool:
     # exactly: NaN is not
     return (
         v.means2d[i] == wp.vec2(0.0, 0.0)
         and v.conics[i] == wp.vec3(0.0, 0.0, 0.0)
         and v.depths[i] == 0.0
-        and v.opacities[i] == 0.0
+        and v.view_opacities[i] == 0.0
     )
 
 
@@ -360,8 +269,8 @@ def _project_vjp(
     num: wp.int32,
     lens: Lens,
     scene_in: Scene,
-    splats_in: Splats,
-    v_splats_in: Splats,
+    splats_in: struct_of(Projected),
+    v_splats_in: struct_of(Projected),
     v_scene_out: Scene,
     v_viewmats_out: wp.array3d[wp.float32],
 ):
@@ -403,7 +312,7 @@ def _project_vjp(
             v_m0 = v_across * across - e * v[1] * m1
             v_m1 = (v_across * k - e * v[1]) * across - e * (v[1] * k + 2.0 * e * v[2]) * m1
 
-            v_o = v_splats_in.opacities[i]
+            v_o = v_splats_in.view_opacities[i]
             if lens.antialiased != 0:
                 # README eq. 9: the factor sqrt(det0 / det), det0 = |m0 × m1|²
                 det0 = wp.dot(n, n)
@@ -459,96 +368,12 @@ def _project_vjp(
             v_scene_out.quats[g] = _rotation_vjp(q, v_R) / size
 
 
-def make_lens(options: LensOptions) -> Lens:
-    """The scalars of a projection as one kernel argument, which is shared: not to be changed."""
-    return filled(Lens, *options[:7], *map(int, options[7:]))
-
-
-def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """An empty tensor; a large one on the CPU is of large pages, since it is read at random."""
-    if device.type == "cpu":
-        return empty(shape, dtype)
-    return torch.empty(*shape, dtype=dtype, device=device)
-
-
 def project_on_threads(images: int, num: int, arguments: list, device: torch.device) -> None:
-    """Runs the projection of ``num`` Gaussians into so many views, a thread for each of a view."""
+    """Run the projection of ``num`` Gaussians into so many views, a thread for each of a view."""
     launch(_project, images * num, arguments, [], device)
 
 
-def project_forward(
-    inputs: Sequence[Any], lens: Lens, run: Callable[..., None] = project_on_threads
-) -> Projected:
-    """Project objects of N Gaussians into V views each; float32, contiguous tensors.
-
-    Args:
-        inputs: means ``[.., N, 3]``, quats ``[.., N, 4]`` or None, scales ``[.., N, 3]``,
-            opacities ``[.., N]``; colors ``[.., N, C]`` or ``[.., V, N, C]``, only to cull what is
-            not finite; viewmats ``[.., V, 4, 4]`` and Ks ``[.., V, 3, 3]``.
-        lens: from ``make_lens``.
-        run: launcher of the device.
-    """
-    *gaussians, colors, viewmats, Ks = inputs
-    shape, num, device = viewmats.shape[:-2], colors.shape[-2], colors.device
-    projected = Projected(
-        *(empty_on(device, [*shape, num, *size], torch.float32) for size in PROJECTED_SIZES),
-        status=empty_on(device, [*shape, num], torch.int32),
-    )
-    if projected.status.numel():
-        scene = Packed(Scene, *gaussians, viewmats, Ks)
-        per_view = int(colors.dim() > gaussians[0].dim())
-        arguments = [shape[-1], num, lens, scene, per_view, colors.flatten(0, -2)]
-        run(shape.numel(), num, [*arguments, Packed(Splats, *projected)], device)
-    return projected
-
-
-def project_backward(
-    inputs: Sequence[Any],
-    lens: Lens,
-    conics: Tensor,
-    status: Tensor,
-    cotangents: Sequence[Tensor],
-    wanted: Sequence[bool],
-    on_lanes: Callable[..., None] | None,
-) -> list[Tensor | None]:
-    """Gradients of ``project_forward`` by means, quats, scales, opacities and viewmats.
-
-    Args:
-        inputs: as given forward, without the colors.
-        lens: as given forward.
-        conics: as returned forward.
-        status: as returned forward.
-        cotangents: of means2d, conics, depths and view_opacities; contiguous.
-        wanted: of which of the five the gradient is asked for; the others are None.
-        on_lanes: the device's launcher where neither viewmats nor antialiasing are asked for, that
-            of ``cpu/project_vjp.py``, or None.
-    """
-    *gaussians, viewmats, Ks = inputs
-    (*lead, views, num), means = status.shape, gaussians[0]
-    batch = math.prod(lead)
-    # the kernel writes all of a gradient, where there is a view
-    grads = [
-        None
-        if x is None or not want
-        else empty_on(x.device, x.shape, x.dtype)
-        if status.numel()
-        else torch.zeros_like(x)
-        for x, want in zip(gaussians, wanted)
-    ]
-    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[4] else None
-    if status.numel():
-        given = [
-            Packed(Scene, *gaussians, viewmats, Ks),
-            Packed(Splats, None, conics, None, None, None, status),
-            Packed(Splats, *cotangents, None, None),
-            Packed(Scene, *grads, None, None),
-        ]
-        if on_lanes and v_viewmats is None and not lens.antialiased:
-            on_lanes(batch, num, [views, num, lens, *given])
-        else:
-            arguments = [views, num, lens, *given, v_viewmats]
-            launch(_project_vjp, batch * num, arguments, [], means.device)
-    if v_viewmats is not None:
-        v_viewmats = v_viewmats.sum(1).view(*lead, views, 3, 4)
-        v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))
-    return [*grads, v_viewmats]
+def vjp_on_threads(batch: int, num: int, arguments: list, v_viewmats: Tensor | None) -> None:
+    """Run the gradient for B objects; see ``projection.project_backward``."""
+    device = arguments[3].values[0].device
+    launch(_project_vjp, batch * num, [*arguments, v_viewmats], [], device)

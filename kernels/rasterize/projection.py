@@ -1,0 +1,187 @@
+"""3D Gaussians to 2D: culling, the EWA projection, and its gradient (README.md §1 and §4).
+
+The arguments, and the launches on both devices: the kernels are in ``cpu/`` and ``cuda/``.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ..runtime.memory import empty
+from ..runtime.views import Packed, as_struct, filled, struct
+
+# Status of a (view, Gaussian).
+VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
+STATUS_NAMES = ("visible", "near", "far", "not_finite", "transparent", "outside", "small")
+
+
+class LensOptions(NamedTuple):
+    """Arguments of a ``Lens``, as numbers that fit in a list of floats.
+
+    Attributes:
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+        near_plane: as ``rasterization``, like the following three.
+        far_plane: as ``rasterization``.
+        radius_clip: as ``rasterization``.
+        eps2d: as ``rasterization``.
+        alpha_min: as ``rasterization``.
+        antialiased: not 0 for ``rasterize_mode="antialiased"``.
+        skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
+        rounded: not 0 to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
+            does; a Gaussian that this keeps beside the picture has no pair.
+    """
+
+    width: float
+    height: float
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    alpha_min: float
+    antialiased: float
+    skip_unused: float
+    rounded: float = 0.0
+
+    def numbers(self) -> list[float]:
+        """The attributes in their order; ``LensOptions(*numbers)`` is the way back."""
+        return [float(x) for x in self]
+
+
+class Projected(NamedTuple):
+    """N Gaussians of each of B objects in V views; one that is culled has opacity and extents 0.
+
+    Attributes:
+        means2d: ``[B, V, N, 2]`` centres in pixels.
+        conics: ``[B, V, N, 3]``: a, k, e of README eq. 4.
+        depths: ``[B, V, N]`` along the camera's axis, world units.
+        view_opacities: ``[B, V, N]``, with the factor of antialiasing.
+        extents: ``[B, V, N, 2]`` half sides of the box around alpha >= alpha_min, pixels.
+        status: ``[B, V, N]`` int32, an index of ``STATUS_NAMES``.
+    """
+
+    means2d: Annotated[Any, wp.array[wp.vec2]] = None
+    conics: Annotated[Any, wp.array[wp.vec3]] = None
+    depths: Annotated[Any, wp.array[wp.float32]] = None
+    view_opacities: Annotated[Any, wp.array[wp.float32]] = None
+    extents: Annotated[Any, wp.array[wp.vec2]] = None
+    status: Annotated[Any, wp.array[wp.int32]] = None
+
+
+PROJECTED_SIZES = ((2,), (3,), (), (), (2,))  # of ``Projected``'s floats, after [B, V, N]
+
+
+@struct
+class Lens:
+    """The scalars of a projection's launch: picture size and thresholds."""
+
+    width: float
+    height: float
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    alpha_min: float
+    antialiased: int
+    skip_unused: int
+    rounded: int
+
+
+@struct
+class Scene:
+    """Gaussians and cameras as a launch takes them, or their gradients."""
+
+    means: wp.array[wp.vec3]
+    quats: wp.array[wp.vec4]
+    scales: wp.array[wp.vec3]
+    opacities: wp.array[wp.float32]
+    viewmats: wp.array[wp.mat44]
+    Ks: wp.array[wp.mat33]
+
+
+def make_lens(options: LensOptions) -> Lens:
+    """The scalars of a projection as one kernel argument, which is shared: not to be changed."""
+    return filled(Lens, *options[:7], *map(int, options[7:]))
+
+
+def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """An empty tensor; a large one on the CPU is of large pages, since it is read at random."""
+    if device.type == "cpu":
+        return empty(shape, dtype)
+    return torch.empty(*shape, dtype=dtype, device=device)
+
+
+def project_forward(inputs: Sequence[Any], lens: Lens, run: Callable[..., None]) -> Projected:
+    """Project objects of N Gaussians into V views each; float32, contiguous tensors.
+
+    Args:
+        inputs: means ``[.., N, 3]``, quats ``[.., N, 4]`` or None, scales ``[.., N, 3]``,
+            opacities ``[.., N]``; colors ``[.., N, C]`` or ``[.., V, N, C]``, only to cull values
+            that are not finite; viewmats ``[.., V, 4, 4]`` and Ks ``[.., V, 3, 3]``.
+        lens: from ``make_lens``.
+        run: launches the device's kernel.
+    """
+    *gaussians, colors, viewmats, Ks = inputs
+    shape, num, device = viewmats.shape[:-2], colors.shape[-2], colors.device
+    projected = Projected(
+        *(empty_on(device, [*shape, num, *size], torch.float32) for size in PROJECTED_SIZES),
+        status=empty_on(device, [*shape, num], torch.int32),
+    )
+    if projected.status.numel():
+        scene = Packed(Scene, *gaussians, viewmats, Ks)
+        per_view = int(colors.dim() > gaussians[0].dim())
+        arguments = [shape[-1], num, lens, scene, per_view, colors.flatten(0, -2)]
+        run(shape.numel(), num, [*arguments, as_struct(projected)], device)
+    return projected
+
+
+def project_backward(
+    inputs: Sequence[Any],
+    lens: Lens,
+    conics: Tensor,
+    status: Tensor,
+    cotangents: Sequence[Tensor],
+    wanted: Sequence[bool],
+    run: Callable[..., None],
+) -> list[Tensor | None]:
+    """Gradients of ``project_forward`` by means, quats, scales, opacities and viewmats.
+
+    Args:
+        inputs: as given forward, without the colors.
+        lens: as given forward.
+        conics: as returned forward.
+        status: as returned forward.
+        cotangents: of means2d, conics, depths and view_opacities; contiguous.
+        wanted: True for the needed gradients of the five; the others are None.
+        run: launches the device's kernel; the last argument is the gradient of viewmats, by
+            Gaussians ``[B * V, N, 12]``, or None.
+    """
+    *gaussians, viewmats, Ks = inputs
+    (*lead, views, num), means = status.shape, gaussians[0]
+    batch = math.prod(lead)
+    # the kernel writes all of a gradient, where there is a view
+    grads = [
+        None
+        if x is None or not want
+        else empty_on(x.device, x.shape, x.dtype)
+        if status.numel()
+        else torch.zeros_like(x)
+        for x, want in zip(gaussians, wanted)
+    ]
+    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[4] else None
+    if status.numel():
+        arguments = [
+            *(views, num, lens, Packed(Scene, *gaussians, viewmats, Ks)),
+            as_struct(Projected(conics=conics, status=status)),
+            as_struct(Projected(*cotangents)),
+            Packed(Scene, *grads, None, None),
+        ]
+        run(batch, num, arguments, v_viewmats)
+    if v_viewmats is not None:
+        v_viewmats = v_viewmats.sum(1).view(*lead, views, 3, 4)
+        v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))
+    return [*grads, v_viewmats]
