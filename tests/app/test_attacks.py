@@ -6,13 +6,16 @@ import signal
 import socket
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.app import FORM, MEGABYTES, Program, form, serving
 from PIL import Image
 
 from gamba_warp.app.cutting import examples
+from gamba_warp.app.work import KINDS
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
+AREAS = MAKE + 2 + 2 * len(KINDS)  # after the two functions of each kind of file
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
 
@@ -65,6 +68,18 @@ def test_a_program_that_does_as_the_page_does(program, private):
     painted = {"layers": [given(program.upload(encoded(layer)))], "background": {"path": "/"}}
     after = program.result(MEND, [None, painted])["data"][1]["background"]["path"]
     assert Path(after).read_bytes() != Path(shown).read_bytes()
+
+
+def test_enclosed_areas_are_filled_and_cleared(program):
+    pixels = np.full((60, 60, 3), 255, np.uint8)
+    pixels[10:50, 10:50] = 200, 30, 20
+    pixels[20:40, 20:40] = 255
+    output = program.result(TAKE, [given(program.upload(encoded(Image.fromarray(pixels))))])
+    assert "1 enclosed area" in output["data"][3]
+    shown = [output["data"][2]["background"]["path"]]
+    shown += [program.result(AREAS, [None])["data"][1]["background"]["path"] for _ in range(2)]
+    first, filled, cleared = (np.asarray(Image.open(path))[360, 360] for path in shown)
+    assert filled.min() == 255 > first.max() and (first == cleared).all()
 
 
 @pytest.mark.parametrize("meta", [None, {"_type": "gradio.FileData"}])
