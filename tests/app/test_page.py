@@ -146,22 +146,6 @@ def test_the_whole_way(opened, served, tmp_path):
     assert "my-square.ply" in listed and "my-square.spz" in listed
 
 
-def test_enclosed_areas_are_filled_and_cleared(opened, tmp_path):
-    picture = np.full((200, 200, 3), (0.2, 0.4, 0.9))
-    picture[40:160, 40:160] = RED
-    picture[70:130, 70:130] = 0.2, 0.4, 0.9
-    save_image(tmp_path / "frame.png", picture)
-    page = opened.page
-    give(page, tmp_path / "frame.png")
-    page.wait_for_selector("#note:has-text('1 enclosed area')")
-    page.wait_for_selector("#editor canvas")
-    until(lambda: middle(page)[0] > 150, "the hole is cleared")
-    page.locator("#areas").click()
-    until(lambda: middle(page)[0] < 80, "the hole is filled")
-    page.locator("#areas").click()
-    until(lambda: middle(page)[0] > 150, "the hole is cleared again")
-
-
 def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
     page = opened.page
     page.locator("#examples button").last.click()
