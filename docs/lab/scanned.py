@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+from PIL import Image
 
 from gamba_warp import cli
 from gamba_warp.errors import UserError
-from gamba_warp.files import write_text
+from gamba_warp.files import atomic_path, write_text
 from gamba_warp.image_metrics import METRICS
 from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
@@ -40,7 +41,7 @@ def main(
     up: Literal["auto", "y", "z"] = "auto",
     page: Path | Literal["none"] = PAGE,
 ) -> int:
-    """Renders, evaluates and writes the page's tables.
+    """Renders, evaluates and writes the page's tables and its picture of all objects.
 
     Args:
         folder: of the meshes, named by object.
@@ -61,7 +62,7 @@ def main(
         _run("data render", folder, "--out", views, *words)
     model = ["--checkpoint", checkpoint, "--data", views, "--split", "all", "--views", 5]
     few = [] if limit is None else ["--limit", limit]
-    more = ["--save-gaussians", "--strips", 0, "--out", out / "eval"]
+    more = ["--save-gaussians", "--strips", 0, "--sheet", 100, "--out", out / "eval"]
     code = _run("eval-views", *model, *more, *few, *([] if lpips else ["--no-lpips"]))
     words = ["--frame", "reference", "--data", views, "--out", out / "shapes"]
     gaussians = out / "eval" / "gaussians"
@@ -74,6 +75,10 @@ def main(
         print("\n\n".join(parts.values()))
     else:
         write_text(page, with_parts(page.read_text(encoding="utf-8"), "make scanned", parts))
+        with Image.open(out / "eval" / "contact_sheet.png") as sheet:
+            half = sheet.convert("RGB").reduce(2)
+        with atomic_path(page.parent / "pictures" / "scanned.webp") as path:
+            half.save(path, "WEBP", quality=80, method=6)
     return code
 
 

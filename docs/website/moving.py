@@ -1,10 +1,11 @@
 """Draws docs/pictures/turntables.webp: turning objects outside the shipped model's training set.
 
-    python docs/website/moving.py data/furniture128
+    python docs/website/moving.py data/furniture128 out/scanned/views
 
 Left of each pair is the input, right of it the shipped model's reconstruction of that picture. The
-objects are of the test split, one of a kind, chosen by eye; docs/pictures/held-out.webp has the
-best, the middle and the worst by PSNR.
+objects are of furniture's test split and of Google Scanned Objects (``make scanned`` renders them),
+one of a kind, chosen by eye; docs/pictures/held-out.webp has the best, the middle and the worst of
+furniture by PSNR, docs/pictures/scanned.webp all scanned objects.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from gamba_warp.files import atomic_path
 from gamba_warp.images import load_rgba, to_uint8
 
 OBJECTS = (
-    *("blendswap-cc-by-horse", "blendswap-cc-0-teddybear", "scopia-cardboard-box"),
-    *("blendswap-cc-by-mediumindoorplant", "scopia-dog-house", "blendswap-cc-0-caballito"),
+    *("TZX_Runner", "Room_Essentials_Mug_White_Yellow", "CHICKEN_RACER"),
+    *("blendswap-cc-0-teddybear", "Schleich_Hereford_Bull", "scopia-dog-house"),
 )
 COLUMNS = 3
 SIDE = 200  # pixels of the input and of the turntable
@@ -31,11 +32,11 @@ MILLISECONDS = 100  # duration of a frame
 PICTURE = Path(__file__).parents[1] / "pictures" / "turntables.webp"
 
 
-def main(data: Path) -> None:
+def main(*data: Path) -> None:
     """Write the picture.
 
     Args:
-        data: made by `gamba data furniture` and `gamba data render`.
+        data: folders made by `gamba data render`, which together have the objects.
     """
     from gamba_warp import load_model, reconstruct
     from gamba_warp.pages.turntable import turntable_frames
@@ -43,7 +44,8 @@ def main(data: Path) -> None:
     model = load_model()
     cells = []
     for name in OBJECTS:
-        rgba = load_rgba(data / name / "000.webp")
+        path = next(path for folder in data if (path := folder / name / "000.webp").exists())
+        rgba = load_rgba(path)
         seen = Image.fromarray(to_uint8(over_background(rgba, GREY)))
         still = np.asarray(seen.resize((SIDE, SIDE), Image.Resampling.BICUBIC))
         turn = turntable_frames(reconstruct(model, rgba), size=SIDE, frames=FRAMES, elevation=10.0)
@@ -58,4 +60,4 @@ def main(data: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))

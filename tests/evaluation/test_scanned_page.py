@@ -5,6 +5,7 @@ import json
 import pytest
 from lab import scanned
 from lab.figures.parts import marks
+from PIL import Image
 
 from gamba_warp.image_metrics import METRICS
 
@@ -77,9 +78,12 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
         (folder / "report.json").write_text(
             json.dumps(VIEWS if command == "eval-views" else SHAPES)
         )
+        if command == "eval-views":
+            Image.new("RGB", (9, 14), "red").save(folder / "contact_sheet.png")
         return int(command == "eval-views")
 
     monkeypatch.setattr(scanned.cli, "run", run)
+    (tmp_path / "pictures").mkdir()
     page = tmp_path / "page.md"
     parts = "\n".join("\n".join(marks("make scanned", name)) for name in ("figures", "objects"))
     page.write_text(f"before\n{parts}\nafter\n")
@@ -90,6 +94,7 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n")
     assert "| b " in text and "**this project**" in text
+    assert Image.open(tmp_path / "pictures" / "scanned.webp").size == (5, 7)
 
 
 def test_the_page_that_is_there_has_its_marks_and_every_metric():
