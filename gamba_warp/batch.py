@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from unicodedata import normalize
 
 from .errors import UserError, first_line, one_line
+from .files import check_folder_name
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -201,6 +202,7 @@ def plan_outputs(
     Raises:
         UserError: an output would overwrite an input.
     """
+    check_folder_name(folder)
     names: dict[str, Path] = {}
     taken = {name.casefold() for name in own}
     renamed: list[str] = []

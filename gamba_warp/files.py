@@ -4,6 +4,7 @@ import errno
 import fnmatch
 import hashlib
 import json
+import mimetypes
 import os
 import re
 import secrets
@@ -29,6 +30,9 @@ PART = ".gamba-part-"
 _PART_NAME = re.compile(re.escape(PART) + "[a-z0-9_]{8}")
 _DAY = 24 * 3600.0  # seconds; no command writes one file for so long
 _READ = 1 << 20  # bytes read at once; a file may be larger than the memory
+# Endings of names of files: those that every Python knows, without the system's, and ours.
+_FILE_NAMES = mimetypes.MimeTypes()
+_FILE_SUFFIXES = {*".ply .splat .spz .glb .gltf .obj .stl .off .safetensors .npz".split()}
 # Codes of a failed write that blame the disk, even if the error names no file.
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 
@@ -257,13 +261,25 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_bytes(text.encode(errors="backslashreplace"))
 
 
+def check_folder_name(path: Path) -> None:
+    """Refuse a new folder whose name ends like that of a file, such as ``model.glb``.
+
+    Raises:
+        UserError: the name has such an ending, and there is no folder of that name.
+    """
+    kind, coding = _FILE_NAMES.guess_type(path.name)
+    if (kind or coding or path.suffix.lower() in _FILE_SUFFIXES) and not path.exists():
+        raise UserError(f"{path}: a file's name, but the results need a folder; give one")
+
+
 def output_folder(path: str | Path) -> Path:
     """Make a folder with its parents, check that it is writable, and sweep it.
 
     Raises:
-        UserError: it is a file, or cannot be created or written.
+        UserError: it is a file or has a file's name, or cannot be created or written.
     """
     path = Path(path)
+    check_folder_name(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path, prefix=PART):

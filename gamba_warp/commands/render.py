@@ -69,6 +69,8 @@ def render_command(
 
     single = out.suffix.lower() in _SUFFIXES and not out.is_dir()
     suffix = out.suffix.lower()[1:]
+    if suffix[:1].isalpha() and not single and not out.is_dir():
+        raise UserError(f"--out {out}: expected a folder, or a file {', '.join(_SUFFIXES)}")
     if single and kind not in (None, suffix):
         raise UserError(f"--out {out}: its name says {suffix}, but --kind {kind}")
     kind = cast(Kind, suffix) if single else kind or "gif"

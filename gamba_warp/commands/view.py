@@ -59,6 +59,8 @@ def view_command(
     from ..viewer.page import write_viewer
 
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
+    if out is not None and out.suffix.lower() not in (".html", ".htm"):
+        raise UserError(f"--out {out}: the page is an .html file")
     if mesh is not None and file.is_dir():
         raise UserError(f"--mesh {mesh}: a training run has no mesh")
     gaussians = None if file.is_dir() else read_with_warning(file, drop_bad)

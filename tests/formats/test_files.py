@@ -200,3 +200,13 @@ def test_who_reads_the_older_file_reads_it_to_its_end(tmp_path):
             temporary.write_text("new")
         assert reader.read() == "old" * 99_999
     assert path.read_text() == "new"
+
+
+def test_a_folder_has_no_files_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("model.glb", "m.webm", "A.PLY", "views.tar.gz", "page.html"):
+        refused(f"{name}: a file's name", output_folder, name)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "old.zip").mkdir()
+    for name in ("old.zip", "run.v2", "2026.11.27", "out"):
+        assert output_folder(name).is_dir()

@@ -125,6 +125,7 @@ REFUSED = {
     "--trajectory {cameras} --fov 30": "--fov goes with a turntable or a spiral",
     "--trajectory {cameras} --out a.png": "there are 2 views",
     "--out a.gif --kind mp4": "its name says gif",
+    "--out a.webm": "expected a folder, or a file .gif, .mp4, .png",
     "--size 4096 --frames 100": "too many for a .gif",
 }
 

@@ -99,7 +99,9 @@ def test_view_shows_a_mesh_too(ball, tmp_path, capsys):
     (tmp_path / "bad.glb").write_bytes(b"no mesh")
     page.unlink()
     assert run([*command[:3], str(tmp_path / "bad.glb"), "--out", str(page)]) == 2
-    assert not page.exists()
+    assert run(["view", str(ball), "--out", str(tmp_path / "page.webm")]) == 2
+    assert "page.webm: the page is an .html file" in capsys.readouterr().err
+    assert not page.exists() and not (tmp_path / "page.webm").exists()
 
 
 def test_view_without_a_browser_says_so_in_one_line(ball, tmp_path, monkeypatch, capsys):
