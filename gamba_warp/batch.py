@@ -58,7 +58,7 @@ def for_each(
 def progress_bar(
     items: Iterable[Item] | None = None, lines: bool = False, **options: Any
 ) -> tqdm[Item]:
-    """Return a tqdm bar on stderr; nothing is drawn unless stderr is a terminal.
+    """Return a tqdm bar on stderr; nothing is drawn with --quiet, or unless stderr is a terminal.
 
     A log or a pipe would collect every state of the bar on one long line.
 
@@ -70,11 +70,12 @@ def progress_bar(
     from tqdm import tqdm
 
     stream = options.get("file") or sys.stderr
-    if lines and not stream.isatty():
+    if lines and not (stream.isatty() or STAGES.quiet):
         form = options.get("bar_format", _LINE).replace("|{bar}|", "")
         options |= {"file": _Lines(stream), "disable": False, "bar_format": form}
         return tqdm(items, **options)
-    bar: Any = tqdm(items, disable=None, **options)  # without items its type is unknown
+    hidden = True if STAGES.quiet else None
+    bar: Any = tqdm(items, disable=hidden, **options)  # without items its type is unknown
     return bar
 
 
@@ -117,11 +118,13 @@ class Stages:
     """Stages of a command, timed and shown beside the bar of ``for_each``.
 
     Attributes:
+        quiet: no bar is drawn.
         show: shows a name; None without a bar.
         seconds: wall-clock and CPU seconds of each stage, over all items.
     """
 
     def __init__(self) -> None:
+        self.quiet = False
         self.show: Callable[[str], object] | None = None
         self.seconds: dict[str, list[float]] = {}
         self._name, self._since = "start", (None, 0.0)

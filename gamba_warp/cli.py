@@ -7,62 +7,82 @@ import io
 import os
 import re
 import sys
+import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import is_dataclass
-from typing import Any, get_args, get_type_hints
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
+from difflib import get_close_matches
+from typing import Any, Literal, NamedTuple
 
+from .batch import STAGES
 from .devices import keep_memory, quiet_warp, share_cores, use_fastest_products
 from .errors import FileWarning, UserError
 from .files import DISK_ERRORS
-from .versions import __version__, advice, missing
+from .usage import completions, help_text, read_words
+from .versions import MADE, SHAPES, __version__, advice, require
 
-# A command has one or two words. The command "a b-c" is the function ``a_b_c_command`` of
-# ``gamba_warp.commands.a_b_c``, unless MODULES names another module; it is imported when called.
+
+class Command(NamedTuple):
+    """Command of the console script.
+
+    Attributes:
+        about: its purpose, a line.
+        extra: the extra that brings its libraries; empty for the core.
+        needs: libraries that it always needs; those of single options are checked on use.
+        uses: it launches "kernels" (``quiet_warp``), runs the "network" (``keep_memory``,
+            ``use_fastest_products``), or leaves "cores" to others while it waits (``share_cores``),
+            unlike training and measurements, which keep torch's busy-waiting.
+        module: has its function, and is imported when called; "a b-c" is ``a_b_c_command``, by
+            default of ``gamba_warp.commands.a_b_c``.
+    """
+
+    about: str
+    extra: str = ""
+    needs: tuple[str, ...] = ()
+    uses: tuple[Literal["kernels", "network", "cores"], ...] = ()
+    module: str = ""
+
+
+_DATA, _TRAIN = "gamba_warp.train.sources.commands", "gamba_warp.train.command"
+_VIEWS, _SHAPES = "gamba_warp.eval.views.command", "gamba_warp.eval.shapes.command"
+_COMPARE, _ABLATION = "gamba_warp.eval.compare_command", "gamba_warp.ablation.command"
+_MACHINE, _WEIGHTS = "gamba_warp.commands.machine", "gamba_warp.commands.weights"
+_APP, _GRADIO = "gamba_warp.app.server", ("gradio",)
+_RENDERS, _METRICS = ("trimesh", "open3d", "manifold3d"), ("kornia",)
+_MODEL: Any = ("kernels", "network")
+_DRAWING: Any = ("kernels", "cores")
+_PICTURES: Any = (*_MODEL, "cores")
+# A command has one or two words.
 COMMANDS = {
-    "demo": "Train, reconstruct and evaluate on the starter set.",
-    "reconstruct": "Pictures to 3D Gaussians.",
-    "train": "Train a model on posed views.",
-    "fit": "Posed views of an object to 3D Gaussians.",
-    "data furniture": "Get 820 models.",
-    "data made": "Make models: toys, shoes, tools, boxes.",
-    "data render": "Meshes to posed views.",
-    "data pack": "Posed views to a few large files.",
-    "data index": "Check a dataset once, for all later starts.",
-    "data objaverse": "Objaverse, and its G-Objaverse views.",
-    "data gso": "Google Scanned Objects, for evaluation.",
-    "eval-views": "PSNR, SSIM, LPIPS of views.",
-    "eval-geometry": "Chamfer, IoU, F-score.",
-    "compare": "Reports of several methods in one table.",
-    "ablate": "Train and compare variants of a model.",
-    "export": "Gaussians to meshes, splats and pages.",
-    "view": "Gaussians in the browser.",
-    "render": "Gaussians to pictures and movies along a path.",
-    "app": "Pictures to 3D on a page of this machine.",
-    "bench": "Run time against error, on this machine.",
-    "stress": "Random hostile cases against float64.",
-    "gpu-check": "Test and measure on a CUDA machine.",
-    "import-released": "The authors' public weights to ours.",
-    "weights lpips": "Fetch the LPIPS-VGG weights.",
-    "doctor": "Say what this machine can run.",
-}
-# Interactive commands (``share_cores``); training and measurements keep torch's busy-waiting.
-SHARING = {"reconstruct", "export", "render", "app"}
-# Commands that run the network (``keep_memory``, ``use_fastest_products``).
-KEEPING = {"reconstruct", "app", "train", "ablate", "bench", "demo", "fit", "eval-views"}
-# Commands that launch kernels (``quiet_warp``).
-LAUNCHING = KEEPING | {"export", "render", "stress", "gpu-check", "doctor"}
-MODULES = {
-    "app": "gamba_warp.app.server",
-    "train": "gamba_warp.train.command",
-    **{name: "gamba_warp.train.sources.commands" for name in COMMANDS if name[:5] == "data "},
-    "ablate": "gamba_warp.ablation.command",
-    **dict.fromkeys(("bench", "stress", "gpu-check", "doctor"), "gamba_warp.commands.machine"),
-    **dict.fromkeys(("import-released", "weights lpips"), "gamba_warp.commands.weights"),
-    "eval-views": "gamba_warp.eval.views.command",
-    "eval-geometry": "gamba_warp.eval.shapes.command",
-    "compare": "gamba_warp.eval.compare_command",
+    "demo": Command("Train, reconstruct and evaluate on the starter set.", "all", SHAPES, _MODEL),
+    "reconstruct": Command("Pictures to 3D Gaussians.", "photo", (), _PICTURES),
+    "train": Command("Train a model on posed views.", "train", _METRICS, _MODEL, _TRAIN),
+    "fit": Command("Posed views of an object to 3D Gaussians.", "fit", _METRICS, _MODEL),
+    "data furniture": Command("Get 820 models.", "", (), (), _DATA),
+    "data made": Command("Make models: toys, shoes, tools, boxes.", "mesh", MADE, (), _DATA),
+    "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),
+    "data pack": Command("Posed views to a few large files.", "", (), (), _DATA),
+    "data index": Command("Check a dataset once, for all later starts.", "", (), (), _DATA),
+    "data objaverse": Command("Objaverse, and its G-Objaverse views.", "", (), (), _DATA),
+    "data gso": Command("Google Scanned Objects, for evaluation.", "mesh", _RENDERS, (), _DATA),
+    "eval-views": Command("PSNR, SSIM, LPIPS of views.", "eval", _METRICS, _MODEL, _VIEWS),
+    "eval-geometry": Command("Chamfer, IoU, F-score.", "eval", SHAPES, (), _SHAPES),
+    "compare": Command("Reports of several methods in one table.", "", (), (), _COMPARE),
+    "ablate": Command("Train and compare variants of a model.", "all", _METRICS, _MODEL, _ABLATION),
+    "export": Command("Gaussians to meshes, splats and pages.", "mesh", (), _DRAWING),
+    "view": Command("Gaussians in the browser."),
+    "render": Command("Gaussians to pictures and movies along a path.", "", (), _DRAWING),
+    "app": Command("Pictures to 3D on a page of this machine.", "app", _GRADIO, _PICTURES, _APP),
+    "bench": Command("Run time against error, on this machine.", "", (), _MODEL, _MACHINE),
+    "stress": Command("Random hostile cases against float64.", "all", (), ("kernels",), _MACHINE),
+    "gpu-check": Command("Test and measure on a CUDA machine.", "", (), ("kernels",), _MACHINE),
+    "import-released": Command(
+        "The authors' public weights to ours.", "train", ("timm",), (), _WEIGHTS
+    ),
+    "weights lpips": Command("Fetch the LPIPS-VGG weights.", "", (), (), _WEIGHTS),
+    "doctor": Command("Say what this machine can run.", "", (), ("kernels",), _MACHINE),
+    "completion": Command("Completion by Tab for bash, zsh or fish."),
 }
 
 
@@ -75,13 +95,17 @@ def _find_command(arguments: list[str]) -> tuple[str, list[str]]:
     group = [name for name in COMMANDS if name.startswith(arguments[0] + " ")]
     if group:
         raise UserError(f"'{arguments[0]}' needs one of: {', '.join(group)}")
-    raise UserError(f"unknown command '{arguments[0]}'; gamba --help lists them")
+    close = get_close_matches(
+        arguments[0], [*COMMANDS, *(n.split()[0] for n in COMMANDS), "help"], 1
+    )
+    meant = f"did you mean {close[0]!r}?" if close else "gamba --help lists them"
+    raise UserError(f"unknown command '{arguments[0]}'; {meant}")
 
 
 def load_command(name: str) -> Callable[..., int | None]:
     """Import the function of one of ``COMMANDS``."""
     plain = name.replace(" ", "_").replace("-", "_")
-    module = importlib.import_module(MODULES.get(name, f"gamba_warp.commands.{plain}"))
+    module = importlib.import_module(COMMANDS[name].module or f"gamba_warp.commands.{plain}")
     return getattr(module, f"{plain}_command")
 
 
@@ -96,29 +120,37 @@ def run(name: str, arguments: list[str]) -> int:
         The exit code: 0 success, 1 some inputs failed, 2 bad input or a missing resource (memory,
         a file, the disk), 130 Ctrl-C. Any other error is a bug, and keeps its traceback.
     """
+    verbose = False
     try:
+        row, everything = COMMANDS[name], "--help-all" in arguments
+        if everything or {"-h", "--help"} & {*arguments}:
+            command = load_command(name)
+            arguments = _expanded(command, arguments)
+            print(help_text(name, command, everything))
+            return 0
+        require(*row.needs)
         import tyro
 
-        helps = bool({"-h", "--help"} & {*arguments})
-        reason = None if helps else missing(name)
-        if reason is not None:
-            raise UserError(reason)
-        if name in SHARING:
-            share_cores()
-        if name in KEEPING:
-            keep_memory()
-            use_fastest_products()
-        if name in LAUNCHING and not helps:
-            quiet_warp()
         command = load_command(name)
         if name != "train":  # which has the option itself, and records it
             arguments = _load_plugins(arguments)
-        arguments = _merge_repeated(arguments, command)
-        expand = getattr(sys.modules.get(command.__module__), "expand", None)
-        arguments = expand(arguments) if expand else arguments
+        words = read_words(arguments, command)
+        arguments, verbose = _expanded(command, words.arguments), words.verbose
+        if "cores" in row.uses:
+            share_cores()
+        if "network" in row.uses:
+            keep_memory()
+            use_fastest_products()
+        if "kernels" in row.uses and not verbose:
+            quiet_warp()
         # None marks an option that is left out; the word "None" is not a valid value.
         plain = (tyro.conf.DisallowNone,)
-        return tyro.cli(command, args=arguments, prog=f"gamba {name}", config=plain) or 0
+        with _quiet() if words.quiet else nullcontext():
+            code = tyro.cli(command, args=arguments, prog=f"gamba {name}", config=plain) or 0
+        if verbose:
+            table = [STAGES.table()] if STAGES.seconds else []
+            print("\n".join([*table, f"{time.process_time():.1f} s of CPU time"]), file=sys.stderr)
+        return code
     except BrokenPipeError:
         raise  # the reader of the output closed it; see ``main``
     except KeyboardInterrupt:
@@ -128,6 +160,8 @@ def run(name: str, arguments: list[str]) -> int:
         reason = _user_message(error, name)
         if reason is None:
             raise
+        if verbose:
+            traceback.print_exc()
         _print_error(reason)
         return 2
 
@@ -148,51 +182,21 @@ def _load_plugins(arguments: list[str]) -> list[str]:
     return arguments[:at] + arguments[end:]
 
 
-def _merge_repeated(arguments: list[str], command: Callable) -> list[str]:
-    """Merge the values of a repeated option, of which tyro silently keeps the last only.
-
-    Raises UserError if the option takes one value.
-    """
-    options = dict(_options(command))
-    first: dict[str, list[str]] = {}
-    groups = [values := []]
-    for at, word in enumerate(arguments):
-        if word == "--":  # no options follow
-            groups.append(arguments[at:])
-            break
-        if not re.match("--?[A-Za-z]", word):
-            values.append(word)
-            continue
-        written, _, value = word.partition("=")
-        key = written.lstrip("-").replace("_", "-").removeprefix("no-")
-        name, several = options.get(key, (key, False))
-        if name not in first:
-            values = [written, *([value] if value else [])] if several else [word]
-            groups.append(values)
-            first[name] = values
-        elif several:
-            values = first[name]
-            values += [value] if value else []
-        else:
-            earlier = first[name][0].partition("=")[0]
-            which = f"{earlier} once" if written == earlier else f"{earlier} or {written}"
-            raise UserError(f"give {which}: this option takes one value")
-    return [word for group in groups for word in group]
+def _expanded(command: Callable, arguments: list[str]) -> list[str]:
+    """Return the arguments as the command's own module expands them, if it does."""
+    expand = getattr(sys.modules.get(command.__module__), "expand", None)
+    return expand(arguments) if expand else arguments
 
 
-def _options(kind: Any) -> Iterator[tuple[str, tuple[str, bool]]]:
-    """Yield each option of a command or options class, its full name, and if it takes a list."""
-    noted = get_type_hints(kind, include_extras=True)
-    for name, hint in get_type_hints(kind).items():
-        parts = hint, *get_args(hint)  # with the members of a union
-        several = any(... in get_args(part) for part in parts)  # tuple[str, ...]
-        aliases = [
-            x for note in get_args(noted[name]) for x in getattr(note, "aliases", None) or ()
-        ]
-        for written in (name, *aliases):
-            yield written.lstrip("-").replace("_", "-"), (name, several)
-        for part in filter(is_dataclass, parts):
-            yield from _options(part)
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Print nothing on stdout, and draw no progress bars."""
+    STAGES.quiet = True
+    try:
+        with open(os.devnull, "w", encoding="utf-8") as nothing, redirect_stdout(nothing):
+            yield
+    finally:
+        STAGES.quiet = False
 
 
 def _user_message(error: Exception, command: str) -> str | None:
@@ -201,7 +205,7 @@ def _user_message(error: Exception, command: str) -> str | None:
     if isinstance(error, UserError):
         return text or "bad input"
     if isinstance(error, ModuleNotFoundError):
-        return advice(error.name or "", command)
+        return advice(error.name or "", command, COMMANDS[command].extra)
     # torch raises plain RuntimeErrors when it runs out of memory on the CPU.
     exhausted = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
     if isinstance(error, MemoryError) or exhausted:
@@ -253,11 +257,16 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _main(arguments: list[str]) -> int:
+    if arguments[:1] == ["--complete"]:  # called by the script of ``gamba completion``
+        print("\n".join(_candidates(arguments[1:])))
+        return 0
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     if not arguments or arguments[0] in ("-h", "--help"):
         print(f"gamba {__version__}: one image to 3D Gaussians\n\nCommands:")
-        for name, text in COMMANDS.items():
-            print(f"  gamba {name:<14} {text}")
-        print("\ngamba COMMAND --help shows the options of one.")
+        for name, row in COMMANDS.items():
+            print(f"  gamba {name:<15} {row.about}")
+        print("\ngamba help COMMAND shows the options of one.")
         print("gamba COMMAND ... --plugin my.py [NAME=VALUE ...] loads a plugin first.")
         return 0
     if arguments[0] in ("-V", "--version"):
@@ -269,3 +278,17 @@ def _main(arguments: list[str]) -> int:
         _print_error(str(error))
         return 2
     return run(name, rest)
+
+
+def _candidates(words: list[str]) -> list[str]:
+    """Return completions of the last word; none where a file's name is expected."""
+    *before, last = words
+    before = before[1:] if before[:1] == ["help"] else before
+    try:
+        name, given = _find_command(before)
+    except (UserError, IndexError):
+        known = [name.split() for name in COMMANDS if name.split()[: len(before)] == before]
+        found = [parts[len(before)] for parts in known] + ([] if before else ["help"])
+    else:
+        found = completions(load_command(name), given, last)
+    return [word for word in dict.fromkeys(found) if word.startswith(last)]

@@ -31,7 +31,7 @@ _USED = (
     "gsplat",
     "tyro",
 )
-# The extra that brings a library, by import name. A command with its own extra (``OWN``) names that
+# The extra that brings a library, by import name. A command with an extra of its own names that
 # instead if it holds the library too.
 EXTRA_OF = {
     "backports.zstd": "spz",
@@ -50,51 +50,25 @@ EXTRA_OF = {
     "skimage": "mesh",
     "tensorboard": "train",
     "timm": "train",
+    "tomli": "train",
     "trimesh": "mesh",
     "xatlas": "mesh",
+    "yaml": "train",
 }
-OWN = {
-    "ablate": "all",
-    "app": "app",
-    "demo": "all",
-    "data made": "mesh",
-    "data render": "mesh",
-    "data gso": "mesh",
-    "eval-geometry": "eval",
-    "eval-views": "eval",
-    "export": "mesh",
-    "fit": "fit",
-    "reconstruct": "photo",
-    "stress": "all",
-    "import-released": "train",
-    "train": "train",
-}
-_SHAPES = ("kornia", "manifold3d", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
+# What the evaluation of shapes always needs, and the made objects.
+SHAPES = ("kornia", "manifold3d", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
+MADE = ("trimesh", "manifold3d", "skimage")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
-    "train": {"kornia", "tensorboard", "timm"},
-    "mesh": {*_SHAPES, "manifold3d", "xatlas"},
-    "eval": {*_SHAPES, "manifold3d", "xatlas"},
+    "train": {"kornia", "tensorboard", "timm", "tomli", "yaml"},
+    "mesh": {*SHAPES, "manifold3d", "xatlas"},
+    "eval": {*SHAPES, "manifold3d", "xatlas"},
     "fit": {"gsplat", "kornia"},
     "app": {
         *("gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", "manifold3d"),
-        *_SHAPES,
+        *SHAPES,
     },
     "all": set(EXTRA_OF),
-}
-# Libraries that a command always needs; those of single options are checked on use.
-NEEDS = {
-    "ablate": ("kornia",),
-    "app": ("gradio",),
-    "data made": ("trimesh", "manifold3d", "skimage"),
-    "data render": ("trimesh", "open3d", "manifold3d"),
-    "data gso": ("trimesh", "open3d", "manifold3d"),
-    "demo": _SHAPES,
-    "eval-geometry": _SHAPES,
-    "eval-views": ("kornia",),
-    "fit": ("kornia",),
-    "import-released": ("timm",),
-    "train": ("kornia",),
 }
 
 
@@ -126,28 +100,17 @@ def used_versions() -> dict[str, str]:
     return named
 
 
-def missing(command: str) -> str | None:
-    """Return a line about a library that a command needs and is not installed; None if complete.
-
-    Args:
-        command: one of ``cli.COMMANDS``.
-    """
-    absent = (name for name in NEEDS.get(command, ()) if find_spec(name) is None)
-    name = next(absent, None)
-    return None if name is None else advice(name, command)
-
-
-def advice(library: str, command: str) -> str | None:
+def advice(library: str, command: str, extra: str = "") -> str | None:
     """Return how to install an optional library that a command needs; None for any other library.
 
     Args:
         library: the failed import; also a submodule, such as ``scipy.spatial``.
         command: the command that needs it.
+        extra: that of the command, if it has one.
     """
     name = library if library in EXTRA_OF else library.partition(".")[0]
     if name not in EXTRA_OF:
         return None
-    extra = OWN.get(command, "")
     if name not in HOLDS.get(extra, ()):
         extra = EXTRA_OF[name]
     return f"{command} needs {name}, which is not installed: {to_install(extra)}"

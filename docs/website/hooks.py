@@ -65,6 +65,8 @@ def on_files(files: Files, config) -> Files:
 def on_page_markdown(markdown: str, page, config, files) -> str:
     """Turn links between files of the repository into links between pages."""
     path = _origin.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    if path == "docs/commands.md":
+        markdown += command_reference()
     if is_code(path) or path.endswith(".ipynb"):
         return markdown
     return rewritten(markdown, path, page.file.src_uri)
@@ -95,6 +97,15 @@ def on_shutdown():
     """Remove the folder of links for mkdocstrings."""
     while _tree:
         _tree.pop().cleanup()
+
+
+def command_reference() -> str:
+    """Return the help of every command, from its parser, as Markdown."""
+    from gamba_warp import cli
+    from gamba_warp.usage import help_text
+
+    helps = ((name, help_text(name, cli.load_command(name), True)) for name in cli.COMMANDS)
+    return "".join(f"\n## gamba {name}\n\n```text\n{text}\n```\n" for name, text in helps)
 
 
 def _content(path: str) -> str | bytes:

@@ -15,7 +15,7 @@ from msgspec import Meta
 from ..conventions import DeviceChoice
 from ..errors import UserError
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
-from ..versions import NEEDS, require
+from ..versions import SHAPES, require
 
 if TYPE_CHECKING:
     from .jobs import Settings
@@ -117,7 +117,7 @@ def ablate_command(
             raise UserError(answer.reason)
     end_idle()
     if meshes is not None:
-        require(*NEEDS["eval-geometry"])
+        require(*SHAPES)
     threads = threads or max(1, cores() // jobs)
 
     def find_tasks() -> list[Task]:

@@ -48,7 +48,7 @@ def with_page_errors(function: Callable) -> Callable:
         except (UserError, MemoryError) as error:
             raise _error(error) from None
         except ModuleNotFoundError as error:
-            reason = advice(error.name or "", "app")
+            reason = advice(error.name or "", "app", "app")
             if reason is None:
                 raise
             raise _error(UserError(reason)) from None

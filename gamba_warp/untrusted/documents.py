@@ -1,18 +1,22 @@
-"""Untrusted JSON files: bounded in size and depth, decoded into declared types."""
+"""Untrusted JSON and config files: bounded in size and depth, decoded into declared types."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import msgspec
 
-from ..errors import UserError
+from ..errors import UserError, first_line
+from ..versions import require
 
 MAX_BYTES = 64 << 20  # a file of 100,000 views takes 60 MB; ours take a few kB
 MAX_DEPTH = 32  # levels of lists and objects; ours have up to 6
 MAX_LINE = 1 << 20  # bytes of a line of JSON Lines; ours have a few hundred, or a few thousand
+
+_MAX_CONFIG = 16 << 10  # bytes; few, because aliases of YAML may repeat a long list
 
 Kind = TypeVar("Kind")
 
@@ -113,6 +117,28 @@ def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
                 yield line
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from error
+
+
+def read_config(path: str | Path) -> dict[str, Any]:
+    """Read a config file of a command, ``.yaml`` or ``.toml``: values, and groups of values.
+
+    Raises:
+        UserError: as for ``read_bytes``; or another suffix, invalid, or nested deeper.
+        ModuleNotFoundError: the reader of the format is not installed.
+    """
+    kind = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml"}.get(Path(path).suffix.lower())
+    if kind is None:
+        raise UserError(f"--config {path}: expected a .yaml or .toml file")
+    data = read_bytes(path, _MAX_CONFIG)
+    require({"toml": "tomllib" if sys.version_info >= (3, 11) else "tomli", "yaml": "yaml"}[kind])
+    try:
+        return getattr(msgspec, kind).decode(data, type=_CONFIG)
+    except (msgspec.MsgspecError, UnicodeError, ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not a valid config file ({first_line(error)})") from error
+
+
+_VALUE: Any = str | int | float | bool | None
+_CONFIG: Any = dict[str, _VALUE | list[_VALUE] | dict[str, _VALUE | list[_VALUE]]]
 
 
 def value_of(text: str) -> Any:

@@ -1,16 +1,18 @@
 import os
 import re
+import shutil
 import subprocess
 import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pytest
 import tyro
 
 from gamba_warp import __version__, cli
+from gamba_warp.batch import STAGES
 from gamba_warp.errors import FileWarning, UserError
 from gamba_warp.vision.weights import DOWNLOAD_MB
 
@@ -29,15 +31,15 @@ def command(monkeypatch):
 
     def register(function):
         names = "try", "group one"
-        monkeypatch.setattr(cli, "COMMANDS", dict.fromkeys(names, "Tries something."))
-        monkeypatch.setattr(cli, "MODULES", dict.fromkeys(names, __name__))
+        row = cli.Command("Tries something.", module=__name__)
+        monkeypatch.setattr(cli, "COMMANDS", dict.fromkeys(names, row))
         for name in ("try_command", "group_one_command"):
             monkeypatch.setattr(f"{__name__}.{name}", function, raising=False)
 
     return register
 
 
-@pytest.mark.parametrize("arguments", [[], ["-h"], ["--help"]])
+@pytest.mark.parametrize("arguments", [[], ["-h"], ["--help"], ["help"]])
 def test_help_lists_every_command(arguments, capsys):
     assert exit_code(arguments) == 0
     out = capsys.readouterr().out
@@ -57,6 +59,8 @@ def test_version(flag, capsys):
         (["data"], "'data' needs one of: data furniture, data made, data render"),
         (["data", "nonsense"], "'data' needs one of"),
         (["--nonsense"], "unknown command '--nonsense'"),
+        (["trian", "x"], "unknown command 'trian'; did you mean 'train'?"),
+        (["help", "dta"], "did you mean 'data'?"),
     ],
 )
 def test_unknown_commands_are_told_in_one_line(arguments, reason, capsys):
@@ -96,6 +100,8 @@ class Place:
 
     axes: tuple[str, ...] = ()
     """Names."""
+    place_file: Path | None = None
+    """File."""
 
 
 def _with_lists(
@@ -136,6 +142,162 @@ def test_a_repeated_option_of_one_value_is_refused(command, capsys, words, said)
     assert exit_code(["try", "f", *words.split()]) == 2
     read = capsys.readouterr()
     assert read.out == "" and read.err == f"gamba: {said}: this option takes one value\n"
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("f --nmber 1", "unknown option --nmber; did you mean --number?"),
+        ("f --nonsense", "unknown option --nonsense"),
+        ("f -o out", "unknown option -o"),
+        ("https://host/f.ply --number 1", "https://host/f.ply is a URL; download it"),
+        ("--place-file=https://host/f f", "https://host/f is a URL; download it"),
+    ],
+)
+def test_wrong_words_are_told_in_one_line(command, capsys, words, said):
+    command(_with_lists)
+    assert exit_code(["try", *words.split()]) == 2
+    read = capsys.readouterr()
+    assert read.out == "" and read.err.startswith(f"gamba: {said}") and read.err.count("\n") == 1
+
+
+def test_a_url_is_taken_where_text_is(command, capsys):
+    command(_with_lists)
+    assert exit_code(["try", "f", "--change", "https://host/a"]) == 0
+    assert "https://host/a" in capsys.readouterr().out
+
+
+def test_common_options(command, capsys):
+    def current(out: Path = Path("here"), *, steps: int = 1) -> None:
+        """Says it."""
+        print(out, STAGES.quiet)
+
+    command(current)
+    assert exit_code(["try", "-o", "there"]) == 0
+    assert capsys.readouterr().out == "there False\n"
+    for word in ("-q", "--quiet"):
+        assert exit_code(["try", word]) == 0
+        assert capsys.readouterr() == ("", "")
+    assert not STAGES.quiet
+    assert exit_code(["try", "--steps", "2", "-v"]) == 0
+    assert re.fullmatch(r"[\d.]+ s of CPU time\n", capsys.readouterr().err)
+    assert exit_code(["try", "-o", "a", "--out", "b"]) == 2
+    assert "give --out once" in capsys.readouterr().err
+    assert exit_code(["help", "try"]) == 0
+    out = capsys.readouterr().out
+    assert "-o, --out PATH" in out and "(default: here)" in out and "-q, --quiet" in out
+
+
+def _configured(
+    data: tyro.conf.Positional[Path],
+    names: tuple[str, ...] = (),
+    steps: int | None = None,
+    dry_run: bool = False,
+    page: bool = True,
+    lpips: Literal["on", "off"] = "on",
+    place: Annotated[Place, tyro.conf.OmitArgPrefixes] = Place(),
+) -> None:
+    print(data, names, steps, dry_run, page, place.axes, lpips)
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        (
+            "a.yaml",
+            "data: here\nsteps: 3\nnames: [a, b]\ndry_run: true\nlpips: off\nplace:\n  axes: [x]\n",
+        ),
+        (
+            "a.toml",
+            'data="here"\nsteps=3\nnames=["a","b"]\ndry-run=true\nlpips="off"\n[place]\naxes=["x"]\n',
+        ),
+    ],
+)
+def test_a_config_file_holds_options(command, capsys, tmp_path, name, text):
+    command(_configured)
+    path = tmp_path / name
+    path.write_text(text + ("page: false\n" if name == "a.yaml" else "page=false\n"))
+    if name == "a.toml":  # a key after a table belongs to it
+        assert exit_code(["try", "--config", str(path), "--page"]) == 0
+        assert capsys.readouterr().out == "here ('a', 'b') 3 True True ('x',) off\n"
+    assert exit_code(["try", "--config", str(path)]) == 0
+    assert capsys.readouterr().out == "here ('a', 'b') 3 True False ('x',) off\n"
+    words = ["there", f"--config={path}", "--steps", "4", "--names", "c", "--no-dry-run"]
+    assert exit_code(["try", *words]) == 0
+    assert capsys.readouterr().out == "there ('c',) 4 False False ('x',) off\n"
+
+
+@pytest.mark.parametrize(
+    "name, text, said",
+    [
+        ("a.yaml", "stps: 3", "unknown option stps; did you mean steps?"),
+        ("a.yaml", "steps: [", "not a valid config file"),
+        ("a.yaml", "[3]", "not a valid config file"),
+        ("a.yaml", "a: {b: {c: 1}}", "not a valid config file"),
+        ("a.toml", "steps = ", "not a valid config file"),
+        ("a.toml", 'names = ["--page"]', "is not a valid value"),
+        ("a.yaml", "x: " + "y" * 20_000, "the limit for such a file"),
+        ("a.ini", "", "expected a .yaml or .toml file"),
+        ("b.yaml", None, "No such file"),
+    ],
+)
+def test_bad_config_files_are_one_line(command, capsys, tmp_path, name, text, said):
+    command(_configured)
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    assert exit_code(["try", "data", "--config", str(tmp_path / name)]) == 2
+    read = capsys.readouterr()
+    assert read.out == "" and said in read.err and read.err.count("\n") == 1, read.err
+
+
+def test_help_of_many_options_names_them_and_help_all_explains_them(capsys):
+    assert exit_code(["train", "--help"]) == 0
+    short = capsys.readouterr().out
+    assert exit_code(["train", "--help-all"]) == 0
+    long = capsys.readouterr().out
+    assert len(short.splitlines()) < 70 < len(long.splitlines())
+    assert "--beta2" in short and "Second-moment" not in short and "Second-moment" in long
+
+
+@pytest.mark.parametrize(
+    "words, found",
+    [
+        ("", {"train", "data", "help"}),
+        ("re", {"reconstruct", "render"}),
+        ("data ma", {"made"}),
+        ("help data ren", {"render"}),
+        ("export x.ply --me", {"--mesh"}),
+        ("view x.ply --no-o", {"--no-open-browser"}),
+        ("export x.ply --mesh glb st", {"stl"}),
+        ("export x.ply --surface d", {"density"}),
+        ("export x.ply --out ", set()),
+        ("nonsense ", set()),
+    ],
+)
+def test_completion(words, found, capsys):
+    assert exit_code(["--complete", *words.split(" ")]) == 0
+    given = {*capsys.readouterr().out.split()}
+    assert given >= found if words == "" else given == found
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes(shell, tmp_path):
+    program = shutil.which(shell)
+    if program is None:
+        pytest.skip(f"{shell} is not installed")
+    (tmp_path / "gamba").write_text(f'#!/bin/sh\nexec {sys.executable} -m gamba_warp "$@"\n')
+    (tmp_path / "gamba").chmod(0o755)
+    ask = {
+        "bash": 'eval "$(gamba completion bash)"; COMP_WORDS=(gamba export x --me); COMP_CWORD=3; '
+        '_gamba; echo "${COMPREPLY[@]}"',
+        "zsh": 'compdef() { }; compadd() { echo $found }; eval "$(gamba completion zsh)"; '
+        "words=(gamba export x --me); CURRENT=4; _gamba",
+        "fish": 'gamba completion fish | source; complete -C "gamba export x --me"',
+    }[shell]
+    room = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "HOME": str(tmp_path)}
+    room["PYTHONPATH"] = str(ROOT)
+    done = subprocess.run([program, "-c", ask], env=room, capture_output=True, text=True)
+    assert done.stdout.strip() == "--mesh", done
 
 
 def test_help_of_a_command(command, capsys):
@@ -200,15 +362,15 @@ def test_help_shows_no_value_none_and_one_size_of_the_lpips_weights(capsys):
         assert exit_code([*name.split(), "--help"]) == 0
         helps[name] = capsys.readouterr().out
     assert not any("{None}" in text for text in helps.values())
-    assert "none" in helps["reconstruct"].split("--mesh ")[1].split("]")[0]
+    assert "none" in helps["reconstruct"].split("--mesh ")[1].split("}")[0]
+    assert not any(re.search(r"default: (None)?\)|'None'", text) for text in helps.values())
     page = (ROOT / "docs" / "evaluate.md").read_text(encoding="utf-8")
     for text in (helps["demo"], helps["weights lpips"], page.split("gamba weights lpips")[1]):
         assert re.search(r"(\d+) MB", text)[1] == str(DOWNLOAD_MB), text
 
 
 def test_every_command_has_one_line_of_help():
-    assert set(cli.MODULES) <= set(cli.COMMANDS)
-    assert all(text.endswith(".") and len(text) < 60 for text in cli.COMMANDS.values())
+    assert all(row.about.endswith(".") and len(row.about) < 60 for row in cli.COMMANDS.values())
 
 
 # Ctrl-C while ``gamba train`` opens its data; in the loop it saves and stops, see test_train.py.

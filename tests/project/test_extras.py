@@ -91,12 +91,14 @@ def test_each_library_is_in_the_extras_that_are_named():
     found = declared()
     distributions = {"skimage": "scikit-image", "imageio_ffmpeg": "imageio-ffmpeg"}
     distributions |= {"huggingface_hub": "huggingface-hub", "pillow_heif": "pillow-heif"}
+    distributions |= {"yaml": "pyyaml"}
     for library, extra in versions.EXTRA_OF.items():
         name = distributions.get(library, library)
         holding = {extra} | {e for e, libraries in versions.HOLDS.items() if library in libraries}
         for one in holding:
             assert name in found[one], f"{one} lacks {name}"
-    assert set(versions.OWN) | set(versions.NEEDS) <= set(cli.COMMANDS)
+    for name, row in cli.COMMANDS.items():
+        assert {*row.needs} <= versions.HOLDS.get(row.extra, {*row.needs}), name
     assert found["all"] >= set().union(*(found[e] for e in set(versions.EXTRA_OF.values())))
 
 

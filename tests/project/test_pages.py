@@ -146,7 +146,7 @@ def options(*names: str) -> str:
     name = next(name for name in names if name in cli.COMMANDS)
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        cli._main([*name.split(), "--help"])
+        cli._main([*name.split(), "--help-all"])
     return out.getvalue() + "--help --version"
 
 

@@ -22,7 +22,7 @@ from gamba_warp.data.layouts import DecodedPicture, ObjectFiles
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.children import Failed, end_idle, run_each
-from gamba_warp.versions import NEEDS, require
+from gamba_warp.versions import MADE, require
 
 from .render import DEPTH_UNIT, Views, draw_views
 from .settings import Settings
@@ -65,7 +65,7 @@ class Pool:
         Raises:
             ModuleNotFoundError: a library for making objects is not installed.
         """
-        require(*NEEDS["data made"])
+        require(*MADE)
         self.options = options
         self._first = first
         self._ready: dict[int, ViewDataset] = {}

@@ -26,7 +26,7 @@ from ..data.settings import Settings, Up
 from .objaverse_lists import Lists
 
 Item = TypeVar("Item")
-Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+
 # Consequence of an empty part of a split.
 _WITHOUT = {
     "train": "there is nothing to train on",
@@ -87,7 +87,7 @@ def _report_empty_splits(data: Path) -> None:
             print(f"the {parts} empty; {'; '.join(_WITHOUT[name] for name in empty)}")
 
 
-def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None = None) -> int:
+def data_furniture_command(out: Path, deb: Path | None = None, tree: Path | None = None) -> int:
     """Get 820 free textured models with icons: Sweet Home 3D's libraries, from Debian's package.
 
     Without --deb or --tree the installed package is used, else apt-get downloads it (125 MB).
@@ -106,7 +106,7 @@ def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None 
 
 @ranged
 def data_made_command(
-    out: Out, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
+    out: Path, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
 ) -> int:
     """Make toys, animals, shoes, tools, packages, furniture, free of copyright (.glb).
 
@@ -127,7 +127,7 @@ def data_made_command(
 @ranged
 def data_render_command(
     folder: tyro.conf.Positional[Path],
-    out: Out,
+    out: Path,
     settings: tyro.conf.OmitArgPrefixes[Settings],
     share: tyro.conf.OmitArgPrefixes[Share],
     split: Literal["all", "train", "val", "test"] = "all",
