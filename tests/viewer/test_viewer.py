@@ -213,8 +213,8 @@ def test_what_it_shows(viewer):
     dark = canvas(opened)
     assert dark[0, 0].max() < 0.2 < 0.9 < mesh[0, 0].min()
     assert np.abs(dark - mesh)[covered].mean() < 0.02  # only the background is another
-    for _ in range(2):
-        page.click("#do-input")
+    assert not page.get_attribute("#lines path", "d")  # the camera is drawn when asked for
+    page.click("#do-input")
     assert page.get_attribute("#do-input", "aria-pressed") == "true"
     opened.promised("gambaViewer.rest()")
     assert len(page.get_attribute("#lines path", "d")) > 50
@@ -233,6 +233,54 @@ def test_a_picture_is_saved(viewer, tmp_path):
     assert download.value.suggested_filename == "A-chair.png"
     with Image.open(tmp_path / "saved.png") as picture:
         np.testing.assert_array_equal(np.asarray(picture.convert("RGB")) / 255, shown)
+
+
+def test_a_picture_has_the_asked_size_and_an_alpha(viewer, tmp_path):
+    opened = viewer(colourful(), 600, 500)
+    page = opened.page
+    for _ in range(3):
+        page.keyboard.press("l")
+    assert page.evaluate("document.documentElement.dataset.ground") == "clear"
+    page.evaluate("gambaViewer.about.title = 'chair.ply'")
+    page.click("#do-picture")
+    with page.expect_download() as download:
+        page.click("[data-side='1024']")
+    assert download.value.suggested_filename == "chair.png" and not page.is_visible("#picture")
+    download.value.save_as(tmp_path / "saved.png")
+    with Image.open(tmp_path / "saved.png") as picture:
+        assert max(picture.size) == 1024 and picture.mode == "RGBA"
+        alpha = np.asarray(picture)[..., 3]
+    assert alpha[0, 0] == 0 and alpha.max() > 250 and not opened.messages
+
+
+def test_the_tools_cover_no_part_of_the_picture_and_can_be_left_out(viewer, tmp_path):
+    opened = viewer(colourful(), 900, 600)
+    page = opened.page
+    picture, bar = (page.query_selector(name).bounding_box() for name in ("#canvas", "#bar"))
+    assert picture["y"] + picture["height"] <= bar["y"]
+    page.goto((tmp_path / "view.html").as_uri() + "?controls=0&ground=grey")
+    opened.promised("gambaViewer.rest()")
+    assert not page.is_visible("#bar") and not page.is_visible("header")
+    assert page.query_selector("#canvas").bounding_box()["height"] == 600
+    assert page.evaluate("background()") == [140 / 255] * 3 + [1]
+
+
+def test_it_turns_until_it_is_touched(viewer):
+    opened = viewer(colourful(40), reduced_motion="no-preference")
+    page = opened.page
+    page.reload()
+    for _ in range(100):
+        page.wait_for_timeout(100)
+        if page.evaluate("gambaViewer.camera.azimuth < 0"):
+            break
+    page.mouse.click(100, 70)
+    held = page.evaluate("[gambaViewer.turning, gambaViewer.camera.azimuth]")
+    opened.promised("gambaViewer.rest()")
+    assert (
+        held[1] < 0
+        and held == [False, page.evaluate("gambaViewer.camera.azimuth")]
+        and not opened.messages
+    )
 
 
 def test_an_object_of_any_size_anywhere(viewer):

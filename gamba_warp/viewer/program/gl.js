@@ -140,7 +140,7 @@ class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.viewport(0, 0, width, height);
     if (from === 0) {
-      gl.clearColor(...background, 1);
+      gl.clearColor(...background);
       gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     }
     const { program, set } = { gaussians: this.splats, centres: this.points, mesh: this.surface }[mode];

@@ -6,10 +6,11 @@ const SIZES = [1, 0.8, 0.64, 0.5, 0.4, 0.32]; // shares of the canvas's sides, i
 const SLOW = 42, QUICK = 21; // milliseconds of a frame: above, less is drawn; below, more
 const PIECE = 131072; // Gaussians drawn at once at rest
 const LEAST = 40000; // Gaussians that are always drawn
+const TURN = (2 * Math.PI) / 30000; // radians per millisecond, until the object is touched
 
 class Viewer {
   constructor(canvas, about) {
-    Object.assign(this, { canvas, about, mode: "gaussians", showInput: true });
+    Object.assign(this, { canvas, about, mode: "gaussians", showInput: false });
     this.camera = new OrbitCamera(about.home, about.home.fov);
     this.coarse = this.quick = 0; // index into SIZES; quick frames in a row
     this.some = about.count; // Gaussians drawn in motion
@@ -25,6 +26,9 @@ class Viewer {
       focus: (x, y) => this.focus(x, y),
     };
     this.act.keys = startButtons(this, about);
+    this.turning = !matchMedia("(prefers-reduced-motion: reduce)").matches && asked("turn") !== "0";
+    for (const kind of ["pointerdown", "wheel", "keydown"])
+      window.addEventListener(kind, () => { this.turning = false; }, { capture: true, passive: true });
     this.send = startSorter((message) => this[message.kind](message));
   }
 
@@ -37,7 +41,7 @@ class Viewer {
   }
 
   start() {
-    const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" });
+    const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: true, powerPreference: "high-performance" });
     if (!gl) return say("It needs WebGL2 to show the object in 3D.", "This browser cannot show it");
     this.gl = gl;
     this.renderer = new Renderer(gl, this.about.count, this.about.degree);
@@ -152,9 +156,9 @@ class Viewer {
 
   frame(now) {
     if (!this.idle(now)) return this.schedule();
-    if (this.camera.step(now)) this.changed = now;
+    if (this.camera.step(now) || this.turn(now)) this.changed = now;
     const ratio = Math.min(2, window.devicePixelRatio || 1);
-    const [width, height] = this.shownSize().map((side) => Math.round(side * ratio));
+    const [width, height] = this.fixed || this.shownSize().map((side) => Math.round(side * ratio));
     const { renderer } = this;
     if (renderer.resize(width, height)) {
       this.progress = 0;
@@ -172,7 +176,16 @@ class Viewer {
       this.finished = false;
       this.progress = 0;
     } else if (!this.finished && ordered) this.drawRest(now);
-    if (fast || (!this.finished && ordered)) this.schedule();
+    if (fast || this.turning || (!this.finished && ordered)) this.schedule();
+  }
+
+  // Turns the object a little; returns true if it does. A slow graphics card ends it.
+  turn(now) {
+    if (this.coarse === SIZES.length - 1) this.turning = false;
+    if (!this.turning || !this.shownOnce) return false;
+    this.camera.azimuth -= TURN * Math.min(100, now - (this.turnedAt ?? now));
+    this.turnedAt = now;
+    return true;
   }
 
   // One more piece of the picture at full size.
@@ -254,6 +267,7 @@ class Viewer {
 
   // Resolves when the picture of the current camera is complete.
   rest() {
+    this.turning = false;
     this.schedule();
     return new Promise((resolve) => {
       if (this.finished && !this.camera.goal && this.ready) resolve();
@@ -261,10 +275,16 @@ class Viewer {
     });
   }
 
-  async save() {
+  // Saves the picture, with its longer side of that many pixels, or as shown.
+  async save(side) {
+    const shown = this.shownSize(), scale = side / Math.max(...shown);
+    this.fixed = side ? shown.map((length) => Math.max(1, Math.round(length * scale))) : null;
+    if (side) this.redraw();
     await this.rest();
     this.renderer.present();
     savePicture(this.canvas, this.about.title);
+    this.fixed = null;
+    if (side) this.redraw();
   }
 
   // For programs: a picture of the canvas, as a data URL.

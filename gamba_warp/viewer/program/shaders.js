@@ -174,5 +174,5 @@ const PRESENT_FRAGMENT = `${SHADER_HEAD}
 uniform sampler2D picture;
 out vec4 result;
 void main() {
-  result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1.0);
+  result = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
 }`;

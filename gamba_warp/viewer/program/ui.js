@@ -2,6 +2,10 @@
 
 const STEP = 26; // pixels of a drag equal to an arrow key
 
+const GROUNDS = ["light", "dark", "grey", "clear"]; // in the order of the button
+
+// An option in the page's address, such as `controls` of viewer.html?controls=0.
+const asked = (name) => new URLSearchParams(location.search).get(name);
 const byId = (name) => document.getElementById(name);
 
 function dressPage(about) {
@@ -14,6 +18,7 @@ function dressPage(about) {
   document.querySelector("[data-mode=mesh]").hidden = !about.faces;
   byId("do-input").hidden = !about.input;
   byId("do-full").hidden = !document.fullscreenEnabled;
+  document.documentElement.classList.toggle("bare", asked("controls") === "0");
 }
 
 function say(text, title = "") {
@@ -22,21 +27,24 @@ function say(text, title = "") {
   byId("message-text").textContent = text;
 }
 
-// Light or dark: the system's choice, until the user chooses.
-function startTheme(changed) {
-  const system = matchMedia("(prefers-color-scheme: dark)");
-  const set = (dark) => {
-    document.documentElement.dataset.theme = dark ? "dark" : "light";
+// The background: the system's choice of light or dark, until the user chooses.
+function startGround(changed) {
+  const system = matchMedia("(prefers-color-scheme: dark)"), root = document.documentElement;
+  const set = (ground) => {
+    root.dataset.ground = ground;
     changed();
   };
-  set(system.matches);
-  system.addEventListener("change", () => set(system.matches));
-  return () => set(document.documentElement.dataset.theme !== "dark");
+  const first = () => set(GROUNDS.includes(asked("ground")) ? asked("ground") : system.matches ? "dark" : "light");
+  first();
+  system.addEventListener("change", first);
+  return () => set(GROUNDS[(GROUNDS.indexOf(root.dataset.ground) + 1) % GROUNDS.length]);
 }
 
+// Colour of the background and its alpha.
 function background() {
   const text = getComputedStyle(document.documentElement).getPropertyValue("--stage").trim();
-  return [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16) / 255);
+  if (document.documentElement.dataset.ground === "clear") return [0, 0, 0, 0];
+  return [...[1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16) / 255), 1];
 }
 
 function toggleFull() {
@@ -44,11 +52,13 @@ function toggleFull() {
   done.catch(() => say("This browser does not let the page fill the screen."));
 }
 
-function toggleHelp() {
-  const help = byId("help");
-  if (help.open) help.close();
-  else help.showModal();
+function toggleDialog(name) {
+  const dialog = byId(name);
+  if (dialog.open) dialog.close();
+  else dialog.showModal();
 }
+
+const toggleHelp = () => toggleDialog("help");
 
 // The input's camera as an SVG path: its centre, and the rectangle of its picture.
 function inputLines(input, camera, width, height) {
@@ -79,7 +89,7 @@ function savePicture(canvas, name) {
   canvas.toBlob((blob) => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(blob);
-    link.download = `${name.replace(/[^\p{L}\p{N}._-]+/gu, "-") || "view"}.png`;
+    link.download = `${name.replace(/\.(ply|splat|spz|glb)$/i, "").replace(/[^\p{L}\p{N}._-]+/gu, "-") || "view"}.png`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   }, "image/png");
@@ -87,16 +97,20 @@ function savePicture(canvas, name) {
 
 // Buttons and keys; `viewer` does what they ask for.
 function startButtons(viewer, about) {
-  const toggleTheme = startTheme(() => viewer.redraw());
+  const nextGround = startGround(() => viewer.redraw());
   const press = {
-    home: () => viewer.goHome(), input: () => viewer.toggleInput(), theme: toggleTheme,
-    picture: () => viewer.save(), help: toggleHelp, full: toggleFull,
+    home: () => viewer.goHome(), input: () => viewer.toggleInput(), theme: nextGround,
+    picture: () => toggleDialog("picture"), help: toggleHelp, full: toggleFull,
   };
   for (const [name, action] of Object.entries(press)) byId(`do-${name}`).onclick = action;
   const modes = [...document.querySelectorAll("[data-mode]")];
   for (const button of modes) button.onclick = () => viewer.setMode(button.dataset.mode);
-  byId("help").onclick = (event) => event.target === byId("help") && byId("help").close();
-  byId("help-close").onclick = () => byId("help").close();
+  for (const dialog of document.querySelectorAll("dialog"))
+    dialog.onclick = (event) => {
+      if (event.target === dialog || event.target.closest("button")) dialog.close();
+    };
+  for (const button of document.querySelectorAll("[data-side]"))
+    button.onclick = () => viewer.save(Number(button.dataset.side));
   const turn = (x, y) => () => viewer.act.turn(x * STEP, y * STEP);
   const pan = (x, y) => () => viewer.act.pan(x * STEP, y * STEP);
   const zoom = (factor) => () => viewer.act.zoom(factor);
@@ -106,7 +120,7 @@ function startButtons(viewer, about) {
     "Shift+ArrowUp": pan(0, -1), "Shift+ArrowDown": pan(0, 1),
     "+": zoom(0.9), "=": zoom(0.9), "-": zoom(1 / 0.9), _: zoom(1 / 0.9),
     1: () => viewer.setMode("gaussians"), 2: () => viewer.setMode("centres"), 3: () => viewer.setMode("mesh"),
-    r: press.home, Home: press.home, c: press.input, l: press.theme, s: press.picture,
+    r: press.home, Home: press.home, c: press.input, l: press.theme, s: () => viewer.save(0),
     f: () => document.fullscreenEnabled && toggleFull(), h: toggleHelp, "?": toggleHelp,
   };
 }
