@@ -162,6 +162,9 @@ class Actions:
 
         def write(
             state: tuple[work.Reconstruction, list[Path]] | None,
+            faces: str,
+            texture: str,
+            watertight: bool,
             request: gr.Request,
             progress: gr.Progress = gr.Progress(),  # noqa: B008
         ) -> tuple:
@@ -170,7 +173,8 @@ class Actions:
             made, older = state
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
             folder = self._new_folder(request)
-            path, note = self._main_thread.call(work.write, made, kind, folder, self._device)
+            mesh = work.MeshChoice.of(faces, texture, watertight)
+            path, note = self._main_thread.call(work.write, made, kind, folder, self._device, mesh)
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
             files = [*(old for old in older if old.name != path.name and old.is_file()), path]

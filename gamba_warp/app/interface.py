@@ -116,6 +116,11 @@ def build(actions: Actions) -> gr.Blocks:
                 stage = gr.HTML(_EMPTY, elem_id="stage")
                 buttons: dict[str, gr.Button] = {}
                 with gr.Column(visible=False, elem_id="files") as files_part:
+                    with gr.Row(elem_id="mesh"):
+                        small: dict[str, Any] = {"container": False, "min_width": 120}
+                        faces = gr.Dropdown([*work.FACES], value="10,000 faces", **small)
+                        texture = gr.Dropdown([*work.TEXTURES], value="Texture 1024", **small)
+                        closed = gr.Checkbox(label="Closed, for printing", **small)
                     for title, kinds in _FILES.items():
                         with gr.Row(elem_classes="kinds"):
                             gr.HTML(f"<span>{title}</span>", elem_classes="kinds-title")
@@ -160,7 +165,7 @@ def build(actions: Actions) -> gr.Blocks:
         for kind, button in buttons.items():
             written = button.click(
                 actions.writer(kind),
-                made,
+                [made, faces, texture, closed],
                 [made, made_files],
                 show_progress_on=made_files,
                 **one,
@@ -191,6 +196,8 @@ def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
         gr.Image: GivenFile | None,
         gr.ImageEditor: Painted | None,
         gr.Slider: Elevation,
+        gr.Dropdown: Literal[(*work.FACES, *work.TEXTURES)],  # type: ignore[invalid-type-form]
+        gr.Checkbox: bool,
         gr.Radio: Literal[tuple(_BRUSHES)],  # type: ignore[invalid-type-form]
     }
     ours = {number: fn.inputs for number, fn in page.fns.items() if fn.fn is not None}

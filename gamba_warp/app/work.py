@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import UserError
+from ..files import atomic_path
 from ..formats.names import MESH_FORMATS, SPLAT_FORMATS, splat_suffix
 from .cutting import Cut, model_picture
 
@@ -19,8 +22,38 @@ FRAMES, SIZE = 48, 320  # views of the turntable; their side in pixels
 # By kind of file: the label of its button, and the suffix after the object's name.
 GAUSSIANS = {kind: (f".{kind.replace('-', ' ')}", splat_suffix(kind)) for kind in SPLAT_FORMATS}
 MESHES = {f"mesh-{kind}": (f".{kind}", f"-mesh.{kind}") for kind in MESH_FORMATS}
-SHOWS = {"gif": ("Turntable .gif", ".gif"), "html": ("Viewer .html", ".html")}
+SHOWS = {
+    "gif": ("Turntable .gif", ".gif"),
+    "html": ("Viewer .html", ".html"),
+    "zip": ("All of these .zip", ".zip"),
+}
+IN_ZIP = ("ply", "mesh-glb", "mesh-stl", "gif", "html")
+# Choices for the mesh, by label.
+FACES = {f"{count:,} faces": count for count in (2_000, 10_000, 50_000, 200_000)}
+TEXTURES = {"No texture": 0, **{f"Texture {side}": side for side in (512, 1024, 2048)}}
 KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
+
+
+class MeshChoice(NamedTuple):
+    """Choices for the mesh: faces at most, side of a ``.glb``'s texture (0: none), closed."""
+
+    faces: int = 10_000
+    texture: int = 1024
+    watertight: bool = False
+
+    @classmethod
+    def of(cls, faces: str, texture: str, watertight: bool) -> MeshChoice:
+        """Read the labels of ``FACES`` and ``TEXTURES``.
+
+        Raises:
+            UserError: a label is unknown.
+        """
+        if faces not in FACES or texture not in TEXTURES:
+            raise UserError(f"no such mesh: {faces}, {texture}")
+        return cls(FACES[faces], TEXTURES[texture], watertight)
+
+
+MESH = MeshChoice()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +107,11 @@ def viewer(made: Reconstruction) -> str:
 
 
 def write(
-    made: Reconstruction, kind: str, folder: Path, device: str = "cpu"
+    made: Reconstruction,
+    kind: str,
+    folder: Path,
+    device: str = "cpu",
+    mesh: MeshChoice = MESH,
 ) -> tuple[Path, str | None]:
     """Write one file of a reconstruction.
 
@@ -83,6 +120,7 @@ def write(
         kind: one of ``KINDS``.
         folder: exists.
         device: device that renders.
+        mesh: choices for a mesh.
 
     Returns:
         The file, and for Gaussians a note on its content, else None.
@@ -107,8 +145,16 @@ def write(
         from ..surfaces.files import save_mesh
         from ..surfaces.options import SurfaceOptions
 
-        options, chosen = SurfaceOptions(colors=True), torch.device(device)
-        save_mesh(path, surface_of(made.gaussians.to(chosen), options, chosen))
+        options = SurfaceOptions(colors=True, faces=mesh.faces, watertight=mesh.watertight)
+        chosen, texture = torch.device(device), mesh.texture if kind == "mesh-glb" else 0
+        options.require(texture)
+        save_mesh(path, surface_of(made.gaussians.to(chosen), options, chosen, texture))
+    elif kind == "zip":
+        with tempfile.TemporaryDirectory(dir=folder) as inner, atomic_path(path) as temporary:
+            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+                for part in IN_ZIP:
+                    file, _ = write(made, part, Path(inner), device, mesh)
+                    archive.write(file, file.name)
     elif kind == "gif":
         from ..pages.turntable import save_turntable, turntable_frames
 

@@ -14,15 +14,11 @@ from ..errors import UserError
 from ..files import output_folder
 from ..pages.options import EXPORTED, FileOptions
 from ..surfaces.options import (
-    BROWSER_FACES,
-    TEXTURED_FACES,
-    Faces,
     Holes,
     PartShare,
     Pixels,
     Smoothing,
     SurfaceOptions,
-    Texels,
     Views,
     Voxels,
 )
@@ -38,9 +34,7 @@ def export_command(
     voxels: Voxels = 128,
     views: Views = 64,
     pixels: Pixels = 256,
-    faces: Faces | None = None,
     colors: bool = True,
-    texture: Texels = 0,
     close_holes: Holes = 30,
     min_component: PartShare = 0.01,
     largest: bool = False,
@@ -64,10 +58,7 @@ def export_command(
         voxels: Number of voxels along the object's longest side.
         views: Number of views around the object, for depth and colours.
         pixels: Side of these views, pixels.
-        faces: Largest number of faces; 0 keeps all. By default 50,000, with --texture 10,000.
         colors: Give the vertices colours (.stl has none).
-        texture: Side of a colour texture in pixels, in the .glb, or beside the .obj with a .mtl; 0
-            for none. 1024 is enough for the models.
         close_holes: Largest number of edges of holes that are closed.
         min_component: Remove parts with a smaller share of the faces.
         largest: Keep the largest part only.
@@ -91,8 +82,7 @@ def export_command(
         voxels=voxels,
         views=views,
         pixels=pixels,
-        faces=(TEXTURED_FACES if texture else BROWSER_FACES) if faces is None else faces,
-        colors=colors and set(files.mesh) != {"stl"},
+        colors=colors,
         close_holes=close_holes,
         min_component=min_component,
         largest=largest,
@@ -101,7 +91,6 @@ def export_command(
     job = ExportJob(
         options=files,
         surface=options,
-        texture=texture,
         device=pick_device(device),
         view=Viewpoint().changed(elevation, distance, fov),
         drop_bad=drop_bad,

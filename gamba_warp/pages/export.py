@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,9 @@ from ..gaussians import Gaussians
 from ..images import save_image, to_uint8
 from ..model.config import GambaConfig
 from ..photo.cutout import CutOut
-from ..surfaces.extract import unit_frame
+from ..surfaces.extract import Surface, unit_frame
 from ..surfaces.files import mesh_suffixes, write_meshes
-from ..surfaces.options import BROWSER_FACES, SurfaceOptions
+from ..surfaces.options import BROWSER_FACES, TEXTURE, TEXTURED_FACES, SurfaceOptions
 from ..trajectories.movies import require_movie
 from ..trajectories.paths import Viewpoint, set_up
 from .options import FileOptions
@@ -39,7 +40,7 @@ from .turntable import save_turntable, turntable_frames
 
 INDEX = "index.html"  # links to the pages of several results
 _SMALL = (320, 160)  # size of its thumbnails, an input and its result, pixels
-_SURFACE = SurfaceOptions(colors=True, faces=BROWSER_FACES)
+_SURFACE = SurfaceOptions(colors=True)
 
 
 @dataclass(kw_only=True)
@@ -48,17 +49,28 @@ class ObjectFiles:
 
     Attributes:
         options: the files.
-        surface: options of the mesh.
+        surface: options of the mesh; the number of faces follows from ``options``.
         texture: side of its texture, pixels; 0: none.
         mesh: formats of the mesh.
     """
 
     options: FileOptions
     surface: SurfaceOptions
-    texture: int = 0
+    texture: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.mesh = mesh_formats(self.options.mesh)
+        options, self.mesh = self.options, mesh_formats(self.options.mesh)
+        self.texture = options.texture or 0
+        # xatlas has wheels for some machines only; elsewhere the vertices have the colours.
+        if options.texture is None and "glb" in self.mesh and self.surface.colors:
+            self.texture = TEXTURE if find_spec("xatlas") else 0
+        faces = TEXTURED_FACES if self.texture else BROWSER_FACES
+        self.surface = replace(
+            self.surface,
+            faces=faces if options.faces is None else options.faces,
+            colors=self.surface.colors and set(self.mesh) != {"stl"},
+            watertight=options.watertight,
+        )
 
     def suffixes(self, meshes: bool = True) -> list[str]:
         """Return the suffixes of an object's files, those of meshes last."""
@@ -122,12 +134,12 @@ class ObjectFiles:
         if self.mesh:  # the slowest comes last, so that the rest can be viewed
             STAGES.begin("mesh")
             start = time.perf_counter()
-            how = self.surface, options.frame, device, self.texture
+            how = self.surface, options.frame, device, self.texture, options.size_mm
             mesh = write_meshes(base, gaussians, self.mesh, *how)
             seconds = time.perf_counter() - start
-            closed = "closed" if mesh.is_watertight() else "open"
-            counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closed}"
-            notes.append(f"Mesh: {counts}, {seconds:.1f} s.")
+            counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
+            colors = f", texture of {self.texture} pixels" if self.texture else ""
+            notes.append(f"Mesh: {counts}{colors}, {_closedness(mesh)}, {seconds:.1f} s.")
             section.mesh = mesh if shown is None else None
             self._write_page(section, meshes=True)
         STAGES.begin("rest")
@@ -140,6 +152,16 @@ class ObjectFiles:
             ends = [end for end in self.suffixes(meshes) if end != ".html"]
             section.files = [section.title + end for end in ends]
             reconstruction_page(self.options.out / f"{section.title}.html", section)
+
+
+def _closedness(mesh: Surface) -> str:
+    """Describe if a mesh has holes, and how far the surface moved if they were closed."""
+    if mesh.moved is not None:
+        mean, most = (f"{100 * part:.2g} %" for part in mesh.moved)
+        return f"closed (moved by {mean} of the longest side, {most} at most)"
+    if mesh.is_watertight():
+        return "closed"
+    return "open (with holes where no view met a surface; --watertight closes them)"
 
 
 @dataclass(kw_only=True)

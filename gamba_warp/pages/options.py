@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 from ..conventions import Axes
 from ..formats.names import MeshChoice, SplatFormat
+from ..surfaces.options import Faces, Texels
 from ..untrusted.ranges import Frames, Opacity, Side
 
 
@@ -18,7 +21,13 @@ class FileOptions:
     Attributes:
         out: Folder for the results.
         splats: Files of the Gaussians.
-        mesh: Files of a coloured mesh of the surface (gamba export has its options).
+        mesh: Files of a mesh of the surface, in colour except .stl (gamba export has more options).
+        faces: Largest number of faces of the mesh; 0 keeps all. By default 50,000, with a texture
+            10,000.
+        texture: Side of the mesh's colour texture in pixels, in the .glb, or beside the .obj with a
+            .mtl; 0 for none. By default 1024 with --mesh glb.
+        watertight: Make the mesh closed, as a slicer for 3D printing needs it.
+        size_mm: Longest side of the mesh in millimetres, the unit of slicers.
         page: Write an HTML page with a 3D viewer, and the input and the turntable, if any.
         turntable: Animation of one turn.
         size: Side of the turntable's frames in pixels.
@@ -31,6 +40,10 @@ class FileOptions:
     out: Path = Path("out")
     splats: tuple[SplatFormat, ...] = ()
     mesh: tuple[MeshChoice, ...] = ()
+    faces: Faces | None = None
+    texture: Texels | None = None
+    watertight: bool = False
+    size_mm: Annotated[float, Meta(gt=0, le=1e6)] | None = None
     page: bool = False
     turntable: Literal["gif", "mp4", "none"] = "none"
     size: Side = 256

@@ -12,9 +12,11 @@ from ..errors import UserError
 from ..gaussians import Gaussians
 from .density import level_set
 from .options import SurfaceOptions
+from .solid import distances, solid_of
 from .texture import Texture, bake_texture, vertex_colors
 from .tsdf import fuse, look_around
 
+_SOLID_VOXELS = 96  # voxels per unit of a closed surface; 128 take twice the time
 VISIBLE = 0.05  # opacity from which a Gaussian counts for the object's extent
 
 
@@ -27,12 +29,15 @@ class Surface:
         faces: ``[F, 3]`` int64, F > 0.
         colors: ``[V, 3]`` float32 RGB in [0, 1] (display values), or None.
         texture: the colours as a picture, or None.
+        moved: mean and largest distance of the surface before it was closed from this one, in units
+            of the longest side, or None.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
     texture: Texture | None = None
+    moved: tuple[float, float] | None = None
 
     def is_watertight(self) -> bool:
         """Return True if every edge has two faces."""
@@ -75,16 +80,22 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
         largest=options.largest,
         close_holes=options.close_holes,
         smooth=options.smooth,
-        max_faces=options.faces,
+        max_faces=0 if options.watertight else options.faces,
     )
-    colors = picture = None
+    colors = picture = moved = None
+    if options.watertight:
+        before = vertices
+        voxels = min(options.voxels, _SOLID_VOXELS)
+        vertices, faces = solid_of(vertices, faces, voxels, options.faces)
+        distance = distances(before, vertices, faces)
+        moved = float(distance.mean()), float(distance.max())
     if options.colors:
         assert views is not None
         colors = vertex_colors(vertices, faces, views, options.voxels)
     if texture:
         assert views is not None
         picture = bake_texture(vertices, faces, views, options.voxels, texture)
-    return Surface(vertices, faces, colors, picture)
+    return Surface(vertices, faces, colors, picture, moved)
 
 
 def near_and_visible(gaussians: Gaussians) -> Gaussians:

@@ -119,6 +119,7 @@ def write_meshes(
     axes: Axes,
     device: torch.device,
     texture: int = 0,
+    size_mm: float | None = None,
 ) -> Surface:
     """Extract an object's surface and write it as ``NAME-mesh.FORMAT``.
 
@@ -130,6 +131,8 @@ def write_meshes(
         axes: of all formats except .glb, which is always y up.
         device: device that renders.
         texture: side of a texture, pixels; 0: none.
+        size_mm: longest side in the files, in millimetres (in a .glb, whose unit is the metre, a
+            thousandth of that); None: that of the Gaussians.
 
     Returns:
         The surface in the Gaussians' own frame.
@@ -138,6 +141,9 @@ def write_meshes(
         UserError: the surface is empty, or a file cannot be written.
     """
     found = surface_of(gaussians, options, device, texture)
+    longest = float(np.ptp(found.vertices, axis=0).max())
     for kind in formats:
-        save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), found, axes)
+        scale = 1.0 if size_mm is None else size_mm / longest / (1000 if kind == "glb" else 1)
+        sized = replace(found, vertices=found.vertices * scale)
+        save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), sized, axes)
     return found

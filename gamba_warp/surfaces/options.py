@@ -17,6 +17,7 @@ Pixels = Annotated[int, Meta(ge=8, le=4096)]
 Faces = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 # Sizes that a browser loads and renders smoothly (docs/formats.md).
 BROWSER_FACES, TEXTURED_FACES = 50_000, 10_000
+TEXTURE = 1024  # pixels; enough for the models
 Texels = Annotated[int, Meta(ge=0, le=8192)]
 Holes = Annotated[int, Meta(ge=0, le=10_000)]
 Smoothing = Annotated[int, Meta(ge=0, le=1000)]
@@ -49,6 +50,7 @@ class SurfaceOptions:
         smooth: steps of Taubin smoothing.
         faces: largest number of faces, by decimation; 0: no limit.
         colors: colour vertices from the views.
+        watertight: make it the closed surface of a solid, for printing.
     """
 
     method: Method = "tsdf"
@@ -69,6 +71,7 @@ class SurfaceOptions:
     smooth: Smoothing = 0
     faces: Faces = 0
     colors: bool = False
+    watertight: bool = False
 
     def check(self) -> None:
         """Check the ranges of the numbers.
@@ -89,3 +92,4 @@ class SurfaceOptions:
         """
         require("trimesh", "scipy", "pymeshlab", "open3d" if self.method == "tsdf" else "skimage")
         require(*["xatlas"] * bool(texture))
+        require(*["open3d", "manifold3d"] * self.watertight)

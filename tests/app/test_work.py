@@ -2,6 +2,7 @@
 
 import html.parser
 import re
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -205,19 +206,29 @@ def test_a_mesh(made, tmp_path, monkeypatch):
     trimesh = pytest.importorskip("trimesh")
     asked = []
 
-    def surface_of(gaussians, options, device):
-        asked.append((gaussians.num, options.colors, str(device)))
+    def surface_of(gaussians, options, device, texture):
+        asked.append((gaussians.num, options.faces, options.watertight, texture, str(device)))
         corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
         faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
         return extract.Surface(corners, faces, np.full((4, 3), 0.5, np.float32))
 
     monkeypatch.setattr(extract, "surface_of", surface_of)
     for kind, suffix in (("mesh-stl", ".stl"), ("mesh-glb", ".glb")):
-        path, _ = work.write(made, kind, tmp_path)
+        mesh = work.MeshChoice.of("50,000 faces", "Texture 512", True)
+        path, _ = work.write(made, kind, tmp_path, mesh=mesh)
         assert path.name == f"My-thing-v2-mesh{suffix}"
         mesh = trimesh.load(path, force="mesh")
         assert len(mesh.faces) == 4 and mesh.bounds[:, 1].tolist() == [-1, 0]  # y up
-    assert asked == [(made.gaussians.num, True, "cpu")] * 2
+    assert asked == [(made.gaussians.num, 50_000, True, side, "cpu") for side in (0, 512)]
+    with pytest.raises(UserError, match="no such mesh"):
+        work.MeshChoice.of("50,000 faces", "10,000 faces", True)
+    asked.clear()
+    monkeypatch.setattr(work, "FRAMES", 2)
+    path, _ = work.write(made, "zip", tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        names = {f"My-thing-v2{work.KINDS[kind][1]}" for kind in work.IN_ZIP}
+        assert {*archive.namelist()} == names and archive.testzip() is None
+    assert [p for p in tmp_path.iterdir() if p.is_dir()] == [] and len(asked) == 2
 
 
 def test_the_viewer_is_a_whole_document(made):

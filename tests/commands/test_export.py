@@ -46,7 +46,8 @@ def export(*arguments):
 @pytest.mark.parametrize("surface", ["tsdf", "density"])
 def test_meshes_lie_where_the_gaussians_are(ball, tmp_path, surface):
     out = tmp_path / "out"
-    code = export(ball, "--out", out, "--mesh", *MESH_FORMATS, "--surface", surface)
+    words = ["--mesh", *MESH_FORMATS, "--texture", "0", "--surface", surface]
+    code = export(ball, "--out", out, *words)
     assert code == 0 and sorted(p.name for p in out.iterdir()) == sorted(
         f"egg-mesh.{kind}" for kind in MESH_FORMATS
     )
@@ -68,6 +69,18 @@ def test_meshes_lie_where_the_gaussians_are(ball, tmp_path, surface):
         want = to_linear(want) if kind == "glb" else want
         assert np.abs(colors[top].mean(0) - want[1]).max() < 0.1
         assert np.abs(colors[mesh.vertices[:, 1] < -20.5].mean(0) - want[0]).max() < 0.1
+
+
+def test_a_glb_has_a_texture_and_a_size_of_print_is_millimetres(ball, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert export(ball, "-o", out, "--mesh", "glb", "stl", "--watertight", "--size-mm", "80") == 0
+    mesh = trimesh.load(out / "egg-mesh.glb", force="mesh")
+    assert mesh.visual.material.baseColorTexture.size == (1024, 1024)
+    assert np.ptp(mesh.bounds, axis=0).max() == pytest.approx(0.08, rel=1e-4)
+    print_me = trimesh.load(out / "egg-mesh.stl")
+    assert print_me.is_volume and np.ptp(print_me.bounds, axis=0).max() == pytest.approx(80)
+    said = capsys.readouterr().out
+    assert "texture of 1024 pixels, closed (moved by " in said and len(print_me.faces) <= 10_000
 
 
 def test_frame_faces_and_colors_follow_the_options(ball, tmp_path):

@@ -2,6 +2,7 @@
 
 import math
 
+import manifold3d
 import numpy as np
 import pytest
 import torch
@@ -19,7 +20,9 @@ from gamba_warp.render import render
 from gamba_warp.surfaces.density import MOST_POINTS, opacity_volume
 from gamba_warp.surfaces.extract import cleaned_mesh, extract_surface, unit_frame, vertex_colors
 from gamba_warp.surfaces.options import SurfaceOptions
+from gamba_warp.surfaces.solid import distances, solid_of
 from gamba_warp.surfaces.tsdf import CLEAR, Views, fuse, look_around, sphere_cameras
+from gamba_warp.versions import import_open3d
 
 QUICK = dict(voxels=64, views=24, pixels=128)
 
@@ -33,6 +36,30 @@ def on(mesh, count=4000, **options):
     """Gaussians spread over a trimesh, evenly."""
     points, _ = trimesh.sample.sample_surface_even(mesh, count, seed=0)
     return at(points, **options)
+
+
+def test_a_mesh_with_holes_becomes_a_closed_solid():
+    """A cap that is missing, a cavity and a crumb; checked by three libraries."""
+    ball = trimesh.creation.icosphere(3, 0.5)
+    ball.update_faces(ball.triangles_center[:, 2] < 0.46)
+    cavity = trimesh.creation.icosphere(2, 0.2)
+    cavity.invert()
+    crumb = trimesh.creation.box((0.06, 0.06, 0.06)).apply_translation((0.6, 0, 0))
+    given = trimesh.util.concatenate([ball, cavity, crumb])
+    for most in (0, 900):
+        vertices, faces = solid_of(given.vertices, given.faces, 32, most)
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        assert mesh.is_watertight and mesh.is_winding_consistent and mesh.body_count == 1
+        assert mesh.volume == pytest.approx(ball.convex_hull.volume, rel=0.1)  # cap, grid
+        solid = manifold3d.Manifold(manifold3d.Mesh(vertices.astype(np.float32), faces))
+        assert solid.status() == manifold3d.Error.NoError and solid.genus() == 0
+        o3d = import_open3d()
+        corners = o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
+        assert o3d.geometry.TriangleMesh(*corners).is_edge_manifold(False)
+        assert not most or len(faces) <= most
+        assert distances(ball.vertices, vertices, faces).mean() < 0.01  # a third of a voxel
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    refused("encloses nothing", solid_of, flat, np.array([[0, 1, 2]]), 16)
 
 
 def as_trimesh(surface):

@@ -1,0 +1,118 @@
+"""Closed surface of a solid, from a mesh that may have holes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import UserError
+from ..versions import import_open3d
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+_VOTES = 7  # rays of each point; odd
+_MARGIN = 2  # grid points around the object
+_CHUNK = 1 << 20  # points asked at once
+_SHARE = 0.01  # of the volume; smaller parts vanish
+_TOUCHING = 1e-5  # voxels
+
+
+def solid_of(
+    vertices: np.ndarray, faces: np.ndarray, voxels: int, max_faces: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the closed surface of what a mesh encloses, as the level set of its signed distance.
+
+    A point is inside if most rays from it cross the mesh an odd number of times, so that holes do
+    not count; cavities without a way out are filled. Parts thinner than a voxel vanish, and so do
+    parts under a hundredth of the volume.
+
+    Args:
+        vertices: ``[V, 3]``, an object about the origin with a longest side of about 1.
+        faces: ``[F, 3]``, outside in front.
+        voxels: number of grid points per unit.
+        max_faces: target of the decimation; 0: none.
+
+    Returns:
+        Vertices ``[W, 3]`` float64, and faces ``[G, 3]`` int64 of a manifold, outside in front.
+
+    Raises:
+        UserError: the mesh encloses nothing.
+    """
+    from manifold3d import Manifold
+    from scipy.ndimage import binary_fill_holes
+
+    first = np.floor(vertices.min(0) * voxels).astype(int) - _MARGIN
+    shape = np.ceil(vertices.max(0) * voxels).astype(int) + _MARGIN + 1 - first
+    points = ((np.indices(shape).reshape(3, -1).T + first) / voxels).astype(np.float32)
+    scene = _scene(vertices, faces)
+    parts = [points[at : at + _CHUNK] for at in range(0, len(points), _CHUNK)]
+    distance = np.concatenate([scene.compute_distance(part).numpy() for part in parts])
+    votes = np.concatenate([scene.compute_occupancy(p, nsamples=_VOTES).numpy() for p in parts])
+    inside, distance = votes.reshape(shape) > 0, distance.reshape(shape) * voxels
+    filled = np.asarray(binary_fill_holes(inside))
+    # The walls of a filled cavity are no surface: a voxel inside there.
+    depth = np.where(inside, distance, np.where(filled, 1.0, -distance))
+    made = Manifold.level_set(_interpolated(depth), [0.0] * 3 + [*(shape - 1.0)], 1.0)
+    large = [part for part in made.decompose() if part.volume() > _SHARE * made.volume()]
+    if not large:
+        raise UserError("the surface encloses nothing: it has no solid")
+    corners, triangles = _decimated(Manifold.compose(large), max_faces)
+    return (corners + first) / voxels, triangles
+
+
+def _decimated(solid: Manifold, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and faces of a manifold, at most ``max_faces`` unless that is 0."""
+    from manifold3d import Manifold
+    from manifold3d import Mesh as Triangles
+    from pymeshlab import Mesh, MeshSet  # pyright: ignore[reportAttributeAccessIssue]
+
+    if 0 < max_faces < solid.num_tri():
+        made, meshes = solid.to_mesh(), MeshSet()
+        vertices = made.vert_properties[:, :3].astype(np.float64)
+        meshes.add_mesh(Mesh(vertices, made.tri_verts.astype(np.int32)))
+        meshes.meshing_decimation_quadric_edge_collapse(
+            targetfacenum=max_faces, preservenormal=True, preservetopology=True
+        )
+        meshes.meshing_remove_unreferenced_vertices()
+        kept = meshes.current_mesh()
+        corners = kept.vertex_matrix().astype(np.float32)
+        # Edges where two sheets touch have four faces; they are split.
+        split = Manifold(Triangles(corners, kept.face_matrix().astype(np.uint32)))
+        solid = split.simplify(_TOUCHING)
+    made = solid.to_mesh()
+    return made.vert_properties[:, :3].astype(np.float64), made.tri_verts.astype(np.int64)
+
+
+def distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the distance ``[P]`` of points ``[P, 3]`` from a mesh."""
+    return _scene(vertices, faces).compute_distance(points.astype(np.float32)).numpy()
+
+
+def _scene(vertices: np.ndarray, faces: np.ndarray):
+    """Return Open3D's scene of a mesh."""
+    o3d = import_open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
+    return scene
+
+
+def _interpolated(volume: np.ndarray) -> Callable[[float, float, float], float]:
+    """Return the trilinear function of a volume ``[X, Y, Z]``, without numpy's cost per call."""
+    flat, (_, rows, columns) = volume.astype(np.float32).ravel().tolist(), volume.shape
+    plane = rows * columns
+    limits = [side - 1.001 for side in volume.shape]
+
+    def value(x: float, y: float, z: float) -> float:
+        x, y, z = (min(max(at, 0.0), most) for at, most in zip((x, y, z), limits))
+        i, j, k = int(x), int(y), int(z)
+        a, x, y, z = i * plane + j * columns + k, x - i, y - j, z - k
+        found = []
+        for at in (a, a + columns, a + plane, a + plane + columns):
+            found.append(flat[at] + (flat[at + 1] - flat[at]) * z)
+        near, far = found[0] + (found[1] - found[0]) * y, found[2] + (found[3] - found[2]) * y
+        return near + (far - near) * x
+
+    return value
