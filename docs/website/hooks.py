@@ -63,7 +63,12 @@ def on_files(files: Files, config) -> Files:
 
 
 def on_page_markdown(markdown: str, page, config, files) -> str:
-    """Turn links between files of the repository into links between pages."""
+    """Turn links between files of the repository into links between pages.
+
+    Pages of the project's own studies and credits are left out of the search.
+    """
+    if page.file.src_uri.startswith("lab/") or page.file.name in ("THIRD_PARTY", "ATTRIBUTION"):
+        page.meta.setdefault("search", {"exclude": True})
     path = _origin.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     if path == "docs/commands.md":
         markdown += command_reference()
