@@ -94,7 +94,7 @@ gpu_check | the checks on a CUDA machine | MEASURES measure |
 ablation | rows trained and evaluated alike | RESULTS | measure TRAIN EVAL
 commands | commands, by subject | MEASURES measure ablation gpu_check | TRAIN EVAL
 app | the local web app | RESULTS |
-cli | finds the command, parses, calls | versions core untrusted | commands app gpu_check ablation TRAIN EVAL
+cli | finds the command, parses, calls | READERS | commands app gpu_check ablation TRAIN EVAL
 public | import gamba_warp: names loaded when used | versions kernels | RESULTS
 """
 
@@ -140,7 +140,7 @@ def package_of(module: str) -> str:
         return "public"
     if name == "versions":
         return "versions"
-    if name in ENTRY_POINTS:
+    if name in (*ENTRY_POINTS, "usage"):
         return "cli"
     package = name
     while package and package not in PACKAGES:
