@@ -53,8 +53,8 @@ def test_the_site_builds_strictly_and_has_every_page(site):
         assert (site / page).is_file(), page
     for page in ("examples/first-steps.html", "repository/kernels/rasterize.html"):
         assert (site / page).is_file(), page
-    code = (site / "code/docs/examples/layer_speed.py.html").read_text()
-    assert "Mamba" in code
+    code = (site / "code/docs/examples/fit_photograph.py.html").read_text()
+    assert "rasterization" in code
     assert not list(site.rglob("*.py")) and not list(site.rglob("*.ipynb"))
 
 
