@@ -1,7 +1,7 @@
 """Conversion of links between files of the repository to links of the site.
 
 The pages are also read in the repository, so a link is relative to its file:
-``../kernels/rasterize/README.md``, ``examples/fit_photograph.py``. On the site each linked file is a
+``../kernels/ssim/README.md``, ``examples/fit_photograph.py``. On the site each linked file is a
 page: those of docs/ at their path, other Markdown under ``repository/``, code under ``code/``.
 """
 

@@ -18,7 +18,6 @@ __all__ = (
     "read_config",
     "read_weights",
     "save_model",
-    "shipped_model",
 )
 DEFAULT_CHECKPOINT = STARTER / "rays.safetensors"
 
@@ -44,20 +43,3 @@ def load_model(
             the encoder differs from that of the training.
     """
     return read_model(Gamba, Path(path or DEFAULT_CHECKPOINT), device, encoder_weights)
-
-
-def shipped_model(preset: str, device: str | torch.device = "cpu") -> Gamba | None:
-    """Load the model of a preset that is shipped with the package.
-
-    Args:
-        preset: its name.
-        device: the model's device.
-
-    Returns:
-        The model in eval mode; None if no model of this preset is shipped.
-
-    Raises:
-        UserError: the file cannot be read, as in ``load_model``.
-    """
-    path = STARTER / f"{preset}.safetensors"
-    return load_model(path, device) if path.is_file() else None

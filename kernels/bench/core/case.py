@@ -21,16 +21,8 @@ def dtype_name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-class NotMeasured(Exception):
-    """Raised where there is nothing to measure; the status is the class's word, and why."""
-
-    word = "not measured"
-
-
-class NotInstalled(NotMeasured):
+class NotInstalled(Exception):
     """Raised for a peer that is not installed; ``str(error)`` names its package."""
-
-    word = "not installed"
 
 
 @dataclass(frozen=True)

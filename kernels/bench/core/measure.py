@@ -21,7 +21,7 @@ import warp as wp
 from gamba_warp.versions import __version__
 
 from ...runtime import memory
-from .case import LEVELS, Case, NotMeasured, Settings, Variant
+from .case import LEVELS, Case, NotInstalled, Settings, Variant
 
 FORMAT = "gamba_warp.bench.1"
 TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
@@ -215,8 +215,8 @@ def _summarize(timed: list[_Timed]) -> None:
 
 
 def _reason(error: Exception) -> str:
-    if isinstance(error, NotMeasured):
-        return f"{error.word}: {error}"
+    if isinstance(error, NotInstalled):
+        return f"not installed: {error}"
     lines = str(error).strip().splitlines()
     return f"failed: {type(error).__name__}: {lines[0] if lines else ''}"
 
