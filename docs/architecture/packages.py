@@ -94,7 +94,7 @@ gpu_check | the checks on a CUDA machine | MEASURES measure |
 ablation | rows trained and evaluated alike | RESULTS | measure TRAIN EVAL
 commands | commands, by subject | MEASURES measure ablation gpu_check | TRAIN EVAL
 app | the local web app | RESULTS |
-cli | finds and calls commands | versions core untrusted | commands app gpu_check ablation TRAIN EVAL
+cli | parses and calls | versions core untrusted | commands app gpu_check ablation TRAIN EVAL
 public | import gamba_warp: names loaded when used | versions kernels | RESULTS
 """
 

@@ -13,7 +13,7 @@ from ..versions import import_open3d
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-_VOTES = 7  # rays of each point; odd
+_VOTES = 15  # rays of each point; odd
 _MARGIN = 2  # grid points around the object
 _CHUNK = 1 << 20  # points asked at once
 _SHARE = 0.01  # of the volume; smaller parts vanish
@@ -42,7 +42,7 @@ def solid_of(
         UserError: the mesh encloses nothing.
     """
     from manifold3d import Manifold
-    from scipy.ndimage import binary_fill_holes
+    from scipy.ndimage import binary_fill_holes, median_filter
 
     first = np.floor(vertices.min(0) * voxels).astype(int) - _MARGIN
     shape = np.ceil(vertices.max(0) * voxels).astype(int) + _MARGIN + 1 - first
@@ -50,8 +50,10 @@ def solid_of(
     scene = _scene(vertices, faces)
     parts = [points[at : at + _CHUNK] for at in range(0, len(points), _CHUNK)]
     distance = np.concatenate([scene.compute_distance(part).numpy() for part in parts])
-    votes = np.concatenate([scene.compute_occupancy(p, nsamples=_VOTES).numpy() for p in parts])
-    inside, distance = votes.reshape(shape) > 0, distance.reshape(shape) * voxels
+    votes = np.concatenate([_votes(scene, part) for part in parts])
+    # Near a hole the votes are noisy: the median closes tunnels of a voxel.
+    inside = median_filter(2 * votes.reshape(shape) > _VOTES, 3)
+    distance = distance.reshape(shape) * voxels
     filled = np.asarray(binary_fill_holes(inside))
     # The walls of a filled cavity are no surface: a voxel inside there.
     depth = np.where(inside, distance, np.where(filled, 1.0, -distance))
@@ -61,6 +63,17 @@ def solid_of(
         raise UserError("the surface encloses nothing: it has no solid")
     corners, triangles = _decimated(Manifold.compose(large), max_faces)
     return (corners + first) / voxels, triangles
+
+
+def _votes(scene, points: np.ndarray) -> np.ndarray:
+    """Return the number ``[P]`` of rays from points ``[P, 3]`` that cross a mesh an odd number
+    of times, of ``_VOTES`` rays in fixed directions.
+    """
+    votes = np.zeros(len(points), int)
+    for direction in np.random.default_rng(0).normal(size=(_VOTES, 3)):
+        rays = np.concatenate([points, np.broadcast_to(direction, points.shape)], 1)
+        votes += scene.count_intersections(rays.astype(np.float32)).numpy() % 2
+    return votes
 
 
 def _decimated(solid: Manifold, max_faces: int) -> tuple[np.ndarray, np.ndarray]:

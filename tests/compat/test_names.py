@@ -81,7 +81,7 @@ def test_a_module_runs_as_with_python(monkeypatch):
 def test_what_cannot_be_run_is_one_line(tmp_path):
     done = run(tmp_path / "none.py")
     assert done.returncode == 1 and not done.stdout
-    assert done.stderr.startswith("python -m gamba_warp.compat SCRIPT …")
+    assert done.stderr.startswith("python -m gamba_warp.compat [--take NAMES] SCRIPT …")
     assert done.stderr.count("\n") == 1 and "none.py" in done.stderr
 
 

@@ -50,12 +50,12 @@ def test_a_mesh_with_holes_becomes_a_closed_solid():
         vertices, faces = solid_of(given.vertices, given.faces, 32, most)
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         assert mesh.is_watertight and mesh.is_winding_consistent and mesh.body_count == 1
-        assert mesh.volume == pytest.approx(ball.convex_hull.volume, rel=0.1)  # cap, grid
+        assert mesh.volume == pytest.approx(ball.convex_hull.volume, rel=0.05)  # cap, grid
         solid = manifold3d.Manifold(manifold3d.Mesh(vertices.astype(np.float32), faces))
         assert solid.status() == manifold3d.Error.NoError and solid.genus() == 0
         o3d = import_open3d()
         corners = o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
-        assert o3d.geometry.TriangleMesh(*corners).is_edge_manifold(False)
+        assert o3d.geometry.TriangleMesh(*corners).is_watertight()
         assert not most or len(faces) <= most
         assert distances(ball.vertices, vertices, faces).mean() < 0.01  # a third of a voxel
     flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
