@@ -73,9 +73,9 @@ def progress_bar(
     if lines and not (stream.isatty() or STAGES.quiet):
         form = options.get("bar_format", _LINE).replace("|{bar}|", "")
         options |= {"file": _Lines(stream), "disable": False, "bar_format": form}
-        return tqdm(items, **options)
-    hidden = True if STAGES.quiet else None
-    bar: Any = tqdm(items, disable=hidden, **options)  # without items its type is unknown
+    else:
+        options["disable"] = True if STAGES.quiet else None
+    bar: Any = tqdm(items, **options)  # without items its type is unknown
     return bar
 
 

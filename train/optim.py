@@ -96,13 +96,15 @@ def build_optimizer(
     kind = getattr(torch.optim, optim.optimizer, None)
     if not (isinstance(kind, type) and issubclass(kind, torch.optim.Optimizer)):
         raise UserError(f"--optimizer {optim.optimizer[:60]}: not one of torch.optim")
-    options = {}
+    options: dict[str, Any] = {"lr": 0.0}
     for text in optim.optimizer_options:
         name, _, value = text.partition("=")
+        if name == "lr":
+            raise UserError("--optimizer-options lr: the rate is that of --lr")
         found = value_of(value)
         options[name] = tuple(found) if isinstance(found, list) else found
     try:
-        return kind(groups, lr=0.0, **options)
+        return kind(groups, **options)
     except (TypeError, ValueError, AttributeError) as error:
         raise UserError(f"--optimizer {optim.optimizer}: {first_line(error)}") from error
 

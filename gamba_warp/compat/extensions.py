@@ -40,7 +40,7 @@ def scan_bwd(
     With ``recompute_out_z`` the output after the gate follows.
     """
     y, grads = _gradients(
-        lambda u, *more: selective_scan_fn(u.to(dout.dtype), *more, delta_softplus),
+        lambda u, *more: selective_scan_fn(u.to(dout.dtype), *more, delta_softplus=delta_softplus),
         (u, delta, A, B, C, D, z, delta_bias),
         dout,
     )
@@ -78,8 +78,9 @@ def conv_fwd(x, weight, bias, *rest) -> Tensor:
     None: causal-conv1d 1.0; ``seq_idx``: 1.1; ``seq_idx, initial_states, final_states_out``: from
     1.2; ``seq_idx, initial_states, out, final_states_out``: from 1.6.
     """
-    *rest, silu = rest
-    seq_idx, initial, *outs = (*rest, None, None)[: max(2, len(rest))]
+    *between, silu = rest
+    outs: list[Any]
+    seq_idx, initial, *outs = (*between, None, None)[: max(2, len(between))]
     final = outs[-1] if outs else None
     states = initial, final is not None, final, "silu" if silu else None
     y = causal_conv1d_fn(x, weight, bias, seq_idx, *states)

@@ -124,7 +124,8 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
     if config.encoder == "none":
         return None
     if config.encoder in added("encoder"):
-        return ImageEncoder(*added("encoder")[config.encoder](config, weights), config)
+        network, channels = added("encoder")[config.encoder](config, weights)
+        return ImageEncoder(network, channels, config)
     if config.encoder == "vgg16":
         from ..vision.vgg import vgg16_features
 

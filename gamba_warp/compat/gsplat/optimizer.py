@@ -73,6 +73,7 @@ class SelectiveAdam(torch.optim.Adam):
                     state["exp_avg"], state["exp_avg_sq"] = (
                         torch.zeros_like(param) for _ in range(2)
                     )
-                averages = state["exp_avg"], state["exp_avg_sq"]
-                numbers = group["lr"], *group["betas"], group["eps"]
-                adam(param, param.grad, *averages, visibility, *numbers)
+                mean, square = state["exp_avg"], state["exp_avg_sq"]
+                b1, b2 = group["betas"]
+                options = {"lr": group["lr"], "b1": b1, "b2": b2, "eps": group["eps"]}
+                adam(param, param.grad, mean, square, visibility, **options)

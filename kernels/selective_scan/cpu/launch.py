@@ -228,8 +228,8 @@ def backward(
     through = any(needs._replace(C=False, D=False, z=False))  # gradients of the states
     wanted = {"NEED_DZ": needs.z, "NEED_DC": needs.C, "NEED_DB": needs.B, "NEED_DH": through}
     flags = sum(NEEDS[name] for name, need in wanted.items() if need)
-    dout = x.u.new_zeros(1, 1, y.channels).expand_as(x.u) if dout is None else dout
-    dout = lane_contiguous(dout)
+    none = x.u.new_zeros(1, 1, y.channels).expand_as(x.u)
+    dout = lane_contiguous(none if dout is None else dout)
     if x.C is None:
         s.c = s.b.new_zeros(1, 1, 1, y.states).expand_as(s.b)
 

@@ -42,8 +42,13 @@ def create_block(
     one_of("ssm_cfg['layer']", options.pop("layer"), "Mamba1")
     mixer = partial(Mamba, layer_idx=layer_idx, **options, **at)
     norm = partial(RMSNorm if rms_norm else nn.LayerNorm, eps=norm_epsilon, **at)
-    switches = {"fused_add_norm": fused_add_norm, "residual_in_fp32": residual_in_fp32}
-    block = Block(d_model, mixer, norm_cls=norm, **switches)
+    block = Block(
+        d_model,
+        mixer,
+        norm_cls=norm,
+        fused_add_norm=fused_add_norm,
+        residual_in_fp32=residual_in_fp32,
+    )
     block.layer_idx = layer_idx
     return block
 
@@ -88,7 +93,8 @@ class MixerModel(nn.Module):
 
     def allocate_inference_cache(self, batch_size: int, max_seqlen: int, dtype=None, **kwargs):
         """Make the states of all layers, by their numbers."""
-        made = (x.allocate_inference_cache(batch_size, max_seqlen, dtype) for x in self.layers)
+        layers: Any = self.layers
+        made = (x.allocate_inference_cache(batch_size, max_seqlen, dtype) for x in layers)
         return dict(enumerate(made))
 
     def forward(self, input_ids: Tensor, inference_params=None, **kwargs) -> Tensor:
@@ -104,10 +110,11 @@ class MambaLMHeadModel(nn.Module, GenerationMixin):
 
     def __init__(self, config: MambaConfig, initializer_cfg=None, device=None, dtype=None) -> None:
         super().__init__()
-        self.config, given = config, asdict(config)
+        self.config = config
+        given: dict[str, Any] = asdict(config)
         given["vocab_size"] += -config.vocab_size % given.pop("pad_vocab_size_multiple")
         del given["tie_embeddings"]
-        at = {"device": device, "dtype": dtype}
+        at: dict[str, Any] = {"device": device, "dtype": dtype}
         self.backbone = MixerModel(**given, initializer_cfg=initializer_cfg, **at)
         self.lm_head = nn.Linear(config.d_model, given["vocab_size"], bias=False, **at)
         self.apply(partial(_init_weights, n_layer=config.n_layer, **(initializer_cfg or {})))

@@ -16,6 +16,8 @@ class Block(nn.Module):
     an MLP also ``norm2``, ``mlp``.
     """
 
+    layer_idx: int | None = None
+
     def __init__(
         self, dim: int, mixer_cls: Callable, mlp_cls: Callable = nn.Identity,
         norm_cls: Callable = nn.LayerNorm, fused_add_norm=False, residual_in_fp32=False,

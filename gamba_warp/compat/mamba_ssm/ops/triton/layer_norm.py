@@ -44,7 +44,8 @@ def layer_norm_fn(
     if rowscale is not None and x1 is not None:
         raise ValueError("rowscale is given beside x1, allowed is one of them")
     wide = torch.promote_types(x.dtype, torch.float32)
-    total, masks = x.to(wide) if rowscale is None else x.to(wide) * rowscale[..., None], []
+    total: Any = x.to(wide) if rowscale is None else x.to(wide) * rowscale[..., None]
+    masks = []
     for part, mask in ((total, dropout_mask), (x1, dropout_mask1)):
         if part is not None and dropout_p > 0:
             mask = torch.rand(x.shape, device=x.device) >= dropout_p if mask is None else mask
@@ -95,6 +96,13 @@ class RMSNorm(nn.Module):
     ) -> Any:
         """Normalize ``x [.., D]`` plus a residual, as ``layer_norm_fn``."""
         dropout_p = self.drop.p if self.drop is not None and self.training else 0.0
-        options = {"prenorm": prenorm, "residual_in_fp32": residual_in_fp32}
-        given = {"residual": residual, "eps": self.eps, "dropout_p": dropout_p}
-        return rms_norm_fn(x, self.weight, None, **given, **options)
+        return rms_norm_fn(
+            x,
+            self.weight,
+            None,
+            residual=residual,
+            eps=self.eps,
+            dropout_p=dropout_p,
+            prenorm=prenorm,
+            residual_in_fp32=residual_in_fp32,
+        )
