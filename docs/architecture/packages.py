@@ -66,7 +66,7 @@ kernels.stress.oracles | the formulas in float64 | kernels.stress.core kernels.r
 kernels.stress.cases | one file per subject | KERNELS kernels.stress.core kernels.stress.oracles |
 kernels.stress | parent of its three packages | |
 core | Gaussians, cameras, images, rendering, files, errors | KERNELS |
-compat | other packages' interfaces over our kernels | KERNELS core |
+compat | other packages' interfaces over our kernels | READERS |
 untrusted | validation of untrusted files | KERNELS core |
 data | datasets and preprocessing | READERS |
 formats | .ply, .splat, .glb, meshes, their headers | READERS |

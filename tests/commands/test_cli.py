@@ -167,7 +167,9 @@ def test_a_url_is_taken_where_text_is(command, capsys):
     assert "https://host/a" in capsys.readouterr().out
 
 
-def test_common_options(command, capsys):
+def test_common_options(command, capsys, monkeypatch):
+    monkeypatch.setattr(STAGES, "seconds", {})  # of the commands before
+
     def current(out: Path = Path("here"), *, steps: int = 1) -> None:
         """Says it."""
         print(out, STAGES.quiet)

@@ -15,15 +15,17 @@ DOORS = {
         "gamba_warp/untrusted/archives.py",
         "gamba_warp/untrusted/torch_files.py",
         "gamba_warp/vision/weights.py",
+        "gamba_warp/app/work.py",  # which writes one
     },
     "np.load": set(),
     "pickle.load": set(),
     "pickle.loads": {"gamba_warp/untrusted/children.py"},
     "json.load": set(),
-    # files just written by the same process or its parent, or by Warp's compiler
+    # files just written by the same process or its parent, or by Warp's compiler, and options
     "json.loads": {
         "gamba_warp/gpu_check/check.py",
         "gamba_warp/model/pretrained.py",
+        "gamba_warp/plugins.py",
         "kernels/bench/static/report.py",
         "train/config.py",
     },

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import json
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from ....untrusted.documents import read_document
 
 
 def _file(model_name: str, name: str) -> Path:
@@ -20,7 +21,7 @@ def _file(model_name: str, name: str) -> Path:
 
 def load_config_hf(model_name: str) -> Any:
     """Read ``config.json``."""
-    return json.loads(_file(model_name, "config.json").read_text(encoding="utf-8"))
+    return read_document(_file(model_name, "config.json"), dict[str, Any])
 
 
 def load_state_dict_hf(model_name: str, device=None, dtype: torch.dtype | None = None) -> dict:
