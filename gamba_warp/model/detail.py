@@ -17,7 +17,7 @@ each front cell may therefore split into k x k children, each on the ray of its 
 Plain cells do not split. Cells that contain or touch background split in 2 x 2 at most: a
 rasterizer widens every Gaussian by a part of its own pixel, so more of them along a silhouette
 make it wider in pictures smaller than the intended one. For the same reason two rounds of
-correction take colours at k times the cells, but opacities from the mean error of two smaller
+correction take colours at k times the cells, but opacities from the errors of two smaller
 pictures, of twice as many pixels as cells and of as many.
 """
 
@@ -44,12 +44,13 @@ from .parts.rays import EMPTY
 PLAIN = 6 / 255  # largest contrast of a plain cell, with its neighbours
 MAX_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
 # By detail: the least standard deviation of a child across the view, in sides of its cell, and the
-# share of its parent's offset from the ray (docs/lab/rays.md compares other values).
+# share of its parent's offset from the ray.
 MIN_SIZE = {2: 0.4, 4: 0.45}
 OFFSET_SHARE = {2: 0.5, 4: 0.125}
 MIN_OPACITY = 0.5  # logit; least opacity of a child where alpha is 1
 ROUNDS = 2  # of correction
 OPACITY_GAIN = 8.0  # added to the logit of an opacity per missing unit of alpha
+SMALL_SHARE = 0.2  # of that, for the smaller picture: a large one loses what a small one gains
 FAINT = 0.05  # alpha of a rendered pixel below which its colour is unreliable
 
 
@@ -280,10 +281,10 @@ def _correct(
         out = render(both, camera.resized(size, size))
         color = want[..., :3] - want[..., 3:] * out.rgb[0] / out.alpha[0].clamp_min(FAINT)
         logits = torch.logit(children.opacities, 1e-4)
-        for step in (detail // 2, detail):
+        for step, share in ((detail // 2, 1 - SMALL_SHARE), (detail, SMALL_SHARE)):
             found = render(both, camera.resized(size // step, size // step)).alpha[0, ..., 0]
             missing = F.avg_pool2d(picture[:, 3:], step)[0, 0] - found
-            logits = logits + OPACITY_GAIN / 2 * missing[row // step, column // step]
+            logits = logits + share * OPACITY_GAIN * missing[row // step, column // step]
         children = replace(
             children,
             colors=(children.colors + color[row, column]).clamp(0, 1),
