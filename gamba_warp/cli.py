@@ -81,7 +81,9 @@ COMMANDS = {
         "The authors' public weights to ours.", "train", ("timm",), (), _WEIGHTS
     ),
     "weights lpips": Command("Fetch the LPIPS-VGG weights.", "", (), (), _WEIGHTS),
-    "doctor": Command("Say what this machine can run.", "", (), ("kernels",), _MACHINE),
+    "doctor": Command(
+        "Check this machine's libraries and devices.", "", (), ("kernels",), _MACHINE
+    ),
     "completion": Command("Completion by Tab for bash, zsh or fish."),
 }
 

@@ -478,7 +478,7 @@ def find_pictures(
 
 
 def passed_over(path: Path, recursive: bool = False) -> str:
-    """Return what ``find_pictures`` leaves out of a folder; empty if nothing, or for a file."""
+    """Return the entries of a folder that ``find_pictures`` leaves out; none for a file."""
     try:
         files, folders = _inside(path, recursive) if path.is_dir() else ([], [])
     except OSError:

@@ -24,7 +24,7 @@ GROUP = "gamba_warp.plugins"  # of entry points: installed plugins are given by 
 
 
 class _Table(NamedTuple):
-    """Table of a module, and the conversion of what plugins add."""
+    """Table of a module, and the conversion of plugins' entries."""
 
     own: dict[str, Any]
     entry: Callable[[Any], Any]
@@ -46,7 +46,7 @@ class Plugin:
     """
 
     def __init__(self, name: str, sha256: str, options: Mapping[str, Any]) -> None:
-        """Nothing is added yet."""
+        """Start without additions."""
         self.name, self.sha256, self.options = name, sha256, dict(options)
         self.added: list[tuple[str, str]] = []
 
@@ -131,7 +131,7 @@ class Plugin:
         self.added.append((kind, name))
 
     def remove(self) -> None:
-        """Take back what it has added."""
+        """Remove the additions from their tables."""
         for kind, name in self.added:
             _ADDED[kind].pop(name, None)
             if kind in _TABLES:
@@ -146,9 +146,9 @@ def extensible(
     """Let plugins add to a module's table.
 
     Args:
-        kind: of its entries, in words.
+        kind: name of the kind of its entries.
         own: the table.
-        entry: makes an entry of what ``Plugin`` was given.
+        entry: conversion of an addition to an entry.
 
     Returns:
         The table.
@@ -165,12 +165,12 @@ def extensible(
 
 
 def added(kind: str) -> dict[str, Any]:
-    """Return what plugins have added of a kind, by name."""
+    """Return the additions of all plugins of one kind, by name."""
     return _ADDED.get(kind, {})
 
 
 def load(words: Sequence[str]) -> list[dict[str, Any]]:
-    """Load plugins; one that is loaded already with the same text and options is left alone.
+    """Load plugins, unless they are loaded already with the same text and options.
 
     Args:
         words: for each plugin its file (.py) or the name of its entry point, then its options as
@@ -260,7 +260,7 @@ def _load(source: str, options: dict[str, Any]) -> None:
 
 
 def unload() -> None:
-    """Take back everything that plugins have added."""
+    """Remove the additions of all plugins."""
     for plugin in [*_LOADED.values()]:
         plugin.remove()
 
@@ -276,7 +276,7 @@ def needed(**names: str) -> list[dict[str, Any]]:
 
 
 def missing(record: Mapping[str, Any]) -> str | None:
-    """Describe why the plugin of a record is not there: not loaded; None if it is."""
+    """Return a message if the plugin of a record is not loaded, else None."""
     name, digest = str(record["name"])[:100], str(record["sha256"])[:12]
     if name in _LOADED:
         return None

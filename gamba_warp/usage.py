@@ -8,7 +8,7 @@ import shutil
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -209,7 +209,7 @@ def help_text(name: str, command: Callable, everything: bool) -> str:
                 lines += _entry(", ".join(_spelled(option)), _with_default(option), width)
         lines.append("")
     lines.append("every command:")
-    common = {**COMMON}
+    common = dict(COMMON)
     if short:
         common |= {"--help-all": "Print every option with its explanation."}
     for names, text in common.items():
@@ -304,9 +304,7 @@ def read_words(arguments: Sequence[str], command: Callable) -> Words:
             key = aliases[key]
             word = f"--{key}" + word[len(written) :]
         if key not in known and key != "config":
-            close = get_close_matches(key, known, 1)
-            meant = f"; did you mean --{close[0]}?" if close else ""
-            raise UserError(f"unknown option {written}{meant}")
+            raise UserError(f"unknown option {written}{_closest(key, known, '--')}")
         owner = known.get(key)
         _check_no_url(value, owner)
         several, name = owner is not None and owner.several, owner.key if owner else key
@@ -330,6 +328,12 @@ def read_words(arguments: Sequence[str], command: Callable) -> Words:
     return Words([w for group in groups for w in group], "quiet" in switches, "verbose" in switches)
 
 
+def _closest(name: str, known: Iterable[str], dashes: str = "") -> str:
+    """Return a question for the known name that is closest to an unknown one, or nothing."""
+    close = get_close_matches(name, known, 1)
+    return f"; did you mean {dashes}{close[0]}?" if close else ""
+
+
 def config_words(path: Path, options: Sequence[Option]) -> tuple[list[str], list[str]]:
     """Return the arguments and the options that a config file holds, as words.
 
@@ -349,9 +353,7 @@ def config_words(path: Path, options: Sequence[Option]) -> tuple[list[str], list
         key = name.replace("_", "-")
         option = known.get(key)
         if option is None:
-            close = get_close_matches(key, known, 1)
-            meant = f"; did you mean {close[0]}?" if close else ""
-            raise UserError(f"{path}: unknown option {name}{meant}")
+            raise UserError(f"{path}: unknown option {name}{_closest(key, known)}")
         values = value if isinstance(value, list) else [value]
         if any(re.match("--?[A-Za-z]", str(one)) for one in values):
             raise UserError(f"{path}: {name}: {value!r} is not a valid value of an option")

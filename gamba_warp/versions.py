@@ -55,17 +55,17 @@ EXTRA_OF = {
     "xatlas": "mesh",
     "yaml": "train",
 }
-# What the evaluation of shapes always needs, and the made objects.
+# Libraries of the evaluation of shapes, and of the made objects.
 SHAPES = ("kornia", "manifold3d", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 MADE = ("trimesh", "manifold3d", "skimage")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
     "train": {"kornia", "tensorboard", "timm", "tomli", "yaml"},
-    "mesh": {*SHAPES, "manifold3d", "xatlas"},
-    "eval": {*SHAPES, "manifold3d", "xatlas"},
+    "mesh": {*SHAPES, "xatlas"},
+    "eval": {*SHAPES, "xatlas"},
     "fit": {"gsplat", "kornia"},
     "app": {
-        *("gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", "manifold3d"),
+        *("gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch"),
         *SHAPES,
     },
     "all": set(EXTRA_OF),

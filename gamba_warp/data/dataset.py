@@ -245,7 +245,7 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
         named = progress_bar(folders, lines=True, delay=2.0, desc="checking", unit="object")
         for path in named:
             uid = path.relative_to(root).as_posix()
-            # Before anything is read: what changes meanwhile makes the manifest an old one.
+            # Before the objects are read: a change during the reading outdates the manifest.
             names = _CAMERA_FILES.get(layout, LAYOUTS[layout][:1])
             marks, digest = marks_of(path, (*names, ".")), "0" * 16
             files = None

@@ -56,10 +56,8 @@ _UNSURE = 0.4  # largest share of alpha's sum in pixels that are neither object 
 # A result is doubted if the object
 _BORDER = 0.02  # covers more than this share of the picture's border,
 _PART = 0.15  # has further parts of at least this share of its largest,
-_ALIKE, _ALIKE_SHARE = (
-    0.06,
-    0.3,
-)  # differs by less from what is beside it along more of its outline,
+_ALIKE = 0.06  # differs by less than this from the background beside it
+_ALIKE_SHARE = 0.3  # along more than this share of its outline,
 _VAGUE = 0.03  # has more than this share of its alpha in wide areas that are neither 0 nor 1
 
 _BESIDE = 360  # longer side of each picture of ``CutOut.beside``
@@ -151,7 +149,7 @@ class CutOut:
         mask: alpha of the object in it, ``[H, W]`` float32 in [0, 1].
         editable: ``[H, W, 4]`` float32: the whole picture, with colours in transparent parts too,
             so that an editor can restore them in a PNG, which may be used as input again.
-        warning: why the cut-out may be wrong, and what else to try; empty without a doubt.
+        warning: reasons to doubt the cut-out, and a remedy; empty without a doubt.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour, kept or removed.
     """
 
@@ -170,7 +168,7 @@ class CutOut:
         return " ".join(filter(None, (self.how, self.warning, MEND)))
 
     def beside(self) -> np.ndarray:
-        """Return the picture and beside it what was kept, on grey, ``[H, 2 W, 3]``."""
+        """Return the picture beside its cut-out on grey, ``[H, 2 W, 3]``."""
         whole = np.ones_like(self.editable[..., :1])
         both = np.dstack([self.source_rgb, whole]), self.editable
         small = np.hstack([shrink(half, _BESIDE) for half in both])
