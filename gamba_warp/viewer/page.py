@@ -19,7 +19,7 @@ from ..gaussians import Gaussians
 from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
 
 # In order of their dependencies.
-_SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "ui", "main")
+_SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "open", "ui", "main")
 # The page may load only inlined content; the sorting worker is made from a text of the page.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "

@@ -12,6 +12,9 @@ from PIL import Image
 
 from gamba_warp import render
 from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.formats.gaussians.files import read_gaussians
+from gamba_warp.formats.gaussians.splat import save_splat
+from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.viewer.page import write_viewer
@@ -289,6 +292,67 @@ def test_an_object_of_any_size_anywhere(viewer):
     moved = gaussians.transformed(torch.eye(3), torch.tensor([3e4, -2e4, 1e4]), 2e3)
     # float32 centres at 3e4 are exact to 1e-3, a millionth of the object's size
     assert psnr(canvas(viewer(moved, camera=None)), small) > 45
+
+
+def drop(opened, name, content):
+    """Drop a file on the page."""
+    opened.page.evaluate(
+        """([name, text]) => {
+          const dropped = new DataTransfer();
+          const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+          dropped.items.add(new File([bytes], name));
+          window.dispatchEvent(new DragEvent("drop", { dataTransfer: dropped, cancelable: true }));
+        }""",
+        [name, base64.b64encode(content).decode()],
+    )
+
+
+@pytest.mark.parametrize("suffix, coefficients", [("ply", None), ("ply", 8), ("splat", None)])
+def test_a_dropped_file_is_shown_as_gamba_view_shows_it(viewer, tmp_path, suffix, coefficients):
+    """The page's reader in JavaScript and ours are two programs for the same pixels."""
+    gaussians = colourful(coefficients=coefficients)
+    gaussians.means += torch.tensor([30.0, -20.0, 7.0])
+    gaussians.opacities[:5] = 0.003  # not seen
+    path = tmp_path / f"chair.{suffix}"
+    (save_ply if suffix == "ply" else save_splat)(path, gaussians)
+    wanted = canvas(viewer(read_gaussians(path), camera=None))
+
+    opened = viewer(colourful(40), mesh=tetrahedron())
+    opened.page.keyboard.press("3")
+    before = canvas(opened)
+    drop(opened, path.name, path.read_bytes())
+    opened.until("gambaViewer.ready && gambaViewer.about.title.startsWith('chair')")
+    # The last bit of a float16 may differ; over 400 Gaussians that is a level of colour.
+    assert np.abs(canvas(opened) - wanted).max() <= 4 / 255 < np.abs(wanted - before).max()
+    assert opened.page.inner_text("#about") == "400 Gaussians"
+    assert not opened.page.is_visible("[data-mode=mesh]") and not opened.messages
+    opened.page.keyboard.press("3")  # the former object's mesh is gone
+    assert np.abs(canvas(opened) - wanted).max() <= 4 / 255
+
+
+def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
+    save_ply(tmp_path / "chair.ply", colourful(40))
+    good = (tmp_path / "chair.ply").read_bytes()
+    opened = viewer(colourful(40))
+    before = canvas(opened)
+    for name, content, reason in (
+        ("chair.ply", good[:-1], "cut short"),
+        ("chair.ply", good[:-4] + b"\0\0\x80\x7f", "1 of 40 Gaussians are invalid"),
+        ("chair.ply", good.replace(b"f_dc_1", b"f_xx_1"), "Only uncompressed"),
+        ("chair.ply", good.replace(b"binary_little_endian", b"ascii"), "Only uncompressed"),
+        ("chair.ply", b"", "Only uncompressed"),
+        ("chair.glb", b"glTF", "Only uncompressed"),
+        ("chair.splat", b"0" * 33, "cut short"),
+        ("chair.splat", b"", "No Gaussian"),
+        ("chair.splat", b"\0" * 32, "No Gaussian"),
+        ("chair.splat", b"\0" * 24 + b"\xff" * 8, "at one point"),
+    ):
+        drop(opened, name, content)
+        opened.until(f"byId('message-text').textContent.includes('{reason}')")
+        assert name in opened.page.inner_text("#message-title")
+        opened.page.evaluate("say('')")
+    assert opened.page.evaluate("gambaViewer.about.title") == "A chair" and not opened.messages
+    np.testing.assert_array_equal(canvas(opened), before)
 
 
 def test_a_phone_and_a_small_frame_hold_all_buttons(viewer):

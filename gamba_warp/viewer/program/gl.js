@@ -35,7 +35,6 @@ class Renderer {
     this.shown = glProgram(gl, PRESENT_VERTEX, PRESENT_FRAGMENT);
     this.rows = Math.ceil(count / ROW);
     this.harmonicRows = Math.ceil((count * TEXELS[degree]) / 2048);
-    this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.records = this.table(0, this.rows, gl.RGBA32UI);
     this.harmonics = this.table(1, this.harmonicRows, gl.RGBA32UI);
     this.order = this.table(2, Math.ceil(count / 2048), gl.R32UI);
@@ -44,15 +43,24 @@ class Renderer {
     this.makeTarget();
   }
 
-  fits() {
-    return Math.max(this.rows, this.harmonicRows) <= this.most;
+  static fits(gl, count, degree) {
+    const rows = Math.max(count / ROW, (count * TEXELS[degree]) / 2048);
+    return rows <= gl.getParameter(gl.MAX_TEXTURE_SIZE);
+  }
+
+  // Frees the memory on the graphics card, all but that of a mesh, which goes with this object.
+  free() {
+    const { gl } = this;
+    for (const texture of [this.records, this.harmonics, this.order, this.picture]) gl.deleteTexture(texture);
+    gl.deleteRenderbuffer(this.depth);
+    gl.deleteFramebuffer(this.frame);
   }
 
   table(unit, rows, format) {
     const { gl } = this, texture = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, format, 2048, Math.max(1, Math.min(rows, this.most)));
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, 2048, Math.max(1, rows));
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
       gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
     return texture;

@@ -10,12 +10,8 @@ const TURN = (2 * Math.PI) / 30000; // radians per millisecond, until the object
 
 class Viewer {
   constructor(canvas, about) {
-    Object.assign(this, { canvas, about, mode: "gaussians", showInput: false });
-    this.camera = new OrbitCamera(about.home, about.home.fov);
-    this.coarse = this.quick = 0; // index into SIZES; quick frames in a row
-    this.some = about.count; // Gaussians drawn in motion
+    Object.assign(this, { canvas, about, showInput: false });
     this.changed = this.asked = -Infinity;
-    this.sortedFor = this.askedFor = null;
     this.waiting = [];
     this.picks = new Map();
     this.stats = { frames: 0, sorts: 0, cost: 0 };
@@ -25,7 +21,9 @@ class Viewer {
       zoom: (factor) => this.moving(() => this.camera.zoom(factor)),
       focus: (x, y) => this.focus(x, y),
     };
-    this.act.keys = startButtons(this, about);
+    this.camera = new OrbitCamera(about.home, about.home.fov);
+    this.choose = asked("controls") === "0" ? () => {} : takeFiles((...object) => this.open(...object));
+    this.act.keys = startButtons(this);
     this.turning = !matchMedia("(prefers-reduced-motion: reduce)").matches && asked("turn") !== "0";
     for (const kind of ["pointerdown", "wheel", "keydown"])
       window.addEventListener(kind, () => { this.turning = false; }, { capture: true, passive: true });
@@ -44,21 +42,35 @@ class Viewer {
     const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: true, powerPreference: "high-performance" });
     if (!gl) return say("It needs WebGL2 to show the object in 3D.", "This browser cannot show it");
     this.gl = gl;
-    this.renderer = new Renderer(gl, this.about.count, this.about.degree);
-    if (!this.renderer.fits()) return say("It has more Gaussians than this graphics card takes.", "Too many");
     const text = (name) => {
       const element = byId(name), found = element ? element.textContent : "";
       element?.remove(); // frees the text, which may be large
       return found;
     };
-    const { vertices, faces } = this.about;
-    this.send({ kind: "load", gaussians: text("gaussians"), harmonics: text("harmonics"), mesh: text("mesh"), vertices, faces });
+    this.open(this.about, { gaussians: text("gaussians"), harmonics: text("harmonics"), mesh: text("mesh") });
     takeHands(this.canvas, this.act);
     this.canvas.addEventListener("webglcontextlost", () => {
       this.renderer = null;
       say("The graphics card was needed elsewhere. Load the page again to go on.", "Stopped");
     });
     new ResizeObserver(() => this.redraw()).observe(this.canvas);
+  }
+
+  // Shows an object, instead of one that is shown; `parts` are base64 or buffers.
+  open(about, parts) {
+    if (!Renderer.fits(this.gl, about.count, about.degree))
+      return say("It has more Gaussians than this graphics card takes.", "Too many");
+    this.renderer?.free();
+    this.renderer = new Renderer(this.gl, about.count, about.degree);
+    this.camera = new OrbitCamera(about.home, about.home.fov);
+    this.coarse = this.quick = 0; // index into SIZES; quick frames in a row
+    this.some = about.count; // Gaussians drawn in motion
+    this.ready = this.shownOnce = this.showInput = false;
+    this.fence = this.spare = this.sortedFor = this.askedFor = null;
+    this.about = about;
+    dressPage(about);
+    this.setMode("gaussians");
+    this.send({ kind: "load", ...parts, vertices: about.vertices, faces: about.faces });
   }
 
   // Unpacked words from the sorter, uploaded in pieces, one per frame.
@@ -81,7 +93,7 @@ class Viewer {
   }
 
   sorted({ buffer, used, id }) {
-    if (!this.renderer) return;
+    if (!this.renderer || !this.ready) return; // not an order of the former object
     this.renderer.setOrder(new Uint32Array(buffer), used);
     this.spare = buffer;
     this.sortedFor = id;
@@ -302,7 +314,5 @@ class Viewer {
   }
 }
 
-const about = JSON.parse(byId("object").textContent);
-dressPage(about);
-window.gambaViewer = new Viewer(byId("canvas"), about);
+window.gambaViewer = new Viewer(byId("canvas"), JSON.parse(byId("object").textContent));
 window.gambaViewer.start();

@@ -17,6 +17,7 @@ function sorterProgram(post) {
   }
 
   function bytesOf(base64) {
+    if (base64 instanceof ArrayBuffer) return base64;
     if (Uint8Array.fromBase64) return Uint8Array.fromBase64(base64).buffer;
     const text = atob(base64), bytes = new Uint8Array(text.length);
     for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
@@ -58,7 +59,7 @@ function sorterProgram(post) {
     }
     depths = new Float32Array(count);
     keys = new Uint16Array(count);
-    if (message.mesh) mesh = meshOf(message.mesh, message.vertices, message.faces);
+    mesh = message.mesh ? meshOf(message.mesh, message.vertices, message.faces) : null;
     const harmonics = message.harmonics ? bytesOf(message.harmonics) : new ArrayBuffer(0);
     const sent = records.slice(0);
     post({ kind: "loaded", records: sent, harmonics, mesh }, [sent, harmonics]);

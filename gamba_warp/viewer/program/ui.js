@@ -96,7 +96,7 @@ function savePicture(canvas, name) {
 }
 
 // Buttons and keys; `viewer` does what they ask for.
-function startButtons(viewer, about) {
+function startButtons(viewer) {
   const nextGround = startGround(() => viewer.redraw());
   const press = {
     home: () => viewer.goHome(), input: () => viewer.toggleInput(), theme: nextGround,
@@ -121,6 +121,6 @@ function startButtons(viewer, about) {
     "+": zoom(0.9), "=": zoom(0.9), "-": zoom(1 / 0.9), _: zoom(1 / 0.9),
     1: () => viewer.setMode("gaussians"), 2: () => viewer.setMode("centres"), 3: () => viewer.setMode("mesh"),
     r: press.home, Home: press.home, c: press.input, l: press.theme, s: () => viewer.save(0),
-    f: () => document.fullscreenEnabled && toggleFull(), h: toggleHelp, "?": toggleHelp,
+    o: viewer.choose, f: () => document.fullscreenEnabled && toggleFull(), h: toggleHelp, "?": toggleHelp,
   };
 }
