@@ -51,7 +51,8 @@ class PlyPredictions:
 class ModelPredictions:
     """A checkpoint, given only the reference view; attributes as those of ``PlyPredictions``.
 
-    Its Gaussians are those of ``gamba reconstruct`` for that view: see ``model.predict``.
+    Its Gaussians are those of ``gamba reconstruct`` for that view, see ``model.predict``; but where
+    they do not split they are the network's, since views of its size have no gaps.
     """
 
     def __init__(

@@ -11,6 +11,7 @@ each front cell may therefore split into k x k children, each on the ray of its 
 - Sizes are the parent's, across the view 1/k of them, but large enough that neighbours overlap: at
   ``image_size`` a rasterizer's own widening covers the gaps between small Gaussians, at k times
   that size it does not. Sizes along the view stay, so that no crack opens from the side.
+- Gaussians that do not split are enlarged in the same way, across the view.
 - A parent lies up to a pixel off its ray. Its children take a part of that offset: without it they
   would separate from cells that do not split, and with all of it their pixels would be displaced.
 
@@ -46,6 +47,7 @@ MAX_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for m
 # By detail: the least standard deviation of a child across the view, in sides of its cell, and the
 # share of its parent's offset from the ray.
 MIN_SIZE = {2: 0.4, 4: 0.45}
+WHOLE_MIN_SIZE = 0.45  # the same of a Gaussian that does not split
 OFFSET_SHARE = {2: 0.5, 4: 0.125}
 MIN_OPACITY = 0.5  # logit; least opacity of a child where alpha is 1
 ROUNDS = 2  # of correction
@@ -79,6 +81,23 @@ def checked_detail(detail: Detail | None, config: GambaConfig, side: int) -> Det
     return max(each for each in DETAILS if each == 1 or each * _cells(config) <= side)
 
 
+def fill_gaps(gaussians: Gaussians, config: GambaConfig, camera: Cameras) -> Gaussians:
+    """Enlarge small Gaussians across the view, so that larger pictures have no gaps between them.
+
+    At ``image_size`` a rasterizer's own widening covers the gaps.
+
+    Args:
+        gaussians: ``[N]``, result of a model with the decoder ``rays``.
+        config: of the model.
+        camera: ``[1]``, camera of the picture in the model's world, see ``posing``.
+    """
+    side = _cells(config)
+    least = WHOLE_MIN_SIZE * camera.viewmats[0, 2, 3] / camera.resized(side, side).Ks[0, 1, 1]
+    along = _along_the_view(gaussians.quats, gaussians.scales)
+    scales = torch.where(along, gaussians.scales, gaussians.scales.clamp_min(least))
+    return replace(gaussians, scales=scales)
+
+
 def split_front(
     gaussians: Gaussians,
     image: Tensor,
@@ -100,13 +119,15 @@ def split_front(
 
     Returns:
         Gaussians of the same frame: those that did not split, then at most ``MAX_CHILDREN``
-        children (or four for each cell, if that is more). With detail 1, or if all cells are plain,
-        ``gaussians`` itself.
+        children (or four for each cell, if that is more); all without gaps, see ``fill_gaps``. With
+        detail 1 ``gaussians`` itself.
     """
     if detail == 1:
         return gaussians
     side, device = _cells(config), gaussians.means.device
     large = torch.from_numpy(resize_rgba(rgba, side * detail, side * detail)).to(device)
+    camera = camera.to(device)
+    whole = fill_gaps(gaussians, config, camera)
     step = config.image_size // side
     picture, front_cells = premultiplied(large[None]), foreground_cells(image[None], step)
     alpha = F.avg_pool2d(image[None, None, ..., 3], step)
@@ -114,8 +135,7 @@ def split_front(
     counts = _children_a_side(picture, alpha, detail).flatten()
     splits = counts[cells] > 1
     if not splits.any():
-        return gaussians
-    camera = camera.to(device)
+        return whole
     is_front = torch.arange(gaussians.num, device=device) % config.ray_layers == 0
     front = gaussians.select(is_front)
     parent = cells.new_full((side * side,), -1)
@@ -128,7 +148,7 @@ def split_front(
     children, pixels = _concatenate([one for one, _ in made]), torch.cat([at for _, at in made])
     stays = ~is_front
     stays[is_front] = ~splits
-    return _correct(gaussians.select(stays), children, pixels, picture, camera, detail)
+    return _correct(whole.select(stays), children, pixels, picture, camera, detail)
 
 
 def _cells(config: GambaConfig) -> int:

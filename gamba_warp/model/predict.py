@@ -14,7 +14,7 @@ from ..data.preprocess import composite, resize_rgba
 from ..devices import network_precision, pick_precision
 from ..gaussians import Gaussians
 from .config import GambaConfig
-from .detail import checked_detail, split_front
+from .detail import checked_detail, fill_gaps, split_front
 from .posing import reference_cameras
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ def reconstruct(
             middle.
         precision: of the network's products, see ``devices.pick_precision``.
         detail: largest number of Gaussians a side into which each front one splits, see
-            ``detail.split_front``; 1 for no splitting. None is the largest that the picture's
-            pixels allow, and 1 for a decoder other than ``rays``.
+            ``detail.split_front``; 1 for the network's output. None is the largest that the
+            picture's pixels allow; a picture with too few has no gaps, see ``detail.fill_gaps``.
 
     Returns:
         Gaussians ``[N]``, float32, on the model's device, in the reference camera's frame.
@@ -56,14 +56,16 @@ def reconstruct(
     if rgba.ndim != 3 or rgba.shape[0] != rgba.shape[1] or rgba.shape[2] != 4:
         raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config
-    detail = checked_detail(detail, config, len(rgba))
+    chosen = checked_detail(detail, config, len(rgba))
     device = next(model.parameters()).device
     images = model_input(rgba, config).to(device)
     dtype = pick_precision(precision, device, config.width)
     camera = reference_cameras(config, 1).to(device)
     with network_precision(device, dtype):
         gaussians = model(images, camera)[0]
-    return split_front(gaussians, images[0], rgba, config, detail, camera)
+    if detail is None and chosen == 1 and config.decoder == "rays":
+        return fill_gaps(gaussians, config, camera)
+    return split_front(gaussians, images[0], rgba, config, chosen, camera)
 
 
 def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:

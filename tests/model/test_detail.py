@@ -21,7 +21,7 @@ from gamba_warp.images import save_image
 from gamba_warp.model import detail as subject
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.detail import MIN_SIZE, OFFSET_SHARE, checked_detail, split_front
+from gamba_warp.model.detail import MIN_SIZE, OFFSET_SHARE, checked_detail, fill_gaps, split_front
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.model.predict import model_input, reconstruct
@@ -68,6 +68,11 @@ def same(one: Gaussians, other: Gaussians) -> bool:
     return all(torch.equal(getattr(one, name), getattr(other, name)) for name in FIELDS)
 
 
+def filled(model: Gamba, rgba: np.ndarray) -> Gaussians:
+    whole = reconstruct(model, rgba, detail=1)
+    return fill_gaps(whole, model.config, reference_cameras(model.config, 1))
+
+
 def test_detail_1_is_what_the_network_gave_bit_for_bit():
     model, rgba = fresh(), board(96, 8)
     with torch.inference_mode():
@@ -82,15 +87,29 @@ def test_the_default_is_what_the_picture_has_the_pixels_for():
     halves = rays(ray_cells=4)  # cells of 2 x 2 pixels
     assert [checked_detail(None, halves, side) for side in (23, 24, 48)] == [1, 2, 4]
     model = fresh()
-    assert same(reconstruct(model, board(47, 4)), reconstruct(model, board(47, 4), detail=1))
+    assert same(reconstruct(model, board(47, 4)), filled(model, board(47, 4)))
     assert same(reconstruct(model, board(96, 4)), reconstruct(model, board(96, 4), detail=4))
+
+
+@pytest.mark.parametrize("size, changes", [(24, {}), (96, {}), (24, {"predict_rotation": True})])
+def test_a_plain_picture_has_no_gaps_when_it_is_drawn_large(size, changes):
+    """Four pixels a cell; the network's own Gaussians let the background through between them."""
+    model, rgba = fresh(**changes), box(size, size // 4, 3 * size // 4)
+    model.decoder.scale_bias.data[0] = math.log(0.2)  # sides of a cell
+    camera = reference_cameras(model.config, 1).resized(96, 96)
+    inside = slice(32, 64)
+    found, raw = (
+        render(reconstruct(model, rgba, detail=k), camera).alpha[0, inside, inside].min()
+        for k in (None, 1)
+    )
+    assert raw < 0.4 < 0.75 < found
 
 
 def test_what_is_plain_does_not_split():
     model = fresh()
     for detail in (2, 4):
         full = box(24 * detail, 0, 24 * detail)
-        before = reconstruct(model, full, detail=1)
+        before = filled(model, full)
         assert same(reconstruct(model, full, detail=detail), before)
         # A mark on one cell splits this one and its neighbours.
         full[12 * detail, 12 * detail, :3] = 0
