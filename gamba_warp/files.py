@@ -12,7 +12,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
@@ -25,6 +25,7 @@ CHECKOUT = PACKAGE.parent
 # The shipped model and example pictures: two in an installed package, more in a checkout, which
 # also has the starter set's data.
 STARTER = PACKAGE / "starter" if (PACKAGE / "starter").is_dir() else CHECKOUT / "starter"
+CONFIG = "config.json"  # options of a command, in the folder of its results
 # Prefix of unfinished files. Commands ignore inputs whose names begin with a dot.
 PART = ".gamba-part-"
 _PART_NAME = re.compile(re.escape(PART) + "[a-z0-9_]{8}")
@@ -249,6 +250,17 @@ def visible(folder: Path, pattern: str) -> Iterator[Path]:
 def write_json(path: str | Path, value: object) -> None:
     """Write ``value`` as indented JSON, atomically; NaN and infinity are refused."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_options(folder: Path, options: Mapping[str, object]) -> None:
+    """Write the options of a command into the folder of its results, for ``--config FOLDER``.
+
+    Args:
+        folder: of the results.
+        options: values by name; those that were not given (None, or an empty tuple) are left out.
+    """
+    given = {name: value for name, value in options.items() if value not in (None, ())}
+    write_text(folder / CONFIG, json.dumps(given, indent=2, default=str) + "\n")
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -21,10 +21,11 @@ from .untrusted.documents import read_config
 COMMON = {
     "-q, --quiet": "Print errors and warnings only.",
     "-v, --verbose": "Also print the time taken, the compiler's messages, and errors in full.",
-    "--config FILE": "Take options from a file, .yaml or .toml; those that are given override it.",
+    "--config FILE": "Take options from a file (.yaml, .toml, .json) or from the folder of an "
+    "earlier run; those that are given override it.",
     "-h, --help": "Print this text.",
 }
-CONFIG_SUFFIXES = (".yaml", ".yml", ".toml")
+CONFIG_SUFFIXES = (".yaml", ".yml", ".toml")  # train reads its run's config.json itself
 _KINDS = {int: "INT", float: "FLOAT", Path: "PATH"}
 _UNIONS = (typing.Union, types.UnionType)
 _NO_DEFAULT = (MISSING, inspect.Parameter.empty)
@@ -338,7 +339,8 @@ def config_words(path: Path, options: Sequence[Option]) -> tuple[list[str], list
     """Return the arguments and the options that a config file holds, as words.
 
     Args:
-        path: .yaml or .toml: names of options, with or without the groups of the help, and values.
+        path: names of options, with or without the groups of the help, and values; or the folder of
+            an earlier run (``read_config``).
         options: of the command.
 
     Raises:

@@ -6,7 +6,7 @@ Slow imports are inside the command, so that ``--help`` is quick.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +14,7 @@ import tyro
 from msgspec import Meta
 
 from gamba_warp.errors import UserError
+from gamba_warp.files import write_options
 from gamba_warp.surfaces.options import Method, Pixels, Views, Voxels
 from gamba_warp.untrusted.ranges import Seed, ranged
 
@@ -140,12 +141,14 @@ def eval_geometry_command(
         from .sensitivity import evaluate_variants
 
         table, records = evaluate_variants(options, protocol)
+        _save(options)
         print(table, end="")
         failed = [record for record in records if record["status"] == FAILED]
         for record in failed:
             print(f"failed: {record['name']}: {record['reason']}", file=sys.stderr)
         return 1 if failed else 0
     report = evaluate_shapes(options, protocol)
+    _save(options)
     parts = {"": report} | report["baselines"]
     for name, part in parts.items():
         for text in part["warnings"]:
@@ -173,6 +176,12 @@ def eval_geometry_command(
                 print(f"failed: {item['name']} ({name}): {item['reason']}")
     print(count_line(report, options.out, beside))
     return code
+
+
+def _save(options: ShapesOptions) -> None:
+    """Write the options into the folder of the results, if there is one."""
+    if options.out is not None:
+        write_options(options.out, asdict(options))
 
 
 def _explain(options: ShapesOptions) -> int:

@@ -6,7 +6,7 @@ Slow imports are inside the command, so that ``--help`` is quick.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from gamba_warp.conventions import DEFAULT_DISTANCE, Detail, DeviceChoice, Precision
 from gamba_warp.errors import UserError
+from gamba_warp.files import write_options
 from gamba_warp.fitting.config import FitConfig, Steps
 from gamba_warp.untrusted.ranges import check_options, option, ranged
 from gamba_warp.versions import require
@@ -159,14 +160,16 @@ def eval_views_command(
         json: Print report.json in place of the table.
         csv: Print objects.csv in place of the table.
     """
-    options = options.filled()
+    filled = options.filled()
     if json and csv:
         raise UserError("--json and --csv: give one of them")
     from ..report import count_line, csv_of, json_of
     from .evaluate import evaluate_views
     from .table import page
 
-    report = evaluate_views(options)
+    report = evaluate_views(filled)
+    if options.out is not None:
+        write_options(options.out, asdict(options))
     text = json_of(report) if json else csv_of(report) if csv else page(report)
     print(text, end="")
     for name, reason in report["left_out_baselines"].items():

@@ -79,13 +79,14 @@ def ablate_command(
         retry: Run failed rows again.
         dry_run: Only print the commands and an estimate of their time.
     """
+    options = dict(locals())
     import sys
 
     from msgspec.structs import replace
     from tqdm import tqdm
 
     from ..batch import check_not_read, progress_bar
-    from ..files import only_process, output_folder
+    from ..files import only_process, output_folder, write_options
     from ..kernels.runtime.system import cores
     from ..untrusted.children import Failed, end_idle, run_each
     from .jobs import Settings, budget_of, check
@@ -143,6 +144,7 @@ def ablate_command(
     out = output_folder(settings.out)
     with only_process(out, "runs an ablation"):
         save_plan(chosen, out)
+        write_options(out, options)
         tasks = find_tasks()
         for task in tasks:
             if task.changed:

@@ -61,14 +61,16 @@ def app_command(
         max_upload_mb: Largest picture file, MB.
         device: Device that computes; auto is the GPU if there is one.
     """
-    from ..devices import pick_device
-    from ..model.checkpoint import load_model
-    from ..photo.cutout import Ways
+    with listener(port) as listening, work_folder() as folder:
+        print("loading the model", flush=True)
+        from ..devices import pick_device
+        from ..model.checkpoint import load_model
+        from ..photo.cutout import Ways
 
-    chosen, listening = pick_device(device), listener(port)
-    ways = Ways(matte_model=matte_model, device=chosen).checked()
-    model = load_model(checkpoint, chosen, encoder_weights)
-    with listening, work_folder() as folder:
+        chosen = pick_device(device)
+        ways = Ways(matte_model=matte_model, device=chosen).checked()
+        model = load_model(checkpoint, chosen, encoder_weights)
+        print("loading the page's libraries", flush=True)
         configure_gradio(folder)
         from .actions import Actions
         from .interface import build

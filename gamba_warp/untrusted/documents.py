@@ -10,6 +10,7 @@ from typing import Any, TypeVar, overload
 import msgspec
 
 from ..errors import UserError, first_line
+from ..files import CONFIG
 from ..versions import require
 
 MAX_BYTES = 64 << 20  # a file of 100,000 views takes 60 MB; ours take a few kB
@@ -120,17 +121,26 @@ def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
-    """Read a config file of a command, ``.yaml`` or ``.toml``: values, and groups of values.
+    """Read a config file of a command, ``.yaml``, ``.toml`` or ``.json``: values, groups of values.
+
+    Args:
+        path: of the file, or of the folder of an earlier run, which has a ``config.json``.
 
     Raises:
         UserError: as for ``read_bytes``; or another suffix, invalid, or nested deeper.
         ModuleNotFoundError: the reader of the format is not installed.
     """
-    kind = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml"}.get(Path(path).suffix.lower())
+    path = Path(path) / CONFIG if Path(path).is_dir() else Path(path)
+    kinds = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml", ".json": "json"}
+    kind = kinds.get(path.suffix.lower())
     if kind is None:
-        raise UserError(f"--config {path}: expected a .yaml or .toml file")
+        raise UserError(
+            f"--config {path}: expected a .yaml, .toml or .json file, or the folder of a run"
+        )
     data = read_bytes(path, _MAX_CONFIG)
-    require({"toml": "tomllib" if sys.version_info >= (3, 11) else "tomli", "yaml": "yaml"}[kind])
+    if kind != "json":
+        toml = "tomllib" if sys.version_info >= (3, 11) else "tomli"
+        require(toml if kind == "toml" else "yaml")
     try:
         return getattr(msgspec, kind).decode(data, type=_CONFIG)
     except (msgspec.MsgspecError, UnicodeError, ValueError, RecursionError) as error:

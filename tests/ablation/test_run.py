@@ -107,6 +107,13 @@ def test_rows_run_once_and_their_figures_are_these(gamba, tmp_path, capsys):
     assert code == 0 and called == ["train b/5", "eval-views b/5"]
     assert table(tmp_path)[1]["b"]["seeds"] == [0, 2, 5]
     assert not list((tmp_path / "out").rglob(f"{PART}*"))
+    # The folder gives the options of the last call; those of the command line override them.
+    kept = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert kept["plan"] == str(path) and kept["seeds"] == [5] and "steps" not in kept
+    (tmp_path / "calls").write_text("")
+    assert cli.run("ablate", ["--config", str(tmp_path / "out")]) == 0 and not calls(tmp_path)
+    assert cli.run("ablate", ["--config", str(tmp_path / "out"), "--rows", "a"]) == 0
+    assert calls(tmp_path) == ["train a/5", "eval-views a/5"]
 
 
 def test_rows_that_fail_are_told_and_the_others_go_on(gamba, tmp_path, capsys):

@@ -190,9 +190,9 @@ def test_too_large_an_upload_is_refused(opened, served, tmp_path):
 def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):
     port = served.address.rstrip("/").rpartition(":")[2]
     before = served.folders()
-    for options, reason in (
-        (["--port", port], f"gamba: --port {port}: Address already in use\n"),
-        (["--port", 0, "--matte-model", tmp_path / "none.onnx"], None),
+    for options, said, reason in (
+        (["--port", port], "", f"gamba: --port {port}: Address already in use\n"),
+        (["--port", 0, "--matte-model", tmp_path / "none.onnx"], "loading the model\n", None),
     ):
         done = subprocess.run(
             command(*options),
@@ -201,7 +201,7 @@ def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):
             timeout=60,
             env={**os.environ, "TMPDIR": str(served.temporary)},
         )
-        assert done.returncode == 2 and done.stdout == ""
+        assert done.returncode == 2 and done.stdout == said
         assert done.stderr.count("\n") == 1 and done.stderr.startswith("gamba: "), done.stderr
         assert reason in (None, done.stderr)
     assert served.folders() == before

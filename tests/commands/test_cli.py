@@ -213,12 +213,20 @@ def _configured(
             "a.toml",
             'data="here"\nsteps=3\nnames=["a","b"]\ndry-run=true\nlpips="off"\n[place]\naxes=["x"]\n',
         ),
+        (
+            "run/config.json",
+            '{"data": "here", "steps": 3, "names": ["a", "b"], "dry_run": true, "lpips": "off",'
+            ' "axes": ["x"], "page": false}',
+        ),
     ],
 )
 def test_a_config_file_holds_options(command, capsys, tmp_path, name, text):
     command(_configured)
     path = tmp_path / name
-    path.write_text(text + ("page: false\n" if name == "a.yaml" else "page=false\n"))
+    path.parent.mkdir(exist_ok=True)
+    ends = {"a.yaml": "page: false\n", "a.toml": "page=false\n"}
+    path.write_text(text + ends.get(name, ""))
+    path = path.parent if path.suffix == ".json" else path
     if name == "a.toml":  # a key after a table belongs to it
         assert exit_code(["try", "--config", str(path), "--page"]) == 0
         assert capsys.readouterr().out == "here ('a', 'b') 3 True True ('x',) off\n"
@@ -239,8 +247,10 @@ def test_a_config_file_holds_options(command, capsys, tmp_path, name, text):
         ("a.toml", "steps = ", "not a valid config file"),
         ("a.toml", 'names = ["--page"]', "is not a valid value"),
         ("a.yaml", "x: " + "y" * 20_000, "the limit for such a file"),
-        ("a.ini", "", "expected a .yaml or .toml file"),
+        ("a.ini", "", "expected a .yaml, .toml or .json file, or the folder of a run"),
+        ("a.json", '{"steps": [[3]]}', "not a valid config file"),
         ("b.yaml", None, "No such file"),
+        ("", None, "config.json: No such file"),
     ],
 )
 def test_bad_config_files_are_one_line(command, capsys, tmp_path, name, text, said):

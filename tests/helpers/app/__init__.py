@@ -54,9 +54,10 @@ def serving(temporary: Path) -> Iterator[Served]:
         text=True,
         env=environment,
     )
-    line = process.stdout.readline()
-    match = re.match(r"(http://127\.0\.0\.1:\d+/) \(Ctrl-C ends it\)$", line)
-    assert match, line + process.communicate(timeout=10)[1]
+    lines = [process.stdout.readline() for _ in range(3)]
+    match = re.match(r"(http://127\.0\.0\.1:\d+/) \(Ctrl-C ends it\)$", lines[-1])
+    assert match, "".join(lines) + process.communicate(timeout=10)[1]
+    assert lines[:2] == ["loading the model\n", "loading the page's libraries\n"]
     yield Served(process, match[1], temporary)
     process.kill()
     process.communicate()
