@@ -5,7 +5,12 @@ LOCKED ?=
 VENV := .venv
 BIN := $(VENV)/bin
 LOCK := $(if $(LOCKED),constraints.txt)
+# What users need, and what tests, checks and pages need beside it: a browser's driver, node, linters.
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
+TOOLS := $(VENV)/.tools$(if $(LOCKED),-locked)
+# setuptools warns of any editable install that is no plain link to a folder; errors are still shown.
+EDIT := PYTHONWARNINGS='ignore:Editable installation' \
+	$(BIN)/python -m pip install $(addprefix --constraint ,$(LOCK)) --editable
 WHEEL := build/wheel-check
 
 .PHONY: setup demo test ptx debug hostile endurance bench study instructions docs lint format figures \
@@ -20,9 +25,15 @@ $(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py $(LOCK) | starter/data
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
 		{ rm -rf $(VENV); $(PYTHON) -m pip install --quiet --user virtualenv && \
 		  $(PYTHON) -m virtualenv --quiet $(VENV); }
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet $(addprefix --constraint ,$(LOCK)) --editable '.[test]'
-	@rm -f $(VENV)/.ready*
+	@echo "Installing gamba into $(VENV) once: pip fetches 3.7 GB (torch with its CUDA libraries), 7.8 GB on disk."
+	@$(BIN)/python -m pip install --quiet --upgrade pip
+	@$(EDIT) '.[all]'
+	@rm -f $(VENV)/.ready* $(VENV)/.tools*
+	@touch $@
+
+$(TOOLS): $(STAMP)
+	@echo "Adding to $(VENV) once what tests, checks and pages need, 0.5 GB on disk."
+	@$(EDIT) '.[test]' --quiet
 	@touch $@
 
 # The starter set's pictures are a thousand files, which the repository keeps as one.
@@ -30,13 +41,14 @@ starter/data: starter/data.tar
 	@tar -xf $< -C starter && touch $@
 
 demo: $(STAMP)
+	@echo "Reconstructing, evaluating and training for 2 minutes; fetches 64 MB once (weights of LPIPS)."
 	$(BIN)/gamba demo
 
 # Two processes share the tests, a file each at a time, in the order of their names: by the number of
 # its tests the demo, the longest file, would come last, and one process would wait for it. Each
 # computes with the threads that a user's would, so waiting threads must let go of the core
 # (docs/reconstruct.md, "Shared cores").
-test: $(STAMP)
+test: $(TOOLS)
 	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder
 
 # The operators' own tests on their CUDA path, executed from PTX (tests/ptx), in the order that SEED
@@ -45,7 +57,7 @@ test: $(STAMP)
 # sums in kernels of these names, as ptxas may.
 APPROXIMATE ?= 0
 CONTRACT ?=
-ptx: $(STAMP)
+ptx: $(TOOLS)
 	GAMBA_PTX_SEED=$(SEED) GAMBA_PTX_APPROXIMATE=$(APPROXIMATE) GAMBA_PTX_CONTRACT='$(CONTRACT)' \
 		PYTHONPATH=tests $(BIN)/python -m pytest -p ptx.plugin tests/ops/causal_conv1d \
 		tests/ops/selective_scan tests/ops/rasterize tests/ptx/large.py
@@ -55,7 +67,7 @@ ptx: $(STAMP)
 # The operators' own tests in Warp's debug mode on the CPU: indices into Warp arrays are checked,
 # pointers in C++ are not (tests/ops/debug_mode.py). What an assertion says comes from C, past what
 # Python prints, and must not be lost with the process.
-debug: $(STAMP)
+debug: $(TOOLS)
 	PYTHONPATH=tests $(BIN)/python -m pytest --capture=sys -p ops.debug_mode \
 		tests/ops/causal_conv1d tests/ops/rasterize tests/ops/runtime tests/ops/selective_scan \
 		tests/ops/ssim
@@ -63,7 +75,7 @@ debug: $(STAMP)
 # Hostile files for every reader, or for READERS='shape or picture', as SEED draws them.
 MINUTES ?= 10
 READERS ?=
-hostile: $(STAMP)
+hostile: $(TOOLS)
 	GAMBA_HOSTILE_MINUTES=$(MINUTES) GAMBA_HOSTILE_SEED=$(SEED) \
 		$(BIN)/python -m pytest -s tests/hostile -k 'test_hostile_files $(if $(READERS),and ($(READERS)))'
 
@@ -71,7 +83,7 @@ hostile: $(STAMP)
 KILLS ?= 20
 FULL ?= 10
 SEED ?= 1
-endurance: $(STAMP)
+endurance: $(TOOLS)
 	GAMBA_ENDURANCE_KILLS=$(KILLS) GAMBA_ENDURANCE_FULL=$(FULL) GAMBA_ENDURANCE_SEED=$(SEED) \
 		GAMBA_ENDURANCE_NODES=10 $(BIN)/python -m pytest -s tests/endurance \
 		tests/nodes/test_nodes_restart.py
@@ -81,23 +93,23 @@ bench: $(STAMP)
 
 # Choices inside the kernels, times of a scan, a training step by parts, the loader
 # (docs/lab/studies): make study WHAT="scan --quick".
-study: $(STAMP)
+study: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
 
 # docs/lab/benchmarks: counts.md, what the CUDA kernels execute, counted while their PTX is executed
 # here; static.md, what they take, and with nvdisasm (on PATH, in CUDA_HOME or inside Triton) their
 # instructions and the scan's least times.
-instructions: $(STAMP)
+instructions: $(TOOLS)
 	PYTHONPATH=docs:tests $(BIN)/python -m lab.instructions
 
 # The site, in site/: a broken link, anchor or docstring is an error.
-docs: $(STAMP)
+docs: $(TOOLS)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "to read it (its search needs a server): $(BIN)/python -m http.server --bind 127.0.0.1 --directory site"
 
 # pyright reads what users get: the wheel, unpacked. (build/ goes first: setuptools would take
 # files from it that are gone from the checkout.)
-lint: $(STAMP)
+lint: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python tests/project/kernel_lint.py
@@ -108,28 +120,28 @@ lint: $(STAMP)
 	$(BIN)/python -m zipfile --extract build/*.whl $(WHEEL)
 	$(BIN)/pyright
 
-format: $(STAMP)
+format: $(TOOLS)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	git ls-files -z '*.h' '*.inl' '*.cpp' | xargs -0r $(BIN)/clang-format -i
 
 # Tables and pictures of the pages from results that are kept; REPORTS="--views out/eval/report.json"
 # puts an evaluation of the shipped model into its card first.
-figures: $(STAMP)
+figures: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.figures $(REPORTS)
 
 # The tables of docs/scanned.md: renders the meshes of a folder and evaluates the shipped model on them.
 # make scanned MESHES=FOLDER OPTIONS="--no-lpips --limit 8"
-scanned: $(STAMP)
+scanned: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.scanned $(MESHES) $(OPTIONS)
 
 # The table of docs/architecture.md, from today's imports.
-architecture: $(STAMP)
+architecture: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m architecture
 
 # After a green `make test`: constraints.txt from what is installed. Versions without the local
 # part that some wheels carry (torch's +cu130), which no index has; nothing installed from a folder.
-constraints: $(STAMP)
+constraints: $(TOOLS)
 	@{ echo "# The environment that the suite last passed in: make setup LOCKED=1 installs it."; \
 	   echo "# Made by make constraints on $$($(BIN)/python -VV | cut -d' ' -f1,2), $$(uname -sm)."; \
 	   $(BIN)/python -m pip freeze --exclude-editable | sed -n 's/^\([^ @]*==[^+]*\).*/\1/p'; } \
