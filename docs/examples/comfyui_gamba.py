@@ -1,6 +1,6 @@
 """Node for ComfyUI: a picture to 3D Gaussians and a turntable.
 
-Copy this file into ``ComfyUI/custom_nodes/`` and install gamba_warp into ComfyUI's Python
+Copy this file into ``ComfyUI/custom_nodes/`` and install the checkout into ComfyUI's Python
 (docs/formats.md, "ComfyUI"). The node is "Gamba: picture to 3D" in the category 3d.
 """
 

@@ -25,7 +25,7 @@ ALL_OF_IT = {
 }
 # The name on the command line of an installer, or as an address there.
 BY_NAME = re.compile(
-    r"(install|run|add)\s[^\n]*?\s*['\"\s]gamba[-_]warp[\[=\s'\"]|pypi\.org/\S*gamba"
+    r"(install|run|add)\s([^\n]*?['\"\s])?gamba[-_]warp[\[=\s'\"]|pypi\.org/\S*gamba"
 )
 # Libraries whose distribution has another name than the module.
 DISTRIBUTIONS = {"PIL": "pillow", "skimage": "scikit-image", "warp": "warp-lang"}

@@ -27,6 +27,7 @@ MAKEFILE = (ROOT / "Makefile").read_text()
 OTHERS = {
     "git",
     "cd",
+    "docker",
     "source",
     "pip",
     "for",
