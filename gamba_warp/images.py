@@ -157,9 +157,14 @@ def load_rgba(
         return to_rgba(image, path, np.float32, longest, turned=True, warn=warn)
 
 
-def load_rgba8(path: str | Path) -> np.ndarray:
-    """Read like ``load_rgba``, but ``[H, W, 4]`` uint8, a quarter of the memory."""
-    with _still(path) as image:
+def load_rgba8(path: str | Path, content: bytes | None = None) -> np.ndarray:
+    """Read like ``load_rgba``, but ``[H, W, 4]`` uint8, a quarter of the memory.
+
+    Args:
+        path: the file, or the name of ``content``.
+        content: bytes of a file; None reads it.
+    """
+    with _still(path, content) as image:
         return to_rgba(image, path, np.uint8, turned=True)
 
 
@@ -175,23 +180,28 @@ def picture_size(path: str | Path) -> tuple[int, int]:
 
 
 @contextmanager
-def _still(path: str | Path) -> Iterator[Image.Image]:
-    _check_file(path, path)  # opening a pipe would wait for its writer
-    formats = (*FORMATS, *_phone_formats(path))
-    with open_picture(path, max_pixels=MAX_PIXELS, formats=formats) as image:
+def _still(path: str | Path, content: bytes | None = None) -> Iterator[Image.Image]:
+    if content is None:
+        _check_file(path, path)  # opening a pipe would wait for its writer
+    formats = (*FORMATS, *_phone_formats(path, content))
+    source = path if content is None else io.BytesIO(content)
+    with open_picture(source, path, max_pixels=MAX_PIXELS, formats=formats) as image:
         # Phones append a preview or a depth map to a JPEG (MPO) or a HEIC.
         if image.format not in ("MPO", "HEIF") and getattr(image, "is_animated", False):
-            small = os.path.getsize(path) <= _COUNT_FRAMES_UP_TO
+            size = os.path.getsize(path) if content is None else len(content)
+            small = size <= _COUNT_FRAMES_UP_TO
             frames = getattr(image, "n_frames", 1) if small else "many"
             raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
         yield image
 
 
-def _phone_formats(path: str | Path) -> tuple[str, ...]:
+def _phone_formats(path: str | Path, content: bytes | None) -> tuple[str, ...]:
     """Return AVIF or HEIF if the file is one. Raises UserError if no reader is installed."""
+    head = content or b""
     try:
-        with open(path, "rb") as file:
-            head = file.read(12)
+        if content is None:
+            with open(path, "rb") as file:
+                head = file.read(12)
     except OSError:
         return ()  # ``open_picture`` reports it
     if head[4:8] != b"ftyp":

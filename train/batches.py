@@ -115,7 +115,7 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
     packed = data.train.packed_size
     if packed is not None and sizes[-1] > packed:
         data.notes.append(
-            f"{config.data} is packed at {packed} pixels; its pictures are enlarged to {sizes[-1]}"
+            f"{config.data} has shards of {packed} pixels; pictures are enlarged to {sizes[-1]}"
         )
     if config.views.cache_device and device is not None:
         data.train.preload(sorted(set(data.objects)), sizes, device, config.views.workers)

@@ -83,7 +83,7 @@ pages | pages, charts, turntables | LIBRARY photo trajectories surfaces viewer f
 measure | benchmark and stress cases that need the model | MEASURES |
 train.data.made | procedural objects, made from a seed | LIBRARY |
 train.data | furniture, rendering of meshes | LIBRARY train.data.made |
-train.sources | published datasets, packs; commands of data | LIBRARY train.data train.data.made |
+train.sources | published datasets, shards; commands of data | LIBRARY train.data train.data.made |
 train.config | the options of a run | LIBRARY |
 train.objective | the losses | LIBRARY train.config |
 train | batches, loop, checkpoints | LIBRARY train.config train.objective TRAIN_DATA | pages

@@ -1,6 +1,6 @@
 """Posed views on disk; ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
 
-Layouts are described in ``layouts.py``, packs in ``packs.py``, lists of checked objects in
+Layouts are described in ``layouts.py``, shards in ``shards.py``, lists of checked objects in
 ``manifest.py``. ``split.json`` in the root lists the
 uids of ``train``, ``val`` and ``test``; ``split_of`` places other uids by the hash of the name.
 """
@@ -49,7 +49,8 @@ from .manifest import (
     read_manifest,
     write_manifest,
 )
-from .packs import INDEX, open_pack, read_index, read_packed
+from .shard_cache import Source
+from .shards import INDEX, ShardPicture, Shards, read_index
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of written files; version 1 had fewer objects in one group
@@ -136,14 +137,15 @@ def _read_split(root: Path) -> tuple[int, dict[str, str]]:
 
 
 def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
-    """Return the split of each object, by ``split.json`` or the index of a pack, else by hash.
+    """Return the split of each object, by ``split.json`` or the index of shards, else by hash.
 
     Raises:
-        UserError: that file, or the pack's index, is invalid.
+        UserError: that file, or the index, is invalid.
     """
     root = Path(folder)
     if (root / INDEX).exists():
-        stated = {values["uid"]: str(values.get("split")) for values in read_index(root).objects}
+        index = read_index(root)
+        stated = {uid: shard.split for shard in index.shards for uid, _, _ in shard.objects}
     else:
         _, stated = _read_split(root)
     return {uid: stated.get(uid) or split_of(uid) for uid in uids}
@@ -155,14 +157,14 @@ def open_dataset(
     """Find the objects under a folder, without decoding anything yet.
 
     Args:
-        folder: a dataset, a pack of one, or the folder of a single object.
+        folder: a dataset, shards of one, or the folder of a single object.
         split: "all", "train", "val" or "test".
         layout: "auto", "transforms", "nerf", "gobjaverse" or "openlrm".
         cache: keep decoded views in memory, with 8 bits a channel.
 
     Raises:
         UserError: the folder does not exist, has no objects or none of the split, or its
-            ``split.json`` or the index of the pack is invalid.
+            ``split.json`` or the index of the shards is invalid.
     """
     root = Path(folder)
     if split not in ("all", *SPLITS):
@@ -172,13 +174,16 @@ def open_dataset(
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
     if layout == "auto" and (root / INDEX).exists():
-        pack = open_pack(root)
-        chosen = [values for values in pack.objects if split in ("all", values.get("split"))]
+        shards = Shards(root)
+        chosen = shards.uids(split)
         if not chosen:
-            raise UserError(f"{root}: none of its {len(pack.objects)} objects is in split {split}")
-        read = partial(_read_packed, root, {values["uid"]: values for values in chosen})
-        packed = dict.fromkeys((values["uid"] for values in chosen), read)
-        return ViewDataset(packed, "pack", cache, pack.split_version, pack.size)
+            raise UserError(f"{root}: none of its {len(shards.places)} objects is in split {split}")
+        readers = dict.fromkeys(chosen, shards.read)
+        dataset = ViewDataset(readers, "shards", cache, shards.split_version, shards.size)
+        dataset.shards = {uid: shards.sources[shards.places[uid].shard] for uid in chosen}
+        # Its objects were checked when they were packed.
+        dataset._digests = {uid: shards.digest(uid) for uid in chosen}
+        return dataset
     manifest = None
     if layout == "auto" and (root / MANIFEST).exists():
         manifest = read_manifest(root)
@@ -199,10 +204,6 @@ def open_dataset(
         if not uids:
             raise UserError(f"{root}: none of its {count} objects is in the {split} split")
     return ViewDataset(dict.fromkeys(uids, read), layout, cache, version, manifest=manifest)
-
-
-def _read_packed(root: Path, entries: Mapping[str, dict], uid: str) -> ObjectFiles:
-    return read_packed(root, entries[uid])
 
 
 def _read_folder(root: Path, layout: str, uid: str) -> ObjectFiles:
@@ -228,13 +229,13 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
         The file, the number of objects, and the reasons by uid of those that cannot be read.
 
     Raises:
-        UserError: the folder is a pack or one object, has no objects, or cannot be written.
+        UserError: the folder has shards or is one object, has no objects, or cannot be written.
     """
     root = Path(folder)
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
     if (root / INDEX).exists():
-        raise UserError(f"{root}: is a pack, which has its own index")
+        raise UserError(f"{root}: has shards, with their own index")
     layout, folders, others = find_objects(root, "auto")
     if not folders or folders == [root]:
         raise UserError(f"{root}: {'is one object' if folders else 'no objects found'}")
@@ -284,7 +285,7 @@ def content_digest(files: ObjectFiles) -> str:
 def _check_pictures(files: ObjectFiles) -> None:
     """Raise UserError if a picture is missing; folders with many pictures are listed once."""
     kinds = filter(None, (files.images, files.masks, files.depths, files.backs))
-    # Pictures in a pack are checked when its cameras are read.
+    # Pictures in a shard are located when its cameras are read.
     paths = [path for path in chain.from_iterable(kinds) if isinstance(path, Path)]
     parents = Counter(path.parent for path in paths)
     plain: dict[Path, set[str]] = {}
@@ -301,9 +302,10 @@ class ViewDataset:
 
     Attributes:
         uids: names of the objects, their paths under the root, sorted.
-        layout: layout of the folders, or "pack".
+        layout: layout of the folders, or "shards".
         split_version: version of the rule or of the file that defines the split.
-        packed_size: height of the pictures of a pack; None for files, of any size.
+        packed_size: height of pictures that were resized in shards; None for files, of any size.
+        shards: the tar of each object that lies in one.
     """
 
     def __init__(
@@ -318,6 +320,7 @@ class ViewDataset:
         """Make a dataset of the reader of each uid; ``cache`` as for ``open_dataset``."""
         self.uids = list(readers)
         self.layout, self.split_version, self.packed_size = layout, split_version, packed_size
+        self.shards: dict[str, Source] = {}
         self._readers = dict(readers)
         # Of objects that were checked before; by uid.
         self._digests: dict[str, str] = {} if manifest is None else manifest.digests
@@ -353,6 +356,7 @@ class ViewDataset:
             min(sizes, default=None),
         )
         for known, mine, theirs in (
+            (both.shards, self.shards, other.shards),
             (both._digests, self._digests, other._digests),
             (both._bad, self._bad, other._bad),
         ):
@@ -582,7 +586,7 @@ class ViewDataset:
         path, stated = files.images[view], files.sizes[view]
         found = self._pictures.get((path, size)) if self._pictures is not None else None
         if found is None:
-            picture = path.read() if isinstance(path, DecodedPicture) else load_rgba8(path)
+            picture = _read_rgba8(path)
             height, width = picture.shape[:2]
             if stated not in (None, (width, height)):
                 wanted = f"{stated[0]}x{stated[1]}"
@@ -605,12 +609,16 @@ class ViewDataset:
         return picture, files.Ks[view] * np.array(factor)[:, None]
 
 
-def _masked(picture: np.ndarray, path: Path) -> np.ndarray:
+def _read_rgba8(path: Path | DecodedPicture) -> np.ndarray:
+    return path.read() if isinstance(path, DecodedPicture) else load_rgba8(path)
+
+
+def _masked(picture: np.ndarray, path: Path | DecodedPicture) -> np.ndarray:
     """Multiply the alpha of RGBA ``[H, W, 4]`` uint8 with a grey picture of the same size.
 
     A mask of zeros and ones counts as black and white, as in nerfstudio.
     """
-    mask = load_rgba8(path)
+    mask = _read_rgba8(path)
     if mask.shape != picture.shape:
         got, wanted = (f"{x.shape[1]}x{x.shape[0]}" for x in (mask, picture))
         raise UserError(f"{path}: the mask is {got}, its picture {wanted}")
@@ -626,10 +634,11 @@ def _masked(picture: np.ndarray, path: Path) -> np.ndarray:
 def background_note(dataset: ViewDataset) -> str | None:
     """Warning if the pictures of a dataset have no transparent background, else None.
 
-    Checks the first view of up to eight objects, skipping unreadable ones.
+    Checks the first view of up to eight objects, skipping unreadable ones. ``gamba data pack`` has
+    checked those of shards.
     """
     checked = False
-    for uid in evenly(dataset.uids, 8):
+    for uid in evenly([uid for uid in dataset.uids if uid not in dataset.shards], 8):
         with suppress(*EXPECTED):
             pixels, _ = dataset.pictures(uid, [0])
             if (pixels[..., 3] < 255).any():
@@ -642,9 +651,10 @@ def background_note(dataset: ViewDataset) -> str | None:
 
 def _read_depth(path: Path | DecodedPicture, width: int, height: int) -> np.ndarray:
     """Read depth ``[height, width]`` float32 in steps of the file, by nearest samples."""
-    if isinstance(path, DecodedPicture):
-        image = Image.fromarray(path.read())
-        opened = nullcontext(image)
+    if isinstance(path, ShardPicture):
+        opened = path.open()
+    elif isinstance(path, DecodedPicture):
+        opened = nullcontext(Image.fromarray(path.read()))
     else:
         opened = open_picture(path)
     with opened as image:

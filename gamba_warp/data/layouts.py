@@ -66,7 +66,7 @@ PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
 class DecodedPicture:
-    """Decoded picture in memory or inside a larger file (``packs.py``).
+    """Picture in memory or inside a larger file (``shards.py``).
 
     Attributes:
         stem: empty, in place of a path's.
@@ -121,7 +121,7 @@ class ObjectFiles:
     """Files and cameras of the views of one object.
 
     Attributes:
-        images: the V pictures: paths, or pictures in a pack.
+        images: the V pictures: paths, or pictures in a shard or in memory.
         camera_to_world: ``[V, 4, 4]`` float64, OpenGL frame, object units.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: width and height of each of the V pictures as stated by the file, or None.
@@ -138,7 +138,7 @@ class ObjectFiles:
     camera_to_world: np.ndarray
     Ks: np.ndarray
     sizes: Sequence[tuple[int, int] | None]
-    masks: Sequence[Path] | None = None
+    masks: Sequence[Path | DecodedPicture] | None = None
     depths: Sequence[Path | DecodedPicture] | None = None
     backs: Sequence[Path | DecodedPicture] | None = None
     depth_unit: float = 1.0
@@ -310,13 +310,12 @@ def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
     Raises:
         UserError: the file is invalid; one line says where.
     """
-    top, frames = _frames(path)
+    top, frames = _frames(path, read_document(path, object))
     return _cameras(path, top, frames, None)
 
 
-def _frames(path: Path) -> tuple[dict, list[dict]]:
-    """Read the values common to all frames of a file, and its frames."""
-    top = read_document(path, object)
+def _frames(path: Path | str, top: object) -> tuple[dict, list[dict]]:
+    """Check the content of a file; return the values common to all frames, and its frames."""
     if not isinstance(top, dict):
         raise UserError(f"{path}: expected a JSON object")
     frames = top.get("frames")
@@ -330,7 +329,7 @@ def _frames(path: Path) -> tuple[dict, list[dict]]:
 
 
 def _cameras(
-    path: Path, top: dict, frames: list[dict], size: Callable[[], tuple[int, int]] | None
+    path: Path | str, top: dict, frames: list[dict], size: Callable[[], tuple[int, int]] | None
 ) -> tuple[np.ndarray, np.ndarray, Sizes]:
     poses, lenses, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
     shared = None  # most files have one lens for all frames
@@ -349,29 +348,39 @@ def _cameras(
 _PATHS = ("file_path", "mask_path", "depth_file_path", "back_file_path")
 
 
-def _pictures(path: Path, frames: list[dict]) -> dict[str, list[Path]]:
+# From a name in a document, and the document's for errors, to the picture.
+Find = Callable[[Any, str], Path | DecodedPicture]
+
+
+def _pictures(path: Path | str, frames: list[dict], find: Find) -> dict[str, list]:
     """Files named by the frames, by the name of the field."""
-    files: dict[str, list[Path]] = {key: [] for key in _PATHS}
-    within = Within(path.parent)
+    files: dict[str, list] = {key: [] for key in _PATHS}
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
         if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise UserError(f"{source}: no file_path")
         for key, paths in files.items():
             if frame.get(key):
-                paths.append(within.path(frame[key], source))
-        picture = files["file_path"][-1]
-        # Blender omits the suffix; a dot may then be part of the name.
-        if picture.suffix.lower() not in PICTURE_SUFFIXES and not os.path.lexists(picture):
-            found = [picture.with_name(picture.name + suffix) for suffix in PICTURES]
-            files["file_path"][-1] = next((p for p in found if p.exists()), found[1])
+                paths.append(find(frame[key], source))
+        files["file_path"][-1] = _with_suffix(files["file_path"][-1])
     for key, paths in files.items():
         repeated = next((p for p, n in Counter(paths).items() if n > 1), None)
         if repeated and key != "mask_path":  # frames may share a mask
-            raise UserError(f"{path}: two frames have the picture {repeated.name}")
+            name = Path(str(repeated)).name
+            raise UserError(f"{path}: two frames have the picture {name}")
     if 0 < len(files["mask_path"]) < len(frames):
         raise UserError(f"{path}: {len(files['mask_path'])} of {len(frames)} frames have a mask")
     return files
+
+
+def _with_suffix(picture: Path | DecodedPicture) -> Path | DecodedPicture:
+    """Blender omits the suffix; a dot may then be part of the name."""
+    if not isinstance(picture, Path) or picture.suffix.lower() in PICTURE_SUFFIXES:
+        return picture
+    if os.path.lexists(picture):
+        return picture
+    found = [picture.with_name(picture.name + suffix) for suffix in PICTURES]
+    return next((p for p in found if p.exists()), found[1])
 
 
 def _read_transforms(folder: Path) -> ObjectFiles:
@@ -384,18 +393,33 @@ def _read_nerf(folder: Path) -> ObjectFiles:
 
 
 def _read_frames(paths: list[Path]) -> ObjectFiles:
-    """Read one object from the frames of all files; its common values are those of the first."""
+    """Read one object from the frames of all files."""
+    return object_of(
+        [(path, read_document(path, object), Within(path.parent).path) for path in paths]
+    )
+
+
+def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFiles:
+    """Make an object of the frames of documents such as ``transforms.json``.
+
+    Args:
+        documents: for each its name, its content, and its way from names to pictures. The common
+            values are those of the first.
+
+    Raises:
+        UserError: a document is invalid.
+    """
     parts = []
-    files: dict[str, list[Path]] = {key: [] for key in _PATHS}
+    files: dict[str, list] = {key: [] for key in _PATHS}
     top: dict = {}
-    for path in paths:
-        common, frames = _frames(path)
-        top, found = top or common, _pictures(path, frames)
+    for path, content, find in documents:
+        common, frames = _frames(path, content)
+        top, found = top or common, _pictures(path, frames, find)
         first = found["file_path"][0]
-        parts.append(_cameras(path, common, frames, cache(partial(picture_size, first))))
+        parts.append(_cameras(path, common, frames, cache(partial(_size_of, first))))
         for key in _PATHS:
             files[key] += found[key]
-    path, count = paths[0], len(files["file_path"])
+    path, count = documents[0][0], len(files["file_path"])
     _check_count(count, path)
     depth_unit = _number({"depth_unit": 1e-3, **top}, "depth_unit", str(path))
     if not 0 < depth_unit <= 1e3:
@@ -422,12 +446,19 @@ def _read_frames(paths: list[Path]) -> ObjectFiles:
     )
 
 
+def _size_of(picture: Path | DecodedPicture) -> tuple[int, int]:
+    if isinstance(picture, Path):
+        return picture_size(picture)
+    height, width = picture.read().shape[:2]
+    return width, height
+
+
 def one_line(value: object) -> str:
     """Convert any value of a field to one line of text."""
     return " ".join(str(value).split())[:_MAX_TEXT]
 
 
-def _check_count(count: int, path: Path) -> None:
+def _check_count(count: int, path: Path | str) -> None:
     if count > MAX_VIEWS:
         raise UserError(f"{path}: {count} views, at most {MAX_VIEWS} are supported")
 

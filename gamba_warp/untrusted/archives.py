@@ -303,3 +303,59 @@ def _plain_members(tar: tarfile.TarFile, total: int, source: object) -> Iterator
             parts_of(member.name, str(source))
             yield Member(member.name, member.size, file)
     raise UserError(f"{source}: over {MAX_MEMBERS} members")
+
+
+class _Part(_ShortReads):
+    """Part of a file, as a file for tarfile."""
+
+    def __init__(self, file: BinaryIO, start: int, size: int) -> None:
+        super().__init__(file)
+        self._start, self._size, self._at = start, size, 0
+        self.seek, self.tell = self._seek, lambda: self._at
+
+    def _seek(self, position: int) -> int:
+        self._at = position
+        return position
+
+    def read(self, size: int = -1) -> bytes:
+        left = max(0, min(size, self._size - self._at))
+        self._file.seek(self._start + self._at)
+        data = super().read(left if size >= 0 else size)
+        self._at += len(data)
+        return data
+
+
+def files_in_tar(
+    file: BinaryIO, start: int, size: int, source: object
+) -> dict[str, tuple[int, int]]:
+    """Locate the files in a part of an uncompressed tar, without reading them.
+
+    Args:
+        file: the archive.
+        start: first byte of the part.
+        size: number of bytes of the part.
+        source: its name for error messages.
+
+    Returns:
+        First byte in ``file`` and number of bytes, by name.
+
+    Raises:
+        UserError: it is damaged or cut short, a name leaves the folder or occurs twice, a member is
+            no plain file, or there are too many.
+    """
+    found: dict[str, tuple[int, int]] = {}
+    with _as_user_error(source):
+        part = cast(BinaryIO, _Part(file, start, size))
+        with tarfile.open(fileobj=part, mode="r:") as tar:
+            for member in tar:
+                parts_of(member.name, str(source))
+                if member.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
+                    raise UserError(f"{source}: {member.name!r} is a link, a folder or a device")
+                if not 0 <= member.size <= size - member.offset_data:
+                    raise UserError(f"{source}: {member.name!r} is cut short")
+                if member.name in found:
+                    raise UserError(f"{source}: {member.name!r} occurs twice")
+                if len(found) == MAX_MEMBERS:
+                    raise UserError(f"{source}: over {MAX_MEMBERS} members")
+                found[member.name] = start + member.offset_data, member.size
+    return found

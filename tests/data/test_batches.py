@@ -218,6 +218,6 @@ def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):
 
     write_pack(data, tmp_path / "pack", PackSettings(size=8), 1)
     config = micro.options(tmp_path / "pack", tmp_path)
-    assert "is packed at 8 pixels" in open_data(config).notes[-1]
+    assert "has shards of 8 pixels" in open_data(config).notes[-1]
     write_pack(data, tmp_path / "large", PackSettings(size=16), 1)
     assert not open_data(micro.options(tmp_path / "large", tmp_path)).notes

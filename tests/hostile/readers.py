@@ -325,7 +325,7 @@ READERS = {
     "shape": Reader(alone(load_shape), checks.shape, seeds.shapes, 12),
     "evaluation": Reader(_evaluation, checks.report, seeds.compared, 1),
     "dataset": Reader(_dataset, checks.views, seeds.datasets, 8, True),
-    "pack": Reader(_dataset, checks.views, seeds.packs, 6, True),
+    "shards": Reader(_dataset, checks.views, seeds.shards, 6, True),
     "shown": Reader(_shown, checks.each(checks.shown), seeds.shown, 3, True),
     "split": Reader(_split, checks.nothing, seeds.split, 2, True),
     "catalogue": Reader(alone(find_meshes), checks.catalogue, seeds.catalogues, 4, True),

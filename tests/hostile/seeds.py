@@ -418,14 +418,14 @@ def datasets() -> Kinds:
     }
 
 
-def packs() -> Kinds:
-    """Packs of two objects of two views, the first with depth, with either kind of shard."""
+def shards() -> Kinds:
+    """Shards of two objects of two views, the first with depth: with the files' bytes, resized."""
     made = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         put(split()["transforms"], folder / "data")
-        for kind in ("arrays", "webdataset"):
-            write_pack(folder / "data", folder / kind, PackSettings(_SIZE, shards=kind), 1)
+        for kind, size in (("bytes", None), ("resized", _SIZE // 2)):
+            write_pack(folder / "data", folder / kind, PackSettings(size), 1)
             files = sorted((folder / kind).iterdir())
             made[kind] = {path.name: path.read_bytes() for path in files if path.is_file()}
     return made

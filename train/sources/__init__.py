@@ -1,1 +1,1 @@
-"""Published datasets: G-Objaverse, Objaverse, GSO; and packs of decoded views."""
+"""Published datasets: G-Objaverse, Objaverse, GSO; and shards of views."""

@@ -173,34 +173,33 @@ def data_render_command(
 def data_pack_command(
     data: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
-    size: Annotated[int, Meta(ge=1, le=4096)] | None = 128,
+    size: Annotated[int, Meta(ge=1, le=4096)] | None = None,
     split: Literal["all", "train", "val", "test"] = "all",
-    format: Literal["arrays", "webdataset"] = "arrays",
-    shard_mb: Annotated[int, Meta(ge=1, le=100_000)] = 256,
+    shard_mb: Annotated[int, Meta(ge=1, le=100_000)] = 1000,
     limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
 ) -> int:
-    """Decode the views of a dataset once, and write them into a few large files.
+    """Write the views of a dataset into a few tar files, shards in the format of WebDataset.
 
-    Every command that takes a dataset also takes the pack. Its views at SIZE are bit-identical to
-    those of the files; larger ones are enlarged. A stopped command continues with the next shard.
+    The pictures keep their bytes. Every command that takes a dataset also takes the shards. A
+    stopped command continues with the next shard.
 
     Args:
         data: the dataset.
-        out: folder of the pack to make or to continue.
-        size: height of the pictures, pixels; None keeps that of the files.
+        out: folder of the shards to make or to continue.
+        size: height of the pictures, pixels: they are resized once, and are lossless WebP. Its
+            views at SIZE are bit-identical to those of the files; larger ones are enlarged.
         split: pack only the objects of this part of the set.
-        format: memory-mapped arrays, or WebDataset's .tar files of the same arrays.
-        shard_mb: a file ends with the object that exceeds this size, megabytes.
+        shard_mb: a shard ends with the object that exceeds this size, megabytes.
         limit: stop after this many objects.
-        workers: number of threads that decode; 0 means one per core.
+        workers: number of threads that read; 0 means one per core.
     """
     from gamba_warp.data.dataset import background_note, open_dataset
     from gamba_warp.kernels.runtime.system import cores
 
     from .pack import PackSettings, write_pack
 
-    settings = PackSettings(size, split, format, shard_mb << 20)
+    settings = PackSettings(size, split, shard_mb << 20)
     done = write_pack(data, out, settings, workers or cores(), limit)
     if done.there:
         print(f"{counted(done.there, 'object')} already in {out}")
@@ -208,7 +207,7 @@ def data_pack_command(
     print(f"{made}, {len(done.failures)} failed")
     if split == "all":
         _report_empty_splits(out)
-    if note := background_note(open_dataset(out)):
+    if note := background_note(open_dataset(data)):
         print(f"warning: {data}: {note}", file=sys.stderr)
     return _report(done.failures, "failed", {})
 

@@ -1,53 +1,49 @@
-"""Writer of packs (``gamba_warp/data/packs.py``): views of a dataset, decoded and resized once."""
+"""Writer of shards (``gamba_warp/data/shards.py``): the views of a dataset in a few tar files."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import itertools
 import json
+import os
 import tarfile
-import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
+from PIL import Image
 
 from gamba_warp.batch import EXPECTED, progress_bar
-from gamba_warp.data import packs
-from gamba_warp.data.dataset import ViewDataset, open_dataset, splits_of
+from gamba_warp.data import shards
+from gamba_warp.data.dataset import SPLITS, ViewDataset, open_dataset, splits_of
+from gamba_warp.data.layouts import DecodedPicture
 from gamba_warp.errors import UserError, first_line
-from gamba_warp.files import atomic_path, only_process, output_folder, write_text
-from gamba_warp.untrusted.documents import MAX_BYTES
+from gamba_warp.files import atomic_path, only_process, output_folder, sha256, write_text
+from gamba_warp.untrusted.documents import MAX_BYTES, read_bytes
 from gamba_warp.untrusted.names import parts_of
 
-_ALIGNMENT = 64  # bytes; an object begins at a multiple
-_AHEAD = 2  # objects decoded ahead, per thread
-_METADATA = ("uid", "name", "split", "attribution", "depth_unit")  # of an object in a tar
-SUFFIXES = {"arrays": "bin", "webdataset": "tar"}
-
-# Object to write: its entry, and its arrays by their names in the index.
-Block = tuple[packs.Entry, dict[str, np.ndarray]]
+_AHEAD = 2  # objects read ahead, per thread
+_MOST = 1 << 30  # bytes of a picture's file
 
 
 @dataclass(frozen=True)
 class PackSettings:
-    """Settings of a pack.
+    """Settings of shards.
 
     Attributes:
-        size: height of the pictures, pixels; None keeps that of the files.
+        size: height of the pictures, pixels; None keeps the bytes of the files.
         split: "all", "train", "val" or "test".
-        shards: "arrays" or "webdataset".
-        shard_bytes: a shard ends with the object that exceeds this size.
+        shard_bytes: a tar ends with the object that exceeds this size.
     """
 
-    size: int | None = 128
+    size: int | None = None
     split: str = "all"
-    shards: str = "arrays"
-    shard_bytes: int = 256 << 20
+    shard_bytes: int = 1000 << 20
 
 
 @dataclass
@@ -56,8 +52,8 @@ class Packed:
 
     Attributes:
         written: number of newly packed objects.
-        there: number of objects that were already in the pack.
-        shards: number of all shards.
+        there: number of objects that were already in the shards.
+        shards: number of all tars.
         failures: reasons by uid, of unreadable objects.
     """
 
@@ -67,22 +63,31 @@ class Packed:
     failures: dict[str, str]
 
 
+class Block(NamedTuple):
+    """Object to write: its uid, its split, and the content of its files by their suffix."""
+
+    uid: str
+    split: str
+    files: dict[str, bytes]
+
+
 def write_pack(
     data: Path, out: Path, settings: PackSettings, workers: int, limit: int | None = None
 ) -> Packed:
-    """Pack a dataset, or continue a pack of it.
+    """Write the shards of a dataset, or continue them.
 
-    If the command is killed or the disk is full, only complete shards remain.
+    Each tar has objects of one split only, in the order of the hash of their names, so that any of
+    them is a fair sample. If the command is killed or the disk is full, complete tars remain.
 
     Args:
         data: the dataset.
-        out: folder of the pack, created if missing.
-        settings: settings of the pack.
-        workers: number of decoding threads.
+        out: folder of the shards, created if missing.
+        settings: settings of the shards.
+        workers: number of reading threads.
         limit: number of objects to pack, the first ones; None means all.
 
     Raises:
-        UserError: the data cannot be opened, the folder holds something else or a pack with other
+        UserError: the data cannot be opened, the folder holds something else or shards with other
             settings, cannot be written, or its disk is full.
     """
     dataset = open_dataset(data, settings.split)
@@ -90,53 +95,60 @@ def write_pack(
     index = _open_index(out, settings)  # before the folder is made
     out = output_folder(out)
     with only_process(out, "packs"):
-        index.size, index.split, index.shards = settings.size, settings.split, settings.shards
+        index.size, index.split = settings.size, settings.split
         index.split_version = dataset.split_version
-        stored, index.objects = index.objects, []
-        for values in stored:  # keep entries with a complete shard and valid cameras
-            with suppress(UserError):
-                packs.read_packed(out, values)
-                index.objects.append(values)
-        known = {values["uid"] for values in index.objects}
+        index.shards = [shard for shard in index.shards if _complete(out, shard)]
+        known = {uid for shard in index.shards for uid, _, _ in shard.objects}
         wanted = dataset.uids[:limit]
-        todo = [uid for uid in wanted if uid not in known]
-        named = {values["shard"] for values in index.objects}
-        for suffix in SUFFIXES.values():  # of a killed run, or damaged
-            for path in out.glob(f"shard-*.{suffix}"):
-                if path.name not in named:
-                    path.unlink(missing_ok=True)
+        todo = sorted((uid for uid in wanted if uid not in known), key=_order(splits))
+        named = {shard.name for shard in index.shards}
+        for path in out.glob("*-[0-9]*.tar"):  # of a killed run, or damaged
+            if path.name not in named:
+                path.unlink(missing_ok=True)
         failures: dict[str, str] = {}
         if todo or not index.finished:
             index.finished = False
-            with closing(
-                _blocks(dataset, todo, splits, settings.size, workers, failures)
-            ) as blocks:
+            blocks = _blocks(dataset, todo, splits, settings.size, workers, failures)
+            with closing(blocks):
                 _write_shards(out, index, blocks, settings)
             index.finished = True
-            if index.objects:
+            if index.shards:
                 _write_index(out, index)
-        if not index.objects:
+        if not index.shards:
             raise UserError(f"{data}: no object can be packed: {next(iter(failures.values()))}")
-    shards = {values["shard"] for values in index.objects}
     there = len(wanted) - len(todo)
-    return Packed(len(todo) - len(failures), there, len(shards), failures)
+    return Packed(len(todo) - len(failures), there, len(index.shards), failures)
 
 
-def _open_index(out: Path, settings: PackSettings) -> packs.Index:
-    """Read the index of an existing pack, or make a new one; raise for any other folder."""
-    if (out / packs.INDEX).exists():
-        index = packs.read_index(out)
-        old = {"--size": index.size, "--split": index.split, "--format": index.shards}
-        for (name, value), new in zip(
-            old.items(), (settings.size, settings.split, settings.shards)
-        ):
-            if value != new:
-                raise UserError(f"{out}: holds a pack of {name} {value}, not {new}")
+def _order(splits: dict[str, str]):
+    def key(uid: str) -> tuple[int, bytes]:
+        digest = hashlib.sha256(uid.encode(errors="surrogatepass")).digest()
+        return SPLITS.index(splits[uid]), digest
+
+    return key
+
+
+def _complete(out: Path, shard: shards.Shard) -> bool:
+    try:
+        return os.stat(out / shard.name).st_size == shard.bytes
+    except OSError:
+        return False
+
+
+def _open_index(out: Path, settings: PackSettings) -> shards.Index:
+    """Read the index of existing shards, or make a new one; raise for any other folder."""
+    if (out / shards.INDEX).exists():
+        index = shards.read_index(out)
+        if index.address:
+            raise UserError(f"{out}: its shards lie at {index.address}; give another folder")
+        for name, old in {"size": index.size, "split": index.split}.items():
+            if old != (new := getattr(settings, name)):
+                raise UserError(f"{out}: holds shards of --{name} {old}, not {new}")
         return index
     names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
-    if strange := [name for name in names if not name.startswith((".", "shard-"))]:
+    if strange := [name for name in names if not name.startswith(".") and name[-4:] != ".tar"]:
         raise UserError(f"{out}: holds other files ({strange[0]}); give an empty folder")
-    return packs.Index(format=packs.FORMAT, version=packs.VERSION)
+    return shards.Index(format=shards.FORMAT, version=shards.VERSION)
 
 
 def _blocks(
@@ -147,7 +159,7 @@ def _blocks(
     workers: int,
     failures: dict[str, str],
 ) -> Generator[Block, None, None]:
-    """Yield the readable objects in order, decoded ahead on threads."""
+    """Yield the readable objects in order, read ahead on threads."""
     pool, waiting = ThreadPoolExecutor(workers), dict[str, Future[Block]]()
     try:
         for number, uid in enumerate(progress_bar(uids, desc="packing", unit="object")):
@@ -163,58 +175,81 @@ def _blocks(
 
 
 def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> Block:
-    """Decode one object."""
+    """Read one object; each picture is decoded, so that none is damaged."""
     parts_of(uid, f"the object {uid!r}")
-    files = dataset.files(uid)
-    images, Ks = dataset.pictures(uid, None, size)
-    views, height, width = images.shape[:3]
-    steps = dict(zip(packs.KINDS[1:], dataset.depth_steps(uid, width, height)))
-    steps = {kind: values for kind, values in steps.items() if values is not None}
-    whole = all((v == np.floor(v)).all() and v.max() < 1 << 16 for v in steps.values())
-    dtype = np.dtype("<u2" if whole else "<f4")
-    arrays = {"images": images, **{kind: values.astype(dtype) for kind, values in steps.items()}}
-    sums = np.zeros((views, len(packs.KINDS)))
-    for kind, array in arrays.items():
-        sums[:, packs.KINDS.index(kind)] = [zlib.crc32(view) for view in array]
-    poses = files.camera_to_world.reshape(views, -1)
-    cameras = np.concatenate([poses, Ks.reshape(views, -1), sums], 1).astype("<f8")
-    entry = packs.Entry(
-        uid=uid,
-        split=split,  # pyright: ignore[reportArgumentType]: one of three, as it comes
-        shard="",
-        views=views,
-        width=width,
-        height=height,
-        crc=zlib.crc32(cameras.tobytes()),
-        cameras=0,
-        images=0,
-        depth_type="uint16" if whole else "float32",
-        depth_unit=float(files.depth_unit),
-        name=files.name,
-        attribution=files.attribution,
-    )
-    if files.placement is not None:
-        entry.applied_transform = files.placement.transform.tolist()
-        entry.applied_scale = files.placement.scale
-    return entry, {"cameras": cameras, **arrays}
+    found, frames, lenses = dataset.files(uid), list[dict[str, Any]](), list[dict[str, Any]]()
+    files: dict[str, bytes] = {"": b""}  # the document comes first
+    names = dict[Any, str]()  # of a picture that frames share
+
+    def take(picture: Path | DecodedPicture, kind: str) -> str:
+        if picture not in names:
+            names[picture] = f"{len(frames):03d}{kind}{Path(str(picture)).suffix.lower()}"
+            files[names[picture]] = _content(picture)
+        return names[picture]
+
+    for view, pose in enumerate(found.camera_to_world):
+        (pixels,), (K,) = dataset.pictures(uid, [view], size)
+        frame: dict[str, Any] = {"transform_matrix": pose.tolist()}
+        if size is None:
+            frame["file_path"] = take(found.images[view], "")
+        else:
+            frame["file_path"] = f"{view:03d}.webp"
+            files[frame["file_path"]] = _encoded(Image.fromarray(pixels))
+        more: dict[str, Sequence | None] = {"depth": found.depths, "back": found.backs}
+        more = {f"{kind}_file": paths for kind, paths in more.items()}
+        more |= {"mask": found.masks if size is None else None}
+        for kind, paths in more.items():
+            if paths is not None:
+                frame[f"{kind}_path"] = take(paths[view], f".{kind.removesuffix('_file')}")
+        frames.append(frame)
+        lens = {"w": pixels.shape[1], "h": pixels.shape[0], "fl_x": K[0, 0], "fl_y": K[1, 1]}
+        lenses.append(lens | {"cx": K[0, 2], "cy": K[1, 2]})
+    height, width = lenses[0]["h"], lenses[0]["w"]
+    for view in range(len(frames)):
+        dataset.depth_steps(uid, width, height, [view])
+    top: dict[str, Any] = {"uid": uid, "name": found.name, "attribution": found.attribution}
+    top["depth_unit"] = float(found.depth_unit)
+    if found.placement is not None:
+        top["applied_transform"] = found.placement.transform.tolist()
+        top["applied_scale"] = found.placement.scale
+    if all(lens == lenses[0] for lens in lenses):
+        top |= lenses[0]
+    else:
+        frames = [frame | lens for frame, lens in zip(frames, lenses)]
+    files[""] = json.dumps({**top, "frames": frames}).encode()
+    return Block(uid, split, {name or shards.DOCUMENT: content for name, content in files.items()})
+
+
+def _content(picture: Path | DecodedPicture) -> bytes:
+    if isinstance(picture, Path):
+        return read_bytes(picture, _MOST)
+    assert isinstance(picture, shards.ShardPicture)
+    return picture.content()
+
+
+def _encoded(picture: Image.Image) -> bytes:
+    content = io.BytesIO()
+    picture.save(content, "WEBP", lossless=True, exact=True)
+    return content.getvalue()
 
 
 def _write_shards(
-    out: Path, index: packs.Index, blocks: Iterator[Block], settings: PackSettings
+    out: Path, index: shards.Index, blocks: Iterator[Block], settings: PackSettings
 ) -> None:
-    """Write all objects; the index names a shard as soon as it is complete."""
-    names = (f"shard-{n:05d}.{SUFFIXES[settings.shards]}" for n in itertools.count())
-    free = (out / name for name in names if not (out / name).exists())
-    for first in blocks:
-        path = next(free)
-        taken = _take_bytes(itertools.chain([first], blocks), settings.shard_bytes)
-        entries = _write_shard(path, taken, len(index.objects))
-        index.objects += [msgspec.to_builtins(entry) for entry in entries]
-        try:
-            _write_index(out, index)
-        except BaseException:
-            path.unlink(missing_ok=True)  # nothing names it
-            raise
+    """Write all objects; the index names a tar as soon as it is complete."""
+    for split, members in itertools.groupby(blocks, lambda block: block.split):
+        names = (f"{split}-{number:05d}.tar" for number in itertools.count())
+        free = (out / name for name in names if not (out / name).exists())
+        for first in members:
+            path = next(free)
+            rest = itertools.chain([first], members)  # noqa: B031
+            taken = _take_bytes(rest, settings.shard_bytes)
+            index.shards.append(_write_shard(path, split, taken))
+            try:
+                _write_index(out, index)
+            except BaseException:
+                path.unlink(missing_ok=True)  # nothing names it
+                raise
 
 
 def _take_bytes(blocks: Iterator[Block], limit: int) -> Iterator[Block]:
@@ -222,54 +257,32 @@ def _take_bytes(blocks: Iterator[Block], limit: int) -> Iterator[Block]:
     size = 0
     for block in blocks:
         yield block
-        size += sum(array.nbytes for array in block[1].values())
+        size += sum(map(len, block.files.values()))
         if size >= limit:
             return
 
 
-def _write_index(out: Path, index: packs.Index) -> None:
+def _write_index(out: Path, index: shards.Index) -> None:
     text = msgspec.json.encode(index).decode()
     if len(text) > MAX_BYTES:
         raise UserError(
-            f"{out}: the index would exceed {MAX_BYTES >> 20} MB, the limit of readers; make "
-            "several packs of parts of the dataset, and train on them with --extra"
+            f"{out}: the index would exceed {MAX_BYTES >> 20} MB, the limit of readers; pack "
+            "several parts of the dataset, and train on them with --extra"
         )
-    write_text(out / packs.INDEX, text + "\n")
+    write_text(out / shards.INDEX, text + "\n")
 
 
-def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[packs.Entry]:
-    """Write a shard: raw arrays one after the other, or a WebDataset.
-
-    A WebDataset has ``NUMBER.json`` and a ``.npy`` per array of each object, from ``number`` on.
-    """
-    entries = []
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        tar = None
-        if path.suffix == ".tar":
-            tar = tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)
-
-        def add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
-            member = tarfile.TarInfo(name)
-            member.size, member.mode = len(content), 0o444
-            tar.addfile(member, io.BytesIO(content))
-
-        for key, (entry, arrays) in enumerate(blocks, number):
-            starts = {}
-            if tar is None:
-                file.write(bytes(-file.tell() % _ALIGNMENT))
-                for kind, array in arrays.items():
-                    starts[kind] = file.tell()
-                    file.write(np.ascontiguousarray(array).data)
-            else:
-                for kind, array in sorted(arrays.items()):
-                    npy = io.BytesIO()
-                    np.save(npy, np.ascontiguousarray(array))
-                    # The array comes last, after the headers of tar and npy.
-                    starts[kind] = file.tell() + tarfile.BLOCKSIZE + npy.tell() - array.nbytes
-                    add(tar, f"{key:08d}.{kind}.npy", npy.getvalue())
-                about = {name: getattr(entry, name) for name in _METADATA}
-                add(tar, f"{key:08d}.json", json.dumps(about).encode())
-            entries.append(msgspec.structs.replace(entry, shard=path.name, **starts))
-        if tar is not None:
-            tar.close()
-    return entries
+def _write_shard(path: Path, split: str, blocks: Iterator[Block]) -> shards.Shard:
+    """Write a tar."""
+    objects = []
+    with atomic_path(path) as temporary:
+        with tarfile.open(temporary, "w", format=tarfile.GNU_FORMAT) as tar:
+            for block in blocks:
+                start, key = tar.offset, shards.key_of(block.uid)
+                for suffix, content in block.files.items():
+                    member = tarfile.TarInfo(f"{key}.{suffix}")
+                    member.size, member.mode = len(content), 0o444
+                    tar.addfile(member, io.BytesIO(content))
+                objects.append((block.uid, start, tar.offset - start))
+        size, digest = os.stat(temporary).st_size, sha256(temporary)
+    return shards.Shard(name=path.name, split=split, bytes=size, sha256=digest, objects=objects)

@@ -1,4 +1,4 @@
-"""Benchmark case of the training's data: batches alone, from files, from memory and from a pack."""
+"""Benchmark case of the training's data: batches alone, from files, from memory and from shards."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def cases(settings: Settings) -> list[Case]:
         f"three in ten recoloured, prepared by {_WORKERS} threads and taken at once, from the "
         "first one on. Views are those of --data, or made up; up to "
         f"{_OBJECTS} objects, so that all lie in the system's own cache of files. From there the "
-        "pictures are decoded, or were decoded before: into memory, into a pack, onto the device. "
+        "pictures are decoded, or were decoded before, into memory or onto the device; or they were "
+        "resized into shards. "
         "There is no oracle: a test holds the batches to be the same to the bit."
     )
     return [Case(op="loader", name="views", text=text, build=partial(_build, settings), axis=None)]
@@ -81,11 +82,11 @@ def _build(settings: Settings) -> list[Variant]:
     objects = list(range(min(_OBJECTS, len(files))))
     for index in objects:
         cached.pictures(index, None, _SIZE)
-    write_pack(data, root / "pack", PackSettings(_SIZE), _WORKERS, len(objects))
-    pack, resident = open_dataset(root / "pack"), open_dataset(root / "pack")
+    write_pack(data, root / "shards", PackSettings(_SIZE), _WORKERS, len(objects))
+    shards, resident = open_dataset(root / "shards"), open_dataset(root / "shards")
     resident.preload(objects, [_SIZE], settings.device, _WORKERS)
     made: dict[str, ViewDataset] = {"files": files, "files, --cache": cached}
-    made |= {"pack": pack, "pack, --cache-device": resident}
+    made |= {"shards": shards, "shards, --cache-device": resident}
     world, batches = World(0, 1, settings.device), _BATCHES[settings.level]
     variants = []
     for name, dataset in made.items():

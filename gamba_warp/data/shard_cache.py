@@ -1,0 +1,147 @@
+"""Tars on a server, kept in a folder of limited size. Needs the package ``webdataset``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import subprocess
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import UserError, first_line
+from ..files import atomic_path
+from ..versions import require
+
+# Addresses that are opened; others, such as webdataset's "pipe:", would run commands of the index.
+ADDRESS = r"^(https?|s3|gs)://[A-Za-z0-9][A-Za-z0-9_.:/@%~+-]{0,999}$"
+TRIES = 4
+_DELAY = 1.0  # seconds before the second try; doubled each time
+_PART = 1 << 20  # bytes
+
+
+class Unreachable(UserError):
+    """A shard cannot be fetched: no fault of its objects, so a training stops."""
+
+
+class Source(NamedTuple):
+    """Tar of an index.
+
+    Attributes:
+        name: of the file.
+        bytes: its size.
+        sha256: of the file.
+        address: address of its folder; empty for a local one.
+        cache_bytes: largest size of all kept tars.
+    """
+
+    name: str
+    bytes: int
+    sha256: str
+    address: str
+    cache_bytes: int
+
+
+def fetch(source: Source, folder: Path) -> Path:
+    """Return the path of a tar in the cache, after fetching it if it is not there.
+
+    Only one process of a machine fetches a tar. The ones used longest ago make room for it.
+
+    Raises:
+        Unreachable: it cannot be fetched, after ``TRIES`` tries, or is not what the index states.
+        UserError: the cache cannot be written.
+    """
+    path = folder / source.name
+    if _touched(path, source.bytes):
+        return path
+    require("webdataset")
+    from filelock import FileLock
+    from webdataset.cache import LRUCleanup
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.parent / f".{source.name}.lock"):
+        if _touched(path, source.bytes):  # by another process, meanwhile
+            return path
+        room = max(0, source.cache_bytes - source.bytes)
+        LRUCleanup(str(folder), room, keyfn=os.path.getmtime, interval=None).cleanup()
+        with atomic_path(path) as temporary:
+            download(f"{source.address}/{source.name}", temporary, source.bytes, source.sha256)
+    return path
+
+
+def _touched(path: Path, size: int) -> bool:
+    """True if the file is there and complete; it then counts as the last one used."""
+    with suppress(OSError):
+        if os.stat(path).st_size == size:
+            os.utime(path)
+            return True
+    return False
+
+
+def download(url: str, target: Path, most: int, sha256: str | None = None) -> None:
+    """Fetch a file through ``webdataset``; a failure is tried again.
+
+    Args:
+        url: address of the file.
+        target: file to write.
+        most: largest size, bytes; the exact one with ``sha256``.
+        sha256: of the content; None for an unknown one.
+
+    Raises:
+        Unreachable: no try succeeds, or the content is larger than ``most`` or another.
+        OSError: the target cannot be written.
+    """
+    reason = ""
+    for number in range(TRIES):
+        if number:
+            time.sleep(_DELAY * 2 ** (number - 1))
+        try:
+            found, size = _download(url, target, most)
+        except (_Broken, subprocess.TimeoutExpired) as error:
+            reason = first_line(error)
+            continue
+        if size > most or sha256 not in (None, found):
+            what = "is larger than stated" if size > most else "is not the file of the index"
+            raise Unreachable(f"{url}: {what}")
+        return
+    raise Unreachable(f"{url}: cannot be fetched, {TRIES} tries: {reason}")
+
+
+class _Broken(Exception):
+    """A transfer failed."""
+
+
+def _download(url: str, target: Path, most: int) -> tuple[str, int]:
+    """Return SHA-256 and size of one transfer, which ends after ``most`` bytes."""
+    from webdataset import gopen
+
+    gopen.gopen_schemes.setdefault("s3", _open_s3)
+    digest, size = hashlib.sha256(), 0
+    try:
+        stream = gopen.gopen(url)
+    except FileNotFoundError as error:
+        raise Unreachable(f"{url}: needs the program {error.filename}") from error
+    with open(target, "wb") as file:
+        try:
+            with stream:
+                while size <= most and (part := stream.read(_PART)):
+                    size += len(part)
+                    digest.update(part)
+                    file.write(part)
+        except OSError as error:
+            if error.errno is not None:  # of the target
+                raise
+            code = re.search(r"exit (-?\d+)", str(error))
+            program = url.partition(":")[0]
+            raise _Broken(f"{program} ended with code {code[1]}" if code else "broken") from error
+    return digest.hexdigest(), size
+
+
+def _open_s3(url: str, mode: str, bufsize: int):
+    """Open an object of S3 by the program aws, as webdataset opens gs:// by gsutil."""
+    from webdataset.gopen import Pipe
+
+    command = ["aws", "s3", "cp", "--only-show-errors", url, "-"]
+    return Pipe(command, mode=mode, bufsize=bufsize, stderr=subprocess.DEVNULL)
