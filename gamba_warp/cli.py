@@ -63,6 +63,9 @@ COMMANDS = {
     "data made": Command("Make models: toys, shoes, tools, boxes.", "mesh", MADE, (), _DATA),
     "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),
     "data pack": Command("Posed views to a few large files.", "", (), (), _DATA),
+    "data fetch": Command(
+        "Shards of a server, fetched when used.", "shards", ("webdataset",), (), _DATA
+    ),
     "data index": Command("Check a dataset once, for all later starts.", "", (), (), _DATA),
     "data objaverse": Command("Objaverse, and its G-Objaverse views.", "", (), (), _DATA),
     "data gso": Command("Google Scanned Objects, for evaluation.", "mesh", _RENDERS, (), _DATA),

@@ -52,6 +52,7 @@ EXTRA_OF = {
     "timm": "train",
     "tomli": "train",
     "trimesh": "mesh",
+    "webdataset": "shards",
     "xatlas": "mesh",
     "yaml": "train",
 }
@@ -68,6 +69,7 @@ HOLDS = {
         *("gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch"),
         *SHAPES,
     },
+    "shards": {"webdataset"},
     "all": set(EXTRA_OF),
 }
 

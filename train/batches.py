@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -22,11 +23,13 @@ import torch
 from gamba_warp.batch import EXPECTED
 from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_dataset
 from gamba_warp.data.gso import scanned
+from gamba_warp.data.shard_cache import Source, Unreachable
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.plugins import added
 
 from .config import TrainConfig
+from .data.order import ShardOrder
 from .data.pool import Pool, PoolOptions
 from .data.poses import front_views
 from .data.samples import Batch, choose_views, draw_change, join, load_sample
@@ -34,6 +37,7 @@ from .data.settings import VARIED_CAMERAS, Settings
 from .ddp import World
 from .optim import NewBatch
 
+_FETCHED = 256  # samples of a process for which shards are fetched ahead
 _TRIES = 100  # objects tried in turn until one can be read
 # With --overfit all views share one forward pass of the network; rendering them is cheap beside it.
 _OVERFIT_VIEWS = 9
@@ -67,6 +71,7 @@ class TrainingData:
         val_views: novel views per object in a validation; None means all.
         notes: lines for the user.
         weights: for each of ``objects``, how often it is taken relative to others; None: alike.
+        shards: for each of ``objects``, the SHA-256 of its shard, if the order is by shards.
     """
 
     train: ViewDataset
@@ -78,6 +83,7 @@ class TrainingData:
     val_views: int | None = None
     notes: list[str] = field(default_factory=list)
     weights: np.ndarray | None = None
+    shards: list[str] | None = None
 
     @property
     def scanned(self) -> list[str]:
@@ -88,7 +94,7 @@ class TrainingData:
     @property
     def fingerprint(self) -> str:
         """Hash of the objects' names in order; a run with another list is another run."""
-        names = "\n".join(self.train.uids[i] for i in self.objects)
+        names = "\n".join([*(self.train.uids[i] for i in self.objects), *(self.shards or ())])
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
@@ -137,6 +143,7 @@ def _open_all(config: TrainConfig) -> TrainingData:
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
     notes += filter(None, [background_note(train)])
+    shards = _shards_of(train, objects, config)
     weights, held_out = None, []
     if views.extra_weights:
         each = np.array([1.0, *views.extra_weights])
@@ -163,7 +170,34 @@ def _open_all(config: TrainConfig) -> TrainingData:
         val_views=config.run.val_views,
         notes=notes,
         weights=weights,
+        shards=shards,
     )
+
+
+def _shards_of(train: ViewDataset, objects: list[int], config: TrainConfig) -> list[str] | None:
+    """Return the shard of each object if the order is by shards, else None.
+
+    Raises:
+        UserError: an object is in no shard, or the cache of remote shards is too small for an order
+            in which any shard may come next.
+    """
+    uids = [train.uids[index] for index in objects]
+    if config.views.sampler == "shards":
+        if missing := next((uid for uid in uids if uid not in train.shards), None):
+            raise UserError(f"--sampler shards: {missing} is in no shard (gamba data pack)")
+        return [train.shards[uid].sha256 for uid in uids]
+    remote = {
+        train.shards[uid] for uid in uids if uid in train.shards and train.shards[uid].address
+    }
+    for folder in {source.folder for source in remote}:
+        parts = [source for source in remote if source.folder == folder]
+        size, room = sum(source.bytes for source in parts), parts[0].cache_bytes
+        if size > room:
+            raise UserError(
+                f"{folder}: its shards take {size / 1e9:.1f} GB, its cache {room / 1e9:.1f}: give "
+                "--sampler shards, or a larger cache (gamba data fetch --cache-gb)"
+            )
+    return None
 
 
 def _held_out(name: str, folder: Path, count: int) -> HeldOut:
@@ -242,6 +276,13 @@ class Batches:
         self.failures: dict[str, str] = {}
         self.waited, self.since = 0.0, NewBatch()
         self._made: Pool | None = None  # started with the first batch
+        self._by_shard: ShardOrder | None = None
+        if data.shards is not None:
+            self._by_shard = ShardOrder(
+                data.shards, config.views.shuffle_buffer, config.run.seed, world.size
+            )
+        self._fetched: Source | None = None
+        self._fetching = ThreadPoolExecutor(1, thread_name_prefix="shards")
         self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # epoch and its permutation
         self._pool = ThreadPoolExecutor(config.views.workers, thread_name_prefix="batches")
         self._waiting: dict[int, Future[Prepared]] = {}
@@ -272,6 +313,7 @@ class Batches:
         if self._made is not None:
             self._made.close()
         self._pool.shutdown(cancel_futures=True)
+        self._fetching.shutdown(cancel_futures=True)
 
     def batch(self, number: int, novel: int) -> Batch:
         """Load the ``number``-th batch synchronously, with ``novel`` novel views."""
@@ -319,9 +361,11 @@ class Batches:
             return Prepared(loaded(self._made.take(made), 0), [])
         failed: list[tuple[str, str]] = []
         for attempt in range(_TRIES):
-            index = self._object(number + attempt)
+            index = self._object(number, attempt)
             try:
                 return Prepared(loaded(self.data.train, index), failed)
+            except Unreachable:  # no fault of the object
+                raise
             except EXPECTED as error:
                 failed.append((self.data.train.uids[index], first_line(error)))
         return Prepared(None, failed)
@@ -359,16 +403,38 @@ class Batches:
         )
         self._made = Pool(options, math.floor(number * self.data.batch_size * views.made))
 
-    def _object(self, number: int) -> int:
-        """Return the object of the ``number``-th sample; each epoch has its own permutation."""
-        objects = self.data.objects
-        epoch, position = divmod(number, len(objects))
+    def _object(self, number: int, attempt: int) -> int:
+        """Return the object of the ``number``-th sample; each epoch has its own order.
+
+        Args:
+            number: of the sample in the run.
+            attempt: number of objects of the sample that could not be read.
+        """
+        objects, by_shard = self.data.objects, self._by_shard
+        if by_shard is not None:
+            share, before = self.data.batch_size, self.since.samples
+            batch, position = divmod(number - before, share)
+            number = before // self.world.size + batch // self.world.size * share + position
+        length = len(objects) if by_shard is None else by_shard.length
+        epoch, position = divmod(number + attempt, length)
         known, order = self._order  # read both at once: other threads replace them
         if known != epoch:
-            rng = np.random.default_rng([self.config.run.seed, 1, epoch])
-            order = self._epoch(rng)
+            if by_shard is None:
+                order = self._epoch(np.random.default_rng([self.config.run.seed, 1, epoch]))
+            else:
+                order = by_shard(epoch)
             self._order = epoch, order
+        if by_shard is not None:
+            self._fetch_ahead(objects[order[min(position + _FETCHED, length - 1)]])
         return objects[order[position]]
+
+    def _fetch_ahead(self, index: int) -> None:
+        """Fetch the shard of a later object, if it lies on a server; it raises when it is used."""
+        source = self.data.train.shards[self.data.train.uids[index]]
+        if source.address and source != self._fetched:
+            self._fetched = source
+            with suppress(RuntimeError):  # the run ends
+                self._fetching.submit(source.path)
 
     def _epoch(self, rng: np.random.Generator) -> np.ndarray:
         """Positions of an epoch in the list of objects."""
@@ -436,6 +502,8 @@ def fixed_batches(
             others = range(1, dataset.num_views(index))
             novel = evenly(others, len(others) if views is None else views)
             batch = load_sample(dataset, index, [0, *novel], size, config, torch.ones(3))
+        except Unreachable:
+            raise
         except EXPECTED as error:
             uid = f"{part.name}/{dataset.uids[index]}" if part.name else dataset.uids[index]
             failures[uid] = first_line(error)

@@ -86,7 +86,9 @@ class DataConfig:
         cache: Keep decoded pictures in memory.
         cache_device: Decode all pictures at the start and keep them on the training device, with
             8 bits a channel. Depth pictures are read when they are used.
-        sampler: Order of the objects: "shuffled" anew for each epoch, or that of a plugin.
+        sampler: Order of the objects: "shuffled" anew for each epoch; "shards", by whole shards, of
+            which each process takes its own (docs/training-data.md); or that of a plugin.
+        shuffle_buffer: With --sampler shards: objects of a process that are mixed at a time.
         workers: Threads that decode pictures ahead of the training; also the largest number of
             batches kept ready. The number does not change the result.
     """
@@ -113,6 +115,7 @@ class DataConfig:
     cache: bool = False
     cache_device: bool = False
     sampler: str = "shuffled"
+    shuffle_buffer: Annotated[int, Meta(ge=1, le=10**9)] = 2000
     workers: Annotated[int, Meta(ge=1, le=1024)] = 1
 
     @property
@@ -309,7 +312,7 @@ class TrainConfig:
             check_options(group)
         for kind, chosen, own in (
             ("scheduler", self.optim.schedule, ("cosine", "trapezoid")),
-            ("sampler", self.views.sampler, ("shuffled",)),
+            ("sampler", self.views.sampler, ("shuffled", "shards")),
         ):
             if chosen not in (names := (*own, *plugins.added(kind))):
                 raise UserError(f"{kind} {chosen[:60]!r}: expected one of {', '.join(names)}")
@@ -416,6 +419,7 @@ _OVERRIDABLE = {
     for f in fields(kind)
     if f.name not in {*("extra", "overfit", "train_on_gso", "cache", "cache_device", "workers")}
     and f.name not in {*("optimizer", "optimizer_options", "lr_of", "sampler", "extra_weights")}
+    and f.name != "shuffle_buffer"
     and not f.name.startswith("made")
 }
 STEP_SIZE = {"views.batch_size", "views.accumulate"}

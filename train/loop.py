@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from gamba_warp.data.shard_cache import Unreachable
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json
 from gamba_warp.image_metrics import METRICS
@@ -228,6 +229,10 @@ class Trainer:
                     self._validate()
                     self._compare_ends()
                 self.save()
+        except Unreachable:
+            if self.world.size == 1:  # else the others wait for this process in an exchange
+                self.save()
+            raise
         finally:
             self._batches.close()
             bar.close()

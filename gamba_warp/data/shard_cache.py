@@ -1,15 +1,19 @@
-"""Tars on a server, kept in a folder of limited size. Needs the package ``webdataset``."""
+"""Tars of shards: beside their index, or on a server and kept in a folder of limited size.
+
+Those of a server need the package ``webdataset``.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import re
+import stat
 import subprocess
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple, cast
 
 from ..errors import UserError, first_line
 from ..files import atomic_path
@@ -17,6 +21,7 @@ from ..versions import require
 
 # Addresses that are opened; others, such as webdataset's "pipe:", would run commands of the index.
 ADDRESS = r"^(https?|s3|gs)://[A-Za-z0-9][A-Za-z0-9_.:/@%~+-]{0,999}$"
+CACHE = "cache"  # folder of fetched tars
 TRIES = 4
 _DELAY = 1.0  # seconds before the second try; doubled each time
 _PART = 1 << 20  # bytes
@@ -30,6 +35,7 @@ class Source(NamedTuple):
     """Tar of an index.
 
     Attributes:
+        folder: of the index.
         name: of the file.
         bytes: its size.
         sha256: of the file.
@@ -37,22 +43,53 @@ class Source(NamedTuple):
         cache_bytes: largest size of all kept tars.
     """
 
+    folder: Path
     name: str
     bytes: int
     sha256: str
     address: str
     cache_bytes: int
 
+    def path(self) -> Path:
+        """Return the path of the tar, which is fetched if it lies elsewhere.
 
-def fetch(source: Source, folder: Path) -> Path:
+        Raises:
+            UserError: it is missing, or not of the size that the index states.
+            Unreachable: it cannot be fetched.
+        """
+        if self.address:
+            return _fetch(self)
+        path = self.folder / self.name
+        try:
+            found = os.lstat(path)
+        except OSError as error:
+            raise UserError(f"{path}: {error.strerror or error}") from error
+        if not stat.S_ISREG(found.st_mode):
+            raise UserError(f"{path}: not a plain file")
+        if found.st_size != self.bytes:
+            sizes = f"{found.st_size:,} bytes, not {self.bytes:,}"
+            raise UserError(f"{path}: cut short or changed ({sizes})")
+        return path
+
+    def open(self) -> BinaryIO:
+        """Open the tar, unbuffered; raises as ``path``."""
+        for _ in range(3):  # another process may remove it from the cache meanwhile
+            path = self.path()
+            try:
+                return cast(BinaryIO, open(path, "rb", buffering=0))
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                raise UserError(f"{path}: {error.strerror or error}") from error
+        raise UserError(f"{path}: removed as soon as it is fetched")
+
+
+def _fetch(source: Source) -> Path:
     """Return the path of a tar in the cache, after fetching it if it is not there.
 
     Only one process of a machine fetches a tar. The ones used longest ago make room for it.
-
-    Raises:
-        Unreachable: it cannot be fetched, after ``TRIES`` tries, or is not what the index states.
-        UserError: the cache cannot be written.
     """
+    folder = source.folder / CACHE
     path = folder / source.name
     if _touched(path, source.bytes):
         return path
@@ -61,7 +98,7 @@ def fetch(source: Source, folder: Path) -> Path:
     from webdataset.cache import LRUCleanup
 
     folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder.parent / f".{source.name}.lock"):
+    with FileLock(source.folder / f".{source.name}.lock"):
         if _touched(path, source.bytes):  # by another process, meanwhile
             return path
         room = max(0, source.cache_bytes - source.bytes)
@@ -115,12 +152,12 @@ class _Broken(Exception):
 
 def _download(url: str, target: Path, most: int) -> tuple[str, int]:
     """Return SHA-256 and size of one transfer, which ends after ``most`` bytes."""
-    from webdataset import gopen
+    from webdataset.gopen import gopen, gopen_schemes
 
-    gopen.gopen_schemes.setdefault("s3", _open_s3)
+    gopen_schemes.setdefault("s3", _open_s3)
     digest, size = hashlib.sha256(), 0
     try:
-        stream = gopen.gopen(url)
+        stream = gopen(url)
     except FileNotFoundError as error:
         raise Unreachable(f"{url}: needs the program {error.filename}") from error
     with open(target, "wb") as file:

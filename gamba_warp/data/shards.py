@@ -14,12 +14,10 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
-import stat
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, BinaryIO, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -31,10 +29,9 @@ from ..untrusted.archives import files_in_tar
 from ..untrusted.documents import parse_document, read_document
 from ..untrusted.names import parts_of, plain_name
 from .layouts import DecodedPicture, ObjectFiles, object_of
-from .shard_cache import ADDRESS, Source, fetch
+from .shard_cache import ADDRESS, Source
 
 INDEX = "shards.json"
-CACHE = "cache"  # folder of fetched tars
 FORMAT, VERSION = "gamba-shards", 1
 DOCUMENT = "json"  # suffix of an object's document
 _MAX_PICTURE = 256 << 20  # bytes of an encoded picture
@@ -148,7 +145,7 @@ class Shards:
             raise UserError(f"{folder}: the shards have no objects")
         self.size, self.split_version = index.size, index.split_version
         self.sources = [
-            Source(s.name, s.bytes, s.sha256, index.address, index.cache_bytes)
+            Source(folder, s.name, s.bytes, s.sha256, index.address, index.cache_bytes)
             for s in index.shards
         ]
         self.splits = [shard.split for shard in index.shards]
@@ -170,47 +167,15 @@ class Shards:
         text = f"{self.sources[place.shard].sha256} {place.start} {place.size}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-    def path(self, shard: int) -> Path:
-        """Return the path of a tar, which is fetched if it lies elsewhere.
-
-        Raises:
-            UserError: it is missing, or not of the size that the index states.
-            Unreachable: it cannot be fetched.
-        """
-        source = self.sources[shard]
-        if source.address:
-            return fetch(source, self.folder / CACHE)
-        path = self.folder / source.name
-        try:
-            found = os.lstat(path)
-        except OSError as error:
-            raise UserError(f"{path}: {error.strerror or error}") from error
-        if not stat.S_ISREG(found.st_mode):
-            raise UserError(f"{path}: not a plain file")
-        if found.st_size != source.bytes:
-            sizes = f"{found.st_size:,} bytes, not {source.bytes:,}"
-            raise UserError(f"{path}: cut short or changed ({sizes})")
-        return path
-
     def bytes(self, place: Place) -> bytes:
-        """Read a part of a tar; raises as ``path``."""
-        with self._open(place.shard) as file:
+        """Read a part of a tar; raises as ``Source.path``."""
+        source = self.sources[place.shard]
+        with source.open() as file:
             file.seek(place.start)
             data = file.read(place.size)
         if len(data) < place.size:
-            raise UserError(f"{self.folder / self.sources[place.shard].name}: cut short")
+            raise UserError(f"{source.folder / source.name}: cut short")
         return data
-
-    def _open(self, shard: int) -> BinaryIO:
-        for _ in range(3):  # another process may remove it from the cache meanwhile
-            path = self.path(shard)
-            try:
-                return open(path, "rb", buffering=0)  # type: ignore[return-value]
-            except FileNotFoundError:
-                continue
-            except OSError as error:
-                raise UserError(f"{path}: {error.strerror or error}") from error
-        raise UserError(f"{path}: removed as soon as it is fetched")
 
     def read(self, uid: str) -> ObjectFiles:
         """Read the cameras of an object.
@@ -221,7 +186,7 @@ class Shards:
         """
         place, key = self.places[uid], f"{key_of(uid)}."
         source = f"{self.folder / self.sources[place.shard].name}: {uid}"
-        with self._open(place.shard) as file:
+        with self.sources[place.shard].open() as file:
             members = files_in_tar(file, place.start, place.size, source)
         files = dict[str, ShardPicture]()
         for name, (start, size) in members.items():
@@ -257,7 +222,7 @@ class ShardPicture(DecodedPicture):
         return hash(self.name)
 
     def content(self) -> bytes:
-        """Return the bytes of the picture's file; raises as ``Shards.path``."""
+        """Return the bytes of the picture's file; raises as ``Source.path``."""
         if self.place.size > _MAX_PICTURE:
             raise UserError(f"{self}: over {_MAX_PICTURE >> 20} MB")
         return self.shards.bytes(self.place)

@@ -213,6 +213,33 @@ def data_pack_command(
 
 
 @ranged
+def data_fetch_command(
+    out: tyro.conf.Positional[Path],
+    address: str,
+    cache_gb: Annotated[float, Meta(ge=0.001, le=1e6)] = 100.0,
+) -> int:
+    """Use the shards of a server: OUT then is a dataset, whose shards are fetched when needed.
+
+    Writes OUT/shards.json. Fetched shards stay in OUT/cache; the ones used longest ago make room.
+    Run it again with another address or cache; what is in the cache stays.
+
+    Args:
+        out: folder of the index and the cache, on this machine's own disk.
+        address: folder of the shards: http(s)://, s3:// (needs the program aws) or gs:// (gsutil).
+        cache_gb: largest size of the cache, gigabytes.
+    """
+    from .pack import take_index
+
+    index = take_index(address, out, int(cache_gb * 1e9))
+    size = sum(shard.bytes for shard in index.shards) / 1e9
+    objects = sum(len(shard.objects) for shard in index.shards)
+    counts = f"{counted(objects, 'object')} in {counted(len(index.shards), 'shard')}, {size:.1f} GB"
+    print(f"{counts}, at {index.address}")
+    print(f"next: gamba train {out} --sampler shards ...")
+    return 0
+
+
+@ranged
 def data_objaverse_command(
     out: tyro.conf.Positional[Path],
     source: str,

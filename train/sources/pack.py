@@ -7,7 +7,9 @@ import io
 import itertools
 import json
 import os
+import re
 import tarfile
+import tempfile
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -22,10 +24,12 @@ from gamba_warp.batch import EXPECTED, progress_bar
 from gamba_warp.data import shards
 from gamba_warp.data.dataset import SPLITS, ViewDataset, open_dataset, splits_of
 from gamba_warp.data.layouts import DecodedPicture
+from gamba_warp.data.shard_cache import ADDRESS, download
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_path, only_process, output_folder, sha256, write_text
-from gamba_warp.untrusted.documents import MAX_BYTES, read_bytes
+from gamba_warp.untrusted.documents import MAX_BYTES, parse_document, read_bytes
 from gamba_warp.untrusted.names import parts_of
+from gamba_warp.versions import require
 
 _AHEAD = 2  # objects read ahead, per thread
 _MOST = 1 << 30  # bytes of a picture's file
@@ -286,3 +290,36 @@ def _write_shard(path: Path, split: str, blocks: Iterator[Block]) -> shards.Shar
                 objects.append((block.uid, start, tar.offset - start))
         size, digest = os.stat(temporary).st_size, sha256(temporary)
     return shards.Shard(name=path.name, split=split, bytes=size, sha256=digest, objects=objects)
+
+
+def take_index(address: str, out: Path, cache_bytes: int) -> shards.Index:
+    """Write the index of shards on a server; their tars are fetched when they are used.
+
+    Args:
+        address: address of their folder: http(s)://, s3:// or gs://.
+        out: folder for the index and the cache; made, or of the same kind.
+        cache_bytes: largest size of all tars in the cache.
+
+    Raises:
+        UserError: the address is none, its index cannot be fetched or is invalid or unfinished, or
+            the folder has other files.
+    """
+    if not re.fullmatch(ADDRESS, address):
+        raise UserError(f"{address[:200]}: expected http(s)://, s3:// or gs://, in plain letters")
+    if (out / shards.INDEX).exists():
+        if not shards.read_index(out).address:
+            raise UserError(f"{out}: holds shards of its own; give another folder")
+    elif out.is_dir() and (names := [p.name for p in out.iterdir() if p.name[0] != "."]):
+        raise UserError(f"{out}: holds other files ({min(names)}); give an empty folder")
+    require("webdataset")
+    address = address.rstrip("/")
+    url = f"{address}/{shards.INDEX}"
+    with tempfile.TemporaryDirectory() as folder:
+        download(url, Path(folder) / shards.INDEX, MAX_BYTES)
+        content = read_bytes(Path(folder) / shards.INDEX)
+    index = shards.checked_index(parse_document(content, shards.Index, url), url)
+    if not index.finished or not index.shards:
+        raise UserError(f"{url}: unfinished shards")
+    index.address, index.cache_bytes = address, cache_bytes
+    _write_index(output_folder(out), index)
+    return index

@@ -31,9 +31,9 @@ def cases(settings: Settings) -> list[Case]:
         f"Batches of {_BATCH} objects in {_NOVEL + 1} views of {_SIZE}², half of them mirrored and "
         f"three in ten recoloured, prepared by {_WORKERS} threads and taken at once, from the "
         "first one on. Views are those of --data, or made up; up to "
-        f"{_OBJECTS} objects, so that all lie in the system's own cache of files. From there the "
-        "pictures are decoded, or were decoded before, into memory or onto the device; or they were "
-        "resized into shards. "
+        f"{_OBJECTS} objects, so that all lie in the system's own cache of files. "
+        "Pictures are decoded, or were decoded before, into memory or onto the device, or resized "
+        "into shards before. "
         "There is no oracle: a test holds the batches to be the same to the bit."
     )
     return [Case(op="loader", name="views", text=text, build=partial(_build, settings), axis=None)]
