@@ -45,7 +45,7 @@ _GROUPS = {
     "MEASURES": "RESULTS BENCH STRESS",
     "TRAIN_DATA": "train.data train.data.made train.sources",
     "TRAIN": "train.config train.objective train TRAIN_DATA",
-    "EVAL": "eval eval.views eval.shapes",
+    "EVAL": "eval eval.views eval.shapes eval.join",
 }
 # package | holds | may import | may import inside functions
 _TABLE = """
@@ -90,6 +90,7 @@ train | batches, loop, checkpoints | LIBRARY train.config train.objective TRAIN_
 eval | the report that both evaluations share | RESULTS |
 eval.views | PSNR, SSIM, LPIPS; baselines | RESULTS eval |
 eval.shapes | Chamfer, IoU, F-score | RESULTS eval |
+eval.join | reports of shards | core untrusted eval eval.views eval.shapes |
 gpu_check | the checks on a CUDA machine | MEASURES measure |
 ablation | rows trained and evaluated alike | RESULTS | measure TRAIN EVAL
 commands | commands, by subject | MEASURES measure ablation gpu_check | TRAIN EVAL

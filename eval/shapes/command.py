@@ -41,6 +41,8 @@ class ShapesOptions:
         out: Folder for report.json, objects.csv, table.md and table.tex. An interrupted evaluation
             resumes there.
         limit: Number of objects, evenly spaced in the order of names; all by default.
+        shard: i/n takes every n-th of these objects from the i-th, for n machines; gamba eval-join
+            joins their reports.
         objects: Text file of the objects of --protocol gso in place of its own list, one name a
             line; the report states that.
         baseline: Folders of other predictions of the same objects: PRED is compared with each,
@@ -85,6 +87,7 @@ class ShapesOptions:
     gt: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="GT")] = None
     out: Path | None = None
     limit: Annotated[int, Meta(ge=1)] | None = None
+    shard: str | None = None
     objects: Path | None = None
     baseline: tuple[Path, ...] = ()
     protocol: str = "default"
@@ -131,12 +134,14 @@ def eval_geometry_command(
         return _explain(options)
     if options.pred is None or options.gt is None:
         raise UserError("give PRED and GT: two files or two folders")
-    from ..report import FAILED, count_line, csv_of, json_of, summary_lines
+    from ..report import FAILED, count_line, csv_of, json_of
     from .pairs import evaluate_shapes
     from .protocol import chosen_protocol
-    from .table import page
+    from .table import text_of
 
     protocol = chosen_protocol(options)
+    if options.sensitivity and options.shard is not None:
+        raise UserError("--sensitivity: cannot be divided by --shard")
     if options.sensitivity:
         from .sensitivity import evaluate_variants
 
@@ -157,23 +162,8 @@ def eval_geometry_command(
     if json or csv:
         print(json_of(report) if json else csv_of(report), end="")
         return code
-    changes = f", changed: {', '.join(protocol.changes())}" if protocol.changes() else ""
-    print(f"protocol {protocol.name}{changes}")
-    for key in ("axes", "flags"):
-        for side, counts in report[key].items():
-            if counts:
-                text = ", ".join(f"{count} {word}" for word, count in counts.items())
-                print(f"{side + ' ' + key:<24} {text} of {report['num_ok']}")
-    if any("unknown" in counts for counts in report["axes"].values()):
-        print(f"{'':<24} unknown axes: coordinates are used as they are (--pred-axes, --up)")
-    print("\n".join(summary_lines(report)))
-    beside = 0
-    if report["baselines"]:
-        print("\n" + page(report), end="")
-        for name, part in report["baselines"].items():
-            beside += len(part["failures"])
-            for item in part["failures"]:
-                print(f"failed: {item['name']} ({name}): {item['reason']}")
+    print(text_of(report, protocol), end="")
+    beside = sum(len(part["failures"]) for part in report["baselines"].values())
     print(count_line(report, options.out, beside))
     return code
 

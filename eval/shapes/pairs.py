@@ -26,6 +26,7 @@ from gamba_warp.files import output_folder, sha256, visible, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes, object_names
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_lines
+from gamba_warp.untrusted.ranges import shard_numbers
 from gamba_warp.versions import __version__, installed
 
 from ..report import (
@@ -137,10 +138,16 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     assert options.pred is not None and options.gt is not None  # checked by the command
     dataset, known = open_objects(options.data)
     found = find_all(options.pred, options.baseline, options.gt, listed, known)
-    if options.limit is not None:
-        names = {pair.name for pairs, _ in found.values() for pair in pairs}
-        names |= {each["name"] for _, failures in found.values() for each in failures}
-        found = {name: limited(*each, names, options.limit) for name, each in found.items()}
+    names = {pair.name for pairs, _ in found.values() for pair in pairs}
+    names |= {each["name"] for _, failures in found.values() for each in failures}
+    if options.limit is not None or options.shard is not None:
+        from gamba_warp.data.dataset import evenly
+
+        first, count = shard_numbers(options.shard or "0/1")
+        kept = {*evenly(sorted(names), options.limit or len(names))[first::count]}
+        if not kept:
+            raise UserError(f"--shard {options.shard}: there are too few objects for it")
+        found = {name: only(*each, kept) for name, each in found.items()}
     if options.paint and options.out is None:
         raise UserError("--paint: needs --out")
     folder = output_folder(options.out) if options.out is not None else None
@@ -160,34 +167,62 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
             name: failures + run(pairs, **extra[name]) for name, (pairs, failures) in found.items()
         }
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
-    predicted = objects.pop(PREDICTED)
-    report = make_report(
-        protocol.to_json(),
-        predicted,
-        {"gamba_warp": __version__} | installed(*PACKAGES),
-        left_out=_NO_MEAN,
-        inputs={side: path.name if path else None for side, path in named.items()},
-        **summaries(predicted),
-        baselines={},
-        differences={},
-    )
-    for name, records in objects.items():
-        other = over_objects(records, _NO_MEAN) | summaries(records)
-        report["baselines"][name] = finite_or_none(other)
-        report["differences"][name] = differences_of(report["objects"], other["objects"])
+    versions = {"gamba_warp": __version__} | installed(*PACKAGES)
+    inputs = {side: path.name if path else None for side, path in named.items()}
+    report = make_shapes_report(protocol.to_json(), objects, versions, inputs)
     if listed:
         done = [record["name"] for record in report["objects"] if record["status"] == OK]
         report["evaluation"] = gso.protocol_of(done, listed)
+    if options.shard is not None:
+        report["shard"] = options.shard
     if folder is not None:
-        save_report(report, folder)
-        write_text(folder / "table.md", page(report))
-        write_text(folder / "table.tex", latex(lines_of(report, "mean")))
+        save_shapes_report(report, folder)
         if options.paint:
             from .painted import painted_page
 
             painted_page(report, folder, options.paint)
         cache.end()
     return report
+
+
+def make_shapes_report(
+    protocol: dict[str, Any],
+    objects: dict[str, list[dict[str, Any]]],
+    versions: dict[str, str],
+    inputs: dict[str, str | None],
+) -> dict[str, Any]:
+    """Return the report of ``evaluate_shapes``, but ``evaluation``.
+
+    Args:
+        protocol: of the comparison.
+        objects: records of the objects, by row: ``PREDICTED`` and the baselines.
+        versions: of packages by name.
+        inputs: names of the compared folders.
+    """
+    predicted = objects[PREDICTED]
+    report = make_report(
+        protocol,
+        predicted,
+        versions,
+        left_out=_NO_MEAN,
+        inputs=inputs,
+        **summaries(predicted),
+        baselines={},
+        differences={},
+    )
+    for name, records in objects.items():
+        if name != PREDICTED:
+            other = over_objects(records, _NO_MEAN) | summaries(records)
+            report["baselines"][name] = finite_or_none(other)
+            report["differences"][name] = differences_of(report["objects"], other["objects"])
+    return report
+
+
+def save_shapes_report(report: dict[str, Any], folder: Path) -> None:
+    """Write report.json, objects.csv, table.md and table.tex; raises as ``save_report``."""
+    save_report(report, folder)
+    write_text(folder / "table.md", page(report))
+    write_text(folder / "table.tex", latex(lines_of(report, "mean")))
 
 
 class _CacheLine(msgspec.Struct):
@@ -271,13 +306,10 @@ def find_all(
     return {name: find_pairs(path, gt, wanted, known) for name, path in folders.items()}
 
 
-def limited(
-    pairs: list[Pair], failures: list[dict[str, str]], names: Iterable[str], limit: int
+def only(
+    pairs: list[Pair], failures: list[dict[str, str]], kept: Container[str]
 ) -> PairsAndFailures:
-    """Keep the objects that are among ``limit`` of the names, evenly spaced in their order."""
-    from gamba_warp.data.dataset import evenly
-
-    kept = {*evenly(sorted(names), limit)}
+    """Keep the objects of these names."""
     return [p for p in pairs if p.name in kept], [f for f in failures if f["name"] in kept]
 
 

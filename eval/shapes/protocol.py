@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -223,7 +223,12 @@ def read_protocol(choice: str) -> GeometryProtocol:
     if not path.is_file():
         raise UserError(f"--protocol {choice}: neither {', '.join(PRESETS)} nor a file")
     value = read_document(path, dict[str, Any])
-    value = dict(inner if isinstance(inner := value.get("protocol"), dict) else value)
+    return protocol_of(inner if isinstance(inner := value.get("protocol"), dict) else value, path)
+
+
+def protocol_of(value: Mapping[str, Any], path: Path) -> GeometryProtocol:
+    """Return a protocol of its fields; ``path`` is for errors, as of ``read_protocol``."""
+    value = dict(value)
     version, words = value.pop("version", VERSION), value.pop("definitions", None)
     if version != VERSION:
         shown = str(version)[:40]

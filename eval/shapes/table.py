@@ -6,8 +6,9 @@ from collections import Counter
 from typing import Any
 
 from ..averages import LEVEL, intervals_of, mean_of, median, median_of, minus
-from ..report import OK, flat
+from ..report import OK, flat, summary_lines
 from ..tables import Column, Lines, Row, figures, markdown
+from .protocol import GeometryProtocol
 
 PREDICTED = "predicted"  # name of the row under test
 METRICS = (
@@ -60,6 +61,27 @@ def page(report: dict[str, Any]) -> str:
     )
     means, medians = (markdown(lines_of(report, of)) for of in ("mean", "median"))
     return "\n\n".join([means, note, "Medians over objects:", medians]) + "\n"
+
+
+def text_of(report: dict[str, Any], protocol: GeometryProtocol) -> str:
+    """Return the text that ``gamba eval-geometry`` prints of a report."""
+    changes = f", changed: {', '.join(protocol.changes())}" if protocol.changes() else ""
+    lines = [f"protocol {protocol.name}{changes}"]
+    for key in ("axes", "flags"):
+        for side, counts in report[key].items():
+            if counts:
+                text = ", ".join(f"{count} {word}" for word, count in counts.items())
+                lines.append(f"{side + ' ' + key:<24} {text} of {report['num_ok']}")
+    if any("unknown" in counts for counts in report["axes"].values()):
+        note = "unknown axes: coordinates are used as they are (--pred-axes, --up)"
+        lines.append(f"{'':<24} {note}")
+    lines += summary_lines(report)
+    if report["baselines"]:
+        lines += ["", page(report).rstrip("\n")]
+        for name, part in report["baselines"].items():
+            for item in part["failures"]:
+                lines.append(f"failed: {item['name']} ({name}): {item['reason']}")
+    return "\n".join(lines) + "\n"
 
 
 def lines_of(report: dict[str, Any], of: str) -> Lines:

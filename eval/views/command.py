@@ -17,7 +17,7 @@ from gamba_warp.conventions import DEFAULT_DISTANCE, Detail, DeviceChoice, Preci
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_options
 from gamba_warp.fitting.config import FitConfig, Steps
-from gamba_warp.untrusted.ranges import check_options, option, ranged
+from gamba_warp.untrusted.ranges import check_options, option, ranged, shard_numbers
 from gamba_warp.versions import require
 
 from ..presets import PRESETS
@@ -44,6 +44,8 @@ class ViewsOptions:
         views: Number of views of an object, input included, evenly spaced; all by default.
         size: Height of the pictures compared; the files' own by default.
         limit: Number of objects, evenly spaced in the order of names; all by default.
+        shard: i/n takes every n-th of these objects from the i-th, for n machines; gamba eval-join
+            joins their reports.
         objects: Text file of the objects of --protocol gso in place of its own list, one name a
             line; the report states that.
         baselines: Also score an empty picture, a copy of the input, the input as a billboard, and
@@ -86,6 +88,7 @@ class ViewsOptions:
     views: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     size: Annotated[int, Meta(ge=16, le=4096)] | None = None
     limit: Annotated[int, Meta(ge=1)] | None = None
+    shard: str | None = None
     objects: Path | None = None
     baselines: bool = True
     retrieval_data: tuple[Path, ...] = ()
@@ -121,6 +124,10 @@ class ViewsOptions:
             raise UserError("--objects: needs --protocol gso")
         if self.retrieval_data and not self.baselines:
             raise UserError("--retrieval-data: needs the baselines")
+        if self.shard is not None:
+            shard_numbers(self.shard)
+            if (self.ceiling or "").isdigit():
+                raise UserError("--shard: --ceiling takes the folder of all fits, not a number")
         for name in ("save_gaussians", "save_pictures"):
             if getattr(self, name) and self.out is None:
                 raise UserError(f"{option(name)}: needs --out")

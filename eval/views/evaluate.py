@@ -6,7 +6,7 @@ import hashlib
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from gamba_warp.fitting.objects import choose_objects
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.untrusted.ranges import shard_numbers
 from gamba_warp.versions import __version__, installed
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import FETCH, lpips_available
@@ -80,7 +81,8 @@ class Job:
         device: torch device.
         baselines: by name.
         left_out: reasons by name, of unavailable baselines.
-        missing: failure records of the protocol's objects that the dataset lacks.
+        missing: failure records of the protocol's objects that the dataset lacks; of the first
+            shard only.
         failures: ``{name, reason}`` of failed baselines.
         retrieval: the baseline of this name, if used.
         meshes: of the training objects, for the retrieval's shapes; or None.
@@ -142,6 +144,10 @@ def open_job(options: ViewsOptions) -> Job:
         evaluation, uids = gso.protocol_of(uids, names), [uid for uid in uids if uid in names]
         if not uids:
             raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
+    first, count = shard_numbers(options.shard or "0/1")
+    uids = uids[first::count]
+    if not uids:
+        raise UserError(f"--shard {options.shard}: there are too few objects for it")
     _check_outputs(options, uids)
     size = gso.SIZE if evaluation else options.size
     predictions = open_predictions(
@@ -185,7 +191,8 @@ def open_job(options: ViewsOptions) -> Job:
     job = Job(predictions, dataset, uids, protocol, network, device)
     job.retrieval_data = [folder.resolve().name for folder in options.retrieval_data]
     reason = f"an object of --protocol gso that is not in {options.data}"
-    job.missing = [failure(name, reason) for name in (evaluation or {"missing": ()})["missing"]]
+    if first == 0 and evaluation:
+        job.missing = [failure(name, reason) for name in evaluation["missing"]]
     folder = None if options.out is None else output_folder(options.out)
     ceiling = {}
     if options.ceiling is not None:
@@ -276,6 +283,8 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
             raise
         interrupted = True
     report = report_of(job, options.data, objects) | {"interrupted": interrupted}
+    if options.shard is not None:
+        report["shard"] = options.shard
     if folder:
         save_report(report, folder)
         write_text(folder / "table.md", page(report))
@@ -423,46 +432,75 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
 
 
 def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the report: that of ``make_report``, with entries for the baselines.
+    """Return the report of ``make_views_report``.
 
     Args:
         job: shared state.
         data: the dataset, whose name the report holds.
         objects: the records; those of ``job.missing`` are added.
+    """
+    protocol = asdict(job.protocol) | {
+        "source": job.predictions.source,
+        "data": data.name,
+        **named(job.uids),
+        "baselines": {name: MEANING[name] for name in job.baselines},
+        "contact_sheet": RULE,
+        **({"retrieval_data": job.retrieval_data} if job.retrieval_data else {}),
+    }
+    versions = {"gamba_warp": __version__} | installed("torch", "kornia")
+    every = objects + job.missing
+    return make_views_report(protocol, every, versions, job.left_out, job.failures)
+
+
+def named(uids: Iterable[str]) -> dict[str, Any]:
+    """Return the fields of a protocol that name its objects."""
+    uids = sorted(uids)
+    digest = hashlib.sha256(os.fsencode("\n".join(uids))).hexdigest()
+    return {"uids": uids, "uids_sha256": digest}
+
+
+def make_views_report(
+    protocol: dict[str, Any],
+    objects: list[dict[str, Any]],
+    versions: dict[str, str],
+    left_out: Mapping[str, str],
+    failures: Iterable[dict[str, str]],
+) -> dict[str, Any]:
+    """Return the report: that of ``make_report``, with entries for the baselines.
+
+    Args:
+        protocol: definition of the numbers, with the objects.
+        objects: their records.
+        versions: of packages by name.
+        left_out: reasons by name, of unavailable baselines.
+        failures: ``{name, reason}`` of failed baselines.
 
     Returns:
         The report, with ``baselines`` (their means), ``left_out_baselines`` (reasons by name), the
         rows ``table`` and ``differences`` of ``table.md``, ``nearly_empty`` (counts of views and
         objects), and ``without_nearly_empty``: both sets of rows without these views.
     """
+    objects = sorted(objects, key=lambda record: record["name"])
     done = [record for record in objects if record["status"] == OK]
     others = {
         name: {r["name"]: r["baselines"][name] for r in done if name in r["baselines"]}
-        for name in job.baselines
+        for name in protocol["baselines"]
     }
     candidates = {"model": {record["name"]: record for record in done}} | others
-    empty = [name for name, records in others.items() if not records]
-    protocol = asdict(job.protocol) | {
-        "source": job.predictions.source,
-        "data": data.name,
-        "uids": job.uids,
-        "uids_sha256": hashlib.sha256(os.fsencode("\n".join(job.uids))).hexdigest(),
-        "baselines": {name: MEANING[name] for name in job.baselines},
-        "contact_sheet": RULE,
-        **({"retrieval_data": job.retrieval_data} if job.retrieval_data else {}),
-    }
     report = make_report(
         protocol,
-        objects + job.missing,
-        {"gamba_warp": __version__} | installed("torch", "kornia"),
+        objects,
+        versions,
         left_out=("baselines", "num_nearly_empty", "retrieval", "pictures"),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},
-        left_out_baselines=job.left_out | dict.fromkeys(empty, "none of the objects has it"),
+        left_out_baselines=dict(left_out)
+        | {name: "none of the objects has it" for name, records in others.items() if not records},
         **tables_of(candidates),
         nearly_empty=count_nearly_empty(done),
         without_nearly_empty=tables_of(without_nearly_empty(candidates)),
     )
-    report["failures"] += job.failures
+    unique = {(failure["name"], failure["reason"]) for failure in failures}
+    report["failures"] += [{"name": name, "reason": reason} for name, reason in sorted(unique)]
     return report
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass
@@ -166,3 +167,15 @@ def ranged(command: Function) -> Function:
         return command(*args, **kwargs)
 
     return typing.cast(Function, checked)
+
+
+def shard_numbers(text: str) -> tuple[int, int]:
+    """Return i and n of ``--shard i/n``, which takes every n-th object from the i-th.
+
+    Raises:
+        UserError: the text is not of the form i/n with 0 <= i < n.
+    """
+    match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
+    if not match or not int(match[1]) < int(match[2]):
+        raise UserError(f"--shard {text[:40]}: expected i/n with 0 <= i < n, such as 0/4")
+    return int(match[1]), int(match[2])

@@ -12,17 +12,18 @@ from helpers.nodes.processes import environment
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "docs" / "examples" / "slurm.sh"
+ARRAY = SCRIPT.with_name("slurm_array.sh")
 PAGE = (ROOT / "docs" / "sixteen-gpus.md").read_text(encoding="utf-8")
 
 
-def slurm(folder, *arguments):
-    """Run the script with stand-ins for scontrol and srun that print their arguments."""
+def slurm(folder, *arguments, script=SCRIPT, **more):
+    """Run a script with stand-ins for scontrol and srun that print their arguments."""
     for name, text in (("scontrol", "printf 'node7\\nnode8\\n'"), ("srun", 'printf "%s\\n" "$@"')):
         (folder / name).write_text(f"#!/bin/bash\n{text}\n")
         (folder / name).chmod(0o755)
     place = {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_JOB_ID": "41234"}
-    place |= {"SLURM_JOB_NODELIST": "node[7-8]", "SLURM_NNODES": "2"}
-    command = ["bash", str(SCRIPT), *arguments]
+    place |= {"SLURM_JOB_NODELIST": "node[7-8]", "SLURM_NNODES": "2", **more}
+    command = ["bash", str(script), *arguments]
     return subprocess.run(command, env=place, capture_output=True, text=True, timeout=60)
 
 
@@ -44,9 +45,21 @@ def test_the_slurm_script_starts_torchrun_on_each_machine(tmp_path):
     assert missing.returncode == 2 and missing.stderr.startswith("usage:")
 
 
+def test_the_tasks_of_an_array_take_their_parts(tmp_path):
+    task = {"script": ARRAY, "SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "16"}
+    done = slurm(tmp_path, "data", "render", "my meshes", "--out", "DATA", **task)
+    wanted = ["gamba", "data", "render", "my meshes", "--out", "DATA", "--shard", "3/16"]
+    assert done.stdout.splitlines() == wanted, done.stderr
+    task |= {"SLURM_ARRAY_TASK_COUNT": "1", "PARTS": "8"}  # one task again, of eight
+    done = slurm(tmp_path, "eval-views", "--out", "EVAL", "--split", "test", **task)
+    assert done.stdout.split()[1:] == "eval-views --out EVAL/3 --split test --shard 3/8".split()
+    assert slurm(tmp_path, "eval-views", **task).returncode == 2
+
+
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
-def test_the_slurm_script_is_clean():
-    subprocess.run(["shellcheck", str(SCRIPT)], check=True, timeout=60)
+@pytest.mark.parametrize("script", [SCRIPT, ARRAY], ids=lambda path: path.name)
+def test_the_slurm_scripts_are_clean(script):
+    subprocess.run(["shellcheck", str(script)], check=True, timeout=60)
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ Failures are printed to stderr, and the exit code is then 1.
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -20,7 +19,7 @@ from msgspec import Meta
 from gamba_warp.batch import counted
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
-from gamba_warp.untrusted.ranges import Seed, ranged
+from gamba_warp.untrusted.ranges import Seed, ranged, shard_numbers
 
 from ..data.settings import Settings, Up
 from .objaverse_lists import Lists
@@ -55,10 +54,7 @@ class Share:
         Raises:
             UserError: the shard is not of the form i/n with 0 <= i < n.
         """
-        match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", self.shard)
-        if not match or not int(match[1]) < int(match[2]):
-            raise UserError(f"--shard {self.shard[:40]}: expected i/n with 0 <= i < n, such as 0/4")
-        return int(match[1]), int(match[2])
+        return shard_numbers(self.shard)
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
         """Select from the items."""

@@ -1,0 +1,1 @@
+"""Reports of shards, joined to one."""
