@@ -27,7 +27,7 @@ _Views = Annotated[int, Meta(ge=0, le=1000)]
 _Weight = Annotated[float, Meta(ge=0, le=1e6)]
 _Every = Annotated[int, Meta(ge=0, le=10**12)]
 RecipeName = Literal["paper", "tiny", "rays"]
-BestBy = Literal["psnr", "ssim", "lpips", "mask_iou"]  # of image_metrics.METRICS
+_BEST_BY = "psnr", "ssim", "lpips", "mask_iou"  # of image_metrics.METRICS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,8 +238,9 @@ class RunConfig:
         val_views: Novel views of each, evenly spaced in the list; --overfit takes all.
         val_extra: More datasets, whose held-out objects are validated separately, under their
             folder's name.
-        best_by: Figure of the best validation, whose weights are OUT/best.safetensors: of novel
-            views (of inputs without novel ones), the unweighted mean over DATA and --val-extra.
+        best_by: Figure of the best validation, whose weights are OUT/best.safetensors: psnr, ssim,
+            lpips, mask_iou or that of a plugin, of novel views (of inputs without novel ones), the
+            unweighted mean over DATA and --val-extra.
         save_every: Steps between two checkpoints; one is always saved at the end.
         keep: Number of checkpoints kept; the oldest are removed first.
         tensorboard: Write TensorBoard files, if it is installed.
@@ -269,7 +270,7 @@ class RunConfig:
     val_objects: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
     val_views: Annotated[int, Meta(ge=0, le=100_000)] = 4
     val_extra: tuple[Path, ...] = ()
-    best_by: BestBy = "psnr"
+    best_by: str = "psnr"
     save_every: _Count = 500
     keep: _Count = 2
     tensorboard: bool = True
@@ -313,6 +314,7 @@ class TrainConfig:
         for kind, chosen, own in (
             ("scheduler", self.optim.schedule, ("cosine", "trapezoid")),
             ("sampler", self.views.sampler, ("shuffled", "shards")),
+            ("image metric", self.run.best_by, _BEST_BY),
         ):
             if chosen not in (names := (*own, *plugins.added(kind))):
                 raise UserError(f"{kind} {chosen[:60]!r}: expected one of {', '.join(names)}")
@@ -324,8 +326,8 @@ class TrainConfig:
             )
         if self.run.best_by == "lpips" and self.loss.lpips == "off":
             raise UserError("--best-by lpips: --lpips off leaves it out")
-        if self.run.best_by == "ssim" and self.views.size < METRICS["ssim"].least_side:
-            raise UserError(f"--best-by ssim: needs --size {METRICS['ssim'].least_side} or more")
+        if self.views.size < (least := METRICS[self.run.best_by].least_side):
+            raise UserError(f"--best-by {self.run.best_by}: needs --size {least} or more")
         given, wanted = len(self.views.extra_weights), len(self.views.extra)
         if given not in (0, wanted):
             raise UserError(f"--extra-weights: {given} numbers for {wanted} of --extra")

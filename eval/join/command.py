@@ -35,16 +35,18 @@ def eval_join_command(
     """
     if not reports:
         raise UserError("give the report.json of each shard")
-    from gamba_warp.files import output_folder
+    from gamba_warp.files import output_folder, write_text
 
-    from ..report import count_line, json_of
+    from ..report import count_line, json_of, save_report
     from .join import join_reports
 
     joined = join_reports(reports)
     report = joined.report
     if out is not None:
-        joined.save(report, output_folder(out))
-    print(json_of(report) if json else joined.text(report), end="")
+        save_report(report, output_folder(out))
+        for name, text in joined.files.items():
+            write_text(out / name, text)
+    print(json_of(report) if json else joined.text, end="")
     beside = len(report["failures"]) - report["num_failed"]
     beside += sum(len(part.get("failures", ())) for part in report["baselines"].values())
     for item in report["failures"]:

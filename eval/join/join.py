@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -11,14 +11,12 @@ import msgspec
 from msgspec import Meta
 
 from gamba_warp.errors import UserError, first_line, one_line
-from gamba_warp.files import write_text
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.ranges import shard_numbers
 
-from ..report import save_report
-from ..shapes.pairs import make_shapes_report, save_shapes_report
+from ..shapes.pairs import make_shapes_report
 from ..shapes.protocol import protocol_of
-from ..shapes.table import PREDICTED, text_of
+from ..shapes.table import PREDICTED, tables_of, text_of
 from ..views.evaluate import make_views_report, named
 from ..views.table import page
 
@@ -43,11 +41,11 @@ class _Part(msgspec.Struct):
 
 
 class Joined(NamedTuple):
-    """Result of ``join_reports``: the report, its text, and the writer of its files."""
+    """Result of ``join_reports``: the report, the text to print, and files beside the report."""
 
     report: dict[str, Any]
-    text: Callable[[dict[str, Any]], str]
-    save: Callable[[dict[str, Any], Path], None]
+    text: str
+    files: dict[str, str]
 
 
 def join_reports(paths: Iterable[Path]) -> Joined:
@@ -145,12 +143,7 @@ def _join_views(parts: list[_Part]) -> Joined:
     protocol = parts[0].protocol | named(uids)
     report = make_views_report(protocol, _all(parts), parts[0].versions, left_out, beside)
     report["interrupted"] = False
-
-    def save(report: dict[str, Any], folder: Path) -> None:
-        save_report(report, folder)
-        write_text(folder / "table.md", page(report))
-
-    return Joined(report, page, save)
+    return Joined(report, page(report), {"table.md": page(report)})
 
 
 def _join_shapes(parts: list[_Part], path: Path) -> Joined:
@@ -172,4 +165,4 @@ def _join_shapes(parts: list[_Part], path: Path) -> Joined:
             "others": sorted({*chain.from_iterable(each["others"] for each in found)}),
         }
     protocol = protocol_of(first.protocol, path)
-    return Joined(report, lambda report: text_of(report, protocol), save_shapes_report)
+    return Joined(report, text_of(report, protocol), tables_of(report))

@@ -40,11 +40,10 @@ from ..report import (
     save_report,
     stdout_to_stderr,
 )
-from ..tables import latex
 from .command import ShapesOptions
 from .protocol import GeometryProtocol
 from .shape import SUFFIXES, Similarity
-from .table import PREDICTED, differences_of, lines_of, page, summaries
+from .table import PREDICTED, differences_of, summaries, tables_of
 
 if TYPE_CHECKING:
     from gamba_warp.data.dataset import ViewDataset
@@ -176,7 +175,9 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     if options.shard is not None:
         report["shard"] = options.shard
     if folder is not None:
-        save_shapes_report(report, folder)
+        save_report(report, folder)
+        for name, text in tables_of(report).items():
+            write_text(folder / name, text)
         if options.paint:
             from .painted import painted_page
 
@@ -216,13 +217,6 @@ def make_shapes_report(
             report["baselines"][name] = finite_or_none(other)
             report["differences"][name] = differences_of(report["objects"], other["objects"])
     return report
-
-
-def save_shapes_report(report: dict[str, Any], folder: Path) -> None:
-    """Write report.json, objects.csv, table.md and table.tex; raises as ``save_report``."""
-    save_report(report, folder)
-    write_text(folder / "table.md", page(report))
-    write_text(folder / "table.tex", latex(lines_of(report, "mean")))
 
 
 class _CacheLine(msgspec.Struct):

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..averages import LEVEL, intervals_of, mean_of, median, median_of, minus
 from ..report import OK, flat, summary_lines
-from ..tables import Column, Lines, Row, figures, markdown
+from ..tables import Column, Lines, Row, figures, latex, markdown
 from .protocol import GeometryProtocol
 
 PREDICTED = "predicted"  # name of the row under test
@@ -61,6 +61,11 @@ def page(report: dict[str, Any]) -> str:
     )
     means, medians = (markdown(lines_of(report, of)) for of in ("mean", "median"))
     return "\n\n".join([means, note, "Medians over objects:", medians]) + "\n"
+
+
+def tables_of(report: dict[str, Any]) -> dict[str, str]:
+    """Return the texts of table.md and table.tex, by these names."""
+    return {"table.md": page(report), "table.tex": latex(lines_of(report, "mean"))}
 
 
 def text_of(report: dict[str, Any], protocol: GeometryProtocol) -> str:

@@ -25,6 +25,8 @@ from gamba_warp.data.dataset import open_dataset
 from gamba_warp.data.preprocess import SamSegmenter
 from gamba_warp.errors import UserError
 from gamba_warp.eval.compare import html_page, join, markdown_page, read_reports
+from gamba_warp.eval.join.join import join_reports
+from gamba_warp.eval.report import save_report
 from gamba_warp.eval.shapes.load import load_shape
 from gamba_warp.eval.shapes.pairs import evaluate_pairs, find_pairs
 from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
@@ -254,6 +256,14 @@ def _compare(path: Path, out: Path) -> Any:
     return [markdown_page(joined, True), html_page(joined, True)]
 
 
+def _join(path: Path, out: Path) -> Any:
+    """Table of ``gamba eval-join`` for the only shard."""
+    joined = join_reports([path])
+    json.dumps(joined.report, allow_nan=False)
+    save_report(joined.report, out)
+    return joined.text, joined.files
+
+
 def _bench(path: Path, out: Path) -> Any:
     return [page.read_text(encoding="utf-8") for page in write_pages([read_document(path)], out)]
 
@@ -342,6 +352,7 @@ READERS = {
     "protocol": Reader(_protocol, checks.protocol, seeds.protocols),
     "plan": Reader(_plan, checks.plan, seeds.plans, 2),
     "compare": Reader(_compare, checks.pages, seeds.reports, 4),
+    "eval-join": Reader(_join, checks.nothing, seeds.shard_reports, 4),
     "bench": Reader(_bench, checks.pages, seeds.benches, 4),
     "stress": Reader(_numeric, checks.nothing, seeds.numeric, 2),
     "released": Reader(_released, checks.released, seeds.released, 2),

@@ -1,5 +1,6 @@
 """Plugins: each kind of addition in a run, what a run and a model record, and bad plugins."""
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -163,3 +164,48 @@ def test_rates_by_name_other_optimizers_and_partial_weights(tmp_path):
     theirs = source.state_dict()
     assert all(torch.equal(got.state_dict()[name], theirs[name]) for name in named["taken"])
     assert [line["step"] for line in lines(wide, "val")] == [0, 1]
+
+
+def test_the_best_by_a_metric_of_a_plugin(tmp_path):
+    """The error falls, and less is better, so the last validation is the best."""
+    data = micro.write_dataset(tmp_path / "clouds", 3)
+    with_it = {"best_by": "mae", "val_every": 2}
+    refused("image metric 'mae': expected one of psnr", run, data, tmp_path / "no", run=with_it)
+    with_it["plugin"] = (str(EXAMPLE),)
+    assert run(data, tmp_path / "run", run=with_it) == 0
+    errors = [line["mae_novel"] for line in lines(tmp_path / "run", "val")]
+    best = [line["mae"] for line in lines(tmp_path / "run", "best")]
+    assert best[-1] == min(errors) and best == sorted(best, reverse=True)
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["run"]["best_by"] == "mae"
+
+
+def installed(folder, name, text):
+    """Write a distribution with an entry point ``name`` of its module ``NAME_module``."""
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    group = f"[{plugins.GROUP}]\n{name} = {name}_module\n"
+    (info / "entry_points.txt").write_text(group)
+    (folder / f"{name}_module.py").write_text(text)
+
+
+def test_an_installed_plugin_is_loaded_by_its_name(tmp_path, monkeypatch):
+    text = "def register(plugin, by=1):\n    plugin.scheduler('steady', lambda done: 1.0 / by)\n"
+    installed(tmp_path / "site", "steadily", text)
+    refused("--plugin steadily: neither a .py file nor an installed", plugins.load, ["steadily"])
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    (record,) = plugins.load(["steadily", "by=2"])
+    assert record["name"] == "steadily" and record["options"] == {"by": 2}
+    assert plugins.added("scheduler")["steady"](0.5) == 0.5
+    content = (tmp_path / "site" / "steadily_module.py").read_bytes()
+    assert record["sha256"] == hashlib.sha256(content).hexdigest()
+    plugins.unload()
+    assert "steady" not in plugins.added("scheduler")
+
+
+def test_an_installed_plugin_that_fails_is_one_line(tmp_path, monkeypatch):
+    installed(tmp_path, "failing", "raise OSError('no such table')\n")
+    installed(tmp_path, "silent", "x = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    refused("--plugin failing: OSError: no such table", plugins.load, ["failing"])
+    refused("--plugin silent: has no function register", plugins.load, ["silent"])
