@@ -446,7 +446,7 @@ class Batches:
             edges = weights[order].cumsum()
             taken = np.searchsorted(edges, (np.arange(count) + rng.random()) * edges[-1] / count)
             return rng.permutation(order[np.minimum(taken, count - 1)])
-        if name == "shuffled":
+        if name in ("shuffled", "shards"):  # the latter with --overfit, which has one object
             return rng.permutation(count)
         order = np.asarray(
             added("sampler")[name](rng, [self.data.train.uids[i] for i in self.data.objects])

@@ -52,7 +52,8 @@ class ShardOrder:
 
     def __call__(self, epoch: int) -> np.ndarray:
         """Return the positions of an epoch among the objects, ``[length]`` int."""
-        from webdataset import SimpleShardList, shuffle, split_by_node
+        from webdataset.filters import shuffle
+        from webdataset.shardlists import SimpleShardList, split_by_node
 
         first, second = np.random.SeedSequence([self._seed, 4, epoch]).generate_state(2).tolist()
         listed = SimpleShardList(sorted(self._inside), seed=first)

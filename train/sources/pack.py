@@ -289,7 +289,8 @@ def _write_shard(path: Path, split: str, blocks: Iterator[Block]) -> shards.Shar
                     tar.addfile(member, io.BytesIO(content))
                 objects.append((block.uid, start, tar.offset - start))
         size, digest = os.stat(temporary).st_size, sha256(temporary)
-    return shards.Shard(name=path.name, split=split, bytes=size, sha256=digest, objects=objects)
+    about = {"name": path.name, "bytes": size, "sha256": digest, "objects": objects}
+    return shards.Shard(split=split, **about)  # pyright: ignore[reportArgumentType]: one of three
 
 
 def take_index(address: str, out: Path, cache_bytes: int) -> shards.Index:
