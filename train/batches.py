@@ -194,7 +194,7 @@ def _shards_of(train: ViewDataset, objects: list[int], config: TrainConfig) -> l
         size, room = sum(source.bytes for source in parts), parts[0].cache_bytes
         if size > room:
             raise UserError(
-                f"{folder}: its shards take {size / 1e9:.1f} GB, its cache {room / 1e9:.1f}: give "
+                f"{folder}: its shards take {size / 1e9:.3g} GB, its cache {room / 1e9:.3g}: give "
                 "--sampler shards, or a larger cache (gamba data fetch --cache-gb)"
             )
     return None

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, cast
 
 from ..errors import UserError, first_line
-from ..files import atomic_path
+from ..files import atomic_path, output_folder
 from ..versions import require
 
 # Addresses that are opened; others, such as webdataset's "pipe:", would run commands of the index.
@@ -25,6 +25,9 @@ CACHE = "cache"  # folder of fetched tars
 TRIES = 4
 _DELAY = 1.0  # seconds before the second try; doubled each time
 _PART = 1 << 20  # bytes
+_REST = 30.0  # seconds after a failure without another try: other threads want the same tar
+_PROGRAMS = {"http": "curl", "https": "curl", "s3": "aws", "gs": "gsutil"}
+_failed: dict[tuple[str, str], tuple[float, str]] = {}  # by address and name: when, and why
 
 
 class Unreachable(UserError):
@@ -97,14 +100,22 @@ def _fetch(source: Source) -> Path:
     from filelock import FileLock
     from webdataset.cache import LRUCleanup
 
-    folder.mkdir(parents=True, exist_ok=True)
+    output_folder(folder)
     with FileLock(source.folder / f".{source.name}.lock"):
         if _touched(path, source.bytes):  # by another process, meanwhile
             return path
+        when, reason = _failed.get((source.address, source.name), (-_REST, ""))
+        if time.monotonic() - when < _REST:
+            raise Unreachable(reason)
         room = max(0, source.cache_bytes - source.bytes)
         LRUCleanup(str(folder), room, keyfn=os.path.getmtime, interval=None).cleanup()
         with atomic_path(path) as temporary:
-            download(f"{source.address}/{source.name}", temporary, source.bytes, source.sha256)
+            try:
+                url = f"{source.address}/{source.name}"
+                download(url, temporary, source.bytes, source.sha256)
+            except Unreachable as error:
+                _failed[source.address, source.name] = time.monotonic(), str(error)
+                raise
     return path
 
 
@@ -171,7 +182,7 @@ def _download(url: str, target: Path, most: int) -> tuple[str, int]:
             if error.errno is not None:  # of the target
                 raise
             code = re.search(r"exit (-?\d+)", str(error))
-            program = url.partition(":")[0]
+            program = _PROGRAMS[url.partition(":")[0]]
             raise _Broken(f"{program} ended with code {code[1]}" if code else "broken") from error
     return digest.hexdigest(), size
 

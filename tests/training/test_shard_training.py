@@ -79,6 +79,7 @@ def fetch(address, out):
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
     monkeypatch.setattr(shard_cache, "_DELAY", 0.01)
+    monkeypatch.setattr(shard_cache, "_failed", {})
 
 
 def orders(names, buffer, processes, epoch, monkeypatch):
@@ -196,14 +197,19 @@ def test_the_cache_keeps_its_limit(packed, tmp_path):
         assert len(asked) > 6, "what was removed is fetched again"
 
 
-def test_a_dead_server_ends_a_run_with_one_line_and_a_checkpoint(packed, tmp_path):
+def test_a_dead_server_ends_a_run_with_one_line_and_a_checkpoint(packed, tmp_path, monkeypatch):
     with served(packed) as (address, _):
         assert fetch(address, tmp_path / "remote") == 0
         open_dataset(tmp_path / "remote").load("clouda")
-    out = tmp_path / "run"
-    message = refused("cannot be fetched, 4 tries", run, tmp_path / "remote", out, views=BY_SHARD)
+    out, tries = tmp_path / "run", []
+    real = shard_cache._download
+    monkeypatch.setattr(shard_cache, "_download", lambda *a: tries.append(a[0]) or real(*a))
+    message = refused(
+        "cannot be fetched, 4 tries: curl", run, tmp_path / "remote", out, views=BY_SHARD
+    )
     assert message.startswith("http://127.0.0.1:") and len(message) < 200
     assert list_checkpoints(out), "nothing is lost"
+    assert max(tries.count(url) for url in tries) == 4, "not again for each of its objects"
     assert run(packed, out, views=BY_SHARD) == 0  # it goes on with the same shards
     assert run(packed, tmp_path / "whole", views=BY_SHARD) == 0
     assert same_weights(out / "model.safetensors", tmp_path / "whole" / "model.safetensors")

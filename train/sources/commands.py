@@ -229,7 +229,7 @@ def data_fetch_command(
     index = take_index(address, out, int(cache_gb * 1e9))
     size = sum(shard.bytes for shard in index.shards) / 1e9
     objects = sum(len(shard.objects) for shard in index.shards)
-    counts = f"{counted(objects, 'object')} in {counted(len(index.shards), 'shard')}, {size:.1f} GB"
+    counts = f"{counted(objects, 'object')} in {counted(len(index.shards), 'shard')}, {size:.3g} GB"
     print(f"{counts}, at {index.address}")
     print(f"next: gamba train {out} --sampler shards ...")
     return 0
