@@ -404,9 +404,19 @@ class ViewDataset:
     def check(self) -> dict[str, str]:
         """Return reasons by uid, for objects with invalid cameras or missing pictures.
 
-        Objects of a manifest were checked before; the others are read, with a progress bar.
+        Objects of a manifest and of shards were checked before, so of local shards only the size is
+        compared; the others are read, with a progress bar.
         """
         bad = {uid: self._bad[uid] for uid in self.uids if uid in self._bad}
+        local = {source for source in self.shards.values() if not source.address}
+        damaged: dict[Source, str] = {}
+        for source in local:
+            try:
+                source.path()
+            except UserError as error:
+                damaged[source] = str(error)
+        if damaged:
+            bad |= {u: damaged[s] for u in self.uids if (s := self.shards.get(u)) in damaged}
         unknown = [uid for uid in self.uids if uid not in self._digests]
         for uid in progress_bar(unknown, lines=True, delay=2.0, desc="checking", unit="object"):
             try:

@@ -404,6 +404,9 @@ def test_a_shard_cut_short_costs_its_own_objects(data, tmp_path):
     pack = open_dataset(out)
     assert_same(pack.load("d"), open_dataset(data).load("d"))
     refused("cut short or changed", pack.load, "a")
+    assert pack.check().keys() == {"a", "b/c.v2"}, "told before a training starts"
+    (out / "train-00000.tar").unlink()
+    assert "No such file" in open_dataset(out, "train").check()["a"]
 
 
 def test_a_shard_that_is_a_link_is_refused(data, tmp_path):

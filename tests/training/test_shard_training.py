@@ -223,6 +223,17 @@ def test_a_dead_address_is_one_line(tmp_path, capsys):
     assert not (tmp_path / "remote").exists()
 
 
+def test_a_folder_of_other_files_is_left_alone(packed, tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    shutil.copytree(packed, tmp_path / "own")
+    with served(packed) as (address, asked):
+        assert fetch(address, tmp_path) == 2
+        assert fetch(address, tmp_path / "own") == 2
+        assert not asked
+    said = capsys.readouterr().err
+    assert "holds other files (notes.txt)" in said and "holds shards of its own" in said
+
+
 @pytest.mark.parametrize("address", ["pipe:touch x", "file:///etc", "http://a b", "http://h/{1,2}"])
 def test_other_addresses_are_refused(tmp_path, address, capsys):
     assert fetch(address, tmp_path / "remote") == 2
