@@ -361,7 +361,7 @@ class Batches:
             return Prepared(loaded(self._made.take(made), 0), [])
         failed: list[tuple[str, str]] = []
         for attempt in range(_TRIES):
-            index = self._object(number, attempt)
+            index = self._object(self._place(number) + attempt)
             try:
                 return Prepared(loaded(self.data.train, index), failed)
             except Unreachable:  # no fault of the object
@@ -403,20 +403,22 @@ class Batches:
         )
         self._made = Pool(options, math.floor(number * self.data.batch_size * views.made))
 
-    def _object(self, number: int, attempt: int) -> int:
-        """Return the object of the ``number``-th sample; each epoch has its own order.
+    def _place(self, number: int) -> int:
+        """Return the place of the ``number``-th sample in the order of the run.
 
-        Args:
-            number: of the sample in the run.
-            attempt: number of objects of the sample that could not be read.
+        By shards, each process has an order of its own, and this sample is of this process.
         """
+        if self._by_shard is None:
+            return number
+        share, before = self.data.batch_size, self.since.samples
+        batch, position = divmod(number - before, share)
+        return before // self.world.size + batch // self.world.size * share + position
+
+    def _object(self, place: int) -> int:
+        """Return the object of a place in the order; each epoch has its own permutation."""
         objects, by_shard = self.data.objects, self._by_shard
-        if by_shard is not None:
-            share, before = self.data.batch_size, self.since.samples
-            batch, position = divmod(number - before, share)
-            number = before // self.world.size + batch // self.world.size * share + position
         length = len(objects) if by_shard is None else by_shard.length
-        epoch, position = divmod(number + attempt, length)
+        epoch, position = divmod(place, length)
         known, order = self._order  # read both at once: other threads replace them
         if known != epoch:
             if by_shard is None:

@@ -15,6 +15,6 @@ def test_the_loader_is_measured(tmp_path, given):
     records = measure(loader.cases(settings), settings)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4, records
     names = [r["variant"] for r in records]
-    assert names == ["files", "files, --cache", "pack", "pack, --cache-device"]
+    assert names == ["files", "files, --cache", "shards", "shards, --cache-device"]
     assert all(r["work"]["samples"] == 8 for r in records)
     assert all(r["work"]["cpu_ms_per_sample"] > 0 for r in records)
