@@ -408,15 +408,14 @@ class ViewDataset:
         compared; the others are read, with a progress bar.
         """
         bad = {uid: self._bad[uid] for uid in self.uids if uid in self._bad}
-        local = {source for source in self.shards.values() if not source.address}
         damaged: dict[Source, str] = {}
-        for source in local:
+        for source in {source for source in self.shards.values() if not source.address}:
             try:
                 source.path()
             except UserError as error:
                 damaged[source] = str(error)
-        if damaged:
-            bad |= {u: damaged[s] for u in self.uids if (s := self.shards.get(u)) in damaged}
+        sources = {uid: self.shards[uid] for uid in self.uids if uid in self.shards}
+        bad |= {uid: damaged[source] for uid, source in sources.items() if source in damaged}
         unknown = [uid for uid in self.uids if uid not in self._digests]
         for uid in progress_bar(unknown, lines=True, delay=2.0, desc="checking", unit="object"):
             try:
