@@ -68,7 +68,7 @@ def join_reports(paths: Iterable[Path]) -> Joined:
         return _join_shapes(known, ordered[0][0])
     except UserError:
         raise
-    except Exception as error:  # of records that are none
+    except Exception as error:  # an invalid record
         reason = f"{type(error).__name__}: {first_line(error)}"
         raise UserError(f"{ordered[0][0]} …: not reports of an evaluation ({reason})") from error
 

@@ -22,7 +22,7 @@ import msgspec
 from msgspec import Meta
 
 from ..errors import UserError
-from ..files import atomic_path
+from ..files import atomic_path, plain_file
 from ..untrusted.documents import parse_document
 from ..untrusted.names import parts_of
 from .layouts import LAYOUTS, one_line
@@ -155,13 +155,7 @@ def read_manifest(root: Path) -> Manifest:
         UserError: it is invalid, cut short, or older than its dataset; the message names the
             command that makes it anew.
     """
-    path = root / MANIFEST
-    try:
-        status = os.stat(path)
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
-    if not stat.S_ISREG(status.st_mode):
-        raise UserError(f"{path}: not a plain file")
+    status = plain_file(root / MANIFEST)
     return _read(root, status.st_mtime_ns, status.st_size, status.st_ino)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import stat
 import subprocess
 import time
 from contextlib import suppress
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, cast
 
 from ..errors import UserError, first_line
-from ..files import atomic_path, output_folder
+from ..files import atomic_path, output_folder, plain_file
 from ..versions import require
 
 # Addresses that are opened; others, such as webdataset's "pipe:", would run commands of the index.
@@ -63,14 +62,9 @@ class Source(NamedTuple):
         if self.address:
             return _fetch(self)
         path = self.folder / self.name
-        try:
-            found = os.lstat(path)
-        except OSError as error:
-            raise UserError(f"{path}: {error.strerror or error}") from error
-        if not stat.S_ISREG(found.st_mode):
-            raise UserError(f"{path}: not a plain file")
-        if found.st_size != self.bytes:
-            sizes = f"{found.st_size:,} bytes, not {self.bytes:,}"
+        found = plain_file(path, links=False).st_size
+        if found != self.bytes:
+            sizes = f"{found:,} bytes, not {self.bytes:,}"
             raise UserError(f"{path}: cut short or changed ({sizes})")
         return path
 

@@ -337,6 +337,8 @@ def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
     before = canvas(opened)
     for name, content, reason in (
         ("chair.ply", good[:-1], "cut short"),
+        ("chair.ply", good + b"0", "more than its 40 Gaussians"),
+        ("chair.ply", good.replace(b"float nx", b"float ny"), "Only uncompressed"),
         ("chair.ply", good[:-4] + b"\0\0\x80\x7f", "1 of 40 Gaussians are invalid"),
         ("chair.ply", good.replace(b"f_dc_1", b"f_xx_1"), "Only uncompressed"),
         ("chair.ply", good.replace(b"binary_little_endian", b"ascii"), "Only uncompressed"),

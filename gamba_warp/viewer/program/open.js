@@ -25,12 +25,13 @@ function plyTable(buffer) {
     if (line.startsWith("element ")) break;
     const [word, type, name] = line.split(" ");
     if (word !== "property") continue;
-    if (!(type in SCALARS)) throw new Error(OTHER);
+    if (!(type in SCALARS) || name in columns) throw new Error(OTHER);
     columns[name] = { at: size, get: `get${SCALARS[type][0]}` };
     size += SCALARS[type][1];
   }
   const start = end.index + end[0].length;
   if (start + count * size > buffer.byteLength) throw new Error("The file is cut short.");
+  if (start + count * size < buffer.byteLength) throw new Error(`It has more than its ${count} Gaussians. ${OTHER}`);
   return { count: Number(count), columns, size, view: new DataView(buffer, start) };
 }
 
