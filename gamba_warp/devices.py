@@ -50,7 +50,7 @@ def share_cores() -> None:
     Variables that the user has set win.
     """
     chosen = {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & {*os.environ}
-    if chosen or "torch" in sys.modules or not hasattr(os, "getloadavg"):
+    if chosen or "torch" in sys.modules:
         return
     if os.getloadavg()[0] > 0.5 * cores():
         os.environ["GOMP_SPINCOUNT"] = "1000"

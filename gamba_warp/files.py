@@ -10,7 +10,6 @@ import re
 import secrets
 import shutil
 import stat
-import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +17,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from .errors import UserError
-from .kernels.runtime.system import is_own
 
 PACKAGE = Path(__file__).resolve().parent
 # The folder of a checkout: of this package, of tests/ and of starter/.
@@ -128,8 +126,6 @@ def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
             _sync(part)
         temporary.chmod(0o777 & ~_umask())  # mkdtemp makes 0700
         with _set_aside(path) if replace else nullcontext():
-            if sys.platform == "win32" and path.is_dir():
-                path.rmdir()  # a rename on Windows replaces no empty folder
             temporary.rename(path)  # replaces an empty folder
         _sync(path.parent)
 
@@ -164,14 +160,9 @@ def remove_folder(folder: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file or folder is on the disk, if the system supports it.
-
-    Windows cannot sync folders, and network drives may refuse.
-    """
-    # Windows syncs only writable handles.
-    mode = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
+    """Wait until a file or folder is on the disk; network drives may refuse."""
     try:
-        handle = os.open(path, mode)
+        handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)
         finally:
@@ -194,7 +185,7 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
         return
     for entry in found:
         try:
-            if not is_own(entry.stat(follow_symlinks=False)) or entry.is_symlink():
+            if entry.stat(follow_symlinks=False).st_uid != os.geteuid() or entry.is_symlink():
                 continue
             if time.time() - _last_written(entry) < age:
                 continue

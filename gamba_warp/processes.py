@@ -82,9 +82,7 @@ class Child:
 
     def poll(self) -> End | None:
         """Return how it ended; None while it runs."""
-        if self._process.returncode is not None or not hasattr(os, "wait4"):
-            self._process.poll()
-        else:
+        if self._process.returncode is None:
             number, status, usage = os.wait4(self._process.pid, os.WNOHANG)
             if number:
                 self._process.returncode = os.waitstatus_to_exitcode(status)
@@ -97,26 +95,15 @@ class Child:
         return End(code if code >= 0 else 128 - code, seconds, self._memory)
 
     def ask(self, number: int) -> None:
-        """Send a signal to its process group; on Windows, terminate it."""
+        """Send a signal to its process group."""
         with contextlib.suppress(OSError):
-            if hasattr(os, "killpg"):
-                os.killpg(self._process.pid, number)
-            else:
-                self._process.terminate()
+            os.killpg(self._process.pid, number)
 
     def kill(self) -> None:
         """Kill its process group, if it runs, and wait until it is gone."""
         if self._process.returncode is not None:
             return
-        if hasattr(os, "killpg"):
-            self.ask(signal.SIGKILL)
-        elif sys.platform == "win32":
-            # By its full path: Windows would search the working directory first.
-            root = os.environ.get("SystemRoot", "C:\\Windows")
-            taskkill = os.path.join(root, "System32", "taskkill.exe")
-            words = [taskkill, "/F", "/T", "/PID", str(self._process.pid)]
-            with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-                subprocess.run(words, capture_output=True, timeout=30)
+        self.ask(signal.SIGKILL)
         self._process.kill()  # at least the process itself; does nothing if it is gone
         self._process.wait()
 

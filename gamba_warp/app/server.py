@@ -151,7 +151,7 @@ def _remove_leftover(folder: Path) -> None:
     except OSError:  # removed meanwhile
         return
     # Other users may create a folder or link of this name.
-    ours = os.name != "posix" or (made.st_uid == os.geteuid() and not made.st_mode & 0o077)
+    ours = made.st_uid == os.geteuid() and not made.st_mode & 0o077
     if not (stat.S_ISDIR(made.st_mode) and ours):
         return
     if not (folder / ".lock").is_file():  # another process is creating it
@@ -182,8 +182,7 @@ def listener(port: int) -> socket.socket:
         UserError: the port is taken or not allowed.
     """
     taken = socket.socket()
-    if os.name == "posix":  # on Windows it would let two servers share a port
-        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         taken.bind((HOST, port))
         taken.listen(BACKLOG)

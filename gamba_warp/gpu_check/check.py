@@ -209,9 +209,8 @@ def in_a_process(words: Sequence[str], seconds: float) -> str:
         except subprocess.TimeoutExpired:
             return _LATE.format(seconds)
         finally:  # also after an interrupt
-            if hasattr(os, "killpg"):  # it leads the group of its children
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it leads the group of its children
+                os.killpg(process.pid, signal.SIGKILL)
             process.kill()
             process.wait()
         output.seek(0)

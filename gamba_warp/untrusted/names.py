@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-import sys
 import unicodedata
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -12,8 +10,6 @@ from ..errors import UserError
 
 MAX_NAME = 200  # bytes of one part, below the 255 of most file systems, so that suffixes fit
 MAX_PATH = 1024  # bytes of the whole name
-# Names with another meaning on Windows: a stream of a file, a device.
-_NOT_ON_WINDOWS = re.compile(r'.*([<>:"|?*]|[. ]$)|(con|prn|aux|nul|com\d|lpt\d) *(\..*)?$', re.I)
 
 
 def inside(folder: str | Path, name: object, source: str) -> Path:
@@ -29,13 +25,12 @@ def inside(folder: str | Path, name: object, source: str) -> Path:
 
     Raises:
         UserError: the name is not text, empty, absolute, too long, has a drive, a ``..`` part, a
-            backslash or a control character, is not allowed on Windows (only there), or passes
-            through a link that leaves the folder.
+            backslash or a control character, or passes through a link that leaves the folder.
     """
     path = Path(folder).joinpath(*parts_of(name, source))
     try:
         base, real = os.path.realpath(folder), os.path.realpath(path)
-        leaves = os.path.commonpath([base, real]) != base  # on Windows, an error for two drives
+        leaves = os.path.commonpath([base, real]) != base
     except (OSError, ValueError) as error:
         raise UserError(f"{source}: the name {name!r} cannot be followed") from error
     if leaves:
@@ -110,6 +105,4 @@ def parts_of(name: object, source: str) -> tuple[str, ...]:
     parts = PurePosixPath(name).parts
     if ".." in parts or not parts:
         raise UserError(f"{source}: the name {shown!r} leaves its folder")
-    if sys.platform == "win32" and any(_NOT_ON_WINDOWS.match(part) for part in parts):
-        raise UserError(f"{source}: Windows has no files of the name {shown!r}")
     return parts

@@ -39,7 +39,7 @@ def cache_folder() -> Path:
     """Return the folder ``$GAMBA_CACHE``, else the system's cache folder; it may not exist yet.
 
     That is ``~/.cache/gamba_warp`` on Linux, and everywhere if it exists; else
-    ``~/Library/Caches/gamba_warp`` on macOS, ``%LOCALAPPDATA%``'s ``gamba_warp/Cache`` on Windows.
+    ``~/Library/Caches/gamba_warp`` on macOS.
 
     Raises:
         UserError: the home folder is unknown, and the variable is not set.

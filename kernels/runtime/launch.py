@@ -148,7 +148,7 @@ def _find_team() -> None:
     global _parallel
     try:
         _parallel = ctypes.cast(ctypes.CDLL(None).GOMP_parallel, ctypes.c_void_p).value or 0
-    except (AttributeError, OSError, TypeError):
+    except (AttributeError, OSError):
         _parallel = 0
 
 
@@ -158,8 +158,7 @@ def _lose_team() -> None:
 
 
 _find_team()
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_lose_team)
+os.register_at_fork(after_in_child=_lose_team)
 
 
 def has_team() -> bool:

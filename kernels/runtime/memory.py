@@ -134,7 +134,7 @@ def _most() -> int:
 
 pool = Pool(_most()) if sys.platform == "linux" else None
 
-if pool is not None and hasattr(os, "register_at_fork"):
+if pool is not None:
     # a child would have to copy the pages that it shares with its parent, which costs more
     os.register_at_fork(after_in_child=pool.clear)
 

@@ -268,7 +268,7 @@ def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
             before = _resident("VmRSS")
             result = run()
             after = _resident("VmHWM")
-    except (OSError, AttributeError, TypeError, StopIteration):
+    except (OSError, AttributeError, StopIteration):
         return None
     del result
     memory.release()  # it has small pages
@@ -283,7 +283,7 @@ def _small_pages() -> Iterator[None]:
     the array is freed. Later allocations there would be counted in steps of 2 MiB.
 
     Raises:
-        AttributeError: the system is not Linux; TypeError on Windows.
+        AttributeError: the system is not Linux.
     """
     prctl = ctypes.CDLL(None).prctl
     disabled = prctl(_GET_THP_DISABLE, *_NO_MORE)
