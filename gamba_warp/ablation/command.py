@@ -23,11 +23,6 @@ if TYPE_CHECKING:
     from .tasks import Task
 
 _Count = Annotated[int, Meta(ge=1, le=1_000_000)]
-# Seconds on one core of a desktop of about 2020, with one job. Rough fits to a few runs; a machine,
-# an encoder or LPIPS in the loss may change them by a factor of three.
-_STEP, _TOKEN, _PIXEL = 0.05, 1.2e-7, 8e-7
-_VIEW, _SHAPE, _FIT, _START = 1.3, 9.0, 4e-6, 15.0
-_GAIN = 0.7  # n threads are n^0.7 times as fast as one
 
 
 @ranged
@@ -77,7 +72,7 @@ def ablate_command(
         device: Device of every command; auto is the GPU if there is one.
         restart: Run commands again whose options changed; their former results are deleted.
         retry: Run failed rows again.
-        dry_run: Only print the commands and an estimate of their time.
+        dry_run: Only print the commands.
     """
     options = dict(locals())
     import sys
@@ -138,7 +133,7 @@ def ablate_command(
         return found
 
     if dry_run:
-        print_plan(settings, find_tasks(), jobs, threads)
+        print_plan(find_tasks())
         return 0
     check_not_read([settings.out / "table.json"], [settings.data, settings.meshes])
     out = output_folder(settings.out)
@@ -202,65 +197,14 @@ def open_inputs(given: tuple[Settings, list[Row]]) -> None:
                 raise UserError(f"row {row.name}: {reason}")
 
 
-def row_minutes(settings: Settings, row: Row, threads: int, known: float | None) -> float:
-    """Estimate the minutes of a row with one seed.
-
-    Args:
-        settings: the plan, and the settings shared by all rows.
-        row: of the plan.
-        threads: of each command.
-        known: seconds per step of this row in an earlier run; None: estimated from its size.
-    """
-    from .jobs import fit_options, train_config
-
-    faster, evaluation = threads**_GAIN, settings.evaluation
-    shapes = 0.0
-    if row.kind == "fit":
-        fit = fit_options(settings, row)
-        step = known or (_STEP + _FIT * fit.gaussians) / faster
-        objects, spent = fit.limit, step * fit.steps * fit.limit
-    else:
-        config = train_config(settings, row)
-        model, name = config.model_config(), settings.budget[0]
-        views = config.views.views_per_object
-        views = 1 + (config.views.views_last if views is None else views)
-        batch = (config.views.batch_size or 8) * config.views.accumulate
-        work = _TOKEN * model.num_tokens * model.depth * model.width
-        step = _STEP + batch * (work + _PIXEL * views * config.views.size**2)
-        step = known or step / faster
-        spent = settings.budget[1] * (60 if name == "minutes" else step)
-        objects = evaluation.objects
-        spent += objects * evaluation.views * _VIEW / faster
-    if settings.meshes is not None:
-        shapes = min(objects, evaluation.geometry_objects or objects) * _SHAPE
-    return (spent + shapes + _START) / 60
-
-
-def print_plan(settings: Settings, tasks: list[Task], jobs: int, threads: int) -> None:
-    """Print the commands of every row and an estimate of the time.
-
-    Args:
-        settings: the plan, and the settings shared by all rows.
-        tasks: rows with their seeds.
-        jobs: rows at once.
-        threads: of each command.
-    """
-    from .figures import read_log, step_seconds
-
-    total = 0.0
+def print_plan(tasks: list[Task]) -> None:
+    """Print the commands of every row."""
     for name in dict.fromkeys(task.row.name for task in tasks):
         seeds = [task for task in tasks if task.row.name == name]
-        steps = [step_seconds(read_log(task.folder / "run" / "log.jsonl")) for task in seeds]
-        known = next((step for step in steps if step is not None), None)
-        minutes = row_minutes(settings, seeds[0].row, threads, known)
-        print(f"{name}: {seeds[0].row.label}, about {minutes:.1f} minutes a seed")
+        print(f"{name}: {seeds[0].row.label}")
         for task in seeds:
             done = task.record.status != "begun" and not task.changed
-            total += 0 if done else minutes
             print(f"  {task.name}{f' ({task.record.status} before)' if done else ''}")
             for stage in task.stages:
                 print(f"    gamba {shlex.join(stage.words_in(task.folder))}")
-    print(
-        f"{len(tasks)} runs, {jobs} at once with {threads} threads each: roughly "
-        f"{total / jobs / 60:.1f} hours left (within a factor of three)"
-    )
+    print(f"{len(tasks)} runs")
