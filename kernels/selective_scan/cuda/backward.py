@@ -21,13 +21,13 @@ from .blocks import (
     RUN,
     SUB,
     BlockShape,
-    Place,
+    Position,
     Sizes,
     arena_io,
     halves,
     matrix_io,
     offsets,
-    placing,
+    position_of,
     states_io,
     stepping,
     sync,
@@ -65,7 +65,7 @@ def backward_kernel(
     io, delta_io, matrix = dtypes
     scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
     read, through = "read" in flags, "through" in flags
-    place = placing(f)
+    position = position_of(f)
     vec, read_states, write_states = states_io(f)
     pair, join, first_half, second_half = halves(f)
     m, g = Groups(f, MARK_TILE), Groups(f, TILE)
@@ -83,13 +83,13 @@ def backward_kernel(
     parts |= {"Y": sums} if "y" in flags else {}
     parts |= {"S": sums, "P": sums} if through else {}
     parts |= {name: products for name, flag in (("DB", "dB"), ("DC", "dC")) if flag in flags}
-    at, size = offsets(parts)
-    mark_at, mark_size = offsets({"STEP": m.size, "DU": m.size, "B": MARK_TILE * f.padded})
+    offset, size = offsets(parts)
+    mark_offset, mark_size = offsets({"STEP": m.size, "DU": m.size, "B": MARK_TILE * f.padded})
     size = max(size, 2 * mark_size)
-    at = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P", "DB", "DC"), 0) | at
+    offset = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P", "DB", "DC"), 0) | offset
     arena_type, _, _ = arena_io(size)
     marked, put_mark, _, _ = group_shared(m, size)
-    own, put, get, sum_lanes = group_shared(g, size)
+    elements, put, get, sum_lanes = group_shared(g, size)
     _, _, put_mark_matrix = matrix_io(f, matrix, MARK_TILE, size)
     _, _, put_matrix = matrix_io(f, matrix, TILE, size)
     origin_matrix, fetch_matrix = row_io(f, matrix, TILE)
@@ -107,8 +107,8 @@ def backward_kernel(
     constants = {"MARK": MARK, "SUB": SUB, "TAKEN": taken, "READ": read, "THROUGH": through}
     constants |= {"NEED_DB": "dB" in flags, "NEED_DC": "dC" in flags, "NEED_Y": "y" in flags}
     constants |= macros(mode, False)
-    back = constants | {f"AT_{name}": place for name, place in at.items()}
-    marking = constants | {f"AT_{name}": place for name, place in mark_at.items()}
+    back = constants | {f"AT_{name}": start for name, start in offset.items()}
+    marking = constants | {f"AT_{name}": start for name, start in mark_offset.items()}
 
     @wp.func_native(m.text("mark.inl", **marking))
     def mark(
@@ -117,7 +117,7 @@ def backward_kernel(
         marks_out: wp.array(dtype=float),
         tile: int,
         count: int,
-        p: Place,
+        p: Position,
         a: vec,
         h: vec,
     ) -> vec: ...
@@ -127,7 +127,7 @@ def backward_kernel(
         arena: arena_type,
         marks_in: wp.array(dtype=float),
         tile: Tile,
-        p: Place,
+        p: Position,
         a: vec,
         both: pair,
         db_out: wp.array3d(dtype=float),
@@ -140,7 +140,7 @@ def backward_kernel(
     def total(
         arena: arena_type,
         tile: Tile,
-        p: Place,
+        p: Position,
         db_out: wp.array3d(dtype=float),
         dc_out: wp.array3d(dtype=float),
     ): ...
@@ -148,14 +148,14 @@ def backward_kernel(
     @wp.func
     @no_type_check
     def prepare(
-        p: Place, arena: arena_type, left: int, bias: float,
+        p: Position, arena: arena_type, left: int, bias: float,
         u_raw: raw, delta_raw: raw, dout_raw: raw, z_raw: raw,
     ):  # fmt: skip
         # values of a channel: operands of the walk, and of the gradients after it
-        steps = own()
-        inputs = own()
-        u = own()
-        slopes = own()
+        steps = elements()
+        inputs = elements()
+        u = elements()
+        slopes = elements()
         for i in range(wp.static(g.count)):
             x = widen_delta(delta_raw[i]) + bias
             slopes[i] = 1.0
@@ -167,13 +167,13 @@ def backward_kernel(
             steps[i] = wp.where(inside, step, 0.0)
             u[i] = widen(u_raw[i])
             inputs[i] = steps[i] * u[i]
-        put(arena, wp.static(at["STEP"]), p, steps)
-        put(arena, wp.static(at["DU"]), p, inputs)
-        put(arena, wp.static(at["U"]), p, u)
-        put(arena, wp.static(at["SLOPE"]), p, slopes)
+        put(arena, wp.static(offset["STEP"]), p, steps)
+        put(arena, wp.static(offset["DU"]), p, inputs)
+        put(arena, wp.static(offset["U"]), p, u)
+        put(arena, wp.static(offset["SLOPE"]), p, slopes)
         if wp.static(read):
-            dys = own()
-            gates = own()
+            dys = elements()
+            gates = elements()
             for i in range(wp.static(g.count)):
                 dys[i] = wp.where(wp.static(g.token(i)) < left, widen(dout_raw[i]), 0.0)
                 if wp.static(use_z):
@@ -181,9 +181,9 @@ def backward_kernel(
                     s = sigmoid(z)
                     gates[i] = dys[i] * s * (1.0 + z * (1.0 - s))
                     dys[i] = dys[i] * z * s
-            put(arena, wp.static(at["DY"]), p, dys)
+            put(arena, wp.static(offset["DY"]), p, dys)
             if wp.static(use_z):
-                put(arena, wp.static(at["GATE"]), p, gates)
+                put(arena, wp.static(offset["GATE"]), p, gates)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds, grid_stride=False)
     @no_type_check
@@ -214,11 +214,11 @@ def backward_kernel(
         dbias_out: wp.array3d(dtype=float),
     ):
         index, lane = wp.tid()
-        p = place(sizes, packed_in, index, lane)
+        p = position(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
         marks = wp.zeros(shape=(wp.static(marks_size),), dtype=float)
         a = read_states(a_in, 0, p) * wp.static(scale)
-        state = join(read_states(last_in, p.at, p), vec())
+        state = join(read_states(last_in, p.segment_row, p), vec())
         bias = bias_in[p.d]
         skip = skip_in[p.d]
         sums = wp.vec2()
@@ -252,9 +252,9 @@ def backward_kernel(
                 for i in range(wp.static(m.count)):
                     steps[i] = step_of(delta_mark[i], bias, wp.static(m.token(i)) < left)
                     inputs[i] = steps[i] * widen(u_mark[i])
-                put_mark(arena, base + wp.static(mark_at["STEP"]), p, steps)
-                put_mark(arena, base + wp.static(mark_at["DU"]), p, inputs)
-                put_mark_matrix(arena, base + wp.static(mark_at["B"]), p, b_mark)
+                put_mark(arena, base + wp.static(mark_offset["STEP"]), p, steps)
+                put_mark(arena, base + wp.static(mark_offset["DU"]), p, inputs)
+                put_mark_matrix(arena, base + wp.static(mark_offset["B"]), p, b_mark)
                 sync()
                 t += wp.static(MARK_TILE)
                 u_mark = fetch_mark(u_in, u_at, t, end - 1)
@@ -287,8 +287,8 @@ def backward_kernel(
                 left = wp.where(p.active != 0, end - t, 0)
                 prepare(p, arena, left, bias, u_raw, delta_raw, dout_raw, z_raw)
                 if wp.static(read):
-                    put_matrix(arena, wp.static(at["C"]), p, c_raw)
-                put_matrix(arena, wp.static(at["B"]), p, b_raw)
+                    put_matrix(arena, wp.static(offset["C"]), p, c_raw)
+                put_matrix(arena, wp.static(offset["B"]), p, b_raw)
                 sync()
                 tile.t0 = t0
                 tile.left = end - t0
@@ -312,22 +312,22 @@ def backward_kernel(
                 # equations 9 and 11; the terms of dD and ddelta_bias
                 dskip = wp.float32(0.0)
                 dbias = wp.float32(0.0)
-                u = get(arena, wp.static(at["U"]), p)
-                dys = own()
+                u = get(arena, wp.static(offset["U"]), p)
+                dys = elements()
                 if wp.static(read):
-                    dys = get(arena, wp.static(at["DY"]), p)
+                    dys = get(arena, wp.static(offset["DY"]), p)
                 if wp.static("y" in flags):
-                    y = sum_lanes(arena, wp.static(at["Y"]), p)
-                    gates = get(arena, wp.static(at["GATE"]), p)
+                    y = sum_lanes(arena, wp.static(offset["Y"]), p)
+                    gates = get(arena, wp.static(offset["GATE"]), p)
                     for i in range(wp.static(g.count)):
                         inside = wp.static(g.token(i)) < left
                         dz = gates[i] * (y[i] + skip * u[i])
                         store(dz_out, dz_at, t + wp.static(g.token(i)), inside, dz)
                 if wp.static(through):
-                    s = sum_lanes(arena, wp.static(at["S"]), p)
-                    d = sum_lanes(arena, wp.static(at["P"]), p)
-                    step = get(arena, wp.static(at["STEP"]), p)
-                    slopes = get(arena, wp.static(at["SLOPE"]), p)
+                    s = sum_lanes(arena, wp.static(offset["S"]), p)
+                    d = sum_lanes(arena, wp.static(offset["P"]), p)
+                    step = get(arena, wp.static(offset["STEP"]), p)
+                    slopes = get(arena, wp.static(offset["SLOPE"]), p)
                     for i in range(wp.static(g.count)):
                         inside = wp.static(g.token(i)) < left
                         ddelta = (d[i] * wp.static(1.0 / scale) + u[i] * s[i]) * slopes[i]
@@ -343,7 +343,7 @@ def backward_kernel(
                 sums += wp.vec2(dskip, dbias)
             sync()
             # the chunk's sums join those of its run, which begin at 0 in memory
-            e = place(sizes, packed_in, anew(index), anew(lane))
+            e = position(sizes, packed_in, anew(index), anew(lane))
             run = e.run + back / RUN
             write_states(da_out, run, e, second_half(state) + read_states(da_out, run, e))
             state = join(first_half(state), vec())
@@ -353,6 +353,6 @@ def backward_kernel(
                 dbias_out[run, e.row, e.d] = sums[1]
             sums = wp.vec2()
         if p.segment == 0:
-            write_states(first_out, p.own, p, first_half(state))
+            write_states(first_out, p.sequence, p, first_half(state))
 
     return scan_backward

@@ -130,15 +130,15 @@ class Sizes:
 
 
 @struct
-class Place:
+class Position:
     """Position of a thread in the problem."""
 
     b: int
     group: int
     part: int
     segment: int
-    own: int  # the sequence
-    at: int  # row of arrays [B * segments, ...]
+    sequence: int
+    segment_row: int  # of arrays [B * segments, ...]
     mark: int  # row of the saved states, of the first token
     run: int  # row of the gradient's sums, of the first token
     begin: int  # tokens
@@ -159,11 +159,11 @@ class Place:
 # an element of a tile has a barrier.
 def offsets(parts: dict) -> tuple[dict, int]:
     """Return the offsets of parts of so many floats in shared memory, and their sum."""
-    at, size = {}, 0
+    starts, size = {}, 0
     for name, count in parts.items():
-        at[name] = size
+        starts[name] = size
         size += -(-count // 4) * 4
-    return at, size
+    return starts, size
 
 
 @functools.cache
@@ -185,33 +185,33 @@ def sync(): ...
 
 
 @functools.cache
-def placing(f: BlockShape):
-    """Makes the function that finds a thread's place."""
+def position_of(f: BlockShape):
+    """Makes the function that finds a thread's Position."""
 
     @wp.func
     @no_type_check
-    def place(sizes: Sizes, packed_in: wp.array2d(dtype=int), index: int, lane: int) -> Place:
-        p = Place()
+    def position(sizes: Sizes, packed_in: wp.array2d(dtype=int), index: int, lane: int) -> Position:
+        p = Position()
         p.part = index % sizes.parts
         rest = index / sizes.parts
         p.group = rest % sizes.groups
         rest = rest / sizes.groups
         p.segment = rest % sizes.segments
-        p.own = rest / sizes.segments
-        p.at = rest
+        p.sequence = rest / sizes.segments
+        p.segment_row = rest
         if packed_in.shape[0] > 0:  # one segment each; rows as ``packed.slots`` has them
-            p.b = packed_in[p.own, 0]
-            p.begin = packed_in[p.own, 1]
-            p.end = packed_in[p.own, 2]
+            p.b = packed_in[p.sequence, 0]
+            p.begin = packed_in[p.sequence, 1]
+            p.end = packed_in[p.sequence, 2]
             t = p.b * sizes.length + p.begin
-            p.mark = t / MARK + p.own
-            p.run = t / wp.static(RUN * MARK) + p.own
+            p.mark = t / MARK + p.sequence
+            p.run = t / wp.static(RUN * MARK) + p.sequence
         else:
-            p.b = p.own
+            p.b = p.sequence
             p.begin = p.segment * sizes.segment
             p.end = wp.min(p.begin + sizes.segment, sizes.length)
             p.mark = p.b * ((sizes.length + MARK - 1) / MARK) + p.begin / MARK
-            p.run = p.at * ((sizes.segment / MARK + RUN - 1) / RUN)
+            p.run = p.segment_row * ((sizes.segment / MARK + RUN - 1) / RUN)
         p.lane = lane
         p.d0 = p.group * sizes.group_width + p.part * wp.static(f.span)
         p.count = wp.min(wp.static(f.span), sizes.group_width - p.part * wp.static(f.span))
@@ -224,7 +224,7 @@ def placing(f: BlockShape):
         p.states = sizes.states
         return p
 
-    return place
+    return position
 
 
 @functools.cache
@@ -236,10 +236,10 @@ def states_io(f: BlockShape):
     vec = wp.types.vector(f.walks * f.held, wp.float32)
 
     @wp.func_native(f.text("io.inl", READ_STATES=True))
-    def read(states: wp.array3d(dtype=float), i: int, p: Place) -> vec: ...
+    def read(states: wp.array3d(dtype=float), i: int, p: Position) -> vec: ...
 
     @wp.func_native(f.text("io.inl", WRITE_STATES=True))
-    def write(states: wp.array3d(dtype=float), i: int, p: Place, h: vec): ...
+    def write(states: wp.array3d(dtype=float), i: int, p: Position, h: vec): ...
 
     return vec, read, write
 
@@ -279,10 +279,10 @@ def channel_io(f: BlockShape, io: torch.dtype, tokens: int):
     raw = wp.types.vector(count, wp.uint32)
 
     @wp.func_native(f.text("io.inl", LOAD_CHANNEL=True, COUNT=count, **BITS[io]))
-    def load(x_in: wp.array3d(dtype=scalar), p: Place, t: int, left: int) -> raw: ...
+    def load(x_in: wp.array3d(dtype=scalar), p: Position, t: int, left: int) -> raw: ...
 
     @wp.func
-    def fetch(x_in: wp.array3d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+    def fetch(x_in: wp.array3d(dtype=scalar), p: Position, t0: int, end: int) -> raw:
         left = wp.where(t0 < 0, 0, end - t0 - p.row)  # there is no tile before the first
         return load(x_in, p, t0 + p.row, left)
 
@@ -303,15 +303,15 @@ def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
     widen = widening(io)
 
     @wp.func_native(f.text("io.inl", LOAD_MATRIX=True, COUNT=count, TOKENS=tokens, **BITS[io]))
-    def load(x_in: wp.array4d(dtype=scalar), p: Place, t0: int, left: int) -> raw: ...
+    def load(x_in: wp.array4d(dtype=scalar), p: Position, t0: int, left: int) -> raw: ...
 
     @wp.func
-    def fetch(x_in: wp.array4d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+    def fetch(x_in: wp.array4d(dtype=scalar), p: Position, t0: int, end: int) -> raw:
         left = wp.where(t0 < 0, 0, end - t0)
         return load(x_in, p, t0, left)
 
     @wp.func
-    def put_rows(arena: arena_type, base: int, p: Place, r: raw):
+    def put_rows(arena: arena_type, base: int, p: Position, r: raw):
         for i in range(wp.static(count)):
             e = wp.static(i * f.block) + p.lane
             if wp.static(size % f.block == 0):
@@ -324,7 +324,7 @@ def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
 
 @functools.cache
 def recurrence(
-    f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int, read: bool, reverse: bool
+    f: BlockShape, mode: str, tokens: int, parts: tuple, arena_size: int, read: bool, reverse: bool
 ):
     """The recurrence over a tile, and for rules whose decays are not exponentials their product.
 
@@ -334,18 +334,18 @@ def recurrence(
     6, dh from after a tile to before it.
 
     Args:
-        at: pairs (name, offset) of ``STEP, IN, W`` (δ, and δu and B, or dy and C), with ``read`` of
+        parts: pairs (name, offset) of ``STEP, IN, W`` (δ, and δu and B, or dy and C), with ``read``
             ``C, Y``.
     """
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
-    offset = {"AT_C": 0, "AT_Y": 0} | {f"AT_{name}": place for name, place in at}
+    offset = {"AT_C": 0, "AT_Y": 0} | {f"AT_{name}": start for name, start in parts}
     text = functools.partial(f.text, TOKENS=tokens, **macros(mode, False), **offset)
 
     @wp.func_native(text("recurrence.inl", UNROLL=UNROLL, READ=read, REVERSE=reverse))
-    def advance(arena: arena_type, base: int, p: Place, a: vec, h: vec) -> vec: ...
+    def advance(arena: arena_type, base: int, p: Position, a: vec, h: vec) -> vec: ...
 
     @wp.func_native(text("recurrence.inl", DECAY=True))
-    def decay(arena: arena_type, base: int, p: Place, a: vec, h: vec) -> vec: ...
+    def decay(arena: arena_type, base: int, p: Position, a: vec, h: vec) -> vec: ...
 
     return advance, decay

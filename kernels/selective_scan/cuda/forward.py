@@ -17,13 +17,13 @@ from ..problem import DISCRETIZATIONS
 from .blocks import (
     MARK,
     BlockShape,
-    Place,
+    Position,
     Sizes,
     arena_io,
     channel_io,
     matrix_io,
     offsets,
-    placing,
+    position_of,
     recurrence,
     states_io,
     stepping,
@@ -58,7 +58,7 @@ def forward_kernel(
     io, delta_io, matrix = dtypes
     scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
     tokens = tile_tokens(f)
-    place = placing(f)
+    position = position_of(f)
     vec, read_states, write_states = states_io(f)
     count, raw, fetch, store = channel_io(f, io, tokens)
     _, _, fetch_delta, _ = channel_io(f, delta_io, tokens)
@@ -66,16 +66,16 @@ def forward_kernel(
     parts = {"STEP": tokens * f.span, "IN": tokens * f.span, "W": tokens * f.padded}
     if read:
         parts |= {"C": tokens * f.padded, "Y": f.lanes * (tokens * f.span + f.pad)}
-    at, size = offsets(parts)
+    offset, size = offsets(parts)
     arena_type, put, get = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, tokens, 2 * size)
-    advance, decay = recurrence(f, mode, tokens, tuple(at.items()), 2 * size, read, False)
+    advance, decay = recurrence(f, mode, tokens, tuple(offset.items()), 2 * size, read, False)
     rule = DISCRETIZATIONS[mode]
     multiply, scale = summary and not rule.exponential, rule.scale
 
     @wp.func
     def finish(
-        p: Place, arena: arena_type, base: int, t0: int, u: raw, z: raw,
+        p: Position, arena: arena_type, base: int, t0: int, u: raw, z: raw,
         skip: float, y_out: wp.array3d(dtype=scalar),
     ):  # fmt: skip
         # equation 5
@@ -85,7 +85,7 @@ def forward_kernel(
             if wp.static(i * f.rows) < left:
                 y = skip * widen(u[i])
                 for q in range(wp.static(f.lanes)):
-                    part = wp.static(at["Y"]) + q * wp.static(tokens * f.span + f.pad)
+                    part = wp.static(offset["Y"]) + q * wp.static(tokens * f.span + f.pad)
                     y += get(arena, base + part + t * wp.static(f.span) + p.c)
                 if wp.static(use_z):
                     gate = widen(z[i])
@@ -114,12 +114,12 @@ def forward_kernel(
         y_out: wp.array3d(dtype=scalar),
     ):
         index, lane = wp.tid()
-        p = place(sizes, packed_in, index, lane)
+        p = position(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(2 * size),), dtype=float, storage="shared")
         a = read_states(a_in, 0, p) * wp.static(scale)
         h = vec()
         if wp.static(not summary):
-            h = read_states(first_in, p.at, p)
+            h = read_states(first_in, p.segment_row, p)
         product = vec(1.0)
         bias = bias_in[p.d]
         skip = skip_in[p.d]
@@ -141,12 +141,12 @@ def forward_kernel(
                 t = p.row + wp.static(i * f.rows)
                 step = step_of(delta[i], bias, wp.static(i * f.rows) < left)
                 e = base + t * wp.static(f.span) + p.c
-                put(arena, e + wp.static(at["STEP"]), step)
-                put(arena, e + wp.static(at["IN"]), step * widen(u[i]))
+                put(arena, e + wp.static(offset["STEP"]), step)
+                put(arena, e + wp.static(offset["IN"]), step * widen(u[i]))
                 total += step
-            put_matrix(arena, base + wp.static(at["W"]), p, b)
+            put_matrix(arena, base + wp.static(offset["W"]), p, b)
             if wp.static(read):
-                put_matrix(arena, base + wp.static(at["C"]), p, c)
+                put_matrix(arena, base + wp.static(offset["C"]), p, c)
             sync()
             if wp.static(read):
                 if tile > 0:
@@ -172,12 +172,12 @@ def forward_kernel(
             if tiles > 0:  # a packed sequence may have no token
                 finish(p, arena, base, t0, u_before, z_before, skip, y_out)
         if wp.static(summary):
-            write_states(last_out, p.at, p, h)
+            write_states(last_out, p.segment_row, p, h)
             if wp.static(multiply):
-                write_states(decay_out, p.at, p, product)
+                write_states(decay_out, p.segment_row, p, product)
             elif p.active != 0:
-                decay_out[p.at, p.row, p.d] = total
+                decay_out[p.segment_row, p.row, p.d] = total
         elif p.segment == sizes.segments - 1:
-            write_states(last_out, p.own, p, h)
+            write_states(last_out, p.sequence, p, h)
 
     return scan_forward

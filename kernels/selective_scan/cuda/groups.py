@@ -12,7 +12,7 @@ import warp as wp
 
 from ...runtime.native import WARP_DTYPES
 from ...runtime.scalars import BITS
-from .blocks import BlockShape, Place, arena_io
+from .blocks import BlockShape, Position, arena_io
 
 FOUR = 4  # tokens of a vector
 
@@ -36,9 +36,9 @@ class Groups:
 
     def text(self, file: str, **macros: object) -> str:
         """C++ of a file beside this one for these groups."""
-        own = {"COUNT": self.count, "ADJACENT": self.adjacent, "TOKENS": self.tokens}
-        own |= {"STEP": self.step, "LANE_STRIDE": self.lane_stride}
-        return self.shape.text(file, **own, **macros)
+        sizes = {"COUNT": self.count, "ADJACENT": self.adjacent, "TOKENS": self.tokens}
+        sizes |= {"STEP": self.step, "LANE_STRIDE": self.lane_stride}
+        return self.shape.text(file, **sizes, **macros)
 
     def token(self, i: int) -> int:
         """The token of element i, after the thread's first."""
@@ -98,7 +98,7 @@ def row_io(f: BlockShape, io: torch.dtype, tokens: int):
 
     @wp.func_native(f.text("io.inl", FETCH_MATRIX=True, COUNT=count, TOKENS=tokens, **BITS[io]))
     def fetch(
-        x_in: wp.array4d(dtype=scalar), origin: wp.uint64, p: Place, t0: int, last: int
+        x_in: wp.array4d(dtype=scalar), origin: wp.uint64, p: Position, t0: int, last: int
     ) -> raw: ...
 
     return origin, fetch
@@ -107,16 +107,16 @@ def row_io(f: BlockShape, io: torch.dtype, tokens: int):
 @functools.cache
 def group_shared(g: Groups, arena_size: int):
     """``put`` and ``get`` of a thread's elements in shared memory; ``sum_lanes`` of lanes' sums."""
-    own = wp.types.vector(g.count, wp.float32)
+    elements = wp.types.vector(g.count, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
 
     @wp.func_native(g.text("io.inl", PUT=True))
-    def put(arena: arena_type, at: int, p: Place, x: own): ...
+    def put(arena: arena_type, base: int, p: Position, x: elements): ...
 
     @wp.func_native(g.text("io.inl", GET=True))
-    def get(arena: arena_type, at: int, p: Place) -> own: ...
+    def get(arena: arena_type, base: int, p: Position) -> elements: ...
 
     @wp.func_native(g.text("io.inl", SUM_LANES=True))
-    def sum_lanes(arena: arena_type, at: int, p: Place) -> own: ...
+    def sum_lanes(arena: arena_type, base: int, p: Position) -> elements: ...
 
-    return own, put, get, sum_lanes
+    return elements, put, get, sum_lanes

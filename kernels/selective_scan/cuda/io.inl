@@ -105,8 +105,8 @@ __builtin_assume(__isGlobal(at));
 wp::vec_t<COUNT, unsigned> r;
 WP_PRAGMA_UNROLL
 for (int i = 0; i < COUNT; ++i) {
-    const int own = t + (i / ADJACENT * ROWS * ADJACENT + i % ADJACENT);
-    r.c[i] = *(const WORD*)(at + wide_(own < last ? own : last, x_in.strides[1]));
+    const int token = t + (i / ADJACENT * ROWS * ADJACENT + i % ADJACENT);
+    r.c[i] = *(const WORD*)(at + wide_(token < last ? token : last, x_in.strides[1]));
 }
 return r;
 
@@ -134,11 +134,11 @@ at += wide_(t, x_out.strides[1]);
 const ELEMENT rounded = (ELEMENT)v;
 if (inside) *(ELEMENT*)at = rounded;
 
-#elif PUT || GET || SUM_LANES  // (arena, at, p, x)
+#elif PUT || GET || SUM_LANES  // (arena, base, p, x)
 // A thread's elements of a tile in shared memory, ADJACENT tokens at a time; ``jump`` floats lie
 // between four tokens.
 auto group_ = [&](int k, int jump) -> float* {
-    return arena.data.ptr + at + ((k * ROWS + p.row) * ADJACENT) / 4 * jump + p.row * ADJACENT % 4;
+    return arena.data.ptr + base + ((k * ROWS + p.row) * ADJACENT) / 4 * jump + p.row * ADJACENT % 4;
 };
 float v[ADJACENT];
 #if PUT

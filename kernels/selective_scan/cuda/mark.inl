@@ -25,9 +25,9 @@ for (int walk = 0; walk < WALKS; ++walk) {
         float r[CHANNELS][SUB], x[CHANNELS][SUB];
         WP_PRAGMA_UNROLL
         for (int i = 0; i < CHANNELS; ++i) {
-            const int own = (sub * SPAN + channel + i) * SUB;
-            load_(s + AT_STEP + own, r[i]);
-            load_(s + AT_DU + own, x[i]);
+            const int first = (sub * SPAN + channel + i) * SUB;
+            load_(s + AT_STEP + first, r[i]);
+            load_(s + AT_DU + first, x[i]);
         }
         WP_PRAGMA_UNROLL
         for (int t = 0; t < SUB; ++t) {

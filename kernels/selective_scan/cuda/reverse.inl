@@ -54,10 +54,10 @@ for (int walk = 0; walk < WALKS; ++walk) {
         float r[CHANNELS][SUB], x[CHANNELS][SUB], dy[CHANNELS][SUB];
         WP_PRAGMA_UNROLL
         for (int i = 0; i < CHANNELS; ++i) {
-            const int own = (sub * SPAN + channel + i) * SUB;
-            load_(s + AT_STEP + own, r[i]);
-            load_(s + AT_DU + own, x[i]);
-            if constexpr (READ) load_(s + AT_DY + own, dy[i]);
+            const int first = (sub * SPAN + channel + i) * SUB;
+            load_(s + AT_STEP + first, r[i]);
+            load_(s + AT_DU + first, x[i]);
+            if constexpr (READ) load_(s + AT_DY + first, dy[i]);
         }
         float hn[HELD], hs[SUB][HELD], fs[SUB][HELD];
         load_(marks + (walk * (MARK / SUB) + tile.mark + sub) * HELD, hn);
@@ -103,9 +103,9 @@ for (int walk = 0; walk < WALKS; ++walk) {
                     if constexpr (READ) dyt[i] = dy[i][t];
                     if constexpr (MODE == ZOH) {
                         // its slopes need the registers, so these are loaded again
-                        const int own = (sub * SPAN + channel + i) * SUB + t;
-                        xt[i] = s[AT_DU + own];
-                        if constexpr (READ) dyt[i] = s[AT_DY + own];
+                        const int element = (sub * SPAN + channel + i) * SUB + t;
+                        xt[i] = s[AT_DU + element];
+                        if constexpr (READ) dyt[i] = s[AT_DY + element];
                     }
                 }
                 WP_PRAGMA_UNROLL

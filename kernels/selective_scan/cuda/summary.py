@@ -19,7 +19,7 @@ from .blocks import (
     channel_io,
     matrix_io,
     offsets,
-    placing,
+    position_of,
     recurrence,
     states_io,
     stepping,
@@ -40,15 +40,15 @@ def summary_kernel(
     """
     io, delta_io, matrix = dtypes
     scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
-    place = placing(f)
+    position = position_of(f)
     vec, read_states, write_states = states_io(f)
     count, raw, fetch, _ = channel_io(f, io, TILE)
     _, _, fetch_delta, _ = channel_io(f, delta_io, TILE)
     widen, step_of = widening(io), stepping(delta_io, use_softplus)
-    at, size = offsets({"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded})
+    offset, size = offsets({"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded})
     arena_type, put, _ = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
-    reverse, decay = recurrence(f, mode, TILE, tuple(at.items()), 2 * size, False, True)
+    reverse, decay = recurrence(f, mode, TILE, tuple(offset.items()), 2 * size, False, True)
     rule = DISCRETIZATIONS[mode]
     multiply, scale = not rule.exponential, rule.scale
 
@@ -69,7 +69,7 @@ def summary_kernel(
         decay_out: wp.array3d(dtype=float),
     ):
         index, lane = wp.tid()
-        p = place(sizes, packed_in, index, lane)
+        p = position(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(2 * size),), dtype=float, storage="shared")
         a = read_states(a_in, 0, p) * wp.static(scale)
         dh = vec()
@@ -97,10 +97,10 @@ def summary_kernel(
                 if wp.static(use_z):
                     dy *= widen(z[i]) * sigmoid(widen(z[i]))
                 e = base + (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
-                put(arena, e + wp.static(at["STEP"]), step)
-                put(arena, e + wp.static(at["IN"]), dy)
+                put(arena, e + wp.static(offset["STEP"]), step)
+                put(arena, e + wp.static(offset["IN"]), dy)
                 total += step
-            put_matrix(arena, base + wp.static(at["W"]), p, c)
+            put_matrix(arena, base + wp.static(offset["W"]), p, c)
             sync()
             t0 -= wp.static(TILE)
             delta = fetch_delta(delta_in, p, t0, end)
@@ -111,10 +111,10 @@ def summary_kernel(
             if wp.static(multiply):
                 product = decay(arena, base, p, a, product)
             dh = reverse(arena, base, p, a, dh)
-        write_states(first_out, p.at, p, dh)
+        write_states(first_out, p.segment_row, p, dh)
         if wp.static(multiply):
-            write_states(decay_out, p.at, p, product)
+            write_states(decay_out, p.segment_row, p, product)
         elif p.active != 0:
-            decay_out[p.at, p.row, p.d] = total
+            decay_out[p.segment_row, p.row, p.d] = total
 
     return summarise_backward
