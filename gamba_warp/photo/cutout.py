@@ -1,7 +1,8 @@
 """Cut out the object of a photograph; tries mask, alpha, networks, plain background, GrabCut.
 
 Masks and transparency from the user are used unchanged. Results of the other methods are checked:
-the next method is tried if they cannot be an object, and reasons to doubt them are said.
+the next method is tried if they cannot be an object, and reasons to doubt them are said. Colours
+along the object's edge lose those of its background (``edges.py``).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from ..data.preprocess import (
 from ..errors import UserError
 from ..images import load_rgba
 from . import models
+from .edges import local_colors, without_background, without_matte
 from .grabcut import grabcut
 from .matte import Matte, NoMatte, to_stderr
 
@@ -40,7 +42,7 @@ MEND = (
     "or restore parts of it in a picture editor and give that file, or give --mask FILE."
 )
 _HOW: dict[str, str] = {
-    "alpha": "The picture's own transparency is the cut-out.",
+    "alpha": "The picture's own transparency is the cut-out{fringe}.",
     "mask": "The mask {mask} cut the object out.",
     "plain": "The plain background was removed{holes}{why}.",
     "matte": "The matting model {model} cut the object out.",
@@ -214,7 +216,11 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     elif ways.cutout == "alpha":
         raise UserError(f"{path}: has no transparency, which --cutout alpha uses")
     rgba = shrink(rgba, WORKING_SIZE)
-    source = rgba[..., :3].copy()
+    source, fringe = rgba[..., :3].copy(), None
+    if method == "alpha":
+        rgba, fringe = without_matte(rgba)
+    elif method == "mask":
+        rgba[..., :3] = without_background(source, rgba[..., 3])
     found = _cut_by_methods(path, source, ways) if method is None else _Found(method, rgba)
     method, rgba = found.method, found.rgba
     try:
@@ -227,6 +233,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         model=model and model.path.name,
         holes=found.holes,
         why=found.why,
+        fringe=f", without the {fringe} mixed into its edge" if fringe else "",
     )
     if (most := rgba[..., 3].max()) < _OPAQUE:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
@@ -313,7 +320,7 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
     planes = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
     grown = torch.nn.functional.max_pool2d(planes, 3, 1, 1)[0, 0].numpy() > 0.5
     outline = grown & ~inside
-    ours, theirs = (x[0].permute(1, 2, 0).numpy() for x in _local_colors(rgb, alpha, 3))
+    ours, theirs = (x[0].permute(1, 2, 0).numpy() for x in local_colors(rgb, alpha, 3))
     alike = (np.abs(ours - theirs).max(-1)[outline] < _ALIKE).mean() if outline.any() else 0.0
     if alike > _ALIKE_SHARE:
         found.append(f"along {alike:.0%} of its outline it looks like the background")
@@ -345,31 +352,7 @@ def fault_of(alpha: np.ndarray) -> str | None:
 
 
 def _blended(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Return ``[H, W, 4]`` with the background removed from the colours along the border.
-
-    Colours of object and background are local means weighted by alpha (the fusion of blurs of Forte
-    2021), so that no fringe is left on another background.
-    """
+    """Return ``[H, W, 4]`` without specks, and without the background along the border."""
     alpha = np.where(alpha < _HAZE, 0, alpha)  # haze would enlarge the object's bounds
     alpha = without_specks(alpha) if find_spec("skimage") is not None else alpha
-    picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
-    share = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
-    ours, theirs = _local_colors(rgb, alpha, max(2, max(rgb.shape[:2]) // 64))
-    colors = ours + share * (picture - share * ours - (1 - share) * theirs)
-    colors = torch.where(share > 0.99, picture, colors).clamp(0, 1)
-    return np.dstack([colors[0].permute(1, 2, 0).numpy(), alpha]).astype(np.float32)
-
-
-def _local_colors(
-    rgb: np.ndarray, alpha: np.ndarray, radius: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return mean colours ``[1, 3, H, W]`` of object and of background around each pixel."""
-    picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
-    share = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
-
-    def around(weight: torch.Tensor) -> torch.Tensor:
-        planes = torch.cat([picture * weight, weight], 1)
-        mean = torch.nn.functional.avg_pool2d(planes, 2 * radius + 1, 1, radius)
-        return mean[:, :3] / mean[:, 3:].clamp(min=1e-5)
-
-    return around(share), around(1 - share)
+    return np.dstack([without_background(rgb, alpha), alpha]).astype(np.float32)

@@ -1,0 +1,67 @@
+"""Edges of cut-outs: white and black that is mixed in goes, colours of the object stay."""
+
+import numpy as np
+import pytest
+
+from gamba_warp.images import save_image
+from gamba_warp.photo.cutout import Ways, cut_out
+from gamba_warp.photo.edges import without_matte
+
+SIZE = (61, 83)
+
+
+def disc(color, seed=0):
+    """A disc ``[H, W, 4]`` with a soft edge, of a colour with 5 % of noise; straight alpha."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    alpha = np.clip(24 - np.hypot(x - 40, y - 29), 0, 1)
+    noise = np.random.default_rng(seed).normal(0, 0.05, (*SIZE, 3))
+    return np.dstack([(noise + color).clip(0, 1), alpha]).astype(np.float32)
+
+
+def mixed(rgba, background):
+    colors, alpha = rgba[..., :3], rgba[..., 3:]
+    return np.dstack([alpha * colors + (1 - alpha) * background, alpha]).astype(np.float32)
+
+
+@pytest.mark.parametrize("color", [(0.7, 0.0, 0.1), (0.3, 0.4, 0.5), (0.6, 0.6, 0.2)])
+@pytest.mark.parametrize("name, background", [("white", 1.0), ("black", 0.0)])
+def test_white_and_black_go(name, background, color):
+    clean = disc(color)
+    found, which = without_matte(mixed(clean, background))
+    assert which == name
+    seen = clean[..., 3] > 0.05  # float32 divided by a small alpha
+    np.testing.assert_allclose(found[seen], clean[seen], atol=1e-5)
+    assert found.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        disc((0.3, 0.4, 0.5)),  # clean
+        disc((0.97, 0.97, 0.97)),  # white itself
+        mixed(disc((0.95, 0.95, 0.95)), 1.0),  # a fringe that nobody sees
+        mixed(disc((0.2, 0.3, 0.4)), np.array([0.75, 0.6, 0.3])),  # light on a rim, or a photograph
+        np.dstack([disc((0.5, 0.1, 0.1))[..., :3], np.full(SIZE, 0.5)]).astype(np.float32),
+    ],
+    ids=["clean", "white", "unseen", "coloured", "half transparent"],
+)
+def test_other_edges_stay(picture):
+    found, which = without_matte(picture)
+    assert which is None and found is picture
+
+
+def test_a_picture_keeps_no_fringe_of_its_background(tmp_path):
+    clean = disc((0.7, 0.0, 0.1))
+    save_image(tmp_path / "icon.png", mixed(clean, 1.0))
+    icon = cut_out(tmp_path / "icon.png", Ways(recenter=False))
+    assert icon.how.endswith("is the cut-out, without the white mixed into its edge.")
+    save_image(tmp_path / "clean.png", clean)
+    assert cut_out(tmp_path / "clean.png").how.endswith("is the cut-out.")
+    save_image(tmp_path / "photo.png", mixed(clean, 0.9)[..., :3])
+    save_image(tmp_path / "mask.png", clean[..., 3])
+    photo = cut_out(tmp_path / "photo.png", Ways(mask=tmp_path / "mask.png", recenter=False))
+    edge = (clean[..., 3] > 0.3) & (clean[..., 3] < 0.9)
+    for cut in (icon, photo):
+        inner = cut.editable[edge]
+        np.testing.assert_allclose(inner[:, 3], clean[edge, 3], atol=0.003)  # of 8 bits
+        assert abs(inner[:, 1] - clean[edge, 1]).mean() < 0.08  # .4 with the fringe
