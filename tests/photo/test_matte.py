@@ -153,14 +153,9 @@ def _fetch(path):
 
 
 @pytest.mark.slow
-def test_a_real_network_cuts_real_photographs(real_model):
-    """Two of scikit-image's photographs, with boxes of certain object and background."""
+def test_a_real_network_cuts_a_real_photograph(real_model):
+    """A photograph of scikit-image's, with boxes of certain object and background."""
     data = Path(pytest.importorskip("skimage").__file__).parent / "data"
-    ways = Ways(matte_model=real_model)
-    for name, inside, outside in (
-        ("coffee.png", (slice(200, 260), slice(240, 330)), (slice(0, 60), slice(0, 100))),
-        ("astronaut.png", (slice(350, 450), slice(150, 250)), (slice(0, 150), slice(340, 370))),
-    ):
-        found = cut_out(data / name, ways)
-        assert found.method == "matte"
-        assert found.mask[inside].min() > 0.9 and found.mask[outside].max() < 0.1
+    found = cut_out(data / "coffee.png", Ways(matte_model=real_model))
+    assert found.method == "matte"
+    assert found.mask[200:260, 240:330].min() > 0.9 and found.mask[:60, :100].max() < 0.1

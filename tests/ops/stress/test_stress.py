@@ -205,7 +205,7 @@ def test_a_failing_case_is_made_small(broken_scan):
 
 
 def test_a_small_error_is_caught_written_and_replayed(tmp_path, broken_scan, capsys):
-    code = exit_code("scan", "--cases", 30, "--out", tmp_path, "--shrink-seconds", 1)
+    code = exit_code("scan", "--cases", 24, "--out", tmp_path, "--shrink-seconds", 1)
     assert code == 1
     path = next(tmp_path.glob("failure-scan-*.json"))
     content = json.loads(path.read_text())
@@ -262,7 +262,7 @@ def test_interrupted_keeps_what_was_found(tmp_path, monkeypatch, capsys):
         return right(*arguments, **options)
 
     monkeypatch.setattr(scan, "selective_scan", interrupted)
-    assert exit_code("scan", "--cases", 50, "--out", tmp_path) == 130
+    assert exit_code("scan", "--cases", 24, "--out", tmp_path) == 130
     summary = json.loads((tmp_path / "stress.json").read_text())
     assert summary["interrupted"] and 0 < sum(row["cases"] for row in summary["rows"]) < 50
     assert "interrupted" in capsys.readouterr().out
