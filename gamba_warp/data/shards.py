@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +25,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from ..batch import counted, warn
 from ..errors import UserError
 from ..images import load_rgba8, open_picture
 from ..untrusted.archives import files_in_tar
@@ -37,7 +40,11 @@ DOCUMENT = "json"  # suffix of an object's document
 _MAX_PICTURE = 256 << 20  # bytes of an encoded picture
 _MAX_DOCUMENT = 64 << 20
 
+_NAMED = 3  # unread members that a warning names
+
 _Bytes = Annotated[int, Meta(ge=0, le=1 << 50)]
+_told: set[Path] = set()  # tars of which a warning has named the unread members
+_telling = threading.Lock()
 
 
 class Shard(msgspec.Struct, kw_only=True):
@@ -178,12 +185,33 @@ class Shards:
         return data
 
     def read(self, uid: str) -> ObjectFiles:
-        """Read the cameras of an object.
+        """Read the cameras of an object; warn once for a tar with members that nothing reads.
 
         Raises:
             UserError: its part of the tar is damaged, has other members than its own, or its
                 document is invalid.
         """
+        files, unread = self._read(uid)
+        if unread:
+            self._tell_unread(self.places[uid].shard)
+        return files
+
+    def _tell_unread(self, number: int) -> None:
+        """Name and count the members of a tar that nothing reads, once in a process."""
+        path = self.folder / self.sources[number].name
+        with _telling:
+            if path in _told:
+                return
+            _told.add(path)
+        names = list[str]()
+        for uid in (uid for uid, place in self.places.items() if place.shard == number):
+            with suppress(UserError):  # it is named when it is used
+                names += self._read(uid)[1]
+        shown = ", ".join([*names[:_NAMED], *(["..."] if len(names) > _NAMED else [])])
+        warn(path, [f"{counted(len(names), 'member')} that nothing reads: {shown}"])
+
+    def _read(self, uid: str) -> tuple[ObjectFiles, list[str]]:
+        """Return an object, and the names of its members that its document does not name."""
         place, key = self.places[uid], f"{key_of(uid)}."
         source = f"{self.folder / self.sources[place.shard].name}: {uid}"
         with self.sources[place.shard].open() as file:
@@ -197,13 +225,17 @@ class Shards:
         document = files.pop(DOCUMENT, None)
         if document is None or document.place.size > _MAX_DOCUMENT:
             raise UserError(f"{source}: has no {key}{DOCUMENT}, or one over 64 MB")
-        content = parse_document(document.content(), object, str(document))
-        return object_of([(str(document), content, partial(_find, files))])
+        content, used = parse_document(document.content(), object, str(document)), set[str]()
+        found = object_of([(str(document), content, partial(_find, files, used))])
+        return found, [key + suffix for suffix in files if suffix not in used]
 
 
-def _find(files: dict[str, ShardPicture], name: object, source: str) -> ShardPicture:
+def _find(
+    files: dict[str, ShardPicture], used: set[str], name: object, source: str
+) -> ShardPicture:
     if not isinstance(name, str) or name not in files:
         raise UserError(f"{source}: the shard has no {repr(name)[:80]} of this object")
+    used.add(name)
     return files[name]
 
 

@@ -397,6 +397,36 @@ def test_damage_of_an_object_is_one_line_and_its_own(data, tmp_path, name):
             assert_same(pack.load(other), open_dataset(data).load(other))
 
 
+def test_members_that_nothing_reads_are_named_once_for_a_shard(data, tmp_path, capsys):
+    out = tmp_path / "pack"
+    packed(data, out, size=None)
+    (first, *_), (second, *_) = index_of(out)["shards"][0]["objects"]
+    keys = {uid: shards.key_of(uid) for uid in (first, second)}
+
+    def change(members):
+        at = next(i for i, (m, _) in enumerate(members) if m.name == f"{keys[second]}.json")
+        own = [(tarfile.TarInfo(f"{keys[first]}.{end}"), b"x") for end in ("txt", "000.normal.png")]
+        rest = [(tarfile.TarInfo(f"{keys[second]}.{end}"), b"x") for end in ("txt", "npy")]
+        return [*members[:at], *own, *members[at:], *rest]
+
+    rewritten(out, change)
+    with tarfile.open(out / "train-00000.tar") as tar:
+        middle = tar.getmember(f"{keys[second]}.json").offset
+        end = tar.getmembers()[-1].offset_data + 512
+    edit(out, objects=[[first, 0, middle], [second, middle, end - middle]])
+    pack = open_dataset(out)
+    for uid in (*UIDS, *UIDS):
+        assert_same(pack.load(uid), open_dataset(data).load(uid))
+    pickle.loads(pickle.dumps(pack)).load("a")
+    (said,) = capsys.readouterr().err.splitlines()
+    start = f"warning: {out / 'train-00000.tar'}: 4 members that nothing reads: "
+    named = said.removeprefix(start).removesuffix(", ...").split(", ")
+    assert said.startswith(start) and said.endswith(", ...") and len(named) == 3
+    assert {*named} < {f"{keys[first]}.{end}" for end in ("txt", "000.normal.png")} | {
+        f"{keys[second]}.{end}" for end in ("txt", "npy")
+    }
+
+
 def test_a_shard_cut_short_costs_its_own_objects(data, tmp_path):
     out = tmp_path / "pack"
     packed(data, out, size=None)
