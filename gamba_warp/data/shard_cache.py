@@ -9,6 +9,7 @@ import hashlib
 import os
 import re
 import subprocess
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +24,7 @@ ADDRESS = r"^(https?|s3|gs)://[A-Za-z0-9][A-Za-z0-9_.:/@%~+-]{0,999}$"
 CACHE = "cache"  # folder of fetched tars
 TRIES = 4
 _DELAY = 1.0  # seconds before the second try; doubled each time
+_SILENT = 60.0  # seconds without a byte that end a try
 _PART = 1 << 20  # bytes
 _REST = 30.0  # seconds after a failure without another try: other threads want the same tar
 _PROGRAMS = {"http": "curl", "https": "curl", "s3": "aws", "gs": "gsutil"}
@@ -165,19 +167,33 @@ def _download(url: str, target: Path, most: int) -> tuple[str, int]:
         stream = gopen(url)
     except FileNotFoundError as error:
         raise Unreachable(f"{url}: needs the program {error.filename}") from error
+    last, ended = time.monotonic(), threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(_SILENT / 8):
+            if time.monotonic() - last > _SILENT:
+                stream.proc.kill()
+                return
+
+    threading.Thread(target=watch, daemon=True).start()
     with open(target, "wb") as file:
         try:
             with stream:
-                while size <= most and (part := stream.read(_PART)):
+                while size <= most and (part := stream.stream.read1(_PART)):
+                    last = time.monotonic()
                     size += len(part)
                     digest.update(part)
                     file.write(part)
         except OSError as error:
             if error.errno is not None:  # of the target
                 raise
+            if time.monotonic() - last > _SILENT:
+                raise _Broken(f"no byte for {_SILENT:g} s") from error
             code = re.search(r"exit (-?\d+)", str(error))
             program = _PROGRAMS[url.partition(":")[0]]
             raise _Broken(f"{program} ended with code {code[1]}" if code else "broken") from error
+        finally:
+            ended.set()
     return digest.hexdigest(), size
 
 

@@ -46,15 +46,26 @@ def packed(data):
 
 
 @contextmanager
-def served(folder, broken=()):
-    """Serve a folder; yield the address and the requests, of which those in ``broken`` fail."""
-    asked = []
+def served(folder, broken=(), silent=()):
+    """Serve a folder; yield the address and the requests.
+
+    Those in ``broken`` fail; those in ``silent`` get half of the file, and then nothing.
+    """
+    asked, over = [], threading.Event()
 
     class Handler(SimpleHTTPRequestHandler):
         def do_GET(self):
             asked.append(self.path)
             if len(asked) in broken:
                 self.send_error(404)  # curl itself retries 500
+            elif len(asked) in silent:
+                content = (folder / self.path[1:]).read_bytes()
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(content)))
+                self.end_headers()
+                self.wfile.write(content[: len(content) // 2])
+                self.wfile.flush()
+                over.wait(30)
             else:
                 super().do_GET()
 
@@ -67,6 +78,7 @@ def served(folder, broken=()):
     try:
         yield f"http://127.0.0.1:{server.server_port}", asked
     finally:
+        over.set()
         server.shutdown()
         server.server_close()
         thread.join()
@@ -213,6 +225,25 @@ def test_a_dead_server_ends_a_run_with_one_line_and_a_checkpoint(packed, tmp_pat
     assert run(packed, out, views=BY_SHARD) == 0  # it goes on with the same shards
     assert run(packed, tmp_path / "whole", views=BY_SHARD) == 0
     assert same_weights(out / "model.safetensors", tmp_path / "whole" / "model.safetensors")
+
+
+def test_a_server_that_falls_silent_is_asked_again(packed, tmp_path, monkeypatch):
+    monkeypatch.setattr(shard_cache, "_SILENT", 0.5)
+    with served(packed, silent=(1, 3)) as (address, asked):
+        assert fetch(address, tmp_path / "remote") == 0
+        dataset = open_dataset(tmp_path / "remote")
+        assert (dataset.load("clouda").images == open_dataset(packed).load("clouda").images).all()
+        assert len(asked) == 4, "the index and a shard, twice each"
+
+
+def test_a_server_that_stays_silent_is_one_line(packed, tmp_path, monkeypatch):
+    monkeypatch.setattr(shard_cache, "_SILENT", 0.2)
+    with served(packed, silent=range(2, 9)) as (address, asked):
+        assert fetch(address, tmp_path / "remote") == 0
+        dataset = open_dataset(tmp_path / "remote")
+        message = refused("cannot be fetched, 4 tries: no byte for 0.2 s", dataset.load, "clouda")
+        assert message.startswith(address) and len(message) < 200 and len(asked) == 5
+    assert not [*(tmp_path / "remote" / "cache").iterdir()], "nothing half-written"
 
 
 def test_a_dead_address_is_one_line(tmp_path, capsys):
