@@ -139,7 +139,9 @@ def run(name: str, arguments: list[str]) -> int:
         import tyro
 
         command = load_command(name)
-        if name != "train":  # which has the option itself, and records it
+        if name == "train":  # which has --plugin itself, and records it
+            arguments = sys.modules[command.__module__].take_address(arguments)
+        else:
             arguments = _load_plugins(arguments)
         words = read_words(arguments, command)
         arguments, verbose = _expanded(command, words.arguments), words.verbose

@@ -372,7 +372,9 @@ def config_words(path: Path, options: Sequence[Option]) -> tuple[list[str], list
 
 def _check_no_url(word: str, owner: Option | None) -> None:
     if re.match("[a-z][a-z0-9+]+://", word) and (owner is None or owner.path or not owner.values):
-        raise UserError(f"{word} is a URL; download it, and give the file's name")
+        is_file = re.search(r"//.+/.*\.\w+$", word)
+        fetched = "" if is_file else ", or fetch its shards: gamba data fetch --address"
+        raise UserError(f"{word} is a URL; download it, and give the file's name{fetched}")
 
 
 def completions(command: Callable, given: Sequence[str], last: str) -> list[str]:

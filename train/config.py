@@ -293,7 +293,7 @@ class TrainConfig:
     """Train a model on posed views (``gamba data render`` makes them).
 
     Attributes:
-        data: Dataset folder.
+        data: Dataset folder; or, as the first word, the address of shards on a server.
         preset: Preset of the model.
         set: Changes to the preset, e.g. prepend=false depth=4; the fields are GambaConfig's.
     """

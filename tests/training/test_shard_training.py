@@ -195,6 +195,27 @@ def test_shards_of_a_server_train_like_local_ones(packed, tmp_path, capsys):
     assert same_weights(*paths)
 
 
+def test_an_address_is_trained_on_directly(packed, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))
+    with served(packed) as (address, _):
+        own = [f"{address}/", *words("DATA", tmp_path / "far", "--steps", 4)[1:]]
+        assert cli.run("train", [*own, "--sampler", "shards", "--shuffle-buffer", "3"]) == 0
+        assert f"shards of {address} are kept in {tmp_path / 'cache'}" in capsys.readouterr().out
+        assert cli.run("train", [own[0], "--extra", address]) == 2
+        assert "gamba data fetch --address" in capsys.readouterr().err
+    local = [str(packed), *words("DATA", tmp_path / "near", "--steps", 4)[1:]]
+    assert cli.run("train", [*local, "--sampler", "shards", "--shuffle-buffer", "3"]) == 0
+    assert same_weights(*(tmp_path / name / "model.safetensors" for name in ("far", "near")))
+
+
+@pytest.mark.parametrize("address", ["file:///etc", "pipe://touch", "http://h/a b"])
+def test_other_addresses_are_not_trained_on(address, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))
+    assert cli.run("train", [address]) == 2
+    said = capsys.readouterr().err
+    assert "expected http(s)://, s3:// or gs://" in said and said.count("\n") == 1
+
+
 def test_the_cache_keeps_its_limit(packed, tmp_path):
     largest = max(shard.bytes for shard in shards.read_index(packed).shards)
     with served(packed) as (address, asked):
