@@ -26,7 +26,7 @@ def eval_join_command(
 
     Means, intervals, tables and failures are those of the undivided evaluation. Reports of
     different protocols, data, models or versions are refused, and a shard that is missing or given
-    twice. Pictures are not joined: they stay in the folders of the shards.
+    twice. Pictures and saved shapes are not joined: they stay in the folders of the shards.
 
     Args:
         reports: a report.json, or its folder, of each shard.
@@ -38,7 +38,7 @@ def eval_join_command(
     from gamba_warp.files import output_folder, write_text
 
     from ..report import count_line, json_of, save_report
-    from .join import join_reports
+    from .join import apart, join_reports
 
     joined = join_reports(reports)
     report = joined.report
@@ -51,5 +51,8 @@ def eval_join_command(
     beside += sum(len(part.get("failures", ())) for part in report["baselines"].values())
     for item in report["failures"]:
         print(f"failed: {item['name']}: {item['reason']}", file=sys.stderr)
-    print(count_line(report, out, beside), file=sys.stderr if json else sys.stdout)
+    notes = sys.stderr if json else sys.stdout
+    if stay := apart(reports):
+        print(f"not joined, in the folders of the shards: {', '.join(stay)}", file=notes)
+    print(count_line(report, out, beside), file=notes)
     return 1 if report["failures"] or beside else 0

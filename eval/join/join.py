@@ -73,6 +73,13 @@ def join_reports(paths: Iterable[Path]) -> Joined:
         raise UserError(f"{ordered[0][0]} …: not reports of an evaluation ({reason})") from error
 
 
+def apart(paths: Iterable[Path]) -> list[str]:
+    """Return the names of pictures, shapes and pages beside the shards' reports."""
+    folders = {path.parent for path in _files(paths) if path.name == "report.json"}
+    found = {path for folder in folders for path in folder.iterdir() if path.name[0] != "."}
+    return sorted({p.name for p in found if p.suffix not in (".json", ".csv", ".md", ".tex")})
+
+
 def _files(paths: Iterable[Path]) -> list[Path]:
     return [path / "report.json" if path.is_dir() else path for path in paths]
 

@@ -75,7 +75,7 @@ def parts(folder):
 def test_the_joined_report_is_the_undivided_one(both, tmp_path, capsys):
     assert cli.run("eval-join", [*map(str, parts(both)), "--out", str(tmp_path / "out")]) == 1
     said = capsys.readouterr()
-    assert "c" in said.err and "evaluated" in said.out
+    assert "c" in said.err and "evaluated" in said.out and "not joined" not in said.out
     whole, joined = (
         json.loads((folder / "report.json").read_text())
         for folder in (both / "whole", tmp_path / "out")
@@ -150,9 +150,21 @@ def test_the_list_of_gso_is_joined(world, tmp_path, monkeypatch):
     assert [r["name"] for r in joined["objects"]] == ["a", "absent", "b", "d"]
 
 
-def test_options_that_cannot_be_divided(world, tmp_path):
+def test_pictures_that_stay_are_told(both, tmp_path, capsys):
+    paths = changed(both, tmp_path, lambda report: None)
+    (paths[0] / "strips").mkdir()
+    (paths[1] / "contact_sheet.png").write_bytes(b"")
+    assert cli.run("eval-join", [*map(str, paths), "--json"]) == 1
+    said = capsys.readouterr()
+    assert "not joined, in the folders of the shards: contact_sheet.png, strips\n" in said.err
+
+
+def test_options_that_cannot_be_divided(world, tmp_path, capsys):
     for options in (["--shard", "2/2"], ["--shard", "x"], ["--shard", "7/9"]):
         assert views(world, tmp_path / "v", *options)[0] == 2
         assert shapes(world, tmp_path / "s", *options)[0] == 2
-    assert views(world, tmp_path / "v", "--shard", "0/2", "--ceiling", "1")[0] == 2
-    assert shapes(world, tmp_path / "s", "--shard", "0/2", "--sensitivity")[0] == 2
+    capsys.readouterr()
+    for evaluate, option in ((views, ["--ceiling", "1"]), (shapes, ["--sensitivity"])):
+        assert evaluate(world, tmp_path / "o", "--shard", "0/2", *option)[0] == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and {"--shard", option[0]} <= {*said.replace(":", "").split()}
