@@ -262,7 +262,8 @@ class Outputs(ObjectFiles):
 
     Attributes:
         checkpoint: the model's file, named in the ``.ply``.
-        about: labels and texts about the model for the page.
+        about: labels and texts about the model for the page, which shows the first one; the others
+            are its model card, opened by a click.
         sheet: gets a row of each picture, or None.
         camera: elevation of the input's camera above the object, degrees (outputs are upright);
             distance and field of view, degrees, of the camera of turntable, sheet and viewer, None
@@ -327,8 +328,10 @@ def write_outputs(
         save_image(outputs.options.out / f"{name}-input.png", cut.editable)
     device = gaussians.means.device
     took = ("Forward pass", f"{seconds:.2f} s on {device.type}")
-    table = [("Gaussians", f"{gaussians.num:,}"), took, *outputs.about]
-    section = Section(name, cut.note, cut.rgba, table=table, **asdict(view))
+    table = [("Gaussians", f"{gaussians.num:,}"), took, *outputs.about[:1]]
+    card = "\n\n".join(f"{label}: {text}" for label, text in outputs.about[1:])
+    details = {"Model card": card} if card else {}
+    section = Section(name, cut.note, cut.rgba, table=table, details=details, **asdict(view))
     if cut.warning:
         section.strip = cut.beside()
     comments = [f"from {name} by {outputs.checkpoint.name}"]

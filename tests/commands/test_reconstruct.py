@@ -163,7 +163,9 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     torch.testing.assert_close(gaussians.opacities, want.opacities, rtol=1e-5, atol=0)
     source = (out / "thing.html").read_text()
     assert "<h1>thing</h1>" in source and "model.safetensors" in source and ">64<" in source
-    assert "not known: this model has no card" in source
+    table, card = source.split("<details>")
+    assert "model.safetensors" in table and "no card" not in table
+    assert "Trained on: not known: this model has no card" in card
     said = capsys.readouterr().out
     assert "thing: 64 Gaussians.\n" in said and "1 picture, 0 failures" in said
 
