@@ -145,6 +145,8 @@ def run(name: str, arguments: list[str]) -> int:
             arguments = _load_plugins(arguments)
         words = read_words(arguments, command)
         arguments, verbose = _expanded(command, words.arguments), words.verbose
+        if name == "app" and not words.quiet:  # which takes long to start
+            print("loading torch", flush=True)
         if "cores" in row.uses:
             share_cores()
         if "network" in row.uses:

@@ -201,7 +201,7 @@ def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):
             timeout=60,
             env={**os.environ, "TMPDIR": str(served.temporary)},
         )
-        assert done.returncode == 2 and done.stdout == said
+        assert done.returncode == 2 and done.stdout == f"loading torch\n{said}"
         assert done.stderr.count("\n") == 1 and done.stderr.startswith("gamba: "), done.stderr
         assert reason in (None, done.stderr)
     assert served.folders() == before

@@ -54,10 +54,11 @@ def serving(temporary: Path) -> Iterator[Served]:
         text=True,
         env=environment,
     )
-    lines = [process.stdout.readline() for _ in range(3)]
+    lines = [process.stdout.readline() for _ in range(4)]
     match = re.match(r"(http://127\.0\.0\.1:\d+/) \(Ctrl-C ends it\)$", lines[-1])
     assert match, "".join(lines) + process.communicate(timeout=10)[1]
-    assert lines[:2] == ["loading the model\n", "loading the page's libraries\n"]
+    parts = ("torch", "the model", "the page's libraries")
+    assert lines[:3] == [f"loading {part}\n" for part in parts]
     yield Served(process, match[1], temporary)
     process.kill()
     process.communicate()
