@@ -22,22 +22,24 @@ $(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py $(LOCK) | starter/data
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 		{ echo "Python >= 3.10 is needed; set PYTHON=..." >&2; exit 1; }
 	@# Some systems ship Python without ensurepip: virtualenv, from pip, then serves.
+	@echo "Making the environment $(VENV), with the newest pip."
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
-		{ rm -rf $(VENV); $(PYTHON) -m pip install --quiet --user virtualenv && \
-		  $(PYTHON) -m virtualenv --quiet $(VENV); }
+		{ rm -rf $(VENV); $(PYTHON) -m pip install --user virtualenv && \
+		  $(PYTHON) -m virtualenv $(VENV); }
+	@$(BIN)/python -m pip install --upgrade pip
 	@echo "Installing gamba into $(VENV) once: pip fetches 3.7 GB (torch with its CUDA libraries), 7.8 GB on disk."
-	@$(BIN)/python -m pip install --quiet --upgrade pip
 	@$(EDIT) '.[all]'
 	@rm -f $(VENV)/.ready* $(VENV)/.tools*
 	@touch $@
 
 $(TOOLS): $(STAMP)
 	@echo "Adding to $(VENV) once what tests, checks and pages need, 0.5 GB on disk."
-	@$(EDIT) '.[test]' --quiet
+	@$(EDIT) '.[test]'
 	@touch $@
 
 # The starter set's pictures are a thousand files, which the repository keeps as one.
 starter/data: starter/data.tar
+	@echo "Unpacking $<."
 	@tar -xf $< -C starter && touch $@
 
 demo: $(STAMP)
