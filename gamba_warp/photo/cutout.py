@@ -62,6 +62,8 @@ _ALIKE = 0.06  # differs by less than this from the background beside it
 _ALIKE_SHARE = 0.3  # along more than this share of its outline,
 _VAGUE = 0.03  # has more than this share of its alpha in wide areas that are neither 0 nor 1
 
+_LIKE_GROUND = "it is coloured like the background: parts may be lost, or enclosed background kept"
+
 _BESIDE = 360  # longer side of each picture of ``CutOut.beside``
 _HAZE = 0.1  # lower alpha is set to 0
 _OPAQUE = 0.5  # a warning is given if alpha is lower everywhere
@@ -178,13 +180,14 @@ class CutOut:
 
 
 class _Found(NamedTuple):
-    """A result of a method: ``[H, W, 4]``, enclosed areas ``[H, W]``, and words for ``_HOW``."""
+    """Result of a method: ``[H, W, 4]``, enclosed areas ``[H, W]``, words for ``_HOW``, a doubt."""
 
     method: Method
     rgba: np.ndarray
     areas: np.ndarray | None = None
     holes: str = ""
     why: str = ""
+    doubt: str = ""
 
 
 def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
@@ -239,6 +242,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
     warning, own = "", method in ("mask", "alpha", "none")
     doubts = [] if own else doubts_of(source, rgba[..., 3])
+    doubts += [found.doubt] if found.doubt else []
     if method == "grabcut":  # docs/photo.md has the figure
         doubts.append("colours alone fail for more than half of photographs")
     if doubts:
@@ -277,7 +281,8 @@ def _cut_by_methods(path: str | Path, rgb: np.ndarray, ways: Ways) -> _Found:
                 if (plain := plain_matte(rgb, ways.keep_holes)) is not None:
                     holes = counted(len(plain.holes), "enclosed area")
                     said = f", with {holes} of it (--keep-holes keeps them)" if plain.holes else ""
-                    return _Found("plain", plain.rgba, plain.areas, said, why)
+                    doubt = _LIKE_GROUND if plain.alike else ""
+                    return _Found("plain", plain.rgba, plain.areas, said, why, doubt)
             if ways.cutout == "plain":
                 reasons.append("its border is not plain")
             continue

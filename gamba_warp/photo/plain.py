@@ -39,6 +39,11 @@ _SLOPE = 0.02  # at most this change from pixel to pixel. Areas of such pixels a
 _STRIP = 0.001, 0.35  # they have at least this share of the picture, at most this of the object,
 _FOOT = 0.8  # lie this far down the object (nine of ten pixels), and
 _CONTACT = 0.25  # border on background along this share of their border
+# In a picture of about this longer side an object may have the background's own colour if
+_SMALL = 256  # pixels,
+_STEP, _STEPLESS = 0.03, 0.15  # over this share of its outline changes by less a pixel, or
+_EXACT, _KEPT = 0.02, 0.05  # enclosed areas with a median within this have more of it than this,
+_LIGHT, _LIGHT_SHARE = 0.3, 0.1  # and over this share of its outline differs by less
 
 
 class Plain(NamedTuple):
@@ -49,11 +54,14 @@ class Plain(NamedTuple):
         areas: ``[H, W]`` int32, numbers of enclosed areas of about the background's colour, large
             enough for a hole; 0 elsewhere.
         holes: numbers of those that were removed.
+        alike: True if the object may have the background's colour, so that parts of it are lost, or
+            background that it encloses is kept.
     """
 
     rgba: np.ndarray
     areas: np.ndarray
     holes: list[int]
+    alike: bool
 
 
 def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
@@ -79,11 +87,11 @@ def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
     sizes = np.bincount(areas.ravel())
     small = np.flatnonzero(sizes < max(_LEAST_HOLE, _HOLE * areas.size))
     areas = np.where(background | np.isin(areas, small), 0, areas)
-    holes = [] if keep_holes else _holes(areas, residual, noise)
+    holes, exact = ([], []) if keep_holes else _holes(areas, residual, noise)
     background = _exact(background, residual, noise)
     background |= _shadow(rgb, ground, noise, background) | np.isin(areas, holes)
     rgba = _without(rgb, background)
-    return Plain(rgba, areas, holes)
+    return Plain(rgba, areas, holes, _alike(rgb, residual, rgba[..., 3], np.isin(areas, exact)))
 
 
 def _outer(same: np.ndarray) -> tuple[np.ndarray, NDArray[np.bool_]]:
@@ -146,11 +154,11 @@ def _shadow(
     return shadow
 
 
-def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> list[int]:
-    """Return the numbers of the enclosed areas that are background."""
+def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> tuple[list[int], list[int]]:
+    """Return the numbers of the enclosed areas that are background, and of others so coloured."""
     difference = np.abs(residual).max(-1)
     widest = ndimage.maximum_filter(difference, 3)
-    found = []
+    found, others = [], []
     for number, box in enumerate(ndimage.find_objects(areas), 1):
         if box is None:
             continue
@@ -165,7 +173,34 @@ def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> list[int]:
         faint = (widest[wide][ring] < _FAINT).mean()
         if bias <= max(_BIAS, noise / 3) and islands <= _ISLANDS and faint <= _FAINT_SHARE:
             found.append(number)
-    return found
+        elif bias <= _EXACT:
+            others.append(number)
+    return found, others
+
+
+def _alike(rgb: np.ndarray, residual: np.ndarray, alpha: np.ndarray, exact: np.ndarray) -> bool:
+    """Return True if an object may have the background's colour (``Plain.alike``)."""
+    times = max(1, round(max(alpha.shape) / _SMALL))
+    height, width = (side // times for side in alpha.shape)
+
+    def small(values: np.ndarray) -> np.ndarray:
+        cut = values[: height * times, : width * times].reshape(height, times, width, times, -1)
+        return cut.mean((1, 3))
+
+    inside = small(alpha)[..., 0] > 0.5
+    outline = inside & ~ndimage.binary_erosion(inside, border_value=1)
+    if not outline.any():
+        return False
+    slopes = [
+        ndimage.gaussian_gradient_magnitude(plane, 1.0) for plane in small(rgb).transpose(2, 0, 1)
+    ]
+    steepest = ndimage.maximum_filter(np.max(slopes, 0), 5)[outline]
+    if (steepest < _STEP).mean() > _STEPLESS:
+        return True
+    difference = np.where(inside, np.abs(small(residual)).max(-1), 0)
+    light = ndimage.maximum_filter(difference, 5)[outline] < _LIGHT
+    kept = small(exact)[inside[..., None]].sum() / inside.sum()
+    return bool(kept > _KEPT and light.mean() > _LIGHT_SHARE)
 
 
 def _without(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:

@@ -2,8 +2,9 @@
 
     PYTHONPATH=.:tests python -m helpers.cutouts
 
-prints the table of docs/photo.md. Objects are rendered from ``gamba data made``'s plans or drawn;
-half of them have enclosed background, the others matter of the background's colour.
+prints the tables of docs/photo.md. Objects are rendered from ``gamba data made``'s plans or drawn;
+half of them have enclosed background, the others matter of the background's colour. Further ones
+are light grey on white, and only their doubts are counted.
 """
 
 from __future__ import annotations
@@ -11,11 +12,15 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
 
 from gamba_warp.images import to_uint8
+
+if TYPE_CHECKING:
+    from gamba_warp.photo.plain import Plain
 
 SIZE = 256  # side of a picture, pixels
 _FINE = 3  # drawn pixels per pixel
@@ -208,8 +213,14 @@ def _panda(p: _Pen) -> None:
         p("ellipse", (left + 4, 28, left + 10, 34), _DARK)
 
 
-def _rendered(plan: str, seed: int, white: bool) -> Callable:
-    """Return a renderer of an object of a plan of ``gamba data made``, all white or in colours."""
+def _rendered(plan: str, seed: int, shade: float | None = None) -> Callable:
+    """Return a renderer of an object of a plan of ``gamba data made``.
+
+    Args:
+        plan: name of the plan.
+        seed: of the object and its lights.
+        shade: gives it the background's colour, times this; None keeps its colours.
+    """
 
     def layers(paper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         from gamba_warp.train.data.made.objects import PLANS, made_by
@@ -219,10 +230,10 @@ def _rendered(plan: str, seed: int, white: bool) -> Callable:
         rng = np.random.default_rng(seed)
         mesh = made_by(next(way for way, _ in PLANS if way.__name__ == plan), rng)
         assert mesh is not None
-        if white:
+        if shade is not None:
             mesh.colors[:] = 255
             for material in mesh.materials:
-                material.texture, material.color[:3] = None, np.clip(paper, 0, 0.97) ** 2.2
+                material.texture, material.color[:3] = None, np.clip(shade * paper, 0, 0.97) ** 2.2
         mesh = mesh.normalized("y")[0]
         pose = look_at_origin(25.0, 12.0, 2.2)
         rgba = RayCaster(mesh, Lights.sample(rng)).render(pose, SIZE, 38.0)[0]
@@ -286,12 +297,12 @@ for _plan, _seed in (
     *(("rack", 0), ("rack", 3), ("rack", 4), ("rack", 5), ("rack", 7), ("furniture", 2)),
     *(("teapot", 6), ("mug", 2), ("bag", 0), ("wearable", 3), ("instrument", 5), ("lamp", 1)),
 ):
-    _HOLED[f"{_plan} {_seed}"] = _rendered(_plan, _seed, False)
+    _HOLED[f"{_plan} {_seed}"] = _rendered(_plan, _seed)
 for _plan, _seed in (
     *(("mug", 0), ("teapot", 0), ("device", 1), ("bowl", 1), ("plush", 1), ("hat", 1)),
     *(("bottle", 1), ("quadruped", 1), ("blocks", 1), ("shoe", 1)),
 ):
-    _WHITE[f"white {_plan} {_seed}"] = _rendered(_plan, _seed, True)
+    _WHITE[f"white {_plan} {_seed}"] = _rendered(_plan, _seed, 1.0)
 
 
 def cases() -> list[Case]:
@@ -304,6 +315,25 @@ def cases() -> list[Case]:
     return made
 
 
+def near_white() -> list[Case]:
+    """Make light grey objects on white: parts look like the background, handles enclose it."""
+    objects = [
+        ("mug", 0),
+        ("mug", 1),
+        ("mug", 2),
+        ("mug", 3),
+        ("teapot", 0),
+        ("teapot", 6),
+        ("bag", 0),
+    ]
+    grounds = list(_GROUNDS)[:2]
+    return [
+        _case(f"{plan} {seed} of {shade}", True, _rendered(plan, seed, shade), ground, False)
+        for plan, seed in objects
+        for shade, ground in zip((0.88, 0.93), grounds)
+    ]
+
+
 def iou(found: np.ndarray | None, right: np.ndarray) -> float:
     """Return the IoU of two masks in [0, 1]; 0 without one."""
     if found is None:
@@ -311,20 +341,37 @@ def iou(found: np.ndarray | None, right: np.ndarray) -> float:
     return float(np.minimum(found, right).sum() / np.maximum(found, right).sum())
 
 
+def doubted(case: Case, found: Plain) -> bool:
+    """Return True if the command would doubt a cut-out by its plain background."""
+    from gamba_warp.photo.cutout import doubts_of
+
+    return found.alike or bool(doubts_of(case.rgb, found.rgba[..., 3]))
+
+
 def main() -> None:
-    """Print the table: means of IoU with the right masks, with and without the removal of holes."""
+    """Print IoU with the right masks, with and without the removal of holes, and the doubts."""
     from gamba_warp.photo.plain import plain_matte
 
     groups: dict[str, list[tuple[float, float]]] = {}
-    for case in cases():
-        found = [plain_matte(case.rgb, keep_holes=keep) for keep in (True, False)]
-        kept, removed = (iou(None if f is None else f.rgba[..., 3], case.alpha) for f in found)
-        print(f"| {case.name}{', shadow' * case.shadow} | {kept:.3f} | {removed:.3f} |")
-        for group in ("white matter" if case.white else "holes", *["shadow"] * case.shadow):
-            groups.setdefault(group, []).append((kept, removed))
+    doubts: dict[str, list[bool]] = {}
+    for case in (*cases(), *near_white()):
+        near = " of " in case.name
+        kept, removed = (plain_matte(case.rgb, keep_holes=keep) for keep in (True, False))
+        assert kept is not None and removed is not None
+        scores = iou(kept.rgba[..., 3], case.alpha), iou(removed.rgba[..., 3], case.alpha)
+        doubt = doubted(case, removed)
+        shown = " | ".join(f"{score:.3f}" for score in scores)
+        print(f"| {case.name}{', shadow' * case.shadow} | {shown} | {'doubted' * doubt} |")
+        group = "light grey" if near else "white matter" if case.white else "holes"
+        for name in (group, *["shadow"] * case.shadow):
+            groups.setdefault(name, []).append(scores)
+        right = "right" if scores[1] >= 0.9 else "wrong"
+        doubts.setdefault(f"{right}, {'light grey' if near else 'the others'}", []).append(doubt)
     for group, pairs in groups.items():
         kept, removed = np.mean(pairs, axis=0)
-        print(f"| {group}, mean of {len(pairs)} | {kept:.3f} | {removed:.3f} |")
+        print(f"| {group}, mean of {len(pairs)} | {kept:.3f} | {removed:.3f} | |")
+    for group, found in doubts.items():
+        print(f"| {group} | | | {sum(found)} of {len(found)} doubted |")
 
 
 if __name__ == "__main__":
