@@ -180,7 +180,7 @@ def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> tuple[list[
 
 def _alike(rgb: np.ndarray, residual: np.ndarray, alpha: np.ndarray, exact: np.ndarray) -> bool:
     """Return True if an object may have the background's colour (``Plain.alike``)."""
-    times = max(1, round(max(alpha.shape) / _SMALL))
+    times = min(max(1, round(max(alpha.shape) / _SMALL)), *alpha.shape)
     height, width = (side // times for side in alpha.shape)
 
     def small(values: np.ndarray) -> np.ndarray:
