@@ -13,7 +13,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, cast
+from typing import Any, BinaryIO, NamedTuple, cast
 
 from ..errors import UserError, first_line
 from ..files import atomic_path, output_folder, plain_file
@@ -164,7 +164,7 @@ def _download(url: str, target: Path, most: int) -> tuple[str, int]:
     gopen_schemes.setdefault("s3", _open_s3)
     digest, size = hashlib.sha256(), 0
     try:
-        stream = gopen(url)
+        stream: Any = gopen(url)  # a Pipe of webdataset
     except FileNotFoundError as error:
         raise Unreachable(f"{url}: needs the program {error.filename}") from error
     last, ended = time.monotonic(), threading.Event()
