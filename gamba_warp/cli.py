@@ -11,8 +11,10 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from difflib import get_close_matches
+from functools import partial, wraps
+from itertools import dropwhile, takewhile
 from typing import Any, Literal, NamedTuple
 
 from .batch import STAGES
@@ -136,8 +138,6 @@ def run(name: str, arguments: list[str]) -> int:
             print(help_text(name, command, everything))
             return 0
         require(*row.needs)
-        import tyro
-
         command = load_command(name)
         if name == "train":  # which has --plugin itself, and records it
             arguments = sys.modules[command.__module__].take_address(arguments)
@@ -154,10 +154,8 @@ def run(name: str, arguments: list[str]) -> int:
             use_fastest_products()
         if "kernels" in row.uses and not verbose:
             quiet_warp()
-        # None marks an option that is left out; the word "None" is not a valid value.
-        plain = (tyro.conf.DisallowNone,)
         with _quiet() if words.quiet else nullcontext():
-            code = tyro.cli(command, args=arguments, prog=f"gamba {name}", config=plain) or 0
+            code = _parsed(command, arguments, f"gamba {name}")() or 0
         if verbose:
             table = [STAGES.table()] if STAGES.seconds else []
             print("\n".join([*table, f"{time.process_time():.1f} s of CPU time"]), file=sys.stderr)
@@ -175,6 +173,43 @@ def run(name: str, arguments: list[str]) -> int:
             traceback.print_exc()
         _print_error(reason)
         return 2
+
+
+def _parsed(command: Callable, arguments: list[str], program: str) -> Callable[[], int | None]:
+    """Return the command with its arguments.
+
+    Raises:
+        UserError: they are invalid; what tyro prints in a box, in one line.
+    """
+    import tyro
+
+    calls: list[Callable[[], int | None]] = []
+
+    @wraps(command)
+    def keep(*values: Any, **options: Any) -> None:
+        calls.append(partial(command, *values, **options))
+
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            # None marks an option that is left out; the word "None" is not a valid value.
+            tyro.cli(keep, args=arguments, prog=program, config=(tyro.conf.DisallowNone,))
+    except SystemExit as error:
+        # A title, perhaps a rule, the message, a rule, and how to get help; in a box, perhaps.
+        rows = [re.sub("[│╭╮╰╯]", " ", line)[2:] for line in said.getvalue().splitlines()[1:]]
+        rows = dropwhile(_is_rule, rows)
+        rows = takewhile(lambda row: not _is_rule(row), rows)
+        # Texts of help are indented twice.
+        text = " ".join(row.strip() for row in rows if not row.startswith(" " * 8)).rstrip(".")
+        raise UserError(f"{text or 'invalid arguments'}; {program} --help") from error
+    finally:
+        if calls:
+            sys.stderr.write(said.getvalue())
+    return calls[0]
+
+
+def _is_rule(row: str) -> bool:
+    return not row.strip("─- ")
 
 
 def _load_plugins(arguments: list[str]) -> list[str]:

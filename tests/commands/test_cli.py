@@ -161,6 +161,22 @@ def test_wrong_words_are_told_in_one_line(command, capsys, words, said):
     assert read.out == "" and read.err.startswith(f"gamba: {said}") and read.err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("reconstruct a.png --cutout plan", "invalid choice 'plan' for argument '--cutout'"),
+        ("reconstruct a.png --size abc", "Error parsing --size: invalid literal for int()"),
+        ("data render", "Missing from gamba data render: PATH --out PATH; gamba data render"),
+        ("render a.ply --size", "Missing value for argument '--size'. Expected 1 values; gamba"),
+        ("view a b", "Unrecognized options: b; gamba view --help"),
+    ],
+)
+def test_values_that_are_wrong_are_told_in_one_line(words, said, capsys):
+    assert exit_code(words.split()) == 2
+    read = capsys.readouterr()
+    assert read.out == "" and read.err.startswith(f"gamba: {said}") and read.err.count("\n") == 1
+
+
 def test_a_url_is_taken_where_text_is(command, capsys):
     command(_with_lists)
     assert exit_code(["try", "f", "--change", "https://host/a"]) == 0
