@@ -138,7 +138,8 @@ if (inside) *(ELEMENT*)at = rounded;
 // A thread's elements of a tile in shared memory, ADJACENT tokens at a time; ``jump`` floats lie
 // between four tokens.
 auto group_ = [&](int k, int jump) -> float* {
-    return arena.data.ptr + base + ((k * ROWS + p.row) * ADJACENT) / 4 * jump + p.row * ADJACENT % 4;
+    return arena.data.ptr + base + ((k * ROWS + p.row) * ADJACENT) / 4 * jump
+        + p.row * ADJACENT % 4;
 };
 float v[ADJACENT];
 #if PUT
