@@ -30,7 +30,18 @@ from .projection import (
     project_forward,
 )
 from .skip import UNASKED
-from .tiles import Bins, Drawn, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
+from .tiles import (
+    Bins,
+    Drawn,
+    Limits,
+    Picture,
+    Size,
+    Tiling,
+    Walk,
+    make_grid,
+    make_picture,
+    record_size,
+)
 
 _OP = "gamba_warp::rasterize_"
 MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
@@ -209,7 +220,7 @@ def composite(
     limits: List[float],
     skipped: Tensor | None,
     absolute: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Blend the pairs: pictures, alphas and the fields of a ``Walk``.
 
     ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
@@ -221,8 +232,8 @@ def composite(
     """
     splats = Drawn(means2d, conics, view_opacities, colors.flatten(0, -2))
     given = splats, Bins(*bins), _picture(means2d, size, limits)
-    renders, alphas, w = _compositor(means2d.device).composite_forward(*given)
-    return renders, alphas, w.transmittances, w.stops, w.blocks, w.walked, w.blocks_walked
+    renders, alphas, walk = _compositor(means2d.device).composite_forward(*given)
+    return renders, alphas, *walk
 
 
 def _picture(means2d: Tensor, size: list[int], limits: list[float]) -> Picture:
@@ -230,16 +241,19 @@ def _picture(means2d: Tensor, size: list[int], limits: list[float]) -> Picture:
 
 
 @composite.register_fake
-def _(means2d, conics, view_opacities, colors, bins, size, *rest):
+def _(means2d, conics, opacities, colors, bins, size, *rest):
     width, height = Size(*size).width, Size(*size).height
     images, pairs = means2d.shape[:-2], Bins(*bins).pairs
     tiles = images.numel() * Tiling(width, height).count
+    on_cpu = kind_of(colors.device) == "cpu"
+    record_shape = (0, 0) if on_cpu else (opacities.numel(), record_size(colors.shape[-1]))
     walk = Walk(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.empty_like(pairs),
         walked=pairs.new_empty(tiles),
         blocks_walked=pairs.new_empty(tiles, dtype=torch.int64),
+        records=colors.new_empty(*record_shape),
     )
     renders = colors.new_empty(*images, height, width, colors.shape[-1])
     return renders, colors.new_empty(*images, height, width, 1), *walk

@@ -84,6 +84,7 @@ class Walk(NamedTuple):
         walked: ``[tiles]`` int32, pairs walked until every pixel had stopped; on CUDA, where the
             lists were too short, with a minus, and of all Gaussians of the view.
         blocks_walked: ``[tiles]`` int64, blocks evaluated for these pairs.
+        records: ``[I * N, record_size(C)]``, what CUDA reads of a Gaussian; empty on a CPU.
     """
 
     transmittances: Annotated[Any, wp.array2d[wp.float32]]
@@ -91,6 +92,15 @@ class Walk(NamedTuple):
     blocks: Annotated[Any, wp.array[wp.int32]]
     walked: Annotated[Any, wp.array[wp.int32]]
     blocks_walked: Annotated[Any, wp.array[wp.int64]]
+    records: Annotated[Any, wp.array2d[wp.float32]]
+
+
+CHUNK = 4  # channels that a launch on CUDA has at most
+
+
+def record_size(channels: int) -> int:
+    """Floats of a Gaussian's record: its geometry, and the channels in whole chunks."""
+    return 8 + -(-channels // CHUNK) * CHUNK
 
 
 @struct

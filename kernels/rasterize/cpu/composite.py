@@ -103,6 +103,7 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         blocks=torch.zeros_like(bins.pairs),
         walked=bins.pairs.new_empty(tiles),
         blocks_walked=bins.pairs.new_empty(tiles, dtype=torch.int64),
+        records=colors.new_empty(0, 0),
     )
     arguments = [
         picture,

@@ -12,10 +12,10 @@ import warp as wp
 
 from ...runtime.views import struct, struct_of
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import Bins, Picture, Pixels, Walk, color_row
+from ..tiles import CHUNK, Bins, Picture, Pixels, Walk
 from . import leaves as L
+from .records import Gaussians
 from .warp import (
-    CHUNK,
     HEIGHT,
     PITCH,
     RECORD,
@@ -23,7 +23,6 @@ from .warp import (
     SUB_TILES,
     WARP,
     WIDTH,
-    Gaussians,
     Place,
     any_of,
     ballot,
@@ -157,7 +156,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
     slots, leave, complete = _completing(asked, listed)
     every = channels == 0  # channels are read one by one, from the tensors
     absolute = absolute and geometry
-    touched, stage = touching(parts), staging(channels, size)
+    touched, stage = touching(parts), staging(size)
     pixels = SUB_TILES // parts  # how many a lane has
     part_blocks = (1 << 16 // parts) - 1
     part_stops = (1 << pixels) - 1
@@ -168,16 +167,15 @@ def _walking(asked: Sums, parts: int, listed: bool):
     @wp.func
     def of_part(bits: wp.int32, part: wp.int32, wanted: wp.int32) -> wp.int32:
         # the bits of a pair that belong to a part of the tile; for blocks only the wanted ones
-        stops = bits >> (STOP + part * wp.static(pixels)) & wp.static(part_stops)
-        blocks = bits >> (part * wp.static(16 // parts)) & wp.static(part_blocks)
-        return blocks & wanted | stops << STOP
+        stops = bits >> (part * wp.static(pixels)) & wp.static(part_stops << STOP)
+        return bits >> (part * wp.static(16 // parts)) & wanted | stops
 
     @wp.func
     def of_tile(
         picture: Picture,
         gaussians: Gaussians,
         lists: struct_of(Bins),
-        corner: wp.vec2,
+        p: Place,
         k: wp.int32,
         bits: wp.int32,
     ):
@@ -185,13 +183,9 @@ def _walking(asked: Sums, parts: int, listed: bool):
         left = wp.int32(0)
         if L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1):
             g = L.load_int(lists.order, k)
-            mask = touched(
-                corner,
-                L.load2(gaussians.means2d, g),
-                L.load3(gaussians.conics, g),
-                L.load1(gaussians.opacities, g),
-                picture.alpha_min,
-            )
+            at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
+            level = L.load4(gaussians.records, at + wp.int64(4))
+            mask = touched(p, L.load4(gaussians.records, at), level)
             for j in range(wp.static(pixels)):
                 if (mask & wp.static(1 << j)) != 0:
                     left |= bits & wp.static(3 << first_block(j) | 1 << (STOP + j))
@@ -261,7 +255,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 if (picture.skip & UNUSED) == 0:
                     bits |= wanted
                 if wp.static(not listed):
-                    bits = of_tile(picture, gaussians, lists, p.corner, k, bits)
+                    bits = of_tile(picture, gaussians, lists, p, k, bits)
                 if bits != 0:
                     if wp.static(listed):
                         row = L.load_int(lists.rows, k)
@@ -270,9 +264,15 @@ def _walking(asked: Sums, parts: int, listed: bool):
                         row = k
                         g = L.load_int(lists.order, k)
                     row = row * wp.static(parts) + p.part
-                    stage(arena, picture, gaussians, p.lane, g, bits, row)
+                    at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
+                    shape = L.load4(gaussians.records, at)
+                    level = L.load4(gaussians.records, at + wp.int64(4))
+                    color = wp.vec4()
                     if wp.static(every):
-                        memory.put_int(arena, p.lane * RECORD + 8, color_row(picture, g))
+                        color[0] = wp.cast(g, wp.float32)
+                    else:
+                        color = L.load4(gaussians.records, at + wp.int64(8 + gaussians.first))
+                    stage(arena, p.lane, shape, level, color, bits, row)
             todo = ballot(bits)
             sync()
             while todo != 0:
@@ -301,11 +301,11 @@ def _walking(asked: Sums, parts: int, listed: bool):
                                 if wp.static(every):
                                     step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                                     step *= gaussians.channels
-                                    row = memory.get_int(arena, i * RECORD + 8)
-                                    source = wp.int64(row) * wp.int64(gaussians.channels)
+                                    g = memory.get_int(arena, i * RECORD + 8)
+                                    source = wp.int64(g) * wp.int64(gaussians.records.shape[1])
                                     for c in range(gaussians.channels):
                                         v = L.load(v_pixels_in.renders, first, step + c)
-                                        diff += L.load(gaussians.colors, source, c) * v
+                                        diff += L.load(gaussians.records, source, 8 + c) * v
                                 R[j] = R[j] + clamped * diff
                                 if alpha < picture.alpha_max:
                                     h = weight * diff

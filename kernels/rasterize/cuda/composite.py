@@ -16,11 +16,12 @@ from ...runtime.launch import cuda_launch
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import Packed, as_struct
 from ..constants import BLOCKS
-from ..tiles import Bins, Drawn, Picture, Pixels, Walk
+from ..tiles import CHUNK, Bins, Drawn, Picture, Pixels, Walk
 from .backward import Rows, Sums, backward_kernels, moments_of
 from .forward import forward_kernels
+from .records import Gaussians, make_records
 from .reduce import reduce_rows
-from .warp import CHUNK, WARP, Gaussians
+from .warp import WARP
 
 
 def parts_of_tile(tiles: int, device: torch.device) -> int:
@@ -38,20 +39,19 @@ def _launch(
     kernels: Callable[[int], tuple[Any, Any]],
     warps: tuple[int, int],
     picture: Picture,
-    splats: Drawn,
+    records: Tensor,
+    channels: int,
     inputs: list,
     outputs: list,
     chunk: int = CHUNK,
 ) -> None:
     """Launches both ``kernels`` of each chunk of channels, with so many warps."""
-    colors = splats.colors
-    channels = colors.shape[1]
     for first in range(0, channels if warps[0] else 0, chunk):
-        gaussians = Packed(Gaussians, *splats, channels, first)
+        gaussians = Packed(Gaussians, records, channels, first)
         for kernel, count in zip(kernels(min(chunk, channels - first)), warps):
             arguments = [picture, gaussians, *inputs]
             cuda_launch(
-                kernel, (count, WARP), arguments, outputs, device=colors.device, block_dim=WARP
+                kernel, (count, WARP), arguments, outputs, device=records.device, block_dim=WARP
             )
 
 
@@ -73,12 +73,14 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         blocks=torch.zeros_like(bins.pairs),
         walked=bins.pairs.new_zeros(tiles),
         blocks_walked=bins.pairs.new_zeros(tiles, dtype=torch.int64),
+        records=make_records(splats, picture),
     )
     _launch(
         lambda count: forward_kernels(count, parts),
         (tiles * parts, tiles * parts),
         picture,
-        splats,
+        walk.records,
+        channels,
         [as_struct(bins)],
         [as_struct(walk), Packed(Pixels, renders, alphas)],
     )
@@ -106,7 +108,8 @@ def composite_backward(
     given = (
         (tiles * parts, splats.means2d.shape[:-2].numel() * parts),
         picture,
-        splats,
+        walk.records,
+        channels,
         [as_struct(bins), as_struct(walk), Packed(Pixels, *v_pixels)],
         [Packed(Rows, v_pairs, skipped)],
     )

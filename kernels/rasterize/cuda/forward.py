@@ -13,6 +13,7 @@ from ...runtime.views import struct_of
 from ..skip import BLOCK_TEST, STOPPED
 from ..tiles import Bins, Picture, Pixels, Walk
 from . import leaves as L
+from .records import Gaussians
 from .warp import (
     HEIGHT,
     RECORD,
@@ -20,7 +21,6 @@ from .warp import (
     SUB_TILES,
     WARP,
     WIDTH,
-    Gaussians,
     Place,
     any_of,
     ballot,
@@ -34,7 +34,8 @@ from .warp import (
     word,
 )
 
-_SIZE = WARP * RECORD
+_BITS = WARP * RECORD  # where the bits of the pairs that are evaluated begin
+_SIZE = _BITS + WARP
 
 
 @functools.cache
@@ -47,7 +48,7 @@ def _walking(channels: int, parts: int, listed: bool):
     """
     memory = shared_memory(_SIZE)
     arena_type = memory.arena
-    place, touched, stage = placing(parts), touching(parts), staging(channels, _SIZE)
+    place, touched, stage = placing(parts), touching(parts), staging(_SIZE)
     pixels = SUB_TILES // parts  # how many a lane has
     pixels_type = wp.types.vector(pixels, wp.float32)
     sums_type = wp.types.matrix((pixels, channels), wp.float32)
@@ -58,7 +59,7 @@ def _walking(channels: int, parts: int, listed: bool):
         # stores the bits of a pair, or joins those of the parts, or of the tiles that share it
         if wp.static(parts == 1 and listed):
             L.store_int(blocks, k, mine)
-        elif mine != 0:
+        else:
             shift_used = part * wp.static(16 // parts)
             shift_stop = part * wp.static(pixels)
             shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
@@ -77,11 +78,11 @@ def _walking(channels: int, parts: int, listed: bool):
         p: Place,
     ):
         if wp.static(listed):
-            begin = lists.starts[p.tile]
+            k0 = lists.starts[p.tile]
             end = lists.starts[p.tile + 1]
         else:
-            begin = p.image * picture.num
-            end = begin + picture.num
+            k0 = p.image * picture.num
+            end = k0 + picture.num
         half = p.lane // 4 % 2  # which of a sub-tile's two blocks of 4 x 4 pixels
         # T is positive where a pixel goes on, negative where it stopped, 0 outside of the picture
         T = pixels_type()
@@ -93,44 +94,42 @@ def _walking(channels: int, parts: int, listed: bool):
         sums = sums_type()
         live = any_of(inside)
 
-        walked = end - begin
+        if live == 0:
+            end = k0
         evaluated = wp.int32(0)
-        for k0 in range(begin, end, WARP):
-            if live == 0:
-                break
-            # each lane looks at one of the next 32 Gaussians
-            k = k0 + p.lane
-            mask = wp.int32(0)
-            seen = k < end
-            if wp.static(not listed):
-                if seen:
-                    seen = L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1)
-            if seen:
-                if wp.static(listed):
-                    g = L.load_int(lists.pairs, k)
-                else:
-                    g = L.load_int(lists.order, k)
-                mask = live & touched(
-                    p.corner,
-                    L.load2(gaussians.means2d, g),
-                    L.load3(gaussians.conics, g),
-                    L.load1(gaussians.opacities, g),
-                    picture.alpha_min,
-                )
-                if (picture.skip & BLOCK_TEST) == 0:
-                    mask = live
-                stage(arena, picture, gaussians, p.lane, g, mask, 0)
-            todo = ballot(mask)
+        while k0 < end:
+            # each lane looks at one of the next 32 Gaussians, past the end at the last one
+            k = wp.min(k0 + p.lane, end - 1)
+            seen = k == k0 + p.lane
+            if wp.static(listed):
+                g = L.load_int(lists.pairs, k)
+            else:
+                g = L.load_int(lists.order, k)
+                seen = seen and L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1)
+            at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
+            shape = L.load4(gaussians.records, at)
+            level = L.load4(gaussians.records, at + wp.int64(4))
+            own = live
+            if (picture.skip & BLOCK_TEST) != 0:
+                own &= touched(p, shape, level)
+            if not seen:
+                own = 0
+            # those that touch something lie side by side
+            todo = ballot(own)
+            slot = L.count_bits(todo & ((1 << p.lane) - 1))
+            if own != 0:
+                color = L.load4(gaussians.records, at + wp.int64(8 + gaussians.first))
+                stage(arena, slot, shape, level, color, own, 0)
+            else:
+                slot = -1
+            count = L.count_bits(todo)
+            memory.put_int(arena, wp.static(_BITS) + p.lane, 0)
             sync()
-            mine = wp.int32(0)
-            while todo != 0 and live != 0:
-                i = L.lowest_bit(todo)
-                todo &= todo - 1
+            for i in range(count):
                 shape = memory.get4(arena, i * RECORD)
                 level = memory.get4(arena, i * RECORD + 4)
                 color = memory.get4(arena, i * RECORD + 8)
-                mask = live & memory.get_int(arena, i * RECORD + 6)
-                evaluated += L.count_bits(mask)
+                mask = memory.get_int(arena, i * RECORD + 6)
                 used = word()
                 stopped = word()
                 for j in range(wp.static(pixels)):
@@ -149,35 +148,50 @@ def _walking(channels: int, parts: int, listed: bool):
                             else:
                                 stopped[0] += wp.static(1 << (STOP + j))
                 bits = any_of((used[0] << half) | stopped[0])
-                if p.lane == i:
-                    mine = bits
+                memory.put_int(arena, wp.static(_BITS) + i, bits)
                 if (bits >> STOP) != 0:
+                    k = k0 + L.lowest_bit(ballot(wp.where(slot == i, 1, 0)))
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if (stopped[0] & wp.static(1 << (STOP + j))) != 0:
                                 T[j] = -T[j]
-                                L.store_stop(walked_out.stops, p.place, j * WARP, k0 + i)
+                                L.store_stop(walked_out.stops, p.place, j * WARP, k)
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1
                             over = ballot(going) == 0
                             if over and (picture.skip & STOPPED) != 0:
                                 live &= wp.static(~(1 << j))
+                    sync()
+                    if slot > i:
+                        own = memory.get_int(arena, slot * RECORD + 6) & live
+                        memory.put_int(arena, slot * RECORD + 6, own)
+                    sync()
                     if live == 0:
-                        walked = k0 + i - begin + 1
-            if k < end:
-                leave(walked_out.blocks, k, p.part, mine)
+                        end = k + 1
+                        break
             sync()
+            own = 0
+            mine = wp.int32(0)
+            if slot >= 0:
+                own = memory.get_int(arena, slot * RECORD + 6)
+                mine = memory.get_int(arena, wp.static(_BITS) + slot)
+            for j in range(wp.static(pixels)):
+                evaluated += L.count_bits(ballot(own & wp.static(1 << j)))
+            if mine != 0:
+                leave(walked_out.blocks, k0 + p.lane, p.part, mine)
+            sync()
+            k0 += WARP
 
+        # found anew, so that no registers hold the lane's place during the walk
+        p = place(picture, L.anew(p.index), p.lane)
         if p.lane == 0:
             if wp.static(listed):
-                wp.atomic_max(walked_out.walked, p.tile, walked)
+                wp.atomic_max(walked_out.walked, p.tile, end - lists.starts[p.tile])
             else:
-                wp.atomic_min(walked_out.walked, p.tile, -walked)
+                wp.atomic_min(walked_out.walked, p.tile, p.image * picture.num - end)
         if p.lane == 0 and gaussians.first == 0:
             wp.atomic_add(walked_out.blocks_walked, p.tile, wp.int64(evaluated))
-        # the lane's pixels are found anew, so that no registers hold them during the walk
-        p = place(picture, L.anew(p.index), p.lane)
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
             L.store(walked_out.transmittances, p.place, j * WARP, T[j])

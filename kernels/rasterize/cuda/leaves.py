@@ -25,16 +25,16 @@ def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
 def store_int(values: wp.array[wp.int32], i: wp.int32, v: wp.int32): ...
 
 
-@wp.func_native("return values.data[i];")
-def load1(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
+# Four numbers at once, at multiples of 16 bytes.
+@wp.func_native(
+    "const float4 r = *(const float4*)(values.data + i);"
+    " return wp::vec_t<4, float>(r.x, r.y, r.z, r.w);"
+)
+def load4(values: wp.array2d[wp.float32], i: wp.int64) -> wp.vec4: ...
 
 
-@wp.func_native("return values.data[i];")
-def load2(values: wp.array[wp.vec2], i: wp.int32) -> wp.vec2: ...
-
-
-@wp.func_native("return values.data[i];")
-def load3(values: wp.array[wp.vec3], i: wp.int32) -> wp.vec3: ...
+@wp.func_native("*(float4*)(values.data + i) = make_float4(v[0], v[1], v[2], v[3]);")
+def store4(values: wp.array2d[wp.float32], i: wp.int64, v: wp.vec4): ...
 
 
 @wp.func_native("return values.data[i + step];")

@@ -15,7 +15,7 @@ from ..projection import Projected
 from ..tiles import Bins, Drawn
 from . import leaves as L
 from .backward import moments_of
-from .warp import LOG2_E_HALF
+from .records import LOG2_E_HALF
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,7 +13,7 @@ import warp as wp
 
 from ...runtime.views import struct
 from ..constants import TILE
-from ..tiles import Picture, color_row, q_limit
+from ..tiles import Picture
 from . import leaves as L
 
 wp.set_module_options({"enable_backward": False})
@@ -22,14 +22,12 @@ WARP = 32
 WIDTH, HEIGHT = 8, 4  # pixels of a sub-tile; two of them side by side
 SUB_TILES = 8  # in a tile
 STOP = 16  # bit STOP + j of a pair: a pixel of sub-tile j stopped at it; below are 4 x 4 blocks
-RECORD = 12  # floats of a Gaussian in shared memory
+RECORD = 12  # floats of a Gaussian in shared memory, as of one in ``records.py``
 PITCH = WARP + 4  # floats of a row of partial sums: aligned, and without bank conflicts
-CHUNK = 4  # a launch has at most so many channels
 
 # An integer that branches change in place; Warp would keep a copy of a plain one for each branch.
 word = wp.types.vector(1, wp.int32)
 
-LOG2_E_HALF = 0.72134752044  # exp(-q/2) = 2^(-this q)
 # The rounding of a position: the test of a sub-tile may keep too much, never too little.
 _SLACK_PIXELS = 0.01
 
@@ -133,7 +131,6 @@ class Place:
     place: wp.int64  # its number by tiles and sub-tiles; those of the next ones are WARP apart
     x: wp.vec2  # centres of the lane's pixels, by columns of sub-tiles
     y: wp.vec4  # by rows of sub-tiles
-    corner: wp.vec2  # the centre of the part's first pixel
 
 
 @functools.cache
@@ -161,7 +158,6 @@ def placing(parts: int):
             p.x[i] = float(p.px + i * WIDTH) + 0.5
         for i in range(wp.static(pixels // 2)):
             p.y[i] = float(p.py + i * HEIGHT) + 0.5
-        p.corner = wp.vec2(float(x) + 0.5, float(y) + 0.5)
         return p
 
     return place
@@ -169,22 +165,23 @@ def placing(parts: int):
 
 @functools.cache
 def touching(parts: int):
-    """The test of a Gaussian against the sub-tiles of a part of a tile (README eq. 6)."""
+    """The test of a Gaussian against the sub-tiles of a part of a tile (README eq. 6).
+
+    Takes the first two quarters of its record (``records.py``).
+    """
 
     @wp.func
     @no_type_check
-    def touched(
-        corner: wp.vec2, mean: wp.vec2, conic: wp.vec3, opacity: wp.float32, alpha_min: wp.float32
-    ) -> wp.int32:
+    def touched(p: Place, shape: wp.vec4, level: wp.vec4) -> wp.int32:
         # bit j: the ellipse alpha >= alpha_min touches sub-tile j
-        a, k, e = conic[0], conic[1], conic[2]
-        limit = q_limit(opacity, alpha_min)
+        a, k, e = -shape[2], shape[3], -level[0]
+        limit, top = level[2], level[3]
         reach = L.root(limit * L.reciprocal(e))
         over_a = L.reciprocal(a)
-        # top = -k a sqrt(limit / (a e (a k² + e)))
-        top = -k * a * reach * L.root(over_a * L.reciprocal(a * k * k + e))
-        x = corner[0] - mean[0]
-        y = corner[1] - mean[1]
+        # the centre of the part's first pixel, which no registers hold during the walk
+        lane = L.anew(p.lane)
+        x = p.x[0] - float(lane & wp.static(WIDTH - 1)) - shape[0]
+        y = p.y[0] - float(lane >> wp.static(WIDTH.bit_length() - 1)) - shape[1]
         bits = word()
         for row in range(wp.static(SUB_TILES // parts // 2)):
             y0 = wp.max(y + float(row * HEIGHT), -reach)
@@ -204,48 +201,29 @@ def touching(parts: int):
     return touched
 
 
-@struct
-class Gaussians:
-    """Gaussians to composite; dense arrays in view-major order."""
-
-    means2d: wp.array[wp.vec2]
-    conics: wp.array[wp.vec3]
-    opacities: wp.array[wp.float32]
-    colors: wp.array2d[wp.float32]
-    channels: int  # how many ``colors`` has
-    first: int  # the first channel of this launch
-
-
 @functools.cache
-def staging(channels: int, size: int):
-    """The function that puts a lane's Gaussian into its record.
+def staging(size: int):
+    """The function that copies a record to a lane's place in shared memory.
 
-    A record holds mean x, y, -a log2(e)/2, k; -e log2(e)/2, log2 of opacity, two integers; colours.
+    There two integers take the places of ``limit`` and ``top``.
     """
     memory = shared_memory(size)
-    arena_type = memory.arena
 
     @wp.func
     @no_type_check
     def stage(
-        arena: arena_type,
-        picture: Picture,
-        gaussians: Gaussians,
+        arena: memory.arena,
         lane: wp.int32,
-        g: wp.int32,
+        shape: wp.vec4,
+        level: wp.vec4,
+        color: wp.vec4,
         bits: wp.int32,
         row: wp.int32,
     ):
-        at = lane * RECORD
-        mean = L.load2(gaussians.means2d, g)
-        conic = L.load3(gaussians.conics, g)
-        memory.put4(arena, at, wp.vec4(mean[0], mean[1], -LOG2_E_HALF * conic[0], conic[1]))
-        memory.put(arena, at + 4, -LOG2_E_HALF * conic[2])
-        memory.put(arena, at + 5, wp.log2(L.load1(gaussians.opacities, g)))
-        memory.put_int(arena, at + 6, bits)
-        memory.put_int(arena, at + 7, row)
-        source = wp.int64(color_row(picture, g)) * wp.int64(gaussians.channels)
-        for c in range(wp.static(channels)):
-            memory.put(arena, at + 8 + c, L.load(gaussians.colors, source, gaussians.first + c))
+        level[2] = wp.cast(bits, wp.float32)
+        level[3] = wp.cast(row, wp.float32)
+        memory.put4(arena, lane * RECORD, shape)
+        memory.put4(arena, lane * RECORD + 4, level)
+        memory.put4(arena, lane * RECORD + 8, color)
 
     return stage

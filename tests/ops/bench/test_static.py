@@ -44,6 +44,7 @@ BOUNDS = {
     ("conv", "conv_backward", "float32"): (196, 0, 2000, 8),
     ("raster", "project", "32 views"): (80, 0, 2000, 24),
     ("raster", "project_vjp", "32 views"): (128, 0, 2000, 16),
+    ("raster", "record", "32 views"): (48, 0, 2000, 40),
     ("raster", "count", "32 views"): (64, 0, 2000, 32),
     ("raster", "emit", "32 views"): (64, 0, 2000, 32),
     ("raster", "note", "32 views"): (32, 0, 2000, 48),

@@ -12,9 +12,11 @@ from gamba_warp.kernels.rasterize import Skip, ops, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
-from gamba_warp.kernels.rasterize.cuda.warp import touching
+from gamba_warp.kernels.rasterize.cuda import leaves as leaves_cuda
+from gamba_warp.kernels.rasterize.cuda.records import make_records
+from gamba_warp.kernels.rasterize.cuda.warp import Place, touching
+from gamba_warp.kernels.rasterize.tiles import Drawn, Limits, Size, make_picture
 from gamba_warp.kernels.runtime.launch import cuda_launch
-from gamba_warp.kernels.runtime.views import view
 
 SAME = 2e-6  # the two sum in another order
 
@@ -177,16 +179,15 @@ _touched = touching(1)
 
 
 @wp.kernel(enable_backward=False)
-def _test_sub_tiles(
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    opacities_in: wp.array[float],
-    alpha_min: float,
-    bits_out: wp.array[int],
-):
+def _test_sub_tiles(records_in: wp.array2d[float], bits_out: wp.array[int]):
     i = wp.tid()
-    corner = wp.vec2(0.5, 0.5)
-    bits_out[i] = _touched(corner, means2d_in[i], conics_in[i], opacities_in[i], alpha_min)
+    at = wp.int64(i) * wp.int64(records_in.shape[1])
+    shape = leaves_cuda.load4(records_in, at)
+    level = leaves_cuda.load4(records_in, at + wp.int64(4))
+    place = Place()  # that of the first lane, in a tile at the picture's corner
+    place.x[0] = 0.5
+    place.y[0] = 0.5
+    bits_out[i] = _touched(place, shape, level)
 
 
 @pytest.mark.parametrize("longest", [3.0, 2000.0])
@@ -202,9 +203,11 @@ def test_no_sub_tile_is_missed(from_ptx, longest):
     conics = torch.stack([cov[2] / (xx * yy), -cov[1] / cov[2], 1 / cov[2]], 1).float()
     opacities = 0.01 + 0.98 * torch.rand(count)
     bits = torch.zeros(count, dtype=torch.int32)
-    inputs = [view(means, wp.vec2), view(conics, wp.vec3), opacities, ALPHA_MIN]
+    splats = Drawn(means, conics, opacities, torch.rand(count, 3))
+    picture = make_picture(Size(16, 16, 1, 1, 0), Limits(ALPHA_MIN, 1.0, 0.0), num=count)
     from_ptx()
-    cuda_launch(_test_sub_tiles, count, inputs, [bits], device=bits.device)
+    records = make_records(splats, picture)
+    cuda_launch(_test_sub_tiles, count, [records], [bits], device=bits.device)
     centre = torch.arange(16).double() + 0.5
     a, k, e = conics.double()[:, :, None, None].unbind(1)
     dy = centre[:, None] - means.double()[:, 1, None, None]

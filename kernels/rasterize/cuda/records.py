@@ -1,0 +1,68 @@
+"""One record for each Gaussian of a view: what the compositor reads of it, 16 bytes at a time."""
+
+from typing import no_type_check
+
+import warp as wp
+from torch import Tensor
+
+from ...runtime.launch import launch
+from ...runtime.views import as_struct, struct, struct_of
+from ..tiles import CHUNK, Drawn, Picture, color_row, q_limit, record_size
+from . import leaves as L
+
+wp.set_module_options({"enable_backward": False})
+
+LOG2_E_HALF = 0.72134752044  # exp(-q/2) = 2^(-this q)
+
+
+@struct
+class Gaussians:
+    """Gaussians to composite, in view-major order.
+
+    A record has mean x, y, a', k; e', log2 of opacity, limit, top; then the colours, in chunks of
+    four. a', e' and the limit of q are those of README §1 times log2(e)/2, the first two with a
+    minus; ``top`` is y* of eq. 6.
+    """
+
+    records: wp.array2d[wp.float32]
+    channels: int
+    first: int  # the first channel of this launch
+
+
+@wp.kernel
+@no_type_check
+def _record(
+    offset: wp.int32,
+    picture: Picture,
+    splats_in: struct_of(Drawn),
+    records_out: wp.array2d[wp.float32],
+):
+    g = offset + wp.tid()
+    mean = splats_in.means2d[g]
+    conic = splats_in.conics[g]
+    opacity = splats_in.view_opacities[g]
+    a, k, e = conic[0], conic[1], conic[2]
+    limit = q_limit(opacity, picture.alpha_min)
+    reach = L.root(limit * L.reciprocal(e))
+    # top = -k a sqrt(limit / (a e (a k² + e)))
+    top = -k * a * reach * L.root(L.reciprocal(a) * L.reciprocal(a * k * k + e))
+    at = wp.int64(g) * wp.int64(records_out.shape[1])
+    L.store4(records_out, at, wp.vec4(mean[0], mean[1], -LOG2_E_HALF * a, k))
+    level = wp.vec4(-LOG2_E_HALF * e, wp.log2(opacity), LOG2_E_HALF * limit, top)
+    L.store4(records_out, at + wp.int64(4), level)
+    row = color_row(picture, g)
+    channels = splats_in.colors.shape[1]
+    for first in range(0, channels, CHUNK):
+        color = wp.vec4()
+        for c in range(CHUNK):
+            if first + c < channels:
+                color[c] = splats_in.colors[row, first + c]
+        L.store4(records_out, at + wp.int64(8 + first), color)
+
+
+def make_records(splats: Drawn, picture: Picture) -> Tensor:
+    """Records ``[I * N, record_size(C)]`` of all Gaussians."""
+    opacities, colors = splats.view_opacities, splats.colors
+    records = colors.new_empty(opacities.numel(), record_size(colors.shape[1]))
+    launch(_record, len(records), [picture, as_struct(splats)], [records], colors.device)
+    return records
