@@ -32,12 +32,11 @@ from .warp import (
     shared_memory,
     staging,
     sync,
+    sync_block,
     touching,
 )
 
 wp.set_module_options({"enable_backward": False})
-
-_BLOCKS = (1 << STOP) - 1
 
 
 @struct
@@ -48,21 +47,11 @@ class Rows:
     skipped: wp.array[wp.int32]
 
 
-@wp.func
-def columns_of_moments(channels: int) -> int:
-    # six for each chunk of channels: a chunk is a launch, and has its own sums of h
-    return (channels + wp.static(CHUNK - 1)) / wp.static(CHUNK) * 6
-
-
-@wp.func
-def _columns_with_absolute(channels: int) -> int:
-    # eight in all: absolute values do not add up over chunks, so one launch has all channels
-    return wp.where(channels > 0, 8, 0)
-
-
-def moments_of(channels: int, absolute: bool) -> tuple[int, int]:
-    """Number of sets of moments before a row's channels, and of moments in each set."""
-    return (1, 8) if absolute else (-(-channels // CHUNK), 6)
+def row_size(channels: int) -> int:
+    """Floats of a row: for each chunk of channels six moments, two sums of absolute values, four
+    colours, as much as a record has in shared memory.
+    """
+    return -(-channels // CHUNK) * RECORD
 
 
 class Sums(NamedTuple):
@@ -83,62 +72,59 @@ class Sums(NamedTuple):
         return (8 if self.absolute else 6) if self.geometry else 0
 
     def shared(self) -> int:
-        """Floats of a warp's shared memory: records, rows, sums of the pairs of a completion."""
+        """Floats of a warp's shared memory: records, their numbers, sums to be completed."""
         values = self.moments() + self.channels
         return WARP * RECORD + WARP + WARP // values * values * PITCH
 
+    def quarters(self) -> list[int]:
+        """Parts of 16 bytes of a chunk's columns that are written."""
+        return [0, 1] * self.geometry + [2] * (self.channels > 0)
+
 
 @functools.cache
-def _completing(asked: Sums, listed: bool):
-    """Return how many pairs' sums are stored at once, and functions to store and to add them.
+def _completing(asked: Sums, parts: int):
+    """Return how many pairs' sums are completed at once, and functions to store and complete them.
 
-    A row has six moments for each chunk of channels, or eight in all, then the channels. If
-    ``listed``, it is a pair's and is written; else it is a Gaussian's, and the pair is added to it.
+    Completed sums take the place of their pair's record.
     """
     moments = asked.moments()
-    columns = _columns_with_absolute if asked.absolute else columns_of_moments
     values = moments + asked.channels  # how many sums a pair has
     slots = WARP // values  # pairs whose sums are completed at once, with a lane for each sum
-    rows_at = WARP * RECORD
-    sums_at = rows_at + WARP
-    memory = shared_memory(asked.shared())
+    numbers_at = WARP * RECORD
+    sums_at = numbers_at + WARP
+    memory = shared_memory(parts * asked.shared())
     arena_type = memory.arena
     values_type = wp.types.vector(values, wp.float32)
 
     @wp.func
-    def leave(arena: arena_type, lane: wp.int32, slot: wp.int32, row: wp.int32, sums: values_type):
+    def leave(
+        arena: arena_type,
+        base: wp.int32,
+        lane: wp.int32,
+        slot: wp.int32,
+        i: wp.int32,
+        sums: values_type,
+    ):
         # stores a lane's sums of a pair, to be completed together with those of other pairs
-        at = wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
+        at = base + wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
         for v in range(wp.static(values)):
             memory.put(arena, at + wp.static(v * PITCH), sums[v])
-        memory.put_int(arena, wp.static(rows_at) + slot, row)
+        memory.put_int(arena, base + wp.static(numbers_at) + slot, i)
 
     @wp.func
-    def complete(
-        arena: arena_type,
-        gaussians: Gaussians,
-        lane: wp.int32,
-        count: wp.int32,
-        v_pairs: wp.array2d[wp.float32],
-    ):
+    def complete(arena: arena_type, base: wp.int32, lane: wp.int32, count: wp.int32):
         # each lane adds up one value of one of the stored pairs, over the 32 lanes
         if lane < count * wp.static(values):
-            at = wp.static(sums_at) + lane * PITCH
+            at = base + wp.static(sums_at) + lane * PITCH
             total = memory.get4(arena, at)
             for i in range(1, wp.static(WARP // 4)):
                 total += memory.get4(arena, at + 4 * i)
             value = (total[0] + total[1]) + (total[2] + total[3])
-            row = wp.int64(memory.get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
-            before = columns(gaussians.channels)
-            row *= wp.int64(before + gaussians.channels)
+            i = memory.get_int(arena, base + wp.static(numbers_at) + lane / wp.static(values))
             column = lane % wp.static(values)
             if column >= wp.static(moments):
-                column += before - wp.static(moments) + gaussians.first
-            else:
-                column += columns(gaussians.first)
-            if wp.static(not listed):
-                value += L.load(v_pairs, row, column)
-            L.store(v_pairs, row, column, value)
+                column += wp.static(8 - moments)
+            memory.put(arena, base + i * RECORD + column, value)
 
     return slots, leave, complete
 
@@ -151,12 +137,14 @@ def _walking(asked: Sums, parts: int, listed: bool):
     its pairs; pairs that a tile's own test excludes are removed from these.
     """
     (channels, geometry, absolute), moments, size = asked, asked.moments(), asked.shared()
-    memory = shared_memory(size)
+    memory = shared_memory(parts * size)
     arena_type = memory.arena
-    slots, leave, complete = _completing(asked, listed)
+    slots, leave, complete = _completing(asked, parts)
+    together = sync if parts == 1 else sync_block
+    quarters = asked.quarters()
     every = channels == 0  # channels are read one by one, from the tensors
     absolute = absolute and geometry
-    touched, stage = touching(parts), staging(size)
+    touched, stage = touching(parts), staging(parts * size)
     pixels = SUB_TILES // parts  # how many a lane has
     part_blocks = (1 << 16 // parts) - 1
     part_stops = (1 << pixels) - 1
@@ -206,6 +194,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
         arena: arena_type,
         p: Place,
     ):
+        base = p.part * wp.static(size)
         if wp.static(listed):
             begin = lists.starts[p.tile]
             walked = walked_in[p.tile]
@@ -241,29 +230,35 @@ def _walking(asked: Sums, parts: int, listed: bool):
         if (picture.skip & ZERO_UPSTREAM) == 0:
             some = wp.static(part_blocks)
         wanted = any_of(some)
-        if wanted == 0:
+        of_all = wanted  # those of the tile, of which each part has its own
+        if wp.static(parts > 1):
+            memory.put_int(arena, base, wanted << (p.part * wp.static(16 // parts)))
+            together()
+            of_all = 0
+            for part in range(wp.static(parts)):
+                of_all |= memory.get_int(arena, wp.static(part * size))
+            together()
+        if of_all == 0:
             walked = 0
         if p.lane == 0:
             wp.atomic_max(rows_out.skipped, p.tile, wp.where(walked > 0, 2, 1))
 
-        waiting = wp.int32(0)
-        for done in range(0, walked, WARP):
-            k = begin + walked - 1 - done - p.lane
+        end = begin + walked
+        while end > begin:
+            k = end - WARP + p.lane
             bits = wp.int32(0)
             if k >= begin:
-                bits = of_part(L.load_int(blocks, k), p.part, wanted)
+                bits = L.load_int(blocks, k)
                 if (picture.skip & UNUSED) == 0:
-                    bits |= wanted
+                    bits |= of_all
+                bits = of_part(bits, p.part, wanted)
                 if wp.static(not listed):
                     bits = of_tile(picture, gaussians, lists, p, k, bits)
                 if bits != 0:
                     if wp.static(listed):
-                        row = L.load_int(lists.rows, k)
                         g = L.load_int(lists.pairs, k)
                     else:
-                        row = k
                         g = L.load_int(lists.order, k)
-                    row = row * wp.static(parts) + p.part
                     at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
                     shape = L.load4(gaussians.records, at)
                     level = L.load4(gaussians.records, at + wp.int64(4))
@@ -272,16 +267,21 @@ def _walking(asked: Sums, parts: int, listed: bool):
                         color[0] = wp.cast(g, wp.float32)
                     else:
                         color = L.load4(gaussians.records, at + wp.int64(8 + gaussians.first))
-                    stage(arena, p.lane, shape, level, color, bits, row)
+                    stage(arena, base + p.lane * RECORD, shape, level, color, bits)
+                elif wp.static(parts > 1 or not listed):  # no sums, but some of another part's
+                    for quarter in range(3):
+                        memory.put4(arena, base + p.lane * RECORD + 4 * quarter, wp.vec4())
+            waiting = wp.int32(0)
             todo = ballot(bits)
             sync()
             while todo != 0:
-                i = L.lowest_bit(todo)
-                todo &= todo - 1
-                shape = memory.get4(arena, i * RECORD)
-                level = memory.get4(arena, i * RECORD + 4)
-                color = memory.get4(arena, i * RECORD + 8)
-                bits = memory.get_int(arena, i * RECORD + 6)
+                i = L.highest_bit(todo)
+                todo ^= 1 << i
+                record = base + i * RECORD
+                shape = memory.get4(arena, record)
+                level = memory.get4(arena, record + 4)
+                color = memory.get4(arena, record + 8)
+                bits = memory.get_int(arena, record + 6)
                 sums = values_type()
                 for j in range(wp.static(pixels)):
                     if (bits & wp.static(3 << first_block(j))) != 0:
@@ -301,7 +301,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                                 if wp.static(every):
                                     step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                                     step *= gaussians.channels
-                                    g = memory.get_int(arena, i * RECORD + 8)
+                                    g = memory.get_int(arena, record + 8)
                                     source = wp.int64(g) * wp.int64(gaussians.records.shape[1])
                                     for c in range(gaussians.channels):
                                         v = L.load(v_pixels_in.renders, first, step + c)
@@ -320,24 +320,52 @@ def _walking(asked: Sums, parts: int, listed: bool):
                                     if wp.static(absolute):
                                         sums[6] += wp.abs(hu)
                                         sums[7] += wp.abs(shape[2] * shape[3] * hu + level[0] * hy)
-                if (bits & wp.static(_BLOCKS)) != 0:
-                    leave(arena, p.lane, waiting, memory.get_int(arena, i * RECORD + 7), sums)
-                    waiting += 1
-                    if waiting == wp.static(slots):
-                        sync()
-                        complete(arena, gaussians, p.lane, waiting, rows_out.sums)
-                        sync()
-                        waiting = 0
+                leave(arena, base, p.lane, waiting, i, sums)
+                waiting += 1
+                if waiting == wp.static(slots):
+                    sync()
+                    complete(arena, base, p.lane, waiting)
+                    sync()
+                    waiting = 0
                 if (bits >> STOP) != 0:
                     # pixels that stopped here take part from the next pair on
-                    k = begin + walked - 1 - done - i
+                    k = end - WARP + i
+                    at = wp.int64(L.anew(p.index)) * wp.int64(wp.static(pixels * WARP))
+                    at += wp.int64(p.lane)
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if T[j] < 0.0:
-                                if L.load_stop(stops, p.place, j * WARP) == k:
+                                if L.load_stop(stops, at, j * WARP) == k:
                                     T[j] = -T[j]
             sync()
-        complete(arena, gaussians, p.lane, waiting, rows_out.sums)
+            complete(arena, base, p.lane, waiting)
+            together()
+            # each lane adds up a pair's sums over the parts, each part has some of the columns
+            k = end - WARP + p.lane
+            used = wp.int32(0)
+            if k >= begin:
+                used = of_all & L.load_int(blocks, k)
+            if used != 0:
+                row = k
+                if wp.static(listed):
+                    row = L.load_int(lists.rows, k)
+                # a row has three quarters for each chunk
+                at = wp.int64(row) * wp.int64(rows_out.sums.shape[1])
+                at += wp.int64(gaussians.first) * wp.int64(3) + wp.int64(wp.static(4 * quarters[0]))
+                record = p.lane * RECORD
+                for n in range(wp.static(len(quarters))):
+                    if p.part == wp.static(n % parts):
+                        total = memory.get4(arena, record + wp.static(4 * quarters[n]))
+                        for part in range(1, wp.static(parts)):
+                            more = wp.static(part * size + 4 * quarters[n])
+                            total += memory.get4(arena, record + more)
+                        if wp.static(not listed):
+                            total += L.load4(rows_out.sums, at)
+                        L.store4(rows_out.sums, at, total)
+                    at += wp.int64(4)
+            if wp.static(parts > 1):
+                together()
+            end -= WARP
 
     return walk
 
@@ -346,12 +374,13 @@ def _walking(asked: Sums, parts: int, listed: bool):
 def backward_kernels(asked: Sums, parts: int):
     """The kernels for these sums and parts of a tile: 1, 2 or 4.
 
-    ``composite_vjp`` has a warp for each part of a tile, and rows of pairs;
-    ``composite_vjp_unlisted`` one for a part of each tile of a view, and rows of Gaussians,
-    numbered as ``lists_in.order``.
+    ``composite_vjp`` has a block for each tile, a warp for each part, and rows of pairs;
+    ``composite_vjp_unlisted`` a block for all tiles of a view, and rows of Gaussians, numbered as
+    ``lists_in.order``.
     """
-    size, place = asked.shared(), placing(parts)
-    options = kernel_options(20 if asked.channels < 4 else 16)  # as there are registers for
+    size, place = parts * asked.shared(), placing(parts)
+    warps = (24 if parts == 4 else 20) if asked.channels < 4 else 16  # as registers allow
+    options = kernel_options(warps, parts)
     walk, walk_unlisted = (_walking(asked, parts, listed) for listed in (True, False))
 
     @wp.kernel(enable_backward=False, **options)

@@ -17,7 +17,7 @@ from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import Packed, as_struct
 from ..constants import BLOCKS
 from ..tiles import CHUNK, Bins, Drawn, Picture, Pixels, Walk
-from .backward import Rows, Sums, backward_kernels, moments_of
+from .backward import Rows, Sums, backward_kernels, row_size
 from .forward import forward_kernels
 from .records import Gaussians, make_records
 from .reduce import reduce_rows
@@ -43,15 +43,17 @@ def _launch(
     channels: int,
     inputs: list,
     outputs: list,
+    block: int = 1,
     chunk: int = CHUNK,
 ) -> None:
-    """Launches both ``kernels`` of each chunk of channels, with so many warps."""
+    """Launches both ``kernels`` of each chunk of channels, with so many warps, some a block."""
     for first in range(0, channels if warps[0] else 0, chunk):
         gaussians = Packed(Gaussians, records, channels, first)
         for kernel, count in zip(kernels(min(chunk, channels - first)), warps):
             arguments = [picture, gaussians, *inputs]
+            threads = WARP * block
             cuda_launch(
-                kernel, (count, WARP), arguments, outputs, device=records.device, block_dim=WARP
+                kernel, (count, WARP), arguments, outputs, device=records.device, block_dim=threads
             )
 
 
@@ -101,8 +103,7 @@ def composite_backward(
     colors = splats.colors
     tiles, channels = walk.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
-    sets, moments = moments_of(channels, absolute is not None)
-    v_pairs = colors.new_zeros(bins.pairs.numel(), parts, sets * moments + channels)
+    v_pairs = colors.new_zeros(bins.pairs.numel(), row_size(channels))
     # a pixel's absolute gradient is of all channels: several chunks leave it to another launch
     apart = absolute is not None and channels > CHUNK
     given = (
@@ -112,6 +113,7 @@ def composite_backward(
         channels,
         [as_struct(bins), as_struct(walk), Packed(Pixels, *v_pixels)],
         [Packed(Rows, v_pairs, skipped)],
+        parts,
     )
     flags = geometry and not apart, absolute is not None
     _launch(lambda count: backward_kernels(Sums(count, *flags), parts), *given)

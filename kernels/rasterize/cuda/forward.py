@@ -35,7 +35,8 @@ from .warp import (
 )
 
 _BITS = WARP * RECORD  # where the bits of the pairs that are evaluated begin
-_SIZE = _BITS + WARP
+_OWN = _BITS + WARP  # and each lane's own sub-tiles
+_SIZE = _OWN + WARP
 
 
 @functools.cache
@@ -114,22 +115,22 @@ def _walking(channels: int, parts: int, listed: bool):
                 own &= touched(p, shape, level)
             if not seen:
                 own = 0
+            memory.put_int(arena, wp.static(_OWN) + p.lane, own)
             # those that touch something lie side by side
             todo = ballot(own)
             slot = L.count_bits(todo & ((1 << p.lane) - 1))
             if own != 0:
                 color = L.load4(gaussians.records, at + wp.int64(8 + gaussians.first))
-                stage(arena, slot, shape, level, color, own, 0)
+                stage(arena, slot * RECORD, shape, level, color, own)
             else:
                 slot = -1
             count = L.count_bits(todo)
-            memory.put_int(arena, wp.static(_BITS) + p.lane, 0)
             sync()
             for i in range(count):
                 shape = memory.get4(arena, i * RECORD)
                 level = memory.get4(arena, i * RECORD + 4)
                 color = memory.get4(arena, i * RECORD + 8)
-                mask = memory.get_int(arena, i * RECORD + 6)
+                mask = live & memory.get_int(arena, i * RECORD + 6)
                 used = word()
                 stopped = word()
                 for j in range(wp.static(pixels)):
@@ -150,7 +151,7 @@ def _walking(channels: int, parts: int, listed: bool):
                 bits = any_of((used[0] << half) | stopped[0])
                 memory.put_int(arena, wp.static(_BITS) + i, bits)
                 if (bits >> STOP) != 0:
-                    k = k0 + L.lowest_bit(ballot(wp.where(slot == i, 1, 0)))
+                    k = k0 + L.highest_bit(ballot(wp.where(slot == i, 1, 0)))
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if (stopped[0] & wp.static(1 << (STOP + j))) != 0:
@@ -162,25 +163,22 @@ def _walking(channels: int, parts: int, listed: bool):
                             over = ballot(going) == 0
                             if over and (picture.skip & STOPPED) != 0:
                                 live &= wp.static(~(1 << j))
-                    sync()
                     if slot > i:
-                        own = memory.get_int(arena, slot * RECORD + 6) & live
-                        memory.put_int(arena, slot * RECORD + 6, own)
-                    sync()
+                        own = live & memory.get_int(arena, wp.static(_OWN) + p.lane)
+                        memory.put_int(arena, wp.static(_OWN) + p.lane, own)
                     if live == 0:
                         end = k + 1
+                        count = i + 1
                         break
             sync()
-            own = 0
-            mine = wp.int32(0)
-            if slot >= 0:
-                own = memory.get_int(arena, slot * RECORD + 6)
-                mine = memory.get_int(arena, wp.static(_BITS) + slot)
+            own = memory.get_int(arena, wp.static(_OWN) + p.lane)
             for j in range(wp.static(pixels)):
                 evaluated += L.count_bits(ballot(own & wp.static(1 << j)))
+            mine = wp.int32(0)
+            if slot >= 0 and slot < count:
+                mine = memory.get_int(arena, wp.static(_BITS) + slot)
             if mine != 0:
                 leave(walked_out.blocks, k0 + p.lane, p.part, mine)
-            sync()
             k0 += WARP
 
         # found anew, so that no registers hold the lane's place during the walk

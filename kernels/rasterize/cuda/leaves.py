@@ -68,9 +68,9 @@ def exponent(
     ...
 
 
-@wp.func_native("return __ffs(x) - 1;")
-def lowest_bit(x: wp.int32) -> wp.int32:
-    """The number of the lowest bit that is set; one must be."""
+@wp.func_native('int y; asm("bfind.u32 %0, %1;" : "=r"(y) : "r"(x)); return y;')
+def highest_bit(x: wp.int32) -> wp.int32:
+    """The number of the highest bit that is set; one instruction, where the lowest takes two."""
     ...
 
 

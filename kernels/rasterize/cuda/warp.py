@@ -64,6 +64,10 @@ _PUT4 = """
 def sync(): ...
 
 
+@wp.func_native("__syncthreads();")
+def sync_block(): ...
+
+
 @wp.func_native(_ANY_OF)
 def any_of(x: wp.int32) -> wp.int32:
     """The or of all lanes' integers."""
@@ -76,9 +80,10 @@ def ballot(x: wp.int32) -> wp.int32:
     ...
 
 
-def kernel_options(warps: int) -> dict[str, Any]:
-    """Options of a kernel whose blocks are warps, so many of which share a multiprocessor."""
-    return {"module": "unique", "launch_bounds": (WARP, warps), "grid_stride": False}
+def kernel_options(warps: int, block: int = 1) -> dict[str, Any]:
+    """Options of a kernel of ``block`` warps a block, ``warps`` of which share a multiprocessor."""
+    bounds = WARP * block, warps // block
+    return {"module": "unique", "launch_bounds": bounds, "grid_stride": False}
 
 
 class Memory(NamedTuple):
@@ -203,27 +208,22 @@ def touching(parts: int):
 
 @functools.cache
 def staging(size: int):
-    """The function that copies a record to a lane's place in shared memory.
-
-    There two integers take the places of ``limit`` and ``top``.
-    """
+    """The function that copies a record to shared memory, with bits in the place of ``limit``."""
     memory = shared_memory(size)
 
     @wp.func
     @no_type_check
     def stage(
         arena: memory.arena,
-        lane: wp.int32,
+        at: wp.int32,
         shape: wp.vec4,
         level: wp.vec4,
         color: wp.vec4,
         bits: wp.int32,
-        row: wp.int32,
     ):
         level[2] = wp.cast(bits, wp.float32)
-        level[3] = wp.cast(row, wp.float32)
-        memory.put4(arena, lane * RECORD, shape)
-        memory.put4(arena, lane * RECORD + 4, level)
-        memory.put4(arena, lane * RECORD + 8, color)
+        memory.put4(arena, at, shape)
+        memory.put4(arena, at + 4, level)
+        memory.put4(arena, at + 8, color)
 
     return stage
