@@ -281,7 +281,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 shape = memory.get4(arena, record)
                 level = memory.get4(arena, record + 4)
                 color = memory.get4(arena, record + 8)
-                bits = memory.get_int(arena, record + 6)
+                bits = wp.cast(level[2], wp.int32)
                 sums = values_type()
                 for j in range(wp.static(pixels)):
                     if (bits & wp.static(3 << first_block(j))) != 0:
@@ -301,7 +301,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                                 if wp.static(every):
                                     step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                                     step *= gaussians.channels
-                                    g = memory.get_int(arena, record + 8)
+                                    g = wp.cast(color[0], wp.int32)
                                     source = wp.int64(g) * wp.int64(gaussians.records.shape[1])
                                     for c in range(gaussians.channels):
                                         v = L.load(v_pixels_in.renders, first, step + c)

@@ -130,7 +130,7 @@ def _walking(channels: int, parts: int, listed: bool):
                 shape = memory.get4(arena, i * RECORD)
                 level = memory.get4(arena, i * RECORD + 4)
                 color = memory.get4(arena, i * RECORD + 8)
-                mask = live & memory.get_int(arena, i * RECORD + 6)
+                mask = live & wp.cast(level[2], wp.int32)
                 used = word()
                 stopped = word()
                 for j in range(wp.static(pixels)):
