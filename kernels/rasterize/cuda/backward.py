@@ -48,9 +48,7 @@ class Rows:
 
 
 def row_size(channels: int) -> int:
-    """Floats of a row: for each chunk of channels six moments, two sums of absolute values, four
-    colours, as much as a record has in shared memory.
-    """
+    """Floats of a row; for each chunk six moments, two sums of absolute values, four colours."""
     return -(-channels // CHUNK) * RECORD
 
 
