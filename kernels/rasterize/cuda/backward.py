@@ -23,12 +23,12 @@ from .warp import (
     SUB_TILES,
     WARP,
     WIDTH,
-    Place,
+    LanePixels,
     any_of,
     ballot,
     first_block,
     kernel_options,
-    placing,
+    pixels_of_lane,
     shared_memory,
     staging,
     sync,
@@ -161,7 +161,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
         picture: Picture,
         gaussians: Gaussians,
         lists: struct_of(Bins),
-        p: Place,
+        p: LanePixels,
         k: wp.int32,
         bits: wp.int32,
     ):
@@ -190,7 +190,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
         v_pixels_in: Pixels,
         rows_out: Rows,
         arena: arena_type,
-        p: Place,
+        p: LanePixels,
     ):
         base = p.part * wp.static(size)
         if wp.static(listed):
@@ -208,7 +208,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
         some = wp.int32(0)  # bits of the blocks whose upstream gradient is not 0
         for j in range(wp.static(pixels)):
             if walked > 0:
-                T[j] = L.load(transmittances, p.place, j * WARP)
+                T[j] = L.load(transmittances, p.walk_row, j * WARP)
             if T[j] != 0.0:
                 step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 largest = wp.float32(0.0)
@@ -376,7 +376,7 @@ def backward_kernels(asked: Sums, parts: int):
     ``composite_vjp_unlisted`` a block for all tiles of a view, and rows of Gaussians, numbered as
     ``lists_in.order``.
     """
-    size, place = parts * asked.shared(), placing(parts)
+    size, lane_pixels = parts * asked.shared(), pixels_of_lane(parts)
     warps = (24 if parts == 4 else 20) if asked.channels < 4 else 16  # as registers allow
     options = kernel_options(warps, parts)
     walk, walk_unlisted = (_walking(asked, parts, listed) for listed in (True, False))
@@ -393,7 +393,7 @@ def backward_kernels(asked: Sums, parts: int):
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
-        p = place(picture, index, lane)
+        p = lane_pixels(picture, index, lane)
         walk(
             picture,
             gaussians_in,
@@ -426,7 +426,7 @@ def backward_kernels(asked: Sums, parts: int):
             tiles = 0
         for tile in range(tiles):
             tile += image * picture.tiles_x * picture.tiles_y
-            p = place(picture, tile * wp.static(parts) + worker % wp.static(parts), lane)
+            p = lane_pixels(picture, tile * wp.static(parts) + worker % wp.static(parts), lane)
             walk_unlisted(
                 picture,
                 gaussians_in,

@@ -21,12 +21,12 @@ from .warp import (
     SUB_TILES,
     WARP,
     WIDTH,
-    Place,
+    LanePixels,
     any_of,
     ballot,
     first_block,
     kernel_options,
-    placing,
+    pixels_of_lane,
     shared_memory,
     staging,
     sync,
@@ -49,7 +49,7 @@ def _walking(channels: int, parts: int, listed: bool):
     """
     memory = shared_memory(_SIZE)
     arena_type = memory.arena
-    place, touched, stage = placing(parts), touching(parts), staging(_SIZE)
+    lane_pixels, touched, stage = pixels_of_lane(parts), touching(parts), staging(_SIZE)
     pixels = SUB_TILES // parts  # how many a lane has
     pixels_type = wp.types.vector(pixels, wp.float32)
     sums_type = wp.types.matrix((pixels, channels), wp.float32)
@@ -76,7 +76,7 @@ def _walking(channels: int, parts: int, listed: bool):
         walked_out: struct_of(Walk),
         pixels_out: Pixels,
         arena: arena_type,
-        p: Place,
+        p: LanePixels,
     ):
         if wp.static(listed):
             k0 = lists.starts[p.tile]
@@ -156,7 +156,7 @@ def _walking(channels: int, parts: int, listed: bool):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if (stopped[0] & wp.static(1 << (STOP + j))) != 0:
                                 T[j] = -T[j]
-                                L.store_stop(walked_out.stops, p.place, j * WARP, k)
+                                L.store_stop(walked_out.stops, p.walk_row, j * WARP, k)
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1
@@ -181,8 +181,8 @@ def _walking(channels: int, parts: int, listed: bool):
                 leave(walked_out.blocks, k0 + p.lane, p.part, mine)
             k0 += WARP
 
-        # found anew, so that no registers hold the lane's place during the walk
-        p = place(picture, L.anew(p.index), p.lane)
+        # found anew, so that no registers hold the lane's pixels during the walk
+        p = lane_pixels(picture, L.anew(p.index), p.lane)
         if p.lane == 0:
             if wp.static(listed):
                 wp.atomic_max(walked_out.walked, p.tile, end - lists.starts[p.tile])
@@ -192,7 +192,7 @@ def _walking(channels: int, parts: int, listed: bool):
             wp.atomic_add(walked_out.blocks_walked, p.tile, wp.int64(evaluated))
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
-            L.store(walked_out.transmittances, p.place, j * WARP, T[j])
+            L.store(walked_out.transmittances, p.walk_row, j * WARP, T[j])
             if T[j] != 0.0:
                 step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 L.store(pixels_out.alphas, p.pixel, step, 1.0 - wp.abs(T[j]))
@@ -211,7 +211,7 @@ def forward_kernels(channels: int, parts: int):
     lists are too short.
     """
     options = kernel_options(24 if channels < 4 else 20)  # warps that there are registers for
-    place = placing(parts)
+    lane_pixels = pixels_of_lane(parts)
     walk, walk_unlisted = _walking(channels, parts, True), _walking(channels, parts, False)
 
     @wp.kernel(enable_backward=False, **options)
@@ -225,7 +225,7 @@ def forward_kernels(channels: int, parts: int):
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
-        p = place(picture, index, lane)
+        p = lane_pixels(picture, index, lane)
         walk(picture, gaussians_in, lists_in, walked_out, pixels_out, arena, p)
 
     @wp.kernel(enable_backward=False, **options)
@@ -240,7 +240,7 @@ def forward_kernels(channels: int, parts: int):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         if lists_in.count[0] > wp.int64(lists_in.pairs.shape[0]):
-            p = place(picture, index, lane)
+            p = lane_pixels(picture, index, lane)
             walk_unlisted(picture, gaussians_in, lists_in, walked_out, pixels_out, arena, p)
 
     return composite, composite_unlisted

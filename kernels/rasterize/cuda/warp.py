@@ -122,7 +122,7 @@ def shared_memory(size: int) -> Memory:
 
 
 @struct
-class Place:
+class LanePixels:
     """Tile and pixels of a warp and a lane."""
 
     index: wp.int32  # of the warp's part among those of all tiles
@@ -133,20 +133,20 @@ class Place:
     px: wp.int32  # the lane's pixel in the first sub-tile
     py: wp.int32
     pixel: wp.int64  # its number in all pictures
-    place: wp.int64  # its number by tiles and sub-tiles; those of the next ones are WARP apart
+    walk_row: wp.int64  # its number by tiles and sub-tiles; those of the next ones are WARP apart
     x: wp.vec2  # centres of the lane's pixels, by columns of sub-tiles
     y: wp.vec4  # by rows of sub-tiles
 
 
 @functools.cache
-def placing(parts: int):
-    """The function that finds a lane's place, with tiles cut into so many parts."""
+def pixels_of_lane(parts: int):
+    """The function that finds a lane's ``LanePixels``, with tiles cut into so many parts."""
     pixels = SUB_TILES // parts
 
     @wp.func
     @no_type_check
-    def place(picture: Picture, index: wp.int32, lane: wp.int32) -> Place:
-        p = Place()
+    def lane_pixels(picture: Picture, index: wp.int32, lane: wp.int32) -> LanePixels:
+        p = LanePixels()
         p.index = index
         p.lane = lane
         p.tile = index // wp.static(parts)
@@ -158,14 +158,14 @@ def placing(parts: int):
         p.py = y + lane // WIDTH
         line = p.image * picture.height + p.py  # among those of all pictures
         p.pixel = wp.int64(line) * wp.int64(picture.width) + wp.int64(p.px)
-        p.place = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
+        p.walk_row = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
         for i in range(2):
             p.x[i] = float(p.px + i * WIDTH) + 0.5
         for i in range(wp.static(pixels // 2)):
             p.y[i] = float(p.py + i * HEIGHT) + 0.5
         return p
 
-    return place
+    return lane_pixels
 
 
 @functools.cache
@@ -177,7 +177,7 @@ def touching(parts: int):
 
     @wp.func
     @no_type_check
-    def touched(p: Place, shape: wp.vec4, level: wp.vec4) -> wp.int32:
+    def touched(p: LanePixels, shape: wp.vec4, level: wp.vec4) -> wp.int32:
         # bit j: the ellipse alpha >= alpha_min touches sub-tile j
         a, k, e = -shape[2], shape[3], -level[0]
         limit, top = level[2], level[3]

@@ -1,9 +1,10 @@
-// needs: cpu.py: seen, v_seen, D, UNROLL, SHORTEST, task
+// needs: cpu.py: arrays, v_arrays, D, UNROLL, SHORTEST, task
 // gives: the body of harmonics_vjp
 #include "gather.h"
-const float *const colors = seen.colors.data, *const v_colors = v_seen.colors.data;
-float *const v_coefficients = v_seen.coefficients.data, *const v_means = (float*)v_seen.means.data;
-float* const v_centers = (float*)v_seen.centers.data;
+const float *const colors = arrays.colors.data, *const v_colors = v_arrays.colors.data;
+float *const v_coefficients = v_arrays.coefficients.data,
+             *const v_means = (float*)v_arrays.means.data;
+float* const v_centers = (float*)v_arrays.centers.data;
 auto slopes_ = [&](F x, F y, F z, const F* s, F& v_x, F& v_y, F& v_z) {
 #include "slopes.h"
 };

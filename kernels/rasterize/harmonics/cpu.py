@@ -8,7 +8,7 @@ import functools
 from pathlib import Path
 
 from ...runtime.native import native, native_kernel
-from .shared import SHORTEST, Seen, Size
+from .shared import SHORTEST, Arrays, Size
 
 CHUNK = 256  # Gaussians of a task; their gradient by a centre is one partial sum
 _UNROLLED = 96  # floats of a row up to which its loops are written out
@@ -32,11 +32,13 @@ def _text(name: str, degree: int, channels: int, clamped: bool) -> str:
 def forward_kernel(degree: int, channels: int, clamped: bool):
     """Fills the colours, or the bare sums unless ``clamped``."""
     text = _text("forward.inl", degree, channels, clamped)
-    return native_kernel("harmonics", text, {"size": Size}, {"seen": Seen})
+    return native_kernel("harmonics", text, {"size": Size}, {"arrays": Arrays})
 
 
 @functools.cache
 def backward_kernel(degree: int, channels: int, clamped: bool):
-    """The gradient of ``forward_kernel``: from ``v_seen``'s colours to its other arrays."""
+    """The gradient of ``forward_kernel``: from ``v_arrays``'s colours to its other arrays."""
     text = _text("backward.inl", degree, channels, clamped)
-    return native_kernel("harmonics_vjp", text, {"size": Size, "seen": Seen}, {"v_seen": Seen})
+    return native_kernel(
+        "harmonics_vjp", text, {"size": Size, "arrays": Arrays}, {"v_arrays": Arrays}
+    )

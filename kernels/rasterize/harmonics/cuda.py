@@ -13,7 +13,7 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.native import native
-from .shared import SHORTEST, Seen, Size
+from .shared import SHORTEST, Arrays, Size
 
 CHUNK = 1  # Gaussians of a task
 _HERE = Path(__file__).parent
@@ -78,32 +78,32 @@ def forward_kernel(degree: int, channels: int, clamped: bool):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
     @no_type_check
-    def harmonics(offset: wp.int32, size: Size, seen_out: Seen):
+    def harmonics(offset: wp.int32, size: Size, arrays_out: Arrays):
         i = offset + wp.tid()
         num, views = size.num, size.views
-        mean = seen_out.means[i]
+        mean = arrays_out.means[i]
         for view in range(views):
             image = i // num * views + view
             at = image * num + i % num
             row = wp.where(size.per_view != 0, at, i)
-            t = _direction(mean, seen_out.centers[image])
+            t = _direction(mean, arrays_out.centers[image])
             Y = basis(t[0], t[1], t[2])
             bad = not (wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2]))
-            for d in range(seen_out.colors.shape[1]):
+            for d in range(arrays_out.colors.shape[1]):
                 value = wp.float32(0.0)
                 for k in range(count):
-                    value += Y[k] * seen_out.coefficients[row, k, d]
+                    value += Y[k] * arrays_out.coefficients[row, k, d]
                 # a coefficient that is not finite leaves such a sum; the reverse need not hold
                 bad = bad or not wp.isfinite(value)
                 if wp.static(clamped):
                     value += 0.5
                     value = wp.where(value < 0.0, 0.0, value)
-                seen_out.colors[at, d] = value
+                arrays_out.colors[at, d] = value
             if bad:
                 finite = wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2])
-                if not (finite and used_are_finite(seen_out.coefficients, row)):
-                    for d in range(seen_out.colors.shape[1]):
-                        seen_out.colors[at, d] = wp.nan
+                if not (finite and used_are_finite(arrays_out.coefficients, row)):
+                    for d in range(arrays_out.colors.shape[1]):
+                        arrays_out.colors[at, d] = wp.nan
 
     return harmonics
 
@@ -117,31 +117,31 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
     @no_type_check
-    def harmonics_vjp(offset: wp.int32, size: Size, seen_in: Seen, v_seen_out: Seen):
+    def harmonics_vjp(offset: wp.int32, size: Size, arrays_in: Arrays, v_arrays_out: Arrays):
         i = offset + wp.tid()
         num, views = size.num, size.views
-        mean = seen_in.means[i]
+        mean = arrays_in.means[i]
         b = i // num
-        channels = v_seen_out.colors.shape[1]
-        if v_seen_out.coefficients:
+        channels = v_arrays_out.colors.shape[1]
+        if v_arrays_out.coefficients:
             for d in range(channels):
                 v_column = column()
                 for view in range(views):
                     image = b * views + view
                     at = image * num + i % num
                     # channels that pass no gradient on may hold NaN, which must not meet a zero
-                    if seen_in.colors[at, d] > wp.static(above):
-                        t = _direction(mean, seen_in.centers[image])
-                        v_column += v_seen_out.colors[at, d] * basis(t[0], t[1], t[2])
+                    if arrays_in.colors[at, d] > wp.static(above):
+                        t = _direction(mean, arrays_in.centers[image])
+                        v_column += v_arrays_out.colors[at, d] * basis(t[0], t[1], t[2])
                     last = size.per_view != 0 or view == views - 1
                     if last:
                         row = wp.where(size.per_view != 0, at, i)
                         for k in range(count):
-                            v_seen_out.coefficients[row, k, d] = v_column[k]
-                        for k in range(count, v_seen_out.coefficients.shape[1]):
-                            v_seen_out.coefficients[row, k, d] = 0.0
+                            v_arrays_out.coefficients[row, k, d] = v_column[k]
+                        for k in range(count, v_arrays_out.coefficients.shape[1]):
+                            v_arrays_out.coefficients[row, k, d] = 0.0
                         v_column = column()
-        if wp.static(degree > 0) and (v_seen_out.means or v_seen_out.centers):
+        if wp.static(degree > 0) and (v_arrays_out.means or v_arrays_out.centers):
             v_mean = wp.vec3(0.0, 0.0, 0.0)
             for view in range(views):
                 image = b * views + view
@@ -150,13 +150,13 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
                 s = column()
                 alive = wp.bool(False)
                 for d in range(channels):
-                    if seen_in.colors[at, d] > wp.static(above):
+                    if arrays_in.colors[at, d] > wp.static(above):
                         alive = True
-                        v = v_seen_out.colors[at, d]
+                        v = v_arrays_out.colors[at, d]
                         for k in range(count):
-                            s[k] = s[k] + v * seen_in.coefficients[row, k, d]
+                            s[k] = s[k] + v * arrays_in.coefficients[row, k, d]
                 if alive:
-                    t = _direction(mean, seen_in.centers[image])
+                    t = _direction(mean, arrays_in.centers[image])
                     u = wp.vec3(t[0], t[1], t[2])
                     v_t = slopes(u[0], u[1], u[2], s)
                     # through the division by the length, a constant where it is too short
@@ -164,9 +164,9 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
                         v_t = v_t - wp.dot(u, v_t) * u
                     v_t = v_t / wp.max(t[3], SHORTEST)
                     v_mean += v_t
-                    if v_seen_out.centers:
-                        v_seen_out.centers[at] = -v_t
-            if v_seen_out.means:
-                v_seen_out.means[i] = v_mean
+                    if v_arrays_out.centers:
+                        v_arrays_out.centers[at] = -v_t
+            if v_arrays_out.means:
+                v_arrays_out.means[i] = v_mean
 
     return harmonics_vjp

@@ -1,7 +1,7 @@
-// needs: cpu.py: seen, D, UNROLL
+// needs: cpu.py: arrays, D, UNROLL
 // gives: the body of harmonics
 #include "gather.h"
-float* const colors = seen.colors.data;
+float* const colors = arrays.colors.data;
 for (int first = begin; first < end; first += 16) {
     const int live = end - first < 16 ? end - first : 16;
     F mean[3];

@@ -1,4 +1,4 @@
-// needs: cpu.py: DEGREE, D, seen, SHORTEST, CLAMPED, CHUNK, task
+// needs: cpu.py: DEGREE, D, arrays, SHORTEST, CLAMPED, CHUNK, task
 // gives: F, I, COUNT, FLOATS, PADDED, fma_, b, any_, wild_, turn_, num, views, per_view,
 //     coefficients, centers, K_D, stop, load_rows_, direction_, basis_, shown_, passes_, chunks,
 //     begin, end, means_
@@ -37,8 +37,8 @@ auto turn_ = [](F* r) {
 #undef LOW
 const int num = size.num, views = size.views;
 const bool per_view = size.per_view;
-const wp::array_t<float>& coefficients = seen.coefficients;
-const float* const centers = (const float*)seen.centers.data;
+const wp::array_t<float>& coefficients = arrays.coefficients;
+const float* const centers = (const float*)arrays.centers.data;
 const size_t K_D = coefficients.shape[1] * coefficients.shape[2];
 const float* const stop = coefficients.data + (size_t)coefficients.shape[0] * K_D;
 // turns the rows of ``live`` Gaussians: the i-th float of each becomes into[i]
@@ -85,7 +85,7 @@ const int b = task / chunks, begin = task % chunks * CHUNK;
 const int end = begin + CHUNK < num ? begin + CHUNK : num;
 // the means of the lanes from ``first`` on, of which ``live`` are Gaussians
 auto means_ = [&](int first, int live, F* mean) {
-    const float* const points = (const float*)seen.means.data + ((size_t)b * num + first) * 3;
+    const float* const points = (const float*)arrays.means.data + ((size_t)b * num + first) * 3;
     for (int j = 0; j < 16; ++j)
         for (int i = 0; i < 3; ++i) mean[i][j] = points[(j < live ? j : live - 1) * 3 + i];
 };

@@ -12,7 +12,7 @@ from ...runtime.views import Packed
 from ..projection import empty_on
 from . import cpu, cuda
 from .formula import colors_by_formula, sums_by_formula
-from .shared import Seen, Size
+from .shared import Arrays, Size
 
 _OP = "gamba_warp::rasterize_harmonics"
 MOST_CHANNELS = 64  # of the kernels: on a CPU the rows of coefficients lie on a thread's stack
@@ -23,11 +23,11 @@ def _kernels(device: torch.device):
 
 
 def _launch(kernel, chunk: int, tensors: list, outputs: list) -> None:
-    """Run a kernel on chunks of Gaussians; ``tensors`` are those of ``Seen``."""
+    """Run a kernel on chunks of Gaussians; ``tensors`` are those of ``Arrays``."""
     coefficients, means, centers, _ = tensors
     size = Packed(Size, means.shape[1], centers.shape[1], int(coefficients.dim() == 5))
     tasks = means.shape[0] * -(-means.shape[1] // chunk)
-    launch(kernel, tasks, [size, Packed(Seen, *tensors)], outputs, means.device)
+    launch(kernel, tasks, [size, Packed(Arrays, *tensors)], outputs, means.device)
 
 
 def _empty_colors(coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
@@ -54,28 +54,28 @@ def _(degree, clamped, coefficients, means, centers):
 
 @torch.library.custom_op(_OP + "_vjp", mutates_args=())
 def _harmonics_vjp(
-    degree: int, clamped: bool, seen: List[Tensor], v_colors: Tensor, wanted: List[bool]
+    degree: int, clamped: bool, arrays: List[Tensor], v_colors: Tensor, wanted: List[bool]
 ) -> List[Tensor]:
-    # ``seen`` are the inputs and the colours as forward wrote them
-    coefficients, means, centers, colors = seen
+    # ``arrays`` are the inputs and the colours as forward wrote them
+    coefficients, means, centers, colors = arrays
     if not colors.numel():
-        return [torch.zeros_like(x) for x, want in zip(seen, wanted) if want]
+        return [torch.zeros_like(x) for x, want in zip(arrays, wanted) if want]
     (batch, views, _), num, kernels = centers.shape, means.shape[1], _kernels(means.device)
     shape = coefficients.shape
     v_coefficients = empty_on(means.device, shape, torch.float32) if wanted[0] else None
     v_means = torch.zeros_like(means) if wanted[1] else None
     chunks = -(-num // kernels.CHUNK)
     v_centers = means.new_zeros(batch, views, chunks, 3) if wanted[2] else None
-    v_seen = Packed(Seen, v_coefficients, v_means, v_centers, v_colors)
+    v_arrays = Packed(Arrays, v_coefficients, v_means, v_centers, v_colors)
     kernel = kernels.backward_kernel(degree, shape[-1], clamped)
-    _launch(kernel, kernels.CHUNK, seen, [v_seen])
+    _launch(kernel, kernels.CHUNK, arrays, [v_arrays])
     grads = v_coefficients, v_means, None if v_centers is None else v_centers.sum(2)
     return [g for g in grads if g is not None]
 
 
 @_harmonics_vjp.register_fake
-def _(degree, clamped, seen, v_colors, wanted):
-    return [torch.empty_like(x) for x, want in zip(seen, wanted) if want]
+def _(degree, clamped, arrays, v_colors, wanted):
+    return [torch.empty_like(x) for x, want in zip(arrays, wanted) if want]
 
 
 def _setup(ctx, inputs, output):
@@ -84,8 +84,8 @@ def _setup(ctx, inputs, output):
 
 
 def _backward(ctx, v_colors):
-    wanted, seen = list(ctx.needs_input_grad[2:]), list(ctx.saved_tensors)
-    grads = iter(_harmonics_vjp(ctx.degree, ctx.clamped, seen, v_colors.contiguous(), wanted))
+    wanted, arrays = list(ctx.needs_input_grad[2:]), list(ctx.saved_tensors)
+    grads = iter(_harmonics_vjp(ctx.degree, ctx.clamped, arrays, v_colors.contiguous(), wanted))
     return None, None, *(next(grads) if want else None for want in wanted)
 
 

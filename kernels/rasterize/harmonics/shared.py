@@ -17,7 +17,7 @@ class Size:
 
 
 @struct
-class Seen:
+class Arrays:
     """The arrays of a launch, or their gradients; rows of coefficients are ``[K, D]``."""
 
     coefficients: wp.array3d[wp.float32]

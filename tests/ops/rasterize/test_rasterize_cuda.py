@@ -14,7 +14,7 @@ from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 from gamba_warp.kernels.rasterize.cuda import leaves as leaves_cuda
 from gamba_warp.kernels.rasterize.cuda.records import make_records
-from gamba_warp.kernels.rasterize.cuda.warp import Place, touching
+from gamba_warp.kernels.rasterize.cuda.warp import LanePixels, touching
 from gamba_warp.kernels.rasterize.tiles import Drawn, Limits, Size, make_picture
 from gamba_warp.kernels.runtime.launch import cuda_launch
 
@@ -184,7 +184,7 @@ def _test_sub_tiles(records_in: wp.array2d[float], bits_out: wp.array[int]):
     at = wp.int64(i) * wp.int64(records_in.shape[1])
     shape = leaves_cuda.load4(records_in, at)
     level = leaves_cuda.load4(records_in, at + wp.int64(4))
-    place = Place()  # that of the first lane, in a tile at the picture's corner
+    place = LanePixels()  # that of the first lane, in a tile at the picture's corner
     place.x[0] = 0.5
     place.y[0] = 0.5
     bits_out[i] = _touched(place, shape, level)
