@@ -40,6 +40,7 @@ CASES = {
     "scan": (lambda: scan(16), 132),
     "scan of many states": (lambda: scan(70), 132),
     "picture": (lambda: picture(True), 0),
+    "picture of tiles in quarters": (lambda: picture(True), 132),
     "picture without lists": (lambda: picture(False), 0),
 }
 
