@@ -186,11 +186,12 @@ class GltfFile:
             inner = {child for node in nodes for child in node.get("children", kind, [])}
             roots = [index for index in range(len(nodes)) if index not in inner]
         found: list[tuple[Entry, int, np.ndarray]] = []
-        left = [(root, np.eye(4)) for root in reversed(roots)]
+        left = [(root, np.eye(4), 0) for root in reversed(roots)]
+        most = len(self.document.entries("nodes"))  # a longer way has a node twice
         while left:
-            if len(found) + len(left) > MAX_NODES:
+            index, above, depth = left.pop()
+            if len(found) + len(left) >= MAX_NODES or depth > most:
                 raise UserError(f"{self.path}: over {MAX_NODES} nodes, or nodes in a circle")
-            index, above = left.pop()
             node = self.item("nodes", index)
             if node.values.get("matrix") is None:
                 matrix = _matrices(*(node.vector(*item)[None] for item in _IDENTITY.items()))[0]
@@ -198,7 +199,8 @@ class GltfFile:
                 matrix = node.vector("matrix", range(16)).reshape(4, 4).T
             matrix = above @ matrix
             found.append((node, index, matrix))
-            left += [(child, matrix) for child in reversed(node.get("children", kind, []))]
+            children = node.get("children", kind, [])
+            left += [(child, matrix, depth + 1) for child in reversed(children)]
         return found
 
     def instances(self, node: Entry) -> np.ndarray:

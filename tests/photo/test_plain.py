@@ -9,9 +9,14 @@ from gamba_warp.photo.plain import plain_matte
 
 
 @pytest.fixture(scope="module")
-def scores():
+def found():
     pytest.importorskip("manifold3d")
-    return [(case, iou(plain_matte(case.rgb).rgba[..., 3], case.alpha)) for case in cases()]
+    return [(case, plain_matte(case.rgb)) for case in cases()]
+
+
+@pytest.fixture(scope="module")
+def scores(found):
+    return [(case, iou(matte.rgba[..., 3], case.alpha)) for case, matte in found]
 
 
 def test_enclosed_background_and_shadows_go_and_white_matter_stays(scores):
@@ -43,12 +48,10 @@ def test_holes_may_be_kept(scores):
     np.testing.assert_array_equal(found.areas, kept.areas)
 
 
-def test_an_object_like_its_background_is_doubted():
+def test_an_object_like_its_background_is_doubted(found):
     """Counts of docs/photo.md: 15 of 18 that are cut wrong, none of 36 that are cut right."""
-    pytest.importorskip("manifold3d")
     doubts = {True: [], False: []}
-    for case in (*cases(), *near_white()):
-        found = plain_matte(case.rgb)
-        doubts[iou(found.rgba[..., 3], case.alpha) >= 0.9].append(doubted(case, found))
+    for case, matte in (*found, *((case, plain_matte(case.rgb)) for case in near_white())):
+        doubts[iou(matte.rgba[..., 3], case.alpha) >= 0.9].append(doubted(case, matte))
     assert not any(doubts[True]) and len(doubts[True]) > 30
     assert np.mean(doubts[False]) > 0.75

@@ -71,7 +71,7 @@ def test_the_steps_make_a_program_that_reconstructs(tmp_path):
     here = Path(pytest.__file__).parents[1]
     (site / "here.pth").write_text(f"{here}\n")
     out = tmp_path / "out"
-    command = [place / "bin" / "gamba", "reconstruct", PICTURE, "--mesh", "glb", *SMALL, out]
+    command = [place / "bin" / "gamba", "reconstruct", PICTURE, *SMALL, out]
     alone = {
         "cwd": tmp_path,
         "text": True,
@@ -79,7 +79,7 @@ def test_the_steps_make_a_program_that_reconstructs(tmp_path):
     }
     done = subprocess.run(command, capture_output=True, timeout=300, **alone)
     assert done.returncode == 0, done.stderr
-    assert {"scopia-toaster.ply", "scopia-toaster-mesh.glb"} <= {p.name for p in out.iterdir()}
+    assert (out / "scopia-toaster.ply").exists()
     code = "import gamba_warp; print(gamba_warp.__file__)"
     where = [place / "bin" / "python", "-c", code]
     assert subprocess.check_output(where, **alone).startswith(str(place))
