@@ -157,6 +157,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
         return bits >> (part * wp.static(16 // parts)) & wanted | stops
 
     @wp.func
+    @no_type_check
     def of_tile(
         picture: Picture,
         gaussians: Gaussians,
