@@ -38,7 +38,7 @@ def eval_join_command(
     from gamba_warp.files import output_folder, write_text
 
     from ..report import count_line, json_of, save_report
-    from .join import apart, join_reports
+    from .join import join_reports, unjoined
 
     joined = join_reports(reports)
     report = joined.report
@@ -52,7 +52,7 @@ def eval_join_command(
     for item in report["failures"]:
         print(f"failed: {item['name']}: {item['reason']}", file=sys.stderr)
     notes = sys.stderr if json else sys.stdout
-    if stay := apart(reports):
-        print(f"not joined, in the folders of the shards: {', '.join(stay)}", file=notes)
+    if left := unjoined(reports):
+        print(f"not joined, in the folders of the shards: {', '.join(left)}", file=notes)
     print(count_line(report, out, beside), file=notes)
     return 1 if report["failures"] or beside else 0

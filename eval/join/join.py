@@ -73,7 +73,7 @@ def join_reports(paths: Iterable[Path]) -> Joined:
         raise UserError(f"{ordered[0][0]} …: not reports of an evaluation ({reason})") from error
 
 
-def apart(paths: Iterable[Path]) -> list[str]:
+def unjoined(paths: Iterable[Path]) -> list[str]:
     """Return the names of pictures, shapes and pages beside the shards' reports."""
     folders = {path.parent for path in _files(paths) if path.name == "report.json"}
     found = {path for folder in folders for path in folder.iterdir() if path.name[0] != "."}

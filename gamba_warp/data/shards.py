@@ -43,8 +43,8 @@ _MAX_DOCUMENT = 64 << 20
 _NAMED = 3  # unread members that a warning names
 
 _Bytes = Annotated[int, Meta(ge=0, le=1 << 50)]
-_told: set[Path] = set()  # tars of which a warning has named the unread members
-_telling = threading.Lock()
+_warned: set[Path] = set()  # tars of which a warning has named the unread members
+_warning = threading.Lock()
 
 
 class Shard(msgspec.Struct, kw_only=True):
@@ -193,16 +193,16 @@ class Shards:
         """
         files, unread = self._read(uid)
         if unread:
-            self._tell_unread(self.places[uid].shard)
+            self._warn_unread(self.places[uid].shard)
         return files
 
-    def _tell_unread(self, number: int) -> None:
+    def _warn_unread(self, number: int) -> None:
         """Name and count the members of a tar that nothing reads, once in a process."""
         path = self.folder / self.sources[number].name
-        with _telling:
-            if path in _told:
+        with _warning:
+            if path in _warned:
                 return
-            _told.add(path)
+            _warned.add(path)
         names = list[str]()
         for uid in (uid for uid, place in self.places.items() if place.shard == number):
             with suppress(UserError):  # it is named when it is used

@@ -150,7 +150,7 @@ def test_the_list_of_gso_is_joined(world, tmp_path, monkeypatch):
     assert [r["name"] for r in joined["objects"]] == ["a", "absent", "b", "d"]
 
 
-def test_pictures_that_stay_are_told(both, tmp_path, capsys):
+def test_pictures_that_are_not_joined_are_named(both, tmp_path, capsys):
     paths = changed(both, tmp_path, lambda report: None)
     (paths[0] / "strips").mkdir()
     (paths[1] / "contact_sheet.png").write_bytes(b"")

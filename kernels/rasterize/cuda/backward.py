@@ -74,8 +74,8 @@ class Sums(NamedTuple):
         values = self.moments() + self.channels
         return WARP * RECORD + WARP + WARP // values * values * PITCH
 
-    def quarters(self) -> list[int]:
-        """Parts of 16 bytes of a chunk's columns that are written."""
+    def vectors(self) -> list[int]:
+        """Numbers of the vectors that are written, of a chunk's three of four columns."""
         return [0, 1] * self.geometry + [2] * (self.channels > 0)
 
 
@@ -139,7 +139,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
     arena_type = memory.arena
     slots, leave, complete = _completing(asked, parts)
     together = sync if parts == 1 else sync_block
-    quarters = asked.quarters()
+    vectors = asked.vectors()
     every = channels == 0  # channels are read one by one, from the tensors
     absolute = absolute and geometry
     touched, stage = touching(parts), staging(parts * size)
@@ -268,8 +268,8 @@ def _walking(asked: Sums, parts: int, listed: bool):
                         color = L.load4(gaussians.records, at + wp.int64(8 + gaussians.first))
                     stage(arena, base + p.lane * RECORD, shape, level, color, bits)
                 elif wp.static(parts > 1 or not listed):  # no sums, but some of another part's
-                    for quarter in range(3):
-                        memory.put4(arena, base + p.lane * RECORD + 4 * quarter, wp.vec4())
+                    for vector in range(3):
+                        memory.put4(arena, base + p.lane * RECORD + 4 * vector, wp.vec4())
             waiting = wp.int32(0)
             todo = ballot(bits)
             sync()
@@ -348,15 +348,15 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 row = k
                 if wp.static(listed):
                     row = L.load_int(lists.rows, k)
-                # a row has three quarters for each chunk
+                # a row has three vectors for each chunk
                 at = wp.int64(row) * wp.int64(rows_out.sums.shape[1])
-                at += wp.int64(gaussians.first) * wp.int64(3) + wp.int64(wp.static(4 * quarters[0]))
+                at += wp.int64(gaussians.first) * wp.int64(3) + wp.int64(wp.static(4 * vectors[0]))
                 record = p.lane * RECORD
-                for n in range(wp.static(len(quarters))):
+                for n in range(wp.static(len(vectors))):
                     if p.part == wp.static(n % parts):
-                        total = memory.get4(arena, record + wp.static(4 * quarters[n]))
+                        total = memory.get4(arena, record + wp.static(4 * vectors[n]))
                         for part in range(1, wp.static(parts)):
-                            more = wp.static(part * size + 4 * quarters[n])
+                            more = wp.static(part * size + 4 * vectors[n])
                             total += memory.get4(arena, record + more)
                         if wp.static(not listed):
                             total += L.load4(rows_out.sums, at)

@@ -35,8 +35,8 @@ from .warp import (
 )
 
 _BITS = WARP * RECORD  # where the bits of the pairs that are evaluated begin
-_OWN = _BITS + WARP  # and each lane's own sub-tiles
-_SIZE = _OWN + WARP
+_MASKS = _BITS + WARP  # and each lane's mask of the sub-tiles that its Gaussian touches
+_SIZE = _MASKS + WARP
 
 
 @functools.cache
@@ -110,18 +110,18 @@ def _walking(channels: int, parts: int, listed: bool):
             at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
             shape = L.load4(gaussians.records, at)
             level = L.load4(gaussians.records, at + wp.int64(4))
-            own = live
+            lane_mask = live
             if (picture.skip & BLOCK_TEST) != 0:
-                own &= touched(p, shape, level)
+                lane_mask &= touched(p, shape, level)
             if not seen:
-                own = 0
-            memory.put_int(arena, wp.static(_OWN) + p.lane, own)
+                lane_mask = 0
+            memory.put_int(arena, wp.static(_MASKS) + p.lane, lane_mask)
             # those that touch something lie side by side
-            todo = ballot(own)
+            todo = ballot(lane_mask)
             slot = L.count_bits(todo & ((1 << p.lane) - 1))
-            if own != 0:
+            if lane_mask != 0:
                 color = L.load4(gaussians.records, at + wp.int64(8 + gaussians.first))
-                stage(arena, slot * RECORD, shape, level, color, own)
+                stage(arena, slot * RECORD, shape, level, color, lane_mask)
             else:
                 slot = -1
             count = L.count_bits(todo)
@@ -164,16 +164,16 @@ def _walking(channels: int, parts: int, listed: bool):
                             if over and (picture.skip & STOPPED) != 0:
                                 live &= wp.static(~(1 << j))
                     if slot > i:
-                        own = live & memory.get_int(arena, wp.static(_OWN) + p.lane)
-                        memory.put_int(arena, wp.static(_OWN) + p.lane, own)
+                        lane_mask = live & memory.get_int(arena, wp.static(_MASKS) + p.lane)
+                        memory.put_int(arena, wp.static(_MASKS) + p.lane, lane_mask)
                     if live == 0:
                         end = k + 1
                         count = i + 1
                         break
             sync()
-            own = memory.get_int(arena, wp.static(_OWN) + p.lane)
+            lane_mask = memory.get_int(arena, wp.static(_MASKS) + p.lane)
             for j in range(wp.static(pixels)):
-                evaluated += L.count_bits(ballot(own & wp.static(1 << j)))
+                evaluated += L.count_bits(ballot(lane_mask & wp.static(1 << j)))
             mine = wp.int32(0)
             if slot >= 0 and slot < count:
                 mine = memory.get_int(arena, wp.static(_BITS) + slot)

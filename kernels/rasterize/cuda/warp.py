@@ -172,7 +172,7 @@ def pixels_of_lane(parts: int):
 def touching(parts: int):
     """The test of a Gaussian against the sub-tiles of a part of a tile (README eq. 6).
 
-    Takes the first two quarters of its record (``records.py``).
+    Takes the first two vectors of its record (``records.py``).
     """
 
     @wp.func
