@@ -1,7 +1,7 @@
 """Colours along an object's edge, without those of its background.
 
-A pixel of the edge mixes both: c = alpha · object + (1 - alpha) · background. Left as it is, the
-background shows as a fringe on any other one.
+A pixel of the edge mixes both: c = alpha · object + (1 - alpha) · background. If the background's
+share stays, it is visible as a fringe on any other background.
 """
 
 from __future__ import annotations
