@@ -7,6 +7,8 @@ from collections import Counter
 from .machine import Instruction, opcodes
 from .parse import Program
 
+_KINDS = (".f32", ".ftz.f32")  # a module has one of them
+
 
 @functools.cache
 def contracted(program: Program) -> Program:
@@ -22,15 +24,16 @@ def contracted(program: Program) -> Program:
         if at in targets or names[i.op] == "bra":
             products.clear()
         sides = [k for k in (0, 1) if i.given[k] in products]
-        if names[i.op] in ("add.f32", "sub.f32") and i.guard < 0 and sides:
+        first, kind = names[i.op][:3], names[i.op][3:]
+        if first in ("add", "sub") and kind in _KINDS and i.guard < 0 and sides:
             side = sides[0]
-            name = "fma.rn.f32" if names[i.op] == "add.f32" else ("a * b - c", "c - a * b")[side]
+            name = ("fma.rn" if first == "add" else ("a * b - c", "c - a * b")[side]) + kind
             product, other = products.pop(i.given[side]), i.given[1 - side]
             i.op, i.reads = opcodes()[name][0], 3
             i.given[:3] = [*product.given[:2], other]
         for result in i.to[: i.writes]:  # what a product is made of is no longer there
             products = {k: x for k, x in products.items() if result not in x.given[:2]}
-        if names[i.op] == "mul.f32" and i.guard < 0:
+        if first == "mul" and kind in _KINDS and i.guard < 0:
             if written[i.to[0]] == read[i.to[0]] == 1:
                 products[i.to[0]] = i
     return made

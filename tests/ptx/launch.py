@@ -5,6 +5,7 @@ import ctypes
 import functools
 import itertools
 import json
+import math
 import re
 import zlib
 from dataclasses import dataclass, field
@@ -100,9 +101,11 @@ class Interpreter:
             program: from ``read``.
             params: the bytes of each parameter.
             tensors: what may be touched.
-            sizes: threads of a block, blocks, and bytes of shared memory beside the text's.
+            sizes: threads of a block, blocks (a number, or three), and bytes of shared memory
+                beside the text's.
         """
-        threads, blocks, dynamic = sizes
+        shapes = [x if isinstance(x, tuple) else (x, 1, 1) for x in sizes[:2]]
+        threads, blocks = map(math.prod, shapes)
         assert [len(x) for x in params] == [size for _, size in program.params], program.name
         # more blocks have more directions on a GPU, and more bits than a shadow has here
         assert blocks < 1 << 18 and blocks * threads <= 1 << 24, f"{program.name}: {blocks} blocks"
@@ -122,10 +125,11 @@ class Interpreter:
             file_size=program.file_size,
             params_size=len(blob),
             array_count=len(arrays),
-            shared_size=program.shared_size + dynamic,
+            shared_size=program.shared_size + sizes[2],
+            shared_unit=program.shared_unit,
             local_size=program.local_size,
-            threads=threads,
-            blocks=blocks,
+            threads=shapes[0],
+            blocks=shapes[1],
             special=tuple(program.special),
             seed=self.seed and self.seed + 1000 * len(self.trace),
             approximate=self.approximate,

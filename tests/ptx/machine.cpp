@@ -15,18 +15,51 @@
 
 #define ATOMICS(X)                                                                                 \
     X("atom.add.u32", u32, "WQW", now + given)                                                     \
+    X("atom.add.f32", f32, "WQW", now + given)                                                     \
     X("atom.add.u64", u64, "QQQ", now + given)                                                     \
     X("atom.or.b32", u32, "WQW", now | given)                                                      \
     X("atom.min.s32", s32, "WQW", std::min(now, given))                                            \
     X("atom.max.s32", s32, "WQW", std::max(now, given))
 #define ATOMIC_OPCODE(name, T, operands, e) {name, "atomic", operands, 1, ATOMIC, nullptr},
 
-template<bool ballot>
-static void any_of(u8* file, const Instruction& I, u32 lanes) {
-    const u32* given = (const u32*)(file + I.given[0]);
-    u32 all = 0;
-    EACH(l, lanes) all |= ballot ? (u32)(given[l] != 0) << l : given[l];
+// What a warp's lanes compute together: a number from all of them.
+template<class F>
+inline void in_all(u8* file, const Instruction& I, u32 lanes, u32 all, F join) {
+    auto given = (const u32*)(file + I.given[0]);
+    EACH(l, lanes) all = join(all, given[l], l);
     EACH(l, lanes)((u32*)(file + I.to[0]))[l] = all;
+}
+#define TOGETHER(name, start, e)                                                                   \
+    {name, "shuffle", "WWW", 1, WARP, [](u8* file, const Instruction& I, u32 lanes) {              \
+         in_all(file, I, lanes, start, [](u32 all, u32 given, int l) { return (u32)(e); });        \
+     }},
+
+static void same_lanes(u8* file, const Instruction& I, u32 lanes) {
+    auto given = (const u32*)(file + I.given[0]);
+    EACH(l, lanes) {
+        u32 same = 0;
+        EACH(k, lanes) same |= (u32)(given[k] == given[l]) << k;
+        ((u32*)(file + I.to[0]))[l] = same;
+    }
+}
+
+// The lane that a lane of a shuffle reads, as the ISA has it: b is a lane or a distance, c the last
+// lane of a segment and, from bit 8, the bits of a lane that name its segment.
+static int source_of(char mode, int lane, u32 b, u32 c, bool& inside) {
+    int segment = c >> 8 & 31, last = (lane & segment) | (c & 31 & ~segment), by = b & 31;
+    int from = mode == 'u' ? lane - by
+        : mode == 'd'      ? lane + by
+        : mode == 'b'      ? lane ^ by
+                           : (lane & segment) | (by & ~segment);
+    inside = mode == 'u' ? from >= last : from <= last;
+    return inside ? from : lane;
+}
+
+static void halves(u8* file, const Instruction& I, u32 lanes) {
+    EACH(l, lanes) {
+        u32 both = ((u32*)(file + I.given[0]))[l];
+        ((u32*)(file + I.to[0]))[l] = both & 0xFFFF, ((u32*)(file + I.to[1]))[l] = both >> 16;
+    }
 }
 
 static const Opcode OPCODES[] = {
@@ -36,10 +69,17 @@ static const Opcode OPCODES[] = {
     {"bra", "jump", "", 0, BRANCH, nullptr},
     {"ret", "jump", "", 0, EXIT, nullptr},
     {"exit", "jump", "", 0, EXIT, nullptr},
+    {"mov.b32 to 2", "move", "WWW", 2, PLAIN, halves},
     {"bar.sync", "barrier", "", 0, BLOCK, nullptr},
+    {"bar.red.popc.u32", "barrier", "WW", 1, BLOCK, nullptr},
     {"bar.warp.sync", "barrier", "W", 0, WARP, nullptr},
-    {"vote.sync.ballot.b32", "shuffle", "WWW", 1, WARP, any_of<true>},
-    {"redux.sync.or.b32", "shuffle", "WWW", 1, WARP, any_of<false>},
+    TOGETHER("vote.sync.ballot.b32", 0, all | (u32)(given != 0) << l) TOGETHER("redux.sync.or.b32",
+        0, all | given) TOGETHER("redux.sync.max.s32", 1u << 31, std::max((s32)all, (s32)given)){
+        "match.any.sync.b32", "shuffle", "WWW", 1, WARP, same_lanes},
+    {"shfl.sync.up.b32", "shuffle", "WWWWWW", 2, SHUFFLE, nullptr},
+    {"shfl.sync.down.b32", "shuffle", "WWWWWW", 2, SHUFFLE, nullptr},
+    {"shfl.sync.bfly.b32", "shuffle", "WWWWWW", 2, SHUFFLE, nullptr},
+    {"shfl.sync.idx.b32", "shuffle", "WWWWWW", 2, SHUFFLE, nullptr},
 };
 const int COUNT = sizeof OPCODES / sizeof *OPCODES;
 
@@ -78,9 +118,10 @@ struct Launch {
     const Constant* constants;
     const u8* params;
     const Array* arrays;
-    s64 constant_count, file_size, params_size, array_count, shared_size, local_size;
-    s64 threads, blocks;
-    s64 special[9];  // registers of tid, ntid, ctaid, nctaid (x, y, z), laneid; or -1
+    s64 constant_count, file_size, params_size, array_count, shared_size, shared_unit, local_size;
+    s64 threads[3], blocks[3];
+    s64 special[14];  // registers of tid, ntid, ctaid, nctaid (x, y, z each), laneid, lanemask_lt;
+                      // or -1
     u64 seed, approximate;
     s64 limit;  // instructions of a warp in a block
     Finding* findings;
@@ -148,20 +189,23 @@ struct Machine {
     std::vector<Region> arrays;
     std::unordered_set<u64> touched;  // sectors of global memory, where they are counted
     Region shared_region;
+    const s64 threads;  // of a block
     const Region* last = nullptr;
     u32 block = 0, barriers = 0, tag = 0, shared_tag = 0;
     bool stop = false;
 
-    explicit Machine(Launch& launch) : L(launch), draw(launch.seed), drawn(launch.seed != 0) {
-        int count = (L.threads + 31) / 32;
+    explicit Machine(Launch& launch)
+        : L(launch), draw(launch.seed), drawn(launch.seed != 0),
+          threads(launch.threads[0] * launch.threads[1] * launch.threads[2]) {
+        int count = (threads + 31) / 32;
         warps.resize(count);
         files.resize(count * L.file_size + 64);
         knowns.resize(count * L.file_size / 128);
         shared.resize(L.shared_size);
-        shared_shadows.resize(L.shared_size / 4 + 1);
-        shared_region = {
-            SHARED, (u64)L.shared_size, 2, shared.data(), shared_shadows.data(), SHARED_RACE};
-        local.resize(L.threads * L.local_size);
+        shared_shadows.resize((L.shared_size >> L.shared_unit) + 1);
+        shared_region = {SHARED, (u64)L.shared_size, L.shared_unit, shared.data(),
+            shared_shadows.data(), SHARED_RACE};
+        local.resize(threads * L.local_size);
         local_known.resize(local.size());
         size_t units = 0;
         for (s64 i = 0; i < L.array_count; i++) units += (L.arrays[i].size >> L.arrays[i].unit) + 1;
@@ -423,9 +467,9 @@ struct Machine {
 
     void add(Warp& w, Fragment f) {
         if (!f.lanes) return;
-        if (!drawn)
+        if (!drawn && f.state == READY)
             for (auto& g : w.fragments)
-                if (g.at == f.at && g.state == f.state) {
+                if (g.at == f.at && g.state == READY) {
                     g.lanes |= f.lanes;
                     return;
                 }
@@ -433,7 +477,10 @@ struct Machine {
     }
 
     void meet(Warp& w, Fragment& f, State state) {  // takes fragments at the same place into f
-        auto there = [&](const Fragment& g) { return g.state == state && g.at == f.at; };
+        auto there = [&](const Fragment& g) {
+            return g.state == state && g.at == f.at
+                && (state != AT_WARP || mask_of(w, g) == mask_of(w, f));
+        };
         for (auto& g : w.fragments)
             if (there(g)) f.lanes |= g.lanes;
         w.fragments.erase(
@@ -447,18 +494,38 @@ struct Machine {
 
     bool complete(const Warp& w, const Fragment& f) { return !(mask_of(w, f) & w.live & ~f.lanes); }
 
+    // What a lane reads is known if it is in that lane; of lanes outside the mask nothing is.
+    void shuffle(Warp& w, const Instruction& I, u32 lanes, u32 at) {
+        char mode = OPCODES[I.op].name[strlen("shfl.sync.")];
+        u32 found[32], inside[32], there = lanes & w.lanes_known(I.given[0]), known = 0;
+        demand(w, I.given[1], lanes, at), demand(w, I.given[2], lanes, at);
+        EACH(l, lanes) {
+            bool is_inside;
+            int from = source_of(
+                mode, l, w.slot<u32>(I.given[1], l), w.slot<u32>(I.given[2], l), is_inside);
+            found[l] = w.slot<u32>(I.given[0], from), inside[l] = is_inside;
+            known |= (there >> from & 1) << l;
+        }
+        EACH(l, lanes)
+        w.slot<u32>(I.to[0], l) = found[l], w.slot<u32>(I.to[1], l) = inside[l];
+        w.lanes_known(I.to[0]) = (w.lanes_known(I.to[0]) & ~lanes) | known;
+        w.lanes_known(I.to[1]) |= lanes;
+    }
+
     // Executes what all lanes of a mask do together; false: the fragment waits for others.
     bool together(Warp& w, Fragment& f, u32 lanes) {
         const Instruction& I = L.code[f.at];
-        u32 mask = mask_of(w, f), wrong = f.lanes & ~mask;
-        EACH(l, f.lanes) wrong |= (u32)(w.slot<u32>(I.given[I.reads - 1], l) != mask) << l;
-        if (wrong || lanes != f.lanes) report(MASK, f.at, w.index * 32, mask);
+        u32 mask = mask_of(w, f), others = 0;
+        EACH(l, f.lanes) others |= (u32)(w.slot<u32>(I.given[I.reads - 1], l) != mask) << l;
+        if (lanes != f.lanes || f.lanes & ~others & ~mask) report(MASK, f.at, w.index * 32, mask);
+        if (others) add(w, {f.at, others, READY}), f.lanes &= ~others;
         meet(w, f, AT_WARP);
         if (!complete(w, f)) {
             f.state = AT_WARP;
             return false;
         }
-        if (OPCODES[I.op].run) {
+        if (OPCODES[I.op].kind == SHUFFLE) shuffle(w, I, f.lanes, f.at);
+        else if (OPCODES[I.op].run) {
             demand(w, I.given[0], f.lanes, f.at);
             OPCODES[I.op].run(w.file, I, f.lanes);
             w.lanes_known(I.to[0]) |= f.lanes;
@@ -502,8 +569,12 @@ struct Machine {
             f.state = AT_BLOCK;
             return false;
         case WARP:
+        case SHUFFLE: {
+            u32 before = f.lanes;
             if (!together(w, f, lanes)) return false;
-            break;
+            f.at++;
+            return f.lanes == before;  // else those of another mask are behind
+        }
         case LOAD:
         case STORE:
         case ATOMIC:
@@ -515,8 +586,10 @@ struct Machine {
         default: {
             u32 known = known_after(w, I);
             OPCODES[I.op].run(w.file, I, lanes);
-            u32& result = w.lanes_known(I.to[0]);
-            result = (result & ~lanes) | (known & lanes);
+            for (int k = 0; k < I.writes; k++) {
+                u32& result = w.lanes_known(I.to[k]);
+                result = (result & ~lanes) | (known & lanes);
+            }
         }
         }
         f.at++;
@@ -554,7 +627,7 @@ struct Machine {
     }
 
     void begin(Warp& w) {
-        u32 first = w.index * 32, count = std::min<s64>(32, L.threads - first);
+        u32 first = w.index * 32, count = std::min<s64>(32, threads - first);
         std::fill(w.known, w.known + L.file_size / 128, 0);
         w.live = count == 32 ? ~0u : (1u << count) - 1;
         w.barriers = w.steps = 0;
@@ -565,18 +638,31 @@ struct Machine {
             else std::fill_n((u32*)(w.file + c.at), 32, (u32)c.value);
             w.lanes_known(c.at) = ~0u;
         }
-        const u32 of_block[] = {(u32)L.threads, block, 0, 0, (u32)L.blocks, 1, 1};
-        for (int i = 0; i < 9; i++) {
-            if (L.special[i] < 0) continue;
-            for (u32 l = 0; l < 32; l++)
-                w.slot<u32>(L.special[i], l) = i == 0 ? first + l : i < 8 ? of_block[i - 1] : l;
-            w.lanes_known(L.special[i]) = ~0u;
+        for (u32 l = 0; l < 32; l++) {
+            u32 special[14];
+            u64 thread = first + l, of_grid = block;
+            for (int k = 0; k < 3; k++) {
+                special[k] = thread % L.threads[k], special[3 + k] = L.threads[k];
+                special[6 + k] = of_grid % L.blocks[k], special[9 + k] = L.blocks[k];
+                thread /= L.threads[k], of_grid /= L.blocks[k];
+            }
+            special[12] = l, special[13] = (1u << l) - 1;
+            for (int k = 0; k < 14; k++)
+                if (L.special[k] >= 0) w.slot<u32>(L.special[k], l) = special[k];
         }
+        for (s64 r : L.special)
+            if (r >= 0) w.lanes_known(r) = ~0u;
     }
 
     // All warps stand at a barrier of the block, or are gone: they go on.
     void release() {
-        u32 at = ~0u;
+        u32 at = ~0u, set = 0;
+        for (auto& w : warps)
+            for (auto& f : w.fragments)
+                if (L.code[f.at].writes) {
+                    demand(w, L.code[f.at].given[0], f.lanes, f.at);
+                    set += __builtin_popcount(set_lanes(w, L.code[f.at].given[0]) & f.lanes);
+                }
         for (auto& w : warps) {
             u32 there = 0;
             for (auto& f : w.fragments) {
@@ -588,6 +674,10 @@ struct Machine {
             std::vector<Fragment> waiting;
             waiting.swap(w.fragments);
             for (auto& f : waiting) {
+                if (L.code[f.at].writes) {
+                    EACH(l, f.lanes) w.slot<u32>(L.code[f.at].to[0], l) = set;
+                    w.lanes_known(L.code[f.at].to[0]) |= f.lanes;
+                }
                 Fragment next = {f.at + 1, f.lanes, READY};
                 meet(w, next, READY);
                 w.fragments.push_back(next);
@@ -639,7 +729,7 @@ void run(Launch* L) {
     std::fesetenv(FE_DFL_ENV);
     approximate = L->approximate;
     Machine machine(*L);
-    std::vector<s64> order(L->blocks);
+    std::vector<s64> order(L->blocks[0] * L->blocks[1] * L->blocks[2]);
     std::iota(order.begin(), order.end(), 0);
     if (L->seed) std::shuffle(order.begin(), order.end(), machine.draw);
     for (s64 block : order)

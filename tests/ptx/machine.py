@@ -17,8 +17,8 @@ _TEXT = "".join(path.read_text() for path in _SOURCES)
 # Products are contracted with sums only where an operation says so; integers overflow as in PTX.
 _FLAGS = "-O2 -ffp-contract=off -fno-math-errno -fwrapv -std=c++17 -shared -fPIC"
 
-SPECIAL = ("%tid.x", "%ntid.x", *(f"%ctaid.{x}" for x in "xyz"), *(f"%nctaid.{x}" for x in "xyz"))
-SPECIAL += ("%laneid",)
+SPECIAL = tuple(f"%{name}.{x}" for name in ("tid", "ntid", "ctaid", "nctaid") for x in "xyz")
+SPECIAL += ("%laneid", "%lanemask_lt")
 LOCAL = 2 << 56
 FAULTS = (
     "out of bounds",

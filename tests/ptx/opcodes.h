@@ -15,8 +15,10 @@ typedef uint32_t u32;
 typedef uint64_t u64;
 typedef int16_t s16;
 typedef int32_t s32;
+typedef int8_t s8;
 typedef int64_t s64;
 typedef float f32;
+typedef double f64;
 
 const u64 SHARED = 1ull << 56, LOCAL = 2ull << 56;  // where a space begins in generic addresses
 
@@ -31,7 +33,7 @@ struct Instruction {  // as parse.py has it
 };
 
 // Kinds of which machine.cpp knows more than that their lanes compute.
-enum Kind { PLAIN, SELECT, AND, OR, LOAD, STORE, ATOMIC, BRANCH, EXIT, BLOCK, WARP };
+enum Kind { PLAIN, SELECT, AND, OR, LOAD, STORE, ATOMIC, BRANCH, EXIT, BLOCK, WARP, SHUFFLE };
 
 struct Opcode {
     // The unit is what works on it; a move is mostly none of the machine's instructions, and a
@@ -85,7 +87,12 @@ inline void on_lanes(
 // of special arguments state is exact: 0 has the power 1, which masks tokens past the end.
 static u32 approximate = 0;
 
+// What .ftz makes of an operand or a result: subnormal float32 numbers become 0 of their sign.
 inline f32 flushed(f32 x) { return std::fpclassify(x) == FP_SUBNORMAL ? std::copysign(0.f, x) : x; }
+template<class T>
+inline T flushed(T x) {
+    return x;
+}
 
 inline f32 approx(double exact, f32 argument, double bound) {
     if (!approximate || !std::isfinite(exact) || flushed(argument) == 0) return exact;
@@ -126,12 +133,22 @@ inline u32 reversed(u32 x) {
     return y;
 }
 
-inline f32 downward(f32 a, f32 b, f32 c) {  // a product and a sum, rounded down once
-    std::fesetround(FE_DOWNWARD);
+inline u32 selected_bytes(u32 a, u32 b, u32 c) {  // by 4 bits of c: a byte of (b, a), or its sign
+    u64 bytes = (u64)b << 32 | a;
+    u32 found = 0;
+    for (int i = 0; i < 4; i++) {
+        u32 chosen = c >> 4 * i & 15, byte = bytes >> 8 * (chosen & 7) & 255;
+        found |= (chosen & 8 ? (byte & 128 ? 255u : 0u) : byte) << 8 * i;
+    }
+    return found;
+}
+
+inline f32 rounded(int direction, f32 a, f32 b, f32 c) {  // a product and a sum, rounded once
+    std::fesetround(direction);
     volatile f32 x = a;
-    volatile f32 rounded = std::fma(x, b, c);
+    volatile f32 result = std::fma(x, b, c);
     std::fesetround(FE_TONEAREST);
-    return rounded;
+    return result;
 }
 
 // To half precision, to the nearest and of two such to the even one.
@@ -164,6 +181,16 @@ inline f32 of_f16(u16 bits) {
     {name, #unit, Widths<D, A, B, C>::text, 1, kind, RUN(([](A a, B b, C c) { return (D)(e); }), D, A, B, C)},
 #define OP3(unit, name, D, A, B, C, e) OP3K(unit, name, PLAIN, D, A, B, C, e)
 
+// Of float32, with and without .ftz.
+#define FLOAT1(unit, name, t, D, e) OP1(unit, name t, D, f32, e) \
+    {name ".ftz" t, #unit, Widths<D, f32>::text, 1, PLAIN, RUN([](f32 a) { a = flushed(a); return flushed((D)(e)); }, D, f32)},
+#define FLOAT2(unit, name, D, e) OP2(unit, name ".f32", D, f32, f32, e) \
+    {name ".ftz.f32", #unit, Widths<D, f32, f32>::text, 1, PLAIN, \
+        RUN(([](f32 a, f32 b) { a = flushed(a), b = flushed(b); return flushed((D)(e)); }), D, f32, f32)},
+#define FLOAT3(unit, name, e) OP3(unit, name ".f32", f32, f32, f32, f32, e) \
+    {name ".ftz.f32", #unit, Widths<f32, f32, f32, f32>::text, 1, PLAIN, \
+        RUN(([](f32 a, f32 b, f32 c) { a = flushed(a), b = flushed(b), c = flushed(c); return flushed((f32)(e)); }), f32, f32, f32, f32)},
+
 // One operation for several types; an operation that does not depend on the sign is unsigned.
 #define MOVES(t, T) OP1(move, "mov." t, T, T, a) OP3K(integer, "selp." t, SELECT, T, T, T, u32, c ? a : b)
 #define INTEGERS(unit, name, e) \
@@ -189,14 +216,15 @@ inline f32 of_f16(u16 bits) {
     OP1(move, "cvta.shared.u64", u64, u64, a | SHARED) OP1(move, "cvta.local.u64", u64, u64, a) \
     OP1(integer, "cvt.s64.s32", s64, s32, a) OP1(move, "cvt.u64.u32", u64, u32, a) OP1(move, "cvt.u32.u64", u32, u64, a) \
     OP1(move, "cvt.s64.s32 of 64", s64, u64, (s32)a) OP1(move, "cvt.u64.u32 of 64", u64, u64, (u32)a) \
-    OP1(move, "cvt.u32.u16", u32, u16, a) OP1(move, "cvt.u16.u32", u16, u32, a) OP1(integer, "cvt.s32.s16", s32, s16, a) \
+    OP1(move, "cvt.u32.u16", u32, u16, a) OP1(move, "cvt.u16.u32", u16, u32, a) OP1(integer, "cvt.s32.s16", s32, s16, a) OP1(integer, "cvt.s32.s8", s32, s8, a) \
+    OP1(integer, "cvt.u32.u8", u32, u8, a) OP1(integer, "cvt.u16.u8", u16, u8, a) \
     OP1(convert, "cvt.rn.f32.s32", f32, s32, a) OP1(convert, "cvt.rn.f32.u32", f32, u32, a) OP1(convert, "cvt.rn.f32.s64", f32, s64, a) \
-    OP1(convert, "cvt.rzi.s32.f32", s32, f32, truncated<s32>(a)) OP1(convert, "cvt.rzi.u32.f32", u32, f32, truncated<u32>(a)) \
+    FLOAT1(convert, "cvt.rzi", ".s32.f32", s32, truncated<s32>(a)) FLOAT1(convert, "cvt.rzi", ".u32.f32", u32, truncated<u32>(a)) \
     OP1(convert, "cvt.rn.bf16.f32", u16, f32, bf16(a)) OP1(convert, "cvt.rn.f16.f32", u16, f32, f16(a)) \
     OP1(convert, "cvt.f32.f16", f32, u16, of_f16(a)) OP1(integer, "cvt.f32.bf16", f32, u16, value<f32>((u32)a << 16)) \
-    OP1(convert, "cvt.rpi.f32.f32", f32, f32, std::ceil(a)) OP1(convert, "cvt.rmi.f32.f32", f32, f32, std::floor(a)) \
+    FLOAT1(convert, "cvt.rpi", ".f32.f32", f32, std::ceil(a)) FLOAT1(convert, "cvt.rmi", ".f32.f32", f32, std::floor(a)) \
     OP1(float, "cvt.sat.f32.f32", f32, f32, a > 0 ? a < 1 ? a : 1 : 0) \
-    OP1(move, "abs.f32", u32, u32, a & 0x7fffffffu) OP1(move, "neg.f32", u32, u32, a ^ 0x80000000u) \
+    FLOAT1(move, "abs", ".f32", f32, std::fabs(a)) FLOAT1(move, "neg", ".f32", f32, -a) \
     OP1(integer, "neg.s32", u32, u32, 0 - a) OP1(integer, "neg.s64", u64, u64, 0 - a) \
     OP1(integer, "not.b16", u16, u16, ~a) OP1(integer, "not.b32", u32, u32, ~a) OP1(integer, "not.b64", u64, u64, ~a) \
     OP1(special, "brev.b32", u32, u32, reversed(a)) OP1(special, "popc.b32", u32, u32, __builtin_popcount(a)) \
@@ -219,23 +247,31 @@ inline f32 of_f16(u16 bits) {
     OP2(integer, "shr.s32", s32, s32, u32, a >> (b > 31 ? 31 : b)) OP2(integer, "shr.s64", s64, s64, u32, a >> (b > 63 ? 63 : b)) \
     SAME("setp.eq", a == b) SAME("setp.ne", a != b) COMPARE("setp.lt", a < b) \
     COMPARE("setp.le", a <= b) COMPARE("setp.gt", a > b) COMPARE("setp.ge", a >= b) \
-    OP2(integer, "setp.eq.f32", u32, f32, f32, a == b) OP2(integer, "setp.ne.f32", u32, f32, f32, a < b || a > b) \
-    OP2(integer, "setp.lt.f32", u32, f32, f32, a < b) OP2(integer, "setp.le.f32", u32, f32, f32, a <= b) \
-    OP2(integer, "setp.gt.f32", u32, f32, f32, a > b) OP2(integer, "setp.ge.f32", u32, f32, f32, a >= b) \
-    OP2(integer, "setp.equ.f32", u32, f32, f32, !(a < b || a > b)) OP2(integer, "setp.neu.f32", u32, f32, f32, !(a == b)) \
-    OP2(integer, "setp.ltu.f32", u32, f32, f32, !(a >= b)) OP2(integer, "setp.leu.f32", u32, f32, f32, !(a > b)) \
-    OP2(integer, "setp.gtu.f32", u32, f32, f32, !(a <= b)) OP2(integer, "setp.geu.f32", u32, f32, f32, !(a < b)) \
-    OP2(integer, "setp.nan.f32", u32, f32, f32, a != a || b != b) OP2(integer, "setp.num.f32", u32, f32, f32, a == a && b == b) \
-    OP2(float, "add.f32", f32, f32, f32, a + b) OP2(float, "sub.f32", f32, f32, f32, a - b) OP2(float, "mul.f32", f32, f32, f32, a * b) \
-    OP2(float, "add.rn.f32", f32, f32, f32, a + b) OP2(float, "sub.rn.f32", f32, f32, f32, a - b) \
-    OP2(float, "mul.rn.f32", f32, f32, f32, a * b) OP2(routine, "div.rn.f32", f32, f32, f32, a / b) \
-    OP2(integer, "min.f32", f32, f32, f32, least(a, b)) OP2(integer, "max.f32", f32, f32, f32, greatest(a, b)) \
-    OP3(float, "fma.rn.f32", f32, f32, f32, f32, std::fma(a, b, c)) \
-    OP3(float, "a * b - c", f32, f32, f32, f32, std::fma(a, b, -c)) /* contract.py writes these two */ \
-    OP3(float, "c - a * b", f32, f32, f32, f32, std::fma(-a, b, c)) \
-    OP3(float, "fma.rm.f32", f32, f32, f32, f32, downward(a, b, c)) \
+    FLOAT2(integer, "setp.eq", u32, a == b) FLOAT2(integer, "setp.ne", u32, a < b || a > b) \
+    FLOAT2(integer, "setp.lt", u32, a < b) FLOAT2(integer, "setp.le", u32, a <= b) \
+    FLOAT2(integer, "setp.gt", u32, a > b) FLOAT2(integer, "setp.ge", u32, a >= b) \
+    FLOAT2(integer, "setp.equ", u32, !(a < b || a > b)) FLOAT2(integer, "setp.neu", u32, !(a == b)) \
+    FLOAT2(integer, "setp.ltu", u32, !(a >= b)) FLOAT2(integer, "setp.leu", u32, !(a > b)) \
+    FLOAT2(integer, "setp.gtu", u32, !(a <= b)) FLOAT2(integer, "setp.geu", u32, !(a < b)) \
+    FLOAT2(integer, "setp.nan", u32, a != a || b != b) FLOAT2(integer, "setp.num", u32, a == a && b == b) \
+    FLOAT2(float, "add", f32, a + b) FLOAT2(float, "sub", f32, a - b) FLOAT2(float, "mul", f32, a * b) \
+    FLOAT2(float, "add.rn", f32, a + b) FLOAT2(float, "sub.rn", f32, a - b) \
+    FLOAT2(float, "mul.rn", f32, a * b) FLOAT2(routine, "div.rn", f32, a / b) \
+    FLOAT2(integer, "min", f32, least(a, b)) FLOAT2(integer, "max", f32, greatest(a, b)) \
+    FLOAT3(float, "fma.rn", std::fma(a, b, c)) \
+    FLOAT3(float, "a * b - c", std::fma(a, b, -c)) /* contract.py writes these two */ \
+    FLOAT3(float, "c - a * b", std::fma(-a, b, c)) \
+    OP3(float, "fma.rm.f32", f32, f32, f32, f32, rounded(FE_DOWNWARD, a, b, c)) \
+    FLOAT2(float, "add.rz", f32, rounded(FE_TOWARDZERO, a, 1, b)) \
+    OP2(integer, "copysign.f32", u32, u32, u32, (a & 0x80000000u) | (b & 0x7fffffffu)) \
+    OP2(float, "add.f64", f64, f64, f64, a + b) OP2(float, "mul.f64", f64, f64, f64, a * b) OP2(routine, "div.rn.f64", f64, f64, f64, a / b) \
+    OP1(convert, "cvt.ftz.f64.f32", f64, f32, flushed(a)) OP1(convert, "cvt.rn.ftz.f32.f64", f32, f64, flushed((f32)a)) \
+    OP2(integer, "mov.b32 of 2", u32, u16, u16, a | (u32)b << 16) \
+    OP3(integer, "prmt.b32", u32, u32, u32, u32, selected_bytes(a, b, c)) \
     OP1(routine, "sqrt.rn.f32", f32, f32, std::sqrt(a)) OP1(routine, "rcp.rn.f32", f32, f32, 1 / a) \
     OP1(special, "ex2.approx.ftz.f32", f32, f32, flushed(approx(std::exp2((double)flushed(a)), a, 0x1p-22))) \
     OP1(special, "rcp.approx.ftz.f32", f32, f32, flushed(approx(1 / (double)flushed(a), a, 0x1p-23))) \
+    OP1(special, "lg2.approx.ftz.f32", f32, f32, approx(std::log2((double)flushed(a)), a, 0x1p-22)) \
+    OP1(special, "rsqrt.approx.ftz.f32", f32, f32, approx(1 / std::sqrt((double)flushed(a)), a, 0x1p-22)) \
     OP1(special, "sqrt.approx.ftz.f32", f32, f32, flushed(approx(std::sqrt((double)flushed(a)), a, 0x1p-23)))
 // clang-format on

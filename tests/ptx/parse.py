@@ -34,6 +34,7 @@ class Program:
         file_size: bytes of a warp's file.
         params: places and sizes of the parameters, and their size together.
         shared_size: bytes of shared memory that the text declares; what a launch adds follows.
+        shared_unit: it is watched by 1 << this bytes: 2 where an access may be smaller than 4.
         local_size: bytes of a thread's own memory.
         special: places of ``SPECIAL`` in a warp's file, or -1.
         most_threads: of a block, or 0.
@@ -47,13 +48,18 @@ class Program:
     params: list[tuple[int, int]] = field(default_factory=list)
     params_size: int = 0
     shared_size: int = 0
+    shared_unit: int = 2
     local_size: int = 0
     special: list[int] = field(default_factory=list)
     most_threads: int = 0
 
 
-def read(text: str) -> dict[str, Program]:
+def read(text: str, entries: str = "") -> dict[str, Program]:
     """The programs of a module's PTX, by the names of their entries.
+
+    Args:
+        text: the module.
+        entries: a regular expression that is in the names of those wanted.
 
     Raises:
         Refused: the text has what is not known here, which the error names.
@@ -65,6 +71,8 @@ def read(text: str) -> dict[str, Program]:
     shared = _DECLARATION.findall(text[: text.find(".entry")])
     programs = {}
     for found in _ENTRY.finditer(text):
+        if not re.search(entries, found[1]):
+            continue
         depth, end = 1, found.end()
         while depth:
             depth += {"{": 1, "}": -1}.get(text[end], 0)
@@ -99,16 +107,33 @@ class _Entry:
 
     def read(self, body: str, shared: list[tuple[str, str, str, str]]) -> Program:
         program, labels, statements = self.program, {}, []
+        scopes: list[dict[str, str]] = []  # of inline code: names of registers, as known here
         for statement in body.split(";"):
-            while label := re.match(r"[{}\s]*([\w$]+):", statement):
-                labels[label[1]] = len(statements)
-                statement = statement[label.end() :]
-            statement = re.sub(r"^[{}\s]+", "", statement).rstrip()  # scopes, which inline code has
+            while found := re.match(r"\s*([{}]|([\w$]+):)", statement):
+                if found[2]:
+                    labels[found[2]] = len(statements)
+                elif found[1] == "{":
+                    scopes.append({})
+                elif scopes:
+                    scopes.pop()
+                statement = statement[found.end() :]
+            statement = statement.strip()
             if declared := re.match(r"\.reg\s+\.(\w+)\s+(.*)", statement, re.S):
                 for register in re.split(r"\s*,\s*", declared[2]):
-                    self.wide[register.split("<")[0]] = declared[1] in _WIDE
-            elif declared := _DECLARATION.match(statement):
+                    name = register.split("<")[0]
+                    if scopes:
+                        scopes[-1][name] = name = f"%{name.lstrip('%')}_{len(self.wide)}_"
+                    self.wide[name] = declared[1] in _WIDE
+                continue
+            for own in scopes:
+                statement = re.sub(r"%?\w+", lambda m, own=own: own.get(m[0], m[0]), statement)
+            if declared := _DECLARATION.match(statement):
                 self._declare(*declared.groups())
+            elif quotient := re.match(r"div\.approx(\.ftz)?\.f32\s+(\S+), (\S+), (\S+)", statement):
+                # as ptxas has it, in two instructions
+                self.wide["%inverse_"] = False
+                statements.append(f"rcp.approx.ftz.f32 %inverse_, {quotient[4]}")
+                statements.append(f"mul.ftz.f32 {quotient[2]}, {quotient[3]}, %inverse_")
             elif statement and not statement.startswith("."):
                 statements.append(statement)
         statements.append("ret")
@@ -122,6 +147,11 @@ class _Entry:
                 self._decode(instruction, statement, labels)
             except (AttributeError, KeyError, ValueError, IndexError) as error:
                 raise Refused(f"{program.name}: {statement!r}: {error!r}") from error
+        kinds = [opcodes()[name][0] for name in ("ld", "st")]
+        if any(
+            i.op in kinds and SPACES[i.space] in ("", "shared") and i.size < 4 for i in program.code
+        ):
+            program.shared_unit = 1
         program.special = [self.registers.get(name, (-1,))[0] for name in SPECIAL]
         found = [(at, value, wide) for (value, wide), at in self.constants.items()]
         program.constants = (Constant * len(found))(*found)
@@ -168,16 +198,15 @@ class _Entry:
         i.guard, i.inverted = -1, bool(guard and guard[0] == "!")
         if guard:
             i.guard = self._place(guard.lstrip("!"), False)
-        operands = [x for x in re.split(r"[\s,{}]+", rest) if x]
+        operands = [x for x in re.split(r"[\s,{}|]+", rest) if x]
         first, *words = name.split(".")
         if first == "bra":
             i.op, i.target = opcodes()["bra"][0], labels[operands[0]]
             return
-        if name in ("bar.sync", "barrier.sync"):
-            if operands != ["0"]:
+        if name in ("bar.sync", "barrier.sync", "bar.red.popc.u32"):
+            if operands.pop(len(words) > 1) != "0":
                 raise ValueError("a barrier with a number")
-            i.op = opcodes()["bar.sync"][0]
-            return
+            name = name.replace("barrier", "bar")
         if first in ("ld", "st", "atom"):
             words = [x for x in words if x not in _IGNORED]
             space = words.pop(0) if words[0] in SPACES else ""
@@ -193,6 +222,11 @@ class _Entry:
             name = ".".join([first, *words]) if first == "atom" else first
         if first == "cvt" and words[-1][1:] == "32" and self._is_wide(operands[1]):
             name += " of 64"  # the lower half of a register
+        if first == "mov" and "{" in rest:
+            name += " to 2" if rest[0] == "{" else " of 2"
+        if first == "shfl" and "|" not in rest:
+            self.wide["%inside_"] = False  # which nobody reads
+            operands.insert(1, "%inside_")
         if name not in opcodes():
             raise ValueError(f"{name} is not known")
         i.op, widths, i.writes = opcodes()[name]

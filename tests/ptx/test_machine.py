@@ -112,7 +112,7 @@ def test_faults(monkeypatch, name):
 def test_refusals(monkeypatch):
     for text, reason in (
         ("frob.b32 %r5, %r1;", "frob.b32 is not known"),
-        ("shfl.sync.idx.b32 %r5, %r1, 0, 31, -1;", "shfl.sync.idx.b32 is not known"),
+        ("vote.sync.uni.pred %p1, %p2, -1;", "vote.sync.uni.pred is not known"),
         ("add.s32 %r5, %rd1, 1;", "%rd1 has 64 bits"),
         ("bar.sync 1;", "a barrier with a number"),
     ):
@@ -168,21 +168,146 @@ def test_memory():
         memory[0] = start
         assert not run(f"atom.global.{name} %r10, [%rd1], {value};", memory, blocks=2).findings
         assert memory[0] == want
+    values = torch.full((64,), 0.5)
+    assert not run("atom.global.add.f32 %r10, [%rd1], 0f3FC00000;", values, blocks=2).findings
+    assert values[0] == 0.5 + 128 * 1.5
     memory[:2] = torch.tensor([-1, 0])
     run("mov.u64 %rd10, 1; atom.global.add.u64 %rd11, [%rd1], %rd10;", memory)
     assert memory[:2].tolist() == [63, 1]
+
+
+def lanes(body, threads=32, **options):
+    """What each lane's %r10 holds after a body, in which %r1 is the lane; nothing may be found."""
+    memory = torch.zeros(threads, dtype=torch.int32)
+    made = run(body + "st.global.u32 [%rd4], %r10;", memory, threads, **options)
+    assert not made.findings, made.findings
+    return memory.tolist()
+
+
+@pytest.mark.parametrize("segment", (32, 8))
+@pytest.mark.parametrize("by", (0, 1, 5, 16))
+@pytest.mark.parametrize("mode", ("up", "down", "bfly", "idx"))
+def test_shuffles(mode, by, segment):
+    """The lane read is in the lane's segment; else it is the lane itself."""
+    last, want = (0 if mode == "up" else segment - 1), []
+    for lane in range(32):
+        begin = lane - lane % segment
+        moved = {"up": lane - by, "down": lane + by, "bfly": lane ^ by, "idx": begin + by % segment}
+        inside = mode == "bfly" or begin <= moved[mode]  # of lower segments it can read, too
+        inside &= moved[mode] < begin + segment
+        want.append((moved[mode] if inside else lane) * 2 + inside)
+    c = (32 - segment) << 8 | last
+    body = f"""shl.b32 %r5, %r1, 1; shfl.sync.{mode}.b32 %r6|%p1, %r5, {by}, {c}, -1;
+    selp.u32 %r7, 1, 0, %p1; or.b32 %r10, %r6, %r7;"""
+    for seed in (0, 1):
+        assert lanes(body, seed=seed) == want
+    body = f"shfl.sync.{mode}.b32 %r10, %r1, {by}, {c}, -1;"
+    assert lanes(body) == [x // 2 for x in want]
+
+
+def test_lanes_of_several_masks():
+    """Groups of lanes, each with a mask of its own, do the same at the same place."""
+    body = """and.b32 %r5, %r1, 3; match.any.sync.b32 %r6, %r5, -1;
+    redux.sync.max.s32 %r7, %r1, %r6; shfl.sync.idx.b32 %r8, %r1, %r5, 31, %r6;
+    shl.b32 %r8, %r8, 8; or.b32 %r10, %r7, %r8;"""
+    for seed in (0, 1, 2):
+        assert lanes(body, seed=seed) == [28 + lane % 4 | (lane % 4) << 8 for lane in range(32)]
+    odd = "add.s32 %r5, %r1, -9; redux.sync.max.s32 %r10, %r5, -1;"
+    assert lanes(odd, 8 * 4) == [22] * 32
+    assert lanes("and.b32 %r5, %r1, 3; match.any.sync.b32 %r10, %r5, -1;") == [
+        (0x11111111 << lane % 4) - (1 << 32) * (lane % 4 == 3) for lane in range(32)
+    ]
+
+
+def test_a_lane_that_nobody_asked():
+    """A shuffle gives what nobody wrote where its source has it, or is not in the mask."""
+    half = "setp.lt.u32 %p1, %r1, 16; @%p1 mov.u32 %r5, 7;"
+    read = "shfl.sync.bfly.b32 %r10, %r5, {}, 31, -1;"
+    memory = torch.zeros(32, dtype=torch.int32)
+    for by, threads in ((16, 32), (1, 32)):
+        body = f"{half} {read.format(by)} @%p1 st.global.u32 [%rd4], %r10;"
+        found = run(body, memory, threads).findings
+        assert [line.split(":")[0] for line in found] == [UNWRITTEN] * (by == 16)
+
+
+def test_a_count_at_a_barrier():
+    body = ODD + "setp.ne.u32 %p2, %r1, 0; @!%p2 bra $A; $A: bar.red.popc.u32 %r10, 0, %p1;"
+    for seed in (0, 1):
+        assert lanes(body, 96, seed=seed) == [48] * 96
+
+
+def test_blocks_and_grids_of_three_dimensions():
+    """Threads go by x, then y, then z, and so do blocks."""
+    names = ("tid", "ntid", "ctaid", "nctaid")
+    body = "mov.u32 %r11, 0;" + "".join(
+        f"mov.u32 %r12, %{name}.{x}; mad.lo.s32 %r11, %r11, 7, %r12;"
+        for name in names
+        for x in "xyz"
+    )
+    body += """mov.u32 %r12, %tid.y; mov.u32 %r13, %tid.z; mad.lo.s32 %r12, %r13, 5, %r12;
+    mad.lo.s32 %r12, %r12, 3, %r1; mov.u32 %r13, %ctaid.y; mov.u32 %r14, %ctaid.z;
+    mad.lo.s32 %r13, %r14, 3, %r13; mad.lo.s32 %r13, %r13, 2, %r9; mad.lo.s32 %r12, %r13, 60, %r12;
+    mul.wide.u32 %rd5, %r12, 4; add.s64 %rd5, %rd1, %rd5; st.global.u32 [%rd5], %r11;"""
+    threads, blocks = (3, 5, 4), (2, 3, 2)
+    memory, want = torch.zeros(60 * 12, dtype=torch.int32), []
+    assert not run(body, memory, threads, blocks).findings
+    order = [(x, y, z) for z in range(4) for y in range(5) for x in range(3)]
+    for block in ((x, y, z) for z in range(2) for y in range(3) for x in range(2)):
+        for thread in order:
+            key = 0
+            for number in (*thread, *threads, *block, *blocks):
+                key = (key * 7 + number) % 2**32
+            want.append(key - 2**32 * (key >> 31))
+    assert memory.tolist() == want
+    below = "mov.u32 %r5, %lanemask_lt; popc.b32 %r10, %r5;"
+    assert lanes(below, 48) == [k % 32 for k in range(48)]
+
+
+def test_halves_quotients_and_scopes():
+    pack = "cvt.u16.u32 %h1, %r1; mov.b32 %r5, {%h1, 3}; mov.b32 {%h2, %h3}, %r5;"
+    assert lanes(pack + "mov.u32 %r10, %r5;") == [lane | 3 << 16 for lane in range(32)]
+    unpacked = "cvt.u32.u16 %r6, %h2; cvt.u32.u16 %r7, %h3; mad.lo.s32 %r10, %r6, 8, %r7;"
+    assert lanes(pack + unpacked) == [8 * lane + 3 for lane in range(32)]
+    quotient = (
+        "mov.b32 %r5, 0f40E00000; mov.b32 %r6, 0f40000000; div.approx.ftz.f32 %r10, %r5, %r6;"
+    )
+    assert np.int32(lanes(quotient)[0]).view(np.float32) == 3.5
+    shadowed = ODD + "{ .reg .pred %p1; .reg .b32 r; setp.ne.s32 %p1, %r1, %r1; mov.u32 r, 5; }"
+    assert lanes(shadowed + "selp.u32 %r10, 1, 0, %p1;") == [1 - lane % 2 for lane in range(32)]
+
+
+def test_halves_of_a_word_of_shared_memory():
+    """Two lanes may write to the same word, each its own 2 bytes; not each other's."""
+    body = """shl.b32 %r5, %r1, 1; add.s32 %r6, %r3, %r5; cvt.u16.u32 %h1, %r1;
+    st.shared.u16 [%r6], %h1; {} xor.b32 %r5, %r5, 2; add.s32 %r6, %r3, %r5;
+    ld.shared.u16 %h2, [%r6]; cvt.u32.u16 %r10, %h2;"""
+    assert lanes(body.format("bar.warp.sync -1;")) == [lane ^ 1 for lane in range(32)]
+    found = run(
+        body.format("") + "st.global.u32 [%rd4], %r10;", torch.zeros(32, dtype=torch.int32), 32
+    )
+    assert {line.split(":")[0] for line in found.findings} <= {RACE, UNWRITTEN} and found.findings
 
 
 WORDS = [0, 1, 2, 15, 16, 31, 32, 33, 63, 64, 0x7FFF, 0x8000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF]
 WORDS += [0x00000001, 0x007FFFFF, 0x00800000, 0x3F800000, 0x3FC00000, 0xBFC00000, 0x40200000]
 WORDS += [0x4F000000, 0xCF000000, 0x7F7FFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x3F807FFF]
 LONG = [x << 32 | 0x80000001 for x in (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)]
+DOUBLES = np.array([0, -0.0, 1, 1 + 2.0**-24, 1 + 3 * 2.0**-24, -3.5, 2.0**-149, 2.0**-127, 1e300])
+DOUBLES = [
+    *DOUBLES.view(np.uint64),
+    0x47EFFFFFE0000000,
+    0x47EFFFFFF0000000,
+    0x7FF << 52,
+    0x7FF8 << 48,
+]
 
 
 def number(bits, kind):
     """The value of a register's bits as a type of PTX reads them."""
     if kind == "f32":
-        return np.uint32(bits).view(np.float32)
+        return np.uint32(bits & 0xFFFFFFFF).view(np.float32)
+    if kind == "f64":
+        return np.uint64(bits).view(np.float64)
     if kind == "pred":
         return bits & 1
     if kind.endswith("f16"):
@@ -221,6 +346,27 @@ def to_integer(low, high):
     return lambda x: 0 if np.isnan(x) else int(min(max(float(x), low), high))
 
 
+def flushed(x):
+    return np.copysign(np.float32(0), x) if isinstance(x, np.float32) and abs(x) < 2.0**-126 else x
+
+
+def toward_zero(a, b):
+    y = fused(a, np.float32(1), b)
+    if not np.isfinite([a, b]).all():
+        return y
+    exact = Fraction(float(a)) + Fraction(float(b))
+    if np.isinf(y):
+        return np.copysign(np.finfo(np.float32).max, y)
+    return np.nextafter(y, np.float32(0)) if abs(Fraction(float(y))) > abs(exact) else y
+
+
+def permuted(a, b, c):
+    bytes_ = (a | b << 32).to_bytes(8, "little")
+    chosen = [c >> 4 * i & 15 for i in range(4)]
+    signs = [0xFF * (bytes_[k & 7] >> 7) if k & 8 else bytes_[k & 7] for k in chosen]
+    return int.from_bytes(signs, "little")
+
+
 def lowest(a, b):
     return (a if np.signbit(a) else b) if a == b else np.float32(np.fmin(float(a), float(b)))
 
@@ -252,11 +398,15 @@ INTEGERS = {
     "brev": lambda a: int(f"{a:032b}"[::-1], 2),
     "clz": lambda a: 32 - a.bit_length(),
     "bfind": lambda a: a.bit_length() - 1,
+    "prmt": permuted,
     "bfind.shiftamt": lambda a: 32 - a.bit_length() if a else -1,
     **{f"setp.{name}": function for name, function in COMPARISONS.items()},
 }
+FLOAT = {"f32": np.float32, "f64": np.float64}
 FLOATS = {
     "add": operator.add,
+    "add.rz": toward_zero,
+    "copysign": lambda a, b: np.copysign(b, a),
     "sub": operator.sub,
     "mul": operator.mul,
     "div.rn": np.divide,
@@ -291,6 +441,8 @@ CONVERSIONS = {
     "cvt.f32.bf16": lambda x: np.uint32(x << 16).view(np.float32),
     "cvt.rzi.s32.f32": to_integer(-(2**31), 2**31 - 1),
     "cvt.rzi.u32.f32": to_integer(0, 2**32 - 1),
+    "cvt.f64.f32": np.float64,
+    "cvt.rn.f32.f64": np.float32,
     "cvt.s64.s32 of 64": lambda x: number(x, "s32"),
     "cvt.u64.u32 of 64": lambda x: x & 0xFFFFFFFF,
     "cvta.shared.u64": lambda x: x | 1 << 56,
@@ -300,6 +452,8 @@ APPROXIMATE = {  # the bound of the relative error, from the ISA's text or CUDA'
     "ex2.approx.ftz.f32": (np.exp2, 2.0**-22),
     "rcp.approx.ftz.f32": (np.reciprocal, 2.0**-23),
     "sqrt.approx.ftz.f32": (np.sqrt, 2.0**-23),
+    "rsqrt.approx.ftz.f32": (lambda x: 1 / np.sqrt(x), 2.0**-22),
+    "lg2.approx.ftz.f32": (np.log2, 2.0**-22),
 }
 
 
@@ -358,6 +512,7 @@ def computed(name, operands, **options):
 
 def operands_of(name):
     values = WORDS + LONG if "Q" in opcodes()[name][1][1:] else WORDS
+    values = DOUBLES if name.endswith("f64") else values
     rows = np.zeros((1280, 4), np.int64)
     pairs = [(a, b) for a in values for b in values]
     rng = np.random.default_rng(0)
@@ -385,7 +540,7 @@ def test_operations():
 
 
 def operations():
-    others = re.compile(r"atom|vote|redux|.* \* ")
+    others = re.compile(r"atom|bar|vote|redux|match|shfl|.* (\*|of 2$|to 2)")
     named = (name for name, (_, operands, _) in opcodes().items() if len(operands) > 1)
     return [name for name in named if not others.match(name)]
 
@@ -446,10 +601,13 @@ def test_operations_on_a_gpu():
 
 
 def check_operation(name):
-    first, *words = name.split(".")
-    kind, rows = words[-1], operands_of(name)
+    rows, widths = operands_of(name), opcodes()[name][1]
     got = computed(name, rows)
-    table = FLOATS if kind == "f32" else INTEGERS
+    flush = flushed if ".ftz" in name else lambda x: x
+    name = name.replace(".ftz", "")
+    first, *words = name.split(".")
+    kind = words[-1]
+    table = FLOATS if kind in ("f32", "f64") else INTEGERS
     stem = ".".join([first, *words[:-1]])
     function = (
         CONVERSIONS.get(name) or table.get(stem) or table.get(re.sub(r"\.(rn|f32)$", "", stem))
@@ -461,14 +619,13 @@ def check_operation(name):
         result, source = words[-2], source
         if name not in CONVERSIONS and (kind != "f32" or result != "f32"):
             function = (lambda a: nearest(Fraction(a))) if result == "f32" else lambda a: a
-        if first == "cvta" or result not in ("f32", "u16", "bf16", "f16"):
+        if first == "cvta" or result not in ("f32", "f64", "u16", "bf16", "f16"):
             result = "u64" if first == "cvta" else result
     assert function is not None, f"{name} has no oracle"
     if stem in ("mul.wide", "mad.wide"):
         result = kind[0] + "64"
-    widths = opcodes()[name][1]
     for row, bits in zip(rows.view(np.uint64).tolist(), got.tolist()):
-        given = [number(x, source) for x in row[1 : len(widths)]]
+        given = [flush(number(x, source)) for x in row[1 : len(widths)]]
         if first in ("shl", "shr"):
             given[1] = row[2] & 0xFFFFFFFF
         if stem == "mad.wide":
@@ -476,11 +633,9 @@ def check_operation(name):
         if first == "selp":
             given[2] = row[3]
         want = function(*given)
-        if result == "f32":
-            value = number(bits, "f32")
-            same = (
-                np.isnan(value) and np.isnan(want) or value.tobytes() == np.float32(want).tobytes()
-            )
+        if result in ("f32", "f64"):
+            value, want = number(bits, result), flush(FLOAT[result](want))
+            same = np.isnan(value) and np.isnan(want) or value.tobytes() == want.tobytes()
         elif result in ("bf16", "f16") and np.isnan(given[0]):
             same = bits == 0x7FFF
         else:
