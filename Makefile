@@ -101,9 +101,11 @@ study: $(TOOLS)
 
 # docs/lab/benchmarks: counts.md, what the CUDA kernels execute, counted while their PTX is executed
 # here; static.md, what they take, and with nvdisasm (on PATH, in CUDA_HOME or inside Triton) their
-# instructions and the scan's least times.
+# instructions and the scan's least times. PEERS=1 first fetches nvcc (110 MB) and the sources of
+# mamba-ssm, causal-conv1d and gsplat, and counts their kernels beside ours.
+PEERS ?=
 instructions: $(TOOLS)
-	PYTHONPATH=docs:tests $(BIN)/python -m lab.instructions
+	PYTHONPATH=docs:tests $(BIN)/python -m lab.instructions $(if $(PEERS),--peers)
 
 # The site, in site/: a broken link, anchor or docstring is an error.
 docs: $(TOOLS)

@@ -8,6 +8,7 @@ import json
 import math
 import re
 import zlib
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -62,6 +63,7 @@ class Interpreter:
         counting: whether it counts what instructions ask for, at some cost.
         findings: a line each.
         executed: by entry its program, and by instruction how many warps executed it.
+        blocks: by entry, those of all launches.
         counts: where it is counting, by entry and instruction the fields of ``Count``.
         trace: after each launch a checksum of all the memory that it was given.
         steps: instructions of warps.
@@ -73,6 +75,7 @@ class Interpreter:
     counting: bool = False
     findings: list[str] = field(default_factory=list)
     executed: dict[str, tuple[Program, list[int]]] = field(default_factory=dict)
+    blocks: Counter[str] = field(default_factory=Counter)
     counts: dict[str, np.ndarray] = field(default_factory=dict)
     trace: list[int] = field(default_factory=list)
     steps: int = 0
@@ -141,6 +144,7 @@ class Interpreter:
         )
         library().run(ctypes.byref(launch))
         self.steps += launch.steps
+        self.blocks[program.name] += blocks
         contents = ((ctypes.c_char * x.size).from_address(x.base) for x in arrays)
         self.trace.append(sum(map(zlib.crc32, contents)))  # their addresses have no order
         _, counts = self.executed.setdefault(program.name, (program, [0] * count))

@@ -42,6 +42,7 @@ class Executed:
         splits: share of branches that diverge in a warp.
         code: the PTX.
         times: number of warps that executed each instruction of the PTX.
+        blocks: of threads, of all launches.
     """
 
     name: str
@@ -50,17 +51,18 @@ class Executed:
     splits: float
     code: Sequence[sass.Instruction]
     times: Sequence[int]
+    blocks: int
 
 
 def executed(machine: Interpreter) -> dict[str, Executed]:
     """Return the counts of an interpreter, by entry."""
     return {
-        entry: _sum(program, times, machine.counts[entry])
+        entry: _sum(program, times, machine.counts[entry], machine.blocks[entry])
         for entry, (program, times) in machine.executed.items()
     }
 
 
-def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
+def _sum(program: Program, times: list[int], asked: np.ndarray, blocks: int) -> Executed:
     names = [*opcodes()]
     read = {x for i in program.code for x in (*i.given[: i.reads], i.guard)}
     counts: Counter[str] = Counter()
@@ -96,7 +98,7 @@ def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
     found = _NAME.fullmatch(program.name)
     name = found[1] if found else program.name
     share = splits / jumps if jumps else 0.0
-    return Executed(name, dict(counts), lanes / steps, share, code, times)
+    return Executed(name, dict(counts), lanes / steps, share, code, times, blocks)
 
 
 def count(

@@ -15,6 +15,7 @@ from gamba_warp.kernels.rasterize import depth_quantile, rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.runtime import tables
 
+from . import peers
 from .counting import Executed, count
 from .estimate import DEVICES, LANES, SECTOR, cycles, every
 from .report import TOKENS, WIDTH, count_scan
@@ -105,7 +106,7 @@ def rows_of(op: str, case: str, seen: set[str]) -> Iterator[dict]:
 
 
 def headline(say: Callable[[str], None] = lambda case: None) -> dict:
-    """Execute all cases; ``{format, versions, kernels}``, ready for JSON.
+    """Execute all cases; ``{format, versions, kernels}``, ready for JSON; ``peers`` has its own.
 
     A kernel has ``op, kernel, case, direction, per`` (what its figures are for), ``number`` (warps'
     worth of that), ``each`` (counts for one), ``lanes``, ``splits`` (as ``counting.Executed``), and
@@ -206,4 +207,5 @@ def markdown(document: dict) -> str:
         tables.markdown([*names, *_KINDS], counts),
         tables.markdown([*names, *header], memory),
     )
-    return _TEXT + tables_[0] + "\n" + _MEMORY + tables_[1] + "\n"
+    beside = "\n" + peers.markdown(document["peers"]) if "peers" in document else ""
+    return _TEXT + tables_[0] + "\n" + _MEMORY + tables_[1] + "\n" + beside

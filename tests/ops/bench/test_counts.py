@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
-from lab.instructions import headline
+import torch
+from lab.instructions import headline, peer_code
 from lab.instructions.counting import count
+from lab.instructions.peers import Launched, at_full_width
 from ptx.machine import Missing, library
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "lab" / "benchmarks"
@@ -77,3 +79,65 @@ def test_bounds(kernels):
 def test_what_is_not_executed_is_not_counted():
     found = count(lambda: [], (), 1)
     assert found == {"forward": {}}
+
+
+def test_ratios_to_others(document):
+    """All but two rows are ahead; a tenth above the ratios when this was written."""
+    behind = {("projection, whole tiles", "forward"): 1.2, ("1 x 2,048, bfloat16", "forward"): 1.0}
+    most = {"scan": 0.77, "convolution": 0.96, "rasterizer": 0.56}
+    for row in document["peers"]["rows"]:
+        ratio = row["ours"]["instructions"] / row["theirs"]["instructions"]
+        assert 0 < ratio <= behind.get((row["case"], row["direction"]), most[row["op"]]), row
+
+
+HEADER = """struct Base {
+    using index_t = uint64_t;
+    int batch, dim;  // sizes
+    bool even;
+    index_t x_batch_stride;
+    void *__restrict__ x_ptr;
+};
+struct More: public Base {
+    index_t y_l_stride;
+    void * y_ptr;
+};"""
+
+
+def test_parameters_of_a_kernel():
+    """Fields lie as a C++ compiler lays them; strides go by the names of axes."""
+    x = torch.zeros(3, 5)
+    kind = peer_code.structure(HEADER, "More")
+    made = kind.from_buffer_copy(
+        peer_code.filled(kind, {"x": (x, "batch l"), "y": (x.mT, "l batch")}, dim=7, even=True)
+    )
+    assert (made.batch, made.dim, made.even) == (0, 7, True)
+    assert (made.x_batch_stride, made.y_l_stride) == (5, 1)
+    assert made.x_ptr == made.y_ptr == x.data_ptr()
+    offsets = [
+        getattr(kind, name).offset for name in ("dim", "even", "x_ptr", "y_l_stride", "y_ptr")
+    ]
+    assert offsets == [4, 8, 24, 32, 40]
+
+
+def test_all_channels_from_two_runs():
+    """What channels share counts once for each sequence."""
+
+    def run(channels):
+        kernel = Launched("k", {"first": 100 + 3 * channels, "float": 2 * channels}, channels // 2)
+        return {"forward": [kernel]}
+
+    ((whole,),) = at_full_width(run, 4, 16).values()
+    assert whole.counts == {"first": 16 * (100 + 3 * 1024), "float": 16 * 2 * 1024}
+    assert whole.blocks == 16 * 512
+
+
+def test_without_an_index(monkeypatch, tmp_path):
+    """One line says that others' kernels cannot be had."""
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    try:
+        library()
+        with pytest.raises(Missing, match="pip: .*nvidia-cuda-nvcc|headers are needed"):
+            peer_code.Peers(tmp_path / "peers")
+    except Missing as reason:
+        pytest.skip(str(reason))

@@ -1,0 +1,204 @@
+"""PTX of other projects' kernels, from their source packages and nvcc; nothing of theirs is kept.
+
+Packages and compiler come from the index of pip into a folder outside the repository. A kernel is
+instantiated with the template arguments that its host code chooses for a shape, and compiled with
+the flags of its setup.py.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import re
+import struct
+import subprocess
+import sys
+import sysconfig
+import tarfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from ptx.contract import contracted
+from ptx.launch import ARCHITECTURE, Interpreter
+from ptx.machine import Missing
+from ptx.parse import Program, read
+from torch import Tensor
+
+PACKAGES = {"mamba-ssm": "2.3.2.post1", "causal-conv1d": "1.7.0", "gsplat": "1.5.3"}
+_COMPILER = ("nvidia-cuda-nvcc", "nvidia-nvvm", "nvidia-cuda-crt")
+_NO_BUILD = ("BUILD_NO_CUDA", "MAMBA_SKIP_CUDA_BUILD", "CAUSAL_CONV1D_SKIP_CUDA_BUILD")
+_HALVES = [
+    f"-U__CUDA_NO_{kind}_{what}__"
+    for kind in ("HALF", "BFLOAT16")
+    for what in ("OPERATORS", "CONVERSIONS")
+]
+_FLAGS = ["-O3", "-std=c++20", "--use_fast_math", "--expt-relaxed-constexpr"]
+FLAGS = {
+    "mamba-ssm": [*_HALVES, "--expt-extended-lambda"],
+    "causal-conv1d": [*_HALVES, "--expt-extended-lambda"],
+    "gsplat": ["-diag-suppress", "20012,186"],
+}
+INCLUDES = {
+    "mamba-ssm": ["csrc/selective_scan"],
+    "causal-conv1d": ["csrc"],
+    "gsplat": [f"gsplat/cuda/{name}" for name in ("include", "csrc", "csrc/third_party/glm")],
+}
+# An entry that does nothing; its name says the bytes of shared memory that the host asks for.
+_SHARED = """
+template <int bytes> __global__ void shared_bytes() {{}}
+template __global__ void shared_bytes<{}>();
+"""
+
+
+class Peers:
+    """The source packages and a compiler.
+
+    Args:
+        folder: for all that is downloaded, and the PTX.
+
+    Raises:
+        Missing: pip cannot get one of them, or there is no compiler for the host.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        site = Path(sysconfig.get_path("purelib"))
+        cuda = next((site / "nvidia").glob("cu[0-9]*/include/cuda_runtime.h"), None)
+        if cuda is None or torch.version.cuda is None:
+            raise Missing("torch without CUDA: its headers are needed")
+        self.nvcc = folder / "nvcc" / "nvidia" / cuda.parents[1].name / "bin" / "nvcc"
+        torch_include = site / "torch" / "include"
+        self.headers = [cuda.parent, cuda.parent / "cccl", torch_include]
+        self.headers.append(torch_include / "torch" / "csrc" / "api" / "include")
+        if not self.nvcc.exists():
+            wanted = [f"{name}=={torch.version.cuda}.*" for name in _COMPILER]
+            _pip("install", "--no-deps", "--target", folder / "nvcc", *wanted)
+        for name, version in PACKAGES.items():
+            if not self.source(name).is_dir():
+                chosen = ("--no-deps", "--no-build-isolation", "--no-binary", name)
+                _pip("download", *chosen, "--dest", folder, f"{name}=={version}")
+                with tarfile.open(f"{self.source(name)}.tar.gz") as packed:
+                    packed.extractall(folder, filter="data")
+
+    def source(self, package: str) -> Path:
+        """Folder of a package's sources."""
+        return self.folder / f"{package.replace('-', '_')}-{PACKAGES[package]}"
+
+    def compile(
+        self, package: str, text: str, shared: str = "0", entry: str = "(?!_Z12shared_bytes)"
+    ) -> tuple[Program, int]:
+        """Compile a text that has one of a package's kernels.
+
+        Args:
+            package: whose folders and flags are used.
+            text: CUDA C++.
+            shared: constant expression for the bytes of shared memory of a launch.
+            entry: a regular expression at the beginning of the kernel's name.
+
+        Returns:
+            The program, its products contracted with sums, and the bytes of shared memory.
+
+        Raises:
+            Missing: nvcc fails.
+        """
+        text += _SHARED.format(shared)
+        command = [
+            str(self.nvcc),
+            "-ptx",
+            f"-arch=compute_{ARCHITECTURE}",
+            *_FLAGS,
+            *FLAGS[package],
+        ]
+        command += [f"-I{self.source(package) / name}" for name in INCLUDES[package]]
+        command += [f"-I{path}" for path in self.headers]
+        key = hashlib.sha256(" ".join([*command, text]).encode()).hexdigest()[:16]
+        path = self.folder / f"{key}.cu"
+        ptx = path.with_suffix(".ptx")
+        if not ptx.exists():
+            path.write_text(text)
+            done = subprocess.run([*command, path, "-o", ptx], capture_output=True, text=True)
+            if done.returncode:
+                raise Missing(f"nvcc: {done.stderr.strip().splitlines()[-1:]}")
+        found = ptx.read_text()
+        (program,) = read(found, f"^{entry}").values()
+        (size,) = re.findall(r"_Z12shared_bytesILi(\d+)E", found)[:1]
+        return contracted(program), int(size)
+
+
+def _pip(*arguments: object) -> None:
+    command = [sys.executable, "-m", "pip", *map(str, arguments), "--quiet"]
+    environment = os.environ | {name: "TRUE" for name in _NO_BUILD} | {"BUILD_NO_CUDA": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode:
+        raise Missing(f"pip: {(done.stderr.strip() or 'no reason').splitlines()[-1]}")
+
+
+def structure(text: str, name: str) -> type[ctypes.Structure]:
+    """A structure of parameters from the text of a C++ header."""
+    base, body = re.findall(rf"struct {name}\s*(?::\s*public (\w+))?\s*\{{(.*?)\n\}};", text, re.S)[
+        0
+    ]
+    (index,) = re.findall(r"using index_t = uint(\d+)_t", text)
+    types = {"int": ctypes.c_int, "bool": ctypes.c_bool}
+    types["index_t"] = ctypes.c_uint32 if index == "32" else ctypes.c_uint64
+    fields = []
+    for line in re.sub(r"//.*|using [^;]*;", "", body).split(";")[:-1]:
+        kind, names = re.fullmatch(r"\s*(\w+)(.*)", line, re.S).groups()
+        made = ctypes.c_void_p if "*" in line else types[kind]
+        names = re.sub(r"\*|__restrict__", "", names)
+        fields += [(field.strip(), made) for field in names.split(",")]
+    return type(name, (structure(text, base) if base else ctypes.Structure,), {"_fields_": fields})
+
+
+def filled(
+    kind: type[ctypes.Structure], tensors: dict[str, tuple[Tensor, str]], **numbers
+) -> bytes:
+    """The bytes of a structure.
+
+    Args:
+        kind: from ``structure``.
+        tensors: by name a tensor, whose address is ``<name>_ptr``, and names of its axes, whose
+            strides are ``<name>_<axis>_stride`` where the structure has them.
+        numbers: its other fields; those not named are 0.
+    """
+    made = kind(**numbers)
+    for name, (x, axes) in tensors.items():
+        setattr(made, f"{name}_ptr", x.data_ptr())
+        for axis, stride in zip(axes.split(), x.stride()):
+            if hasattr(made, f"{name}_{axis}_stride"):
+                setattr(made, f"{name}_{axis}_stride", stride)
+    return bytes(made)
+
+
+def packed(program: Program, values: Sequence[Tensor | float | int | None]) -> list[bytes]:
+    """The bytes of separate parameters; None is no tensor."""
+
+    def one(value, size: int) -> bytes:
+        if isinstance(value, float):
+            return struct.pack("f", value)
+        number = value.data_ptr() if isinstance(value, Tensor) else value or 0
+        return int(number).to_bytes(size, "little")
+
+    sizes = [size for _, size in program.params]
+    return [one(value, size) for value, size in zip(values, sizes, strict=True)]
+
+
+def launch(
+    machine: Interpreter,
+    compiled: tuple[Program, int],
+    params: list[bytes],
+    tensors: Sequence[Tensor],
+    threads: tuple[int, ...],
+    blocks: tuple[int, ...],
+) -> None:
+    """Execute a kernel.
+
+    Raises:
+        ValueError: the interpreter reports something, which it names.
+    """
+    program, shared = compiled
+    machine.execute(program, params, tensors, (threads, blocks, shared))
+    if machine.findings:
+        raise ValueError(machine.findings[0])

@@ -1,0 +1,499 @@
+"""Counts of other projects' kernels beside ours, for the same work: the ratios in counts.md."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+from ptx.launch import Interpreter
+from torch import Tensor
+
+from gamba_warp.kernels.bench.cases.raster_scene import LEAVES, orbit_cameras, shell
+from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
+from gamba_warp.kernels.bench.static.dry_run import MULTIPROCESSORS
+from gamba_warp.kernels.causal_conv1d import causal_conv1d
+from gamba_warp.kernels.rasterize import rasterization
+from gamba_warp.kernels.runtime import tables
+from gamba_warp.kernels.selective_scan import selective_scan
+from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
+
+from .counting import Executed, count, executed
+from .estimate import DEVICES, SECTOR, Shape, cycles, every
+from .peer_code import PACKAGES, Peers, filled, launch, packed, structure
+from .report import tuning_of
+
+CHANNELS, STATES, WIDTH = 1024, 16, 4
+GAUSSIANS, SIDE, TILE = 16384, 512, 16
+H200 = DEVICES[90]
+TYPES = {torch.float32: "float", torch.bfloat16: "at::BFloat16"}
+
+
+@dataclass(frozen=True)
+class Launched:
+    """Counts of a kernel, as of ``counting.Executed``, and its blocks."""
+
+    name: str
+    counts: dict[str, float]
+    blocks: float
+
+    @property
+    def seconds(self) -> float:
+        """Least time on an H200, by its busiest unit, where most blocks are."""
+        limits = cycles(H200, self.counts)
+        rounds = -(-self.blocks // H200.multiprocessors) / self.blocks
+        limits = {name: x * rounds for name, x in limits.items() if name != "dram"}
+        memory = self.counts.get("first", 0) * SECTOR / H200.bandwidth
+        return max(memory, *(x / H200.clock for x in limits.values()))
+
+
+# By direction, what is launched one after the other.
+Kernels = dict[str, list[Launched]]
+
+
+def launched(kernels: Iterable[Executed]) -> list[Launched]:
+    """The counts of executed kernels."""
+    return [Launched(x.name, x.counts, x.blocks) for x in kernels]
+
+
+def at_full_width(run: Callable[[int], Kernels], channels: int, batch: int) -> Kernels:
+    """Counts for all channels and sequences, from two runs of one sequence.
+
+    What the channels share, such as B and C, is touched first by one of them only; so the second
+    run has twice the channels, and the difference is what more of them add.
+
+    Args:
+        run: gives the counts for a number of channels.
+        channels: of the first run.
+        batch: number of sequences.
+    """
+    one, two, more = run(channels), run(2 * channels), CHANNELS / channels - 1
+
+    def whole(a: float, b: float) -> float:
+        return batch * (a + more * (b - a))
+
+    return {
+        direction: [
+            Launched(
+                a.name,
+                {k: whole(a.counts.get(k, 0), x) for k, x in b.counts.items()},
+                whole(a.blocks, b.blocks),
+            )
+            for a, b in zip(one[direction], two[direction], strict=True)
+        ]
+        for direction in one
+    }
+
+
+def agree(what: str, ours: Sequence[Tensor], theirs: Sequence[Tensor], limit: float) -> None:
+    """Raise a ``ValueError`` unless two kernels computed the same, by relative rms errors."""
+    for k, (a, b) in enumerate(zip(ours, theirs, strict=True)):
+        error = (a.double() - b.double()).norm() / a.double().norm()
+        if not error <= limit:
+            raise ValueError(f"{what}: result {k} differs by {error:.1e}")
+
+
+# --- the scan
+
+
+def our_scan(length: int, batch: int, dtype: torch.dtype, channels: int) -> Kernels:
+    """One sequence, by the kernels that are chosen for ``batch`` of all channels."""
+    shape = Shape(batch, length, CHANNELS, STATES, dtype.itemsize)
+    inputs = make_inputs(1, length, channels, STATES)
+    for name in ("u", "delta", "z", "B", "C"):
+        inputs[name] = inputs[name].to(dtype)
+    inputs = {name: x.requires_grad_() for name, x in inputs.items()}
+    before, scan_cuda.FORCED = scan_cuda.FORCED, tuning_of(shape)
+    try:
+        run = partial(selective_scan, **inputs, delta_softplus=True)
+        counted = count(lambda: [run()], inputs.values(), MULTIPROCESSORS)
+    finally:
+        scan_cuda.FORCED = before
+    return {direction: launched(kernels.values()) for direction, kernels in counted.items()}
+
+
+def mamba_scan(peers: Peers, length: int, dtype: torch.dtype, channels: int) -> Kernels:
+    """One sequence by mamba-ssm: the traits that its host code chooses for over 1,024 tokens."""
+    folder = peers.source("mamba-ssm") / "csrc" / "selective_scan"
+    header = (folder / "selective_scan.h").read_text()
+    even = str(length % 2048 == 0).lower()
+    text = """#include "selective_scan_{0}_kernel.cuh"
+using T = Selective_Scan_{0}_kernel_traits<128, 16, {1}{2}, true, true, true{3}, {4}, float>;
+template __global__ void selective_scan_{0}_kernel<T>({5});
+"""
+    of_state = "MAX_DSTATE * sizeof(T::scan_t)"
+    forward = peers.compile(
+        "mamba-ssm",
+        text.format("fwd", "1, ", even, "", TYPES[dtype], "SSMParamsBase"),
+        f"T::kSmemSize + {of_state}",
+    )
+    backward = peers.compile(
+        "mamba-ssm",
+        text.format("bwd", "", even, ", true", TYPES[dtype], "SSMParamsBwd"),
+        f"T::kSmemSize + {of_state} + (128 + 4 * MAX_DSTATE) * sizeof(float)",
+    )
+    inputs = {name: x.requires_grad_() for name, x in make_inputs(1, length, channels).items()}
+    for name in ("u", "delta", "z", "B", "C"):
+        inputs[name] = inputs[name].detach().to(dtype).requires_grad_()
+    y = selective_scan(**inputs, delta_softplus=True)
+    dy = torch.randn(y.shape).to(dtype)
+    wanted = torch.autograd.grad(y, [*inputs.values()], dy)
+    x = {name: value.detach() for name, value in inputs.items()}
+    for name in ("u", "delta", "z"):
+        x[name] = x[name].mT.contiguous()
+    for name in ("B", "C"):
+        x[name] = x[name].mT.contiguous()[:, None]
+    chunks = -(-length // 2048)
+    x |= {"out": torch.empty_like(x["u"]), "out_z": torch.empty_like(x["u"])}
+    x["x"] = torch.empty(1, channels, chunks, 2 * STATES)
+    axes = dict.fromkeys(x, "batch d l") | {"A": "d dstate", "x": "", "D": "", "delta_bias": ""}
+    axes |= dict.fromkeys(("B", "C", "dB", "dC"), "batch group dstate l")
+    sizes = dict(batch=1, dim=channels, seqlen=length, dstate=STATES, n_groups=1, n_chunks=chunks)
+    sizes |= dict(dim_ngroups_ratio=channels, is_variable_B=True, is_variable_C=True)
+    sizes["delta_softplus"] = True
+
+    def run(compiled, kind: str) -> list[Launched]:
+        machine = Interpreter(counting=True)
+        tensors = {name: (value, axes[name]) for name, value in x.items()}
+        params = [filled(structure(header, kind), tensors, **sizes)]
+        launch(machine, compiled, params, [*x.values()], (128, 1, 1), (1, channels, 1))
+        return launched(executed(machine).values())
+
+    found = {"forward": run(forward, "SSMParamsBase")}
+    limit = 1e-4 if dtype == torch.float32 else 1e-2
+    agree("mamba-ssm, forward", [y.detach()], [x["out_z"].mT], limit)
+    del x["out_z"]
+    x["dout"] = dy.mT.contiguous()
+    for name in inputs:
+        x[f"d{name}"] = torch.zeros_like(
+            x[name], dtype=None if name in "u delta z" else torch.float32
+        )
+        axes[f"d{name}"] = axes[name]
+    axes["dout"] = axes["u"]
+    found["gradient"] = run(backward, "SSMParamsBwd")
+    theirs = [x[f"d{name}"] for name in inputs]
+    theirs = [
+        g.mT if n in "u delta z" else g[:, 0].mT if n in "BC" else g for n, g in zip(inputs, theirs)
+    ]
+    agree("mamba-ssm, gradient", wanted, theirs, 10 * limit)
+    return found
+
+
+# --- the convolution
+
+
+def our_conv(length: int, dtype: torch.dtype, channels: int) -> Kernels:
+    """One sequence, with bias and SiLU."""
+    x, weight, bias = _conv_inputs(length, dtype, channels)
+    run = partial(causal_conv1d, x, weight, bias, activation="silu")
+    counted = count(lambda: [run()], (x, weight, bias), MULTIPROCESSORS)
+    return {direction: launched(kernels.values()) for direction, kernels in counted.items()}
+
+
+def _conv_inputs(length: int, dtype: torch.dtype, channels: int) -> list[Tensor]:
+    torch.manual_seed(0)
+    x, weight = torch.randn(1, length, channels).to(dtype), torch.randn(channels, WIDTH)
+    return [value.requires_grad_() for value in (x, weight, torch.randn(channels))]
+
+
+def their_conv(peers: Peers, length: int, dtype: torch.dtype, last: bool, channels: int) -> Kernels:
+    """One sequence by causal-conv1d, channels last or tokens last."""
+    folder = peers.source("causal-conv1d") / "csrc"
+    header = (folder / "causal_conv1d.h").read_text()
+    vector, elements = 16 // dtype.itemsize, 128 // dtype.itemsize
+    name = "causal_conv1d_channellast" if last else "causal_conv1d"
+    chunks = (64, 128 if length > 128 else 64)  # forward, gradient
+
+    def compiled(direction: str, more: str, kernel_more: str, chunk: int, kind: str):
+        text = (folder / f"causal_conv1d_{direction}.cu").read_text()
+        text = re.sub(r"^template void .*;$", "", text, flags=re.M)
+        of_chunk = f"{chunk}, " if last else ""
+        even = str(last or length % vector == 0).lower()
+        text += f"""
+using T = {name.capitalize()}_{direction}_kernel_traits<
+    128, {WIDTH}, {of_chunk}{more}{even}, {TYPES[dtype]}, float>;
+template __global__ void {name}_{direction}_kernel<T{kernel_more}>({kind});
+"""
+        return peers.compile("causal-conv1d", text, "0" if last else "T::kSmemSize")
+
+    forward = compiled("fwd", "", ", false" if last else "", chunks[0], "ConvParamsBase")
+    more = ", false, false, false" if last else ", false"
+    backward = compiled("bwd", "true, ", more, chunks[1], "ConvParamsBwd")
+    leaves = _conv_inputs(length, dtype, channels)
+    y = causal_conv1d(*leaves, activation="silu")
+    dy = torch.randn(y.shape).to(dtype)
+    wanted = torch.autograd.grad(y, leaves, dy)
+
+    def laid_out(value: Tensor) -> Tensor:
+        return value.detach().clone().mT if last else value.detach().mT.contiguous()
+
+    x = {"x": laid_out(leaves[0]), "weight": leaves[1].detach(), "bias": leaves[2].detach()}
+    x["out"] = laid_out(torch.empty_like(y))
+    axes = {name: "batch c l" for name in ("x", "out", "dout", "dx")}
+    axes |= {name: "c width" for name in ("weight", "dweight", "bias", "dbias")}
+    sizes = dict(batch=1, dim=channels, seqlen=length, width=WIDTH, silu_activation=True)
+
+    def run(program, kind: str, chunk: int) -> list[Launched]:
+        machine = Interpreter(counting=True)
+        params = [filled(structure(header, kind), {k: (v, axes[k]) for k, v in x.items()}, **sizes)]
+        blocks = (1, -(-length // chunk), -(-channels // elements)) if last else (1, channels, 1)
+        launch(machine, program, params, [*x.values()], (128, 1, 1), blocks)
+        return launched(executed(machine).values())
+
+    found = {"forward": run(forward, "ConvParamsBase", chunks[0])}
+    limit = 1e-4 if dtype == torch.float32 else 1e-2
+    agree("causal-conv1d, forward", [y.detach()], [x["out"].mT], limit)
+    x |= {"dout": laid_out(dy), "dx": laid_out(torch.empty_like(y))}
+    x |= {"dweight": torch.zeros(channels, WIDTH), "dbias": torch.zeros(channels)}
+    found["gradient"] = run(backward, "ConvParamsBwd", chunks[1])
+    agree("causal-conv1d, gradient", wanted, [x["dx"].mT, x["dweight"], x["dbias"]], limit)
+    return found
+
+
+# --- the rasterizer
+
+# Our kernels that do what each of theirs does; those of tiles' lists, which gsplat sorts, do not.
+STAGES = {
+    ("projection", "forward"): ("project",),
+    ("projection", "gradient"): ("project_vjp",),
+    ("drawing", "forward"): ("record", "composite", "composite_unlisted"),
+    ("drawing", "gradient"): ("composite_vjp", "composite_vjp_unlisted", "add_rows"),
+}
+
+
+def our_picture(
+    leaves: dict[str, Tensor], cameras: dict, multiprocessors: int
+) -> dict[str, Kernels]:
+    """One view, stage by stage; on few multiprocessors by whole tiles."""
+    run = partial(rasterization, **leaves, **cameras)
+    counted = count(lambda: run()[:2], leaves.values(), multiprocessors)
+    found: dict[str, Kernels] = {"projection": {}, "drawing": {}}
+    for (stage, direction), names in STAGES.items():
+        kernels = (x for x in counted[direction].values() if x.name in names)
+        found[stage][direction] = launched(kernels)
+    return found
+
+
+def pairs(means2d: Tensor, radii: Tensor, depths: Tensor) -> tuple[Tensor, Tensor]:
+    """Tiles' first pairs and the pairs' Gaussians, by tile and depth, as gsplat sorts them."""
+    side = SIDE // TILE
+    first = ((means2d - radii) / TILE).floor().clamp(0, side).long()
+    last = ((means2d + radii) / TILE).ceil().clamp(0, side).long()
+    size = (last - first).prod(1) * (radii > 0).all(1)
+    of = torch.repeat_interleave(torch.arange(len(radii)), size)
+    within = torch.arange(len(of)) - (size.cumsum(0) - size)[of]
+    wide = (last - first)[of, 0]
+    tile = (first[of, 1] + within // wide) * side + first[of, 0] + within % wide
+    order = torch.argsort(depths[of], stable=True)
+    order = order[torch.argsort(tile[order], stable=True)]
+    begins = torch.searchsorted(tile[order], torch.arange(side * side))
+    return begins.int().view(1, side, side), of[order].int()
+
+
+def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> dict[str, Kernels]:
+    """The same by gsplat."""
+    folder = peers.source("gsplat") / "gsplat" / "cuda" / "csrc"
+
+    def compiled(file: str, entry: str, shared: int = 0):
+        text = (folder / f"{file}.cu").read_text()
+        text = re.sub(r"^__INS__\((?!3\)).*$", "", text, flags=re.M)  # of 3 channels
+        return peers.compile(
+            "gsplat", text, str(shared), f"_ZN6gsplat\\d+{entry}_kernel(If|ILj3Ef)E"
+        )
+
+    files = {
+        ("projection", "forward"): ("ProjectionEWA3DGSFused", "projection_ewa_3dgs_fused_fwd"),
+        ("projection", "gradient"): ("ProjectionEWA3DGSFused", "projection_ewa_3dgs_fused_bwd"),
+        ("drawing", "forward"): ("RasterizeToPixels3DGSFwd", "rasterize_to_pixels_3dgs_fwd"),
+        ("drawing", "gradient"): ("RasterizeToPixels3DGSBwd", "rasterize_to_pixels_3dgs_bwd"),
+    }
+    found: dict[str, Kernels] = {"projection": {}, "drawing": {}}
+    threads, blocks = {}, {}
+    threads["projection"], blocks["projection"] = (256, 1, 1), (-(-GAUSSIANS // 256), 1, 1)
+    threads["drawing"], blocks["drawing"] = (TILE, TILE, 1), (1, SIDE // TILE, SIDE // TILE)
+    of_pixel = {"forward": 4 + 12 + 12, "gradient": 4 + 12 + 12 + 4 * 3}
+
+    def run(stage: str, direction: str, values: Sequence) -> None:
+        shared = TILE * TILE * of_pixel[direction] if stage == "drawing" else 0
+        program = compiled(*files[stage, direction], shared)
+        machine = Interpreter(counting=True)
+        tensors = [value for value in values if isinstance(value, Tensor)]
+        params = packed(program[0], values)
+        launch(machine, program, params, tensors, threads[stage], blocks[stage])
+        found[stage][direction] = launched(executed(machine).values())
+
+    n, x = GAUSSIANS, {name: value.detach() for name, value in leaves.items()}
+    viewmats, Ks = cameras["viewmats"], cameras["Ks"]
+    radii = torch.empty(n, 2, dtype=torch.int32)
+    means2d, depths, conics = torch.empty(n, 2), torch.empty(n), torch.empty(n, 3)
+    of_scene = [1, 1, n, x["means"], None, x["quats"], x["scales"]]
+    of_camera = [viewmats, Ks, SIDE, SIDE, 0.3]
+    outputs = [radii, means2d, depths, conics, None]
+    inputs = [*of_scene, x["opacities"], *of_camera, 0.01, 1e10, 0.0, 0]
+    run("projection", "forward", [*inputs, *outputs])
+    begins, ids = pairs(means2d, radii, depths)
+    colors, alphas = torch.empty(SIDE, SIDE, 3), torch.empty(SIDE, SIDE)
+    last = torch.empty(SIDE, SIDE, dtype=torch.int32)
+    drawn = [1, n, len(ids), 0, means2d, conics, x["colors"], x["opacities"], None, None]
+    drawn += [SIDE, SIDE, TILE, SIDE // TILE, SIDE // TILE, begins, ids]
+    run("drawing", "forward", [*drawn, colors, alphas, last])
+    torch.manual_seed(1)
+    cotangents = [torch.randn_like(colors), torch.randn_like(alphas)]
+    grads = [torch.zeros_like(value) for value in (means2d, conics, x["colors"], x["opacities"])]
+    run("drawing", "gradient", [*drawn, alphas, last, *cotangents, None, *grads])
+    back = [torch.zeros_like(x[name]) for name in ("means", "quats", "scales")]
+    zero = torch.zeros_like(depths)
+    of_forward = [radii, conics, None, grads[0], zero, grads[1], None]
+    run(
+        "projection",
+        "gradient",
+        [*of_scene, *of_camera, 0, *of_forward, back[0], None, back[1], back[2], None],
+    )
+    renders, ours, _ = rasterization(**leaves, **cameras)
+    wanted = torch.autograd.grad(
+        [renders[0], ours[0, ..., 0]], [leaves[name] for name in LEAVES], cotangents
+    )
+    # it cuts Gaussians off at another distance, and alphas at .999
+    agree(
+        "gsplat, forward", [renders[0].detach(), ours[0, ..., 0].detach()], [colors, alphas], 1e-3
+    )
+    agree("gsplat, gradient", wanted, [*back, grads[3], grads[2]], 1e-2)
+    return found
+
+
+# --- the table
+
+LENGTHS = {"2,048": 2048, "16,961": 16961}
+# Medians on an H200 from docs/gpu.md, milliseconds: forward, and with the gradient. Others have
+# published no time of these kernels with device, shape and type.
+MEASURED = {
+    "16 x 16,961, bfloat16": {"ours": (2.66, 12.2), "theirs": (9.61, 43.4)},
+    "1 x 16,961, bfloat16": {"ours": (0.53, 2.23), "theirs": (0.75, 3.27)},
+    "16 x 16,961, bfloat16, theirs channels last": {"ours": (0.32, 0.90), "theirs": (0.38, None)},
+}
+
+
+def cases(peers: Peers) -> Iterator[tuple[str, str, Kernels, Kernels]]:
+    """Yield an operator, a case, and the counts of ours and of theirs."""
+    for batch, text, dtype in (
+        (16, "2,048", torch.float32),
+        (16, "2,048", torch.bfloat16),
+        (16, "16,961", torch.bfloat16),
+        (1, "2,048", torch.bfloat16),
+        (1, "16,961", torch.bfloat16),
+    ):
+        ours, theirs = partial(our_scan, LENGTHS[text], batch, dtype), partial(mamba_scan, peers)
+        wide = at_full_width(ours, 64, batch)
+        named = f"{batch} x {text}, {str(dtype)[6:]}"
+        yield "scan", named, wide, at_full_width(partial(theirs, LENGTHS[text], dtype), 1, batch)
+        if batch == 16 and text == "16,961":
+            padded = at_full_width(
+                partial(theirs, -(-LENGTHS[text] // 2048) * 2048, dtype), 1, batch
+            )
+            yield "scan", f"{named}, theirs padded to 18,432", wide, padded
+    for text, dtype in (
+        ("2,048", torch.float32),
+        ("2,048", torch.bfloat16),
+        ("16,961", torch.bfloat16),
+    ):
+        ours = at_full_width(partial(our_conv, LENGTHS[text], dtype), 128, 16)
+        for last in (True, False) if LENGTHS[text] % 8 == 0 else (True,):
+            one = at_full_width(partial(their_conv, peers, LENGTHS[text], dtype, last), 128, 16)
+            layout = "channels last" if last else "tokens last"
+            yield "convolution", f"16 x {text}, {str(dtype)[6:]}, theirs {layout}", ours, one
+    viewmats, Ks = orbit_cameras(1, SIDE)
+    leaves = {name: x.requires_grad_() for name, x in shell(GAUSSIANS).items()}
+    cameras = dict(viewmats=viewmats, Ks=Ks, width=SIDE, height=SIDE)
+    theirs = gsplat_picture(peers, leaves, cameras)
+    for multiprocessors, text in ((0, "whole tiles"), (MULTIPROCESSORS, "quarters of tiles")):
+        ours = our_picture(leaves, cameras, multiprocessors)
+        for stage in ours:
+            if stage == "drawing" or not multiprocessors:
+                yield "rasterizer", f"{stage}, {text}", ours[stage], theirs[stage]
+
+
+def total(kernels: list[Launched]) -> dict[str, float]:
+    """Sums of launches that follow each other, "ms" by the estimate."""
+    found = {name: sum(x.counts.get(name, 0) for x in kernels) for name in ("sectors", "first")}
+    every_one = sum(every(x.counts) for x in kernels)
+    return {"instructions": every_one, **found, "ms": 1e3 * sum(x.seconds for x in kernels)}
+
+
+def compare(folder: Path, say: Callable[[str], None] = lambda case: None) -> dict:
+    """Count all cases: ``{versions, rows}``, ready for JSON.
+
+    A row has ``op, case, direction``, and of ``ours`` and ``theirs`` "instructions" of warps,
+    "sectors", "first" of them, and "ms", the least time on an H200.
+
+    Args:
+        folder: for what is downloaded.
+        say: told each case.
+
+    Raises:
+        Missing: as ``Peers``.
+    """
+    rows = []
+    for op, case, ours, theirs in cases(Peers(folder)):
+        say(f"counted beside others: {op}, {case}")
+        for direction in ours:
+            both = {"ours": total(ours[direction]), "theirs": total(theirs[direction])}
+            rows.append({"op": op, "case": case, "direction": direction, **both})
+    return {"versions": PACKAGES | {"nvcc": str(torch.version.cuda)}, "rows": rows}
+
+
+_TEXT = """## Beside the kernels of others
+Written by `make instructions PEERS=1`: the sources of {packages} were
+compiled by nvcc {nvcc}, with the flags of their setup.py and the template arguments that their host
+code chooses, and executed in the same interpreter on the same inputs; their results agree with
+ours. The scan and the convolution have {channels:,} channels, the scan {states} states,
+softplus and gate, the convolution {width} weights and SiLU; the rasterizer draws the view of above.
+
+**Ratios, ours to theirs: below 1 is less.** **least** is the time of an H200 if its busiest unit
+works in every cycle, in milliseconds. Products are contracted with sums, and moves left out, in
+theirs as in ours. gsplat orders its pairs by a library's sort, which is not counted, and neither
+are our kernels for lists. Ours add the rows of gradients in a fixed order, theirs with atomics.
+
+"""
+_CALIBRATION = """
+### Estimates beside measured times
+Times on an H200 ([gpu.md](../../gpu.md)) over the estimates. The scan takes {scan} times its
+estimate, the convolution {convolution} times. The times of one sequence include what the host
+does for a call.
+
+"""
+
+
+def markdown(document: dict) -> str:
+    """Section of a page, of the document of ``compare``."""
+    versions = dict(document["versions"])
+    nvcc = versions.pop("nvcc")
+    packages = ", ".join(f"{name} {version}" for name, version in versions.items())
+    found = _TEXT.format(
+        packages=packages, nvcc=nvcc, channels=CHANNELS, states=STATES, width=WIDTH
+    )
+    table = []
+    for row in document["rows"]:
+        ours, theirs = row["ours"], row["theirs"]
+        ratios = [f"{ours[name] / theirs[name]:.2f}" for name in ours]
+        times = [f"{both['ms']:.3g}" for both in (ours, theirs)]
+        table.append([row["op"], row["case"], row["direction"], *ratios, *times])
+    header = ["operator", "case", "direction", "instructions", "sectors", "first", "least"]
+    found += tables.markdown([*header, "ours", "theirs"], table) + "\n"
+    table, factors = [], {"scan": [], "convolution": []}
+    for case, of in MEASURED.items():
+        rows = [row for row in document["rows"] if row["case"] == case]
+        for whose, measured in of.items():
+            estimate = 0.0
+            for row, direction, time in zip(rows, ("forward", "with gradients"), measured):
+                estimate += row[whose]["ms"]
+                if time is None:
+                    continue
+                factors[row["op"]].append(time / estimate)
+                cells = [row["op"], case, direction, whose, f"{time:.3g}", f"{estimate:.3g}"]
+                table.append([*cells, f"{time / estimate:.1f}"])
+    spans = {op: f"{min(x):.1f} to {max(x):.1f}" for op, x in factors.items()}
+    header = ["operator", "case", "direction", "whose", "measured, ms", "estimate, ms", "factor"]
+    return found + _CALIBRATION.format(**spans) + tables.markdown(header, table) + "\n"
