@@ -15,7 +15,7 @@ from gamba_warp.kernels.rasterize import depth_quantile, rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.runtime import tables
 
-from . import peers
+from . import peer_page
 from .counting import Executed, count
 from .estimate import DEVICES, LANES, SECTOR, cycles, every
 from .report import TOKENS, WIDTH, count_scan
@@ -207,5 +207,5 @@ def markdown(document: dict) -> str:
         tables.markdown([*names, *_KINDS], counts),
         tables.markdown([*names, *header], memory),
     )
-    beside = "\n" + peers.markdown(document["peers"]) if "peers" in document else ""
+    beside = "\n" + peer_page.markdown(document["peers"]) if "peers" in document else ""
     return _TEXT + tables_[0] + "\n" + _MEMORY + tables_[1] + "\n" + beside

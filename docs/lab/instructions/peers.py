@@ -17,7 +17,6 @@ from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
 from gamba_warp.kernels.bench.static.dry_run import MULTIPROCESSORS
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
-from gamba_warp.kernels.runtime import tables
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 
@@ -367,13 +366,6 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
 # --- the table
 
 LENGTHS = {"2,048": 2048, "16,961": 16961}
-# Medians on an H200 from docs/gpu.md, milliseconds: forward, and with the gradient. Others have
-# published no time of these kernels with device, shape and type.
-MEASURED = {
-    "16 x 16,961, bfloat16": {"ours": (2.66, 12.2), "theirs": (9.61, 43.4)},
-    "1 x 16,961, bfloat16": {"ours": (0.53, 2.23), "theirs": (0.75, 3.27)},
-    "16 x 16,961, bfloat16, theirs channels last": {"ours": (0.32, 0.90), "theirs": (0.38, None)},
-}
 
 
 def cases(peers: Peers) -> Iterator[tuple[str, str, Kernels, Kernels]]:
@@ -442,60 +434,3 @@ def compare(folder: Path, say: Callable[[str], None] = lambda case: None) -> dic
             both = {"ours": total(ours[direction]), "theirs": total(theirs[direction])}
             rows.append({"op": op, "case": case, "direction": direction, **both})
     return {"versions": PACKAGES | {"nvcc": str(torch.version.cuda)}, "rows": rows}
-
-
-_TEXT = """## Beside the kernels of others
-Written by `make instructions PEERS=1`: the sources of {packages} were
-compiled by nvcc {nvcc}, with the flags of their setup.py and the template arguments that their host
-code chooses, and executed in the same interpreter on the same inputs; their results agree with
-ours. The scan and the convolution have {channels:,} channels, the scan {states} states,
-softplus and gate, the convolution {width} weights and SiLU; the rasterizer draws the view of above.
-
-**Ratios, ours to theirs: below 1 is less.** **least** is the time of an H200 if its busiest unit
-works in every cycle, in milliseconds. Products are contracted with sums, and moves left out, in
-theirs as in ours. ptxas makes .89 to 1.14 times as many instructions of theirs (1.5 times in the
-gradient of the projection, counted once by the loops of its disassembly). gsplat orders its pairs
-by a library's sort, which is not counted, and neither are our kernels for lists. Ours add the rows
-of gradients in a fixed order, theirs with atomics.
-
-"""
-_CALIBRATION = """
-### Estimates beside measured times
-Times on an H200 ([gpu.md](../../gpu.md)) over the estimates. The scan takes {scan} times its
-estimate, the convolution {convolution} times. The times of one sequence include what the host
-does for a call.
-
-"""
-
-
-def markdown(document: dict) -> str:
-    """Section of a page, of the document of ``compare``."""
-    versions = dict(document["versions"])
-    nvcc = versions.pop("nvcc")
-    packages = ", ".join(f"{name} {version}" for name, version in versions.items())
-    found = _TEXT.format(
-        packages=packages, nvcc=nvcc, channels=CHANNELS, states=STATES, width=WIDTH
-    )
-    table = []
-    for row in document["rows"]:
-        ours, theirs = row["ours"], row["theirs"]
-        ratios = [f"{ours[name] / theirs[name]:.2f}" for name in ours]
-        times = [f"{both['ms']:.3g}" for both in (ours, theirs)]
-        table.append([row["op"], row["case"], row["direction"], *ratios, *times])
-    header = ["operator", "case", "direction", "instructions", "sectors", "first", "least"]
-    found += tables.markdown([*header, "ours", "theirs"], table) + "\n"
-    table, factors = [], {"scan": [], "convolution": []}
-    for case, of in MEASURED.items():
-        rows = [row for row in document["rows"] if row["case"] == case]
-        for whose, measured in of.items():
-            estimate = 0.0
-            for row, direction, time in zip(rows, ("forward", "with gradients"), measured):
-                estimate += row[whose]["ms"]
-                if time is None:
-                    continue
-                factors[row["op"]].append(time / estimate)
-                cells = [row["op"], case, direction, whose, f"{time:.3g}", f"{estimate:.3g}"]
-                table.append([*cells, f"{time / estimate:.1f}"])
-    spans = {op: f"{min(x):.1f} to {max(x):.1f}" for op, x in factors.items()}
-    header = ["operator", "case", "direction", "whose", "measured, ms", "estimate, ms", "factor"]
-    return found + _CALIBRATION.format(**spans) + tables.markdown(header, table) + "\n"
