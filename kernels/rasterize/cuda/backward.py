@@ -41,15 +41,26 @@ wp.set_module_options({"enable_backward": False})
 
 @struct
 class Rows:
-    """Outputs of a gradient's launch: sums of pairs or Gaussians, and marks of skipped tiles."""
+    """Outputs of a gradient's launch: rows of pairs or Gaussians, and marks of skipped tiles.
 
-    sums: wp.array2d[wp.float32]
+    A row has for each chunk of channels the six moments, the two sums of absolute values if they
+    are asked for, and the colours: the first eight of these numbers, a sector of memory, in
+    ``heads``, the others in ``tails``. A row of a pair that is not ``written`` holds nothing.
+    """
+
+    heads: wp.array2d[wp.float32]
+    tails: wp.array2d[wp.float32]
+    written: wp.array[wp.int32]  # a bit for each pair's row
     skipped: wp.array[wp.int32]
 
 
-def row_size(channels: int) -> int:
-    """Floats of a row; for each chunk six moments, two sums of absolute values, four colours."""
-    return -(-channels // CHUNK) * RECORD
+HEAD = 8  # numbers of a chunk in ``heads``
+
+
+def row_sizes(channels: int, absolute: bool) -> tuple[int, int]:
+    """Numbers of a row in ``heads`` and in ``tails``."""
+    chunks = [min(CHUNK, channels - first) for first in range(0, channels, CHUNK)]
+    return HEAD * len(chunks), sum(Sums(c, False, absolute).tail() for c in chunks)
 
 
 class Sums(NamedTuple):
@@ -58,7 +69,7 @@ class Sums(NamedTuple):
     Attributes:
         channels: of colours, at most 4; 0 for the moments alone, of however many channels.
         geometry: moments of h (README eq. 11).
-        absolute: rows with the two sums of absolute values (eq. 14) after the six moments.
+        absolute: rows have the two sums of absolute values (eq. 14) after the six moments.
     """
 
     channels: int
@@ -74,9 +85,44 @@ class Sums(NamedTuple):
         values = self.moments() + self.channels
         return WARP * RECORD + WARP + WARP // values * values * PITCH
 
+    def color(self) -> int:
+        """Column of the first colour in a row."""
+        return 8 if self.absolute else 6
+
+    def tail(self) -> int:
+        """Number of columns behind the head."""
+        return max(0, self.color() + self.channels - HEAD)
+
     def vectors(self) -> list[int]:
-        """Numbers of the vectors that are written, of a chunk's three of four columns."""
-        return [0, 1] * self.geometry + [2] * (self.channels > 0)
+        """Numbers of the vectors of four columns that are written."""
+        colors = range(self.color(), self.color() + self.channels)
+        return sorted({column // 4 for column in (*range(self.moments()), *colors)})
+
+
+@functools.cache
+def _storing(asked: Sums, adding: bool):
+    """The function that stores a vector of a chunk of a row, or adds it to what is there."""
+    pitch = Sums(CHUNK, False, asked.absolute).tail()
+
+    @wp.func
+    @no_type_check
+    def store(rows: Rows, row: wp.int32, first: wp.int32, vector: wp.int32, sums: wp.vec4):
+        total = wp.vec4(sums)
+        if vector < wp.static(HEAD // 4):
+            at = wp.int64(row) * wp.int64(rows.heads.shape[1])
+            at += wp.int64(first) * wp.int64(HEAD // CHUNK) + wp.int64(vector) * wp.int64(4)
+            if wp.static(adding):
+                total += L.load4(rows.heads, at)
+            L.store4(rows.heads, at, total)
+        else:
+            at = wp.int64(row) * wp.int64(rows.tails.shape[1])
+            for c in range(wp.static(asked.tail())):
+                column = first / CHUNK * pitch + c
+                if wp.static(adding):
+                    total[c] += L.load(rows.tails, at, column)
+                L.store(rows.tails, at, column, total[c])
+
+    return store
 
 
 @functools.cache
@@ -121,7 +167,7 @@ def _completing(asked: Sums, parts: int):
             i = memory.get_int(arena, base + wp.static(numbers_at) + lane / wp.static(values))
             column = lane % wp.static(values)
             if column >= wp.static(moments):
-                column += wp.static(8 - moments)
+                column += wp.static(asked.color() - moments)
             memory.put(arena, base + i * RECORD + column, value)
 
     return slots, leave, complete
@@ -140,6 +186,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
     slots, leave, complete = _completing(asked, parts)
     together = sync if parts == 1 else sync_block
     vectors = asked.vectors()
+    store = _storing(asked, adding=not listed)
     every = channels == 0  # channels are read one by one, from the tensors
     absolute = absolute and geometry
     touched, stage = touching(parts), staging(parts * size)
@@ -206,11 +253,13 @@ def _walking(asked: Sums, parts: int, listed: bool):
         R = pixels_type()
         upstream = upstream_type()
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
+        # no Gaussian reached a pixel whose T is 1, unless fainter ones than float32 resolves count
+        untouched = wp.where(picture.alpha_min > 1e-6, 1.0, 0.0)
         some = wp.int32(0)  # bits of the blocks whose upstream gradient is not 0
         for j in range(wp.static(pixels)):
             if walked > 0:
                 T[j] = L.load(transmittances, p.walk_row, j * WARP)
-            if T[j] != 0.0:
+            if T[j] != 0.0 and T[j] != untouched:
                 step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 largest = wp.float32(0.0)
                 if gaussians.first == 0:
@@ -348,20 +397,18 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 row = k
                 if wp.static(listed):
                     row = L.load_int(lists.rows, k)
-                # a row has three vectors for each chunk
-                at = wp.int64(row) * wp.int64(rows_out.sums.shape[1])
-                at += wp.int64(gaussians.first) * wp.int64(3) + wp.int64(wp.static(4 * vectors[0]))
                 record = p.lane * RECORD
+                channel = L.anew(gaussians.first)  # no registers hold what follows from it
                 for n in range(wp.static(len(vectors))):
                     if p.part == wp.static(n % parts):
                         total = memory.get4(arena, record + wp.static(4 * vectors[n]))
                         for part in range(1, wp.static(parts)):
                             more = wp.static(part * size + 4 * vectors[n])
                             total += memory.get4(arena, record + more)
-                        if wp.static(not listed):
-                            total += L.load4(rows_out.sums, at)
-                        L.store4(rows_out.sums, at, total)
-                    at += wp.int64(4)
+                        store(rows_out, row, channel, wp.static(vectors[n]), total)
+                if wp.static(listed):
+                    if p.part == 0:
+                        wp.atomic_or(rows_out.written, row >> 5, 1 << (row & 31))
             if wp.static(parts > 1):
                 together()
             end -= WARP
@@ -381,6 +428,7 @@ def backward_kernels(asked: Sums, parts: int):
     warps = (24 if parts == 4 else 20) if asked.channels < 4 else 16  # as registers allow
     options = kernel_options(warps, parts)
     walk, walk_unlisted = (_walking(asked, parts, listed) for listed in (True, False))
+    store, vectors = _storing(asked, adding=False), asked.vectors()
 
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
@@ -425,6 +473,11 @@ def backward_kernels(asked: Sums, parts: int):
         tiles = picture.tiles_x * picture.tiles_y
         if lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0]):
             tiles = 0
+        elif worker % wp.static(parts) == 0:
+            for g in range(lane, picture.num, WARP):
+                row = image * picture.num + g
+                for n in range(wp.static(len(vectors))):
+                    store(rows_out, row, gaussians_in.first, wp.static(vectors[n]), wp.vec4())
         for tile in range(tiles):
             tile += image * picture.tiles_x * picture.tiles_y
             p = lane_pixels(picture, tile * wp.static(parts) + worker % wp.static(parts), lane)

@@ -17,7 +17,7 @@ from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import Packed, as_struct
 from ..constants import BLOCKS
 from ..tiles import CHUNK, Bins, Drawn, Picture, Pixels, Walk
-from .backward import Rows, Sums, backward_kernels, row_size
+from .backward import Rows, Sums, backward_kernels, row_sizes
 from .forward import forward_kernels
 from .records import Gaussians, make_records
 from .reduce import reduce_rows
@@ -103,7 +103,11 @@ def composite_backward(
     colors = splats.colors
     tiles, channels = walk.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
-    v_pairs = colors.new_zeros(bins.pairs.numel(), row_size(channels))
+    pairs = bins.pairs.numel()
+    # a chunk without gradients does not write its part of a row that another chunk has written
+    make = colors.new_empty if channels <= CHUNK else colors.new_zeros
+    sums = [make(pairs, size) for size in row_sizes(channels, absolute is not None)]
+    rows = Packed(Rows, *sums, bins.pairs.new_zeros(-(-pairs // 32)), skipped)
     # a pixel's absolute gradient is of all channels: several chunks leave it to another launch
     apart = absolute is not None and channels > CHUNK
     given = (
@@ -112,11 +116,11 @@ def composite_backward(
         walk.records,
         channels,
         [as_struct(bins), as_struct(walk), Packed(Pixels, *v_pixels)],
-        [Packed(Rows, v_pairs, skipped)],
+        [rows],
         parts,
     )
     flags = geometry and not apart, absolute is not None
     _launch(lambda count: backward_kernels(Sums(count, *flags), parts), *given)
     if apart:
         _launch(lambda _: backward_kernels(Sums(0, True, True), parts), *given, channels)
-    return reduce_rows(v_pairs, splats, bins, geometry, absolute)
+    return reduce_rows(rows, splats, bins, geometry, absolute)

@@ -33,6 +33,15 @@ def store_int(values: wp.array[wp.int32], i: wp.int32, v: wp.int32): ...
 def load4(values: wp.array2d[wp.float32], i: wp.int64) -> wp.vec4: ...
 
 
+@wp.func_native(
+    "wp::vec_t<4, float> v; for (int c = 0; c < 4; c++) v.c[c] = c < n ? values.data[i + c] : 0.f;"
+    " return v;"
+)
+def load_some(values: wp.array2d[wp.float32], i: wp.int64, n: wp.int32) -> wp.vec4:
+    """The first n of four numbers, one by one; the others are 0."""
+    ...
+
+
 @wp.func_native("*(float4*)(values.data + i) = make_float4(v[0], v[1], v[2], v[3]);")
 def store4(values: wp.array2d[wp.float32], i: wp.int64, v: wp.vec4): ...
 

@@ -10,10 +10,11 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.views import as_struct, struct_of, view
+from ...runtime.views import Packed, as_struct, struct_of, view
 from ..projection import Projected
 from ..tiles import CHUNK, Bins, Drawn
 from . import leaves as L
+from .backward import Rows
 from .records import LOG2_E_HALF
 
 wp.set_module_options({"enable_backward": False})
@@ -26,7 +27,7 @@ def _add_rows(
     order_in: wp.array[wp.int32],
     offsets_in: wp.array[wp.int32],
     count_in: wp.array[wp.int64],
-    v_pairs_in: wp.array2d[wp.float32],
+    rows_in: Rows,
     splats_in: struct_of(Projected),
     v_splats_out: struct_of(Projected),
     v_colors_out: wp.array2d[wp.float32],
@@ -37,24 +38,34 @@ def _add_rows(
     begin = offsets_in[j]
     end = offsets_in[j + 1]
     drawn = begin != end
-    if count_in[0] > wp.int64(v_pairs_in.shape[0]):
+    listed = count_in[0] <= wp.int64(rows_in.heads.shape[0])
+    if not listed:
         # rows of Gaussians, written where they have pairs
         end = j + wp.where(drawn, 1, 0)
         begin = j
-    columns = wp.int64(v_pairs_in.shape[1])
     low = wp.vec4()  # h, hu, hy, huu
     high = wp.vec4()  # huy, hyy, and the sums of absolute values
+    tail_at = wp.int32(0)
     for first in range(0, v_colors_out.shape[1], CHUNK):
+        head_at = wp.int64(2) * wp.int64(first)
         low_of = wp.vec4()
         high_of = wp.vec4()
-        color = wp.vec4()
-        at = wp.int64(begin) * columns + wp.int64(first) * wp.int64(3)
-        for _ in range(begin, end):
-            if v_splats_out.means2d:
-                low_of += L.load4(v_pairs_in, at)
-                high_of += L.load4(v_pairs_in, at + wp.int64(4))
-            color += L.load4(v_pairs_in, at + wp.int64(8))
-            at += columns
+        tail = wp.vec4()
+        tails = wp.min(v_colors_out.shape[1] - first, CHUNK)
+        if not absolute_out:
+            tails -= 2
+        for p in range(begin, end):
+            if listed and (L.load_int(rows_in.written, p >> 5) >> (p & 31) & 1) == 0:
+                continue
+            at = wp.int64(p) * wp.int64(rows_in.heads.shape[1]) + head_at
+            low_of += L.load4(rows_in.heads, at)
+            high_of += L.load4(rows_in.heads, at + wp.int64(4))
+            at = wp.int64(p) * wp.int64(rows_in.tails.shape[1]) + wp.int64(tail_at)
+            tail += L.load_some(rows_in.tails, at, tails)
+        tail_at += tails
+        color = tail
+        if not absolute_out:
+            color = wp.vec4(high_of[2], high_of[3], tail[0], tail[1])
         low += low_of
         high += high_of
         for c in range(CHUNK):
@@ -78,13 +89,13 @@ def _add_rows(
 
 
 def reduce_rows(
-    v_pairs: Tensor, splats: Drawn, bins: Bins, geometry: bool, absolute: Tensor | None
+    rows: Packed, splats: Drawn, bins: Bins, geometry: bool, absolute: Tensor | None
 ) -> Drawn:
     """Sum rows by (view, Gaussian), as the CPU's; all rows are written.
 
     Args:
-        v_pairs: ``[P, row_size(C)]``, or where the lists were too short, rows of Gaussians in the
-            order of ``bins.order``.
+        rows: ``Rows`` of pairs, or where the lists were too short, of Gaussians in the order of
+            ``bins.order``.
         splats: as forward, like the lists.
         bins: of the pairs.
         geometry: True to compute more than the gradient of the colours.
@@ -102,7 +113,7 @@ def reduce_rows(
         _add_rows,
         bins.order.numel(),
         [
-            *(bins.order, bins.offsets, bins.count.view(1), v_pairs),
+            *(bins.order, bins.offsets, bins.count.view(1), rows),
             as_struct(Projected(conics=conics, view_opacities=view_opacities)),
         ],
         [

@@ -112,6 +112,30 @@ def test_colours_alone(on_cuda, parts):
     assert_same(blocks, lanes)
 
 
+@pytest.mark.parametrize("first, parts", [(0, 1), (4, 4)])
+def test_a_chunk_without_gradients(on_cuda, first, parts):
+    """Its launch writes nothing to the rows that the other one writes."""
+    scene = crowded(5)
+    v_renders, v_alphas = upstream(5)
+    v_renders[..., first : first + 4] = 0
+    lanes, _ = run(scene, v_renders, v_alphas * (first > 0))
+    on_cuda(parts)
+    blocks, _ = run(scene, v_renders, v_alphas * (first > 0))
+    assert_same(blocks, lanes)
+
+
+def test_too_faint_to_change_a_transmittance(on_cuda):
+    """Pixels that no Gaussian reached are known by T = 1, but not among such Gaussians."""
+    scene = crowded(3)
+    scene["opacities"] = 1e-8 * (1 + torch.rand_like(scene["opacities"]))
+    v = upstream()
+    lanes, _ = run(scene, *v, alpha_min=5e-9)
+    on_cuda()
+    blocks, _ = run(scene, *v, alpha_min=5e-9)
+    assert (lanes["alphas"] == 0).all() and (lanes["colors"] != 0).float().mean() > 0.5
+    assert_same(blocks, lanes)
+
+
 def test_without_dilation(on_cuda):
     """Gaussians of determinant 0 are culled on both devices, before the division by it."""
     scene = crowded(3)
