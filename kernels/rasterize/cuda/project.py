@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.views import struct_of
+from ...runtime.views import struct, struct_of
 from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN
 from ..projection import (
     FAR,
@@ -110,27 +110,30 @@ def _finite3(v: wp.vec3) -> bool:
     return wp.isfinite(wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2]))
 
 
-@wp.kernel
+@struct
+class _Splat:
+    """A Gaussian in a view; the fields of ``Projected``."""
+
+    mean: wp.vec2
+    conic: wp.vec3
+    depth: wp.float32
+    opacity: wp.float32
+    extent: wp.vec2
+    status: wp.int32
+
+
+@wp.func
 @no_type_check
-def _project(
-    offset: wp.int32,
-    views: wp.int32,
-    num: wp.int32,
+def _splat(
+    g: wp.int32,
+    image: wp.int32,
+    color_row: wp.int32,
     lens: Lens,
     scene_in: Scene,
-    colors_per_view: wp.int32,
     colors_in: wp.array2d[wp.float32],
-    splats_out: struct_of(Projected),
-):
-    i = offset + wp.tid()
-    image = i // num
-    g = (image // views) * num + i % num
-    splats_out.means2d[i] = wp.vec2(0.0, 0.0)
-    splats_out.conics[i] = wp.vec3(1.0, 0.0, 1.0)
-    splats_out.depths[i] = 0.0
-    splats_out.view_opacities[i] = 0.0
-    splats_out.extents[i] = wp.vec2(0.0, 0.0)
-
+) -> _Splat:
+    splat = _Splat()
+    splat.conic = wp.vec3(1.0, 0.0, 1.0)
     mean = scene_in.means[g]
     scale = scene_in.scales[g]
     opacity = scene_in.opacities[g]
@@ -140,24 +143,21 @@ def _project(
     if scene_in.quats:
         q = scene_in.quats[g]
         finite = finite and wp.isfinite(wp.dot(wp.abs(q), wp.vec4(0.25, 0.25, 0.25, 0.25)))
-    row = g
-    if colors_per_view != 0:
-        row = i
     for c in range(colors_in.shape[1]):
-        finite = finite and wp.isfinite(colors_in[row, c])
+        finite = finite and wp.isfinite(colors_in[color_row, c])
     # Every cull is written so that NaN fails it, and comes before the first division by z.
     if not finite:
-        splats_out.status[i] = NOT_FINITE
-        return
+        splat.status = NOT_FINITE
+        return splat
     if not (t[2] >= lens.near_plane):
-        splats_out.status[i] = NEAR
-        return
+        splat.status = NEAR
+        return splat
     if not (t[2] <= lens.far_plane):
-        splats_out.status[i] = FAR
-        return
+        splat.status = FAR
+        return splat
     if not (opacity >= lens.alpha_min):
-        splats_out.status[i] = TRANSPARENT
-        return
+        splat.status = TRANSPARENT
+        return splat
 
     K = scene_in.Ks[image]
     M = jacobian(t, K, lens) * rotation_of(viewmat)
@@ -173,39 +173,67 @@ def _project(
     sxy = wp.dot(m0, m1)
     syy = wp.dot(m1, m1) + lens.eps2d
     if not (wp.isfinite(det) and det > 0.0 and syy > 0.0):
-        splats_out.status[i] = NOT_FINITE
-        return
+        splat.status = NOT_FINITE
+        return splat
     a = syy / det
     e = 1.0 / syy
     center = wp.vec2(K[0, 0] * t[0] / t[2] + K[0, 2], K[1, 1] * t[1] / t[2] + K[1, 2])
     sound = a > 0.0 and a <= CONIC_MAX and e <= CONIC_MAX
     if not (sound and wp.isfinite(center[0]) and wp.isfinite(center[1])):
-        splats_out.status[i] = NOT_FINITE
-        return
+        splat.status = NOT_FINITE
+        return splat
     if lens.antialiased != 0:
         opacity *= wp.max(COMPENSATION_MIN, wp.sqrt(det0 / det))
         if not (opacity >= lens.alpha_min):
-            splats_out.status[i] = TRANSPARENT
-            return
+            splat.status = TRANSPARENT
+            return splat
     cut = wp.sqrt(2.0 * wp.log(opacity / lens.alpha_min))
     extent = wp.vec2(cut * wp.sqrt(sxx), cut * wp.sqrt(syy))
     reach = extent
     if lens.rounded != 0:
         reach = wp.vec2(wp.ceil(extent[0]), wp.ceil(extent[1]))
     if reach[0] <= lens.radius_clip and reach[1] <= lens.radius_clip:
-        splats_out.status[i] = SMALL
-        return
+        splat.status = SMALL
+        return splat
     inside_x = center[0] + reach[0] >= 0.0 and center[0] - reach[0] <= lens.width
     inside_y = center[1] + reach[1] >= 0.0 and center[1] - reach[1] <= lens.height
     if not (inside_x and inside_y):
-        splats_out.status[i] = OUTSIDE
-        return
-    splats_out.status[i] = VISIBLE
-    splats_out.means2d[i] = center
-    splats_out.conics[i] = wp.vec3(a, -sxy / syy, e)
-    splats_out.depths[i] = t[2]
-    splats_out.view_opacities[i] = opacity
-    splats_out.extents[i] = extent
+        splat.status = OUTSIDE
+        return splat
+    splat.status = VISIBLE
+    splat.mean = center
+    splat.conic = wp.vec3(a, -sxy / syy, e)
+    splat.depth = t[2]
+    splat.opacity = opacity
+    splat.extent = extent
+    return splat
+
+
+@wp.kernel
+@no_type_check
+def _project(
+    offset: wp.int32,
+    views: wp.int32,
+    num: wp.int32,
+    lens: Lens,
+    scene_in: Scene,
+    colors_per_view: wp.int32,
+    colors_in: wp.array2d[wp.float32],
+    splats_out: struct_of(Projected),
+):
+    i = offset + wp.tid()
+    image = i // num
+    g = (image // views) * num + i % num
+    row = g
+    if colors_per_view != 0:
+        row = i
+    splat = _splat(g, image, row, lens, scene_in, colors_in)
+    splats_out.means2d[i] = splat.mean
+    splats_out.conics[i] = splat.conic
+    splats_out.depths[i] = splat.depth
+    splats_out.view_opacities[i] = splat.opacity
+    splats_out.extents[i] = splat.extent
+    splats_out.status[i] = splat.status
 
 
 @wp.func
