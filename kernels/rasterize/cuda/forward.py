@@ -172,8 +172,7 @@ def _walking(channels: int, parts: int, listed: bool):
                         break
             sync()
             lane_mask = memory.get_int(arena, wp.static(_MASKS) + p.lane)
-            for j in range(wp.static(pixels)):
-                evaluated += L.count_bits(ballot(lane_mask & wp.static(1 << j)))
+            evaluated += L.count_bits(lane_mask)
             mine = wp.int32(0)
             if slot >= 0 and slot < count:
                 mine = memory.get_int(arena, wp.static(_BITS) + slot)
@@ -188,7 +187,7 @@ def _walking(channels: int, parts: int, listed: bool):
                 wp.atomic_max(walked_out.walked, p.tile, end - lists.starts[p.tile])
             else:
                 wp.atomic_min(walked_out.walked, p.tile, p.image * picture.num - end)
-        if p.lane == 0 and gaussians.first == 0:
+        if evaluated != 0 and gaussians.first == 0:
             wp.atomic_add(walked_out.blocks_walked, p.tile, wp.int64(evaluated))
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
