@@ -474,6 +474,7 @@ def backward_kernels(asked: Sums, parts: int):
         if lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0]):
             tiles = 0
         elif worker % wp.static(parts) == 0:
+            # the tiles' sums are added to the rows
             for g in range(lane, picture.num, WARP):
                 row = image * picture.num + g
                 for n in range(wp.static(len(vectors))):

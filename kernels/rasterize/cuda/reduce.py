@@ -44,7 +44,7 @@ def _add_rows(
         end = j + wp.where(drawn, 1, 0)
         begin = j
     low = wp.vec4()  # h, hu, hy, huu
-    high = wp.vec4()  # huy, hyy, and the sums of absolute values
+    high = wp.vec4()  # huy, hyy, and the sums of absolute values or colours
     tail_at = wp.int32(0)
     for first in range(0, v_colors_out.shape[1], CHUNK):
         head_at = wp.int64(2) * wp.int64(first)
@@ -53,7 +53,7 @@ def _add_rows(
         tail = wp.vec4()
         tails = wp.min(v_colors_out.shape[1] - first, CHUNK)
         if not absolute_out:
-            tails -= 2
+            tails -= 2  # as the head has two colours, in place of the sums of absolute values
         for p in range(begin, end):
             if listed and (L.load_int(rows_in.written, p >> 5) >> (p & 31) & 1) == 0:
                 continue
