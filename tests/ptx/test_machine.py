@@ -177,7 +177,7 @@ def test_memory():
 
 
 def lanes(body, threads=32, **options):
-    """What each lane's %r10 holds after a body, in which %r1 is the lane; nothing may be found."""
+    """Return each lane's %r10 after a body, in which %r1 is the lane; nothing may be found."""
     memory = torch.zeros(threads, dtype=torch.int32)
     made = run(body + "st.global.u32 [%rd4], %r10;", memory, threads, **options)
     assert not made.findings, made.findings

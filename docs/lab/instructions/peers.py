@@ -17,6 +17,7 @@ from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
 from gamba_warp.kernels.bench.static.dry_run import MULTIPROCESSORS
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
+from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 
@@ -56,6 +57,12 @@ Kernels = dict[str, list[Launched]]
 def launched(kernels: Iterable[Executed]) -> list[Launched]:
     """The counts of executed kernels."""
     return [Launched(x.name, x.counts, x.blocks) for x in kernels]
+
+
+def count_launches(run: Callable[[], Sequence[Tensor]], wanted: Iterable[Tensor]) -> Kernels:
+    """The counts of our operators' launches, as of ``counting.count``."""
+    counted = count(run, wanted, MULTIPROCESSORS)
+    return {direction: launched(kernels.values()) for direction, kernels in counted.items()}
 
 
 def at_full_width(run: Callable[[int], Kernels], channels: int, batch: int) -> Kernels:
@@ -108,10 +115,9 @@ def our_scan(length: int, batch: int, dtype: torch.dtype, channels: int) -> Kern
     before, scan_cuda.FORCED = scan_cuda.FORCED, tuning_of(shape)
     try:
         run = partial(selective_scan, **inputs, delta_softplus=True)
-        counted = count(lambda: [run()], inputs.values(), MULTIPROCESSORS)
+        return count_launches(lambda: [run()], inputs.values())
     finally:
         scan_cuda.FORCED = before
-    return {direction: launched(kernels.values()) for direction, kernels in counted.items()}
 
 
 def mamba_scan(peers: Peers, length: int, dtype: torch.dtype, channels: int) -> Kernels:
@@ -188,8 +194,7 @@ def our_conv(length: int, dtype: torch.dtype, channels: int) -> Kernels:
     """One sequence, with bias and SiLU."""
     x, weight, bias = _conv_inputs(length, dtype, channels)
     run = partial(causal_conv1d, x, weight, bias, activation="silu")
-    counted = count(lambda: [run()], (x, weight, bias), MULTIPROCESSORS)
-    return {direction: launched(kernels.values()) for direction, kernels in counted.items()}
+    return count_launches(lambda: [run()], (x, weight, bias))
 
 
 def _conv_inputs(length: int, dtype: torch.dtype, channels: int) -> list[Tensor]:
@@ -292,17 +297,36 @@ def pairs(means2d: Tensor, radii: Tensor, depths: Tensor) -> tuple[Tensor, Tenso
     return begins.int().view(1, side, side), of[order].int()
 
 
+def gsplat_kernel(
+    peers: Peers,
+    file: str,
+    entry: str,
+    values: Sequence[Tensor | float | int | None],
+    sizes: tuple[tuple[int, ...], tuple[int, ...]],
+    shared: int = 0,
+) -> list[Launched]:
+    """One of gsplat's kernels, for 3 channels and float32.
+
+    Args:
+        peers: the sources.
+        file: of its source.
+        entry: the beginning of its name.
+        values: its parameters.
+        sizes: threads of a block and blocks, three of each.
+        shared: bytes of shared memory.
+    """
+    text = (peers.source("gsplat") / "gsplat" / "cuda" / "csrc" / f"{file}.cu").read_text()
+    text = re.sub(r"^__INS__\((?!3\)).*$", "", text, flags=re.M)
+    name = f"_ZN6gsplat\\d+{entry}_kernel(If|ILj3Ef)E"
+    compiled = peers.compile("gsplat", text, str(shared), name)
+    machine = Interpreter(counting=True)
+    tensors = [value for value in values if isinstance(value, Tensor)]
+    launch(machine, compiled, packed(compiled[0], values), tensors, *sizes)
+    return launched(executed(machine).values())
+
+
 def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> dict[str, Kernels]:
     """The same by gsplat."""
-    folder = peers.source("gsplat") / "gsplat" / "cuda" / "csrc"
-
-    def compiled(file: str, entry: str, shared: int = 0):
-        text = (folder / f"{file}.cu").read_text()
-        text = re.sub(r"^__INS__\((?!3\)).*$", "", text, flags=re.M)  # of 3 channels
-        return peers.compile(
-            "gsplat", text, str(shared), f"_ZN6gsplat\\d+{entry}_kernel(If|ILj3Ef)E"
-        )
-
     files = {
         ("projection", "forward"): ("ProjectionEWA3DGSFused", "projection_ewa_3dgs_fused_fwd"),
         ("projection", "gradient"): ("ProjectionEWA3DGSFused", "projection_ewa_3dgs_fused_bwd"),
@@ -310,19 +334,16 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
         ("drawing", "gradient"): ("RasterizeToPixels3DGSBwd", "rasterize_to_pixels_3dgs_bwd"),
     }
     found: dict[str, Kernels] = {"projection": {}, "drawing": {}}
-    threads, blocks = {}, {}
-    threads["projection"], blocks["projection"] = (256, 1, 1), (-(-GAUSSIANS // 256), 1, 1)
-    threads["drawing"], blocks["drawing"] = (TILE, TILE, 1), (1, SIDE // TILE, SIDE // TILE)
+    sizes = {
+        "projection": ((256, 1, 1), (-(-GAUSSIANS // 256), 1, 1)),
+        "drawing": ((TILE, TILE, 1), (1, SIDE // TILE, SIDE // TILE)),
+    }
     of_pixel = {"forward": 4 + 12 + 12, "gradient": 4 + 12 + 12 + 4 * 3}
 
     def run(stage: str, direction: str, values: Sequence) -> None:
         shared = TILE * TILE * of_pixel[direction] if stage == "drawing" else 0
-        program = compiled(*files[stage, direction], shared)
-        machine = Interpreter(counting=True)
-        tensors = [value for value in values if isinstance(value, Tensor)]
-        params = packed(program[0], values)
-        launch(machine, program, params, tensors, threads[stage], blocks[stage])
-        found[stage][direction] = launched(executed(machine).values())
+        kernel = files[stage, direction]
+        found[stage][direction] = gsplat_kernel(peers, *kernel, values, sizes[stage], shared)
 
     n, x = GAUSSIANS, {name: value.detach() for name, value in leaves.items()}
     viewmats, Ks = cameras["viewmats"], cameras["Ks"]
@@ -361,6 +382,31 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
     )
     agree("gsplat, gradient", wanted, [*back, grads[3], grads[2]], 1e-2)
     return found
+
+
+def both_harmonics(peers: Peers, degree: int = 3) -> tuple[Kernels, Kernels]:
+    """Colours of one view by ours and by gsplat, which is given directions."""
+    torch.manual_seed(0)
+    count = (degree + 1) ** 2
+    coefficients, means = torch.randn(1, GAUSSIANS, count, 3), torch.randn(1, GAUSSIANS, 3)
+    leaves = [coefficients.requires_grad_(), means.requires_grad_()]
+    center = torch.zeros(1, 1, 3)
+    counted = count_launches(lambda: [sums_seen_from(degree, *leaves, center)], leaves)
+    wanted = sums_seen_from(degree, *leaves, center)
+    v_colors = torch.randn_like(wanted)
+    of = [GAUSSIANS, count, degree, means.detach(), coefficients.detach(), None]
+    sizes = (256, 1, 1), (-(-GAUSSIANS * 3 // 256), 1, 1)
+    colors, back = torch.empty_like(wanted), [torch.zeros_like(x) for x in leaves]
+    file, theirs = "SphericalHarmonicsCUDA", {}
+    for direction, name, values in (
+        ("forward", "fwd", [colors]),
+        ("gradient", "bwd", [v_colors, *back]),
+    ):
+        entry = f"spherical_harmonics_{name}"
+        theirs[direction] = gsplat_kernel(peers, file, entry, [*of, *values], sizes)
+    agree("gsplat, harmonics", [wanted.detach()], [colors], 1e-5)
+    agree("gsplat, harmonics", torch.autograd.grad(wanted, leaves, v_colors), back, 1e-4)
+    return counted, theirs
 
 
 # --- the table
@@ -405,6 +451,7 @@ def cases(peers: Peers) -> Iterator[tuple[str, str, Kernels, Kernels]]:
         for stage in ours:
             if stage == "drawing" or not multiprocessors:
                 yield "rasterizer", f"{stage}, {text}", ours[stage], theirs[stage]
+    yield "rasterizer", "harmonics of degree 3", *both_harmonics(peers)
 
 
 def total(kernels: list[Launched]) -> dict[str, float]:

@@ -1,8 +1,8 @@
 """The harmonics on CUDA: one thread a Gaussian, which loops over its views.
 
-So the gradients by coefficients and by the mean are summed by one thread, without atomics. Sums of
-views go channel by channel: a thread holds one column of coefficients at a time, whatever
-the number of channels. README.md §6 of the rasterizer holds the maths.
+So the gradients by coefficients and by the mean are summed by one thread, without atomics. A thread
+holds the coefficients of all channels where they are few, else those of one channel at a time.
+README.md §6 of the rasterizer holds the maths.
 """
 
 import functools
@@ -16,6 +16,7 @@ from ...runtime.native import native
 from .shared import SHORTEST, Arrays, Size
 
 CHUNK = 1  # Gaussians of a task
+HELD = 48  # coefficients of a row that a thread holds at most: three channels of degree 3
 _HERE = Path(__file__).parent
 # Loops over a column of coefficients are written out, so that it stays in registers.
 _OPTIONS = {"max_unroll": 25}
@@ -37,14 +38,18 @@ _ABOVE = {True: 0.0, False: -3.4e38}
 
 
 @functools.cache
-def _leaves(degree: int) -> SimpleNamespace:
-    """The type ``column``, of all coefficients of a channel, and the functions of a degree.
+def _leaves(degree: int, channels: int) -> SimpleNamespace:
+    """The functions of a degree, and ``group``, the number of channels worked on at a time.
 
-    ``basis`` gives the Y_k of a direction, ``slopes`` the gradient of ``Σ_k s_k Y_k`` by it.
+    ``basis`` gives the Y_k of a direction, a ``column``, ``slopes`` the gradient of ``Σ_k s_k Y_k``
+    by it; ``load`` and ``store`` copy a ``part`` of a row, ``[k, channel of the group]``.
     """
     count = (degree + 1) ** 2
+    group = channels if count * channels <= HELD else 1
     column = wp.types.vector(count, wp.float32)
+    part = wp.types.vector(count * group, wp.float32)
     packed = f"typedef float F; wp::vec_t<{count}, float> Y;"
+    sizes = dict(COUNT=count, CHANNELS=group, WHOLE=group == channels)
 
     @wp.func_native(packed + native(_HERE / "basis.h", DEGREE=degree) + "return Y;")
     def basis(x: wp.float32, y: wp.float32, z: wp.float32) -> column: ...
@@ -56,6 +61,12 @@ def _leaves(degree: int) -> SimpleNamespace:
     )
     def slopes(x: wp.float32, y: wp.float32, z: wp.float32, s: column) -> wp.vec3: ...
 
+    @wp.func_native(native(_HERE / "part.inl", **sizes, LOAD=True))
+    def load(coefficients: wp.array3d[wp.float32], row: wp.int32, first: wp.int32) -> part: ...
+
+    @wp.func_native(native(_HERE / "part.inl", **sizes, LOAD=False))
+    def store(coefficients: wp.array3d[wp.float32], row: wp.int32, first: wp.int32, part: part): ...
+
     @wp.func
     @no_type_check
     def used_are_finite(coefficients: wp.array3d[wp.float32], row: wp.int32) -> bool:
@@ -65,16 +76,16 @@ def _leaves(degree: int) -> SimpleNamespace:
                     return False
         return True
 
-    return SimpleNamespace(
-        column=column, basis=basis, slopes=slopes, used_are_finite=used_are_finite
-    )
+    found = dict(column=column, part=part, basis=basis, slopes=slopes, load=load, store=store)
+    return SimpleNamespace(group=group, used_are_finite=used_are_finite, **found)
 
 
 @functools.cache
 def forward_kernel(degree: int, channels: int, clamped: bool):
-    """As the CPU's, for any number of channels."""
-    count, leaves = (degree + 1) ** 2, _leaves(degree)
-    basis, used_are_finite = leaves.basis, leaves.used_are_finite
+    """As the CPU's."""
+    count, leaves = (degree + 1) ** 2, _leaves(degree, channels)
+    group, load, basis = leaves.group, leaves.load, leaves.basis
+    used_are_finite = leaves.used_are_finite
 
     @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
     @no_type_check
@@ -89,16 +100,18 @@ def forward_kernel(degree: int, channels: int, clamped: bool):
             t = _direction(mean, arrays_out.centers[image])
             Y = basis(t[0], t[1], t[2])
             bad = not (wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2]))
-            for d in range(arrays_out.colors.shape[1]):
-                value = wp.float32(0.0)
-                for k in range(count):
-                    value += Y[k] * arrays_out.coefficients[row, k, d]
-                # a coefficient that is not finite leaves such a sum; the reverse need not hold
-                bad = bad or not wp.isfinite(value)
-                if wp.static(clamped):
-                    value += 0.5
-                    value = wp.where(value < 0.0, 0.0, value)
-                arrays_out.colors[at, d] = value
+            for step in range(wp.static(channels // group)):
+                c = load(arrays_out.coefficients, row, step * wp.static(group))
+                for d in range(wp.static(group)):
+                    value = wp.float32(0.0)
+                    for k in range(count):
+                        value += Y[k] * c[k * wp.static(group) + d]
+                    # a coefficient that is not finite leaves such a sum; the reverse need not hold
+                    bad = bad or not wp.isfinite(value)
+                    if wp.static(clamped):
+                        value += 0.5
+                        value = wp.where(value < 0.0, 0.0, value)
+                    arrays_out.colors[at, step * wp.static(group) + d] = value
             if bad:
                 finite = wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2])
                 if not (finite and used_are_finite(arrays_out.coefficients, row)):
@@ -110,9 +123,10 @@ def forward_kernel(degree: int, channels: int, clamped: bool):
 
 @functools.cache
 def backward_kernel(degree: int, channels: int, clamped: bool):
-    """As the CPU's, for any number of channels."""
-    count, leaves = (degree + 1) ** 2, _leaves(degree)
+    """As the CPU's."""
+    count, leaves = (degree + 1) ** 2, _leaves(degree, channels)
     above = _ABOVE[clamped]
+    group, part, load, store = leaves.group, leaves.part, leaves.load, leaves.store
     column, basis, slopes = leaves.column, leaves.basis, leaves.slopes
 
     @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
@@ -122,25 +136,29 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
         num, views = size.num, size.views
         mean = arrays_in.means[i]
         b = i // num
-        channels = v_arrays_out.colors.shape[1]
         if v_arrays_out.coefficients:
-            for d in range(channels):
-                v_column = column()
+            for step in range(wp.static(channels // group)):
+                first = step * wp.static(group)
+                v_part = part()
                 for view in range(views):
                     image = b * views + view
                     at = image * num + i % num
-                    # channels that pass no gradient on may hold NaN, which must not meet a zero
-                    if arrays_in.colors[at, d] > wp.static(above):
-                        t = _direction(mean, arrays_in.centers[image])
-                        v_column += v_arrays_out.colors[at, d] * basis(t[0], t[1], t[2])
+                    t = _direction(mean, arrays_in.centers[image])
+                    Y = basis(t[0], t[1], t[2])
+                    for d in range(wp.static(group)):
+                        # channels that pass no gradient on may hold NaN, which must not meet a zero
+                        if arrays_in.colors[at, first + d] > wp.static(above):
+                            v = v_arrays_out.colors[at, first + d]
+                            for k in range(count):
+                                v_part[k * wp.static(group) + d] += v * Y[k]
                     last = size.per_view != 0 or view == views - 1
                     if last:
                         row = wp.where(size.per_view != 0, at, i)
-                        for k in range(count):
-                            v_arrays_out.coefficients[row, k, d] = v_column[k]
+                        store(v_arrays_out.coefficients, row, first, v_part)
                         for k in range(count, v_arrays_out.coefficients.shape[1]):
-                            v_arrays_out.coefficients[row, k, d] = 0.0
-                        v_column = column()
+                            for d in range(wp.static(group)):
+                                v_arrays_out.coefficients[row, k, first + d] = 0.0
+                        v_part = part()
         if wp.static(degree > 0) and (v_arrays_out.means or v_arrays_out.centers):
             v_mean = wp.vec3(0.0, 0.0, 0.0)
             for view in range(views):
@@ -149,12 +167,20 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
                 row = wp.where(size.per_view != 0, at, i)
                 s = column()
                 alive = wp.bool(False)
-                for d in range(channels):
-                    if arrays_in.colors[at, d] > wp.static(above):
+                for step in range(wp.static(channels // group)):
+                    first = step * wp.static(group)
+                    some = wp.bool(False)
+                    for d in range(wp.static(group)):
+                        some = some or arrays_in.colors[at, first + d] > wp.static(above)
+                    if some:
+                        # all used coefficients are finite, for else no channel would pass
                         alive = True
-                        v = v_arrays_out.colors[at, d]
-                        for k in range(count):
-                            s[k] = s[k] + v * arrays_in.coefficients[row, k, d]
+                        c = load(arrays_in.coefficients, row, first)
+                        for d in range(wp.static(group)):
+                            if arrays_in.colors[at, first + d] > wp.static(above):
+                                v = v_arrays_out.colors[at, first + d]
+                                for k in range(count):
+                                    s[k] = s[k] + v * c[k * wp.static(group) + d]
                 if alive:
                     t = _direction(mean, arrays_in.centers[image])
                     u = wp.vec3(t[0], t[1], t[2])

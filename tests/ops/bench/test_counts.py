@@ -120,7 +120,7 @@ def test_parameters_of_a_kernel():
 
 
 def test_all_channels_from_two_runs():
-    """What channels share counts once for each sequence."""
+    """Count once for each sequence what channels share."""
 
     def run(channels):
         kernel = Launched("k", {"first": 100 + 3 * channels, "float": 2 * channels}, channels // 2)

@@ -51,9 +51,10 @@ BOUNDS = {
     ("raster", "note", "32 views"): (32, 0, 2000, 48),
     ("raster", "add_rows", "32 views"): (72, 0, 2000, 28),
     ("raster", "quantile", "depth of a transmittance"): (64, 0, 2000, 32),
-    ("raster", "harmonics", "harmonics of degree 3"): (56, 0, 2000, 32),
-    ("raster", "harmonics", "harmonics of degree 4"): (64, 0, 2000, 28),
-    ("raster", "harmonics_vjp", "harmonics of degree 3"): (72, 0, 2000, 28),
+    # a row of up to 75 coefficients is on its way at once
+    ("raster", "harmonics", "harmonics of degree 3"): (96, 0, 2000, 16),
+    ("raster", "harmonics", "harmonics of degree 4"): (96, 0, 2000, 16),
+    ("raster", "harmonics_vjp", "harmonics of degree 3"): (88, 0, 2000, 16),
     ("raster", "harmonics_vjp", "harmonics of degree 4"): (80, 0, 2000, 24),
     ("raster", "composite", "32 views"): (80, 40, 3200, 24),
     ("raster", "composite", "1 view, a tile in quarters"): (80, 0, 3200, 24),
