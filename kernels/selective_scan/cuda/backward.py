@@ -13,7 +13,7 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.native import WARP_DTYPES
-from ...runtime.scalars import anew, sigmoid, softplus, softplus_slope
+from ...runtime.scalars import sigmoid, softplus, softplus_slope
 from ...runtime.views import struct
 from ..problem import DISCRETIZATIONS, macros
 from .blocks import (
@@ -46,7 +46,6 @@ class Tile:
     t0: int
     left: int  # tokens that are there
     mark: int  # of the chunk, that before the first token
-    subs: int  # marks of the tile
     product: wp.int64  # where the block's products for dB and dC begin
 
 
@@ -77,16 +76,15 @@ def backward_kernel(
     step_of = stepping(delta_io, use_softplus)
 
     sums, products = f.lanes * g.lane_stride, g.tokens * (f.slots + 1) * f.width
-    parts = {"STEP": g.size, "DU": g.size, "U": g.size, "SLOPE": g.size, "B": g.tokens * f.padded}
-    if read:
-        parts |= {"DY": g.size, "C": g.tokens * f.padded} | ({"GATE": g.size} if use_z else {})
+    parts = {"STEP": g.size, "DU": g.size, "B": g.tokens * f.padded}
+    parts |= {"DY": g.size, "C": g.tokens * f.padded} if read else {}
     parts |= {"Y": sums} if "y" in flags else {}
     parts |= {"S": sums, "P": sums} if through else {}
     parts |= {name: products for name, flag in (("DB", "dB"), ("DC", "dC")) if flag in flags}
     offset, size = offsets(parts)
     mark_offset, mark_size = offsets({"STEP": m.size, "DU": m.size, "B": MARK_TILE * f.padded})
     size = max(size, 2 * mark_size)
-    offset = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P", "DB", "DC"), 0) | offset
+    offset = dict.fromkeys(("DY", "C", "Y", "S", "P", "DB", "DC"), 0) | offset
     arena_type, _, _ = arena_io(size)
     marked, put_mark, _, _ = group_shared(m, size)
     elements, put, get, sum_lanes = group_shared(g, size)
@@ -110,13 +108,21 @@ def backward_kernel(
     back = constants | {f"AT_{name}": start for name, start in offset.items()}
     marking = constants | {f"AT_{name}": start for name, start in mark_offset.items()}
 
+    # Where the marks begin, aligned for vectors, as one number for the reason that ORIGIN has.
+    @wp.func_native(
+        "unsigned long long r;"
+        'asm("add.s64 %0, %1, 0;" : "=l"(r) : "l"(((size_t)marks.data + 15) & ~(size_t)15));'
+        "return r;"
+    )
+    def place(marks: wp.array(dtype=float)) -> wp.uint64: ...
+
     @wp.func_native(m.text("mark.inl", **marking))
     def mark(
         arena: arena_type,
         base: int,
-        marks_out: wp.array(dtype=float),
+        marks_at: wp.uint64,
         tile: int,
-        count: int,
+        walked: int,
         p: Position,
         a: vec,
         h: vec,
@@ -125,7 +131,7 @@ def backward_kernel(
     @wp.func_native(g.text("reverse.inl", **back))
     def reverse(
         arena: arena_type,
-        marks_in: wp.array(dtype=float),
+        marks_at: wp.uint64,
         tile: Tile,
         p: Position,
         a: vec,
@@ -151,7 +157,7 @@ def backward_kernel(
         p: Position, arena: arena_type, left: int, bias: float,
         u_raw: raw, delta_raw: raw, dout_raw: raw, z_raw: raw,
     ):  # fmt: skip
-        # values of a channel: operands of the walk, and of the gradients after it
+        # values of a channel: operands of the walk; those of the gradients after it are returned
         steps = elements()
         inputs = elements()
         u = elements()
@@ -169,21 +175,19 @@ def backward_kernel(
             inputs[i] = steps[i] * u[i]
         put(arena, wp.static(offset["STEP"]), p, steps)
         put(arena, wp.static(offset["DU"]), p, inputs)
-        put(arena, wp.static(offset["U"]), p, u)
-        put(arena, wp.static(offset["SLOPE"]), p, slopes)
+        gates = elements()
         if wp.static(read):
             dys = elements()
-            gates = elements()
             for i in range(wp.static(g.count)):
                 dys[i] = wp.where(wp.static(g.token(i)) < left, widen(dout_raw[i]), 0.0)
                 if wp.static(use_z):
                     z = widen(z_raw[i])
                     s = sigmoid(z)
-                    gates[i] = dys[i] * s * (1.0 + z * (1.0 - s))
-                    dys[i] = dys[i] * z * s
+                    gates[i] = dys[i] * s
+                    dys[i] = gates[i] * z
+                    gates[i] += dys[i] * (1.0 - s)
             put(arena, wp.static(offset["DY"]), p, dys)
-            if wp.static(use_z):
-                put(arena, wp.static(offset["GATE"]), p, gates)
+        return u, slopes, gates
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds, grid_stride=False)
     @no_type_check
@@ -216,7 +220,7 @@ def backward_kernel(
         index, lane = wp.tid()
         p = position(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
-        marks = wp.zeros(shape=(wp.static(marks_size),), dtype=float)
+        marks = place(wp.zeros(shape=(wp.static(marks_size),), dtype=float))
         a = read_states(a_in, 0, p) * wp.static(scale)
         state = join(read_states(last_in, p.segment_row, p), vec())
         bias = bias_in[p.d]
@@ -239,18 +243,18 @@ def backward_kernel(
             end = wp.min(chunk + wp.static(MARK), p.end)
             h = read_states(starts_in, p.mark + (chunk - p.begin) / wp.static(MARK), p)
             # the walk that marks
-            subs = (end - chunk + wp.static(SUB - 1)) / wp.static(SUB)
             t = chunk + p.row * wp.static(m.adjacent)
             u_mark = fetch_mark(u_in, u_at, t, end - 1)
             delta_mark = fetch_mark_delta(delta_in, delta_at, t, end - 1)
             b_mark = fetch_mark_matrix(b_in, b_at, p, chunk, end - 1)
+            # only whole groups of tokens that a mark follows: none is masked
+            walked = (end - chunk - 1) / wp.static(SUB)
             for again in range((end - chunk + wp.static(MARK_TILE - 1)) / wp.static(MARK_TILE)):
                 base = (again % 2) * wp.static(mark_size)
-                left = wp.where(p.active != 0, end - t, 0)
                 steps = marked()
                 inputs = marked()
                 for i in range(wp.static(m.count)):
-                    steps[i] = step_of(delta_mark[i], bias, wp.static(m.token(i)) < left)
+                    steps[i] = step_of(delta_mark[i], bias, True)
                     inputs[i] = steps[i] * widen(u_mark[i])
                 put_mark(arena, base + wp.static(mark_offset["STEP"]), p, steps)
                 put_mark(arena, base + wp.static(mark_offset["DU"]), p, inputs)
@@ -262,7 +266,7 @@ def backward_kernel(
                 b_mark = fetch_mark_matrix(
                     b_in, b_at, p, t - p.row * wp.static(m.adjacent), end - 1
                 )
-                h = mark(arena, base, marks, again, subs, p, a, h)
+                h = mark(arena, base, marks, again, walked, p, a, h)
             sync()
             # the walk back
             tile = Tile()
@@ -285,7 +289,7 @@ def backward_kernel(
                 t0 = chunk + (tiles - 1 - again) * wp.static(TILE)
                 t = t0 + p.row * wp.static(g.adjacent)
                 left = wp.where(p.active != 0, end - t, 0)
-                prepare(p, arena, left, bias, u_raw, delta_raw, dout_raw, z_raw)
+                u, slopes, gates = prepare(p, arena, left, bias, u_raw, delta_raw, dout_raw, z_raw)
                 if wp.static(read):
                     put_matrix(arena, wp.static(offset["C"]), p, c_raw)
                 put_matrix(arena, wp.static(offset["B"]), p, b_raw)
@@ -293,9 +297,6 @@ def backward_kernel(
                 tile.t0 = t0
                 tile.left = end - t0
                 tile.mark = (t0 - chunk) / wp.static(SUB)
-                tile.subs = wp.min(
-                    (end - t0 + wp.static(SUB - 1)) / wp.static(SUB), wp.static(TILE // SUB)
-                )
                 state = reverse(arena, marks, tile, p, a, state, db_out, dc_out)
                 # their loads are on their way while the sums are completed
                 before = wp.max(t0 - wp.static(TILE), chunk)
@@ -312,13 +313,11 @@ def backward_kernel(
                 # equations 9 and 11; the terms of dD and ddelta_bias
                 dskip = wp.float32(0.0)
                 dbias = wp.float32(0.0)
-                u = get(arena, wp.static(offset["U"]), p)
                 dys = elements()
                 if wp.static(read):
                     dys = get(arena, wp.static(offset["DY"]), p)
                 if wp.static("y" in flags):
                     y = sum_lanes(arena, wp.static(offset["Y"]), p)
-                    gates = get(arena, wp.static(offset["GATE"]), p)
                     for i in range(wp.static(g.count)):
                         inside = wp.static(g.token(i)) < left
                         dz = gates[i] * (y[i] + skip * u[i])
@@ -327,11 +326,11 @@ def backward_kernel(
                     s = sum_lanes(arena, wp.static(offset["S"]), p)
                     d = sum_lanes(arena, wp.static(offset["P"]), p)
                     step = get(arena, wp.static(offset["STEP"]), p)
-                    slopes = get(arena, wp.static(offset["SLOPE"]), p)
                     for i in range(wp.static(g.count)):
                         inside = wp.static(g.token(i)) < left
                         ddelta = (d[i] * wp.static(1.0 / scale) + u[i] * s[i]) * slopes[i]
-                        dbias += wp.where(inside, ddelta, 0.0)
+                        if inside:
+                            dbias += ddelta
                         own_t = t + wp.static(g.token(i))
                         if wp.static("du" in flags):
                             du = step[i] * s[i] + skip * dys[i]
@@ -343,14 +342,13 @@ def backward_kernel(
                 sums += wp.vec2(dskip, dbias)
             sync()
             # the chunk's sums join those of its run, which begin at 0 in memory
-            e = position(sizes, packed_in, anew(index), anew(lane))
-            run = e.run + back / RUN
-            write_states(da_out, run, e, second_half(state) + read_states(da_out, run, e))
+            run = p.run + back / RUN
+            write_states(da_out, run, p, second_half(state) + read_states(da_out, run, p))
             state = join(first_half(state), vec())
-            if e.active != 0:
-                sums += wp.vec2(dskip_out[run, e.row, e.d], dbias_out[run, e.row, e.d])
-                dskip_out[run, e.row, e.d] = sums[0]
-                dbias_out[run, e.row, e.d] = sums[1]
+            if p.active != 0:
+                sums += wp.vec2(dskip_out[run, p.row, p.d], dbias_out[run, p.row, p.d])
+                dskip_out[run, p.row, p.d] = sums[0]
+                dbias_out[run, p.row, p.d] = sums[1]
             sums = wp.vec2()
         if p.segment == 0:
             write_states(first_out, p.sequence, p, first_half(state))

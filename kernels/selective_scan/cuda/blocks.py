@@ -299,8 +299,11 @@ def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
     size = tokens * f.padded
     count = -(-size // f.block)
     raw = wp.types.vector(count, wp.uint32)
-    arena_type, put, _ = arena_io(arena_size)
+    arena_type, _, _ = arena_io(arena_size)
     widen = widening(io)
+
+    @wp.func_native("(arena.data.ptr + base)[i] = v;")
+    def put(arena: arena_type, base: int, i: int, v: float): ...
 
     @wp.func_native(f.text("io.inl", LOAD_MATRIX=True, COUNT=count, TOKENS=tokens, **BITS[io]))
     def load(x_in: wp.array4d(dtype=scalar), p: Position, t0: int, left: int) -> raw: ...
@@ -313,11 +316,11 @@ def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
     @wp.func
     def put_rows(arena: arena_type, base: int, p: Position, r: raw):
         for i in range(wp.static(count)):
-            e = wp.static(i * f.block) + p.lane
+            first = base + wp.static(i * f.block)
             if wp.static(size % f.block == 0):
-                put(arena, base + e, widen(r[i]))
-            elif e < wp.static(size):
-                put(arena, base + e, widen(r[i]))
+                put(arena, first, p.lane, widen(r[i]))
+            elif p.lane < wp.static(size - i * f.block):
+                put(arena, first, p.lane, widen(r[i]))
 
     return raw, fetch, put_rows
 

@@ -1,13 +1,13 @@
-// needs: backward.py: marks_out, arena, base, p, CHANNELS, WALKS, WIDTH, STATES, HELD, a, TOKENS,
-//     SUB, tile, count, MARK, AT_STEP, AT_DU, AT_B, PADDED, h; blocks.py: SPAN
+// needs: backward.py: marks_at, arena, base, p, CHANNELS, WALKS, WIDTH, STATES, HELD, a, TOKENS,
+//     SUB, tile, walked, MARK, AT_STEP, AT_DU, AT_B, PADDED, h; blocks.py: SPAN
 // gives: the body of mark
-// Walks the recurrence over a tile and keeps the state before every SUB tokens. δ and δu are
-// ``[token / 4, channel, 4]``, as in groups.py.
+// Walks the recurrence over a tile and keeps the state before every SUB tokens; of the chunk only
+// ``walked`` times SUB tokens are walked. δ and δu are ``[token / 4, channel, 4]``, as in groups.py.
 #include "io.inl"
 #include "../discretize.h"
 // Local memory, up to 1 KB per channel: too much for registers, and left to the cache where shared
 // memory would limit the number of blocks.
-float* const marks = (float*)(((size_t)marks_out.data + 15) & ~(size_t)15);
+float* const marks = (float*)marks_at;
 float* const s = arena.data.ptr + base;
 const int channel = p.slot * CHANNELS;
 WP_PRAGMA_NO_UNROLL
@@ -16,12 +16,10 @@ for (int walk = 0; walk < WALKS; ++walk) {
     float hn[HELD], an[HELD];
     WP_PRAGMA_UNROLL
     for (int k = 0; k < HELD; ++k) hn[k] = h.c[walk * HELD + k], an[k] = a.c[walk * HELD + k];
-    WP_PRAGMA_NO_UNROLL
+    WP_PRAGMA_UNROLL
     for (int sub = 0; sub < TOKENS / SUB; ++sub) {
-        const int mark = tile * (TOKENS / SUB) + sub;
-        if (mark >= count) break;
-        store_(marks + (walk * (MARK / SUB) + mark) * HELD, hn);
-        if (mark + 1 == count) break;
+        store_(marks + (walk * (MARK / SUB) + tile * (TOKENS / SUB) + sub) * HELD, hn);
+        if (tile * (TOKENS / SUB) + sub >= walked) break;
         float r[CHANNELS][SUB], x[CHANNELS][SUB];
         WP_PRAGMA_UNROLL
         for (int i = 0; i < CHANNELS; ++i) {

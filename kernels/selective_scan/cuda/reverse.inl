@@ -1,7 +1,7 @@
-// needs: backward.py: marks_in, arena, p, CHANNELS, STATES, WALKS, WIDTH, HELD, a, both, tile,
-//     AT_B, SUB, PADDED, READ, LANE_STRIDE, STEP, AT_STEP, AT_DU, AT_DY, MARK, NEED_DC, NEED_Y,
-//     AT_DC, THROUGH, NEED_DB, AT_DB, AT_S, AT_P; blocks.py: AT_C, SPAN, AT_Y; problem.py: MODE,
-//     MAMBA, ZOH
+// needs: backward.py: marks_at, arena, p, CHANNELS, STATES, WALKS, WIDTH, HELD, a, both, tile,
+//     TOKENS, AT_B, SUB, PADDED, READ, LANE_STRIDE, STEP, AT_STEP, AT_DU, AT_DY, MARK, NEED_DC,
+//     NEED_Y, AT_DC, THROUGH, NEED_DB, AT_DB, AT_S, AT_P; blocks.py: AT_C, SPAN, AT_Y; problem.py:
+//     MODE, MAMBA, ZOH
 // gives: the body of reverse
 // Equations 6 to 12 over the tokens of a tile, SUB at a time, last first: forwards again, holding
 // their decays and states in registers, then backwards. ``both`` is dh and the sum of dA, from
@@ -10,7 +10,7 @@
 #include "io.inl"
 #include "../discretize.h"
 #include "total.h"
-float* const marks = (float*)(((size_t)marks_in.data + 15) & ~(size_t)15);
+float* const marks = (float*)marks_at;
 float* const s = arena.data.ptr;
 const int channel = p.slot * CHANNELS;
 struct Token {
@@ -27,7 +27,7 @@ for (int walk = 0; walk < WALKS; ++walk) {
         da[k] = both.c[(WALKS + walk) * HELD + k];
     }
     WP_PRAGMA_NO_UNROLL
-    for (int sub = tile.subs - 1; sub >= 0; --sub) {
+    for (int sub = TOKENS / SUB - 1; sub >= 0; --sub) {
         auto fetch = [&](int t, Token& v) {
             load_(s + AT_B + (sub * SUB + t) * PADDED + state, v.b);
             if constexpr (READ) load_(s + AT_C + (sub * SUB + t) * PADDED + state, v.c);
