@@ -329,8 +329,7 @@ def backward_kernel(
                     for i in range(wp.static(g.count)):
                         inside = wp.static(g.token(i)) < left
                         ddelta = (d[i] * wp.static(1.0 / scale) + u[i] * s[i]) * slopes[i]
-                        if inside:
-                            dbias += ddelta
+                        dbias += wp.where(inside, ddelta, 0.0)
                         own_t = t + wp.static(g.token(i))
                         if wp.static("du" in flags):
                             du = step[i] * s[i] + skip * dys[i]
