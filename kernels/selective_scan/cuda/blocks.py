@@ -124,8 +124,8 @@ class Sizes:
     group_width: int
     groups: int
     parts: int  # blocks of channels in a group
-    segments: int  # of the sequence, each a block's own
-    segment: int  # tokens of one, a multiple of MARK
+    segments: int  # of a sequence, each a block's own; of packed ones at most
+    segment: int  # tokens of one, a multiple of MARK; packed sequences have their own
     save: int
 
 
@@ -137,6 +137,7 @@ class Position:
     group: int
     part: int
     segment: int
+    last: int  # segment of the sequence
     sequence: int
     segment_row: int  # of arrays [B * segments, ...]
     mark: int  # row of the saved states, of the first token
@@ -199,14 +200,20 @@ def position_of(f: BlockShape):
         p.segment = rest % sizes.segments
         p.sequence = rest / sizes.segments
         p.segment_row = rest
-        if packed_in.shape[0] > 0:  # one segment each; rows as ``packed.slots`` has them
+        if packed_in.shape[0] > 0:  # cut as alone; rows as ``packed.slots`` has them
             p.b = packed_in[p.sequence, 0]
-            p.begin = packed_in[p.sequence, 1]
-            p.end = packed_in[p.sequence, 2]
-            t = p.b * sizes.length + p.begin
-            p.mark = t / MARK + p.sequence
-            p.run = t / wp.static(RUN * MARK) + p.sequence
+            begin = packed_in[p.sequence, 1]
+            end = packed_in[p.sequence, 2]
+            chunks = wp.max((end - begin + MARK - 1) / MARK, 1)
+            segment = (chunks + sizes.segments - 1) / sizes.segments * MARK
+            p.last = (chunks * MARK - 1) / segment
+            p.begin = wp.min(begin + p.segment * segment, end)  # after the last: no token
+            p.end = wp.min(p.begin + segment, end)
+            t = p.b * sizes.length
+            p.mark = (t + begin) / MARK + p.sequence + (p.begin - begin) / MARK
+            p.run = (t + p.begin) / wp.static(RUN * MARK) + p.segment_row
         else:
+            p.last = sizes.segments - 1
             p.b = p.sequence
             p.begin = p.segment * sizes.segment
             p.end = wp.min(p.begin + sizes.segment, sizes.length)

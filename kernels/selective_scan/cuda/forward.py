@@ -132,7 +132,7 @@ def forward_kernel(
         z_before = raw()
         tiles = (p.end - p.begin + wp.static(tokens - 1)) / wp.static(tokens)
         if wp.static(summary):  # the last segment's is not needed
-            tiles = wp.where(p.segment == sizes.segments - 1, 0, tiles)
+            tiles = wp.where(p.segment == p.last, 0, tiles)
         for tile in range(tiles):
             t0 = p.begin + tile * wp.static(tokens)
             base = (tile % 2) * wp.static(size)
@@ -177,7 +177,7 @@ def forward_kernel(
                 write_states(decay_out, p.segment_row, p, product)
             elif p.active != 0:
                 decay_out[p.segment_row, p.row, p.d] = total
-        elif p.segment == sizes.segments - 1:
+        elif p.segment == p.last:
             write_states(last_out, p.sequence, p, h)
 
     return scan_forward

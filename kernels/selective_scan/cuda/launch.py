@@ -171,28 +171,29 @@ class _Operands:
 
     ``state`` is new and dense, ``[B, D, N]`` or of packed rows ``[S, D, N]``: the first state, or
     the gradient of the last. ``shape`` is the block shape; ``back`` says that the gradient runs.
-    Packed sequences are not cut: the number of parts would follow from their lengths, which are
-    on the device.
+    Packed sequences, whose lengths are on the device, are cut as if these were equal: each into at
+    most ``segments``, a short one into fewer.
     """
 
     def __init__(self, scan: Scan, state: Tensor | None, back: bool):
         x, options = scan
         self.batch, self.length, self.channels = x.u.shape
         self.states, self.groups, self.device = x.A.shape[1], x.B.shape[2], x.u.device
-        tuning = scan_tuning(x.u.shape, self.states, self.groups, self.device)
+        self.sequences, self.packed = scan.sequences, options.packed
+        tokens = -(-self.batch * self.length // max(self.sequences, 1))
+        shape = self.sequences, tokens, self.channels
+        tuning = scan_tuning(shape, self.states, self.groups, self.device)
         per_thread, segments = (tuning.channels, tuning.states), tuning.segments
         if back:
             per_thread = (tuning.back_channels, tuning.back_states)
             segments = tuning.back_segments
-        if options.packed is not None:
-            segments = 1
         self.shape = block_shape(tuning.block, *per_thread, self.states)
         self.marks = -(-self.length // MARK)
         self.segment = -(-max(self.marks, 1) // segments) * MARK
-        self.segments = -(-self.length // self.segment)
+        self.segments = min(segments, self.marks)
         self.parts = -(-(self.channels // self.groups) // self.shape.span)
-        self.sequences, self.packed = scan.sequences, options.packed
         if self.packed is None:
+            self.segments = -(-self.length // self.segment)
             self.packed = torch.empty(0, 3, dtype=torch.int32, device=self.device)
 
         C = x.B if x.C is None else x.C
@@ -239,7 +240,7 @@ class _Operands:
 
     def carried(self, kernel: Any, inputs: list, outputs: list, reverse: bool):
         """The state before each segment, from the last state from zero and the decay of each."""
-        rows, width = self.batch * self.segments, self.channels * self.states
+        rows, width = self.sequences * self.segments, self.channels * self.states
         local = self.empty(rows, self.channels, self.states)
         decay = torch.empty_like(local)
         if self.exponential:
@@ -247,7 +248,7 @@ class _Operands:
         self.launch(kernel, inputs, [local, decay, *outputs])
         cuda_launch(
             _carry_kernel(self.exponential, reverse),
-            (self.batch, width),
+            (self.sequences, width),
             [self.segments, self.states, self.A, decay],
             [local.view(-1, width), self.state.view(-1, width)],
             device=self.device,
@@ -325,7 +326,7 @@ def backward(
     db, dc = sums("dB"), sums("dC")
     runs = o.batch * o.segments * -(-o.segment // (RUN * MARK))
     if options.packed is not None:
-        runs = count_slots(options.packed, o.batch, o.length, RUN * MARK)
+        runs = o.batch * o.length // (RUN * MARK) + o.sequences * o.segments
     dfirst = torch.empty_like(o.state)
     da = o.state.new_zeros(runs, o.channels, o.states)
     dskip, dbias = o.state.new_zeros(2, runs, o.shape.rows, o.channels)

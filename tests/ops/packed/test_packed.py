@@ -62,7 +62,7 @@ def conv(**x):
     return causal_conv1d(**x, activation="silu", return_final_state=True)
 
 
-@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.parametrize("device", ["cpu", "ptx", "ptx, in segments"])
 @pytest.mark.parametrize(
     "lengths, channels, states, groups, rule, dtype",
     [
@@ -81,26 +81,33 @@ def test_scan(lengths, channels, states, groups, rule, dtype, device, from_ptx):
     def function(**x):
         return selective_scan(**x, delta_softplus=True, return_last_state=True, discretization=rule)
 
-    # On CUDA packed sequences are not cut into segments, so those alone must not be either.
-    with patch.object(cuda, "FORCED", cuda.Tuning()):
-        if device == "ptx":
+    # On CUDA a sequence alone has the same bits if it is cut in as many segments.
+    tuning = cuda.Tuning() if device == "ptx" else cuda.Tuning(segments=3, back_segments=2)
+    with patch.object(cuda, "FORCED", tuning):
+        if device != "cpu":
             from_ptx()
         assert_as_alone(function, inputs, lengths, 1e-5)
 
 
-def test_scan_on_cuda_keeps_packed_sequences_whole(from_ptx):
-    """Packed rows equal uncut rows, bit for bit, where each alone is cut into four segments."""
-    lengths = [230, 0, 3]
-    inputs, cuts = scan_inputs(lengths, 5, 3), borders(lengths)
+def test_scan_on_cuda_of_long_sequences(from_ptx):
+    """More segments than runs of sums, and a sequence of more tokens than a run of its sums."""
+    lengths = [1300, 0, 70, 1]
     from_ptx()
-    results = []
-    for tuning in (cuda.Tuning(), cuda.Tuning(segments=4, back_segments=4)):
+    for tuning in (cuda.Tuning(5, back_segments=30), cuda.Tuning(2, back_segments=1)):
         with patch.object(cuda, "FORCED", tuning):
-            x = leaves(inputs)
-            outs = scan(**x, cu_seqlens=cuts)
-            grads = gradients(x, outs, [torch.ones_like(out) for out in outs])
-            results.append([*outs, *grads.values()])
-    assert all(map(torch.equal, *results))
+            assert_as_alone(scan, scan_inputs(lengths, 5, 3), lengths, 1e-5)
+
+
+def test_scan_on_cuda_cuts_few_sequences(from_ptx):
+    """As many segments as so many sequences of the mean length have; one alone is as unpacked."""
+    from_ptx()
+    chosen = []
+    with patch.object(cuda, "choose", lambda *shape: chosen.append(shape) or cuda.Tuning(2)):
+        scan(**scan_inputs([100, 0, 131], 5, 3), cu_seqlens=borders([100, 0, 131]))
+    assert {shape[:5] for shape in chosen} == {(3, 77, 5, 3, 1)}
+    for lengths, segments in (([2048], 24), ([410] * 5, 3), ([265] * 64, 1)):
+        got = cuda.choose(len(lengths), -(-sum(lengths) // len(lengths)), 1024, 16, 1, 132)
+        assert got.segments == segments
 
 
 def test_borders_that_nobody_looks_at_are_bounded(from_ptx):
