@@ -29,7 +29,6 @@ from .blocks import (
     offsets,
     position_of,
     states_io,
-    stepping,
     sync,
     widening,
 )
@@ -67,13 +66,13 @@ def backward_kernel(
     position = position_of(f)
     vec, read_states, write_states = states_io(f)
     pair, join, first_half, second_half = halves(f)
-    m, g = Groups(f, MARK_TILE), Groups(f, TILE)
+    g = Groups(f, TILE)
+    m = Groups(f, MARK_TILE, g.adjacent)
     _, origin, fetch_mark, _ = group_io(m, io)
     _, origin_delta, fetch_mark_delta, _ = group_io(m, delta_io)
     raw, _, fetch, store = group_io(g, io)
-    _, _, fetch_delta, store_delta = group_io(g, delta_io)
+    _, _, _, store_delta = group_io(g, delta_io)
     widen, widen_delta = widening(io), widening(delta_io)
-    step_of = stepping(delta_io, use_softplus)
 
     sums, products = f.lanes * g.lane_stride, g.tokens * (f.slots + 1) * f.width
     parts = {"STEP": g.size, "DU": g.size, "B": g.tokens * f.padded}
@@ -93,7 +92,10 @@ def backward_kernel(
     origin_matrix, fetch_matrix = row_io(f, matrix, TILE)
     _, fetch_mark_matrix = row_io(f, matrix, MARK_TILE)
     scale = DISCRETIZATIONS[mode].scale
-    marks_size = MARK // SUB * f.walks * f.held + 4
+    # beside its marks a thread keeps δ and the slope of softplus for its own tokens of the chunk
+    at_steps = MARK // SUB * f.walks * f.held
+    at_slopes = at_steps + MARK // f.rows
+    own_size = at_slopes + MARK // f.rows + 4
     # without outputs 168 registers do, which a compiler left alone exceeds or undercuts with spills
     resident = 1 if read or f.walks > 1 else max(1, 3 * 128 // f.block)
     bounds = (f.block, resident) if resident > 1 else f.block
@@ -108,13 +110,19 @@ def backward_kernel(
     back = constants | {f"AT_{name}": start for name, start in offset.items()}
     marking = constants | {f"AT_{name}": start for name, start in mark_offset.items()}
 
-    # Where the marks begin, aligned for vectors, as one number for the reason that ORIGIN has.
+    # Where a thread's own memory begins, aligned for vectors; one number for the reason of ORIGIN.
     @wp.func_native(
         "unsigned long long r;"
-        'asm("add.s64 %0, %1, 0;" : "=l"(r) : "l"(((size_t)marks.data + 15) & ~(size_t)15));'
+        'asm("add.s64 %0, %1, 0;" : "=l"(r) : "l"(((size_t)own.data + 15) & ~(size_t)15));'
         "return r;"
     )
-    def place(marks: wp.array(dtype=float)) -> wp.uint64: ...
+    def place(own: wp.array(dtype=float)) -> wp.uint64: ...
+
+    @wp.func_native(m.text("io.inl", KEEP=True))
+    def keep(own: wp.uint64, at: int, x: marked): ...
+
+    @wp.func_native(g.text("io.inl", KEPT=True))
+    def kept(own: wp.uint64, at: int) -> elements: ...
 
     @wp.func_native(m.text("mark.inl", **marking))
     def mark(
@@ -154,23 +162,14 @@ def backward_kernel(
     @wp.func
     @no_type_check
     def prepare(
-        p: Position, arena: arena_type, left: int, bias: float,
-        u_raw: raw, delta_raw: raw, dout_raw: raw, z_raw: raw,
+        p: Position, arena: arena_type, left: int,
+        u_raw: raw, steps: elements, dout_raw: raw, z_raw: raw,
     ):  # fmt: skip
         # values of a channel: operands of the walk; those of the gradients after it are returned
-        steps = elements()
         inputs = elements()
         u = elements()
-        slopes = elements()
         for i in range(wp.static(g.count)):
-            x = widen_delta(delta_raw[i]) + bias
-            slopes[i] = 1.0
-            step = x
-            if wp.static(use_softplus):
-                step = softplus(x)
-                slopes[i] = softplus_slope(x)
-            inside = wp.static(g.token(i)) < left
-            steps[i] = wp.where(inside, step, 0.0)
+            steps[i] = wp.where(wp.static(g.token(i)) < left, steps[i], 0.0)
             u[i] = widen(u_raw[i])
             inputs[i] = steps[i] * u[i]
         put(arena, wp.static(offset["STEP"]), p, steps)
@@ -187,7 +186,7 @@ def backward_kernel(
                     dys[i] = gates[i] * z
                     gates[i] += dys[i] * (1.0 - s)
             put(arena, wp.static(offset["DY"]), p, dys)
-        return u, slopes, gates
+        return u, gates
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds, grid_stride=False)
     @no_type_check
@@ -220,7 +219,7 @@ def backward_kernel(
         index, lane = wp.tid()
         p = position(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
-        marks = place(wp.zeros(shape=(wp.static(marks_size),), dtype=float))
+        own = place(wp.zeros(shape=(wp.static(own_size),), dtype=float))
         a = read_states(a_in, 0, p) * wp.static(scale)
         state = join(read_states(last_in, p.segment_row, p), vec())
         bias = bias_in[p.d]
@@ -251,13 +250,22 @@ def backward_kernel(
             walked = (end - chunk - 1) / wp.static(SUB)
             for again in range((end - chunk + wp.static(MARK_TILE - 1)) / wp.static(MARK_TILE)):
                 base = (again % 2) * wp.static(mark_size)
-                steps = marked()
+                own_steps = marked()
                 inputs = marked()
+                own_slopes = marked()
                 for i in range(wp.static(m.count)):
-                    steps[i] = step_of(delta_mark[i], bias, True)
-                    inputs[i] = steps[i] * widen(u_mark[i])
-                put_mark(arena, base + wp.static(mark_offset["STEP"]), p, steps)
+                    x = widen_delta(delta_mark[i]) + bias
+                    own_steps[i] = x
+                    if wp.static(use_softplus):
+                        own_steps[i] = softplus(x)
+                        own_slopes[i] = softplus_slope(x)
+                    inputs[i] = own_steps[i] * widen(u_mark[i])
+                put_mark(arena, base + wp.static(mark_offset["STEP"]), p, own_steps)
                 put_mark(arena, base + wp.static(mark_offset["DU"]), p, inputs)
+                first = again * wp.static(m.count)
+                keep(own, wp.static(at_steps) + first, own_steps)
+                if wp.static(use_softplus):
+                    keep(own, wp.static(at_slopes) + first, own_slopes)
                 put_mark_matrix(arena, base + wp.static(mark_offset["B"]), p, b_mark)
                 sync()
                 t += wp.static(MARK_TILE)
@@ -266,7 +274,7 @@ def backward_kernel(
                 b_mark = fetch_mark_matrix(
                     b_in, b_at, p, t - p.row * wp.static(m.adjacent), end - 1
                 )
-                h = mark(arena, base, marks, again, walked, p, a, h)
+                h = mark(arena, base, own, again, walked, p, a, h)
             sync()
             # the walk back
             tile = Tile()
@@ -275,7 +283,8 @@ def backward_kernel(
             t0 = chunk + (tiles - 1) * wp.static(TILE)
             t = t0 + p.row * wp.static(g.adjacent)
             u_raw = fetch(u_in, u_at, t, end - 1)
-            delta_raw = fetch_delta(delta_in, delta_at, t, end - 1)
+            first = (tiles - 1) * wp.static(g.count)
+            steps = kept(own, wp.static(at_steps) + first)
             z_raw = raw()
             dout_raw = raw()
             b_raw = fetch_matrix(b_in, b_at, p, t0, end - 1)
@@ -289,7 +298,7 @@ def backward_kernel(
                 t0 = chunk + (tiles - 1 - again) * wp.static(TILE)
                 t = t0 + p.row * wp.static(g.adjacent)
                 left = wp.where(p.active != 0, end - t, 0)
-                u, slopes, gates = prepare(p, arena, left, bias, u_raw, delta_raw, dout_raw, z_raw)
+                u, gates = prepare(p, arena, left, u_raw, steps, dout_raw, z_raw)
                 if wp.static(read):
                     put_matrix(arena, wp.static(offset["C"]), p, c_raw)
                 put_matrix(arena, wp.static(offset["B"]), p, b_raw)
@@ -297,12 +306,14 @@ def backward_kernel(
                 tile.t0 = t0
                 tile.left = end - t0
                 tile.mark = (t0 - chunk) / wp.static(SUB)
-                state = reverse(arena, marks, tile, p, a, state, db_out, dc_out)
+                state = reverse(arena, own, tile, p, a, state, db_out, dc_out)
                 # their loads are on their way while the sums are completed
                 before = wp.max(t0 - wp.static(TILE), chunk)
                 ahead = before + p.row * wp.static(g.adjacent)
                 u_raw = fetch(u_in, u_at, ahead, end - 1)
-                delta_raw = fetch_delta(delta_in, delta_at, ahead, end - 1)
+                slopes = kept(own, wp.static(at_slopes) + first)
+                first = wp.max(first - wp.static(g.count), 0)
+                steps = kept(own, wp.static(at_steps) + first)
                 b_raw = fetch_matrix(b_in, b_at, p, before, end - 1)
                 if wp.static(read):
                     dout_raw = fetch(dout_in, dout_at, ahead, end - 1)
@@ -328,7 +339,9 @@ def backward_kernel(
                     step = get(arena, wp.static(offset["STEP"]), p)
                     for i in range(wp.static(g.count)):
                         inside = wp.static(g.token(i)) < left
-                        ddelta = (d[i] * wp.static(1.0 / scale) + u[i] * s[i]) * slopes[i]
+                        ddelta = d[i] * wp.static(1.0 / scale) + u[i] * s[i]
+                        if wp.static(use_softplus):
+                            ddelta = ddelta * slopes[i]
                         dbias += wp.where(inside, ddelta, 0.0)
                         own_t = t + wp.static(g.token(i))
                         if wp.static("du" in flags):

@@ -23,6 +23,7 @@ class Groups:
 
     shape: BlockShape
     tokens: int  # of a tile, a multiple of FOUR and of the rows
+    most: int = FOUR  # adjacent elements of a thread
 
     @property
     def count(self) -> int:
@@ -32,7 +33,7 @@ class Groups:
     @property
     def adjacent(self) -> int:
         """Of these so many tokens are adjacent."""
-        return min(FOUR, self.count)
+        return min(self.most, self.count)
 
     def text(self, file: str, **macros: object) -> str:
         """C++ of a file beside this one for these groups."""

@@ -134,6 +134,21 @@ at += wide_(t, x_out.strides[1]);
 const ELEMENT rounded = (ELEMENT)v;
 if (inside) *(ELEMENT*)at = rounded;
 
+#elif KEEP  // (own, at, x)
+// A thread's elements of a tile in its own memory.
+float v[COUNT];
+WP_PRAGMA_UNROLL
+for (int k = 0; k < COUNT; ++k) v[k] = x.c[k];
+store_((float*)own + at, v);
+
+#elif KEPT  // (own, at)
+float v[COUNT];
+load_((const float*)own + at, v);
+wp::vec_t<COUNT, float> x;
+WP_PRAGMA_UNROLL
+for (int k = 0; k < COUNT; ++k) x.c[k] = v[k];
+return x;
+
 #elif PUT || GET || SUM_LANES  // (arena, base, p, x)
 // A thread's elements of a tile in shared memory, ADJACENT tokens at a time; ``jump`` floats lie
 // between four tokens.
