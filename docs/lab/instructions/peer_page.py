@@ -32,7 +32,8 @@ works in every cycle, in milliseconds. Products are contracted with sums, and mo
 theirs as in ours. ptxas makes .89 to 1.14 times as many instructions of theirs (1.5 times in the
 gradient of the projection, counted once by the loops of its disassembly). gsplat orders its pairs
 by a library's sort, which is not counted, and neither are our kernels for lists. Ours add the rows
-of gradients in a fixed order, theirs with atomics.
+of gradients in a fixed order, theirs with atomics. What torch does before and after a kernel is
+counted in neither: zeros, sums of parts, the directions of gsplat's harmonics.
 
 """
 _CALIBRATION = """

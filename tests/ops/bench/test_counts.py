@@ -47,8 +47,8 @@ def test_known_counts(kernels):
     )
     # a state's decay; softplus and gate are of 16 states
     assert forward["special"] == 1 + 4 / 16
-    # marks but before the last of 16 groups of tokens, and the walk; likewise
-    assert back["special"] == 1 + 15 / 16 + 8 / 16
+    # marks but before the last of 16 groups of tokens, and the walk; softplus, its slope, the gate
+    assert back["special"] == 1 + 15 / 16 + 6 / 16
     # u, delta, z, out and 1/64 of the states, in sectors: a warp has 32 channels of 2 bytes
     tensors = 4 * 2 / 32 + 16 * 4 / 64 / 32
     assert tensors / 16 * 32 < forward["first"] < 1.25 * tensors / 16 * 32
@@ -82,12 +82,12 @@ def test_what_is_not_executed_is_not_counted():
 
 
 def test_ratios_to_others(document):
-    """All but two rows are ahead; a tenth above the ratios when this was written."""
-    behind = {("projection, whole tiles", "forward"): 1.2, ("1 x 2,048, bfloat16", "forward"): 1.0}
-    most = {"scan": 0.77, "convolution": 0.96, "rasterizer": 0.56}
+    """No kernel executes more instructions; a tenth above the ratios when this was written."""
+    close = {("projection, whole tiles", "forward"): 1.0, ("1 x 2,048, bfloat16", "forward"): 1.0}
+    most = {"scan": 0.77, "convolution": 0.96, "rasterizer": 0.58}
     for row in document["peers"]["rows"]:
         ratio = row["ours"]["instructions"] / row["theirs"]["instructions"]
-        assert 0 < ratio <= behind.get((row["case"], row["direction"]), most[row["op"]]), row
+        assert 0 < ratio <= close.get((row["case"], row["direction"]), most[row["op"]]), row
 
 
 HEADER = """struct Base {
