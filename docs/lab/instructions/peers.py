@@ -106,7 +106,7 @@ def agree(what: str, ours: Sequence[Tensor], theirs: Sequence[Tensor], limit: fl
 
 
 def our_scan(length: int, batch: int, dtype: torch.dtype, channels: int) -> Kernels:
-    """One sequence, by the kernels that are chosen for ``batch`` of all channels."""
+    """Counts of one sequence, by the kernels that are chosen for ``batch`` of all channels."""
     shape = Shape(batch, length, CHANNELS, STATES, dtype.itemsize)
     inputs = make_inputs(1, length, channels, STATES)
     for name in ("u", "delta", "z", "B", "C"):
@@ -121,7 +121,7 @@ def our_scan(length: int, batch: int, dtype: torch.dtype, channels: int) -> Kern
 
 
 def mamba_scan(peers: Peers, length: int, dtype: torch.dtype, channels: int) -> Kernels:
-    """One sequence by mamba-ssm: the traits that its host code chooses for over 1,024 tokens."""
+    """Counts of one by mamba-ssm, with the traits that its host code chooses for over 1,024 tokens."""
     folder = peers.source("mamba-ssm") / "csrc" / "selective_scan"
     header = (folder / "selective_scan.h").read_text()
     even = str(length % 2048 == 0).lower()
@@ -191,7 +191,7 @@ template __global__ void selective_scan_{0}_kernel<T>({5});
 
 
 def our_conv(length: int, dtype: torch.dtype, channels: int) -> Kernels:
-    """One sequence, with bias and SiLU."""
+    """Counts of one sequence, with bias and SiLU."""
     x, weight, bias = _conv_inputs(length, dtype, channels)
     run = partial(causal_conv1d, x, weight, bias, activation="silu")
     return count_launches(lambda: [run()], (x, weight, bias))
@@ -204,7 +204,7 @@ def _conv_inputs(length: int, dtype: torch.dtype, channels: int) -> list[Tensor]
 
 
 def their_conv(peers: Peers, length: int, dtype: torch.dtype, last: bool, channels: int) -> Kernels:
-    """One sequence by causal-conv1d, channels last or tokens last."""
+    """Counts of one by causal-conv1d, channels last or tokens last."""
     folder = peers.source("causal-conv1d") / "csrc"
     header = (folder / "causal_conv1d.h").read_text()
     vector, elements = 16 // dtype.itemsize, 128 // dtype.itemsize
@@ -271,7 +271,7 @@ STAGES = {
 def our_picture(
     leaves: dict[str, Tensor], cameras: dict, multiprocessors: int
 ) -> dict[str, Kernels]:
-    """One view, stage by stage; on few multiprocessors by whole tiles."""
+    """Counts of one view, stage by stage; on few multiprocessors by whole tiles."""
     run = partial(rasterization, **leaves, **cameras)
     counted = count(lambda: run()[:2], leaves.values(), multiprocessors)
     found: dict[str, Kernels] = {"projection": {}, "drawing": {}}
@@ -305,7 +305,7 @@ def gsplat_kernel(
     sizes: tuple[tuple[int, ...], tuple[int, ...]],
     shared: int = 0,
 ) -> list[Launched]:
-    """One of gsplat's kernels, for 3 channels and float32.
+    """Counts of a kernel of gsplat, for 3 channels and float32.
 
     Args:
         peers: the sources.
@@ -326,7 +326,7 @@ def gsplat_kernel(
 
 
 def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> dict[str, Kernels]:
-    """The same by gsplat."""
+    """Counts of the same view by gsplat."""
     files = {
         ("projection", "forward"): ("ProjectionEWA3DGSFused", "projection_ewa_3dgs_fused_fwd"),
         ("projection", "gradient"): ("ProjectionEWA3DGSFused", "projection_ewa_3dgs_fused_bwd"),
@@ -385,7 +385,7 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
 
 
 def both_harmonics(peers: Peers, degree: int = 3) -> tuple[Kernels, Kernels]:
-    """Colours of one view by ours and by gsplat, which is given directions."""
+    """Counts of one view's colours by ours and by gsplat, which is given directions."""
     torch.manual_seed(0)
     count = (degree + 1) ** 2
     coefficients, means = torch.randn(1, GAUSSIANS, count, 3), torch.randn(1, GAUSSIANS, 3)
