@@ -121,7 +121,7 @@ def our_scan(length: int, batch: int, dtype: torch.dtype, channels: int) -> Kern
 
 
 def mamba_scan(peers: Peers, length: int, dtype: torch.dtype, channels: int) -> Kernels:
-    """Counts of one by mamba-ssm, with the traits that its host code chooses for over 1,024 tokens."""
+    """Counts of one by mamba-ssm, with the traits that its host code has for over 1,024 tokens."""
     folder = peers.source("mamba-ssm") / "csrc" / "selective_scan"
     header = (folder / "selective_scan.h").read_text()
     even = str(length % 2048 == 0).lower()

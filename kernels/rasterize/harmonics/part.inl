@@ -7,30 +7,26 @@ float* const at = coefficients.data + (size_t)row * coefficients.shape[1] * stri
 struct alignas(16) Four {
     float v[4];
 };
+auto copy = [](float& there, float& here) {
+    if constexpr (LOAD) here = there;
+    else there = here;
+};
 #if LOAD
 wp::vec_t<COUNT * CHANNELS, float> part;
-#define COPY_(to_memory, in_part) in_part = to_memory
-#else
-#define COPY_(to_memory, in_part) to_memory = in_part
 #endif
 if (WHOLE && size % 4 == 0 && ((size_t)at & 15) == 0) {
     WP_PRAGMA_UNROLL
     for (int i = 0; i < size / 4; ++i) {
-        Four four;
-#if LOAD
-        four = ((const Four*)at)[i];
-#endif
+        Four four = {};
+        if constexpr (LOAD) four = ((Four*)at)[i];
         WP_PRAGMA_UNROLL
-        for (int j = 0; j < 4; ++j) COPY_(four.v[j], part.c[4 * i + j]);
-#if !LOAD
-        ((Four*)at)[i] = four;
-#endif
+        for (int j = 0; j < 4; ++j) copy(four.v[j], part.c[4 * i + j]);
+        if constexpr (!LOAD) ((Four*)at)[i] = four;
     }
 } else {
     WP_PRAGMA_UNROLL
-    for (int i = 0; i < size; ++i) COPY_(at[i / CHANNELS * stride + i % CHANNELS], part.c[i]);
+    for (int i = 0; i < size; ++i) copy(at[i / CHANNELS * stride + i % CHANNELS], part.c[i]);
 }
-#undef COPY_
 #if LOAD
 return part;
 #endif
