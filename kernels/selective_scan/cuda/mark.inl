@@ -2,7 +2,8 @@
 //     SUB, tile, walked, MARK, AT_STEP, AT_DU, AT_B, PADDED, h; blocks.py: SPAN
 // gives: the body of mark
 // Walks the recurrence over a tile and keeps the state before every SUB tokens; of the chunk only
-// ``walked`` times SUB tokens are walked. δ and δu are ``[token / 4, channel, 4]``, as in groups.py.
+// ``walked`` times SUB tokens are walked. δ and δu are ``[token / 4, channel, 4]``, as in
+// groups.py.
 #include "io.inl"
 #include "../discretize.h"
 // Local memory, up to 1 KB per channel: too much for registers, and left to the cache where shared
