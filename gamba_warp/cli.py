@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import io
 import os
@@ -299,6 +300,7 @@ def main(arguments: list[str] | None = None) -> None:
             code = 2
         else:
             raise
+    gc.freeze()  # else the collections at exit visit all objects of torch for most of a second
     sys.exit(code)
 
 
