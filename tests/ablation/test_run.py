@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from ablation import fake
 from ablation.fake import write_plan
+from helpers.forked import python
 
 from gamba_warp import cli, processes
 from gamba_warp.files import PART
@@ -216,7 +217,7 @@ def waiting(gamba, tmp_path):
     """Start an ablation as a process whose run waits for a signal."""
     path = write_plan(tmp_path, "a", {"name": "b", "options": {"clip": 6}}, "c")
     (tmp_path / "calls").write_text("")
-    command = [sys.executable, "-c", DRIVER, *FAKE, str(path), str(tmp_path / "data")]
+    command = [python(), "-c", DRIVER, *FAKE, str(path), str(tmp_path / "data")]
     command += ["--out", str(tmp_path / "out"), "--device", "cpu"]
     said = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     process = subprocess.Popen(command, **said)

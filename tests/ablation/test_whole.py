@@ -4,8 +4,9 @@ import json
 
 import pytest
 from helpers import micro
+from helpers.forked import python
 
-from gamba_warp import cli
+from gamba_warp import cli, processes
 from gamba_warp.ablation.figures import empty_psnr
 from gamba_warp.ablation.run import failure_reason
 from gamba_warp.data.dataset import open_dataset
@@ -38,7 +39,8 @@ PLAN = {
 
 
 @pytest.mark.slow
-def test_the_commands_do_what_the_table_says(tmp_path):
+def test_the_commands_do_what_the_table_says(tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "GAMBA", (python(), "-m", "gamba_warp"))
     data = micro.write_dataset(tmp_path / "data")
     (tmp_path / "plan.json").write_text(json.dumps(PLAN))
     words = [tmp_path / "plan.json", data, "--out", tmp_path / "out", "--device", "cpu"]

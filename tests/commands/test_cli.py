@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import pytest
 import tyro
+from helpers.forked import python
 
 from gamba_warp import __version__, cli
 from gamba_warp.batch import STAGES
@@ -342,8 +343,8 @@ def test_help_of_a_command(command, capsys):
     assert "gamba try" in out and "Counts." in out and "How far." in out
 
 
-def run(*arguments, **options):
-    command = [sys.executable, "-m", "gamba_warp", *arguments]
+def run(*arguments, program=sys.executable, **options):
+    command = [program, "-m", "gamba_warp", *arguments]
     return subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=120, **options)
 
 
@@ -414,7 +415,7 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 @pytest.mark.parametrize("words", [["gamba_warp", "train"], ["gamba_warp.train"]], ids=" ".join)
 def test_ctrl_c_ends_training_in_one_line(tmp_path, words):
-    command = [sys.executable, "-c", CTRL_C, *words, str(tmp_path), "--out", str(tmp_path / "run")]
+    command = [python(), "-c", CTRL_C, *words, str(tmp_path), "--out", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 130 and done.stderr == "gamba: interrupted\n"
 
@@ -528,7 +529,7 @@ def test_a_full_disk_under_the_output_is_one_line(tmp_path):
 
 def test_names_that_are_not_utf_8_can_be_printed(tmp_path):
     name = os.fsdecode(bytes(tmp_path) + b"/caf\xe9.ply")
-    result = run("export", name, stdout=subprocess.PIPE, cwd=tmp_path)
+    result = run("export", name, program=python(), stdout=subprocess.PIPE, cwd=tmp_path)
     assert result.returncode == 2 and "Traceback" not in result.stderr
     assert result.stderr.endswith("caf\\udce9.ply: no such file\n")
 

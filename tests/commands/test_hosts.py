@@ -8,6 +8,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers.forked import python
 from PIL import Image
 
 from gamba_warp.formats.ply import load_ply
@@ -132,7 +133,7 @@ def test_the_add_on_registers_and_leaves(blender):
 
 def program(tmp_path, text):
     path = tmp_path / "gamba"
-    path.write_text(f"#!{sys.executable}\n{text}")
+    path.write_text(f"#!{python()}\n{text}")
     path.chmod(0o755)
     return path
 

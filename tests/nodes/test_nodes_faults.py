@@ -3,11 +3,11 @@
 import json
 import re
 import shutil
-import sys
 
 import pytest
 import torch
 from helpers import micro
+from helpers.forked import python
 from helpers.micro import lines
 from helpers.nodes.processes import run_all, train_all, words
 from safetensors.torch import load_file
@@ -61,7 +61,7 @@ def ends(data, tmp_path_factory):
     step("newer", "far", 7, outs=(root / "far", root / "later"))
     step("spoilt", "spoilt", 6, data=(data, spoilt), more=FIVE)
     (root / "plan.json").write_text(json.dumps(plan))
-    command = [sys.executable, "-m", "helpers.nodes.worker", root / "plan.json", root / "end"]
+    command = [python(), "-m", "helpers.nodes.worker", root / "plan.json", root / "end"]
     done = run_all([[*map(str, command)]] * 2)
     assert [end.code for end in done] == [0, 0], done
     found = [json.loads((root / f"end{rank}").read_text()) for rank in (0, 1)]

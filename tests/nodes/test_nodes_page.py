@@ -4,10 +4,10 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from helpers.forked import python
 from helpers.nodes.processes import environment
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,7 +65,7 @@ def test_the_slurm_scripts_are_clean(script):
 @pytest.mark.slow
 def test_the_count_of_operations_runs():
     program = ROOT / "docs" / "examples" / "step_cost.py"
-    command = [sys.executable, str(program), "tiny"]
+    command = [python(), str(program), "tiny"]
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     kept, block, lean = re.findall(r"^  (?:all|of it|--rec).*$", done.stdout, re.MULTILINE)

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.forked import python
 from helpers.gaussians import some
 from helpers.images import cut_out, disc_on_noise
 
@@ -45,12 +46,13 @@ real = versions.find_spec
 versions.find_spec = lambda name: None if name in versions.EXTRA_OF else real(name)
 importlib.util.find_spec = versions.find_spec
 sys.meta_path.insert(0, Refuse())
+assert not {*versions.EXTRA_OF} & {*sys.modules}
 cli.main(sys.argv[1:])
 """
 
 
 def in_the_core(*arguments):
-    command = [sys.executable, "-c", WITHOUT, *map(str, arguments)]
+    command = [python(), "-c", WITHOUT, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
@@ -118,7 +120,7 @@ def test_no_module_imports_an_extra_when_it_is_loaded():
 
 def test_training_loads_without_what_makes_objects(monkeypatch):
     code = WITHOUT.rpartition("cli.main")[0] + "import gamba_warp.train.batches"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = subprocess.run([python(), "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     from gamba_warp.train.data.pool import Pool, PoolOptions
 

@@ -6,7 +6,6 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import time
 import zipfile
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import micro
+from helpers.forked import python
 from helpers.refusals import refused
 
 from gamba_warp.errors import UserError
@@ -104,7 +104,7 @@ def test_killed_while_saving_leaves_the_old_one(tmp_path, model):
     )
     path = os.pathsep.join([str(Path(micro.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     process = subprocess.Popen(
-        [sys.executable, "-c", script, str(tmp_path)], env={**os.environ, "PYTHONPATH": path}
+        [python(), "-c", script, str(tmp_path)], env={**os.environ, "PYTHONPATH": path}
     )
     try:
         for _ in range(600):

@@ -3,7 +3,6 @@
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 from helpers import micro
+from helpers.forked import python
 from helpers.micro import lines, run, same_weights
 from helpers.nodes.processes import environment, free_port, run_all, words
 from helpers.refusals import refused
@@ -144,7 +144,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(packed, tmp_path):
     options = ["--steps", 9, "--save-every", 1, "--sampler", "shards", "--shuffle-buffer", 3]
 
     def command(out):
-        return [sys.executable, "-m", "gamba_warp.train", *words(packed, out, *options)]
+        return [python(), "-m", "gamba_warp.train", *words(packed, out, *options)]
 
     quiet, killed = tmp_path / "quiet", tmp_path / "killed"
     subprocess.run(command(quiet), env=environment(), check=True)
@@ -321,12 +321,12 @@ def test_two_nodes_read_their_own_shards(packed, tmp_path):
             assert fetch(address, tmp_path / node) == 0
             own = ["--steps", 2, "--sampler", "shards"]
             commands.append(
-                [sys.executable, "-m", "torch.distributed.run", "--nnodes", "2"]
+                [python(), "-m", "torch.distributed.run", "--nnodes", "2"]
                 + ["--nproc-per-node", "1", "--rdzv-id", "gamba", "--rdzv-backend", "c10d"]
                 + ["--rdzv-endpoint", f"127.0.0.1:{port}", "--local-addr", "127.0.0.1"]
                 + ["-m", "gamba_warp.train", *words(tmp_path / node, tmp_path / "run", *own)]
             )
-        ends = run_all(commands)
+        ends = run_all(commands, PYTHON_EXEC=python())
     assert [end.code for end in ends] == [0, 0], ends
     first, second = ({p.name for p in (tmp_path / n / "cache").glob("*.tar")} for n in "ab")
     assert len(first) == len(second) == 2 and not first & second

@@ -8,7 +8,6 @@ import os
 import re
 import secrets
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gamba_warp.files import STARTER
+from helpers.forked import python
 
 MEGABYTES = 1  # the limit on uploads here
 EDGE = "edge"
@@ -40,7 +40,7 @@ class Served:
 
 def command(*options) -> list[str]:
     shared = ["--no-open-browser", "--checkpoint", str(STARTER / "tiny.safetensors")]
-    return [sys.executable, "-m", "gamba_warp", "app", *shared, *map(str, options)]
+    return [python(), "-m", "gamba_warp", "app", *shared, *map(str, options)]
 
 
 @contextmanager

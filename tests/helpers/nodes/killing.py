@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from helpers.forked import python
 from helpers.nodes.processes import environment, free_port
 
 _TIMEOUT = 900.0  # seconds of one run with all its kills
@@ -116,12 +117,11 @@ def _nodes(
     command += ["--local-addr", "127.0.0.1", "-m", "gamba_warp.train", *words]
     agents: list[subprocess.Popen[Any]] = []
     limit = time.monotonic() + _TIMEOUT
+    own = environment(PYTHON_EXEC=python())
     with open(notes, "w+", encoding="utf-8", errors="replace") as file:
         try:
             for _ in range(2):
-                agents.append(
-                    subprocess.Popen(command, env=environment(), stdout=file, stderr=file)
-                )
+                agents.append(subprocess.Popen(command, env=own, stdout=file, stderr=file))
                 time.sleep(1.0)  # makes the first one the host, with the lower rank
             while any(agent.poll() is None for agent in agents):
                 if time.monotonic() > limit:

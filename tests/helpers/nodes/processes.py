@@ -3,13 +3,13 @@
 import os
 import socket
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from helpers import micro
+from helpers.forked import python
 
 ROOT = Path(micro.__file__).resolve().parents[2]
 LONGEST = 300  # seconds until processes that wait for one another are killed
@@ -61,12 +61,16 @@ def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -
     for rank, own in enumerate(arguments):
         script = f"{(patch or {}).get(rank, '')}\nimport sys\nfrom gamba_warp import cli\n"
         script += "cli.main(['train', *sys.argv[1:]])\n"
-        commands.append([sys.executable, "-c", script, *own])
+        commands.append([python(), "-c", script, *own])
     return run_all(commands)
 
 
-def run_all(commands: list[list[str]]) -> list[End]:
+def run_all(commands: list[list[str]], **more: object) -> list[End]:
     """Run commands as one group, like torchrun's workers, with a time limit.
+
+    Args:
+        commands: of each process, by its rank.
+        more: variables of their environment.
 
     Returns:
         The results by rank; processes killed after ``LONGEST`` have the code -9.
@@ -76,7 +80,7 @@ def run_all(commands: list[list[str]]) -> list[End]:
     started, ends = [], []
     try:
         for rank, command in enumerate(commands):
-            place = environment(RANK=rank, LOCAL_RANK=rank, **known)
+            place = environment(RANK=rank, LOCAL_RANK=rank, **known, **more)
             started.append(subprocess.Popen(command, env=place, **pipes))
         limit = time.monotonic() + LONGEST
         for process in started:
