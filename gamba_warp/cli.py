@@ -194,7 +194,8 @@ def _parsed(command: Callable, arguments: list[str], program: str) -> Callable[[
     try:
         with redirect_stderr(said):
             # None marks an option that is left out; the word "None" is not a valid value.
-            tyro.cli(keep, args=arguments, prog=program, config=(tyro.conf.DisallowNone,))
+            config = (tyro.conf.DisallowNone, tyro.conf.HelptextFromCommentsOff)
+            tyro.cli(keep, args=arguments, prog=program, config=config)
     except SystemExit as error:
         # A title, perhaps a rule, the message, a rule, and how to get help; in a box, perhaps.
         rows = [re.sub("[│╭╮╰╯]", " ", line)[2:] for line in said.getvalue().splitlines()[1:]]

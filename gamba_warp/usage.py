@@ -172,8 +172,7 @@ def _texts(kind: Any) -> dict[str, str]:
     for source in kind.__mro__[::-1] if isinstance(kind, type) else [kind]:
         if source is object or not source.__doc__:
             continue
-        parsed = docstring_parser.parse_from_object(source)
-        for param in parsed.params:
+        for param in docstring_parser.parse(source.__doc__).params:
             found[param.arg_name] = " ".join((param.description or "").split())
     return found
 

@@ -20,16 +20,19 @@ from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Camera of the picture, and of its results."""
+    """Camera of the picture, and of its results.
+
+    Attributes:
+        elevation: Elevation of the picture's camera above the object, degrees; all results are
+            rotated so that the object is upright.
+        fov: Field of view of turntable, sheet and 3D viewer, degrees; by default the model's
+            (49.1). Without --distance the object keeps its size in the picture.
+        distance: Distance of their camera, object units; by default the model's (1.5).
+    """
 
     elevation: Elevation = 0.0
-    """Elevation of the picture's camera above the object, degrees; all results are rotated so that
-    the object is upright."""
     fov: Fov | None = None
-    """Field of view of turntable, sheet and 3D viewer, degrees; by default the model's (49.1).
-    Without --distance the object keeps its size in the picture."""
     distance: Distance | None = None
-    """Distance of their camera, object units; by default the model's (1.5)."""
 
 
 @ranged
