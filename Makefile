@@ -49,9 +49,10 @@ demo: $(STAMP)
 # Two processes share the tests, a file each at a time, in the order of their names: by the number of
 # its tests the demo, the longest file, would come last, and one process would wait for it. Each
 # computes with the threads that a user's would, so waiting threads must let go of the core
-# (docs/reconstruct.md, "Shared cores"). The slowest are listed with their seconds.
+# (docs/reconstruct.md, "Shared cores"). Python is started some hundred times, so it keeps bytecode,
+# also where it is told not to. The slowest are listed with their seconds.
 test: $(TOOLS)
-	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder \
+	PYTHONDONTWRITEBYTECODE= GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder \
 		--durations 40 --durations-min 3
 
 # The operators' own tests on their CUDA path, executed from PTX (tests/ptx), in the order that SEED

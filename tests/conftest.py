@@ -1,6 +1,7 @@
 """Configuration of all tests: rewritten asserts in helpers, the marker ``gpu``, a fixed seed."""
 
 import contextlib
+import gc
 import os
 import shutil
 import signal
@@ -29,6 +30,14 @@ use_fastest_products()
 # A script that runs pytest in the background makes every process of a test ignore Ctrl-C, too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Collecting the tests makes millions of objects and no garbage, which is visited again and again.
+gc.disable()
+
+
+def pytest_collection_finish():
+    gc.enable()
+    gc.freeze()
+
 
 def pytest_collection_modifyitems(items):
     if torch.cuda.is_available():
@@ -40,6 +49,7 @@ def pytest_collection_modifyitems(items):
 
 def pytest_unconfigure():
     """Remove NVRTC's precompiled headers, 80 MB, which remain after ``os._exit``."""
+    gc.freeze()  # Python visits all objects while it ends
     for folder in Path(tempfile.gettempdir()).glob(f"__nvrtc_auto_pch_{os.getpid()}_*"):
         shutil.rmtree(folder, ignore_errors=True)
 
