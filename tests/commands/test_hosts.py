@@ -105,11 +105,11 @@ def blender(monkeypatch):
     del sys.modules["blender_gamba"]
 
 
-def imports(blender, program, path):
+def imports(blender, program, path, **changes):
     """Run the operator on a file; return its result and what it reported."""
     kind = blender.module.ImportGamba
     operator, said = kind(), []
-    for name, value in kind.__annotations__.items():
+    for name, value in {**kind.__annotations__, **changes}.items():
         setattr(operator, name, value)
     operator.filepath, operator.report = str(path), lambda level, text: said.append((level, text))
     settings = SimpleNamespace(preferences=SimpleNamespace(program=str(program)))
@@ -142,10 +142,15 @@ def program(tmp_path, text):
 def test_a_picture_is_imported_as_a_mesh(blender, tmp_path):
     code = f"""import sys
 sys.path.insert(0, {str(ROOT)!r})
+from functools import partial
 from gamba_warp.cli import main
+from gamba_warp.pages import export
+small = export.SurfaceOptions(voxels=32, views=12, pixels=64, colors=True)
+export.Outputs = partial(export.Outputs, surface=small)
 main([*sys.argv[1:-2], "--checkpoint", {str(TINY)!r}, *sys.argv[-2:]])
 """
-    assert imports(blender, program(tmp_path, code), TOASTER) == ({"FINISHED"}, [])
+    made = imports(blender, program(tmp_path, code), TOASTER, texture=64)
+    assert made == ({"FINISHED"}, [])
     assert blender.imported == [("scopia-toaster-mesh.glb", b"glTF")]
 
 
