@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import importlib
 import io
 import os
@@ -301,7 +300,6 @@ def main(arguments: list[str] | None = None) -> None:
             code = 2
         else:
             raise
-    gc.freeze()  # else the collections at exit visit all objects of torch for most of a second
     sys.exit(code)
 
 

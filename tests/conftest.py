@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(items):
 
 def pytest_unconfigure():
     """Remove NVRTC's precompiled headers, 80 MB, which remain after ``os._exit``."""
-    gc.freeze()  # Python visits all objects while it ends
+    gc.unfreeze()  # nanobind reports what Python does not collect at its end
     for folder in Path(tempfile.gettempdir()).glob(f"__nvrtc_auto_pch_{os.getpid()}_*"):
         shutil.rmtree(folder, ignore_errors=True)
 
