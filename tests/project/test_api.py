@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.forked import python
 
 import gamba_warp
 from gamba_warp import kernels
@@ -28,9 +29,9 @@ BESIDE = ("gamba_warp.render", "gamba_warp.kernels.selective_scan.reference",
           "gamba_warp.kernels.causal_conv1d.ops", "gamba_warp.kernels.rasterize")  # fmt: skip
 
 
-def run(code: str) -> str:
+def run(code: str, program: str = sys.executable) -> str:
     """Return the output of a fresh Python."""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    done = subprocess.run([program, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -79,17 +80,16 @@ assert reference.selective_scan_reference and ops.__name__.endswith("causal_conv
         for order in ((modules, names, modules), (names, modules, names)):
             orders.append("\n".join([*order, code]))
     forks = """
-import os, torch, warp
+import os
 for code in {!r}:
     child = os.fork()
     if child == 0:
         exec(code, dict(__name__="__main__"))
-        break
+        os._exit(0)
     assert os.waitpid(child, 0)[1] == 0, code
-else:
-    print("right")
+print("right")
 """
-    assert run(forks.format(orders)).strip() == "right"
+    assert run(forks.format(orders), python()).strip() == "right"
 
 
 def test_a_public_name_can_be_replaced(monkeypatch):

@@ -10,6 +10,7 @@ from importlib.metadata import PathDistribution, distribution
 from pathlib import Path
 
 import pytest
+from helpers.forked import python
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -113,7 +114,7 @@ def test_an_installed_wheel_reconstructs_its_own_picture(fresh, tmp_path):
 def test_the_demo_of_an_installed_wheel_asks_for_a_checkout(fresh, tmp_path):
     _, site = fresh  # and all extras, which are where this test runs
     demo = subprocess.run(
-        [sys.executable, "-c", "from gamba_warp import cli; cli.main(['demo'])"],
+        [python(), "-c", "from gamba_warp import cli; cli.main(['demo'])"],
         capture_output=True,
         text=True,
         cwd=tmp_path,

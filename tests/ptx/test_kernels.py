@@ -183,7 +183,7 @@ def test_harmonics(degree):
 
 def test_only_one_kernel_contracts():
     """Counting and writing pairs round alike or not: no Gaussian's pairs fall upon another's."""
-    num, width, height = 1500, 1 << 16, 4096
+    num, width, height = 900, 1 << 16, 1024
     grid = make_grid(Tiling(width, height), num=num, alpha_min=1 / 255, skip=TILE_TEST)
     # slanting needles, of many rows of tiles: at each row's ends rounding may decide upon a tile
     heights = 400 + 400 * torch.rand(1, num, 1)
