@@ -1,12 +1,12 @@
 """The extension modules that layers call themselves, by every version's arguments."""
 
 import subprocess
-import sys
 
 import pytest
 import torch
 import torch.nn.functional as F
 from helpers import assert_rel_rms
+from helpers.forked import python
 from helpers.mamba import block_in_float64, run, scan_in_float64
 
 from gamba_warp.compat.causal_conv1d import cpp_functions
@@ -211,6 +211,6 @@ print(fwd.__module__, "mamba_ssm" in sys.modules, *sys.argv[1:])
 @pytest.mark.parametrize("take", [",".join(EXTENSIONS)])
 def test_a_program_gets_them_by_name(tmp_path, take):
     (tmp_path / "client.py").write_text(CLIENT)
-    command = [sys.executable, "-m", "gamba_warp.compat", *(["--take", take] if take else [])]
+    command = [python(), "-m", "gamba_warp.compat", *(["--take", take] if take else [])]
     done = subprocess.run([*command, tmp_path / "client.py", "3"], capture_output=True, text=True)
     assert done.stdout == f"gamba_warp.compat.extensions {take is None} 3\n", done.stderr

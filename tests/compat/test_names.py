@@ -4,6 +4,8 @@ import importlib.util
 import subprocess
 import sys
 
+from helpers.forked import python
+
 from gamba_warp.compat import __main__ as program
 from gamba_warp.compat import take_names
 
@@ -49,7 +51,7 @@ assert all(x.__module__ == "gamba_warp.compat.gsplat.relocation" for x in ours)
 
 def run(*arguments):
     """Run a new process, because names can be taken once per process."""
-    command = [sys.executable, "-m", "gamba_warp.compat", *map(str, arguments)]
+    command = [python(), "-m", "gamba_warp.compat", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True)
 
 
