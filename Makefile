@@ -52,8 +52,8 @@ demo: $(STAMP)
 # (docs/reconstruct.md, "Shared cores"). Python is started some hundred times, so it keeps bytecode,
 # also where it is told not to. The slowest are listed with their seconds.
 test: $(TOOLS)
-	PYTHONDONTWRITEBYTECODE= GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder \
-		--durations 40 --durations-min 3
+	PYTHONDONTWRITEBYTECODE= GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 \
+		--dist loadfile --no-loadscope-reorder --durations 40 --durations-min 3
 
 # The operators' own tests on their CUDA path, executed from PTX (tests/ptx), in the order that SEED
 # draws (0: none), large shapes, and gamba stress for some MINUTES. APPROXIMATE=1 has ex2, rcp and
