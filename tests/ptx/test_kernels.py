@@ -183,6 +183,7 @@ def test_harmonics(degree):
 
 def test_only_one_kernel_contracts():
     """Counting and writing pairs round alike or not: no Gaussian's pairs fall upon another's."""
+    torch.manual_seed(2)  # counting finds more pairs of two Gaussians, and fewer of one
     num, width, height = 900, 1 << 16, 1024
     grid = make_grid(Tiling(width, height), num=num, alpha_min=1 / 255, skip=TILE_TEST)
     # slanting needles, of many rows of tiles: at each row's ends rounding may decide upon a tile
@@ -200,7 +201,8 @@ def test_only_one_kernel_contracts():
             bins.append(bin_views(grid, splats, lambda count: None, exact=True))
         assert not machine.findings, "\n".join(machine.findings)
     plain, counted, emitted = bins
-    assert 0 < (plain.offsets.diff() != counted.offsets.diff()).sum() < 0.01 * num
+    more = counted.offsets.diff() - plain.offsets.diff()
+    assert (more > 0).any() and (more < 0).any() and (more != 0).sum() < 0.01 * num
     for x in bins:
         owners = torch.repeat_interleave(x.order, x.offsets.diff())
         inside = x.starts[-1]
