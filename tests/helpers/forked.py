@@ -2,7 +2,7 @@
 
 ``python()`` is a program like ``sys.executable``, without the seconds that a fresh process takes to
 import these libraries. The package itself and the libraries of its extras are not loaded before the
-fork. The program is a small process that passes its words, environment, folder and standard streams
+fork. The program is a small process that passes its arguments, environment, folder and streams
 to the server, forwards signals, and ends like the forked process, which is killed with it.
 """
 

@@ -28,12 +28,15 @@ from torch import Tensor
 
 PACKAGES = {"mamba-ssm": "2.3.2.post1", "causal-conv1d": "1.7.0", "gsplat": "1.5.3"}
 _COMPILER = ("nvidia-cuda-nvcc", "nvidia-nvvm", "nvidia-cuda-crt")
-_NO_BUILD = ("BUILD_NO_CUDA", "MAMBA_SKIP_CUDA_BUILD", "CAUSAL_CONV1D_SKIP_CUDA_BUILD")
+# pip asks a source package for its metadata, which needs no compiler where these are set.
+_NO_BUILD = {"MAMBA_SKIP_CUDA_BUILD": "TRUE", "CAUSAL_CONV1D_SKIP_CUDA_BUILD": "TRUE"}
+_NO_BUILD |= {"BUILD_NO_CUDA": "1"}
 _HALVES = [
     f"-U__CUDA_NO_{kind}_{what}__"
-    for kind in ("HALF", "BFLOAT16")
+    for kind in ("HALF", "BFLOAT16", "BFLOAT162")
     for what in ("OPERATORS", "CONVERSIONS")
 ]
+# Their setup.py say C++17, with which torch's headers do not compile.
 _FLAGS = ["-O3", "-std=c++20", "--use_fast_math", "--expt-relaxed-constexpr"]
 FLAGS = {
     "mamba-ssm": [*_HALVES, "--expt-extended-lambda"],
@@ -104,13 +107,8 @@ class Peers:
             Missing: nvcc fails.
         """
         text += _SHARED.format(shared)
-        command = [
-            str(self.nvcc),
-            "-ptx",
-            f"-arch=compute_{ARCHITECTURE}",
-            *_FLAGS,
-            *FLAGS[package],
-        ]
+        command = [str(self.nvcc), "-ptx", f"-arch=compute_{ARCHITECTURE}"]
+        command += [*_FLAGS, *FLAGS[package]]
         command += [f"-I{self.source(package) / name}" for name in INCLUDES[package]]
         command += [f"-I{path}" for path in self.headers]
         key = hashlib.sha256(" ".join([*command, text]).encode()).hexdigest()[:16]
@@ -129,17 +127,15 @@ class Peers:
 
 def _pip(*arguments: object) -> None:
     command = [sys.executable, "-m", "pip", *map(str, arguments), "--quiet"]
-    environment = os.environ | {name: "TRUE" for name in _NO_BUILD} | {"BUILD_NO_CUDA": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | _NO_BUILD)
     if done.returncode:
         raise Missing(f"pip: {(done.stderr.strip() or 'no reason').splitlines()[-1]}")
 
 
 def structure(text: str, name: str) -> type[ctypes.Structure]:
     """A structure of parameters from the text of a C++ header."""
-    base, body = re.findall(rf"struct {name}\s*(?::\s*public (\w+))?\s*\{{(.*?)\n\}};", text, re.S)[
-        0
-    ]
+    pattern = rf"struct {name}\s*(?::\s*public (\w+))?\s*\{{(.*?)\n\}};"
+    ((base, body),) = re.findall(pattern, text, re.S)
     (index,) = re.findall(r"using index_t = uint(\d+)_t", text)
     types = {"int": ctypes.c_int, "bool": ctypes.c_bool}
     types["index_t"] = ctypes.c_uint32 if index == "32" else ctypes.c_uint64

@@ -1,4 +1,4 @@
-"""Page of the counts of others' kernels beside ours, and of estimates beside measured times."""
+"""Page of the comparison with other libraries, and of estimates beside measured times."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ PUBLISHED, PUBLISHED_CHANNELS = {2048: 0.120, 4096: 0.275, 16384: 1.085}, 4 * 41
 PUBLISHED_CASE = "16 x 2,048, bfloat16, theirs tokens last"
 RTX = Device("RTX PRO 6000", 188, 2.6e9, 1.792e12, 128)
 
-_TEXT = """## Beside the kernels of others
+_TEXT = """## Compared with other libraries
 Written by `make instructions PEERS=1`: the sources of {packages} were
-compiled by nvcc {nvcc}, with the flags of their setup.py and the template arguments that their host
-code chooses, and executed in the same interpreter on the same inputs; their results agree with
-ours. The scan and the convolution have {channels:,} channels, the scan {states} states,
+compiled by nvcc {nvcc}, with the flags of their setup.py (but C++20) and the template arguments
+that their host code chooses, and executed in the same interpreter on the same inputs; their results
+agree with ours. The scan and the convolution have {channels:,} channels, the scan {states} states,
 softplus and gate, the convolution {width} weights and SiLU; the rasterizer draws the view of above.
 
 **Ratios, ours to theirs: below 1 is less.** **least** is the time of an H200 if its busiest unit
 works in every cycle, in milliseconds. Products are contracted with sums, and moves left out, in
-theirs as in ours. ptxas makes .89 to 1.14 times as many instructions of theirs (1.5 times in the
-gradient of the projection, counted once by the loops of its disassembly). gsplat orders its pairs
-by a library's sort, which is not counted, and neither are our kernels for lists. Ours add the rows
-of gradients in a fixed order, theirs with atomics. What torch does before and after a kernel is
-counted in neither: zeros, sums of parts, the directions of gsplat's harmonics.
+theirs as in ours. gsplat orders its pairs by a library's sort, which is not counted, and neither
+are our kernels for lists. Ours add the rows of gradients in a fixed order, theirs with atomics.
+torch's own operations before and after a kernel are counted in neither: zeros, sums of parts, the
+directions of gsplat's harmonics.
 
 """
 _CALIBRATION = """

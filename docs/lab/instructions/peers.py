@@ -1,10 +1,11 @@
-"""Counts of other projects' kernels beside ours, for the same work: the ratios in counts.md."""
+"""Counts of other libraries' kernels and of ours for the same work: the ratios in counts.md."""
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -32,37 +33,22 @@ H200 = DEVICES[90]
 TYPES = {torch.float32: "float", torch.bfloat16: "at::BFloat16"}
 
 
-@dataclass(frozen=True)
-class Launched:
-    """Counts of a kernel, as of ``counting.Executed``, and its blocks."""
-
-    name: str
-    counts: dict[str, float]
-    blocks: float
-
-    @property
-    def seconds(self) -> float:
-        """Least time on an H200, by its busiest unit, where most blocks are."""
-        limits = cycles(H200, self.counts)
-        rounds = -(-self.blocks // H200.multiprocessors) / self.blocks
-        limits = {name: x * rounds for name, x in limits.items() if name != "dram"}
-        memory = self.counts.get("first", 0) * SECTOR / H200.bandwidth
-        return max(memory, *(x / H200.clock for x in limits.values()))
+# By direction, kernels that are launched one after the other.
+Kernels = dict[str, list[Executed]]
 
 
-# By direction, what is launched one after the other.
-Kernels = dict[str, list[Launched]]
+def seconds(kernel: Executed) -> float:
+    """Least time on an H200, by its busiest unit, on the multiprocessor with the most blocks."""
+    limits = cycles(H200, kernel.counts)
+    rounds = -(-kernel.blocks // H200.multiprocessors) / kernel.blocks
+    limits = {name: x * rounds for name, x in limits.items() if name != "dram"}
+    memory = kernel.counts.get("first", 0) * SECTOR / H200.bandwidth
+    return max(memory, *(x / H200.clock for x in limits.values()))
 
 
-def launched(kernels: Iterable[Executed]) -> list[Launched]:
-    """The counts of executed kernels."""
-    return [Launched(x.name, x.counts, x.blocks) for x in kernels]
-
-
-def count_launches(run: Callable[[], Sequence[Tensor]], wanted: Iterable[Tensor]) -> Kernels:
-    """The counts of our operators' launches, as of ``counting.count``."""
-    counted = count(run, wanted, MULTIPROCESSORS)
-    return {direction: launched(kernels.values()) for direction, kernels in counted.items()}
+def listed(counted: dict[str, dict[str, Executed]]) -> Kernels:
+    """Kernels of ``counting.count``, in the order of their launches."""
+    return {direction: [*kernels.values()] for direction, kernels in counted.items()}
 
 
 def at_full_width(run: Callable[[int], Kernels], channels: int, batch: int) -> Kernels:
@@ -81,15 +67,12 @@ def at_full_width(run: Callable[[int], Kernels], channels: int, batch: int) -> K
     def whole(a: float, b: float) -> float:
         return batch * (a + more * (b - a))
 
+    def both(a: Executed, b: Executed) -> Executed:
+        counts = {name: whole(a.counts.get(name, 0), x) for name, x in b.counts.items()}
+        return replace(b, counts=counts, blocks=whole(a.blocks, b.blocks))
+
     return {
-        direction: [
-            Launched(
-                a.name,
-                {k: whole(a.counts.get(k, 0), x) for k, x in b.counts.items()},
-                whole(a.blocks, b.blocks),
-            )
-            for a, b in zip(one[direction], two[direction], strict=True)
-        ]
+        direction: [both(a, b) for a, b in zip(one[direction], two[direction], strict=True)]
         for direction in one
     }
 
@@ -115,13 +98,14 @@ def our_scan(length: int, batch: int, dtype: torch.dtype, channels: int) -> Kern
     before, scan_cuda.FORCED = scan_cuda.FORCED, tuning_of(shape)
     try:
         run = partial(selective_scan, **inputs, delta_softplus=True)
-        return count_launches(lambda: [run()], inputs.values())
+        return listed(count(lambda: [run()], inputs.values(), MULTIPROCESSORS))
     finally:
         scan_cuda.FORCED = before
 
 
+@functools.cache
 def mamba_scan(peers: Peers, length: int, dtype: torch.dtype, channels: int) -> Kernels:
-    """Counts of one by mamba-ssm, with the traits that its host code has for over 1,024 tokens."""
+    """Counts of one sequence by mamba-ssm, with its host code's traits for over 1,024 tokens."""
     folder = peers.source("mamba-ssm") / "csrc" / "selective_scan"
     header = (folder / "selective_scan.h").read_text()
     even = str(length % 2048 == 0).lower()
@@ -160,12 +144,12 @@ template __global__ void selective_scan_{0}_kernel<T>({5});
     sizes |= dict(dim_ngroups_ratio=channels, is_variable_B=True, is_variable_C=True)
     sizes["delta_softplus"] = True
 
-    def run(compiled, kind: str) -> list[Launched]:
+    def run(compiled, kind: str) -> list[Executed]:
         machine = Interpreter(counting=True)
         tensors = {name: (value, axes[name]) for name, value in x.items()}
         params = [filled(structure(header, kind), tensors, **sizes)]
         launch(machine, compiled, params, [*x.values()], (128, 1, 1), (1, channels, 1))
-        return launched(executed(machine).values())
+        return [*executed(machine).values()]
 
     found = {"forward": run(forward, "SSMParamsBase")}
     limit = 1e-4 if dtype == torch.float32 else 1e-2
@@ -194,7 +178,7 @@ def our_conv(length: int, dtype: torch.dtype, channels: int) -> Kernels:
     """Counts of one sequence, with bias and SiLU."""
     x, weight, bias = _conv_inputs(length, dtype, channels)
     run = partial(causal_conv1d, x, weight, bias, activation="silu")
-    return count_launches(lambda: [run()], (x, weight, bias))
+    return listed(count(lambda: [run()], (x, weight, bias), MULTIPROCESSORS))
 
 
 def _conv_inputs(length: int, dtype: torch.dtype, channels: int) -> list[Tensor]:
@@ -204,7 +188,7 @@ def _conv_inputs(length: int, dtype: torch.dtype, channels: int) -> list[Tensor]
 
 
 def their_conv(peers: Peers, length: int, dtype: torch.dtype, last: bool, channels: int) -> Kernels:
-    """Counts of one by causal-conv1d, channels last or tokens last."""
+    """Counts of one sequence by causal-conv1d, channels last or tokens last."""
     folder = peers.source("causal-conv1d") / "csrc"
     header = (folder / "causal_conv1d.h").read_text()
     vector, elements = 16 // dtype.itemsize, 128 // dtype.itemsize
@@ -240,12 +224,12 @@ template __global__ void {name}_{direction}_kernel<T{kernel_more}>({kind});
     axes |= {name: "c width" for name in ("weight", "dweight", "bias", "dbias")}
     sizes = dict(batch=1, dim=channels, seqlen=length, width=WIDTH, silu_activation=True)
 
-    def run(program, kind: str, chunk: int) -> list[Launched]:
+    def run(program, kind: str, chunk: int) -> list[Executed]:
         machine = Interpreter(counting=True)
         params = [filled(structure(header, kind), {k: (v, axes[k]) for k, v in x.items()}, **sizes)]
         blocks = (1, -(-length // chunk), -(-channels // elements)) if last else (1, channels, 1)
         launch(machine, program, params, [*x.values()], (128, 1, 1), blocks)
-        return launched(executed(machine).values())
+        return [*executed(machine).values()]
 
     found = {"forward": run(forward, "ConvParamsBase", chunks[0])}
     limit = 1e-4 if dtype == torch.float32 else 1e-2
@@ -276,8 +260,8 @@ def our_picture(
     counted = count(lambda: run()[:2], leaves.values(), multiprocessors)
     found: dict[str, Kernels] = {"projection": {}, "drawing": {}}
     for (stage, direction), names in STAGES.items():
-        kernels = (x for x in counted[direction].values() if x.name in names)
-        found[stage][direction] = launched(kernels)
+        kernels = counted[direction].values()
+        found[stage][direction] = [x for x in kernels if x.name in names]
     return found
 
 
@@ -304,7 +288,7 @@ def gsplat_kernel(
     values: Sequence[Tensor | float | int | None],
     sizes: tuple[tuple[int, ...], tuple[int, ...]],
     shared: int = 0,
-) -> list[Launched]:
+) -> list[Executed]:
     """Counts of a kernel of gsplat, for 3 channels and float32.
 
     Args:
@@ -322,7 +306,7 @@ def gsplat_kernel(
     machine = Interpreter(counting=True)
     tensors = [value for value in values if isinstance(value, Tensor)]
     launch(machine, compiled, packed(compiled[0], values), tensors, *sizes)
-    return launched(executed(machine).values())
+    return [*executed(machine).values()]
 
 
 def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> dict[str, Kernels]:
@@ -387,14 +371,15 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
 def both_harmonics(peers: Peers, degree: int = 3) -> tuple[Kernels, Kernels]:
     """Counts of one view's colours by ours and by gsplat, which is given directions."""
     torch.manual_seed(0)
-    count = (degree + 1) ** 2
-    coefficients, means = torch.randn(1, GAUSSIANS, count, 3), torch.randn(1, GAUSSIANS, 3)
+    terms = (degree + 1) ** 2
+    coefficients, means = torch.randn(1, GAUSSIANS, terms, 3), torch.randn(1, GAUSSIANS, 3)
     leaves = [coefficients.requires_grad_(), means.requires_grad_()]
     center = torch.zeros(1, 1, 3)
-    counted = count_launches(lambda: [sums_seen_from(degree, *leaves, center)], leaves)
-    wanted = sums_seen_from(degree, *leaves, center)
+    run = partial(sums_seen_from, degree, *leaves, center)
+    ours = listed(count(lambda: [run()], leaves, MULTIPROCESSORS))
+    wanted = run()
     v_colors = torch.randn_like(wanted)
-    of = [GAUSSIANS, count, degree, means.detach(), coefficients.detach(), None]
+    of = [GAUSSIANS, terms, degree, means.detach(), coefficients.detach(), None]
     sizes = (256, 1, 1), (-(-GAUSSIANS * 3 // 256), 1, 1)
     colors, back = torch.empty_like(wanted), [torch.zeros_like(x) for x in leaves]
     file, theirs = "SphericalHarmonicsCUDA", {}
@@ -406,7 +391,7 @@ def both_harmonics(peers: Peers, degree: int = 3) -> tuple[Kernels, Kernels]:
         theirs[direction] = gsplat_kernel(peers, file, entry, [*of, *values], sizes)
     agree("gsplat, harmonics", [wanted.detach()], [colors], 1e-5)
     agree("gsplat, harmonics", torch.autograd.grad(wanted, leaves, v_colors), back, 1e-4)
-    return counted, theirs
+    return ours, theirs
 
 
 # --- the table
@@ -454,11 +439,11 @@ def cases(peers: Peers) -> Iterator[tuple[str, str, Kernels, Kernels]]:
     yield "rasterizer", "harmonics of degree 3", *both_harmonics(peers)
 
 
-def total(kernels: list[Launched]) -> dict[str, float]:
+def total(kernels: list[Executed]) -> dict[str, float]:
     """Sums of launches that follow each other, "ms" by the estimate."""
     found = {name: sum(x.counts.get(name, 0) for x in kernels) for name in ("sectors", "first")}
     every_one = sum(every(x.counts) for x in kernels)
-    return {"instructions": every_one, **found, "ms": 1e3 * sum(x.seconds for x in kernels)}
+    return {"instructions": every_one, **found, "ms": 1e3 * sum(map(seconds, kernels))}
 
 
 def compare(folder: Path, say: Callable[[str], None] = lambda case: None) -> dict:

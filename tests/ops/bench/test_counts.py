@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 from lab.instructions import headline, peer_code
-from lab.instructions.counting import count
-from lab.instructions.peers import Launched, at_full_width
+from lab.instructions.counting import Executed, count
+from lab.instructions.peers import at_full_width
 from ptx.machine import Missing, library
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "lab" / "benchmarks"
@@ -123,8 +123,8 @@ def test_all_channels_from_two_runs():
     """Count once for each sequence what channels share."""
 
     def run(channels):
-        kernel = Launched("k", {"first": 100 + 3 * channels, "float": 2 * channels}, channels // 2)
-        return {"forward": [kernel]}
+        counts = {"first": 100 + 3 * channels, "float": 2 * channels}
+        return {"forward": [Executed("k", counts, 32.0, 0.0, [], [], channels // 2)]}
 
     ((whole,),) = at_full_width(run, 4, 16).values()
     assert whole.counts == {"first": 16 * (100 + 3 * 1024), "float": 16 * 2 * 1024}
