@@ -220,7 +220,7 @@ def test_lanes_of_several_masks():
 
 
 def test_a_shuffle_of_what_nobody_wrote():
-    """It matters only in lanes whose source is not written, or not in the mask."""
+    """A shuffle reports unwritten data only in lanes that are in its mask and read one."""
     half = "setp.lt.u32 %p1, %r1, 16; @%p1 mov.u32 %r5, 7;"
     read = "shfl.sync.bfly.b32 %r10, %r5, {}, 31, -1;"
     memory = torch.zeros(32, dtype=torch.int32)
