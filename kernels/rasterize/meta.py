@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .constants import TILE
 from .ops import bin_op, composite
 from .projection import STATUS_NAMES, Projected
 from .tiles import Bins, Limits, Size, Tiling, Walk
@@ -81,26 +82,38 @@ class Meta(dict):
         walks = key not in ("culled", "pairs_box", "pairs", "tiles")
         if walks and int(self.bins.count) > self.bins.pairs.numel():  # the lists were too short
             self.bins, self._walk = self._call.listed()
-        self[key] = _COUNTS[key](self.bins, self._walk, self._call.splats.status)
+        self[key] = _COUNTS[key](self.bins, self._walk, self._call)
         return self[key]
 
 
-def _culled(bins: Bins, walk: Walk, status: Tensor) -> dict[str, int]:
-    counts = torch.bincount(status.view(-1), minlength=len(STATUS_NAMES)).tolist()
+def _culled(bins: Bins, walk: Walk, call: Call) -> dict[str, int]:
+    status = call.splats.status.view(-1)
+    counts = torch.bincount(status, minlength=len(STATUS_NAMES)).tolist()
     return dict(zip(STATUS_NAMES[1:], counts[1:]))
 
 
-_COUNTS: dict[str, Callable[[Bins, Walk, Tensor], Any]] = {
+def _pairs_of_boxes(bins: Bins, walk: Walk, call: Call) -> int:
+    # as the lists have them where tiles are not tested; rows have a pixel to spare
+    means2d, extents = call.splats.means2d, call.splats.extents
+    last = extents.new_tensor([call.size.width - 1, call.size.height - 1])
+    spare = extents.new_tensor([0.0, 1.0])
+    ends = [means2d - extents - spare, means2d + extents + spare]
+    begin, end = (x.clamp(min=0).minimum(last).long() // TILE for x in ends)
+    seen = extents[..., 0] > 0
+    return int((end - begin + 1)[seen].prod(-1).sum())
+
+
+_COUNTS: dict[str, Callable[[Bins, Walk, Call], Any]] = {
     "culled": _culled,
-    "pairs_box": lambda bins, walk, status: int(bins.box_pairs),
-    "pairs": lambda bins, walk, status: int(bins.count),
-    "pairs_walked": lambda bins, walk, status: int(walk.walked.sum(dtype=torch.int64)),
-    "blocks_walked": lambda bins, walk, status: int(walk.blocks_walked.sum()),
-    "blocks_used": lambda bins, walk, status: sum(
+    "pairs_box": _pairs_of_boxes,
+    "pairs": lambda bins, walk, call: int(bins.count),
+    "pairs_walked": lambda bins, walk, call: int(walk.walked.sum(dtype=torch.int64)),
+    "blocks_walked": lambda bins, walk, call: int(walk.blocks_walked.sum()),
+    "blocks_used": lambda bins, walk, call: sum(
         int((walk.blocks >> b & 1).sum()) for b in range(16)
     ),
-    "pairs_used": lambda bins, walk, status: int((walk.blocks != 0).sum()),
-    "gaussians_used": lambda bins, walk, status: bins.pairs[walk.blocks != 0].unique().numel(),
-    "tiles": lambda bins, walk, status: bins.starts.numel() - 1,
-    "tiles_empty": lambda bins, walk, status: int((bins.starts.diff() == 0).sum()),
+    "pairs_used": lambda bins, walk, call: int((walk.blocks != 0).sum()),
+    "gaussians_used": lambda bins, walk, call: bins.pairs[walk.blocks != 0].unique().numel(),
+    "tiles": lambda bins, walk, call: bins.starts.numel() - 1,
+    "tiles_empty": lambda bins, walk, call: int((bins.starts.diff() == 0).sum()),
 }

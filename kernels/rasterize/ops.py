@@ -151,7 +151,7 @@ def bin_op(
     alpha_min: float,
     skip: int,
     exact: bool = False,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Make the tile lists of all views, ``Bins``; on CUDA without waiting for the number of pairs.
 
     There the first call of a shape reads that number back, and later ones take the capacity that
@@ -182,7 +182,7 @@ def bin_op(
         raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
     grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
     b = _bin_views(depths.device, exact)(grid, splats, _refuse_too_many)
-    return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs, b.count
+    return b.order, b.offsets, b.pairs, b.rows, b.starts, b.count
 
 
 @bin_op.register_fake
@@ -200,7 +200,6 @@ def _(means2d, conics, depths, *rest):
             pairs=ints(pairs),
             rows=ints(pairs),
             starts=ints(tiles + 1),
-            box_pairs=ints(dtype=torch.int64),
             count=ints(dtype=torch.int64),
         )
     )

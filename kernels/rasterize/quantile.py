@@ -20,7 +20,7 @@ from .tiles import Bins, Grid, make_grid
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
+@wp.kernel(grid_stride=False)
 @no_type_check
 def _quantile(
     offset: wp.int32,

@@ -1,18 +1,16 @@
-"""Tiles: how a picture is cut into them, their lists, and which of them an ellipse touches.
+"""Tiles: how a picture is cut into them, their lists, and the scalars of launches.
 
 In this order: ``Tiling``, the cut; ``Bins`` and ``Walk``, the results of binning and compositing
 for later steps; ``Drawn``, the Gaussians to composite; ``Grid`` and ``Picture``, the scalars that
-the launches of these two steps take; the test of an ellipse, row by row of tiles, by exact
-intervals of columns. README.md §2 proves the test. Counting and writing call the same functions.
+the launches of these two steps take.
 """
 
-from typing import Annotated, Any, NamedTuple, no_type_check
+from typing import Annotated, Any, NamedTuple
 
 import warp as wp
 
 from ..runtime.views import filled, struct
 from .constants import TILE
-from .skip import TILE_TEST
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,7 +59,6 @@ class Bins(NamedTuple):
         pairs: ``[P]`` view-major Gaussian index of each pair, in tile order.
         rows: ``[P]`` emission number of each pair, in tile order.
         starts: ``[I * tiles + 1]`` where each tile begins in ``pairs``.
-        box_pairs: ``[]`` int64, number of pairs if tiles were tested against boxes only.
         count: ``[]`` int64, number of pairs.
     """
 
@@ -70,7 +67,6 @@ class Bins(NamedTuple):
     pairs: Annotated[Any, wp.array[wp.int32]] = None
     rows: Annotated[Any, wp.array[wp.int32]] = None
     starts: Annotated[Any, wp.array[wp.int32]] = None
-    box_pairs: Annotated[Any, wp.array[wp.int64]] = None
     count: Annotated[Any, wp.array[wp.int64]] = None
 
 
@@ -218,94 +214,3 @@ def color_row(picture: Picture, g: int) -> int:
     if picture.colors_per_view == 0:
         row = g // (picture.views * picture.num) * picture.num + g % picture.num
     return row
-
-
-@struct
-class Ellipse:
-    """The set q <= limit around a mean, with values that the rows of tiles share."""
-
-    mean: wp.vec2
-    k: wp.float32
-    e: wp.float32
-    limit: wp.float32
-    over_a: wp.float32
-    reach: wp.float32
-    top: wp.float32
-
-
-@wp.func
-@no_type_check
-def to_tile(grid: Grid, x: wp.float32, size: wp.int32) -> wp.int32:
-    # clamped before the cast: a footprint may be larger than an int32
-    return wp.int32(wp.clamp(x, 0.0, float(size - 1))) >> grid.shift
-
-
-@wp.func
-@no_type_check
-def tile_rows(grid: Grid, y: wp.float32, extent: wp.float32) -> wp.vec2i:
-    # first and last row with a pixel centre (at +0.5) in reach, with a pixel to spare
-    top = to_tile(grid, y - extent - 1.0, grid.height)
-    return wp.vec2i(top, to_tile(grid, y + extent + 1.0, grid.height))
-
-
-@wp.func
-@no_type_check
-def q_limit(opacity: wp.float32, alpha_min: wp.float32) -> wp.float32:
-    return 2.0 * wp.log(opacity / alpha_min) * SLACK + SLACK_ABS
-
-
-@wp.func
-@no_type_check
-def make_ellipse(mean: wp.vec2, conic: wp.vec3, limit: wp.float32) -> Ellipse:
-    a, k, e = conic[0], conic[1], conic[2]
-    ellipse = Ellipse()
-    ellipse.mean = mean
-    ellipse.k = k
-    ellipse.e = e
-    ellipse.limit = limit
-    ellipse.over_a = 1.0 / a
-    ellipse.reach = wp.sqrt(limit / e)
-    # the ellipse is rightmost at y = top, leftmost at -top
-    ellipse.top = -k * a * wp.sqrt(limit / (a * (a * k * k + e) * e))
-    return ellipse
-
-
-@wp.func
-@no_type_check
-def _box_columns(grid: Grid, x: wp.float32, extent: wp.float32) -> wp.vec2i:
-    return wp.vec2i(to_tile(grid, x - extent, grid.width), to_tile(grid, x + extent, grid.width))
-
-
-@wp.func
-@no_type_check
-def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) -> wp.vec2i:
-    # README eq. 6: columns of row ty that the ellipse touches; first > last: none
-    if (grid.skip & TILE_TEST) == 0:
-        return _box_columns(grid, ellipse.mean[0], extent[0])
-    # exact numbers first, the mean once: rounding must not turn one row of pixels into none
-    y0 = wp.max(float(ty << grid.shift) + 0.5 - ellipse.mean[1], -ellipse.reach)
-    end = float(wp.min((ty + 1) << grid.shift, grid.height)) - 0.5
-    y1 = wp.min(end - ellipse.mean[1], ellipse.reach)
-    if y0 > y1:
-        return wp.vec2i(0, -1)
-    # convex, so clamping finds the extremes
-    right = wp.clamp(ellipse.top, y0, y1)
-    left = wp.clamp(-ellipse.top, y0, y1)
-    e = ellipse.e
-    x1 = wp.sqrt(wp.max(ellipse.limit - e * right * right, 0.0) * ellipse.over_a)
-    x0 = wp.sqrt(wp.max(ellipse.limit - e * left * left, 0.0) * ellipse.over_a)
-    x1 = ellipse.mean[0] - ellipse.k * right + x1
-    x0 = ellipse.mean[0] - ellipse.k * left - x0
-    if x1 < 0.5 or x0 > float(grid.width) - 0.5:
-        return wp.vec2i(0, -1)
-    # a tile spans pixel centres 0.5 to 15.5; a gap between two tiles belongs to neither
-    return wp.vec2i(to_tile(grid, x0 + 0.5, grid.width), to_tile(grid, x1 - 0.5, grid.width))
-
-
-@wp.func
-@no_type_check
-def box_pairs(grid: Grid, mean: wp.vec2, extent: wp.vec2) -> wp.int64:
-    # pairs of a Gaussian if tiles were tested against its box alone
-    rows = tile_rows(grid, mean[1], extent[1])
-    columns = _box_columns(grid, mean[0], extent[0])
-    return wp.int64(rows[1] - rows[0] + 1) * wp.int64(columns[1] - columns[0] + 1)

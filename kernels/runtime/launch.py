@@ -397,7 +397,7 @@ def launch(
     outputs: Sequence,
     device: torch.device,
     threads: int | None = None,
-    block_dim: int = 256,
+    block_dim: int = 128,
 ) -> None:
     """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing.
 

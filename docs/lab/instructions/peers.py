@@ -18,6 +18,7 @@ from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
 from gamba_warp.kernels.bench.static.dry_run import MULTIPROCESSORS
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
+from gamba_warp.kernels.rasterize.cuda.capacity import with_reserve
 from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
@@ -243,13 +244,29 @@ template __global__ void {name}_{direction}_kernel<T{kernel_more}>({kind});
 
 # --- the rasterizer
 
-# Our kernels that do what each of theirs does; those of tiles' lists, which gsplat sorts, do not.
+# Our kernels that do what each of theirs does. Both leave sorting to a library.
 STAGES = {
     ("projection", "forward"): ("project",),
+    ("tile lists", "forward"): ("count", "emit", "in_tile_order"),
     ("projection", "gradient"): ("project_vjp",),
     ("drawing", "forward"): ("record", "composite", "composite_unlisted"),
     ("drawing", "gradient"): ("composite_vjp", "composite_vjp_unlisted", "add_rows"),
 }
+
+
+def radix_sort(number: int, key: int, value: int, bits: int, filled: int = 0) -> Executed:
+    """A library's sort, not executed: it reads all keys, then moves pairs by passes of 8 bits.
+
+    Args:
+        number: of pairs of a key and a value.
+        key: bytes of one.
+        value: bytes of one.
+        bits: of a key, by which it sorts.
+        filled: bytes that are written for each before.
+    """
+    sectors = number * (filled + key + 2 * -(-bits // 8) * (key + value)) // SECTOR
+    counts = {"sectors": sectors, "first": sectors}
+    return Executed("sort", counts, 0, 0, (), (), H200.multiprocessors)
 
 
 def our_picture(
@@ -258,27 +275,45 @@ def our_picture(
     """Counts of one view, stage by stage; on few multiprocessors by whole tiles."""
     run = partial(rasterization, **leaves, **cameras)
     counted = count(lambda: run()[:2], leaves.values(), multiprocessors)
-    found: dict[str, Kernels] = {"projection": {}, "drawing": {}}
+    found: dict[str, Kernels] = {}
     for (stage, direction), names in STAGES.items():
         kernels = counted[direction].values()
-        found[stage][direction] = [x for x in kernels if x.name in names]
+        found.setdefault(stage, {})[direction] = [x for x in kernels if x.name in names]
+    # torch sorts with numbers of 8 bytes: the Gaussians by depth, then places of the lists by tile
+    places = with_reserve(int(run()[2].bins.count))
+    sorts = radix_sort(GAUSSIANS, 4, 8, 32, filled=8), radix_sort(places, 2, 8, 16, filled=8)
+    found["sorting"] = {"forward": [*sorts]}
     return found
 
 
-def pairs(means2d: Tensor, radii: Tensor, depths: Tensor) -> tuple[Tensor, Tensor]:
-    """Tiles' first pairs and the pairs' Gaussians, by tile and depth, as gsplat sorts them."""
+def gsplat_lists(
+    peers: Peers, projected: Sequence[Tensor]
+) -> tuple[list[Executed], tuple[Tensor, Tensor]]:
+    """Counts of gsplat's kernels of tile lists; tiles' first pairs and the pairs' Gaussians.
+
+    Args:
+        peers: the sources.
+        projected: means, radii and depths, as gsplat has them.
+    """
     side = SIDE // TILE
-    first = ((means2d - radii) / TILE).floor().clamp(0, side).long()
-    last = ((means2d + radii) / TILE).ceil().clamp(0, side).long()
-    size = (last - first).prod(1) * (radii > 0).all(1)
-    of = torch.repeat_interleave(torch.arange(len(radii)), size)
-    within = torch.arange(len(of)) - (size.cumsum(0) - size)[of]
-    wide = (last - first)[of, 0]
-    tile = (first[of, 1] + within // wide) * side + first[of, 0] + within % wide
-    order = torch.argsort(depths[of], stable=True)
-    order = order[torch.argsort(tile[order], stable=True)]
-    begins = torch.searchsorted(tile[order], torch.arange(side * side))
-    return begins.int().view(1, side, side), of[order].int()
+    bits = (side * side).bit_length()
+    blocks = (256, 1, 1), (-(-GAUSSIANS // 256), 1, 1)
+    common = [0, 1, GAUSSIANS, 0, None, None, *projected]
+    sizes = [TILE, side, side, bits, 1]
+
+    def run(entry: str, values: Sequence, blocks=blocks) -> list[Executed]:
+        return gsplat_kernel(peers, "IntersectTile", f"intersect_{entry}", values, blocks)
+
+    counts = torch.empty(GAUSSIANS, dtype=torch.int32)
+    counted = run("tile", [*common, None, *sizes, counts, None, None])
+    ends = counts.cumsum(0)
+    keys = torch.empty(int(ends[-1]), dtype=torch.int64)
+    ids, begins = keys.new_empty(len(keys), dtype=torch.int32), counts.new_empty(1, side, side)
+    written = run("tile", [*common, ends, *sizes, None, keys, ids])
+    keys, order = keys.sort(stable=True)
+    of_pairs = (256, 1, 1), (-(-len(keys) // 256), 1, 1)
+    found = run("offset", [len(keys), keys, 1, side * side, bits, begins], of_pairs)
+    return [*counted, *written, *found], (begins, ids[order])
 
 
 def gsplat_kernel(
@@ -301,7 +336,7 @@ def gsplat_kernel(
     """
     text = (peers.source("gsplat") / "gsplat" / "cuda" / "csrc" / f"{file}.cu").read_text()
     text = re.sub(r"^__INS__\((?!3\)).*$", "", text, flags=re.M)
-    name = f"_ZN6gsplat\\d+{entry}_kernel(If|ILj3Ef)E"
+    name = f"_ZN6gsplat\\d+{entry}_kernel(If|ILj3Ef)?E"
     compiled = peers.compile("gsplat", text, str(shared), name)
     machine = Interpreter(counting=True)
     tensors = [value for value in values if isinstance(value, Tensor)]
@@ -317,7 +352,7 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
         ("drawing", "forward"): ("RasterizeToPixels3DGSFwd", "rasterize_to_pixels_3dgs_fwd"),
         ("drawing", "gradient"): ("RasterizeToPixels3DGSBwd", "rasterize_to_pixels_3dgs_bwd"),
     }
-    found: dict[str, Kernels] = {"projection": {}, "drawing": {}}
+    found: dict[str, Kernels] = {name: {} for name in ("projection", "tile lists", "drawing")}
     sizes = {
         "projection": ((256, 1, 1), (-(-GAUSSIANS // 256), 1, 1)),
         "drawing": ((TILE, TILE, 1), (1, SIDE // TILE, SIDE // TILE)),
@@ -338,7 +373,10 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
     outputs = [radii, means2d, depths, conics, None]
     inputs = [*of_scene, x["opacities"], *of_camera, 0.01, 1e10, 0.0, 0]
     run("projection", "forward", [*inputs, *outputs])
-    begins, ids = pairs(means2d, radii, depths)
+    lists, (begins, ids) = gsplat_lists(peers, [means2d, radii, depths])
+    found["tile lists"]["forward"] = lists
+    bits = 32 + ((SIDE // TILE) ** 2).bit_length() + 1  # depth, tile, and picture, of one
+    found["sorting"] = {"forward": [radix_sort(len(ids), 8, 4, bits)]}
     colors, alphas = torch.empty(SIDE, SIDE, 3), torch.empty(SIDE, SIDE)
     last = torch.empty(SIDE, SIDE, dtype=torch.int32)
     drawn = [1, n, len(ids), 0, means2d, conics, x["colors"], x["opacities"], None, None]
@@ -434,8 +472,10 @@ def cases(peers: Peers) -> Iterator[tuple[str, str, Kernels, Kernels]]:
     for multiprocessors, text in ((0, "whole tiles"), (MULTIPROCESSORS, "quarters of tiles")):
         ours = our_picture(leaves, cameras, multiprocessors)
         for stage in ours:
-            if stage == "drawing" or not multiprocessors:
+            if stage == "drawing":
                 yield "rasterizer", f"{stage}, {text}", ours[stage], theirs[stage]
+            elif not multiprocessors:
+                yield "rasterizer", stage, ours[stage], theirs[stage]
     yield "rasterizer", "harmonics of degree 3", *both_harmonics(peers)
 
 

@@ -284,7 +284,6 @@ def rasterize_to_pixels(
         pairs=pairs.int(),
         rows=number.int(),
         starts=starts.int(),
-        box_pairs=starts[-1],
         count=starts[-1],
     )
     tiling = Tiling(grid_x * parts * TILE, grid_y * parts * TILE)

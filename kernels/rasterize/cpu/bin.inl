@@ -76,14 +76,12 @@ for (;;) {
 // Running sums: the lists of all views lie one after the other, a list has its parts in turn, and
 // the counts of the parts become their first numbers. Too many intersections overflow here, and are
 // refused by their sum, which has 64 bits.
-long long intersections = 0, in_boxes = 0;
+long long intersections = 0;
 for (int task = 0; task < work.totals.shape[0]; ++task) {
     work.numbers.data[task] = (int)intersections;
     intersections += work.totals.data[task];
-    in_boxes += work.boxes.data[task];
 }
 lists.count.data[0] = intersections;
-lists.box_pairs.data[0] = in_boxes;
 lists.offsets.data[lists.offsets.shape[0] - 1] = (int)intersections;
 const int tiles = work.counts.shape[1], views = work.counts.shape[0] / parts;
 unsigned place = 0;
@@ -194,7 +192,7 @@ auto words_of = [&](int g) -> Word* { return (Word*)(work.windows.data + (size_t
 #if COUNT
 // Finds the windows of a task's Gaussians and counts its intersections with each tile.
 int* const counts = work.counts.data + (size_t)task * work.counts.shape[1];
-long long intersections = 0, in_boxes = 0;
+long long intersections = 0;
 for (int j = begin, g = image * groups + first_group; j < end; j += 16, ++g) {
     const int n = end - j < 16 ? end - j : 16;
     float part[8][16] = {};
@@ -225,8 +223,6 @@ for (int j = begin, g = image * groups + first_group; j < end; j += 16, ++g) {
         continue;
     }
     const I top = top_(get(1), ry), count = bottom_(get(1), ry) - top + 1;
-    const I box = count * (tile_(get(0) + rx, wide) - tile_(get(0) - rx, wide) + 1);
-    in_boxes += __builtin_reduce_add(seen ? box : I{});  // each is at most 2^24
     const Ellipse E = ellipse_(get(0), get(1), get(2), get(3), get(4), get(5), rx);
     I few = seen & (count <= 4);
     const int most = __builtin_reduce_max(few ? count : I{});
@@ -269,7 +265,6 @@ for (int j = begin, g = image * groups + first_group; j < end; j += 16, ++g) {
                 });
 }
 work.totals.data[task] = intersections;
-work.boxes.data[task] = in_boxes;
 
 #else
 // Writes the intersections of a task's windows, each to the next place of its tile. Where the

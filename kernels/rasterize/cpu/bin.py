@@ -38,7 +38,6 @@ class Work:
     windows: wp.array[wp.int16]  # [groups * 16] its bits
     counts: wp.array2d[wp.int32]  # [parts, tiles] intersections, then where the next one goes
     totals: wp.array[wp.int64]  # [parts] intersections
-    boxes: wp.array[wp.int64]  # [parts] likewise, of boxes
     numbers: wp.array[wp.int32]  # [parts] the number of the first intersection
 
 
@@ -94,7 +93,7 @@ def bin_views(grid: Grid, projected: Projected, check: Callable[[int], None]) ->
     tasks, groups, by_depth = images * parts, images * -(-num // 16), num < MANY
     order, offsets = (empty([images * num + i], torch.int32) for i in range(2))
     starts = order.new_empty(images * tiles + 1)
-    count, box_count = (torch.empty((), dtype=torch.int64) for _ in range(2))
+    count = torch.empty((), dtype=torch.int64)
     splats = as_struct(projected)
     work = Packed(
         Work,
@@ -102,13 +101,12 @@ def bin_views(grid: Grid, projected: Projected, check: Callable[[int], None]) ->
         empty([groups * 16], torch.int16),
         order.new_zeros(tasks, tiles),
         count.new_empty(tasks),
-        count.new_empty(tasks),
         order.new_empty(tasks),
     )
     if not by_depth:
         torch.arange(images * num, out=order)
     ordered = order if by_depth else None  # none: by index
-    made = dict(offsets=offsets, starts=starts, box_pairs=box_count, count=count)
+    made = dict(offsets=offsets, starts=starts, count=count)
     lists = as_struct(Bins(order=ordered, **made))
     if by_depth and images:
         _sort_lists(images, num, splats, None, lists)

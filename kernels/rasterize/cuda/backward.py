@@ -383,7 +383,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if T[j] < 0.0:
-                                if L.load_stop(stops, at, j * WARP) == k:
+                                if L.load_word(stops, at, j * WARP) == k:
                                     T[j] = -T[j]
             sync()
             complete(arena, base, p.lane, waiting)

@@ -17,14 +17,44 @@ from ...runtime.launch import launch
 from ...runtime.views import as_struct, struct_of
 from ..projection import Projected
 from ..skip import TILE_TEST
-from ..tiles import Bins, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
+from ..tiles import Bins, Grid
 from . import capacity
 from . import leaves as L
+from .ellipse import Ellipse, make_ellipse, tile_columns, tile_rows
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
+_KEPT = 7  # rows of tiles of a Gaussian whose columns are kept between counting and writing
+_EACH = 4  # pairs of a thread of ``in_tile_order``
+
+
+@wp.func
+@no_type_check
+def _ellipse(grid: Grid, splats_in: struct_of(Projected), i: wp.int32) -> Ellipse:
+    mean = L.load_vec2(splats_in.means2d, i)
+    opacity = L.load_float(splats_in.view_opacities, i)
+    ellipse = make_ellipse(mean, L.load_vec3(splats_in.conics, i), opacity, grid.alpha_min)
+    if (grid.skip & TILE_TEST) == 0:
+        ellipse.box = L.load_vec2(splats_in.extents, i)
+    return ellipse
+
+
+@wp.func
+@no_type_check
+def _are_kept(grid: Grid, rows: wp.vec2i) -> bool:
+    # few rows, and tiles whose numbers a word has room for
+    return rows[1] - rows[0] < _KEPT and wp.max(grid.tiles_x, grid.tiles_y) < 1 << 15
+
+
+@wp.func
+@no_type_check
+def _span(tiles: wp.vec2i) -> wp.int32:
+    # first and number in a word, from first and last, which is first - 1 at the least
+    return tiles[0] | tiles[1] - tiles[0] + 1 << 16
+
+
+@wp.kernel(grid_stride=False)
 @no_type_check
 def _count(
     offset: wp.int32,
@@ -32,78 +62,115 @@ def _count(
     splats_in: struct_of(Projected),
     nearest_in: wp.array[wp.int64],
     order_out: wp.array[wp.int32],
-    counts_out: wp.array[wp.int32],
-    totals_out: wp.array2d[wp.int64],
+    spans_out: wp.array2d[wp.int32],
+    counts_out: wp.array[wp.int64],
 ):
     j = offset + wp.tid()
-    i = j / grid.num * grid.num + wp.int32(nearest_in[j])
-    order_out[j] = i
-    extent = splats_in.extents[i]
+    num = order_out.shape[0]
+    i = j / grid.num * grid.num + wp.int32(L.load_long(nearest_in, j))
+    L.store_int(order_out, j, i)
+    extent = L.load_vec2(splats_in.extents, i)
     count = wp.int32(0)
-    box_count = wp.int64(0)
     if extent[0] > 0.0:
-        limit = q_limit(splats_in.view_opacities[i], grid.alpha_min)
-        ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
-        rows = tile_rows(grid, ellipse.mean[1], extent[1])
-        for ty in range(rows[0], rows[1] + 1):
-            columns = tile_columns(grid, ellipse, extent, ty)
-            count += wp.max(columns[1] - columns[0] + 1, 0)
-        box_count = box_pairs(grid, ellipse.mean, extent)
+        ellipse = _ellipse(grid, splats_in, i)
+        rows = tile_rows(grid, ellipse)
+        kept = _are_kept(grid, rows)
+        at = wp.int64(j)
+        L.store_word(spans_out, at, 0, wp.where(kept, _span(rows), 0))
+        ty = rows[0]
+        while ty <= rows[1]:
+            columns = tile_columns(grid, ellipse, ty)
+            count += columns[1] - columns[0] + 1
+            at += wp.int64(num)
+            if kept:
+                L.store_word(spans_out, at, 0, _span(columns))
+            ty = L.anew(ty + 1)  # or the loop is unrolled, and lanes wait for others twice
     if j == 0:
-        counts_out[0] = 0  # so that their running sum says where each begins
-    counts_out[j + 1] = count
-    totals_out[0, j] = wp.int64(count)
-    totals_out[1, j] = box_count
+        L.store_long(counts_out, 0, wp.int64(0))  # their running sum says where each begins
+    L.store_long(counts_out, j + 1, wp.int64(count))
 
 
 @functools.cache
 def _tile_kernels(number: Any):
     """The kernels that write and read the numbers of tiles, of this type, between the sort."""
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.func_native("values.data[i] = v;")
+    def store_tile(values: wp.array(dtype=number), i: wp.int32, v: number): ...
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     @no_type_check
     def emit(
         offset: wp.int32,
         grid: Grid,
         splats_in: struct_of(Projected),
         order_in: wp.array[wp.int32],
-        offsets_in: wp.array[wp.int32],
-        count_in: wp.array[wp.int64],
+        spans_in: wp.array2d[wp.int32],
+        sums_in: wp.array[wp.int64],
         first: wp.int32,
         behind: wp.int32,
         tiles_out: wp.array(dtype=number),
         gaussians_out: wp.array[wp.int32],
+        offsets_out: wp.array[wp.int32],
+        count_out: wp.array[wp.int64],
     ):
         j = offset + wp.tid()
+        num = order_in.shape[0]
         size = tiles_out.shape[0]
-        if j < size and (wp.int64(j) >= count_in[0] or count_in[0] > wp.int64(size)):
-            tiles_out[j] = number(behind)
-        if j < order_in.shape[0] and count_in[0] <= wp.int64(size):
-            i = order_in[j]
-            p = offsets_in[j]
-            end = offsets_in[j + 1]
-            extent = splats_in.extents[i]
-            if extent[0] > 0.0:
-                limit = q_limit(splats_in.view_opacities[i], grid.alpha_min)
-                ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
-                rows = tile_rows(grid, ellipse.mean[1], extent[1])
-                for ty in range(rows[0], rows[1] + 1):
-                    columns = tile_columns(grid, ellipse, extent, ty)
-                    row = ((i // grid.num) * grid.tiles_y + ty) * grid.tiles_x
+        total = L.load_long(sums_in, num)
+        p = wp.int32(L.load_long(sums_in, j))
+        end = wp.int32(L.load_long(sums_in, j + 1))
+        if j == 0:
+            count_out[0] = total
+            L.store_int(offsets_out, 0, 0)
+        L.store_int(offsets_out, j + 1, end)
+        count = wp.int32(0)
+        if total <= wp.int64(size):
+            count = wp.int32(total)
+            if p < end:
+                i = L.load_int(order_in, j)
+                at = wp.int64(j)
+                span = L.load_word(spans_in, at, 0)
+                kept = span != 0
+                row = span & 0xFFFF
+                rows = span >> 16
+                ellipse = Ellipse()
+                if not kept:
+                    ellipse = _ellipse(grid, splats_in, i)
+                    ends = tile_rows(grid, ellipse)
+                    row = ends[0]
+                    rows = ends[1] - row + 1
+                tile = first + (i / grid.num * grid.tiles_y + row) * grid.tiles_x
+                for r in range(rows):
+                    at += wp.int64(num)
+                    if kept:
+                        span = L.load_word(spans_in, at, 0)
+                        tx = tile + (span & 0xFFFF)
+                        last = p + (span >> 16)
+                    else:
+                        ends = tile_columns(grid, ellipse, row + r)
+                        tx = tile + ends[0]
+                        last = p + ends[1] - ends[0] + 1
                     # no more than were counted: a compiler may round otherwise here than there
-                    last = wp.min(columns[1], columns[0] + end - p - 1)
-                    for tx in range(columns[0], last + 1):
-                        tiles_out[p] = number(first + row + tx)
+                    last = wp.min(last, end)
+                    while p < last:
+                        store_tile(tiles_out, p, number(tx))
                         L.store_int(gaussians_out, p, i)
+                        tx += 1
                         p += 1
-            for free in range(p, end):  # where rounding found fewer
-                tiles_out[free] = number(behind)
-                L.store_int(gaussians_out, free, i)
+                    tile += grid.tiles_x
+                for free in range(p, end):  # where rounding found fewer
+                    store_tile(tiles_out, free, number(behind))
+                    L.store_int(gaussians_out, free, i)
+        place = wp.int64(count) + wp.int64(j)  # of 64 bits, as the last step may pass 2^31
+        while place < wp.int64(size):
+            store_tile(tiles_out, wp.int32(place), number(behind))
+            place += wp.int64(num)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     @no_type_check
     def in_tile_order(
         offset: wp.int32,
+        threads: wp.int32,
         tiles_in: wp.array(dtype=number),
         emitted_in: wp.array[wp.int64],
         gaussians_in: wp.array[wp.int32],
@@ -115,13 +182,23 @@ def _tile_kernels(number: Any):
     ):
         k = offset + wp.tid()
         size = tiles_in.shape[0]
-        if k < size:
-            row = wp.int32(emitted_in[k])
-            g = wp.int32(0)
-            if wp.int64(k) < count_in[0] and count_in[0] <= wp.int64(size):
-                g = gaussians_in[row]
-            rows_out[k] = row
-            pairs_out[k] = g
+        count = wp.int32(0)
+        if count_in[0] <= wp.int64(size):
+            count = wp.int32(count_in[0])
+        # all loads before the stores, so that they are under way together
+        left = count - k
+        row = wp.vec4i()
+        g = wp.vec4i()
+        for n in range(_EACH):
+            if n * threads < left:
+                row[n] = wp.int32(L.load_long(emitted_in, k + n * threads))
+        for n in range(_EACH):
+            if n * threads < left:
+                g[n] = L.load_int(gaussians_in, row[n])
+        for n in range(_EACH):
+            if n * threads < left:
+                L.store_int(rows_out, k + n * threads, row[n])
+                L.store_int(pairs_out, k + n * threads, g[n])
         if k < starts_out.shape[0]:
             # the first pair whose tile is k or later
             low = wp.int32(0)
@@ -155,28 +232,30 @@ def bin_views(
     num = depths.numel()
     order = torch.empty(num, dtype=torch.int32, device=device)
     make = torch.empty if num else torch.zeros
-    counts = make(num + 1, dtype=torch.int32, device=device)
-    totals = torch.empty(2, num, dtype=torch.int64, device=device)
+    counts = make(num + 1, dtype=torch.int64, device=device)
+    spans = order.new_empty(1 + _KEPT, num)  # see ``_span``: of rows, then of columns
     splats = as_struct(projected)
-    launch(_count, num, [grid, splats, nearest.view(-1)], [order, counts, totals], device)
-    offsets = counts.cumsum(0, dtype=torch.int32)
-    totals = totals.sum(1)
-    count = totals[:1]
-    size = _list_capacity(grid, depths, count, check, exact)
+    inputs = [grid, splats, nearest.view(-1)]
+    launch(_count, num, inputs, [order, spans, counts], device)
+    sums = counts.cumsum(0)
+    size = _list_capacity(grid, depths, sums[-1:], check, exact)
     tiles = images * grid.tiles_x * grid.tiles_y
     # a sort of 16 bits takes half as long as one of 32
     short = tiles < 1 << 16
     first, dtype = (-(1 << 15), torch.int16) if short else (0, torch.int32)
     emit, in_tile_order = _tile_kernels(wp.int16 if short else wp.int32)
     tile_of, gaussians = order.new_empty(size, dtype=dtype), order.new_empty(size)
+    offsets = make(num + 1, dtype=torch.int32, device=device)
+    count = make(1, dtype=torch.int64, device=device)
     # free places have the number behind the last tile's, so that they come last
-    inputs = [grid, splats, order, offsets, count, first, first + tiles]
-    launch(emit, max(num, size) if size else 0, inputs, [tile_of, gaussians], device)
+    inputs = [grid, splats, order, spans, sums, first, first + tiles]
+    launch(emit, num, inputs, [tile_of, gaussians, offsets, count], device)
     sorted_tiles, emitted = torch.sort(tile_of, stable=True)
     pairs, rows, starts = order.new_empty(size), order.new_empty(size), order.new_empty(tiles + 1)
-    inputs = [sorted_tiles, emitted, gaussians, count, first]
-    launch(in_tile_order, max(size, tiles + 1), inputs, [pairs, rows, starts], device)
-    return Bins(order, offsets, pairs, rows, starts, box_pairs=totals[1].clone(), count=totals[0])
+    threads = max(-(-size // _EACH), tiles + 1)
+    inputs = [threads, sorted_tiles, emitted, gaussians, count, first]
+    launch(in_tile_order, threads, inputs, [pairs, rows, starts], device)
+    return Bins(order, offsets, pairs, rows, starts, count.view(()))
 
 
 def _list_capacity(

@@ -156,7 +156,7 @@ def _walking(channels: int, parts: int, listed: bool):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if (stopped[0] & wp.static(1 << (STOP + j))) != 0:
                                 T[j] = -T[j]
-                                L.store_stop(walked_out.stops, p.walk_row, j * WARP, k)
+                                L.store_word(walked_out.stops, p.walk_row, j * WARP, k)
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1

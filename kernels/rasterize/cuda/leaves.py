@@ -4,14 +4,36 @@ import warp as wp
 
 from ...runtime.scalars import anew as anew
 from ...runtime.scalars import exp2 as exp2
-from ...runtime.scalars import reciprocal as reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func_native('float y; asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x)); return y;')
+def _approximate(instruction: str, on_cpu: str) -> str:
+    # the tests run the lists' kernels on a CPU as well
+    return f"""
+#ifdef __CUDA_ARCH__
+    float y; asm("{instruction}.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x)); return y;
+#else
+    return {on_cpu};
+#endif
+"""
+
+
+@wp.func_native(_approximate("sqrt", "sqrtf(x)"))
 def root(x: wp.float32) -> wp.float32:
     """The square root, to 2 units in the last place."""
+    ...
+
+
+@wp.func_native(_approximate("rcp", "1.0f / x"))
+def reciprocal(x: wp.float32) -> wp.float32:
+    """1/x, to 1 unit in the last place."""
+    ...
+
+
+@wp.func_native(_approximate("lg2", "log2f(x)"))
+def log2(x: wp.float32) -> wp.float32:
+    """The logarithm to base 2, with an absolute error of 2^-22."""
     ...
 
 
@@ -19,6 +41,32 @@ def root(x: wp.float32) -> wp.float32:
 # costs instructions and, in loops, registers.
 @wp.func_native("return values.data[i];")
 def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("return values.data[i];")
+def load_float(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
+
+
+@wp.func_native("return values.data[i];")
+def load_long(values: wp.array[wp.int64], i: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native("""
+    const float* at = values.data[i].c;
+    if (((size_t)at & 7) != 0) return wp::vec_t<2, float>(at[0], at[1]);
+    struct alignas(8) Two { float x, y; };
+    const Two two = *(const Two*)at;
+    return wp::vec_t<2, float>(two.x, two.y);
+""")
+def load_vec2(values: wp.array[wp.vec2], i: wp.int32) -> wp.vec2: ...
+
+
+@wp.func_native("return values.data[i];")
+def load_vec3(values: wp.array[wp.vec3], i: wp.int32) -> wp.vec3: ...
+
+
+@wp.func_native("values.data[i] = v;")
+def store_long(values: wp.array[wp.int64], i: wp.int32, v: wp.int64): ...
 
 
 @wp.func_native("values.data[i] = v;")
@@ -55,11 +103,11 @@ def store(values: wp.array2d[wp.float32], i: wp.int64, step: wp.int32, v: wp.flo
 
 
 @wp.func_native("return values.data[i + step];")
-def load_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32) -> wp.int32: ...
+def load_word(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32) -> wp.int32: ...
 
 
 @wp.func_native("values.data[i + step] = v;")
-def store_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32, v: wp.int32): ...
+def store_word(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32, v: wp.int32): ...
 
 
 # fmaf is named, since forward and backward must see the same alpha: the compiler has no choice.

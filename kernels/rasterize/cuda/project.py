@@ -209,7 +209,7 @@ def _splat(
     return splat
 
 
-@wp.kernel
+@wp.kernel(grid_stride=False)
 @no_type_check
 def _project(
     offset: wp.int32,
@@ -289,7 +289,7 @@ def _all_zero(v: struct_of(Projected), i: wp.int32) -> bool:
     )
 
 
-@wp.kernel
+@wp.kernel(grid_stride=False)
 @no_type_check
 def _project_vjp(
     offset: wp.int32,

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from ...runtime.launch import launch
 from ...runtime.views import as_struct, struct, struct_of
-from ..tiles import CHUNK, Drawn, Picture, color_row, q_limit, record_size
+from ..tiles import CHUNK, Drawn, Picture, color_row, record_size
 from . import leaves as L
+from .ellipse import make_ellipse
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,7 +30,7 @@ class Gaussians:
     first: int  # the first channel of this launch
 
 
-@wp.kernel
+@wp.kernel(grid_stride=False)
 @no_type_check
 def _record(
     offset: wp.int32,
@@ -42,13 +43,10 @@ def _record(
     conic = splats_in.conics[g]
     opacity = splats_in.view_opacities[g]
     a, k, e = conic[0], conic[1], conic[2]
-    limit = q_limit(opacity, picture.alpha_min)
-    reach = L.root(limit * L.reciprocal(e))
-    # top = -k a sqrt(limit / (a e (a k² + e)))
-    top = -k * a * reach * L.root(L.reciprocal(a) * L.reciprocal(a * k * k + e))
+    ellipse = make_ellipse(mean, conic, opacity, picture.alpha_min)
     at = wp.int64(g) * wp.int64(records_out.shape[1])
     L.store4(records_out, at, wp.vec4(mean[0], mean[1], -LOG2_E_HALF * a, k))
-    level = wp.vec4(-LOG2_E_HALF * e, wp.log2(opacity), LOG2_E_HALF * limit, top)
+    level = wp.vec4(-LOG2_E_HALF * e, wp.log2(opacity), LOG2_E_HALF * ellipse.limit, ellipse.top)
     L.store4(records_out, at + wp.int64(4), level)
     row = color_row(picture, g)
     channels = splats_in.colors.shape[1]

@@ -20,7 +20,7 @@ from .records import LOG2_E_HALF
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
+@wp.kernel(grid_stride=False)
 @no_type_check
 def _add_rows(
     offset: wp.int32,

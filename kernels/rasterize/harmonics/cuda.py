@@ -87,7 +87,7 @@ def forward_kernel(degree: int, channels: int, clamped: bool):
     group, load, basis = leaves.group, leaves.load, leaves.basis
     used_are_finite = leaves.used_are_finite
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
+    @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS, grid_stride=False)
     @no_type_check
     def harmonics(offset: wp.int32, size: Size, arrays_out: Arrays):
         i = offset + wp.tid()
@@ -129,7 +129,7 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
     group, part, load, store = leaves.group, leaves.part, leaves.load, leaves.store
     column, basis, slopes = leaves.column, leaves.basis, leaves.slopes
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
+    @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS, grid_stride=False)
     @no_type_check
     def harmonics_vjp(offset: wp.int32, size: Size, arrays_in: Arrays, v_arrays_out: Arrays):
         i = offset + wp.tid()

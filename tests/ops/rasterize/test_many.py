@@ -13,10 +13,11 @@ from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.cuda.project import project_on_threads
-from gamba_warp.kernels.rasterize.projection import LensOptions, make_lens
-from gamba_warp.kernels.rasterize.tiles import Drawn
+from gamba_warp.kernels.rasterize.projection import LensOptions, Projected, make_lens
+from gamba_warp.kernels.rasterize.skip import TILE_TEST
+from gamba_warp.kernels.rasterize.tiles import Drawn, Tiling, make_grid
 
-LISTS = ("pairs", "starts", "box_pairs")
+LISTS = ("pairs", "starts")
 
 
 def call(scene, **options):
@@ -62,6 +63,27 @@ def test_same_lists_pictures_and_gradients(monkeypatch, size, shape):
 @pytest.mark.parametrize("options", [{"skip": Skip(tile_test=False)}, {"render_mode": "RGB+ED"}])
 def test_same_with_options(monkeypatch, options):
     assert_lists(monkeypatch, make(1, 2, 200, 50, 70), **options)
+
+
+def test_lists_of_a_wide_picture():
+    """CUDA keeps columns in 16 bits where they have room, and finds them again elsewhere."""
+    num, width, height = 60, (1 << 19) + 100, 200
+    sides = torch.tensor([3e5, 60.0]) * torch.rand(1, num, 2)  # of the box, at alpha_min
+    opacities = 0.1 + 0.9 * torch.rand(1, num)
+    a, e = (2 * (255 * opacities).log()[..., None] / sides**2).unbind(-1)
+    splats = Projected(
+        torch.rand(1, num, 2) * torch.tensor([width, height]),
+        torch.stack([a, torch.zeros(1, num), e], -1),
+        torch.rand(1, num),
+        opacities,
+        sides,
+    )
+    grid = make_grid(Tiling(width, height), num=num, alpha_min=1 / 255, skip=TILE_TEST)
+    want = bin_cpu.bin_views(grid, splats, lambda count: None)
+    got = bin_cuda.bin_views(grid, splats, lambda count: None, exact=True)
+    assert want.count == got.count > 32768
+    for name in LISTS:
+        assert torch.equal(getattr(got, name), getattr(want, name)), name
 
 
 def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):
