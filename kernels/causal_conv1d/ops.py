@@ -48,7 +48,7 @@ def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | No
 
 def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list) -> None:
     threads = 1 if x.numel() < _FEW else None
-    launch(kernel, dim, inputs, outputs, x.device, threads, block_dim=128)
+    launch(kernel, dim, inputs, outputs, x.device, threads)
 
 
 def _pieces(x: Tensor, rows: Tensor | None, tokens: int) -> tuple[int, Tensor]:

@@ -330,7 +330,7 @@ def cuda_launch(
     outputs: Sequence = (),
     *,
     device: torch.device,
-    block_dim: int = 256,
+    block_dim: int = 128,
 ) -> None:
     """Launches on torch's current stream of ``device``, or on a GPU's stand-in.
 

@@ -110,7 +110,7 @@ def scan_tuning(shape: Sequence[int], states: int, groups: int, device: torch.de
 
 @functools.cache
 def _carry_kernel(exponential: bool, reverse: bool):
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     @no_type_check
     def carry(
         # in
@@ -146,7 +146,7 @@ def _carry_kernel(exponential: bool, reverse: bool):
     return carry
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, grid_stride=False)
 @no_type_check
 def _sum_parts(
     # in
@@ -252,7 +252,6 @@ class _Operands:
             [self.segments, self.states, self.A, decay],
             [local.view(-1, width), self.state.view(-1, width)],
             device=self.device,
-            block_dim=128,
         )
         return local
 
