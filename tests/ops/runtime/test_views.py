@@ -72,7 +72,7 @@ def test_a_dry_run_tells_and_does_nothing(monkeypatch):
         cuda_launch(_never, (2, 3), [], [x], device=x.device)
         with ThreadPoolExecutor(1) as pool:
             assert pool.submit(view, x).result().data == x.data_ptr()
-    assert told == [(_never, (6,), [None], 32), (_never, (2, 3), [None], 256)]
+    assert told == [(_never, (6,), [None], 32), (_never, (2, 3), [None], 128)]
     assert not x.any() and len(views._descriptors) == 1
     assert view(x).data == x.data_ptr()
 
