@@ -233,7 +233,8 @@ def bin_views(
     order = torch.empty(num, dtype=torch.int32, device=device)
     make = torch.empty if num else torch.zeros
     counts = make(num + 1, dtype=torch.int64, device=device)
-    spans = order.new_empty(1 + _KEPT, num)  # see ``_span``: of rows, then of columns
+    # see ``_span``: [1 + _KEPT, num], which could have too long strides for Warp
+    spans = order.new_empty(num, 1 + _KEPT)
     splats = as_struct(projected)
     inputs = [grid, splats, nearest.view(-1)]
     launch(_count, num, inputs, [order, spans, counts], device)
