@@ -39,6 +39,7 @@ def model(tmp_path_factory):
         image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
     )
     path = tmp_path_factory.mktemp("model") / "model.safetensors"
+    torch.manual_seed(4)  # its Gaussians are faint: of some seeds no difference is visible
     save_model(path, Gamba(config))
     return path
 
@@ -67,7 +68,7 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
         turntable_frames(gaussians, size=48, frames=1, elevation=elevation)[0].astype(int)
         for gaussians, elevation in ((before, 0.0), (after, 30.0), (before, 30.0))
     )
-    assert np.abs(straight - above).max() <= 3 < np.abs(straight - lying).max()  # rounding
+    assert np.abs(straight - above).max() <= 3 < np.abs(straight - lying).max() - 2  # rounding
     for folder in (plain, turned):
         assert np.abs(first_frame(folder / "thing.gif") - straight).mean() < 1  # 255 colours
     assert camera_of((turned / "thing.html").read_text()) == (1.5, 49.1, 30)
