@@ -52,7 +52,7 @@ def motions(count):
 @pytest.mark.parametrize("name", ["chair", "box", "cube"])
 def test_a_copy_comes_back_from_any_start(name):
     protocol = replace(PRESETS["triposr"], align=("scale", "turn", "icp"))
-    for motion in motions(2):
+    for motion in motions(3):
         moved, got = compare(motion.apply(SHAPES[name]), SHAPES[name], protocol)
         assert got["chamfer"] <= 1e-3 and set(got["fscore"].values()) == {1.0}
         found = got["alignment"]

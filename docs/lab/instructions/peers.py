@@ -297,11 +297,11 @@ def gsplat_lists(
     """
     side = SIDE // TILE
     bits = (side * side).bit_length()
-    blocks = (256, 1, 1), (-(-GAUSSIANS // 256), 1, 1)
     common = [0, 1, GAUSSIANS, 0, None, None, *projected]
     sizes = [TILE, side, side, bits, 1]
 
-    def run(entry: str, values: Sequence, blocks=blocks) -> list[Executed]:
+    def run(entry: str, values: Sequence, number: int = GAUSSIANS) -> list[Executed]:
+        blocks = (256, 1, 1), (-(-number // 256), 1, 1)
         return gsplat_kernel(peers, "IntersectTile", f"intersect_{entry}", values, blocks)
 
     counts = torch.empty(GAUSSIANS, dtype=torch.int32)
@@ -311,8 +311,7 @@ def gsplat_lists(
     ids, begins = keys.new_empty(len(keys), dtype=torch.int32), counts.new_empty(1, side, side)
     written = run("tile", [*common, ends, *sizes, None, keys, ids])
     keys, order = keys.sort(stable=True)
-    of_pairs = (256, 1, 1), (-(-len(keys) // 256), 1, 1)
-    found = run("offset", [len(keys), keys, 1, side * side, bits, begins], of_pairs)
+    found = run("offset", [len(keys), keys, 1, side * side, bits, begins], len(keys))
     return [*counted, *written, *found], (begins, ids[order])
 
 

@@ -84,7 +84,7 @@ def _count(
             at += wp.int64(num)
             if kept:
                 L.store_word(spans_out, at, 0, _span(columns))
-            ty = L.anew(ty + 1)  # or the loop is unrolled, and lanes wait for others twice
+            ty = L.anew(ty + 1)  # keeps the loop from being unrolled, which splits warps more
     if j == 0:
         L.store_long(counts_out, 0, wp.int64(0))  # their running sum says where each begins
     L.store_long(counts_out, j + 1, wp.int64(count))
@@ -233,7 +233,7 @@ def bin_views(
     order = torch.empty(num, dtype=torch.int32, device=device)
     make = torch.empty if num else torch.zeros
     counts = make(num + 1, dtype=torch.int64, device=device)
-    # see ``_span``: [1 + _KEPT, num], which could have too long strides for Warp
+    # holds [1 + _KEPT, num] words of ``_span``; Warp has no strides of 2^31 bytes
     spans = order.new_empty(num, 1 + _KEPT)
     splats = as_struct(projected)
     inputs = [grid, splats, nearest.view(-1)]

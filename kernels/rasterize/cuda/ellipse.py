@@ -1,7 +1,7 @@
-"""The ellipse of a Gaussian, and which tiles it touches: row by row, an exact interval of columns.
+"""The ellipse of a Gaussian and the tiles that it touches: an exact interval of columns a row.
 
-README.md §2 proves the test. Functions on CUDA are approximate to about 2^-22, which the slack of
-the limit covers.
+README.md §2 proves the test. On CUDA roots, reciprocals and logarithms are off by about 2^-22,
+which the slack of the limit covers.
 """
 
 from typing import no_type_check
@@ -78,7 +78,7 @@ def _box_columns(grid: Grid, x: wp.float32, extent: wp.float32) -> wp.vec2i:
 @wp.func
 @no_type_check
 def tile_rows(grid: Grid, ellipse: Ellipse) -> wp.vec2i:
-    # first and last row to ask ``tile_columns`` about; first > last: none
+    # first and last row that may have columns; first > last: none
     if (grid.skip & TILE_TEST) == 0:
         return _box_rows(grid, ellipse.mean[1], ellipse.box[1])
     y, reach = ellipse.mean[1], ellipse.reach

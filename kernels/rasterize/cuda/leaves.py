@@ -4,12 +4,13 @@ import warp as wp
 
 from ...runtime.scalars import anew as anew
 from ...runtime.scalars import exp2 as exp2
+from ...runtime.scalars import reciprocal as reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
 
 def _approximate(instruction: str, on_cpu: str) -> str:
-    # the tests run the lists' kernels on a CPU as well
+    # the tests run kernels for tile lists on a CPU too
     return f"""
 #ifdef __CUDA_ARCH__
     float y; asm("{instruction}.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x)); return y;
@@ -22,12 +23,6 @@ def _approximate(instruction: str, on_cpu: str) -> str:
 @wp.func_native(_approximate("sqrt", "sqrtf(x)"))
 def root(x: wp.float32) -> wp.float32:
     """The square root, to 2 units in the last place."""
-    ...
-
-
-@wp.func_native(_approximate("rcp", "1.0f / x"))
-def reciprocal(x: wp.float32) -> wp.float32:
-    """1/x, to 1 unit in the last place."""
     ...
 
 
