@@ -14,7 +14,16 @@ import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from .gltf_file import INSTANCING, PACKED, Entry, GltfFile, Index, normalised, open_gltf
+from .gltf_file import (
+    INSTANCING,
+    MAX_PRIMITIVES,
+    PACKED,
+    Entry,
+    GltfFile,
+    Index,
+    normalised,
+    open_gltf,
+)
 from .headers import open_shape
 from .materials import Material, SideFiles, plain, to_display
 from .parts import Part, to_rgba8
@@ -22,6 +31,9 @@ from .parts import Part, to_rgba8
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _OTHERS = {0: "points", 1: "lines", 2: "a line loop", 3: "a line strip"}
 _REPEAT = 10497
+_FREE_PRIMITIVES, _PRIMITIVE = 1000, 500  # in any file; bytes of each further one and its accessors
+_GLOSSY = 4 << 20  # largest picture of an older material in memory, bytes
+_EACH = 3  # numbers that a vertex or a face of the scene counts as
 _Weights = tuple[float, ...]
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 _GLOSS = "KHR_materials_pbrSpecularGlossiness"
@@ -51,47 +63,66 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
     scenes = len(file.document.entries("scenes"))
     if scenes > 1:
         sides.omit(f"one of {scenes} scenes is read")
-    reader, known = _Reader(file, sides), {}
-    nodes = file.placed_nodes()
+    reader, nodes = _Reader(file, sides), file.placed_nodes()
     matrices = {index: matrix for _, index, matrix in nodes}
+    poses: dict[tuple[int, int | None, _Weights], list[np.ndarray]] = {}  # of meshes
     for node, _, matrix in nodes:
-        index, skin = node.get("mesh", Index), node.get("skin", Index)
-        if index is None:
+        if (index := node.get("mesh", Index)) is None:
             continue
-        mesh, poses = file.item("meshes", index), matrix @ file.instances(node)
-        weights = node.get("weights", _Weights, mesh.get("weights", _Weights, ()))
-        for number, primitive in enumerate(mesh.entries("primitives")):
-            key = index, number, weights
-            if key not in known:
-                known[key] = reader.triangles(primitive, weights)
-            if known[key] is None:
+        skin, placed = node.get("skin", Index), matrix @ file.instances(node)
+        if skin is not None and len(placed) > 1:
+            sides.omit(f"instances of a skinned mesh ({INSTANCING}) are not read")
+        key = index, skin, node.get("weights", _Weights, ())
+        poses.setdefault(key, []).append(placed)
+    meshes = {index: file.item("meshes", index) for index, _, _ in poses}
+    primitives = {index: mesh.entries("primitives") for index, mesh in meshes.items()}
+    most = min(MAX_PRIMITIVES, _FREE_PRIMITIVES + file.size // _PRIMITIVE)
+    if sum(len(primitives[index]) for index, _, _ in poses) > most:
+        raise UserError(f"{path}: over {most} primitives, too many for its {file.size} bytes")
+    for (index, skin, weights), placed in poses.items():
+        for primitive in primitives[index]:
+            weights = weights or meshes[index].get("weights", _Weights, ())
+            part, used = reader.triangles(primitive, weights)
+            if part is None or used is None:
                 continue
-            if skin is None or "JOINTS_0" not in primitive.entry("attributes").values:
-                yield from (_moved(known[key], pose) for pose in poses)
-                continue
-            if len(poses) > 1:
-                sides.omit(f"instances of a skinned mesh ({INSTANCING}) are not read")
-            yield _moved(known[key], reader.pose(skin, primitive, matrices))
+            at = np.concatenate(placed)
+            if skin is not None and "JOINTS_0" in primitive.entry("attributes").values:
+                at = reader.pose(skin, primitive, matrices, used)[None]
+            file.count(len(at) * _EACH * (len(part.vertices) + len(part.faces)))
+            yield _placed(part, at)
 
 
 class _Reader:
     def __init__(self, file: GltfFile, sides: SideFiles) -> None:
         self.file, self.sides, self.warn = file, sides, sides.warnings.append
         self._looks: dict[int, tuple[Material, Entry]] = {}
+        self._pictures: dict[int, np.ndarray | None] = {}
 
-    def triangles(self, primitive: Entry, weights: _Weights) -> Part | None:
+    def triangles(
+        self, primitive: Entry, weights: _Weights
+    ) -> tuple[Part, np.ndarray] | tuple[None, None]:
         """Return a primitive with its morph targets in its own frame, attributes by vertex.
 
-        None, and a warning, without triangles.
+        Beside it a mask of the vertices of its accessors that it has; both None, and a warning,
+        without triangles.
         """
         mode, given = primitive.get("mode", int, _TRIANGLES), primitive.entry("attributes")
         if mode in _OTHERS:
             self.sides.omit(f"{_OTHERS[mode]} beside the triangles are left out")
-            return None
+            return None, None
         if "POSITION" not in given.values:
             self.sides.omit("a primitive without POSITION is left out")
-            return None
-        count = self.file.item("accessors", given.need("POSITION", Index)).need("count", Index)
+            return None, None
+        count = len(self.file.values(given.need("POSITION", Index)))
+        indices = np.arange(count)
+        if "indices" in primitive.values:
+            indices = self.file.values(primitive.need("indices", Index))[:, 0].astype(np.int64)
+        if len(indices) and not 0 <= indices.min() <= indices.max() < count:
+            raise UserError(f"{self.file.path}: a face names vertex {indices.max()} of {count}")
+        faces = _faces(self.file.path, indices, mode)
+        used = np.zeros(count, bool)  # primitives may share the vertices of a large mesh
+        used[faces] = True
+        faces = (np.cumsum(used) - 1)[faces]
 
         def attribute(name: str, *widths: int) -> np.ndarray | None:
             if name not in given.values:
@@ -100,22 +131,19 @@ class _Reader:
             if base.shape[1] not in widths or len(base) != count:
                 self.warn(f"{name} of {len(base)} x {base.shape[1]} numbers is left out")
                 return None
+            shape, base = base.shape, base[used]
             for weight, target in zip(weights, primitive.entries("targets")):
                 if weight and name in target.values:
                     moves = self.file.values(target.need(name, Index))
-                    if moves.shape != base.shape:
+                    if moves.shape != shape:
                         raise UserError(f"{self.file.path}: a morph target of another shape")
-                    base = base + weight * moves.astype(np.float64)
+                    self.file.count(base.size)
+                    base = base + weight * moves[used].astype(np.float64)
             return base
 
         vertices = attribute("POSITION", 3)
         if vertices is None:
             raise UserError(f"{self.file.path}: vertices are not of 3 numbers")
-        indices = np.arange(count)
-        if "indices" in primitive.values:
-            indices = self.file.values(primitive.need("indices", Index))[:, 0].astype(np.int64)
-        if len(indices) and not 0 <= indices.min() <= indices.max() < count:
-            raise UserError(f"{self.file.path}: a face names vertex {indices.max()} of {count}")
         material, opaque, uvs = None, True, None
         if (index := primitive.get("material", Index)) is not None:
             look = self.file.item("materials", index)
@@ -129,8 +157,8 @@ class _Reader:
             colors = np.clip(np.nan_to_num(normalised(colors)), 0, 1)
             alpha = colors[:, :0] if opaque else colors[:, 3:]
             colors = to_rgba8(np.hstack([to_display(colors[:, :3]), alpha]))
-        faces, normals = _faces(self.file.path, indices, mode), attribute("NORMAL", 3)
-        return Part(vertices.astype(np.float64), faces, material, normals, uvs, colors)
+        normals = attribute("NORMAL", 3)
+        return Part(vertices.astype(np.float64), faces, material, normals, uvs, colors), used
 
     def uvs(self, attribute, info: Entry) -> np.ndarray | None:
         """Return the coordinates ``[V, 2]`` of a texture, v upwards; None without any."""
@@ -180,7 +208,10 @@ class _Reader:
             if texture is None:
                 color[3] = shown
             else:
-                color[3], texture[..., 3] = 1.0, np.where(shown, 255, 0)
+                color[3], alpha = 1.0, np.where(shown, 255, 0).astype(np.uint8)
+                if (alpha != texture[..., 3]).any():
+                    kept = self.sides.claim(texture.nbytes, "a picture without its transparency")
+                    texture = np.dstack([texture[..., :3], alpha]) if kept else None
         return Material(plain(color), texture), info
 
     def glossy(self, gloss: Entry) -> tuple[np.ndarray, np.ndarray | None, Entry]:
@@ -189,11 +220,15 @@ class _Reader:
 
         names = ("diffuseTexture", "specularGlossinessTexture")
         pictures = [(name, self.texture(gloss.entry(name))) for name in names]
+        # Some .7 s for two pictures of 1,024 pixels: they are made smaller, and count more.
+        size = sum(min(x.nbytes, _GLOSSY) for _, x in pictures if x is not None)
+        if not self.sides.claim(6 * size, "glossy pictures"):
+            pictures = [(name, None) for name in names]
         found = specular_to_pbr(
             diffuseFactor=gloss.vector("diffuseFactor", _WHITE),
             specularFactor=gloss.vector("specularFactor", _WHITE[:3]),
             glossinessFactor=gloss.get("glossinessFactor", float, 1.0),
-            **{name: x if x is None else Image.fromarray(x) for name, x in pictures},
+            **{name: x if x is None else _smaller(x) for name, x in pictures},
         )
         texture = found.get("baseColorTexture")
         texture = None if texture is None else np.array(texture.convert("RGBA"))
@@ -211,18 +246,27 @@ class _Reader:
             if source is None:
                 names = ", ".join(x for x in self.file.extensions if x in _PICTURES) or "nothing"
                 raise UserError(f"a texture's picture is named by {names}, which is not read")
-            image, name = self.file.item("images", source), f"image {source}"
-            if (view := image.get("bufferView", Index)) is not None:
-                return self.sides.texture(self.file.view(view), name)
-            uri = image.get("uri", str, "")
-            name = name if uri.startswith("data:") else unquote(uri[:100])
-            return self.sides.texture(self.file.content(uri), name)
+            if source not in self._pictures:
+                self._pictures[source] = None
+                self._pictures[source] = self.picture(source)
+            return self._pictures[source]
         except UserError as error:
             self.warn(str(error))
             return None
 
-    def pose(self, index: int, primitive: Entry, matrices: dict[int, np.ndarray]) -> np.ndarray:
-        """Return ``[V, 4, 4]``, matrices of a skinned primitive's vertices in the scene."""
+    def picture(self, source: int) -> np.ndarray | None:
+        """Return an image as ``SideFiles.texture`` does."""
+        image, name = self.file.item("images", source), f"image {source}"
+        if (view := image.get("bufferView", Index)) is not None:
+            return self.sides.texture(self.file.view(view), name)
+        uri = image.get("uri", str, "")
+        name = name if uri.startswith("data:") else unquote(uri[:100])
+        return self.sides.texture(self.file.content(uri), name)
+
+    def pose(
+        self, index: int, primitive: Entry, matrices: dict[int, np.ndarray], used: np.ndarray
+    ) -> np.ndarray:
+        """Return ``[V, 4, 4]``, matrices of a skinned primitive's used vertices in the scene."""
         skin, path = self.file.item("skins", index), self.file.path
         chain, given = skin.need("joints", list[Index]), primitive.entry("attributes")
         if not chain or not matrices.keys() >= {*chain}:
@@ -234,22 +278,31 @@ class _Reader:
             if inverse.shape[1] != 16 or len(inverse) < len(joints):
                 raise UserError(f"{path}: skin {index} has no matrix for each joint")
             joints = joints @ inverse[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
-        count = len(self.file.values(given.need("POSITION", Index)))
+        count = np.count_nonzero(used)
         total, sums, number = np.zeros((count, 4, 4)), np.zeros((count, 1, 1)), 0
         while f"JOINTS_{number}" in given.values:
             chosen, weights = (
                 self.file.values(given.need(f"{name}_{number}", Index))
                 for name in ("JOINTS", "WEIGHTS")
             )
-            same = chosen.shape == weights.shape == (count, 4)
+            same = chosen.shape == weights.shape == (len(used), 4)
             if not same or chosen.max(initial=0) >= len(joints):
                 raise UserError(f"{path}: JOINTS_{number} or WEIGHTS_{number} is false")
+            chosen, weights = chosen[used], weights[used]
             for column in range(4):
                 weight = weights[:, column, None, None]
                 total += weight * joints[chosen[:, column].astype(np.int64)]
                 sums += weight
             number += 1
         return np.where(sums == 0, joints[0], total / np.where(sums == 0, 1, sums))
+
+
+def _smaller(texture: np.ndarray) -> Image.Image:
+    """Return a picture of at most ``_GLOSSY`` bytes."""
+    image = Image.fromarray(texture)
+    while 4 * image.width * image.height > _GLOSSY:
+        image = image.reduce(2)
+    return image
 
 
 def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
@@ -267,17 +320,27 @@ def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
     return faces[(faces != np.roll(faces, 1, 1)).all(1)]  # strips are joined by faces without area
 
 
-def _moved(part: Part, matrix: np.ndarray) -> Part:
-    """Move a part by a matrix ``[4, 4]``, or one of each vertex; attributes become corners'."""
-    turn, faces, normals = matrix[..., :3, :3], part.faces, part.normals
-    vertices = (turn @ part.vertices[..., None])[..., 0] + matrix[..., :3, 3]
-    if normals is not None and matrix.ndim == 2:
-        normals = normals @ np.linalg.pinv(turn if np.isfinite(turn).all() else np.eye(3))
-    elif normals is not None:
-        normals = (turn @ normals[..., None])[..., 0]
-    if np.nansum(np.linalg.det(turn)) < 0:  # a mirrored face has its front behind
-        faces = faces[:, ::-1]
-    normals, uvs, colors = (
-        None if x is None else x[faces] for x in (normals, part.uvs, part.colors)
-    )
+def _placed(part: Part, poses: np.ndarray) -> Part:
+    """Place a part at each of ``poses [N, 4, 4]``, or once by its vertices' own ``[1, V, 4, 4]``.
+
+    The attributes become those of corners.
+    """
+    turns, moves, normals = poses[..., :3, :3], poses[..., :3, 3], part.normals
+    if poses.ndim == 3:
+        vertices = part.vertices @ turns.transpose(0, 2, 1) + moves[:, None]
+        if normals is not None:
+            finite = np.isfinite(turns).all((1, 2), keepdims=True)
+            normals = normals @ np.linalg.pinv(np.where(finite, turns, np.eye(3)))
+    else:
+        vertices = (turns @ part.vertices[..., None])[..., 0] + moves
+        if normals is not None:
+            normals = (turns @ normals[..., None])[..., 0]
+    signs = np.linalg.det(turns)
+    mirrored = (np.nansum(signs.reshape(len(signs), -1), 1) < 0)[:, None, None]
+    local = np.where(mirrored, part.faces[:, ::-1], part.faces)  # its front would be its back
+    faces = (local + len(part.vertices) * np.arange(len(poses))[:, None, None]).reshape(-1, 3)
+    uvs, colors = (None if x is None else x[local.reshape(-1, 3)] for x in (part.uvs, part.colors))
+    if normals is not None:
+        normals = normals.reshape(-1, 3)[faces]
+    vertices = vertices.reshape(-1, 3)
     return replace(part, vertices=vertices, faces=faces, normals=normals, uvs=uvs, colors=colors)

@@ -21,8 +21,11 @@ from ..errors import UserError
 from ..untrusted.documents import parse_document
 from .headers import MAX_FILE, compare_sizes
 
-MAX_ZEROS = 1 << 24  # bytes of an accessor without bytes in the file
-MAX_NODES = 200_000  # of a scene, and instances of its meshes
+MAX_NODES = 200_000  # of a scene, each way to a node counted, and instances of its meshes
+MAX_PRIMITIVES = 20_000  # in a scene
+# Numbers that a file may mean, in its accessors and in the vertices and faces of its scene: values
+# without bytes, shared accessors and instances let a few bytes stand for any number of them.
+FREE_NUMBERS, NUMBERS_PER_BYTE = 3_000_000, 8
 # Extensions that pack triangles; a reader without them sees zeros.
 PACKED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 INSTANCING = "EXT_mesh_gpu_instancing"
@@ -87,9 +90,19 @@ class GltfFile:
     extensions: list[str]  # names of all extensions anywhere in the document
     binary: bytes | None  # the binary chunk of a .glb
     side_file: Callable[[str], bytes]  # reads the file of a URI
+    size: int  # bytes, with those of the files beside it that were read
+    _numbers: int = 0
     _buffers: dict[int, bytes] = field(default_factory=dict)
     _lists: dict[str, list[Entry]] = field(default_factory=dict)
-    _instances: int = 0
+    _values: dict[int, np.ndarray] = field(default_factory=dict)
+
+    def count(self, numbers: int) -> None:
+        """Add to the numbers of the scene; raise UserError if the file is too small for them."""
+        self._numbers += numbers
+        if self._numbers > FREE_NUMBERS + NUMBERS_PER_BYTE * self.size:
+            raise UserError(
+                f"{self.path}: its {self.size} bytes stand for over {self._numbers} numbers"
+            )
 
     def item(self, what: str, index: int) -> Entry:
         """Return an entry of one of the document's lists."""
@@ -103,7 +116,9 @@ class GltfFile:
     def content(self, uri: str) -> bytes:
         """Return the bytes of a data URI, or of the file of another one."""
         if not uri.startswith("data:"):
-            return self.side_file(uri)
+            found = self.side_file(uri)
+            self.size += len(found)
+            return found
         head, _, data = uri.partition(",")
         try:
             return base64.b64decode(data) if head.endswith(";base64") else unquote_to_bytes(data)
@@ -144,15 +159,19 @@ class GltfFile:
 
     def values(self, index: int) -> np.ndarray:
         """Return the numbers of an accessor, ``[N, C]``, as stored; float64 if normalised."""
+        if index not in self._values:
+            self._values[index] = self._read_values(index)
+        return self._values[index]
+
+    def _read_values(self, index: int) -> np.ndarray:
         accessor = self.item("accessors", index)
         kind, says = np.dtype(_KINDS[accessor.need("componentType", _Kind)]), f"accessor {index}"
         shape = accessor.need("count", Index), _WIDTHS[accessor.need("type", _Width)]
+        self.count(shape[0] * shape[1])
         sparse = accessor.entry("sparse")
         if accessor.get("bufferView", Index) is None:
             if not sparse.values:
                 self.refuse_packed()
-            wanted = kind.itemsize * shape[0] * shape[1]
-            compare_sizes(self.path, f"{shape[0]} values of {says}", wanted, MAX_ZEROS, exact=False)
             rows = np.zeros(shape, kind)
         else:
             rows = self._rows(accessor, kind, shape, says)
@@ -185,23 +204,43 @@ class GltfFile:
             nodes = self.document.entries("nodes")
             inner = {child for node in nodes for child in node.get("children", kind, [])}
             roots = [index for index in range(len(nodes)) if index not in inner]
+        own = self._own_nodes(roots)
         found: list[tuple[Entry, int, np.ndarray]] = []
         left = [(root, np.eye(4), 0) for root in reversed(roots)]
-        most = len(self.document.entries("nodes"))  # a longer way has a node twice
+        most = min(MAX_NODES, 8 * len(own))
         while left:
             index, above, depth = left.pop()
-            if len(found) + len(left) >= MAX_NODES or depth > most:
-                raise UserError(f"{self.path}: over {MAX_NODES} nodes, or nodes in a circle")
-            node = self.item("nodes", index)
-            if node.values.get("matrix") is None:
-                matrix = _matrices(*(node.vector(*item)[None] for item in _IDENTITY.items()))[0]
-            else:
-                matrix = node.vector("matrix", range(16)).reshape(4, 4).T
+            # A longer way has a node twice.
+            if len(found) + len(left) > most or depth > len(own):
+                raise UserError(f"{self.path}: nodes in a circle, or shared in over {most} places")
+            node, children, matrix = own[index]
             matrix = above @ matrix
             found.append((node, index, matrix))
-            children = node.get("children", kind, [])
             left += [(child, matrix, depth + 1) for child in reversed(children)]
         return found
+
+    def _own_nodes(self, roots: list[int]) -> dict[int, tuple[Entry, list[int], np.ndarray]]:
+        """Return each node under the roots with its children and its own matrix, by index."""
+        nodes, children, left = {}, {}, [*roots]
+        moves, matrices = {name: [] for name in _IDENTITY}, {}
+        while left:
+            index = left.pop()
+            if index in nodes:
+                continue
+            if len(nodes) >= MAX_NODES:
+                raise UserError(f"{self.path}: over {MAX_NODES} nodes")
+            nodes[index] = node = self.item("nodes", index)
+            children[index] = node.get("children", list[Index], [])
+            left += children[index]
+            if node.values.get("matrix") is not None:
+                matrices[index] = node.vector("matrix", range(16)).reshape(4, 4).T
+            for name, default in _IDENTITY.items():
+                given = index not in matrices and node.values.get(name) is not None
+                moves[name].append(node.vector(name, default) if given else default)
+        if nodes:
+            made = _matrices(*(np.array(moves[name], np.float64) for name in _IDENTITY))
+            matrices = dict(zip(nodes, made)) | matrices
+        return {index: (node, children[index], matrices[index]) for index, node in nodes.items()}
 
     def instances(self, node: Entry) -> np.ndarray:
         """Return the matrices ``[N, 4, 4]`` of the instances of a node's mesh in the node's frame.
@@ -221,9 +260,7 @@ class GltfFile:
                 raise UserError(f"{given.where}: {len(rows)} x {rows.shape[1]} numbers {name}")
             pose.append(rows.astype(np.float64))
         count = counts.pop() if counts else 1
-        self._instances += count
-        if self._instances > MAX_NODES:
-            raise UserError(f"{self.path}: over {MAX_NODES} instances of meshes")
+        self.count(16 * count)
         return _matrices(*(np.broadcast_to(rows, (count, rows.shape[1])) for rows in pose))
 
 
@@ -274,7 +311,7 @@ def open_gltf(
     needed = document.get("extensionsRequired", list[str], [])
     names = [name.decode("ascii", "replace") for name in _EXTENSION.findall(text)]
     names = dict.fromkeys([*document.get("extensionsUsed", list[str], []), *needed, *names])
-    gltf = GltfFile(path, document, list(names), binary, side_file)
+    gltf = GltfFile(path, document, list(names), binary, side_file, size)
     if {*PACKED} & {*needed}:
         gltf.refuse_packed()
     return gltf

@@ -23,6 +23,8 @@ GREY = 0.6  # display value of a surface whose colour is not known
 MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
 MAX_SIDE_FILE = 256 << 20  # bytes of a file beside the mesh
 MAX_SIDE_FILES = 1 << 30  # bytes of all of them, and of all textures in memory
+# Bytes to which the pictures of a mesh may be decoded: a plain one has few bytes in its file.
+FREE_PIXELS, PIXELS_PER_BYTE = 192 << 20, 64
 _UNSEEN = 8  # of 255: the alpha channel of a texture without a larger alpha is ignored
 # Options of MTL stand before the name: "-s 1 1 1 -clamp on wood.jpg".
 _OPTIONS = re.compile(r"^(-\w+\s+(([-+.\d]+|on|off|[rgbmlz])\s+)+)+")
@@ -71,6 +73,7 @@ class SideFiles:
     omitted: list[str] = field(default_factory=list)  # the warnings that concern the shape
     left: int = MAX_SIDE_FILES  # bytes that side files may still have
     texels: int = MAX_SIDE_FILES  # bytes that textures may still take
+    pixels: int = FREE_PIXELS  # bytes to which pictures may still be decoded
 
     def omit(self, what: str) -> None:
         """Warn of unread content that changes the shape."""
@@ -85,6 +88,13 @@ class SideFiles:
         data = read_bytes(file, min(MAX_SIDE_FILE, max(self.left, 0)))
         self.left -= len(data)
         return data
+
+    def claim(self, size: int, name: str) -> bool:
+        """Count ``size`` bytes of pixels; False, and a warning, if there are too many."""
+        self.pixels -= size
+        if self.pixels < 0:
+            self.warnings.append(f"{name}: too many pixels for the size of its file, left out")
+        return self.pixels >= 0
 
     def picture(self, name: str, profiled: bool = True) -> np.ndarray | None:
         """Return the picture that an MTL file names, as ``texture`` does."""
@@ -105,8 +115,11 @@ class SideFiles:
 
         Colour profiles are used if ``profiled``; glTF 2.0 ignores them (3.8.3, images).
         """
+        self.pixels += PIXELS_PER_BYTE * len(data)
         try:
             with open_picture(io.BytesIO(data), name) as image:
+                if not self.claim(4 * image.width * image.height, name):
+                    return None
                 pixels = to_rgba(image, name, profiled=profiled, warn=self.warnings.append)
         except UserError as error:
             self.warnings.append(str(error))
