@@ -2,7 +2,7 @@
 
 import sys
 
-from gamba_warp.cli import run
+from gamba_warp.cli import main
 
 KINDS = ("views", "geometry")
 
@@ -10,4 +10,4 @@ if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in KINDS:
         print(f"usage: python -m gamba_warp.eval {{{','.join(KINDS)}}} ...", file=sys.stderr)
         sys.exit(0 if sys.argv[1:2] in (["-h"], ["--help"]) else 2)
-    sys.exit(run(f"eval-{sys.argv[1]}", sys.argv[2:]))
+    main([f"eval-{sys.argv[1]}", *sys.argv[2:]])

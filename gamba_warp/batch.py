@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 from unicodedata import normalize
 
 from .errors import UserError, first_line, one_line
@@ -69,12 +69,12 @@ def progress_bar(
     """
     from tqdm import tqdm
 
-    stream = options.get("file") or sys.stderr
+    stream = _terminal(options.get("file") or sys.stderr)
     if lines and not (stream.isatty() or STAGES.quiet):
         form = options.get("bar_format", _LINE).replace("|{bar}|", "")
         options |= {"file": _Lines(stream), "disable": False, "bar_format": form}
     else:
-        options["disable"] = True if STAGES.quiet else None
+        options |= {"file": stream, "disable": True if STAGES.quiet else None}
     bar: Any = tqdm(items, **options)  # without items its type is unknown
     return bar
 
@@ -99,19 +99,22 @@ class _Lines:
         self._stream.flush()
 
 
-def say(line: str) -> None:
-    """Print a line about an item on stdout, above the progress bar of ``for_each``."""
+def _terminal(stream: Any) -> Any:
+    return getattr(stream, "terminal", stream)
+
+
+def say(line: str, stream: TextIO | None = None) -> None:
+    """Print a line on stdout, or on another stream, above the progress bars."""
     from tqdm import tqdm
 
-    tqdm.write(one_line(line))
+    with tqdm.external_write_mode(file=_terminal(sys.stderr)):
+        print(line, file=stream or sys.stdout)
 
 
 def warn(path: Path, lines: Iterable[str]) -> None:
     """Print warnings about a file on stderr, in one line above the bar, if there are any."""
-    from tqdm import tqdm
-
     if text := "; ".join(lines):
-        tqdm.write(one_line(f"warning: {path}: {text}"), file=sys.stderr)
+        say(one_line(f"warning: {path}: {text}"), sys.stderr)
 
 
 class Stages:

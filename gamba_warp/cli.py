@@ -15,11 +15,11 @@ from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_st
 from difflib import get_close_matches
 from functools import partial, wraps
 from itertools import dropwhile, takewhile
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TextIO, cast
 
 from .batch import STAGES
 from .devices import keep_memory, quiet_warp, share_cores, use_fastest_products
-from .errors import FileWarning, UserError
+from .errors import FileWarning, PrintableStream, UserError
 from .files import DISK_ERRORS
 from .usage import completions, help_text, read_words
 from .versions import MADE, SHAPES, __version__, advice, require
@@ -288,8 +288,10 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(stream, io.TextIOWrapper):  # file names need not be UTF-8
             stream.reconfigure(errors="backslashreplace")
     warnings.formatwarning = _format_warning
+    out, notes = PrintableStream(sys.stdout), PrintableStream(sys.stderr)
     try:
-        code = _main(arguments)
+        with redirect_stdout(cast(TextIO, out)), redirect_stderr(cast(TextIO, notes)):
+            code = _main(arguments)
         sys.stdout.flush()
     except OSError as error:  # Python would fail again when it flushes at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

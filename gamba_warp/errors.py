@@ -1,4 +1,6 @@
-"""Exception and warning for faults of the input rather than the program."""
+"""Exception and warning for faults of the input rather than the program, and their texts."""
+
+from typing import Any, TextIO
 
 MOST_LETTERS = 600  # of a message; the longest of the program, a model's fields, takes 450
 
@@ -29,9 +31,39 @@ def one_line(text: str, most: int = MOST_LETTERS) -> str:
     line = " ".join(part.strip() for part in text.strip().splitlines())
     if len(line) > 2 * most:  # before the escapes, which may take long
         line = f"{line[:most]}{line[-most:]}"
-    if not line.isprintable():
-        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    line = printable(line)
     if len(line) > most:
         head = 2 * most // 3
         line = f"{line[:head]} ... {line[head + 5 - most :]}"
     return line
+
+
+def printable(text: str) -> str:
+    """Return the text with escapes for characters that a terminal obeys, such as ESC and U+202E.
+
+    Line ends and tabs stay.
+    """
+    if text.isascii() and text.isprintable():  # the most frequent case
+        return text
+    return "".join(
+        c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text
+    )
+
+
+class PrintableStream:
+    """Text stream that escapes what is written by ``printable``; file names may hold anything.
+
+    Attributes:
+        terminal: the stream below, for progress bars, which move its cursor.
+    """
+
+    def __init__(self, terminal: TextIO) -> None:
+        self.terminal = terminal
+
+    def write(self, text: str) -> int:
+        """Write the escaped text; return the number of letters of the text."""
+        self.terminal.write(printable(text))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.terminal, name)

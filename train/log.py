@@ -20,6 +20,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gamba_warp.batch import progress_bar
+from gamba_warp.batch import say as above_bars
 from gamba_warp.errors import UserError
 from gamba_warp.files import reason_of
 from gamba_warp.images import save_image, to_uint8
@@ -132,7 +133,7 @@ def say(text: str, file: TextIO | None = None) -> None:
     A closed terminal (SIGHUP) and a full disk under the standard output raise OSError.
     """
     with suppress(OSError):
-        tqdm.write(text, file or sys.stdout)
+        above_bars(text, file)
         (file or sys.stdout).flush()
 
 

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
-from gamba_warp.batch import check_not_read, progress_bar
+from gamba_warp.batch import check_not_read, progress_bar, say
 from gamba_warp.conventions import GREY, WHITE
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import ViewDataset, background_note, open_dataset
@@ -386,11 +385,11 @@ def print_lpips_time(job: Job, candidates: Mapping[str, Shown], truth: Truth, lp
     if whole < LONG:
         return
     height, width = truth.rgb.shape[1:3]
-    tqdm.write(
+    say(
         f"LPIPS: {each:.2g} s a picture of {width} x {height}, {pictures} pictures an object: "
         f"about {_duration(one)} an object and {_duration(whole)} for all {len(job.uids)}; "
         "--no-lpips leaves it out",
-        file=sys.stderr,
+        sys.stderr,
     )
 
 

@@ -80,7 +80,7 @@ def ablate_command(
     from msgspec.structs import replace
     from tqdm import tqdm
 
-    from ..batch import check_not_read, progress_bar
+    from ..batch import check_not_read, progress_bar, say
     from ..files import only_process, output_folder, write_options
     from ..kernels.runtime.system import cores
     from ..untrusted.children import Failed, end_idle, run_each
@@ -152,7 +152,7 @@ def ablate_command(
         with progress_bar(total=len(tasks), initial=len(tasks) - len(todo), unit="run") as bar:
 
             def on_end(task: Task) -> None:
-                tqdm.write(row_line(task), sys.stdout)
+                say(row_line(task))
                 sys.stdout.flush()
                 bar.update()
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ..batch import for_each, plan_outputs, report
+from ..batch import for_each, plan_outputs, report, say
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -72,8 +72,6 @@ def export_command(
             zero), and print their number; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from tqdm import tqdm
-
     from ..pages.export import ExportJob, export, find_gaussians
     from ..trajectories.paths import Viewpoint
 
@@ -105,7 +103,7 @@ def export_command(
     output_folder(files.out)
 
     def one(name: str, path: Path) -> None:
-        tqdm.write(export(name, path, job))
+        say(export(name, path, job))
 
     for_each(names, one, "export", "file", failures)
     return report(len(found), "file", failures, files.out)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from tqdm import tqdm
 
 from ..batch import STAGES, say, warn
 from ..data.preprocess import composite
@@ -337,7 +336,7 @@ def write_outputs(
     comments = [f"from {name} by {outputs.checkpoint.name}"]
     lost, turn = outputs.write(gaussians, None, view, section, device, comments)
     for line in lost:
-        tqdm.write(line)
+        say(line)
     if outputs.sheet is not None:
         outputs.sheet.add(name, cut.rgba, gaussians, view)
     if outputs.options.page and turn is not None:
