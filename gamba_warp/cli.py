@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import io
 import os
@@ -257,7 +258,8 @@ def _user_message(error: Exception, command: str) -> str | None:
     exhausted = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
     if isinstance(error, MemoryError) or exhausted:
         return f"not enough memory ({text[:200]})" if text else "not enough memory"
-    if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK_ERRORS):
+    known = {*DISK_ERRORS, errno.EMFILE, errno.ENFILE}
+    if isinstance(error, OSError) and (error.filename is not None or error.errno in known):
         where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return f"{where}{error.strerror or text}"
     if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":

@@ -96,14 +96,16 @@ def expand(arguments: list[str]) -> list[str]:
     if helped:
         print(table_of(name) + "\n")
         return rest
-    # DATA may come first or last beside a recipe, and first beside --config.
+    # DATA may come first, last beside a recipe, and after the one value of --config.
     first = rest[:1] if rest and not rest[0].startswith("-") else []
     if chosen == "--recipe":
         taken = recipe_words(name, rest, os.environ)
         announce(taken)
         return [*first, *taken, *rest[len(first) :]]
-    first = first if at else []
     data, *taken = _options_of(Path(name))
+    if not first and rest[at : at + 1] and not rest[at].startswith("-"):
+        first = [rest.pop(at)]
+        return [*first, *taken, *rest]
     return [*(first or [data]), *taken, *rest[len(first) :]]
 
 

@@ -164,7 +164,7 @@ class Guard:
         request, path, visitor = Request(scope, receive), scope["path"], scope[VISITOR]
         read, answer = receive, self._app
         try:
-            if is_foreign(request.headers.items()):
+            if is_foreign(request.method, request.headers.items()):
                 raise HTTPException(421, "only this page itself may ask, at 127.0.0.1")
             if visitor and at_once > MAX_AT_ONCE:
                 raise HTTPException(503, "too many requests at once; try again")

@@ -18,7 +18,7 @@ READ_SECONDS = 10.0  # time limit of reading a request, and of sending each piec
 PIECE = 1 << 16  # bytes
 
 
-def is_foreign(headers: Iterable[tuple[str, str]]) -> bool:
+def is_foreign(method: str, headers: Iterable[tuple[str, str]]) -> bool:
     """Return True if a request to a server on 127.0.0.1 is neither of its page nor of the user.
 
     Another web page in the same browser can send requests there, and even read the answers by
@@ -26,6 +26,7 @@ def is_foreign(headers: Iterable[tuple[str, str]]) -> bool:
     each of which comes once.
 
     Args:
+        method: of the request, such as GET.
         headers: all of the request, by name.
     """
     found: dict[str, str] = {}
@@ -39,7 +40,8 @@ def is_foreign(headers: Iterable[tuple[str, str]]) -> bool:
         return True
     if found.get("origin") not in (None, f"http://{host}"):
         return True
-    followed = found.get("sec-fetch-mode") == "navigate"  # a link, whose page sees no answer
+    # The page of a link sees no answer; a form of another page, without an Origin, would act.
+    followed = found.get("sec-fetch-mode") == "navigate" and method in ("GET", "HEAD")
     return not followed and site not in (None, "none", "same-origin")
 
 
@@ -116,7 +118,7 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
 
         def do_GET(self) -> None:
             self.reading.cancel()
-            if is_foreign(self.headers.items()):
+            if is_foreign("GET", self.headers.items()):
                 self.send_error(421)
                 return
             if self.path != "/":

@@ -496,6 +496,7 @@ def test_a_value_out_of_its_range_is_one_line_before_anything_starts(
         (RuntimeError("DefaultCPUAllocator: can't allocate memory:\n9 bytes"), "not enough memory"),
         (FileNotFoundError(2, "No such file or directory", "a.txt"), "a.txt: No such file"),
         (OSError(28, "No space left on device"), "No space left on device"),
+        (OSError(24, "Too many open files"), "Too many open files"),
         (UnicodeEncodeError("utf-8", "caf\udce9", 3, 4, "surrogates not allowed"), "not UTF-8"),
         (UserError("two\nlines"), "two lines\n"),
         (KeyboardInterrupt(), "interrupted\n"),

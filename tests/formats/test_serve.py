@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from gamba_warp.pages import serve
+from gamba_warp.pages.serve import is_foreign
 
 
 @pytest.fixture
@@ -100,3 +101,12 @@ def test_its_own_names_and_links_to_it_are_answered(address, host):
     assert status(address, host) == 200
     followed = "Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate"
     assert status(address, host, *followed) == 200
+
+
+@pytest.mark.parametrize("method, foreign", [("GET", False), ("HEAD", False), ("POST", True)])
+def test_a_form_of_another_page_is_refused(method, foreign):
+    """A browser may send a form of another page without an Origin; a link only asks."""
+    headers = {"Host": "127.0.0.1:9", "Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+    assert is_foreign(method, headers.items()) == foreign
+    own = headers | {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1:9"}
+    assert not is_foreign(method, own.items())

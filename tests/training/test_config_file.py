@@ -39,6 +39,9 @@ def test_data_may_be_another(tmp_path):
     assert expand(["--config", str(path)]) == ["here", *want]
     assert expand(["there", "--config", str(path), "--lr", "1"]) == ["there", *want, "--lr", "1"]
     assert expand(["--lr", "1", "--config", str(path)]) == ["here", *want, "--lr", "1"]
+    for before in ([], ["--lr", "1"]):  # the word after the file is DATA, no value of an option
+        given = expand([*before, "--config", str(path), "there", "--steps", "2"])
+        assert given == ["there", *want, *before, "--steps", "2"]
     assert expand(["there", "--steps", "3"]) == ["there", "--steps", "3"]
 
 
