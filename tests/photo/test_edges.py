@@ -5,7 +5,7 @@ import pytest
 
 from gamba_warp.images import save_image
 from gamba_warp.photo.cutout import Ways, cut_out
-from gamba_warp.photo.edges import without_matte
+from gamba_warp.photo.edges import without_background, without_matte
 
 SIZE = (61, 83)
 
@@ -48,6 +48,33 @@ def test_white_and_black_go(name, background, color):
 def test_other_edges_stay(picture):
     found, which = without_matte(picture)
     assert which is None and found is picture
+
+
+def test_solid_pixels_keep_their_colours():
+    """Nearly opaque ones too, whose alpha has one step of 8 bits."""
+    clean = disc((0.5, 0.0, 0.1))
+    clean[20:30, 35:45, 3] = 254 / 255
+    given = mixed(clean, 1.0)
+    found, which = without_matte(given)
+    solid = given[..., 3] == 1
+    assert which == "white" and (found[solid] == given[solid]).all()
+    almost = given[..., 3] == np.float32(254 / 255)
+    np.testing.assert_allclose(found[almost], clean[almost], atol=1e-5)
+
+
+@pytest.mark.parametrize("count, expected", [(19, None), (20, "white")])
+def test_few_pixels_of_an_edge_say_nothing(count, expected):
+    clean = np.zeros((*SIZE, 4), np.float32)
+    clean[10:20, 10:50] = 0.6, 0.1, 0.2, 1
+    clean[20, 10 : 10 + count] = 0.6, 0.1, 0.2, 0.5
+    assert without_matte(mixed(clean, 1.0))[1] == expected
+
+
+def test_a_photograph_keeps_the_colours_of_solid_pixels():
+    rgb = np.random.default_rng(1).random((*SIZE, 3)).astype(np.float32)
+    alpha = disc((0, 0, 0))[..., 3]
+    found = without_background(rgb, alpha)
+    assert (found[alpha == 1] == rgb[alpha == 1]).all()
 
 
 def test_a_picture_keeps_no_fringe_of_its_background(tmp_path):
