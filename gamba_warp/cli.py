@@ -64,7 +64,7 @@ COMMANDS = {
     "train": Command("Train a model on posed views.", "train", _METRICS, _MODEL, _TRAIN),
     "fit": Command("Posed views of an object to 3D Gaussians.", "fit", _METRICS, _MODEL),
     "data furniture": Command("Get 820 models.", "", (), (), _DATA),
-    "data made": Command("Make models: toys, shoes, tools, boxes.", "mesh", MADE, (), _DATA),
+    "data made": Command("Make models of random parts.", "mesh", MADE, (), _DATA),
     "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),
     "data pack": Command("Posed views to a few large files.", "", (), (), _DATA),
     "data fetch": Command(

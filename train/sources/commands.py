@@ -104,7 +104,7 @@ def data_furniture_command(out: Path, deb: Path | None = None, tree: Path | None
 def data_made_command(
     out: Path, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
 ) -> int:
-    """Make toys, animals, shoes, tools, packages, furniture, free of copyright (.glb).
+    """Make objects of random parts, free of copyright (.glb).
 
     An object depends only on the seed and its number; existing ones are kept.
 

@@ -1,7 +1,7 @@
-"""Procedural objects from a seed: toys, animals, shoes, bags, tools, packages, furniture.
+"""Procedural objects from a seed: compositions of random parts.
 
-Each is a union of solids, so it is closed and has a volume. Objects come from plans, which assemble
-typical parts, and from free compositions. y is up, the front looks along +z. All are CC0.
+Each is a union of solids, so it is closed and has a volume. y is up, the front looks along +z. All
+are CC0.
 """
 
 from __future__ import annotations

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from manifold3d import Manifold
+from manifold3d import CrossSection, Manifold
 
-from .details import letter, outline
 from .looks import Maker
 from .solids import (
     Blend,
@@ -23,8 +22,8 @@ from .solids import (
     ring_of,
     ripple,
     rod,
+    rounded,
     slab,
-    solid_of,
     spline,
     superquadric,
     taper,
@@ -90,7 +89,7 @@ def shape(m: Maker, mirrored: bool = True, fine: int = 32) -> Manifold:
     if kind <= 5:
         return turned(m, a, 2 * b, fine)
     if kind == 6:
-        return slab(outline(m, fine * 3 // 2), m.u(0.05, 0.6), m.u(0, 0.1), 3).scale(
+        return slab(outline(m, fine * 3 // 2), m.u(0.05, 0.6), m.u(0, 0.1)).scale(
             [a / 0.6, b / 0.6, 1]
         )
     if kind <= 8:
@@ -101,9 +100,7 @@ def shape(m: Maker, mirrored: bool = True, fine: int = 32) -> Manifold:
         path = m.rng.normal(0, 0.4, (m.n(3, 5), 3)) + np.linspace([0, -0.6, 0], [0, 0.6, 0], 5)[:1]
         if mirrored:
             path[:, 0] *= 0.0 if m.chance(0.7) else 1.0
-        return tube(
-            path, m.rng.uniform(0.05, 0.3, 3), fine // 2, fine * 3 // 4, flat=(1, m.u(0.5, 1))
-        )
+        return tube(path, m.rng.uniform(0.05, 0.3, 3), fine // 2, fine * 3 // 4, m.u(0.5, 1))
     return plate(letter(m), m.u(0.1, 0.5))
 
 
@@ -143,6 +140,51 @@ def loafed(m: Maker, a: float, b: float, c: float, fine: int) -> Manifold:
     return loft(rings, tips)
 
 
+def outline(m: Maker, sides: int = 48) -> np.ndarray:
+    """A smooth, starred or toothed outline ``[sides, 2]`` of radius .6 or so."""
+    angle = np.arange(sides) * (2 * math.pi / sides)
+    kind = m.n(0, 4)
+    if kind == 0:
+        r = 1 + sum(m.u(-0.25, 0.25) / k * np.cos(k * (angle - math.pi / 2)) for k in range(2, 6))
+    elif kind == 1:
+        r = 1 + m.u(0.1, 0.35) * np.cos(m.n(3, 8) * (angle - math.pi / 2))
+    elif kind == 2:
+        teeth = m.n(6, 16)
+        r = 1 + m.u(0.05, 0.15) * np.tanh(4 * np.sin(teeth * angle))
+    elif kind == 3:
+        return 0.6 * ring_of(m.u(1.2, 8), sides)
+    else:
+        width = m.u(0.5, 1.3)
+        return rounded(width, m.u(0.5, 1.3), m.u(0.05, 0.6) * width, sides // 4)
+    return 0.6 * np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
+
+
+def letter(m: Maker) -> CrossSection:
+    """A figure of bars and bows, as letters are."""
+    w = m.u(0.08, 0.2)
+    points = [
+        *((-0.4, -0.5), (0.4, -0.5), (-0.4, 0.0), (0.4, 0.0), (-0.4, 0.5), (0.4, 0.5), (0, -0.5)),
+        (0, 0.5),
+    ]
+    dot = (
+        CrossSection.circle(w, 12)
+        if m.chance(0.5)
+        else CrossSection.square([1.7 * w, 1.7 * w], True)
+    )
+    bars, here = [], points[m.n(0, 7)]
+    for _ in range(m.n(2, 5)):
+        there = points[m.n(0, 7)]
+        bars.append(CrossSection.batch_hull([dot.translate(here), dot.translate(there)]))
+        here = there
+    made = bars[0]
+    for bar in bars[1:]:
+        made = made + bar
+    if m.chance(0.4):
+        bow = CrossSection.circle(0.35, 32) - CrossSection.circle(0.35 - w, 32)
+        made = made + bow.translate([m.u(-0.2, 0.2), m.pick(-0.2, 0.2)])
+    return made
+
+
 def lumps(m: Maker, mirrored: bool, cells: int) -> Manifold:
     """Limbs and eggs that flow together."""
     blend = Blend(m.u(0.03, 0.25), mirrored)
@@ -156,7 +198,7 @@ def lumps(m: Maker, mirrored: bool, cells: int) -> Manifold:
         r = m.u(0.05, 0.22)
         blend.limb([start, end], [r, r * m.u(0.4, 1.5)])
         points.append(end)
-    return blend.solid(lambda v, f, _: solid_of(v, f), cells)
+    return blend.solid(cells)
 
 
 def warped(m: Maker, solid: Manifold, mirrored: bool) -> Manifold:

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from manifold3d import Manifold, Mesh
-from numpy.typing import ArrayLike
 
 from gamba_warp.formats.materials import Material, to_linear
 from gamba_warp.formats.meshes import CREASE, TexturedMesh
 
 from . import textures
-from .solids import both, extent, joined, solid_of
+from .solids import extent, joined
 
 SHARP = 40.0  # degrees; sharper edges are not shaded smoothly
 MAX_FACES = 60_000
@@ -34,15 +33,15 @@ class Look:
     """Look of some of an object's parts.
 
     Attributes:
-        materials: one for all sides; or six, for the sides facing +x, -x, +y, -y, +z and -z.
+        material: its material.
         mapping: texture mapping on the skin: "box", repeated, projected from the side that a face
             looks to; "fit", the same, once over the skin's extent; "round", once about y.
-        repeats: of the texture over a unit, for "box"; about y, for "round".
+        repeats: of the texture over a unit, for "box".
         low: least coordinates ``[3]`` of the skins stamped with it.
         high: greatest coordinates ``[3]``.
     """
 
-    materials: list[Material]
+    material: Material
     mapping: str = "box"
     repeats: float = 1.0
     low: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
@@ -62,7 +61,7 @@ def plain_material(value: np.ndarray) -> Material:
 
 
 class Maker:
-    """Source of random numbers and of looks for plans.
+    """Source of random numbers and of looks.
 
     Args:
         rng: random generator.
@@ -103,20 +102,10 @@ class Maker:
 
     def plain(self, kinds: str = "any") -> int:
         """A look of one colour, of one of some kinds."""
-        return self.painted(self.color(kinds))
-
-    def painted(self, value: np.ndarray) -> int:
-        """A look of one given display colour."""
-        return self.add(Look([plain_material(value)]))
+        return self.add(Look(plain_material(self.color(kinds))))
 
     def pattern(
-        self,
-        patterns: str,
-        kinds: str = "any",
-        *,
-        contrast: float = 0.0,
-        mapping: str = "box",
-        repeats: float = 0.0,
+        self, patterns: str, kinds: str = "any", *, contrast: float = 0.0, repeats: float = 0.0
     ) -> int:
         """A look of a pattern of two colours.
 
@@ -124,14 +113,13 @@ class Maker:
             patterns: names in ``textures.PATTERNS`` to choose from, separated by spaces.
             kinds: of the first colour.
             contrast: probability that the second is another colour, not a shade.
-            mapping: see ``Look``.
-            repeats: the same; 0: drawn.
+            repeats: see ``Look``; 0: drawn.
         """
         name = self.pick(*patterns.split())
         first = self.color(kinds)
         second = self.color() if self.chance(contrast) else first * self.u(0.45, 0.85)
         picture = textures.mixed(textures.PATTERNS[name](self.rng), first, second)
-        return self.add(Look([material(picture)], mapping, repeats or self.u(0.8, 2.5)))
+        return self.add(Look(material(picture), repeats=repeats or self.u(0.8, 2.5)))
 
     def surface(self, kinds: str = "any") -> int:
         """A look for anything: mostly one colour, sometimes a pattern."""
@@ -141,151 +129,43 @@ class Maker:
         names = quiet if self.chance(0.6) else " ".join(textures.PATTERNS)
         return self.pattern(names, kinds, contrast=0.3)
 
-    def wood(self) -> int:
-        """Wood, bare or stained."""
-        return self.pattern("grained", "wood", repeats=self.u(0.7, 1.6))
-
-    def metal(self) -> int:
-        """Metal, brushed or smooth."""
-        return self.pattern("brushed", "metal") if self.chance(0.5) else self.plain("metal dark")
-
-    def cloth(self, kinds: str = "any") -> int:
-        """Cloth: woven, knitted, striped, printed."""
-        names = "woven woven knitted striped checked dotted flowered plain spotted"
-        return self.pattern(names, kinds, contrast=0.4, repeats=self.u(1.5, 4))
-
-    def fur(self, kinds: str = "fur fur fur pastel toy") -> int:
+    def fur(self, kinds: str) -> int:
         """Fur or plush, of one colour or in patches."""
         names = "furry furry speckled plain spotted"
         return self.pattern(names, kinds, contrast=0.35, repeats=self.u(1, 2.5))
 
-    def inks(self, count: int = 3) -> list[np.ndarray]:
-        """Colours of a print."""
-        return [self.color("toy toy dark white any") for _ in range(count)]
-
-    def printed(
-        self,
-        kind: str,
-        ground: np.ndarray,
-        mapping: str = "fit",
-        inks: list[np.ndarray] | None = None,
-        sides: bool = False,
-    ) -> int:
+    def printed(self, kind: str, ground: np.ndarray, mapping: str) -> int:
         """A look of printed matter.
 
         Args:
             kind: see ``textures.package``.
             ground: colour of the paper.
             mapping: see ``Look``.
-            inks: colours; None: drawn.
-            sides: give all faces that do not look to +z the ground's colour.
         """
         # A wrap-around print is four times as wide as high.
         height = textures.PRINT * 3 // 8 if mapping == "round" else textures.PRINT
-        pixels = textures.package(
-            self.rng, ground, inks or self.inks(), kind, textures.PRINT, height
-        )
-        return self.faced(pixels, ground) if sides else self.add(Look([material(pixels)], mapping))
-
-    def faced(self, pixels: np.ndarray, ground: np.ndarray) -> int:
-        """A look with one picture across the faces that look to +z, and one colour elsewhere."""
-        bare = plain_material(ground)
-        return self.add(Look([bare, bare, bare, bare, material(pixels), bare], "fit"))
+        inks = [self.color("toy toy dark white any") for _ in range(3)]
+        pixels = textures.package(self.rng, ground, inks, kind, height)
+        return self.add(Look(material(pixels), mapping))
 
     def stamp(self, solid: Manifold, look: int) -> Manifold:
         """Stamp a solid at its current position with one look."""
         mesh = solid.to_mesh()
-        vertices = np.asarray(mesh.vert_properties)[:, :3]
-        return self.stamped(vertices, np.asarray(mesh.tri_verts), np.zeros(1), (look,))
-
-    def stamped(
-        self, vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray, looks: Sequence[int]
-    ) -> Manifold:
-        """Make a stamped solid of arrays.
-
-        Args:
-            vertices: ``[V, 3]``.
-            faces: ``[F, 3]``.
-            of_face: ``[F]`` indices into looks; ignored with a single look.
-            looks: their numbers.
-        """
+        vertices, faces = np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts)
         if not len(faces):
             return Manifold()
-        runs = [0, 3 * len(faces)]
-        if len(looks) > 1:
-            order = np.argsort(of_face, kind="stable")
-            faces = faces[order]
-            counts = np.bincount(of_face.astype(int), minlength=len(looks))
-            looks = [look for look, count in zip(looks, counts) if count]
-            runs = [0, *np.cumsum(3 * counts[counts > 0])]
-        for number in looks:
-            look = self.looks[number]
-            look.low = np.minimum(look.low, vertices.min(0))
-            look.high = np.maximum(look.high, vertices.max(0))
+        stamped = self.looks[look]
+        stamped.low = np.minimum(stamped.low, vertices.min(0))
+        stamped.high = np.maximum(stamped.high, vertices.max(0))
         points = np.concatenate([vertices, np.zeros_like(vertices), vertices], 1)
-        mesh = Mesh(
-            np.ascontiguousarray(points, np.float32),
-            np.ascontiguousarray(faces, np.uint32),
-            run_index=np.array(runs, np.uint32),
-            run_original_id=np.array(looks, np.uint32),
-        )
-        return Manifold(mesh)
-
-    def blended(self, blend, looks: Sequence[int]) -> Manifold:
-        """The stamped solid of a ``solids.Blend``, whose looks are indices into these."""
-
-        def stamp(vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> Manifold:
-            solid = solid_of(vertices, faces)
-            if solid.is_empty():
-                return solid
-            swapped = faces[:, ::-1]
-            probe = np.einsum(
-                "fk,fk->",
-                vertices[faces[:, 0]],
-                np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]),
+        return Manifold(
+            Mesh(
+                np.ascontiguousarray(points, np.float32),
+                np.ascontiguousarray(faces, np.uint32),
+                run_index=np.array([0, 3 * len(faces)], np.uint32),
+                run_original_id=np.array([look], np.uint32),
             )
-            return self.stamped(vertices, faces if probe > 0 else swapped, of_face, looks)
-
-        return blend.solid(stamp)
-
-
-class Parts(list[Manifold]):
-    """Stamped parts of an object.
-
-    Args:
-        m: source of their looks.
-    """
-
-    def __init__(self, m: Maker) -> None:
-        super().__init__()
-        self.m = m
-
-    def add(
-        self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
-    ) -> None:
-        """Add a solid of one look.
-
-        Args:
-            solid: about the origin.
-            look: its number.
-            turn: degrees about x, then y, then z.
-            at: position of its origin.
-        """
-        self.append(self._stamped(solid, look, turn, at))
-
-    def pair(
-        self, solid: Manifold, look: int, turn: ArrayLike = (0, 0, 0), at: ArrayLike = (0, 0, 0)
-    ) -> None:
-        """Add a solid and its mirror image on the other side of x = 0, see ``add``."""
-        self.append(both(self._stamped(solid, look, turn, at)))
-
-    def _stamped(self, solid: Manifold, look: int, turn: ArrayLike, at: ArrayLike) -> Manifold:
-        turned = solid.rotate(np.asarray(turn, float).tolist())
-        return self.m.stamp(turned.translate(np.asarray(at, float).tolist()), look)
-
-    def turned(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> list[Manifold]:
-        """All parts as one, turned about x, then y, then z by degrees."""
-        return [joined(self).rotate([x, y, z])]
+        )
 
 
 def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh | None:
@@ -376,9 +256,8 @@ def _mapped(
     materials: list[Material] = []
     for index in np.unique(number):
         look, mine = looks[index], np.flatnonzero(number == index)
-        side = 2 * axis[mine] + ~positive[mine]
-        ids[mine] = len(materials) + (side if len(look.materials) == 6 else 0)
-        materials += look.materials
+        ids[mine] = len(materials)
+        materials.append(look.material)
         if look.mapping == "box":
             uvs[mine] = uv[mine] * signs[mine][:, None] * look.repeats
             continue
@@ -393,7 +272,7 @@ def _mapped(
         points = skin[mine]
         turn = np.arctan2(points[..., 0], points[..., 2]) / (2 * math.pi) + 0.5
         turn -= np.round(turn - turn[:, :1])  # the corners of a face lie on one side of the seam
-        uvs[mine, :, 0] = turn * max(1, round(look.repeats))
+        uvs[mine, :, 0] = turn
         uvs[mine, :, 1] = (points[..., 1] - look.low[1]) / size[1]
         flat = axis[mine] == 1
         if flat.any():

@@ -13,11 +13,9 @@ from functools import lru_cache
 import numpy as np
 from manifold3d import CrossSection, Error, Manifold, Mesh, OpType
 from numpy.typing import ArrayLike
-from scipy.ndimage import map_coordinates
 from skimage.measure import marching_cubes
 
-RESOLUTION = 46  # cells along the longest side of a blended solid, at most
-CELLS = 36_000  # of its bounding box, at most
+CELLS = 36_000  # of a blended solid's bounding box, at most
 
 
 def solid_of(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
@@ -50,56 +48,48 @@ def extent(solid: Manifold) -> np.ndarray:
     return np.array(solid.bounding_box()).reshape(2, 3)
 
 
-def spline(points: ArrayLike, count: int, closed: bool = False) -> np.ndarray:
+def spline(points: ArrayLike, count: int) -> np.ndarray:
     """A Catmull-Rom curve ``[count, D]`` through points ``[K, D]``."""
     p = np.asarray(points, float)
-    k = len(p)
-    if closed:
-        t = np.arange(count) / count * k
-        padded = p[np.arange(-1, k + 2) % k]
-    else:
-        t = np.linspace(0, k - 1, count)
-        padded = np.concatenate([[2 * p[0] - p[1]], p, [2 * p[-1] - p[-2]]])
-    i = np.minimum(t.astype(int), k - (0 if closed else 1) - 1)
+    t = np.linspace(0, len(p) - 1, count)
+    padded = np.concatenate([[2 * p[0] - p[1]], p, [2 * p[-1] - p[-2]]])
+    i = np.minimum(t.astype(int), len(p) - 2)
     f = (t - i)[:, None]
     a, b, c, d = (padded[i + j] for j in range(4))
     return b + f / 2 * (c - a + f * (2 * a - 5 * b + 4 * c - d + f * (3 * (b - c) + d - a)))
 
 
 @lru_cache(maxsize=256)
-def _loft_faces(rings: int, sides: int, closed: bool) -> np.ndarray:
-    rows = np.arange(rings if closed else rings - 1)[:, None]
+def _loft_faces(rings: int, sides: int) -> np.ndarray:
+    rows = np.arange(rings - 1)[:, None]
     here = np.arange(sides)[None]
     there = (here + 1) % sides
-    above = (rows + 1) % rings
     a, b = rows * sides + here, rows * sides + there
-    c, d = above * sides + there, above * sides + here
-    faces = [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
-    if not closed:
-        first, last, turn = rings * sides, rings * sides + 1, (rings - 1) * sides
-        tip = np.full(sides, first)
-        faces.append(np.stack([tip, there[0], here[0]], -1))
-        faces.append(np.stack([tip * 0 + last, turn + here[0], turn + there[0]], -1))
+    c, d = b + sides, a + sides
+    first, last, turn = rings * sides, rings * sides + 1, (rings - 1) * sides
+    tip = np.full(sides, first)
+    faces = [
+        np.stack([a, b, c], -1).reshape(-1, 3),
+        np.stack([a, c, d], -1).reshape(-1, 3),
+        np.stack([tip, there[0], here[0]], -1),
+        np.stack([tip * 0 + last, turn + here[0], turn + there[0]], -1),
+    ]
     return np.concatenate(faces).astype(np.uint32)
 
 
-def loft(rings: np.ndarray, tips: np.ndarray | None = None, closed: bool = False) -> Manifold:
+def loft(rings: np.ndarray, tips: np.ndarray | None = None) -> Manifold:
     """A solid through rings of points; its two ends are fans about a point.
 
     Args:
         rings: ``[R, N, 3]``.
         tips: ``[2, 3]`` middle points of the ends; None: the means of the first and last ring.
-        closed: join the last ring to the first instead of closing the ends.
     """
     count, sides = rings.shape[:2]
-    points = rings.reshape(-1, 3)
-    if not closed:
-        ends = rings[[0, -1]].mean(1) if tips is None else tips
-        points = np.concatenate([points, ends])
-    return solid_of(points, _loft_faces(count, sides, closed))
+    ends = rings[[0, -1]].mean(1) if tips is None else tips
+    return solid_of(np.concatenate([rings.reshape(-1, 3), ends]), _loft_faces(count, sides))
 
 
-def lathe(profile: ArrayLike, sides: int = 32) -> Manifold:
+def lathe(profile: ArrayLike, sides: int) -> Manifold:
     """A solid of revolution about y.
 
     Args:
@@ -115,7 +105,7 @@ def lathe(profile: ArrayLike, sides: int = 32) -> Manifold:
     return loft(rings, tips)
 
 
-def ring_of(exponent: float, sides: int = 24) -> np.ndarray:
+def ring_of(exponent: float, sides: int) -> np.ndarray:
     """A superellipse ``[sides, 2]`` of half sizes 1: exponent 2 is a circle, more is squarer."""
     angle = np.arange(sides) * (2 * math.pi / sides)
     c, s = np.cos(angle), np.sin(angle)
@@ -144,26 +134,24 @@ def inset(outline: np.ndarray, distance: float) -> np.ndarray:
     )
 
 
-def slab(outline: ArrayLike, thickness: float, bevel: float = 0.0, steps: int = 3) -> Manifold:
+def slab(outline: np.ndarray, thickness: float, bevel: float) -> Manifold:
     """An outline in x and y, thick along z, with rounded edges.
 
     Args:
         outline: ``[N, 2]`` counterclockwise; star-shaped about its mean.
         thickness: along z, about 0.
         bevel: radius of the edges.
-        steps: rings of a rounded edge.
     """
-    points = np.asarray(outline, float)
     half = thickness / 2
     bevel = min(bevel, 0.99 * half)
     if bevel <= 0:
         layers = [(0.0, -half), (0.0, half)]
     else:
-        angle = np.linspace(0, math.pi / 2, steps + 1)
+        angle = np.linspace(0, math.pi / 2, 4)
         below = [(bevel * (1 - math.sin(a)), -half + bevel * (1 - math.cos(a))) for a in angle]
         layers = [*below, *[(d, -z) for d, z in reversed(below)]]
     rings = np.stack(
-        [np.column_stack([inset(points, d), np.full(len(points), z)]) for d, z in layers]
+        [np.column_stack([inset(outline, d), np.full(len(outline), z)]) for d, z in layers]
     )
     return loft(rings)
 
@@ -181,24 +169,17 @@ def plate(cross: CrossSection, thickness: float) -> Manifold:
     return cross.extrude(thickness).translate([0, 0, -thickness / 2])
 
 
-def rod(radius: float, height: float, sides: int = 24, bevel: float = 0.0) -> Manifold:
+def rod(radius: float, height: float) -> Manifold:
     """A cylinder along y that stands on y = 0."""
-    b = min(bevel, 0.9 * radius, 0.45 * height)
-    if b <= 0:
-        return lathe([(radius, 0), (radius, height)], sides)
-    edge = [
-        (radius - b * (1 - math.sin(a)), b * (1 - math.cos(a))) for a in (0, 0.5, 1.05, math.pi / 2)
-    ]
-    top = [(r, height - y) for r, y in reversed(edge)]
-    return lathe([(0, 0), *edge, *top, (0, height)], sides)
+    return lathe([(radius, 0), (radius, height)], 24)
 
 
-def ball(radii: ArrayLike, segments: int = 32) -> Manifold:
-    """An ellipsoid about the origin."""
-    return Manifold.sphere(1.0, segments).scale(np.broadcast_to(radii, 3).tolist())
+def ball(radius: float) -> Manifold:
+    """A ball about the origin."""
+    return Manifold.sphere(1.0, 32).scale([radius] * 3)
 
 
-def superquadric(radii: ArrayLike, up: float, around: float, segments: int = 32) -> Manifold:
+def superquadric(radii: ArrayLike, up: float, around: float, segments: int) -> Manifold:
     """A superquadric about the origin.
 
     Args:
@@ -217,24 +198,9 @@ def superquadric(radii: ArrayLike, up: float, around: float, segments: int = 32)
     return Manifold.sphere(1.0, segments).warp_batch(shape).scale(np.asarray(radii, float).tolist())
 
 
-def ring(
-    radius: float, thick: float, sides: int = 32, around: int = 12, flat: float = 1.0
-) -> Manifold:
-    """A torus about y; ``flat`` stretches its section along y."""
-    angle = np.arange(sides) * (2 * math.pi / sides)
-    turn = np.arange(around) * (2 * math.pi / around)
-    r = radius + thick * np.cos(turn)[None]
-    y = np.broadcast_to(flat * thick * np.sin(turn), (sides, around))
-    rings = np.stack([r * np.sin(angle)[:, None], y, r * np.cos(angle)[:, None]], -1)
-    return loft(rings, closed=True)
-
-
-def frames(path: np.ndarray, closed: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def frames(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tangents and two normals ``[R, 3]`` each along a curve, with minimal rotation."""
-    if closed:
-        t = np.roll(path, -1, 0) - np.roll(path, 1, 0)
-    else:
-        t = np.gradient(path, axis=0)
+    t = np.gradient(path, axis=0)
     t /= np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-9)
     first = np.eye(3)[np.abs(t[0]).argmin()]
     u = np.empty_like(t)
@@ -246,54 +212,31 @@ def frames(path: np.ndarray, closed: bool = False) -> tuple[np.ndarray, np.ndarr
     return t, u, np.cross(t, u)
 
 
-def tube(
-    path: ArrayLike,
-    radii: ArrayLike,
-    sides: int | np.ndarray = 14,
-    count: int = 24,
-    closed: bool = False,
-    round_ends: bool = True,
-    flat: tuple[float, float] = (1.0, 1.0),
-) -> Manifold:
-    """A profile swept along a smooth curve.
+def tube(path: ArrayLike, radii: ArrayLike, sides: int, count: int, flat: float) -> Manifold:
+    """An ellipse swept along a smooth curve; half balls close its ends.
 
     Args:
         path: ``[K, 3]`` points that the curve goes through.
-        radii: one, or several spread along the curve.
-        sides: points around a circle, or a profile ``[N, 2]`` of radius 1.
+        radii: several, spread along the curve.
+        sides: points around.
         count: rings along the curve.
-        closed: True if the curve is a loop.
-        round_ends: close the ends with half balls.
-        flat: scales of the profile along its two axes.
+        flat: ratio of the ellipse's axes.
     """
-    line = spline(path, count, closed)
-    given = np.atleast_1d(np.asarray(radii, float))
-    if closed:
-        r = np.interp(
-            np.arange(count) / count, np.linspace(0, 1, len(given) + 1), [*given, given[0]]
-        )
-    else:
-        r = spline(given[:, None], count)[:, 0] if len(given) > 1 else np.full(count, given[0])
-    r = np.maximum(r, 1e-4)
-    profile = ring_of(2, sides) if isinstance(sides, int) else sides
-    profile = profile * flat
-    t, u, v = frames(line, closed)
-    if not closed and round_ends:
-        angles = np.radians([75, 50, 25])
-        head, tail = (
-            line[0] - np.outer(np.sin(angles) * r[0], t[0]),
-            line[-1] + np.outer(np.sin(angles[::-1]) * r[-1], t[-1]),
-        )
-        tips = np.stack([line[0] - r[0] * t[0], line[-1] + r[-1] * t[-1]])
-        line = np.concatenate([head, line, tail])
-        r = np.concatenate([np.cos(angles) * r[0], r, np.cos(angles[::-1]) * r[-1]])
-        u, v = (np.concatenate([w[[0] * 3], w, w[[-1] * 3]]) for w in (u, v))
-    else:
-        tips = None
+    line = spline(path, count)
+    r = np.maximum(spline(np.asarray(radii, float)[:, None], count)[:, 0], 1e-4)
+    profile = ring_of(2, sides) * (1, flat)
+    t, u, v = frames(line)
+    angles = np.radians([75, 50, 25])
+    head = line[0] - np.outer(np.sin(angles) * r[0], t[0])
+    tail = line[-1] + np.outer(np.sin(angles[::-1]) * r[-1], t[-1])
+    tips = np.stack([line[0] - r[0] * t[0], line[-1] + r[-1] * t[-1]])
+    line = np.concatenate([head, line, tail])
+    r = np.concatenate([np.cos(angles) * r[0], r, np.cos(angles[::-1]) * r[-1]])
+    u, v = (np.concatenate([w[[0] * 3], w, w[[-1] * 3]]) for w in (u, v))
     rings = line[:, None] + r[:, None, None] * (
         profile[None, :, :1] * u[:, None] + profile[None, :, 1:] * v[:, None]
     )
-    return loft(rings, tips, closed)
+    return loft(rings, tips)
 
 
 class Blend:
@@ -304,48 +247,33 @@ class Blend:
         symmetric: add each on both sides of x = 0.
     """
 
-    def __init__(self, soft: float = 0.08, symmetric: bool = True) -> None:
+    def __init__(self, soft: float, symmetric: bool) -> None:
         self.soft, self.symmetric = soft, symmetric
-        self._items: list[tuple[np.ndarray, np.ndarray, int, Callable]] = []
+        self._items: list[tuple[np.ndarray, np.ndarray, Callable]] = []
 
-    def _add(self, low: np.ndarray, high: np.ndarray, look: int, distance: Callable) -> None:
-        self._items.append((low, high, look, distance))
+    def _add(self, low: np.ndarray, high: np.ndarray, distance: Callable) -> None:
+        self._items.append((low, high, distance))
         if self.symmetric:
             flip = np.array([-1, 1, 1], np.float32)
             a, b = low * flip, high * flip
             mirrored = np.minimum(a, b), np.maximum(a, b)
             if mirrored[0][0] > low[0] + 1e-6 or mirrored[1][0] < high[0] - 1e-6:
-                self._items.append((*mirrored, look, lambda x, y, z: distance(-x, y, z)))
+                self._items.append((*mirrored, lambda x, y, z: distance(-x, y, z)))
 
-    def limb(self, path: ArrayLike, radii: ArrayLike, look: int = 0) -> None:
+    def limb(self, path: ArrayLike, radii: ArrayLike) -> None:
         """Add round cones through points ``[K, 3]`` with a radius at each."""
         p = np.asarray(path, np.float32)
         r = np.broadcast_to(np.asarray(radii, np.float32), len(p))
         for a, b, ra, rb in zip(p, p[1:], r, r[1:]):
-            self._add(
-                np.minimum(a - ra, b - rb), np.maximum(a + ra, b + rb), look, _cone(a, b, ra, rb)
-            )
+            self._add(np.minimum(a - ra, b - rb), np.maximum(a + ra, b + rb), _cone(a, b, ra, rb))
 
-    def egg(self, center: ArrayLike, radii: ArrayLike, look: int = 0, tilt: float = 0.0) -> None:
-        """Add an ellipsoid, turned about x by ``tilt`` radians."""
+    def egg(self, center: ArrayLike, radii: ArrayLike) -> None:
+        """Add an ellipsoid."""
         c, r = np.asarray(center, np.float32), np.asarray(radii, np.float32)
-        s, k = math.sin(tilt), math.cos(tilt)
-        reach = np.array(
-            [r[0], math.hypot(k * r[1], s * r[2]), math.hypot(s * r[1], k * r[2])], np.float32
-        )
-        self._add(c - reach, c + reach, look, _egg(c, r, s, k))
+        self._add(c - r, c + r, _egg(c, r))
 
-    def solid(
-        self,
-        stamp: Callable[[np.ndarray, np.ndarray, np.ndarray], Manifold],
-        cells: int = RESOLUTION,
-    ) -> Manifold:
-        """Make the solid.
-
-        Args:
-            stamp: makes a solid of vertices, faces and the look of each face.
-            cells: along the longest side.
-        """
+    def solid(self, cells: int) -> Manifold:
+        """Make the solid with this many cells along the longest side."""
         lows = np.stack([item[0] for item in self._items])
         highs = np.stack([item[1] for item in self._items])
         low, high = lows.min(0), highs.max(0)
@@ -355,12 +283,9 @@ class Blend:
         shape = np.ceil((high + margin - low) / step).astype(int) + 1
         far = np.float32(2 * margin)
         field = np.full(shape, far, np.float32)
-        nearest = [
-            np.full(shape, far, np.float32) for _ in range(1 + max(i[2] for i in self._items))
-        ]
         axes = [low[i] + step * np.arange(shape[i], dtype=np.float32) for i in range(3)]
         k = np.float32(self.soft)
-        for a, b, look, distance in self._items:
+        for a, b, distance in self._items:
             first = np.maximum(np.floor((a - margin - low) / step).astype(int), 0)
             last = np.minimum(np.ceil((b + margin - low) / step).astype(int) + 1, shape)
             part = tuple(slice(i, j) for i, j in zip(first, last))
@@ -371,51 +296,13 @@ class Blend:
             )
             there = field[part]
             h = np.maximum(k - np.abs(there - d), 0)
-            np.minimum(nearest[look][part], d, out=nearest[look][part])
             field[part] = np.minimum(there, d) - h * h / (4 * k)
         np.minimum(field, far, out=field)
         for axis in range(3):  # nothing reaches the border of the grid
             edge = np.moveaxis(field, axis, 0)
             edge[0] = edge[-1] = far
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=False)
-        looks = np.zeros(len(faces), int)
-        for look in range(1, len(nearest)):
-            others = np.minimum.reduce(nearest[:look] + nearest[look + 1 :])
-            border = map_coordinates(nearest[look] - others, vertices.T, order=1)
-            vertices, faces, looks = _split(vertices, faces, looks, border, look)
-        return stamp(vertices * step + low, faces, looks)
-
-
-def _split(
-    vertices: np.ndarray, faces: np.ndarray, looks: np.ndarray, border: np.ndarray, look: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a mesh along a line; the part with ``border [V]`` below 0 gets another look."""
-    border = np.where(np.abs(border) < 1e-4, 1e-4, border)
-    below = border[faces] < 0
-    count = below.sum(1)
-    whole, crossed = (count == 0) | (count == 3), (count == 1) | (count == 2)
-    kept_looks = np.where(count[whole] == 3, look, looks[whole])
-    if not crossed.any():
-        return vertices, faces, kept_looks
-    # Rotated so that the corner alone on its side comes first.
-    alone = np.where(count[crossed] == 1, below[crossed].argmax(1), (~below[crossed]).argmax(1))
-    order = (alone[:, None] + np.arange(3)) % 3
-    a, b, c = np.take_along_axis(faces[crossed], order, 1).T
-    pairs = np.sort(np.stack([np.concatenate([a, a]), np.concatenate([b, c])], 1), 1)
-    edges, where = np.unique(pairs[:, 0] * len(vertices) + pairs[:, 1], return_inverse=True)
-    first, second = np.divmod(edges, len(vertices))
-    t = (border[first] / (border[first] - border[second]))[:, None]
-    added = vertices[first] * (1 - t) + vertices[second] * t
-    ab, ac = (len(vertices) + where).reshape(2, -1)
-    tip, rest = np.stack([a, ab, ac], 1), np.stack([ab, b, c, ab, c, ac], 1).reshape(-1, 3)
-    single = count[crossed] == 1
-    old = looks[crossed]
-    made = [np.where(single, look, old), np.repeat(np.where(single, old, look), 2)]
-    return (
-        np.concatenate([vertices, added.astype(vertices.dtype)]),
-        np.concatenate([faces[whole], tip, rest]),
-        np.concatenate([kept_looks, *made]),
-    )
+        return solid_of(vertices * step + low, faces)
 
 
 def _cone(a: np.ndarray, b: np.ndarray, ra: float, rb: float) -> Callable:
@@ -431,15 +318,13 @@ def _cone(a: np.ndarray, b: np.ndarray, ra: float, rb: float) -> Callable:
     return distance
 
 
-def _egg(c: np.ndarray, r: np.ndarray, s: float, k: float) -> Callable:
+def _egg(c: np.ndarray, r: np.ndarray) -> Callable:
     least = np.float32(r.min())
 
     def distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         px, py, pz = x - c[0], y - c[1], z - c[2]
-        sine, cosine = np.float32(s), np.float32(k)
-        qy, qz = cosine * py + sine * pz, cosine * pz - sine * py
-        inner = np.sqrt((px / r[0]) ** 2 + (qy / r[1]) ** 2 + (qz / r[2]) ** 2)
-        slope = np.sqrt((px / r[0] ** 2) ** 2 + (qy / r[1] ** 2) ** 2 + (qz / r[2] ** 2) ** 2)
+        inner = np.sqrt((px / r[0]) ** 2 + (py / r[1]) ** 2 + (pz / r[2]) ** 2)
+        slope = np.sqrt((px / r[0] ** 2) ** 2 + (py / r[1] ** 2) ** 2 + (pz / r[2] ** 2) ** 2)
         return np.maximum(inner * (inner - 1) / np.maximum(slope, np.float32(1e-6)), -least)
 
     return distance

@@ -32,10 +32,8 @@ _COLORS = {
     "white": ((0.05, 0.2), (0.0, 0.1), (0.82, 0.98)),
     "wood": ((0.05, 0.11), (0.3, 0.7), (0.3, 0.88)),
     "metal": ((0.5, 0.65), (0.0, 0.08), (0.35, 0.85)),
-    "skin": ((0.04, 0.09), (0.25, 0.55), (0.35, 0.96)),
     "fur": ((0.04, 0.12), (0.0, 0.65), (0.12, 0.95)),
     "earth": ((0.02, 0.2), (0.2, 0.7), (0.2, 0.75)),
-    "leaf": ((0.2, 0.4), (0.3, 0.7), (0.2, 0.6)),
     "leather": ((0.02, 0.1), (0.3, 0.8), (0.1, 0.6)),
 }
 
@@ -236,15 +234,12 @@ class Print:
     Args:
         rng: random generator.
         ground: its colour.
-        width: pixels.
-        height: pixels.
+        height: pixels; ``PRINT`` wide.
     """
 
-    def __init__(
-        self, rng: np.random.Generator, ground: np.ndarray, width: int = PRINT, height: int = PRINT
-    ) -> None:
-        self.rng, self.width, self.height = rng, width, height
-        self.image = Image.new("RGB", (width, height), _ink(ground))
+    def __init__(self, rng: np.random.Generator, ground: np.ndarray, height: int) -> None:
+        self.rng, self.width, self.height = rng, PRINT, height
+        self.image = Image.new("RGB", (PRINT, height), _ink(ground))
         self.draw = ImageDraw.Draw(self.image)
 
     def pixels(self) -> np.ndarray:
@@ -261,12 +256,10 @@ class Print:
             max(int(bottom * h), int(top * h) + 1),
         )
 
-    def word(
-        self, box: tuple[float, float, float, float], ink: np.ndarray, text: str | None = None
-    ) -> None:
+    def word(self, box: tuple[float, float, float, float], ink: np.ndarray) -> None:
         """A word that fills a box of shares (left, top, right, bottom) of the sheet."""
         x0, y0, x1, y1 = self._place(box)
-        text = text or _word(self.rng)
+        text = _word(self.rng)
         size = max(6, min(int(0.95 * (y1 - y0)), int(1.6 * (x1 - x0) / len(text))))
         bold = size // 18 if self.rng.random() < 0.5 else 0
         self.draw.text(
@@ -363,8 +356,7 @@ def package(
     ground: np.ndarray,
     inks: list[np.ndarray],
     kind: str,
-    width: int = PRINT,
-    height: int = PRINT,
+    height: int,
 ) -> np.ndarray:
     """A printed side of a package.
 
@@ -372,11 +364,10 @@ def package(
         rng: random generator.
         ground: colour of the paper.
         inks: two or more colours.
-        kind: front, back, side or label.
-        width: pixels.
-        height: pixels.
+        kind: front or label.
+        height: pixels; ``PRINT`` wide.
     """
-    sheet = Print(rng, ground, width, height)
+    sheet = Print(rng, ground, height)
     ink = lambda: inks[rng.integers(len(inks))]  # noqa: E731
     light = 0.0 if ground.mean() > 0.5 else 1.0
     text = np.full(3, light) if rng.random() < 0.6 else ink()
@@ -399,7 +390,7 @@ def package(
             sheet.word((0.1, y, rng.uniform(0.45, 0.9), y + rng.uniform(0.05, 0.1)), text)
         if rng.random() < 0.5:
             sheet.lines((0.08, 0.86, 0.6, 0.96), text, 0.035)
-    elif kind == "label":
+    else:
         sheet.band((0, 0, 1, rng.uniform(0.05, 0.2)), ink())
         if rng.random() < 0.6:
             sheet.band((0, rng.uniform(0.75, 0.92), 1, 1), ink())
@@ -411,32 +402,4 @@ def package(
             sheet.photo((rng.uniform(0.3, 0.4), 0.4, rng.uniform(0.55, 0.7), 0.9))
         sheet.lines((0.02, 0.3, 0.2, 0.75), text, 0.03)
         sheet.lines((0.8, 0.3, 0.98, 0.75), text, 0.03)
-    else:
-        sheet.word((0.08, 0.05, 0.92, 0.2), text)
-        sheet.lines((0.08, 0.27, 0.92, rng.uniform(0.5, 0.75)), text, rng.uniform(0.03, 0.06))
-        if rng.random() < 0.6:
-            x, y = rng.uniform(0.1, 0.6), 0.78
-            sheet.band((x, y, x + 0.3, 0.95), np.ones(3))
-            for bar in np.flatnonzero(rng.random(20) < 0.5):
-                sheet.band(
-                    (x + 0.02 + 0.013 * bar, y + 0.02, x + 0.028 + 0.013 * bar, 0.93), np.zeros(3)
-                )
-        elif rng.random() < 0.5:
-            sheet.photo((0.1, 0.6, 0.9, 0.95))
-    return sheet.pixels()
-
-
-def screen(rng: np.random.Generator) -> np.ndarray:
-    """Picture of a display: black, windows, or a home screen."""
-    sheet = Print(rng, color(rng, "dark") * 0.5)
-    kind = rng.integers(4)
-    if kind == 1:
-        sheet.photo((0, 0, 1, 1))
-    if kind == 2 or kind == 1:
-        for x in np.arange(0.08, 0.9, 0.22):
-            for y in np.arange(0.1, 0.9, 0.2):
-                if rng.random() < 0.7:
-                    sheet.mark((x + 0.08, y + 0.06), 0.06, color(rng, "toy"), color(rng, "white"))
-    if kind == 3:
-        sheet.word((0.1, 0.3, 0.9, 0.7), color(rng), str(rng.integers(10, 9999)))
     return sheet.pixels()
