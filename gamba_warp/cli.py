@@ -140,10 +140,8 @@ def run(name: str, arguments: list[str]) -> int:
             return 0
         require(*row.needs)
         command = load_command(name)
-        if name == "train":  # which has --plugin itself, and records it
+        if name == "train":
             arguments = sys.modules[command.__module__].take_address(arguments)
-        else:
-            arguments = _load_plugins(arguments)
         words = read_words(arguments, command)
         arguments, verbose = _expanded(command, words.arguments), words.verbose
         if name == "app" and not words.quiet:  # which takes long to start
@@ -212,22 +210,6 @@ def _parsed(command: Callable, arguments: list[str], program: str) -> Callable[[
 
 def _is_rule(row: str) -> bool:
     return not row.strip("─- ")
-
-
-def _load_plugins(arguments: list[str]) -> list[str]:
-    """Load the plugins of ``--plugin``; return the other arguments. Raises UserError."""
-    if "--plugin" not in arguments:
-        return arguments
-    at = arguments.index("--plugin")
-    end = at + 2
-    while end < len(arguments) and re.match(r"[A-Za-z_]\w*=|.*\.py$", arguments[end]):
-        end += 1
-    if end > len(arguments):
-        raise UserError("--plugin: expected a .py file or an installed plugin")
-    from .plugins import load
-
-    load(arguments[at + 1 : end])
-    return arguments[:at] + arguments[end:]
 
 
 def _expanded(command: Callable, arguments: list[str]) -> list[str]:
@@ -318,7 +300,6 @@ def _main(arguments: list[str]) -> int:
         for name, row in COMMANDS.items():
             print(f"  gamba {name:<15} {row.about}")
         print("\ngamba help COMMAND shows the options of one.")
-        print("gamba COMMAND ... --plugin my.py [NAME=VALUE ...] loads a plugin first.")
         return 0
     if arguments[0] in ("-V", "--version"):
         print(__version__)

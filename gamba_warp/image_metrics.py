@@ -10,7 +10,6 @@ from collections.abc import Callable, Container
 from typing import TYPE_CHECKING, NamedTuple
 
 from .conventions import GROUNDS, WHITE
-from .plugins import extensible
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -121,13 +120,13 @@ class Metric(NamedTuple):
         return WHITE if self.ground is None else GROUNDS[self.ground]
 
 
+# By key in records. A script may add to it (docs/change-the-training.md).
 METRICS: dict[str, Metric] = {
     "psnr": Metric("PSNR", psnr, "dB", digits=2, on_grounds=True),
     "ssim": Metric("SSIM", ssim, least_side=SSIM_WINDOW),
     "lpips": Metric("LPIPS", None, more_is_better=False, on_grounds=True),
     "mask_iou": Metric("mask IoU", mask_iou, of_masks=True, in_compare=False),
 }
-extensible("image metric", METRICS)
 
 
 def on_grounds() -> dict[str, Metric]:

@@ -26,7 +26,6 @@ from gamba_warp.data.gso import scanned
 from gamba_warp.data.shard_cache import Source, Unreachable
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.plugins import added
 
 from .config import TrainConfig
 from .data.order import ShardOrder
@@ -41,6 +40,14 @@ _FETCHED = 256  # samples of a process for which shards are fetched ahead
 _TRIES = 100  # objects tried in turn until one can be read
 # With --overfit all views share one forward pass of the network; rendering them is cheap beside it.
 _OVERFIT_VIEWS = 9
+
+
+# By name: positions of an epoch in the list of objects, as many as there are objects. Arguments: a
+# generator of the seed and the epoch, and the objects' uids. A script may add to it
+# (docs/change-the-training.md).
+SAMPLERS: dict[str, Callable[[np.random.Generator, list[str]], np.ndarray]] = {
+    "shuffled": lambda rng, uids: rng.permutation(len(uids))
+}
 
 
 class HeldOut(NamedTuple):
@@ -109,7 +116,9 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
         UserError: the folder or the object of ``--overfit`` does not exist, no object can be read,
             the pictures do not fit on the device, or the data has Google Scanned Objects.
     """
-    one = config.views.overfit
+    one, sampler = config.views.overfit, config.views.sampler
+    if sampler not in (known := (*SAMPLERS, "shards")):
+        raise UserError(f"--sampler {sampler[:60]}: expected one of {', '.join(known)}")
     data = _open_all(config) if one is None else _open_one(config, one)
     if data.scanned and not config.views.train_on_gso:
         names = ", ".join(data.scanned[:3]) + (", ..." if len(data.scanned) > 3 else "")
@@ -448,11 +457,9 @@ class Batches:
             edges = weights[order].cumsum()
             taken = np.searchsorted(edges, (np.arange(count) + rng.random()) * edges[-1] / count)
             return rng.permutation(order[np.minimum(taken, count - 1)])
-        if name in ("shuffled", "shards"):  # the latter with --overfit, which has one object
-            return rng.permutation(count)
-        order = np.asarray(
-            added("sampler")[name](rng, [self.data.train.uids[i] for i in self.data.objects])
-        )
+        # With --overfit, which has one object, "shards" is like "shuffled".
+        sampler = SAMPLERS["shuffled" if name == "shards" else name]
+        order = np.asarray(sampler(rng, [self.data.train.uids[i] for i in self.data.objects]))
         if (
             order.shape != (count,)
             or order.dtype.kind not in "iu"

@@ -14,7 +14,6 @@ import msgspec
 import tyro
 from msgspec import Meta
 
-from gamba_warp import plugins
 from gamba_warp.conventions import DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.image_metrics import METRICS
@@ -27,7 +26,6 @@ _Views = Annotated[int, Meta(ge=0, le=1000)]
 _Weight = Annotated[float, Meta(ge=0, le=1e6)]
 _Every = Annotated[int, Meta(ge=0, le=10**12)]
 RecipeName = Literal["paper", "tiny", "rays"]
-_BEST_BY = "psnr", "ssim", "lpips", "mask_iou"  # of image_metrics.METRICS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +85,7 @@ class DataConfig:
         cache_device: Decode all pictures at the start and keep them on the training device, with
             8 bits a channel. Depth pictures are read when they are used.
         sampler: Order of the objects: "shuffled" anew for each epoch; "shards", by whole shards, of
-            which each process takes its own (docs/training-data.md); or that of a plugin.
+            which each process takes its own (docs/training-data.md).
         shuffle_buffer: With --sampler shards: objects of a process that are mixed at a time.
         workers: Threads that decode pictures ahead of the training; also the largest number of
             batches kept ready. The number does not change the result.
@@ -175,8 +173,7 @@ class OptimConfig:
     Attributes:
         lr: Peak learning rate; after a warm-up it falls to 0 according to --schedule.
         schedule: "cosine" falls along half a cosine from the end of the warm-up; "trapezoid" stays
-            at the peak and falls linearly at the end, so runs of different lengths begin alike; or
-            that of a plugin.
+            at the peak and falls linearly at the end, so runs of different lengths begin alike.
         decay_share: Share of the run in which "trapezoid" falls.
         warmup_steps: Steps of the linear warm-up, a tenth of the run at most.
         weight_decay: Weight decay of matrices, except those flagged by a module.
@@ -239,8 +236,8 @@ class RunConfig:
         val_extra: More datasets, whose held-out objects are validated separately, under their
             folder's name.
         best_by: Figure of the best validation, whose weights are OUT/best.safetensors: psnr, ssim,
-            lpips, mask_iou or that of a plugin, of novel views (of inputs without novel ones), the
-            unweighted mean over DATA and --val-extra.
+            lpips or mask_iou, of novel views (of inputs without novel ones), the unweighted mean
+            over DATA and --val-extra.
         save_every: Steps between two checkpoints; one is always saved at the end.
         keep: Number of checkpoints kept; the oldest are removed first.
         tensorboard: Write TensorBoard files, if it is installed.
@@ -252,8 +249,6 @@ class RunConfig:
         threads: Number of CPU threads; all cores if not given.
         recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
             same result in less memory and more time.
-        plugin: Plugins, each a .py file or the name of an installed one, followed by its options:
-            my.py scale=2 (docs/change-the-training.md).
         seed: Seed of the initial weights and of the order of the data.
     """
 
@@ -279,7 +274,6 @@ class RunConfig:
     device: DeviceChoice = "auto"
     threads: Threads | None = None
     recompute: bool = False
-    plugin: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE [NAME=VALUE ...]")] = ()
     seed: Seed = 0
 
     @property
@@ -308,16 +302,12 @@ class TrainConfig:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
-        plugins.load(self.run.plugin)
         for group in (self.length, self.views, self.loss, self.optim, self.run):
             check_options(group)
-        for kind, chosen, own in (
-            ("scheduler", self.optim.schedule, ("cosine", "trapezoid")),
-            ("sampler", self.views.sampler, ("shuffled", "shards")),
-            ("image metric", self.run.best_by, _BEST_BY),
-        ):
-            if chosen not in (names := (*own, *plugins.added(kind))):
-                raise UserError(f"{kind} {chosen[:60]!r}: expected one of {', '.join(names)}")
+        if self.run.best_by not in METRICS:
+            raise UserError(
+                f"--best-by {self.run.best_by[:60]}: expected one of {', '.join(METRICS)}"
+            )
         if self.loss.lpips == "on" and self.views.size < 16:
             raise UserError(f"--lpips on: needs --size 16 or more, it is {self.views.size}")
         if self.loss.lpips_crop and not 16 <= self.loss.lpips_crop <= self.views.size:
@@ -402,8 +392,6 @@ class TrainConfig:
         """Return JSON-ready values, with the model's full configuration under ``model``."""
         values = json.loads(json.dumps(asdict(self), default=str))
         values["model"] = json.loads(self.model_config().to_json())
-        if self.run.plugin:
-            values["plugins"] = plugins.records(self.run.plugin)
         return values
 
 
@@ -425,13 +413,13 @@ _OVERRIDABLE = {
     and not f.name.startswith("made")
 }
 STEP_SIZE = {"views.batch_size", "views.accumulate"}
-FOLLOWING = {"model", "plugins"}  # of a config.json: they follow from the options
+FOLLOWING = {"model"}  # of a config.json: it follows from the options
 # These may differ between the processes of one run; files are compared by content.
 _PER_MACHINE = {
     *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
     *("run.init", "run.encoder_weights", "run.device", "run.threads", "run.keep", "run.log"),
     "run.init_partial",
-    *("run.plugin", "run.tensorboard", "run.val_extra", "views.cache_device", "views.made_workers"),
+    *("run.tensorboard", "run.val_extra", "views.cache_device", "views.made_workers"),
 }
 # Groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,11 +16,20 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.plugins import added
 from gamba_warp.untrusted.documents import value_of
 
 from .config import OptimConfig
 
+# By name: the rate after the warm-up as a share of its peak. Arguments: the options, the step, the
+# steps of the warm-up and those of the run. A script may add to it (docs/change-the-training.md).
+SCHEDULES: dict[str, Callable[[OptimConfig, float, float, float], float]] = {
+    "cosine": lambda optim, step, warmup, total: _half_cosine(
+        (step - warmup) / max(1e-12, total - warmup)
+    ),
+    "trapezoid": lambda optim, step, warmup, total: _clamped(
+        (total - step) / (optim.decay_share * total)
+    ),
+}
 # After a change of length, a learning rate below the share _LOW of the new schedule's first rises
 # over the share _RISE of the remaining steps.
 _LOW, _RISE = 0.1, 0.1
@@ -256,6 +265,10 @@ class Schedule:
     minutes: float | None
     since: NewLength = NewLength()
 
+    def __post_init__(self) -> None:
+        if (name := self.optim.schedule) not in SCHEDULES:
+            raise UserError(f"--schedule {name[:60]}: expected one of {', '.join(SCHEDULES)}")
+
     def progress(self, step: int, elapsed: float) -> float:
         """Return the share of the run that is done, 0 to 1, by steps or else by the clock."""
         if self.total is not None:
@@ -279,7 +292,7 @@ class Schedule:
             return self._planned(step, total)
         if total <= began:
             return self.since.share
-        if self.optim.schedule in added("scheduler"):
+        if self.optim.schedule not in ("cosine", "trapezoid"):
             return self._planned(step, total)
         if not self.since.rises:  # the rest of the fall, to 0 at the new end
             share, left = self.since.share, (total - step) / (total - began)
@@ -298,11 +311,7 @@ class Schedule:
             warmup = min(warmup, 0.1 * total)
         if step < warmup:
             return (step + 1) / (warmup + 1)
-        if self.optim.schedule == "trapezoid":
-            return _clamped((total - step) / (self.optim.decay_share * total))
-        if (share := added("scheduler").get(self.optim.schedule)) is not None:
-            return share(_clamped((step - warmup) / max(1e-12, total - warmup)))
-        return _half_cosine((step - warmup) / max(1e-12, total - warmup))
+        return SCHEDULES[self.optim.schedule](self.optim, step, warmup, total)
 
     def after(self, old: Schedule, step: int, elapsed: float) -> tuple[Schedule, str | None]:
         """Continue a run, possibly of another length.

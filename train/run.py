@@ -77,7 +77,8 @@ def train(config: TrainConfig, world: World) -> int:
                 raise UserError(f"--best-by lpips: {warning or 'the run has no LPIPS'}")
         world.agree(lambda: _facts(config, data, world, lpips is not None))
         checkpoint = world.on_main(claim)  # the others use its result
-        _refuse_newer(world, run.out if run.resume == "auto" else None, checkpoint)
+        if run.resume == "auto":
+            _refuse_newer(world, run.out, checkpoint)
         torch.manual_seed(run.seed)
         # TF32 applies to the network's products, forward and backward; geometry has none
         # (cameras.exact_product), and SSIM's keep full precision.
@@ -160,13 +161,13 @@ def _facts(
     }
 
 
-def _refuse_newer(world: World, out: Path | None, checkpoint: Path | None) -> None:
+def _refuse_newer(world: World, out: Path, checkpoint: Path | None) -> None:
     """Raise if another process sees a newer checkpoint than the main one.
 
     Without a shared disk this happens if the processes are ranked in another order than before.
     """
     taken = -1 if checkpoint is None else step_of(checkpoint)
-    seen = world.gather((socket.gethostname(), list_checkpoints(out) if out else []))
+    seen = world.gather((socket.gethostname(), list_checkpoints(out)))
     host, known = seen[0]
     steps = {step_of(path) for path in known}
     for rank, (other, found) in enumerate(seen):

@@ -33,7 +33,6 @@ from msgspec import Meta, Struct
 from ..errors import UserError
 from ..files import walk
 from ..images import PICTURE_SUFFIXES, picture_size
-from ..plugins import extensible
 from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
 from ..untrusted.names import Within, inside
@@ -542,14 +541,14 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
     return ObjectFiles(images, poses, Ks, sizes)
 
 
-# Per layout: the file or folder that marks an object's folder, and the folder's reader.
+# By name: the file or folder that marks an object's folder, and the folder's reader, which raises
+# UserError. A script may add to it (docs/change-the-training.md).
 LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
     "transforms": ("transforms.json", _read_transforms),
     "nerf": ("transforms_train.json", _read_nerf),
     "gobjaverse": (GOBJAVERSE, _read_gobjaverse),
     "openlrm": ("intrinsics.npy", _read_openlrm),
 }
-extensible("dataset layout", LAYOUTS)
 
 
 class Found(NamedTuple):

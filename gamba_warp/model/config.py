@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..errors import UserError
-from ..plugins import added
 from ..untrusted.ranges import Meta, check_kind, check_values
 
 Norm = Literal["layer", "rms"]
@@ -17,7 +16,6 @@ Discretization = Literal["mamba", "bilinear", "zoh"]
 Background = Literal["white", "black"]
 Mixer = Literal["mamba", "attention"]
 ImageTokens = Literal["prefix", "mixed"]
-Decoder = Literal["bins", "rays", "triplane"]
 FinalNorm = Literal["same", "layer", "rms"]
 Orders = Literal["backward", "mirrored"]
 PositionWeights = Literal["softmax", "unit"]
@@ -151,7 +149,7 @@ class GambaConfig:
     scale_init: Annotated[float, Meta(ge=1e-6, le=10)] = 0.02
     opacity_init: Annotated[float, Meta(ge=1e-6, le=1 - 1e-6)] = 0.5
     predict_rotation: bool = False
-    decoder: Decoder = "bins"
+    decoder: str = "bins"
     triplane_size: Annotated[int, Meta(ge=2, le=256)] = 32
     triplane_features: Annotated[int, Meta(ge=1, le=1024)] = 80
     ray_cells: Annotated[int, Meta(ge=1, le=256)] = 4
@@ -168,8 +166,7 @@ class GambaConfig:
 
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
-            if not (name == "decoder" and self.decoder in added("decoder")):
-                check_kind(f"config: {name} is", getattr(self, name), kind)
+            check_kind(f"config: {name} is", getattr(self, name), kind)
         hints = get_type_hints(type(self), include_extras=True)
         check_values(vars(self), hints, lambda name: f"config: {name} is")
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):

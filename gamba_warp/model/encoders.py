@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -14,7 +14,6 @@ from torch.nn import functional as F
 
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from ..errors import UserError, first_line
-from ..plugins import added
 from ..untrusted.torch_files import read_torch
 from .config import GambaConfig
 
@@ -105,6 +104,24 @@ class _ViT(nn.Module):
 Weights = str | Path | Mapping[str, Tensor]
 
 
+def _vgg16(config: GambaConfig, weights: Weights | None) -> tuple[nn.Module, int]:
+    from ..vision.vgg import vgg16_features
+
+    if isinstance(weights, Mapping) or str(weights) in ("hub", "random"):
+        got = "tensors" if isinstance(weights, Mapping) else f"'{weights}'"
+        raise UserError(f"encoder vgg16: takes the cached weights or a file, not {got}")
+    network = vgg16_features(weights)
+    return network, network.dim
+
+
+# Encoders that are not ViTs of timm, by name: functions that return a network from pictures
+# ``[B, S, S, 3]`` in [0, 1], S = ``config.encoder_size``, to tokens ``[B, K, C]``, and C. A script
+# may add to it (docs/change-the-training.md).
+ENCODERS: dict[str, Callable[[GambaConfig, Weights | None], tuple[nn.Module, int]]] = {
+    "vgg16": _vgg16
+}
+
+
 def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder | None:
     """Build the encoder of ``config``, with its weights.
 
@@ -123,17 +140,8 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
     """
     if config.encoder == "none":
         return None
-    if config.encoder in added("encoder"):
-        network, channels = added("encoder")[config.encoder](config, weights)
-        return ImageEncoder(network, channels, config)
-    if config.encoder == "vgg16":
-        from ..vision.vgg import vgg16_features
-
-        if isinstance(weights, Mapping) or str(weights) in ("hub", "random"):
-            got = "tensors" if isinstance(weights, Mapping) else f"'{weights}'"
-            raise UserError(f"encoder vgg16: takes the cached weights or a file, not {got}")
-        network = vgg16_features(weights)
-        return ImageEncoder(network, network.dim, config)
+    if config.encoder in ENCODERS:
+        return ImageEncoder(*ENCODERS[config.encoder](config, weights), config)
     if weights is None:
         raise UserError(
             f"encoder {config.encoder}: its weights must be given: a file, 'hub' to fetch them, "
@@ -165,13 +173,13 @@ def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
     """
     if config.encoder == "none" or not config.prepend:
         return None
-    if config.encoder in added("encoder"):
-        with torch.device("meta"):
-            return build_encoder(config, "random")
     if config.encoder == "vgg16":
         from ..vision.weights import WIDTHS
 
         return ImageEncoder(nn.Identity(), WIDTHS[-1], config)
+    if config.encoder in ENCODERS:
+        with torch.device("meta"):
+            return build_encoder(config, "random")
     with torch.device("meta"):
         vit = _create_vit(config, pretrained=False)
         count = sum(parameter.numel() for parameter in vit.parameters())

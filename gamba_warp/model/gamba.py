@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from ..cameras import Cameras
 from ..conventions import over_background
 from ..devices import float32_weights
+from ..errors import UserError
 from ..gaussians import Gaussians
-from ..plugins import extensible
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
 from .parts.attention import AttentionBlock
@@ -24,9 +24,13 @@ from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
 from .pretrained import Pretrained
 
-DECODERS: dict[str, Any] = extensible(
-    "decoder", {"bins": GaussianDecoder, "rays": RayDecoder, "triplane": TriplaneDecoder}
-)
+# By name: a module made of a ``GambaConfig`` that maps tokens ``[B, L, width]`` to ``Gaussians``
+# ``[B, N]``. A script may add to it (docs/change-the-training.md).
+DECODERS: dict[str, Any] = {
+    "bins": GaussianDecoder,
+    "rays": RayDecoder,
+    "triplane": TriplaneDecoder,
+}
 
 
 def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) -> nn.ModuleList:
@@ -58,9 +62,13 @@ class Gamba(Pretrained, nn.Module):
             encoder: used instead of the one of ``config``.
 
         Raises:
-            UserError: the encoder cannot be built, or its weights are missing.
+            UserError: there is no such decoder, the encoder cannot be built, or its weights are
+                missing.
         """
         super().__init__()
+        if config.decoder not in DECODERS:
+            names = ", ".join(DECODERS)
+            raise UserError(f"config: decoder is {config.decoder[:100]!r}, expected one of {names}")
         self.config = config
         self.recompute = False
         self.encoder = None

@@ -9,7 +9,6 @@ neither huggingface_hub nor a network.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
@@ -20,8 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from .. import plugins
-from ..errors import FileWarning, UserError, first_line
+from ..errors import UserError, first_line
 from ..files import atomic_path, output_folder, write_text
 from ..versions import __version__, advice
 from .config import GambaConfig
@@ -42,7 +40,7 @@ CONFIG_NAME, CARD_NAME = "config.json", "README.md"
 WRITTEN = (FILE_NAME, ENCODER_NAME, CONFIG_NAME, CARD_NAME)  # files of ``save_pretrained``
 _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 1,500
 # Reserved keys of the header; extra_metadata may use any other key.
-_RESERVED_KEYS = ("format", "config", "encoder_sha256", "plugins")
+_RESERVED_KEYS = ("format", "config", "encoder_sha256")
 
 
 class Pretrained:
@@ -164,8 +162,8 @@ def save_model(
     Args:
         path: the file; if it is named ``model.safetensors``, ``load_model`` finds it by its folder.
         model: the model; of a frozen encoder only the SHA-256 of its weights is stored.
-        extra_metadata: further entries of the file's header; the keys "format", "config",
-            "encoder_sha256" and "plugins" are reserved.
+        extra_metadata: further entries of the file's header; the keys "format", "config" and
+            "encoder_sha256" are reserved.
 
     Raises:
         TypeError: path or model has the wrong type, for example if they are swapped.
@@ -185,8 +183,6 @@ def save_model(
     metadata |= {"format": FORMAT, "config": model.config.to_json()}
     if model.encoder and model.encoder.frozen:
         metadata["encoder_sha256"] = model.encoder.fingerprint
-    if found := plugins.needed(encoder=model.config.encoder, decoder=model.config.decoder):
-        metadata["plugins"] = json.dumps(found, sort_keys=True)
     state = {name: value.contiguous() for name, value in model.stored_state().items()}
     with atomic_path(path) as temporary:
         save_file(state, temporary, metadata=metadata)
@@ -276,23 +272,10 @@ def read_config(path: Path) -> tuple[GambaConfig, str | None]:
     if metadata.get("format") != FORMAT or "config" not in metadata:
         found = "".join(filter(str.isprintable, metadata.get("format", "none")[:40]))
         raise UserError(f"{path}: not a Gamba checkpoint (format {found}, not {FORMAT})")
-    if "plugins" in metadata:
-        _check_plugins(metadata["plugins"], path)
+    from ..untrusted.documents import check_no_code  # not at the top: msgspec is optional
+
+    check_no_code(metadata, str(path))
     return GambaConfig.from_json(metadata["config"], str(path)), metadata.get("encoder_sha256")
-
-
-def _check_plugins(text: str, path: Path) -> None:
-    """Raise UserError if a plugin that the model needs is not loaded; warn if it is another."""
-    from ..untrusted.documents import parse_document  # not at the top: msgspec is optional
-
-    for record in parse_document(text, list[dict[str, Any]], f"{path}: the plugins"):
-        if not {"name", "sha256", "options"} <= record.keys():
-            raise UserError(f"{path}: the plugins are not stated by name, sha256 and options")
-        if reason := plugins.missing(record):
-            raise UserError(f"{path}: {reason}")
-        if plugins.differs(record):
-            message = f"{path}: was saved with another text or other options of a plugin"
-            warnings.warn(FileWarning(f"{message}, '{record['name']}'"), stacklevel=2)
 
 
 def read_weights(path: Path, model: Gamba) -> dict[str, Tensor]:

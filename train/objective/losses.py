@@ -19,7 +19,6 @@ from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import psnr
 from gamba_warp.kernels.ssim import dissimilarity
-from gamba_warp.plugins import extensible
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available
 
@@ -243,7 +242,7 @@ def radial_weight(loss: LossConfig, at: Progress) -> float:
     return loss.rdist_weight * max(0.0, left) if loss.radial_mask and not at.validates else 0.0
 
 
-# In the order of summation. A new term is one entry here, and its weight an option.
+# In the order of summation. A script may add to it (docs/change-the-training.md).
 TERMS: dict[str, Term] = {
     "rgb": Term(lambda loss, at: 1.0, lambda s: mse(s.rgb, s.target), "MSE and mask", True),
     "mask": Term(
@@ -275,16 +274,6 @@ TERMS: dict[str, Term] = {
         "radial mask",
     ),
 }
-
-
-def _added_term(given: tuple[Callable, float | Callable[[Progress], float]]) -> Term:
-    """Term of a plugin, of its value and weight."""
-    value, weight = given
-    own = weight if callable(weight) else lambda at: weight
-    return Term(lambda loss, at: own(at), value, "plugin")
-
-
-extensible("loss term", TERMS, _added_term)
 
 
 def term_weights(loss: LossConfig, at: Progress) -> dict[str, float]:

@@ -1,6 +1,6 @@
-"""Plugin with one addition of each kind; docs/change-the-training.md explains it.
+"""Every ``gamba`` command with parts of one's own; docs/change-the-training.md explains it.
 
-gamba train DATA --preset tiny --plugin docs/examples/plugin.py edges=0.5 --schedule linear
+python docs/examples/own_parts.py train DATA --preset tiny --schedule linear --sampler hard_first
 """
 
 import json
@@ -9,9 +9,15 @@ import numpy as np
 import torch
 from torch import nn
 
-from gamba_warp.data.layouts import ObjectFiles
+from gamba_warp.cli import main
+from gamba_warp.data.layouts import LAYOUTS, ObjectFiles
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import Metric
+from gamba_warp.image_metrics import METRICS, Metric
+from gamba_warp.model.encoders import ENCODERS
+from gamba_warp.model.gamba import DECODERS
+from gamba_warp.train.batches import SAMPLERS
+from gamba_warp.train.objective.losses import TERMS, Term
+from gamba_warp.train.optim import SCHEDULES
 
 
 def edge_error(inputs):
@@ -79,12 +85,18 @@ def hard_first(rng, uids):
     return rng.permutation(order)[: len(uids)]
 
 
-def register(plugin, edges=0.1):
-    """Add all of them; ``edges`` is the weight of the loss term."""
-    plugin.loss_term("edges", edge_error, weight=edges)
-    plugin.image_metric("mae", Metric("MAE", mean_error, digits=4, more_is_better=False))
-    plugin.dataset_layout("orbit", "orbit.json", read_orbit)
-    plugin.encoder("patches", build_patches)
-    plugin.decoder("cloud", Cloud)
-    plugin.sampler("hard_first", hard_first)
-    plugin.scheduler("linear", lambda done: 1 - done)
+def linear(optim, step, warmup, total):
+    """Fall along a line from the end of the warm-up to the end of the run."""
+    return (total - step) / (total - warmup)
+
+
+TERMS["edges"] = Term(lambda loss, at: 0.5, edge_error, "edges")
+METRICS["mae"] = Metric("MAE", mean_error, digits=4, more_is_better=False)
+LAYOUTS["orbit"] = "orbit.json", read_orbit
+ENCODERS["patches"] = build_patches
+DECODERS["cloud"] = Cloud
+SAMPLERS["hard_first"] = hard_first
+SCHEDULES["linear"] = linear
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Public tables that a user's script fills: its parts in a run, and invalid ones."""
+
+import json
+import runpy
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import micro
+from helpers.micro import lines, run
+from helpers.refusals import refused
+
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.data.layouts import LAYOUTS
+from gamba_warp.image_metrics import METRICS
+from gamba_warp.model.checkpoint import load_model
+from gamba_warp.model.encoders import ENCODERS
+from gamba_warp.model.gamba import DECODERS
+from gamba_warp.train.batches import SAMPLERS
+from gamba_warp.train.checkpoint import list_checkpoints
+from gamba_warp.train.objective.losses import TERMS
+from gamba_warp.train.optim import SCHEDULES
+
+SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "examples" / "own_parts.py"
+TABLES = (LAYOUTS, METRICS, ENCODERS, DECODERS, SAMPLERS, TERMS, SCHEDULES)
+
+
+def restore(saved):
+    for table, own in zip(TABLES, saved):
+        table.clear()
+        table.update(own)
+
+
+@pytest.fixture(autouse=True)
+def tables():
+    saved = [dict(table) for table in TABLES]
+    yield saved
+    restore(saved)
+
+
+@pytest.fixture
+def script(monkeypatch):
+    """Runs the example with the words of a command; returns its exit code."""
+
+    def call(*words):
+        monkeypatch.setattr("sys.argv", [str(SCRIPT), *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(SCRIPT), run_name="__main__")
+        return ended.value.code
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Clouds in the layout that the example adds."""
+    root = micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds", 3)
+    for path in root.glob("*/transforms.json"):
+        names = [frame["file_path"] for frame in json.loads(path.read_text())["frames"]]
+        path.with_name("orbit.json").write_text(
+            json.dumps({"distance": 1.8, "focal": 1.2, "pictures": names})
+        )
+        path.unlink()
+    return root
+
+
+def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, script, capsys):
+    out = tmp_path / "run"
+    words = ["train", data, "--out", out, "--preset", "tiny", "--set", *micro.MODEL]
+    words += ["encoder=patches", "encoder_size=16", "encoder_frozen=false", "decoder=cloud"]
+    words += ["--sampler", "hard_first", "--schedule", "linear", "--size", micro.SIZE]
+    words += ["--lpips", "off", "--no-tensorboard", "--device", "cpu", "--log-every", "1"]
+    words += ["--warmup-steps", "1", "--batch-size", "2", "--val-every", "6"]
+    assert script(*words, "--steps", "6") == 0
+    assert open_dataset(data).layout == "orbit"
+    first, *_, last = lines(out, "train")
+    assert first["loss_edges"] > 0
+    terms = sum(first[f"loss_{name}"] for name in ("rgb", "mask")) + 0.5 * first["loss_edges"]
+    assert first["loss"] == pytest.approx(terms + 0.1 * first["loss_rdist"], rel=1e-4)
+    # A warm-up of a tenth of six steps, then the line: the rate of the last step is 5/6 of it down.
+    assert last["lr"] == pytest.approx(1e-3 * (1 - (5 - 0.6) / (6 - 0.6)), rel=1e-4)
+    assert 0 < lines(out, "val")[0]["mae_novel"] < 1
+    restore(tables)
+    assert script(*words, "--steps", "7") == 0  # the same run goes on
+    got = load_model(out / "model.safetensors")
+    assert type(got.decoder).__name__ == "Cloud" and got.encoder is not None
+    restore(tables)
+    refused("model.safetensors: encoder patches: neither 'none'", load_model,
+            out / "model.safetensors")  # fmt: skip
+    words = ["eval-views", "--checkpoint", out / "model.safetensors", "--data", data, "--json"]
+    capsys.readouterr()
+    assert script(*words, "--no-baselines", "--no-lpips", "--split", "val") == 0
+    assert "mae" in json.loads(capsys.readouterr().out)["objects"][0]
+
+
+def test_unknown_names_are_refused(tmp_path):
+    data = micro.write_dataset(tmp_path / "clouds")
+    for group, name, known in (
+        ("optim", "schedule", "cosine, trapezoid"),
+        ("views", "sampler", "shuffled, shards"),
+    ):
+        refused(f"--{name} linear: expected one of {known}", run, data, tmp_path / "run",
+                **{group: {name: "linear"}})  # fmt: skip
+    model = (*micro.MODEL, "decoder=cloud")
+    refused("decoder is 'cloud', expected one of bins, rays, triplane", run, data,
+            tmp_path / "run", model)  # fmt: skip
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_invalid_order_is_refused(tmp_path):
+    data = micro.write_dataset(tmp_path / "clouds")
+    SAMPLERS["far"] = lambda rng, uids: [9, 9]
+    options = {"views": {"sampler": "far"}}
+    refused("--sampler far: expected 2 positions", run, data, tmp_path / "run", **options)
+
+
+def test_rates_by_name_other_optimizers_and_partial_weights(tmp_path):
+    data = micro.write_dataset(tmp_path / "set", 3)
+    options = {"lr_of": ("blocks=0", "blocks.0.norm=1", "decoder=0.1"), "optimizer": "SGD"}
+    options |= {"optimizer_options": ("momentum=0.9",), "weight_decay": 0.0, "ema": 0.0}
+    out = tmp_path / "run"
+    assert run(data, out, optim=options, run={"save_every": 1, "keep": 9}) == 0
+    first, *_, last = (load_model(p / "model.safetensors") for p in list_checkpoints(out))
+    moved = {
+        name: not torch.equal(a, b)
+        for (name, a), b in zip(first.named_parameters(), last.parameters())
+    }
+    assert {n for n, m in moved.items() if n.startswith("blocks.") and m} <= {
+        "blocks.0.norm.weight", "blocks.0.norm.bias"}  # fmt: skip
+    assert any(m for n, m in moved.items() if n.startswith("decoder"))
+    # Momentum is kept: a run that goes on has the bits of one that was not cut.
+    cut = tmp_path / "cut"
+    shutil.copytree(out, cut)
+    for checkpoint in list_checkpoints(cut)[3:]:
+        shutil.rmtree(checkpoint)
+    assert run(data, cut, optim=options) == 0
+    assert micro.same_weights(cut / "model.safetensors", out / "model.safetensors")
+    for lr_of, words in (("nothing=1", "no such parameter; there are"), ("blocks", "expected NAME"),
+                         ("blocks=-1", "FACTOR from 0")):  # fmt: skip
+        refused(words, run, data, tmp_path / "x", optim={"lr_of": (lr_of,)})
+    refused("not one of torch.optim", run, data, tmp_path / "x", optim={"optimizer": "os"})
+    bad = {"optimizer": "SGD", "optimizer_options": ("speed=1",)}
+    refused("--optimizer SGD: .*speed", run, data, tmp_path / "x", optim=bad)
+
+    wider = tuple(change.replace("depth=1", "depth=2") for change in micro.MODEL)
+    wider = tuple(change.replace("state_size=4", "state_size=8") for change in wider)
+    still = {"lr": 1e-30, "weight_decay": 0.0, "ema": 0.0}
+    partial = {"init_partial": out / "model.safetensors", "val_every": 100}
+    wide = tmp_path / "wide"
+    assert run(data, wide, wider, run=partial, optim=still, length={"steps": 1}) == 0
+    named = json.loads((wide / "init.json").read_text())
+    assert "decoder.mlp.0.weight" in named["taken"] or named["taken"]
+    assert "blocks.0.mamba.A_log" in named["other shape"] and not named["not in the model"]
+    assert any(name.startswith("blocks.1.") for name in named["not in the file"])
+    got, source = load_model(wide / "model.safetensors"), load_model(out / "model.safetensors")
+    theirs = source.state_dict()
+    assert all(torch.equal(got.state_dict()[name], theirs[name]) for name in named["taken"])
+    assert [line["step"] for line in lines(wide, "val")] == [0, 1]
