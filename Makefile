@@ -13,7 +13,7 @@ EDIT := PYTHONWARNINGS='ignore:Editable installation' \
 	$(BIN)/python -m pip install $(addprefix --constraint ,$(LOCK)) --editable
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test ptx debug hostile endurance bench study instructions docs lint format figures \
+.PHONY: setup demo test ptx debug hostile endurance bench study docs lint format figures \
         scanned architecture constraints clean
 
 setup: $(STAMP)
@@ -99,14 +99,6 @@ bench: $(STAMP)
 # (docs/lab/studies): make study WHAT="scan --quick".
 study: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
-
-# docs/lab/benchmarks: counts.md, what the CUDA kernels execute, counted while their PTX is executed
-# here; static.md, what they take, and with nvdisasm (on PATH, in CUDA_HOME or inside Triton) their
-# instructions and the scan's least times. PEERS=1 first fetches nvcc (110 MB) and the sources of
-# mamba-ssm, causal-conv1d and gsplat, and counts their kernels beside ours.
-PEERS ?=
-instructions: $(TOOLS)
-	PYTHONPATH=docs:tests $(BIN)/python -m lab.instructions $(if $(PEERS),--peers)
 
 # The site, in site/: a broken link, anchor or docstring is an error.
 docs: $(TOOLS)

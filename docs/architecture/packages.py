@@ -36,7 +36,7 @@ _GROUPS = {
     "OPS": "kernels.selective_scan kernels.causal_conv1d kernels.rasterize "
     "kernels.ssim kernels.triangles",
     "KERNELS": "versions kernels.runtime OPS kernels",
-    "BENCH": "kernels.bench kernels.bench.core kernels.bench.cases kernels.bench.static",
+    "BENCH": "kernels.bench kernels.bench.core kernels.bench.cases",
     "STRESS": "kernels.stress kernels.stress.core kernels.stress.oracles kernels.stress.cases",
     "READERS": "KERNELS core untrusted",
     "MODEL": "model.config model.parts",
@@ -60,7 +60,6 @@ kernels | the public operators, loaded when used | versions | OPS
 kernels.bench.core | definition of a case, the clock, reports | versions kernels.runtime |
 kernels.bench | comparisons with other packages | KERNELS kernels.bench.core |
 kernels.bench.cases | one file per subject | KERNELS kernels.bench.core kernels.bench |
-kernels.bench.static | registers and stack of the CUDA kernels | KERNELS kernels.bench.core |
 kernels.stress.core | definition of a case, the runner, reports | versions kernels.runtime |
 kernels.stress.oracles | the formulas in float64 | kernels.stress.core kernels.rasterize |
 kernels.stress.cases | one file per subject | KERNELS kernels.stress.core kernels.stress.oracles |
@@ -91,11 +90,11 @@ eval | the report that both evaluations share | RESULTS |
 eval.views | PSNR, SSIM, LPIPS; baselines | RESULTS eval |
 eval.shapes | Chamfer, IoU, F-score | RESULTS eval |
 eval.join | reports of shards | core untrusted eval eval.views eval.shapes |
-gpu_check | the checks on a CUDA machine | MEASURES measure |
+gpu_check | the tests and the benchmark on a GPU | KERNELS BENCH measure |
 ablation | rows trained and evaluated alike | RESULTS | measure TRAIN EVAL
-commands | commands, by subject | MEASURES measure ablation gpu_check | TRAIN EVAL
+commands | commands, by subject | MEASURES measure ablation | TRAIN EVAL
 app | the local web app | RESULTS |
-cli | parses and calls | versions core untrusted | commands app gpu_check ablation TRAIN EVAL
+cli | parses and calls | versions core untrusted | commands app ablation TRAIN EVAL
 public | import gamba_warp: names loaded when used | versions kernels | RESULTS
 """
 

@@ -1,4 +1,4 @@
-"""Checks and benchmarks of a machine: ``gamba bench, stress, gpu-check, doctor``."""
+"""Checks and benchmarks of a machine: ``gamba bench, stress, doctor``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from msgspec import Meta
@@ -15,7 +15,6 @@ from msgspec import Meta
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..files import output_folder
-from ..gpu_check import MINUTES, StepName
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 from ..versions import used_versions
 
@@ -43,7 +42,6 @@ def bench_command(
     threads: Threads | None = None,
     compare: Path | None = None,
     render: tuple[Path, ...] = (),
-    static: bool = False,
     only: tuple[str, ...] = (),
 ) -> int:
     """Measure run time and error, also of other installed packages.
@@ -61,17 +59,10 @@ def bench_command(
         threads: Number of CPU threads; by default torch's.
         compare: An older bench.json; prints the ratios of the times.
         render: Measure nothing; make the tables and the page of these JSON files.
-        static: Measure nothing; compile the CUDA kernels, without a GPU, and write their resources
-            (registers, stack, shared memory, occupancy) to static.json and static.md.
         only: Measure only these cases, by full name, such as "one call".
     """
     from ..measure import suites
 
-    if static:
-        folder = output_folder(out)
-        rows = suites.write_static(folder)
-        print(f"{rows} rows; wrote {folder / 'static.json'} and static.md")
-        return 0
     if render:
         first, *others = suites.write_pages([suites.read_document(path) for path in render], out)
         print(" and ".join([f"wrote {first}", *(path.name for path in others)]))
@@ -149,32 +140,6 @@ def stress_command(
         print("interrupted; the results so far are kept")
         return 130
     return 1 if run.failures else 0
-
-
-@ranged
-def gpu_check_command(
-    *,
-    device: Literal["cuda", "cpu"] = "cuda",
-    quick: bool = False,
-    out: Path = Path("out/gpu-check"),
-    minutes: Minutes = MINUTES,
-    steps: tuple[StepName, ...] = (),
-) -> int:
-    """Run kernel checks, full-size inference and the benchmark on this machine.
-
-    Writes gpu-check.json and gpu-check.md after every item, with skipped items and their reasons.
-    Exit code 0 if all executed items passed, 1 if one failed, 2 without a CUDA device.
-
-    Args:
-        device: "cpu" tests the command itself, with --quick in seconds.
-        quick: Use tiny sizes.
-        out: Folder for the results.
-        minutes: Time limit of the whole run.
-        steps: Steps to run; all by default.
-    """
-    from ..gpu_check.check import run_gpu_check
-
-    return run_gpu_check(device, quick, out, minutes, steps)
 
 
 def doctor_command(warm_up: bool = False) -> int:

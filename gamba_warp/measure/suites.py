@@ -18,7 +18,6 @@ from ..kernels.bench.core.case import Case, Settings
 from ..kernels.bench.core.measure import FORMAT, TIMES, measure
 from ..kernels.bench.core.report import markdown, ratio_table
 from ..kernels.bench.peers import versions
-from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 from ..untrusted import documents
 from .page import page
 
@@ -202,30 +201,6 @@ def write_pages(
     for path in paths:
         write_text(path, makers[path.suffix](documents))
     return paths
-
-
-def write_static(folder: Path) -> int:
-    """Compile the CUDA kernels, and write their resources to static.json and static.md.
-
-    Returns:
-        The number of rows.
-
-    Raises:
-        UserError: this build of Warp has no compiler, or a file cannot be written.
-    """
-    with progress_bar(unit="kernel", desc="static") as bar:
-
-        def say(kernel: str) -> None:
-            bar.set_postfix_str(kernel)
-            bar.update()
-
-        try:
-            document = static_report(say)
-        except NoCompiler as error:
-            raise UserError(f"--static: {error}") from error
-    write_json(folder / "static.json", document)
-    write_text(folder / "static.md", static_markdown(document))
-    return len(document["kernels"])
 
 
 def failed_records(document: dict) -> list[dict]:

@@ -459,7 +459,6 @@ NONSENSE = {
         "seeds": "-1 4294967296",
     },
     "demo": {"minutes": "0 -1 nan inf"},
-    "gpu-check": {"minutes": "0 -1 nan inf"},
     "bench scan": {"threads": "0 -1 1000000"},
     "stress scan": {
         "seed": "-1", "minutes": "0 nan inf", "cases": "0 -1", "threads": "0 1000000",

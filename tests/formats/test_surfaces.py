@@ -10,11 +10,11 @@ import trimesh
 import warp as wp
 from helpers.refusals import refused
 from helpers.views import cloud_of
+from ptx.cubin import read_cubin
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench.static.cubin import read_cubin
 from gamba_warp.kernels.rasterize import depth_quantile, quantile
 from gamba_warp.render import render
 from gamba_warp.surfaces.density import MOST_POINTS, opacity_volume

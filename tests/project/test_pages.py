@@ -90,9 +90,8 @@ def own(words: list[str]) -> list[str] | None:
     """Return the words after ``gamba``, in any form; None for another program."""
     if words[0] == "gamba":
         return words[1:]
-    for name in ("train", "gpu_check"):
-        if f"gamba_warp.{name}" in words:
-            return [name.replace("_", "-"), *words[words.index(f"gamba_warp.{name}") + 1 :]]
+    if "gamba_warp.train" in words:
+        return ["train", *words[words.index("gamba_warp.train") + 1 :]]
     return None
 
 

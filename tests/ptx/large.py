@@ -1,16 +1,16 @@
-"""Tests of minutes, for ``make ptx``: gpu-check's shapes, the paper's size, strides near 2^31.
+"""Tests of minutes, for ``make ptx``: the shapes of tests/gpu, the paper's, strides near 2^31.
 
 Run by ``-p ptx.plugin``, which executes all of it from PTX and reports what is found.
 """
 
 import pytest
 import torch
+from gpu import checks
 from helpers import assert_rel_rms
 from helpers import raster as rasters
 from helpers import scan as scans
 from helpers.kernels import conv_inputs
 
-from gamba_warp.gpu_check.checks import checks
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.runtime.stand_in import stand_in, standing_in
@@ -19,12 +19,29 @@ from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 
 HALF = 4e-3  # of numbers of 8 bits
-CHECKS = {x.name: x for x in checks(quick=False) if not x.cuda or x.name.startswith("scan, ")}
+CPU = torch.device("cpu")
 
 
-@pytest.mark.parametrize("name", CHECKS)
-def test_gpu_check(name):
-    CHECKS[name].run(torch.device("cpu"))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("shape", checks.SCANS)
+def test_scan(shape, dtype):
+    checks.check_scan(shape, dtype, CPU)
+
+
+@pytest.mark.parametrize("tuning", checks.TUNINGS)
+def test_tunings(monkeypatch, tuning):
+    monkeypatch.setattr(scan_cuda, "FORCED", tuning)
+    checks.check_scan(checks.SCANS[3], torch.float32, CPU)
+
+
+@pytest.mark.parametrize("shape", checks.CONVS)
+def test_convolution(shape):
+    checks.check_conv(shape, CPU)
+
+
+@pytest.mark.parametrize(("count", "size", "views", "options"), checks.RASTERS)
+def test_rasterizer(count, size, views, options):
+    checks.check_raster(count, size, views, options, CPU)
 
 
 def on_both(function, inputs, cotangents):

@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import hashlib
+import importlib.util
 import os
 import re
 import shutil
@@ -39,6 +40,18 @@ class Missing(Exception):
 
 class Refused(Exception):
     """The PTX has what the interpreter does not know, by its name."""
+
+
+def cuda_tool(name: str) -> Path | None:
+    """Return a program of CUDA's toolkit: on PATH, in CUDA_HOME or CUDA_PATH, or inside Triton."""
+    homes = (os.environ.get(variable) for variable in ("CUDA_HOME", "CUDA_PATH"))
+    folders = [Path(home) / "bin" for home in homes if home]
+    triton = importlib.util.find_spec("triton")
+    if triton is not None and triton.origin:
+        folders.append(Path(triton.origin).parent / "backends" / "nvidia" / "bin")
+    path = os.pathsep.join([os.environ.get("PATH", ""), *map(str, folders)])
+    found = shutil.which(name, path=path)
+    return Path(found) if found else None
 
 
 def _structure(name: str) -> type[ctypes.Structure]:

@@ -1,9 +1,9 @@
-"""gpu-check's limits of the scan: an exponential as bad as documented passes, a fault does not."""
+"""Limits of the scan on a GPU: an exponential as bad as documented passes, a fault does not."""
 
 import pytest
 import torch
+from gpu.checks import check_scan
 
-from gamba_warp.gpu_check import checks
 from gamba_warp.kernels.bench.core.problem import Operator
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
@@ -20,9 +20,9 @@ SHAPES = {
 
 def check(shape, approximate):
     with interpreted(approximate=approximate) as machine:
-        text = checks._scan(shape, torch.float32, torch.device("cpu"))
+        error = check_scan(shape, torch.float32, torch.device("cpu"))
     assert not machine.findings
-    return float(text)
+    return error
 
 
 @pytest.mark.parametrize("shape", SHAPES)

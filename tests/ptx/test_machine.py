@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.kernels import plain_kernel
-from lab.instructions.sass import find_nvdisasm
 
 from . import launch as launching
 from . import machine as machines
 from .launch import Interpreter
-from .machine import Count, Missing, Refused, opcodes, units
+from .machine import Count, Missing, Refused, cuda_tool, opcodes, units
 from .parse import SPACES, read
 
 HEAD = ".version 8.0\n.target sm_80\n.address_size 64\n.shared .align 16 .b8 mem[1024];\n"
@@ -552,8 +551,8 @@ def operations():
 
 def test_operations_are_ptx(tmp_path):
     """Assembled, as a GPU's driver does it: what is compared there is the ISA's, not only ours."""
-    found = find_nvdisasm()  # ptxas lies beside it
-    if not found or not found.with_name("ptxas").exists():
+    ptxas = cuda_tool("ptxas")
+    if ptxas is None:
         pytest.skip("no ptxas")
     entries = (
         ENTRY.replace(" k(", f" k{i}(").format(body_of(x)) for i, x in enumerate(operations())
@@ -561,7 +560,7 @@ def test_operations_are_ptx(tmp_path):
     path = tmp_path / "k.ptx"
     path.write_text("\n".join([HEAD, *entries]))
     command = [
-        found.with_name("ptxas"),
+        ptxas,
         "--gpu-name=sm_90",
         "-O0",
         path,

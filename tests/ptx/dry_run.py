@@ -1,7 +1,7 @@
 """Lists of the kernels that operators launch on CUDA, found without a GPU.
 
 The operators run on tensors that have a shape, a dtype and the device cuda, but no memory. Their
-launches are recorded (``runtime/stand_in.py``), so the code that chooses kernels is their own.
+launches are recorded (``kernels/runtime/stand_in.py``), so their own code chooses the kernels.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch._library.custom_ops import OPDEFS
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ...runtime.stand_in import StandIn, standing_in
+from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
 
 _READ_BACK = (torch.ops.aten.item.default, torch.ops.aten._local_scalar_dense.default)
 # The number of pairs, which the rasterizer reads back from the device, is taken to be this.
@@ -34,7 +34,7 @@ class Launch(NamedTuple):
 
 
 class _Inside(TorchDispatchMode):
-    """Runs the body of our operators on the fake tensors, where their fake results would do."""
+    """Runs the body of our operators on fake tensors, in place of their fake results."""
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         if function in _READ_BACK:
@@ -58,9 +58,9 @@ def can_dry_run() -> bool:
 
 @contextmanager
 def dry_run() -> Iterator[list[Launch]]:
-    """Inside, tensors made with the device cuda are fake, and launches on it are only noted.
+    """Make tensors on the device cuda fake, and only record launches on it, within the block.
 
-    Gives the list of launches, which grows. Gradients come from ``run_backward``.
+    Yields the list of launches, which grows. Gradients come from ``run_backward``.
     """
     launches: list[Launch] = []
 
@@ -73,7 +73,7 @@ def dry_run() -> Iterator[list[Launch]]:
 
 
 def run_backward(outputs: Sequence[Tensor]) -> None:
-    """All gradients of the outputs, node by node: torch's engine would look for the GPU."""
+    """Compute all gradients of the outputs, node by node: torch's engine would ask for the GPU."""
     pending: dict = {}
 
     def give(node, index: int, gradient: Tensor | None) -> None:
@@ -104,7 +104,7 @@ def run_backward(outputs: Sequence[Tensor]) -> None:
 
 
 def launches_of(run: Callable[[], Sequence[Tensor]]) -> dict[str, list[Launch]]:
-    """The different launches of ``run`` on CUDA: "forward", and "gradient" of what it returns."""
+    """Return the distinct launches of ``run`` on CUDA: "forward", and "gradient" of its result."""
     with dry_run() as launches:
         outputs = run()
         forward = len(launches)

@@ -1,4 +1,4 @@
-"""Reader of the kernels' resources from a compiled CUDA binary.
+"""Registers, stack and shared memory of kernels, read from a compiled CUDA binary.
 
 A cubin is an ELF file. Attributes in ``.nv.info`` hold registers and stack, the sizes of
 ``.nv.shared.*`` sections the static shared memory, and ``.text.*`` the instructions, 16 bytes each
@@ -46,7 +46,7 @@ class Resources(NamedTuple):
 
 
 def read_cubin(cubin: bytes) -> dict[str, Resources]:
-    """The kernels of a binary by name.
+    """Return the resources of a binary's kernels by name.
 
     Raises:
         ValueError: not an ELF file of 64 bits, or a damaged one.

@@ -1,9 +1,8 @@
-"""``gamba gpu-check``'s checks of CUDA graphs, with a graph that runs its function on a CPU."""
+"""The checks of CUDA graphs (tests/gpu), with a graph that runs its function on a CPU."""
 
 import pytest
 import torch
-
-from gamba_warp.gpu_check import checks as graphs
+from gpu import checks
 
 CPU = torch.device("cpu")
 
@@ -27,15 +26,15 @@ class Graph:
 
 @pytest.fixture
 def graph(monkeypatch):
-    """Puts such graphs in place of CUDA's; ``spoil`` may change what a replay returns."""
+    """Function that puts such graphs in place of CUDA's; ``spoil`` may change a replay's result."""
 
     def switch(spoil=None):
         def captured(run, device):
             graph = Graph(run, spoil)
             return graph, graph.made, 0
 
-        monkeypatch.setattr(graphs, "captured", captured)
-        monkeypatch.setattr(graphs, "lists_outgrown", lambda: True)
+        monkeypatch.setattr(checks, "captured", captured)
+        monkeypatch.setattr(checks, "lists_outgrown", lambda: True)
         monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
 
     return switch
@@ -43,27 +42,33 @@ def graph(monkeypatch):
 
 def test_rendering(graph, monkeypatch):
     graph()
-    found = graphs.raster_graph(CPU)
-    pairs = [int(n) for n in found.removeprefix("equal, with ").removesuffix(" pairs").split(", ")]
+    pairs = checks.check_raster_graph(CPU)
     assert pairs[2] > 1.5 * pairs[0] and pairs[2] > 1.5 * pairs[1]  # more than there is room for
-    monkeypatch.setattr(graphs, "lists_outgrown", lambda: False)
-    with pytest.raises(AssertionError, match="not meant"):
-        graphs.raster_graph(CPU)
+    monkeypatch.setattr(checks, "lists_outgrown", lambda: False)
+    with pytest.raises(AssertionError, match="have room"):
+        checks.check_raster_graph(CPU)
     graph(lambda made: made["quats"].mul_(1 + 1e-6))
     with pytest.raises(AssertionError, match="result 4 differs"):
-        graphs.raster_graph(CPU)
+        checks.check_raster_graph(CPU)
 
 
-def test_a_training_step(graph):
-    """The same start gives the same bits on a CPU."""
+def test_layer(graph):
     graph()
-    assert graphs.step_graph(CPU) == "losses to 0.0e+00, the weights' change to 0.0e+00"
+    checks.check_layer_graph(CPU)
+    graph(lambda out: out[0, 0, 0].add_(1e-6))
+    with pytest.raises(AssertionError, match="result 0 differs"):
+        checks.check_layer_graph(CPU)
+
+
+def test_training_step(graph):
+    graph()
+    checks.check_step_graph(CPU)
     graph(lambda loss: loss.mul_(1.001))
     with pytest.raises(AssertionError, match="losses: relative rms error 0.001"):
-        graphs.step_graph(CPU)
+        checks.check_step_graph(CPU)
 
 
-def test_nothing_waits(monkeypatch):
+def test_no_wait(monkeypatch):
     """The first calls may wait, the second ones run under torch's own watch, which is put back."""
     modes, ran = ["default"], []
 
@@ -74,9 +79,13 @@ def test_nothing_waits(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
     monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", modes.append)
-    monkeypatch.setattr(graphs, "render_all", lambda scene: run("splats"))
-    monkeypatch.setattr(graphs.TrainingStep, "run", lambda self: run("steps"))
+    monkeypatch.setattr(checks, "render_all", lambda scene: run("splats"))
+    monkeypatch.setattr(checks.TrainingStep, "run", lambda self: run("steps"))
     with pytest.raises(RuntimeError, match="synchronizing"):
-        graphs.no_wait(CPU)
+        checks.check_no_wait(CPU)
     assert ran == [(name, mode) for name in ("splats", "steps") for mode in ("default", "error")]
     assert modes[-1] == "default"
+
+
+def test_compiled():
+    checks.check_compiled("aot_eager", CPU)

@@ -1,4 +1,4 @@
-"""PTX of other projects' kernels, from their source packages and nvcc; nothing of theirs is kept.
+"""PTX of other projects' kernels, from their source packages and nvcc.
 
 Packages and compiler come from the index of pip into a folder outside the repository. A kernel is
 instantiated with the template arguments that its host code chooses for a shape, and compiled with
@@ -20,11 +20,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from ptx.contract import contracted
-from ptx.launch import ARCHITECTURE, Interpreter
-from ptx.machine import Missing
-from ptx.parse import Program, read
 from torch import Tensor
+
+from .contract import contracted
+from .launch import ARCHITECTURE, Interpreter
+from .machine import Missing
+from .parse import Program, read
 
 PACKAGES = {"mamba-ssm": "2.3.2.post1", "causal-conv1d": "1.7.0", "gsplat": "1.5.3"}
 _COMPILER = ("nvidia-cuda-nvcc", "nvidia-nvvm", "nvidia-cuda-crt")
@@ -86,7 +87,7 @@ class Peers:
                     packed.extractall(folder, filter="data")
 
     def source(self, package: str) -> Path:
-        """Folder of a package's sources."""
+        """Return the folder of a package's sources."""
         return self.folder / f"{package.replace('-', '_')}-{PACKAGES[package]}"
 
     def compile(
@@ -133,7 +134,7 @@ def _pip(*arguments: object) -> None:
 
 
 def structure(text: str, name: str) -> type[ctypes.Structure]:
-    """A structure of parameters from the text of a C++ header."""
+    """Return a structure of parameters from the text of a C++ header."""
     pattern = rf"struct {name}\s*(?::\s*public (\w+))?\s*\{{(.*?)\n\}};"
     ((base, body),) = re.findall(pattern, text, re.S)
     (index,) = re.findall(r"using index_t = uint(\d+)_t", text)
@@ -151,7 +152,7 @@ def structure(text: str, name: str) -> type[ctypes.Structure]:
 def filled(
     kind: type[ctypes.Structure], tensors: dict[str, tuple[Tensor, str]], **numbers
 ) -> bytes:
-    """The bytes of a structure.
+    """Return the bytes of a structure.
 
     Args:
         kind: from ``structure``.
@@ -169,7 +170,7 @@ def filled(
 
 
 def packed(program: Program, values: Sequence[Tensor | float | int | None]) -> list[bytes]:
-    """The bytes of separate parameters; None is no tensor."""
+    """Return the bytes of separate parameters; None stands for a missing tensor."""
 
     def one(value, size: int) -> bytes:
         if isinstance(value, float):

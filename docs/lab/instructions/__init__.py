@@ -1,1 +1,0 @@
-"""Instructions of the CUDA kernels by a disassembler: ``make instructions``."""

@@ -1,1 +1,0 @@
-"""Resources of the CUDA kernels, found without a GPU."""

@@ -1,0 +1,268 @@
+"""Checks of the operators on a device: against float64, or against another run.
+
+The tests marked ``gpu`` run them on a GPU; ``tests/ptx`` runs the first three on the CUDA kernels'
+PTX, and ``tests/graphs`` those of CUDA graphs with a graph that runs its function on a CPU.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gamba_warp.kernels.bench.cases.conv import conv_problem
+from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
+from gamba_warp.kernels.bench.cases.scan_problem import allowances, make_inputs, scan_problem
+from gamba_warp.kernels.bench.core.case import BOTH, Error, Settings, compare
+from gamba_warp.kernels.bench.core.problem import Operator
+from gamba_warp.kernels.causal_conv1d import causal_conv1d
+from gamba_warp.kernels.rasterize import lists_outgrown, rasterization
+from gamba_warp.kernels.runtime.stand_in import kind_of
+from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
+from gamba_warp.measure.inference import Inference, build_model, captured
+
+# Allowed relative rms errors: of float32 sums over a few hundred terms; for the scan plus the error
+# of a GPU's exponential; of half precision, which rounds inputs and outputs; and of pictures, where
+# a few pixels may cross the threshold of alpha.
+LIMIT, HALF_LIMIT, PICTURE_LIMIT = 2e-6, 3e-2, 1e-3
+# Under capture torch may choose other kernels for a matrix product. Adam's first steps follow the
+# sign of the gradient, so weights with a gradient near 0 diverge.
+LOSS_LIMIT, CHANGE_LIMIT = 1e-4, 0.05
+_STEPS = 4  # of training
+# Each is batch, tokens, channels, states and groups.
+SCANS = [
+    (2, 139, 37, 3, 1), (1, 65, 40, 3, 2), (1, 1, 1, 1, 1), (1, 577, 70, 16, 1),
+    (2, 128, 64, 16, 1), (1, 67, 35, 17, 1), (1, 100, 20, 40, 1), (3, 64, 96, 16, 3),
+    (1, 9, 3, 256, 1), (1, 1031, 129, 16, 1), (1, 66, 5, 64, 1), (2, 200, 33, 8, 1),
+]  # fmt: skip
+TUNINGS = [
+    Tuning(segments=2, back_segments=3),
+    Tuning(segments=7, channels=1, states=16, back_channels=1, back_states=8),
+    Tuning(channels=4, states=4, back_segments=4, back_channels=4, back_states=4),
+    Tuning(channels=1, states=4, back_channels=2, back_states=8, block=64),
+]
+# Each is batch, tokens, channels and taps.
+CONVS = [(2, 300, 19, 4), (1, 1, 1, 2), (1, 33, 130, 3), (3, 257, 64, 4)]
+# Each is Gaussians, side of the picture, views and options; tiles of few views are cut into parts.
+RASTERS = [
+    (300, 75, 3, {}), (1, 33, 1, {}), (2000, 130, 1, {"rasterize_mode": "antialiased"}),
+    (700, 61, 40, {}), (500, 48, 2, {"quats": None}), (4000, 257, 12, {}),
+]  # fmt: skip
+
+
+def assert_within(error: Error, limit: float) -> float:
+    """Return a relative rms error that is within its limit."""
+    assert error.rel_rms <= limit, (
+        f"{error.worst}: relative rms error {error.rel_rms:.2g}, allowed {limit:.2g}"
+    )
+    return error.rel_rms
+
+
+def assert_same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
+    """Compare results bit by bit."""
+    for i, (a, b) in enumerate(zip(first, second, strict=True)):
+        assert a.equal(b), f"result {i} differs by up to {(a - b).abs().max().item():.2g}"
+
+
+def problem_of(shape: tuple, device: torch.device) -> Operator:
+    """Return a scan with an initial state."""
+    batch, length, channels, states, groups = shape
+    inputs = make_inputs(batch, length, channels, states, groups)
+    state = torch.randn(batch, channels, states, generator=torch.Generator().manual_seed(2))
+    return scan_problem(inputs, device, length, channels, state)
+
+
+def check_scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> float:
+    """Check the output and all gradients, each by its own limit; return the worst error."""
+    problem = problem_of(shape, device)
+    if dtype != torch.float32:
+        return assert_within(problem.check(BOTH, dtype), HALF_LIMIT)
+    got, truth = problem.results(True), problem.truth(True)
+    limits = dict.fromkeys(truth, LIMIT)
+    if kind_of(device) == "cuda":
+        more = allowances(lambda off: problem.truth(True, off=off))
+        limits = {name: LIMIT + more[name] for name in truth}
+    errors = {name: compare({name: got[name]}, {name: truth[name]}) for name in truth}
+    nearest = max(truth, key=lambda name: errors[name].rel_rms / limits[name])
+    return assert_within(errors[nearest], limits[nearest])
+
+
+def check_conv(shape: tuple[int, int, int, int], device: torch.device) -> None:
+    """Check the output and all gradients, with an initial state."""
+    assert_within(conv_problem(device, shape, state=True).check(BOTH), LIMIT)
+
+
+def scene_of(count: int, size: int, views: int, options: dict, device: torch.device) -> Scene:
+    """Return a shell, without quaternions if ``options`` have None for them."""
+    gaussians: dict[str, Any] = {**shell(count, scale=3.0)}
+    if "quats" in options:
+        gaussians["quats"] = None
+    rest = {name: value for name, value in options.items() if name != "quats"}
+    return Scene(gaussians, *orbit_cameras(views, size), size, device, rest)
+
+
+def check_raster(count: int, size: int, views: int, options: dict, device: torch.device) -> None:
+    """Check picture, alphas and all gradients on a crop of the first view."""
+    scene = scene_of(count, size, views, options, device)
+    picture, alphas, _ = scene.forward()
+    assert picture.isfinite().all() and alphas.max() <= 1
+    assert_within(scene.check(BOTH), PICTURE_LIMIT)
+
+
+def layer_of(shape: tuple, device: torch.device) -> tuple[Callable[..., Tensor], list[Tensor]]:
+    """Return a layer of convolution and scan, and its inputs on the device."""
+    problem = problem_of(shape, device)
+    inputs = problem.at(torch.float32)
+    weight = torch.linspace(-0.5, 0.5, 4 * inputs["u"].shape[2], device=device)
+
+    def layer(u: Tensor, weight: Tensor) -> Tensor:
+        u = causal_conv1d(u, weight, activation="silu")
+        return problem.call({**inputs, "u": u})  # torch 2.6 cannot compile "|" of two dicts
+
+    return layer, [inputs["u"], weight.view(-1, 4)]
+
+
+def check_compiled(backend: str, device: torch.device) -> None:
+    """Check ``torch.compile`` of a layer and its gradients, without graph breaks."""
+    layer, inputs = layer_of((1, 139, 37, 16, 1), device)
+    results = []
+    for function in (layer, torch.compile(layer, fullgraph=True, backend=backend)):
+        leaves = [x.detach().clone().requires_grad_() for x in inputs]
+        out = function(*leaves)
+        results.append({"out": out} | dict(zip("uw", torch.autograd.grad(out.sum(), leaves))))
+    assert_within(compare(results[1], results[0]), 1e-6)
+
+
+def check_side_stream(device: torch.device) -> None:
+    """Check a layer on a stream of its own, after work that takes longer than its launch."""
+    layer, inputs = layer_of((1, 577, 70, 16, 1), device)
+    want = layer(*inputs)
+    stream = torch.cuda.Stream(device)
+    torch.cuda.synchronize(device)
+    with torch.cuda.stream(stream):
+        big = torch.randn(4096, 4096, device=device)
+        for _ in range(8):  # a launch on another stream would run too early
+            big = big @ big * 1e-3
+        out = layer(*(x + 0 * big[0, 0].nan_to_num(0.0, 0.0, 0.0) for x in inputs))
+    stream.synchronize()
+    assert_same((out,), (want,))
+
+
+def check_layer_graph(device: torch.device) -> None:
+    """Check that replays equal plain runs bit for bit, also with changed inputs."""
+    layer, inputs = layer_of((1, 577, 70, 16, 1), device)
+    with torch.no_grad():
+        graph, out, _ = captured(lambda: layer(*inputs), device)
+        for scale in (1.0, 0.5):
+            inputs[0].mul_(scale)
+            out.fill_(torch.nan)
+            graph.replay()
+            torch.cuda.synchronize(device)
+            assert_same((out,), (layer(*inputs),))
+
+
+def render_all(scene: Scene) -> dict[str, Tensor]:
+    """Render; return picture, alphas, the number of pairs and all gradients."""
+    leaves = scene.leaves()
+    given: dict[str, Any] = {**scene.arguments(), **leaves}
+    renders, alphas, meta = rasterization(**given)
+    grads = torch.autograd.grad(renders.square().sum() + alphas.sum(), [*leaves.values()])
+    made = {"renders": renders.detach(), "alphas": alphas.detach(), "pairs": meta.bins.count}
+    return made | dict(zip(leaves, grads))
+
+
+def check_no_wait(device: torch.device) -> None:
+    """Check that torch synchronises with the device in no call after the first."""
+    scene = scene_of(700, 75, 3, {"render_mode": "RGB+D"}, device)
+    for run in (partial(render_all, scene), TrainingStep(device).run):
+        run()
+        before = torch.cuda.get_sync_debug_mode()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            run()
+        finally:
+            torch.cuda.set_sync_debug_mode(before)
+
+
+def check_raster_graph(device: torch.device) -> list[int]:
+    """Check replays bit by bit, with changed sizes and with more pairs than the capacity.
+
+    Returns the numbers of pairs.
+    """
+    scene = scene_of(700, 75, 3, {"render_mode": "RGB+D"}, device)
+    graph, made, _ = captured(partial(render_all, scene), device)
+    found = []
+    for factor in (1.0, 0.8, 6.0, 0.25):
+        scene.gaussians["scales"].mul_(factor)  # and with the sizes the number of pairs
+        for value in made.values():
+            value.fill_(-1)
+        graph.replay()
+        torch.cuda.synchronize(device)
+        replayed = {name: value.clone() for name, value in made.items()}
+        found.append(int(replayed["pairs"]))
+        if factor == 6.0:
+            assert lists_outgrown(), f"the lists have room for {found[-1]} pairs after {found[0]}"
+        assert_same(tuple(replayed.values()), tuple(render_all(scene).values()))
+    return found
+
+
+class TrainingStep:
+    """Training step of a small model with rendering, an image loss and AdamW, in fixed shapes."""
+
+    def __init__(self, device: torch.device):
+        torch.manual_seed(0)
+        model, _ = build_model(Settings(device, level="quick"))
+        self.inputs = Inference(model.train(), device, 2)
+        self.parameters = [p for p in model.parameters() if p.requires_grad]
+        rate = torch.tensor(1e-3, device=device) if device.type == "cuda" else 1e-3
+        self.optimizer = torch.optim.AdamW(
+            self.parameters, lr=rate, capturable=device.type == "cuda", fused=True
+        )
+
+    def run(self) -> Tensor:
+        """Make a step and return its loss."""
+        self.optimizer.zero_grad(set_to_none=True)
+        x = self.inputs
+        picture = x.view(x.model(x.image, x.cameras))[:, 0]
+        loss = (picture - x.image).square().mean()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, 1.0)
+        self.optimizer.step()
+        return loss.detach()
+
+    @torch.no_grad()
+    def begin(self, weights: list[Tensor]) -> None:
+        """Reset weights and the optimizer's state in place."""
+        for parameter, weight in zip(self.parameters, weights):
+            parameter.copy_(weight)
+        for state in self.optimizer.state.values():
+            for value in state.values():
+                value.zero_()
+
+    def weights(self) -> list[Tensor]:
+        """Return a copy of the weights."""
+        return [p.detach().clone() for p in self.parameters]
+
+    def train(self, step: Callable[[], Tensor], first: list[Tensor]) -> dict[str, Tensor]:
+        """Make steps after a reset; return losses and the change of the weights."""
+        self.begin(first)
+        losses = torch.stack([step().clone() for _ in range(_STEPS)])
+        change = [(now - old).flatten() for now, old in zip(self.weights(), first)]
+        return {"losses": losses, "change": torch.cat(change)}
+
+
+def check_step_graph(device: torch.device) -> None:
+    """Check that replays of a captured training step train like plain steps."""
+    steps = TrainingStep(device)
+    first = steps.weights()
+    graph, loss, _ = captured(steps.run, device)
+
+    def replay() -> Tensor:
+        graph.replay()
+        return loss
+
+    got, want = (steps.train(step, first) for step in (replay, steps.run))
+    assert want["losses"][-1] < want["losses"][0], "the loss does not fall"
+    assert_within(compare({"losses": got["losses"]}, {"losses": want["losses"]}), LOSS_LIMIT)
+    assert_within(compare({"change": got["change"]}, {"change": want["change"]}), CHANGE_LIMIT)

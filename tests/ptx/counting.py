@@ -1,0 +1,135 @@
+"""Instructions that kernels execute, counted while their PTX runs without a GPU.
+
+PTX is not machine code. The certain optimizations of ptxas are applied before counting: products
+are fused with the sums that are their only readers; unused results, moves of registers and reads of
+parameters, which become operands, are not counted. Machine code differs by addresses that ptxas
+computes once and reuses.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
+from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
+
+from .dry_run import MULTIPROCESSORS
+from .launch import Interpreter, interpreted
+from .machine import Count, opcodes, units
+from .parse import SPACES, Program
+
+CHANNELS, STATES = 1024, 16  # of the scan in the paper's model
+WIDTH = 4  # of the convolution
+GAUSSIANS, SIDE = 16384, 512
+SECTOR = 32
+# Counts beside instructions: their memory accesses.
+ASKED = ("bytes", "sectors", "first", "own", "passes", "conflicts", "together")
+_NAME = re.compile(r"(?:\w+__locals__)?_?(\w+?)(?:_[0-9a-f]{8})+_cuda_kernel_forward")
+
+
+class Executed(NamedTuple):
+    """Instructions executed by all launches of a kernel.
+
+    Attributes:
+        name: of the kernel.
+        counts: instructions of warps by kind, a "routine" being a division or root of many; and
+            ``ASKED``: "bytes" of global memory, its "sectors" of 32 bytes, "first" of them that
+            the launch had not touched, the sectors of threads' "own" memory, and of shared memory
+            "passes", "conflicts" among them, and "together", the passes if a warp's lanes could be
+            served at once.
+        lanes: mean number of active lanes of 32 per instruction.
+        splits: share of branches that diverge in a warp.
+    """
+
+    name: str
+    counts: dict[str, float]
+    lanes: float
+    splits: float
+
+
+Counts = dict[str, dict[str, Executed]]  # by direction and entry
+
+
+def executed(machine: Interpreter) -> dict[str, Executed]:
+    """Return the counts of an interpreter, by entry."""
+    return {
+        entry: _sum(program, times, machine.counts[entry])
+        for entry, (program, times) in machine.executed.items()
+    }
+
+
+def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
+    names = [*opcodes()]
+    read = {x for i in program.code for x in (*i.given[: i.reads], i.guard)}
+    counts: Counter[str] = Counter()
+    fields = [name for name, _ in Count._fields_]
+    steps = lanes = jumps = splits = 0
+    for i, warps, row in zip(program.code, times, asked):
+        kind, more = units()[i.op], dict(zip(fields, map(int, row)))
+        memory = kind in ("load", "store")
+        if kind != "atomic" and i.writes and not read & {*i.to[: i.writes]}:
+            continue
+        if memory:
+            kind = {"param": "parameter", "": "generic"}.get(SPACES[i.space], SPACES[i.space])
+            if kind == "generic":  # the compiler does not know, the addresses do
+                kind = "global" if more["bytes"] else "shared" if more["passes"] else "local"
+        if kind in ("move", "parameter"):
+            continue
+        twice = kind == "integer" and names[i.op].endswith("64")  # 32 bits at a time
+        counts[kind] += warps * (1 + twice)
+        steps, lanes = steps + warps, lanes + more["lanes"]
+        jumps, splits = jumps + warps * (kind == "jump"), splits + more["splits"]
+        if memory or kind == "atomic":
+            more["own"] = more.pop("sectors") if kind == "local" else 0
+            counts.update({name: more.get(name, 0) for name in ASKED})
+    found = _NAME.fullmatch(program.name)
+    share = splits / jumps if jumps else 0.0
+    return Executed(found[1] if found else program.name, dict(counts), lanes / steps, share)
+
+
+def count(
+    run: Callable[[], Sequence[Tensor]], wanted: Iterable[Tensor], multiprocessors: int
+) -> Counts:
+    """Count the instructions of a call on an imagined device: "forward", and "gradient"."""
+    options = {"counting": True, "contract": ".*"}
+    with interpreted(multiprocessors, **options) as machine:
+        outputs = [x for x in run() if x.requires_grad]
+    found = {"forward": executed(machine)}
+    if outputs:
+        cotangents = [torch.randn_like(x) for x in outputs]
+        with interpreted(multiprocessors, **options) as machine:
+            torch.autograd.grad(outputs, [*wanted], cotangents, allow_unused=True)
+        found["gradient"] = executed(machine)
+    return found
+
+
+def instructions(counts: Mapping[str, float]) -> float:
+    """Return the total number of instructions."""
+    return sum(number for kind, number in counts.items() if kind not in ASKED)
+
+
+def scan_tuning(batch: int, length: int) -> scan_cuda.Tuning:
+    """Return the tuning that the scan chooses for sequences of the paper's width."""
+    return scan_cuda.choose(batch, length, CHANNELS, STATES, 1, MULTIPROCESSORS)
+
+
+def scan_inputs(length: int, channels: int, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return the scan's inputs of one sequence, which require gradients."""
+    inputs = make_inputs(1, length, channels)
+    for name in ("u", "delta", "z", "B", "C"):
+        inputs[name] = inputs[name].to(dtype)
+    return {name: x.requires_grad_() for name, x in inputs.items()}
+
+
+def conv_inputs(length: int, channels: int, dtype: torch.dtype) -> list[Tensor]:
+    """Return the convolution's inputs of one sequence, which require gradients."""
+    torch.manual_seed(0)
+    x, weight = torch.randn(1, length, channels).to(dtype), torch.randn(channels, WIDTH)
+    return [value.requires_grad_() for value in (x, weight, torch.randn(channels))]
