@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ...kernels.causal_conv1d import causal_conv1d_fn
 from ...kernels.causal_conv1d.reference import causal_conv1d_reference
-from ...kernels.selective_scan.cpu.step import conv_step
 from ..shared import DTYPES, INDEX_DTYPES, check_tensor, of_rows, one_of
 
 __all__ = [
@@ -47,12 +46,6 @@ def causal_conv1d_update(
         TypeError: an argument is not a tensor or has another dtype.
         ValueError: a shape or ``activation`` is not one of the above.
     """
-    if cache_seqlens is None and conv_state_indices is None and activation in ACTIVATIONS:
-        one = isinstance(x, Tensor) and x.dim() == 3 and x.shape[2] == 1
-        token = x[..., 0] if one else x
-        out = conv_step(token, weight, bias, conv_state, activation is not None)
-        if out is not None:  # None without effect also for an invalid argument
-            return out[..., None] if one else out
     check_tensor("x", x, ("B", "D"), ("B", "D", "L"), dtypes=DTYPES)
     batch, channels = x.shape[:2]
     check_tensor("weight", weight, (channels, "W >= 1"), dtypes=DTYPES)

@@ -2,7 +2,6 @@
 
 from ..absent import complete
 from ..causal_conv1d import causal_conv1d_fn, causal_conv1d_update
-from .models.mixer_seq_simple import MambaLMHeadModel
 from .modules.mamba_simple import Mamba
 from .ops.selective_scan_interface import (
     mamba_inner_fn,
@@ -16,7 +15,6 @@ from .utils.generation import InferenceParams
 __all__ = [
     "InferenceParams",
     "Mamba",
-    "MambaLMHeadModel",
     "causal_conv1d_fn",
     "causal_conv1d_update",
     "mamba_inner_fn",
@@ -32,13 +30,15 @@ ABSENT = complete(
     "mamba-ssm",
     "only its Mamba-1 is",
     {
-        "": "Mamba2 Mamba3",
+        "": "Mamba2 Mamba3 MambaLMHeadModel",
         "distributed.distributed_utils": "AllGatherFunc AllReduceFunc ReduceScatterFunc all_gather "
         "all_gather_raw all_reduce all_reduce_raw allreduce_sequence_parallel_grad "
         "get_dim_for_local_rank reduce_scatter reduce_scatter_raw sync_shared_params",
         "distributed.tensor_parallel": "ColumnParallelEmbedding ColumnParallelLinear "
         "ParallelEmbeddings ParallelLinearFunc RowParallelLinear VocabParallelEmbedding "
         "parallel_linear_func",
+        "models.config_mamba": "MambaConfig",
+        "models.mixer_seq_simple": "MambaLMHeadModel MixerModel",
         "modules.mamba2": "Mamba2",
         "modules.mamba2_simple": "Mamba2Simple",
         "modules.mamba3": "Mamba3",
@@ -63,9 +63,11 @@ ABSENT = complete(
         "ssd_chunk_scan_combined_ref ssd_selective_scan",
         "ops.triton.ssd_state_passing": "StatePassingFn state_passing state_passing_ref",
         "utils.determinism": "set_deterministic_mode use_deterministic_mode",
-        "utils.generation": "DecodingCGCache capture_graph "
+        "utils.generation": "DecodingCGCache GenerationMixin capture_graph decode "
         "modify_logit_for_repetition_penalty modify_logits_for_min_p_filtering "
-        "modify_logits_for_top_k_filtering modify_logits_for_top_p_filtering update_graph_cache",
+        "modify_logits_for_top_k_filtering modify_logits_for_top_p_filtering sample "
+        "update_graph_cache",
+        "utils.hf": "load_config_hf load_state_dict_hf",
         "utils.torch": "custom_amp_decorator custom_bwd custom_fwd",
     },
 )

@@ -1,1 +1,1 @@
-"""Language models of mamba-ssm, in files of its names."""
+"""Parts of mamba-ssm's language models, in files of its names."""

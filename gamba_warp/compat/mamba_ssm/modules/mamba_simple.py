@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from ....kernels.causal_conv1d import causal_conv1d
 from ....kernels.selective_scan import selective_scan
-from ....kernels.selective_scan.cpu.step import scan_step
 from ...causal_conv1d import causal_conv1d_update
 from ...shared import DTYPES, check_tensor, one_of
 from ..ops.triton.selective_state_update import selective_state_update
@@ -182,12 +181,10 @@ class Mamba(nn.Module):
         )
         low_rank, B, C = self.x_proj(x).split([self.dt_rank, self.d_state, self.d_state], dim=-1)
         dt, bias = F.linear(low_rank, self.dt_proj.weight), self.dt_proj.bias
-        y = scan_step(ssm_state, x, dt, self.A_log, B, C, self.D, z, bias, True, logs=True)
-        if y is None:
-            A = -torch.exp(self.A_log.float())
-            y = selective_state_update(
-                ssm_state, x, dt, A, B, C, self.D, z=z, dt_bias=bias, dt_softplus=True
-            )
+        A = -torch.exp(self.A_log.float())
+        y = selective_state_update(
+            ssm_state, x, dt, A, B, C, self.D, z=z, dt_bias=bias, dt_softplus=True
+        )
         return self.out_proj(y)[:, None], conv_state, ssm_state
 
     def allocate_inference_cache(

@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .....kernels.selective_scan.cpu.step import scan_step
 from ....shared import DTYPES, INDEX_DTYPES, check_tensor, of_rows
 
 
@@ -42,10 +41,6 @@ def selective_state_update(
         TypeError: an argument is not a tensor or has another dtype (complex and float64 too).
         ValueError: a shape is not one of the above.
     """
-    if state_batch_indices is None:
-        done = scan_step(state, x, dt, A, B, C, D, z, dt_bias, dt_softplus)
-        if done is not None:  # None without effect also for an invalid argument
-            return done
     check_tensor("state", state, ("B", "D", "N"), ("B", "H", "D", "N"), dtypes=DTYPES)
     rows, *heads, channels, states = state.shape
     parameter = (*heads, channels)
