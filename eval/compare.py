@@ -1,7 +1,7 @@
 """``gamba compare``: reports of several methods with the same protocol and truth in one table.
 
 A method has a report of ``eval-views``, one of ``eval-geometry``, or both. The table covers the
-objects that all methods have. It is written as Markdown, JSON and a self-contained page.
+objects that all methods have. It is written as Markdown and JSON.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gamba_warp.untrusted.documents import parse_document, read_bytes
 from gamba_warp.versions import __version__
 
 from .averages import BOOTSTRAP, LEVEL, summary_of
-from .report import OK, csv_of, flat
+from .report import OK, flat
 from .tables import Column, Lines, Row, figures, markdown
 
 FORMAT = "gamba_warp.compare.1"
@@ -408,22 +408,6 @@ def main_lines(joined: dict[str, Any], paper: bool) -> Lines:
     return lines
 
 
-def csv_text(joined: dict[str, Any]) -> str:
-    """Return the text of ``compare.csv``, one line per method and per difference.
-
-    Figures have the columns ``KEY.mean``, ``KEY.low`` and ``KEY.high`` (of the interval).
-    """
-
-    def plain(value: Any) -> Any:
-        if not isinstance(value, dict):
-            return value
-        low, high = value["interval"] or (None, None)
-        return {"mean": value["mean"], "low": low, "high": high}
-
-    rows = [*joined["rows"], *joined["differences"]]
-    return csv_of({"objects": [{k: plain(v) for k, v in row.items() if v} for row in rows]})
-
-
 def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
     """Yield texts and tables in order."""
     columns, grounds, of_shapes = _columns(joined, paper)
@@ -488,22 +472,3 @@ def markdown_page(joined: dict[str, Any], paper: bool) -> str:
     """
     parts = [p if isinstance(p, str) else markdown(p) for p in _parts(joined, paper)]
     return "\n\n".join(parts) + "\n"
-
-
-def html_page(joined: dict[str, Any], paper: bool) -> str:
-    """Return the text of ``compare.html``; arguments as for ``markdown_page``."""
-    from gamba_warp.pages.page import (
-        Section,
-        page_text,
-    )  # imports torch, which the table does not need
-
-    sections, texts = [], []
-    for part in _parts(joined, paper):
-        if isinstance(part, str):
-            texts.append(part)
-        else:
-            head, *rows = part
-            sections.append(Section("", "\n\n".join(texts), header=head, table=rows))
-            texts = []
-    sections += [Section("", "\n\n".join(texts))] if texts else []
-    return page_text("Methods compared", "", sections)

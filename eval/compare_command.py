@@ -37,26 +37,15 @@ def compare_command(
         against: Baseline of the paired differences; by default the first method.
         seconds: NAME=SECONDS: time of a method per object, if no report has measured it.
         paper: Also print the paper's Table 1, which has other objects and another protocol.
-        out: Folder for compare.json, compare.md, compare.html, compare.csv and, of the first table,
-            compare.tex.
+        out: Folder for compare.json and compare.md.
         json: Print compare.json in place of the table.
     """
     if not reports:
         raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
     from gamba_warp.files import output_folder, write_json, write_text
 
-    from .compare import (
-        CAVEAT,
-        TABLE_1,
-        csv_text,
-        html_page,
-        join,
-        main_lines,
-        markdown_page,
-        read_reports,
-    )
+    from .compare import CAVEAT, TABLE_1, join, markdown_page, read_reports
     from .report import json_of
-    from .tables import latex
 
     joined = join(read_reports(reports, seconds), against)
     if paper:
@@ -65,8 +54,5 @@ def compare_command(
         folder = output_folder(out)
         write_json(folder / "compare.json", joined)
         write_text(folder / "compare.md", markdown_page(joined, paper))
-        write_text(folder / "compare.html", html_page(joined, paper))
-        write_text(folder / "compare.csv", csv_text(joined))
-        write_text(folder / "compare.tex", latex(main_lines(joined, paper)))
     print(json_of(joined) if json else markdown_page(joined, paper), end="")
     return 0

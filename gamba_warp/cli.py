@@ -49,7 +49,6 @@ class Command(NamedTuple):
 
 _DATA, _TRAIN = "gamba_warp.train.sources.commands", "gamba_warp.train.command"
 _VIEWS, _SHAPES = "gamba_warp.eval.views.command", "gamba_warp.eval.shapes.command"
-_JOIN = "gamba_warp.eval.join.command"
 _COMPARE, _ABLATION = "gamba_warp.eval.compare_command", "gamba_warp.ablation.command"
 _MACHINE, _WEIGHTS = "gamba_warp.commands.machine", "gamba_warp.commands.weights"
 _APP, _GRADIO = "gamba_warp.app.server", ("gradio",)
@@ -75,7 +74,6 @@ COMMANDS = {
     "data gso": Command("Google Scanned Objects, for evaluation.", "mesh", _RENDERS, (), _DATA),
     "eval-views": Command("PSNR, SSIM, LPIPS of views.", "eval", _METRICS, _MODEL, _VIEWS),
     "eval-geometry": Command("Chamfer, IoU, F-score.", "eval", SHAPES, (), _SHAPES),
-    "eval-join": Command("Reports of --shard i/n to one.", "eval", SHAPES, (), _JOIN),
     "compare": Command("Reports of several methods in one table.", "", (), (), _COMPARE),
     "ablate": Command("Train and compare variants of a model.", "all", _METRICS, _MODEL, _ABLATION),
     "export": Command("Gaussians to meshes, splats and pages.", "mesh", (), _DRAWING),

@@ -20,9 +20,8 @@ import torch
 
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_folder, reason_of, remove_folder, sha256, sweep, write_json
-from gamba_warp.model.checkpoint import read_config, read_weights, save_model
+from gamba_warp.model.checkpoint import outline, read_config, read_weights, save_model
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.pretrained import outline
 from gamba_warp.untrusted.documents import check_no_code, read_document
 from gamba_warp.untrusted.names import plain_name
 from gamba_warp.untrusted.torch_files import read_torch
@@ -382,7 +381,7 @@ def load_partial(path: Path, model: Gamba) -> dict[str, list[str]]:
     """
     config, _ = read_config(path)
     try:
-        theirs = read_weights(path, outline(Gamba, config))
+        theirs = read_weights(path, outline(config))
     except ValueError as error:
         raise UserError(f"{path}: does not fit its own configuration: {error}") from error
     ours = model.stored_state()

@@ -45,7 +45,7 @@ _GROUPS = {
     "MEASURES": "RESULTS BENCH STRESS",
     "TRAIN_DATA": "train.data train.data.made train.sources",
     "TRAIN": "train.config train.objective train TRAIN_DATA",
-    "EVAL": "eval eval.views eval.shapes eval.join",
+    "EVAL": "eval eval.views eval.shapes",
 }
 # package | holds | may import | may import inside functions
 _TABLE = """
@@ -89,7 +89,6 @@ train | batches, loop, checkpoints | LIBRARY train.config train.objective TRAIN_
 eval | the report that both evaluations share | RESULTS |
 eval.views | PSNR, SSIM, LPIPS; baselines | RESULTS eval |
 eval.shapes | Chamfer, IoU, F-score | RESULTS eval |
-eval.join | reports of shards | core untrusted eval eval.views eval.shapes |
 gpu_check | the tests and the benchmark on a GPU | KERNELS BENCH measure |
 ablation | rows trained and evaluated alike | RESULTS | measure TRAIN EVAL
 commands | commands, by subject | MEASURES measure ablation | TRAIN EVAL
@@ -194,10 +193,15 @@ def _ours(entry: Import, target: str) -> str | None:
 
 
 def edges(entries: Iterable[Import], by_package: bool) -> dict[str, set[str]]:
-    """Return the import graph: packages by any import, or modules by their load-time imports."""
+    """Return the graph of imports of packages, or of files, inside functions too.
+
+    Strings count for packages alone: a suffix such as ``.gltf`` looks like a module. A package's ``__init__`` loads its public names on demand, so no file depends on it.
+    """
     found: dict[str, set[str]] = defaultdict(set)
+    entries = list(entries)
+    parents = {entry.source.rpartition(".")[0] for entry in entries}
     for entry in entries:
-        if entry.target and (by_package or not entry.lazy):
+        if entry.target and (by_package or not (entry.text or entry.target in parents)):
             pair = (entry.source, entry.target)
             here, there = map(package_of, pair) if by_package else pair
             if here != there:

@@ -14,7 +14,7 @@ import numpy as np
 from gamba_warp.errors import UserError
 from gamba_warp.versions import import_open3d
 
-from .command import Step
+from .options import Step
 from .shape import Points, Similarity, nearest
 
 STEPS: dict[Step, str] = {

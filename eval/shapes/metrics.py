@@ -12,9 +12,9 @@ from gamba_warp.cameras import intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
 
 from .align import aligned, match_moments, symmetry
-from .command import ChamferForm
 from .load import LoadedShape, centers
 from .occupancy import RULES, grid_around, syncdreamer_grid
+from .options import ChamferForm
 from .protocol import GeometryProtocol
 from .shape import Mesh, Points, halves, nearest, sample, visible_points
 
@@ -32,7 +32,7 @@ _FEW = 5_000  # points, enough for a warning
 
 def compare(
     predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
-) -> tuple[Mesh | Points, dict[str, Any]]:
+) -> dict[str, Any]:
     """Compute all metrics of one pair, after the protocol's alignment.
 
     Args:
@@ -41,13 +41,13 @@ def compare(
         protocol: with the rules of points, voxels and alignment.
 
     Returns:
-        The aligned prediction; and the results of the three functions below.
+        The results of the three functions below.
 
     Raises:
         UserError: a shape cannot be sampled or aligned.
     """
     predicted, alignment = align_shape(predicted, truth, protocol)
-    return predicted, {
+    return {
         **point_metrics(predicted, truth, protocol),
         **shape_iou(predicted, truth, protocol),
         **alignment,

@@ -10,7 +10,7 @@ import numpy as np
 
 from gamba_warp.formats.parts import merged
 
-from .command import OccupancyRule
+from .options import OccupancyRule
 from .shape import Mesh, directed_edges
 
 VOTERS = 26  # rays per point

@@ -26,7 +26,6 @@ from gamba_warp.files import output_folder, sha256, visible, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes, object_names
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_lines
-from gamba_warp.untrusted.ranges import shard_numbers
 from gamba_warp.versions import __version__, installed
 
 from ..report import (
@@ -40,7 +39,7 @@ from ..report import (
     save_report,
     stdout_to_stderr,
 )
-from .command import ShapesOptions
+from .options import ShapesOptions
 from .protocol import GeometryProtocol
 from .shape import SUFFIXES, Similarity
 from .table import PREDICTED, differences_of, summaries, tables_of
@@ -139,21 +138,13 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     found = find_all(options.pred, options.baseline, options.gt, listed, known)
     names = {pair.name for pairs, _ in found.values() for pair in pairs}
     names |= {each["name"] for _, failures in found.values() for each in failures}
-    if options.limit is not None or options.shard is not None:
+    if options.limit is not None:
         from gamba_warp.data.dataset import evenly
 
-        first, count = shard_numbers(options.shard or "0/1")
-        kept = {*evenly(sorted(names), options.limit or len(names))[first::count]}
-        if not kept:
-            raise UserError(f"--shard {options.shard}: there are too few objects for it")
+        kept = {*evenly(sorted(names), options.limit)}
         found = {name: only(*each, kept) for name, each in found.items()}
-    if options.paint and options.out is None:
-        raise UserError("--paint: needs --out")
     folder = output_folder(options.out) if options.out is not None else None
     cache = RecordCache(folder, protocol, options.data)
-    extra: dict[str, dict[str, Any]] = {name: {} for name in found}
-    if options.paint:
-        extra[PREDICTED]["evaluate"] = partial(evaluate_pair, painted=folder)
     run = partial(
         evaluate_pairs,
         protocol=protocol,
@@ -162,47 +153,13 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         workers=options.workers,
     )
     with stdout_to_stderr():
-        objects = {
-            name: failures + run(pairs, **extra[name]) for name, (pairs, failures) in found.items()
-        }
+        objects = {name: failures + run(pairs) for name, (pairs, failures) in found.items()}
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
     versions = {"gamba_warp": __version__} | installed(*PACKAGES)
     inputs = {side: path.name if path else None for side, path in named.items()}
-    report = make_shapes_report(protocol.to_json(), objects, versions, inputs)
-    if listed:
-        done = [record["name"] for record in report["objects"] if record["status"] == OK]
-        report["evaluation"] = gso.protocol_of(done, listed)
-    if options.shard is not None:
-        report["shard"] = options.shard
-    if folder is not None:
-        save_report(report, folder)
-        for name, text in tables_of(report).items():
-            write_text(folder / name, text)
-        if options.paint:
-            from .painted import painted_page
-
-            painted_page(report, folder, options.paint)
-        cache.end()
-    return report
-
-
-def make_shapes_report(
-    protocol: dict[str, Any],
-    objects: dict[str, list[dict[str, Any]]],
-    versions: dict[str, str],
-    inputs: dict[str, str | None],
-) -> dict[str, Any]:
-    """Return the report of ``evaluate_shapes``, but ``evaluation``.
-
-    Args:
-        protocol: of the comparison.
-        objects: records of the objects, by row: ``PREDICTED`` and the baselines.
-        versions: of packages by name.
-        inputs: names of the compared folders.
-    """
     predicted = objects[PREDICTED]
     report = make_report(
-        protocol,
+        protocol.to_json(),
         predicted,
         versions,
         left_out=_NO_MEAN,
@@ -216,6 +173,14 @@ def make_shapes_report(
             other = over_objects(records, _NO_MEAN) | summaries(records)
             report["baselines"][name] = finite_or_none(other)
             report["differences"][name] = differences_of(report["objects"], other["objects"])
+    if listed:
+        done = [record["name"] for record in report["objects"] if record["status"] == OK]
+        report["evaluation"] = gso.protocol_of(done, listed)
+    if folder is not None:
+        save_report(report, folder)
+        for name, text in tables_of(report).items():
+            write_text(folder / name, text)
+        cache.end()
     return report
 
 
@@ -400,10 +365,7 @@ def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: f
 
 
 def evaluate_pair(
-    pair: Pair,
-    protocol: GeometryProtocol,
-    motion: Similarity | None,
-    painted: Path | None = None,
+    pair: Pair, protocol: GeometryProtocol, motion: Similarity | None
 ) -> dict[str, Any]:
     """Load and compare one pair.
 
@@ -411,7 +373,6 @@ def evaluate_pair(
         pair: the files.
         protocol: of the comparison.
         motion: of the prediction into the truth's unit frame; None: the same as the truth's.
-        painted: folder for painted surfaces, or None.
 
     Returns:
         The object's record.
@@ -428,14 +389,9 @@ def evaluate_pair(
         into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
         predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     with stages("compare"):
-        shape, metrics = compare(predicted.shape, truth.shape, protocol)
+        metrics = compare(predicted.shape, truth.shape, protocol)
         check_finite(metrics)
         turned = check_finite(chamfer_by_turn(predicted, truth, protocol))
-    if painted is not None:
-        from .painted import paint
-
-        with stages("paint"):
-            paint(pair.name, shape, truth.shape, painted)
     return {
         "name": pair.name,
         "status": OK,

@@ -18,7 +18,8 @@ from gamba_warp.untrusted.ranges import Seed, check_options
 
 from .. import presets
 from .align import STEPS
-from .command import (
+from .occupancy import RULES
+from .options import (
     ChamferForm,
     Distance,
     Frame,
@@ -31,7 +32,6 @@ from .command import (
     Step,
     Up,
 )
-from .occupancy import RULES
 
 Thresholds = Annotated[
     tuple[Annotated[float, Meta(gt=0, le=100)], ...], Meta(min_length=1, max_length=100)

@@ -17,7 +17,7 @@ from gamba_warp.files import output_folder, write_json, write_text
 from ..averages import mean_of
 from ..report import OK, check_finite, finite_or_none, stdout_to_stderr
 from ..tables import Lines, markdown
-from .command import ShapesOptions
+from .options import ShapesOptions
 from .pairs import Pair, evaluate_pairs, find_pairs, only, open_objects
 from .protocol import PRESETS, GeometryProtocol
 from .shape import Similarity

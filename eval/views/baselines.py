@@ -41,8 +41,6 @@ MEANING = {
     f"place of the input it shows the view found, in place of a novel view the true view of that "
     f"object whose camera, relative to the view found, is turned least against the novel one's, "
     f"relative to the input",
-    "ceiling": "gamba fit on all views of the object itself, those compared included: an upper "
-    "bound of what so many Gaussians show",
 }
 
 

@@ -24,7 +24,6 @@ from gamba_warp.fitting.objects import choose_objects
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.untrusted.ranges import shard_numbers
 from gamba_warp.versions import __version__, installed
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import FETCH, lpips_available
@@ -40,8 +39,6 @@ from .baselines import (
     billboard,
     input_copy,
 )
-from .ceiling import open_ceiling
-from .command import ViewsOptions
 from .compare import (
     NEARLY_EMPTY,
     Shown,
@@ -56,6 +53,7 @@ from .compare import (
     summary,
 )
 from .contact_sheet import RULE, Row, choose_ranks, contact_sheet, label, save_strips
+from .options import ViewsOptions
 from .pictures import MEANING as PICTURES
 from .pictures import PicturePredictions, Pictures, save_pictures
 from .predictions import Predictions, open_predictions
@@ -80,8 +78,7 @@ class Job:
         device: torch device.
         baselines: by name.
         left_out: reasons by name, of unavailable baselines.
-        missing: failure records of the protocol's objects that the dataset lacks; of the first
-            shard only.
+        missing: failure records of the protocol's objects that the dataset lacks.
         failures: ``{name, reason}`` of failed baselines.
         retrieval: the baseline of this name, if used.
         meshes: of the training objects, for the retrieval's shapes; or None.
@@ -143,10 +140,6 @@ def open_job(options: ViewsOptions) -> Job:
         evaluation, uids = gso.protocol_of(uids, names), [uid for uid in uids if uid in names]
         if not uids:
             raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
-    first, count = shard_numbers(options.shard or "0/1")
-    uids = uids[first::count]
-    if not uids:
-        raise UserError(f"--shard {options.shard}: there are too few objects for it")
     _check_outputs(options, uids)
     size = gso.SIZE if evaluation else options.size
     predictions = open_predictions(
@@ -190,20 +183,12 @@ def open_job(options: ViewsOptions) -> Job:
     job = Job(predictions, dataset, uids, protocol, network, device)
     job.retrieval_data = [folder.resolve().name for folder in options.retrieval_data]
     reason = f"an object of --protocol gso that is not in {options.data}"
-    if first == 0 and evaluation:
+    if evaluation:
         job.missing = [failure(name, reason) for name in evaluation["missing"]]
-    folder = None if options.out is None else output_folder(options.out)
-    ceiling = {}
-    if options.ceiling is not None:
-        ceiling["ceiling"] = open_ceiling(
-            *(options.ceiling, dataset, uids, protocol),
-            device=device,
-            out=folder,
-            steps=options.ceiling_steps,
-        )
+    if options.out is not None:
+        output_folder(options.out)
     if options.baselines:
         _add_baselines(job, options)
-    job.baselines |= ceiling
     if note := background_note(dataset):
         print(f"warning: {options.data}: {note}", file=sys.stderr)
     return job
@@ -282,8 +267,6 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
             raise
         interrupted = True
     report = report_of(job, options.data, objects) | {"interrupted": interrupted}
-    if options.shard is not None:
-        report["shard"] = options.shard
     if folder:
         save_report(report, folder)
         write_text(folder / "table.md", page(report))

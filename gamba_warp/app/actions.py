@@ -25,7 +25,7 @@ from .cutting import (
     switch_areas,
 )
 from .guard import VISITOR
-from .server import MainThread
+from .main_thread import MainThread
 from .visitor_files import VisitorFiles
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import queue
 import shutil
 import signal
 import socket
@@ -13,11 +12,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Future
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from msgspec import Meta
@@ -26,6 +24,7 @@ from ..conventions import DeviceChoice
 from ..errors import UserError
 from ..files import only_process
 from ..untrusted.ranges import ranged
+from .main_thread import MainThread
 from .visitor_files import MAX_PER_VISITOR, VisitorFiles
 
 if TYPE_CHECKING:
@@ -35,7 +34,6 @@ HOST = "127.0.0.1"
 PREFIX = "gamba-app-"
 _PAGES = 8  # pages whose pictures and results are kept at once
 BACKLOG = 64  # pending connections; each takes a descriptor
-Result = TypeVar("Result")
 
 
 @ranged
@@ -79,53 +77,6 @@ def app_command(
         files = VisitorFiles(folder, per_visitor=max(MAX_PER_VISITOR, max_upload_mb << 20))
         page = build(Actions(model, ways, files, str(chosen), main_thread))
         serve(page, files, listening, max_upload_mb, open_browser, main_thread)
-
-
-class MainThread:
-    """Queue of jobs that run on the thread that calls ``work``, the main thread.
-
-    gradio calls from short-lived threads. Open3D aborts the process at its exit if it was used on a
-    thread that has ended, and OpenMP makes a new team for every computing thread. So all jobs run
-    on the main thread.
-    """
-
-    def __init__(self) -> None:
-        self._jobs: queue.SimpleQueue[tuple[Future, Callable, tuple]] = queue.SimpleQueue()
-        self._ended = False
-
-    def call(self, function: Callable[..., Result], *args: Any) -> Result:
-        """Call the function on the main thread, wait, and return its result or raise its error.
-
-        Raises:
-            UserError: the main thread has ended.
-        """
-        future: Future[Result] = Future()
-        self._jobs.put((future, function, args))
-        if self._ended:
-            future.cancel()
-        try:
-            return future.result()
-        except CancelledError:
-            raise UserError("gamba app was ended; start it again") from None
-
-    def work(self) -> None:
-        """Run jobs until Ctrl-C or another exception that is not an ``Exception``."""
-        try:
-            while True:
-                future, function, args = self._jobs.get()
-                try:
-                    result = function(*args)
-                except Exception as error:
-                    future.set_exception(error)
-                except BaseException:
-                    future.cancel()
-                    raise
-                else:
-                    future.set_result(result)
-        finally:  # release the threads that wait for a job
-            self._ended = True
-            while not self._jobs.empty():
-                self._jobs.get()[0].cancel()
 
 
 @contextmanager

@@ -29,12 +29,12 @@ def import_released_command(
             it.
         depth: Number of blocks in the file; 14 are published.
     """
-    from ..model.pretrained import WRITTEN
+    from ..model.checkpoint import ENCODER_NAME, FILE_NAME, save_folder
     from ..model.released import load_released
 
-    check_not_read([out / name for name in WRITTEN], [file, encoder_weights])
+    check_not_read([out / name for name in (FILE_NAME, ENCODER_NAME)], [file, encoder_weights])
     model = load_released(file, encoder_weights, depth)
-    model.save_pretrained(out)
+    save_folder(out, model)
     config = model.config
     print(
         f"wrote {out}: {config.depth} blocks of {config.width} channels, "

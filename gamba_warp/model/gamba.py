@@ -22,7 +22,6 @@ from .parts.patches import foreground_patches
 from .parts.rays import RayDecoder
 from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
-from .pretrained import Pretrained
 
 # By name: a module made of a ``GambaConfig`` that maps tokens ``[B, L, width]`` to ``Gaussians``
 # ``[B, N]``. A script may add to it (docs/change-the-training.md).
@@ -39,7 +38,7 @@ def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) 
     return nn.ModuleList(kind(config, camera_channels, image_channels) for _ in range(config.depth))
 
 
-class Gamba(Pretrained, nn.Module):
+class Gamba(nn.Module):
     """Network from one posed picture to Gaussians (paper §3.2, GambaFormer and decoder).
 
     Attributes:

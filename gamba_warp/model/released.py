@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
+from .checkpoint import outline
 from .config import PRESETS, GambaConfig
 from .encoders import Weights, read_state
 from .gamba import Gamba
-from .pretrained import outline
 
 DEPTH = PRESETS["released"].depth  # blocks of the published network
 _ROOT, _ENCODER = "model.", "model.map_image.model."
@@ -138,7 +138,7 @@ def convert_released(
             )
         weights = _rename(found, config.depth)
         shapes = {name: value.shape for name, value in weights.items()}
-        outline(Gamba, config).check_stored_state(shapes)  # before allocating memory
+        outline(config).check_stored_state(shapes)  # before allocating memory
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except KeyError as error:

@@ -13,7 +13,7 @@ import pytest
 from helpers.app import FORM, form
 
 from gamba_warp.app import guard, server, visitor_files
-from gamba_warp.app.server import MainThread
+from gamba_warp.app.main_thread import MainThread
 from gamba_warp.app.visitor_files import VisitorFiles
 from gamba_warp.errors import UserError
 

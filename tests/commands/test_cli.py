@@ -440,7 +440,7 @@ NONSENSE = {
     },
     "eval-views --checkpoint M --data DATA": {
         "views": "0 -1", "size": "15 100000", "limit": "0", "sheet": "-1 1000", "strips": "-1",
-        "distance": "nan inf 0 -1", "reference": "-1", "ceiling-steps": "0",
+        "distance": "nan inf 0 -1", "reference": "-1",
     },
     "eval-geometry A B": {
         "points": "7 -1 1000000000", "voxels": "7 1000000", "views": "0 100000",

@@ -1,6 +1,5 @@
 import json
 import shutil
-from dataclasses import replace
 
 import pytest
 import torch
@@ -9,11 +8,9 @@ from helpers.views import around, cloud_of, eval_views, straight, write_split, w
 from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.eval.views import baselines
 from gamba_warp.eval.views.baselines import Retrieval, background, billboard, input_copy
-from gamba_warp.eval.views.ceiling import open_ceiling
-from gamba_warp.eval.views.compare import Truth, ViewsProtocol, compare, load_truth, summary
+from gamba_warp.eval.views.compare import Truth, ViewsProtocol, load_truth
 from gamba_warp.eval.views.contact_sheet import Row, choose_ranks, contact_sheet
 from gamba_warp.eval.views.table import differences_of, means, table_of
 from gamba_warp.formats.ply import save_ply
@@ -205,18 +202,16 @@ def evaluate(data, out, *options):
 
 
 def test_a_whole_report(data, tmp_path, capsys):
-    code, report = evaluate(data, tmp_path / "out", "--ceiling", str(tmp_path / "pred"))
+    code, report = evaluate(data, tmp_path / "out")
     assert code == 0 and report["interrupted"] is False
-    names = ["background", "input_copy", "billboard", "retrieval", "ceiling"]
+    names = ["background", "input_copy", "billboard", "retrieval"]
     assert list(report["baselines"]) == list(report["protocol"]["baselines"]) == names
     assert report["baselines"]["retrieval"]["psnr"] > 40 > report["baselines"]["billboard"]["psnr"]
-    # the predictions are the ceiling's own files, moved from a world to the same
-    assert abs(report["baselines"]["ceiling"]["psnr"] - report["mean"]["psnr"]) < 1e-3
     assert report["protocol"]["uids"] == ["twin"] and report["protocol"]["split_version"] == 1
     shown = (tmp_path / "out" / "table.md").read_text()
     assert shown in capsys.readouterr().out
     # means, on other grounds, and medians beside the PSNR of the mean error; no view nearly empty
-    assert shown.count("| novel |") == 3 * (6 + 5) and shown.count("| input |") == 6 + 5
+    assert shown.count("| novel |") == 3 * (5 + 4) and shown.count("| input |") == 5 + 4
     assert "None of the 6 views is nearly empty" in shown
     header, row = (tmp_path / "out" / "objects.csv").read_text().splitlines()
     assert "baselines.billboard.input.psnr" in header and row.startswith("twin,ok,")
@@ -277,42 +272,6 @@ def test_interrupted(data, tmp_path, monkeypatch, capsys):
     assert code == 130 and report["interrupted"] is True
     assert report["num_ok"] == 1 and len(report["protocol"]["uids"]) == 4
     assert "interrupted" in capsys.readouterr().err
-
-
-def test_ceiling_is_fitted_and_kept(data, tmp_path):
-    dataset, objects = open_dataset(data), ["flat", "other"]
-
-    def make(wanted, protocol=PROTOCOL):
-        return open_ceiling(
-            *(wanted, dataset, objects, protocol), device="cpu", out=tmp_path, steps=25
-        )
-
-    ceiling = make("1")
-    assert ceiling.job.config.steps == 25 and list(ceiling.uids) == ["flat"]  # the first of two
-    ceiling.job.config = replace(ceiling.job.config, gaussians=150)
-    truth = load_truth(dataset, "flat", PROTOCOL, "cpu")
-    first = ceiling(truth)
-    # 25 steps are enough to be better than an empty picture by far
-    shown = {"fitted": first, "empty": background(truth)}
-    means = {n: summary(v, truth.coverage)["psnr"] for n, v in compare(shown, truth).items()}
-    assert means["fitted"] > 3 + means["empty"]
-    assert ceiling(load_truth(dataset, "other", PROTOCOL, "cpu")) is None
-    kept = make(str(tmp_path / "ceiling"))  # the same by the folder's name
-    assert kept.job is None and torch.equal(kept(truth).rgb, first.rgb)
-    assert kept(load_truth(dataset, "other", PROTOCOL, "cpu")) is None
-    # another input view and distance: the same Gaussians, in another world
-    moved = ViewsProtocol("test", 2, None, None, None, None, 2.5)
-    again = make(str(tmp_path / "ceiling"), moved)(load_truth(dataset, "flat", moved, "cpu"))
-    assert (again[0][0] - first[0][2]).abs().max() < 1e-3
-
-
-@pytest.mark.parametrize("wanted", ["0", "absent", "-3", "empty", "2"])
-def test_ceiling_of_nothing(data, wanted, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty").mkdir()
-    dataset = open_dataset(data)
-    with pytest.raises(UserError, match=f"--ceiling {wanted}: "):
-        open_ceiling(wanted, dataset, dataset.uids, PROTOCOL, device="cpu", out=None, steps=5)
 
 
 def record(psnr, novel=True, lpips=None):

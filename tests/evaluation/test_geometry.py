@@ -59,7 +59,7 @@ def test_a_shape_and_itself(name):
     """The identity: distance 0, F-scores 1 and Volume IoU 1 under every protocol."""
     shape = join(cube((0.25, 0, 0), 0.5), cube((-0.3, 0.1, 0.05), 0.35))
     for align in (PRESETS[name].align, ()):
-        _, got = compare(shape, shape, protocol(name=name, align=align))
+        got = compare(shape, shape, protocol(name=name, align=align))
         assert got["iou"] == (None if PRESETS[name].occupancy == "none" else 1)
         # The search has turned and turned back, by rounding; without it there is no rounding.
         assert got["chamfer"] <= (2e-5 if align else 0) and set(got["fscore"].values()) == {1.0}

@@ -228,7 +228,7 @@ def test_predictions_of_another_size_or_place_still_count(other, want, error):
 def test_spheres(radius):
     a, b = (trimesh.creation.icosphere(4, r) for r in (radius, 0.5))
     meshes = [Mesh(np.array(m.vertices), np.array(m.faces)) for m in (a, b)]
-    _, got = compare(*meshes, replace(PRESETS["default"], num_points=30_000, iou_voxels=32))
+    got = compare(*meshes, replace(PRESETS["default"], num_points=30_000, iou_voxels=32))
     # nearest samples are not straight across: at most a noise floor longer, squared against it
     slack = got["noise_floor"] ** 2 / (0.5 - radius) + 5e-4
     facets = 5e-4  # how far the balls' faces lie within their spheres
@@ -245,7 +245,7 @@ def test_alignment_recovers_scale_and_rotation():
     values = {}
     for align, steps in {"none": (), "scale": ("scale",), "icp": ("scale", "icp")}.items():
         options = {"num_points": 10_000, "align": steps, "iou_voxels": 32}
-        _, values[align] = compare(moved, truth, replace(PRESETS["default"], **options))
+        values[align] = compare(moved, truth, replace(PRESETS["default"], **options))
     assert values["icp"]["chamfer"] < 1.3 * values["icp"]["noise_floor"]
     assert values["icp"]["iou"] > 0.93 > values["scale"]["iou"] > values["none"]["iou"]
     alignment = values["icp"]["alignment"]
@@ -255,7 +255,7 @@ def test_alignment_recovers_scale_and_rotation():
     assert abs(values["scale"]["alignment"]["scale"] * 0.7 - 1) < 0.02
     straight = Similarity(np.eye(3), np.array([0.2, -0.1, 0.05]), 0.5).apply(truth)
     options = {"num_points": 20_000, "align": ("scale",)}
-    _, got = compare(straight, truth, replace(PRESETS["default"], **options))
+    got = compare(straight, truth, replace(PRESETS["default"], **options))
     assert abs(got["alignment"]["scale"] - 2) < 0.02 and got["iou"] > 0.95
 
 

@@ -51,7 +51,7 @@ def assert_as_alone(pair, protocols, found):
     truth = load_truth(pair.gt, SMALL)
     for label, protocol in protocols.items():
         shape = load_prediction(pair.pred, truth.motion, truth.axes, protocol).shape
-        want, got = compare(shape, truth.shape, protocol)[1], found[label]
+        want, got = compare(shape, truth.shape, protocol), found[label]
         for key in ("chamfer", "iou", "noise_floor", "normal_consistency"):
             assert got[key] == want[key], (label, key)
         assert got["fscore"] == want["fscore"][f"{min(protocol.thresholds):g}"], label

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gamba_warp.eval.views.command import ViewsOptions
+from gamba_warp.eval.views.options import ViewsOptions
 
 
 def options(**given):

@@ -24,9 +24,7 @@ from gamba_warp.data import gso
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.data.preprocess import SamSegmenter
 from gamba_warp.errors import UserError
-from gamba_warp.eval.compare import html_page, join, markdown_page, read_reports
-from gamba_warp.eval.join.join import join_reports
-from gamba_warp.eval.report import save_report
+from gamba_warp.eval.compare import join, markdown_page, read_reports
 from gamba_warp.eval.shapes.load import load_shape
 from gamba_warp.eval.shapes.pairs import evaluate_pairs, find_pairs
 from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
@@ -253,15 +251,7 @@ def _compare(path: Path, out: Path) -> Any:
     """Table of ``gamba compare`` for a report and itself."""
     joined = join(read_reports((f"a={path}", f"b={path}"), ()), None)
     json.dumps(joined, allow_nan=False)
-    return [markdown_page(joined, True), html_page(joined, True)]
-
-
-def _join(path: Path, out: Path) -> Any:
-    """Table of ``gamba eval-join`` for the only shard."""
-    joined = join_reports([path])
-    json.dumps(joined.report, allow_nan=False)
-    save_report(joined.report, out)
-    return joined.text, joined.files
+    return [markdown_page(joined, True)]
 
 
 def _bench(path: Path, out: Path) -> Any:
@@ -352,7 +342,6 @@ READERS = {
     "protocol": Reader(_protocol, checks.protocol, seeds.protocols),
     "plan": Reader(_plan, checks.plan, seeds.plans, 2),
     "compare": Reader(_compare, checks.pages, seeds.reports, 4),
-    "eval-join": Reader(_join, checks.nothing, seeds.shard_reports, 4),
     "bench": Reader(_bench, checks.pages, seeds.benches, 4),
     "stress": Reader(_numeric, checks.nothing, seeds.numeric, 2),
     "released": Reader(_released, checks.released, seeds.released, 2),

@@ -33,7 +33,6 @@ from gamba_warp.eval.shapes.protocol import PRESETS as PROTOCOLS
 from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.names import splat_suffix
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import all_figures
 from gamba_warp.kernels.bench.core.measure import FORMAT as BENCH
 from gamba_warp.kernels.stress.cases.conv import OP
 from gamba_warp.kernels.stress.core.case import Case, Outcome
@@ -633,33 +632,6 @@ def reports() -> Kinds:
         report = {"protocol": rules[name], "objects": objects, "versions": {"torch": "2"}}
         made[name] = {"report.json": as_json(report)}
     return made
-
-
-def shard_reports() -> Kinds:
-    """Small reports of all objects, as shard 0/1."""
-    shapes = {"name": "chair", "status": "ok", "chamfer": 0.05, "iou": 0.4, "fscore": {"0.1": 0.5}}
-    shapes |= {"normal_consistency": 0.6, "pred_flags": ["open"], "gt_flags": []}
-    shapes |= {
-        "pred_axes": "opencv",
-        "gt_axes": "y-up",
-        "chamfer_turned": {"as it is": 0.05, "x": 0.2},
-    }
-    failed = {"name": "lamp", "status": "failed", "reason": "no prediction"}
-    figures = dict.fromkeys(all_figures(), 0.5) | {"mse": 0.01}
-    figures |= {"input": dict(figures)}
-    figures |= {"without_nearly_empty": dict(figures)}
-    views = {"name": "chair", "status": "ok", **figures, "views": [0, 1], "coverage": [0.2, 0.2]}
-    views |= {"baselines": {"billboard": figures}}
-    views |= {"num_nearly_empty": 0}
-    common = {"versions": {"torch": "2"}, "num_failed": 1, "shard": "0/1"}
-    common["failures"] = [{"name": "lamp", "reason": "no prediction"}]
-    rules = {"uids": ["chair", "lamp"], "baselines": {"billboard": "a plane"}}
-    rules |= {"lpips_reason": None, "lpips": None}
-    of_views = {**common, "protocol": rules, "objects": [views, failed], "baselines": {}}
-    of_shapes = {**common, "protocol": PROTOCOLS["default"].to_json(), "objects": [shapes, failed]}
-    of_shapes |= {"baselines": {}, "inputs": {"pred": "a", "gt": "b", "data": None}}
-    made = {"views": of_views, "shapes": of_shapes}
-    return {name: {"report.json": as_json(report)} for name, report in made.items()}
 
 
 def benches() -> Kinds:

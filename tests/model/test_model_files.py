@@ -3,6 +3,8 @@
 import json
 import os
 import struct
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +14,13 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from gamba_warp.errors import UserError
-from gamba_warp.model.checkpoint import FILE_NAME, load_model, save_model
+from gamba_warp.model.checkpoint import (
+    ENCODER_NAME,
+    FILE_NAME,
+    load_model,
+    save_folder,
+    save_model,
+)
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.checkpoint import load_weights
 
@@ -189,3 +197,33 @@ def test_half_precision_becomes_float32(tmp_path, dtype):
     save_file(half, tmp_path / "m.safetensors", metadata=metadata)
     for name, value in load_model(tmp_path / "m.safetensors").stored_state().items():
         assert value.dtype == torch.float32 and torch.equal(value, half[name].float()), name
+
+
+@pytest.mark.parametrize("prepend", [False, True])
+def test_a_folder_has_a_frozen_encoder(tmp_path, prepend):
+    torch.manual_seed(0)
+    model = Gamba(micro(prepend=prepend), "random" if prepend else None).eval()
+    folder = save_folder(tmp_path / "mine", model)
+    names = {path.name for path in folder.iterdir()}
+    assert names == {FILE_NAME} | ({ENCODER_NAME} if prepend else set())
+    back, (images, cameras) = load_model(folder), inputs(2)
+    with torch.no_grad():
+        assert torch.equal(back(images, cameras).means, model(images, cameras).means)
+    assert back.config == model.config and not back.training
+
+
+def test_a_repository_of_the_hub(tmp_path, monkeypatch):
+    """One in the cache is read; another one, without a network, is refused in one line."""
+    model, commit = Gamba(micro(prepend=False)).eval(), "a" * 40
+    repository = tmp_path / "models--owner--name"
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs" / "main").write_text(commit)
+    save_folder(repository / "snapshots" / commit, model)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    for name in ("hf://owner/name", Path("hf://owner/name")):
+        assert load_model(name).config == model.config
+    for name in ("owner/other", "", "a/b/c", "../x", "owner/" + "n" * 300, "weiß nicht"):
+        refused("^hf://.*: cannot be read", load_model, f"hf://{name}")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    refused(r"pip install '\.\[hub\]' in the checkout", load_model, "hf://owner/name")

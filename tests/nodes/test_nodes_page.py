@@ -51,9 +51,9 @@ def test_the_tasks_of_an_array_take_their_parts(tmp_path):
     wanted = ["gamba", "data", "render", "my meshes", "--out", "DATA", "--shard", "3/16"]
     assert done.stdout.splitlines() == wanted, done.stderr
     task |= {"SLURM_ARRAY_TASK_COUNT": "1", "PARTS": "8"}  # one task again, of eight
-    done = slurm(tmp_path, "eval-views", "--out", "EVAL", "--split", "test", **task)
-    assert done.stdout.split()[1:] == "eval-views --out EVAL/3 --split test --shard 3/8".split()
-    assert slurm(tmp_path, "eval-views", **task).returncode == 2
+    done = slurm(tmp_path, "data", "render", "MESHES", "--out", "DATA", **task)
+    assert done.stdout.split()[1:] == "data render MESHES --out DATA --shard 3/8".split()
+    assert slurm(tmp_path, "data", **task).returncode == 2
 
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")

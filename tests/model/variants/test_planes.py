@@ -5,11 +5,11 @@ import torch
 from helpers import assert_rel_rms
 from helpers.model import FIELDS, inputs, micro
 
+from gamba_warp.model.checkpoint import outline
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.block import run_blocks
 from gamba_warp.model.parts.triplane import TriplaneDecoder, query_planes
-from gamba_warp.model.pretrained import outline
 
 PLANES = {"decoder": "triplane", "triplane_size": 3, "triplane_features": 5}
 
@@ -154,5 +154,5 @@ def test_recomputation_and_dropped_background_change_no_colour():
 def test_the_blocks_are_doubled():
     configs = [GambaConfig(encoder="none", dt_rank=32, decoder=d) for d in ("bins", "triplane")]
     assert configs[1].num_gaussians == 16384
-    counts = [sum(p.numel() for p in outline(Gamba, c).parameters()) for c in configs]
+    counts = [sum(p.numel() for p in outline(c).parameters()) for c in configs]
     assert 1.75 < counts[1] / counts[0] < 1.85  # E, of 8.4 M parameters, is there once

@@ -1,1 +1,0 @@
-"""Reports of shards, joined to one."""
