@@ -112,13 +112,6 @@ class RunLog:
             with self._guarded(name):
                 board.picture("val/pictures", step, to_uint8(strip))
 
-    def page(self) -> None:
-        """Write the run's page, ``RUN/index.html``, from the log so far."""
-        with self._guarded("index.html"):
-            from gamba_warp.pages.run import write_run_page
-
-            write_run_page(self._run)
-
     def close(self) -> None:
         """Close the files."""
         self._file.close()

@@ -325,7 +325,6 @@ class Trainer:
             if rows:
                 path = self.config.run.out / "samples" / f"step_{self.step:06d}.png"
                 self.log.sample(self.step, path, rows)
-                self.log.page()
 
         self.world.on_main(validate_all)
 

@@ -212,7 +212,6 @@ def _report(trainer: Trainer, log: RunLog, code: int, failures: dict[str, str]) 
     if trainer.world.device.type == "cuda":
         memory = {"device_memory": torch.cuda.max_memory_allocated(trainer.world.device)}
     log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures, **memory)
-    log.page()
     if trainer.skipped:
         say(f"{trainer.skipped} of {trainer.step} steps were skipped: not finite")
     for uid, reason in failures.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -15,8 +16,7 @@ from msgspec import Meta
 from ..conventions import WHITE, over_background
 from ..errors import UserError
 from ..image_metrics import all_figures
-from ..pages.run_log import RunRecord, read_run_log
-from ..untrusted.documents import read_document
+from ..untrusted.documents import read_document, read_lines
 from .jobs import Settings, gaussians_of
 from .plan import Row
 from .tasks import Task, task_of
@@ -25,6 +25,29 @@ VIEW_METRICS = tuple(all_figures())
 SHAPE_METRICS = ("chamfer", "iou")
 METRICS = (*VIEW_METRICS, *SHAPE_METRICS)
 Objects = dict[str, dict[str, float]]  # metrics by object
+
+
+@dataclass
+class TrainLog:
+    """Figures of a training's ``log.jsonl``.
+
+    Attributes:
+        step: the last step.
+        seconds: of the logged steps.
+        losses: the last one of "train" and of each "val"; NaN if it was not finite.
+        skipped: number of steps that were not finite.
+        device: device of the training; empty if unknown.
+        device_memory: peak memory on a GPU, bytes; 0 if unknown.
+        parameters: number of the model's parameters.
+    """
+
+    step: int = 0
+    seconds: list[float] = field(default_factory=list)
+    losses: dict[str, float] = field(default_factory=dict)
+    skipped: int = 0
+    device: str = ""
+    device_memory: int = 0
+    parameters: int | None = None
 
 
 @dataclass
@@ -46,7 +69,7 @@ class SeedResult:
     objects: Objects = field(default_factory=dict)
     views: dict[str, list[int]] = field(default_factory=dict)
     size: int | None = None
-    log: RunRecord = field(default_factory=RunRecord)
+    log: TrainLog = field(default_factory=TrainLog)
     step_seconds: float | None = None
     missing: list[str] = field(default_factory=list)
 
@@ -168,7 +191,8 @@ def read_result(task: Task) -> SeedResult:
         found.objects = report.figures(VIEW_METRICS)
         found.views = {record.name: record.views[1:] for record in report.objects}
         found.log = read_log(task.folder / "run" / "log.jsonl")
-        found.step_seconds = step_seconds(found.log)
+        seconds = found.log.seconds
+        found.step_seconds = statistics.median(seconds) if seconds else None
     if "shapes" in task.record.ended:
         report = read_document(task.folder / "shapes" / "report.json", _Report)
         for name, values in report.figures(SHAPE_METRICS).items():
@@ -200,14 +224,28 @@ def empty_psnr(data: Path, views: dict[str, list[int]], size: int | None) -> dic
     return found
 
 
-def read_log(path: Path) -> RunRecord:
-    """Read a run's log; an empty record if it is missing."""
+class _Line(msgspec.Struct):
+    event: str
+    step: int
+    loss: float | None | msgspec.UnsetType = msgspec.UNSET
+    seconds: float | None = None
+    skipped: int = 0
+    device: str = ""
+    device_memory: int = 0
+    parameters: int | None = None
+
+
+def read_log(path: Path) -> TrainLog:
+    """Read a run's log; an empty one if it is missing."""
+    log = TrainLog()
     with contextlib.suppress(UserError):
-        return read_run_log(path)
-    return RunRecord()
-
-
-def step_seconds(log: RunRecord) -> float | None:
-    """Return the median time of a training step, seconds, or None."""
-    seconds = log.values("train.seconds")
-    return statistics.median(seconds) if seconds else None
+        for line in read_lines(path, _Line):
+            log.step, log.skipped = line.step, max(log.skipped, line.skipped)
+            log.device_memory = max(log.device_memory, line.device_memory)
+            if line.event == "start":
+                log.device, log.parameters = line.device, line.parameters
+            if line.event == "train" and line.seconds is not None:
+                log.seconds.append(line.seconds)
+            if line.loss is not msgspec.UNSET:
+                log.losses[line.event] = math.nan if line.loss is None else line.loss
+    return log

@@ -1,4 +1,4 @@
-"""Outputs of an ablation: ``table.md``, and the page with curves and pictures."""
+"""Outputs of an ablation: ``table.md``, and the page with pictures."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from ..errors import UserError
 from ..files import write_json, write_text
 from ..kernels.runtime.tables import cell, markdown
 from ..pages.charts import Axis, Point, Series, chart
-from ..pages.curves import Chart, curves_section
 from ..pages.page import Section, demo_page
-from ..pages.run_log import read_run_log
 from ..pages.sheet import tiles
 from .figures import RowResult, collect, empty_psnr
 from .jobs import STRIPS, Settings
@@ -29,8 +27,6 @@ _GROUNDS = {key: metric.head for key, metric in image_metrics.on_grounds().items
 _DIGITS = {key: metric.digits for key, metric in image_metrics.all_figures().items()}
 _DIGITS |= {"chamfer": 4, "iou": 3}
 _MAX_ROWS = 24  # of one picture
-_HELD_OUT = "Held-out novel views, PSNR [dB]"
-_CURVES = {"Loss of training": ("train.loss", True), _HELD_OUT: ("val.psnr_novel", False)}
 Lines = list[list[str]]  # cells by row, the head first
 
 
@@ -61,7 +57,7 @@ def write_results(settings: Settings) -> bool:
     first.text = _about(table)
     sections = [first, *others, *_needed(table["series"])]
     sections.append(Section("Notes", table=[[text] for text in _remarks(table)]))
-    sections += [*_curves(results, table["compare_with"]), *_pictures(results)]
+    sections += _pictures(results)
     page = settings.out / "index.html"
     demo_page(page, sections, title=table["title"], text=table["note"])
     return any(result.failed for result in results)
@@ -219,32 +215,6 @@ def _needed(series: Mapping[str, Any]) -> list[Section]:
         axes = Axis("Gaussians", values=part["numbers"]), Axis("quality [%]", False)
         drawn = chart([Series(name, points, "straight")], *axes)
         found.append(Section(f"How many Gaussians are needed: {name}", text, charts=[drawn]))
-    return found
-
-
-def _curves(results: list[RowResult], compare_with: str | None) -> list[Section]:
-    """Return the curves of each trained row, beside those of the row compared with."""
-    trained = {r.row.name: r for r in results if r.row.kind == "train" and r.seeds}
-    records = {}
-    for name, result in trained.items():
-        try:
-            records[name] = read_run_log(result.first.task.folder / "run" / "log.jsonl")
-        except UserError:
-            continue
-    found, other = [], records.get(compare_with or "")
-    for name, record in records.items():
-        title, charts = trained[name].row.label, []
-        further = {
-            f"{_HELD_OUT}, {name}": (f"val/{name}.psnr_novel", False) for name in record.validated
-        }
-        for label, (key, logarithmic) in (_CURVES | further).items():
-            lines = {title: key}
-            if other is not None and other is not record and key in other.series:
-                record.series[f"{key} of another"] = other.series[key]
-                lines[trained[compare_with or ""].row.label] = f"{key} of another"
-            charts.append(Chart(label, lines, logarithmic))
-        text = f"Seed {min(trained[name].seeds)}; the minutes are those of {title}."
-        found.append(curves_section(f"Curves: {title}", text, record, charts))
     return found
 
 

@@ -115,9 +115,8 @@ def diverged(run: Path) -> str | None:
         if not math.isfinite(loss):
             name = "loss" if event == "train" else "validation's loss"
             return f"diverged: its last {name} is not finite"
-    skipped = log.most.get("skipped", 0)
-    if log.step and skipped > log.step / 2:
-        return f"diverged: {skipped:.0f} of its {log.step} steps were not finite"
+    if log.step and log.skipped > log.step / 2:
+        return f"diverged: {log.skipped} of its {log.step} steps were not finite"
     return None
 
 

@@ -54,10 +54,10 @@ def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
     logs = [seed.log for seed in seeds.values()]
     records = [seed.task.record.ended for seed in seeds.values()]
     ended = [part for of in records if (part := of.get("fit" if row.kind == "fit" else "train"))]
-    on_gpu = any(str(log.start.get("device")).startswith("cuda") for log in logs)
+    on_gpu = any(log.device.startswith("cuda") for log in logs)
     memory = [part.peak_memory for part in ended]
     if on_gpu:
-        memory = [round(log.most["device_memory"]) for log in logs if "device_memory" in log.most]
+        memory = [log.device_memory for log in logs]
     figures = _figures(result)
     status = "failed" if result.failed else "incomplete" if result.absent else "ok"
     return {
@@ -77,7 +77,7 @@ def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
         "seconds": _median([part.seconds for part in ended]),
         "peak_memory": max(filter(None, memory), default=None),
         "peak_memory_of": "GPU" if on_gpu else "process",
-        "parameters": next((log.start.get("parameters") for log in logs if log.start), None),
+        "parameters": next((log.parameters for log in logs), None),
         "threads": sorted({part.threads for part in ended}),
         "jobs": sorted({part.jobs for part in ended}),
         "missing": {str(n): s.missing for n, s in seeds.items() if s.missing},

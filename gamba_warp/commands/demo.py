@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..errors import UserError
 from ..files import STARTER, only_process, output_folder
+from ..processes import GAMBA, Child
 from ..untrusted.ranges import Minutes, ranged
 
 # An installed package has the shipped model and two pictures, but neither views nor meshes.
@@ -20,24 +21,20 @@ def demo_command(
     minutes: Minutes = 2.0,
     starter: Path = STARTER,
     lpips: bool = True,
-    fresh: bool = False,
 ) -> int:
     """Reconstruct and evaluate with the shipped model, then train one, and write a page.
 
-    The page is written after the shipped model's part, and again at the end. An interrupted demo
-    resumes and skips finished stages. An installed package lacks most of the starter set, and tells
-    where to get it.
+    The page is written after the shipped model's part, and again at the end. An installed package
+    lacks most of the starter set, and tells where to get it.
 
     Args:
         out: Folder for everything; OUT/index.html is the page.
         minutes: Training time.
         starter: The starter set's folder.
         lpips: Fetch the LPIPS weights (64 MB) for the evaluation, if they are missing.
-        fresh: Remove the results of an earlier demo in OUT, and start again.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT
     from ..pages.demo import DemoResults
-    from ..pages.stages import Stages, Stopped
 
     for name in ("data", "icons", "meshes"):
         if not (starter / name).is_dir():
@@ -55,72 +52,73 @@ def demo_command(
         views_here=out / "views-here",
     )
     with only_process(out, "runs a demo"):
-        stages = Stages(out)
-        if fresh:
-            stages.forget()
         started = time.perf_counter()
-        try:
-            if lpips:
-                stages.gamba("weights", "lpips", may_fail=True)
-            _shipped(stages, results, starter, out / "truth")
-            _write(
-                results, out, minutes, "Training still runs; the second half of this page follows."
-            )
-            _train_here(stages, results, starter / "data", minutes)
-        except Stopped as stopped:
-            print("stopped; the same command resumes from here")
-            return stopped.code
-        spent = f"{(time.perf_counter() - started + stages.seconds) / 60:.1f} minutes"
+        if lpips:
+            _gamba("weights", "lpips", may_fail=True)
+        _shipped(results, starter, out / "truth")
+        _write(results, out, minutes, "Training still runs; the second half of this page follows.")
+        _train_here(results, starter / "data", minutes)
+        spent = f"{(time.perf_counter() - started) / 60:.1f} minutes"
         _write(results, out, minutes, f"The whole demo took {spent}.")
         print(f"wrote {out / 'index.html'} after {spent}")
     return 0
 
 
-def _shipped(stages, results, starter: Path, truth: Path) -> None:
+def _gamba(*words: object, may_fail: bool = False) -> None:
+    """Run a command in a child process, with its output passed through.
+
+    Raises:
+        UserError: it failed, unless it may.
+    """
+    texts = [str(word) for word in words]
+    print(f"\n$ gamba {' '.join(texts)}", flush=True)
+    code = _call(texts)
+    if code and not may_fail:
+        raise UserError(f"the command above ended with exit code {code}")
+
+
+def _call(words: list[str]) -> int:
+    end = Child([*GAMBA, *words]).wait(lambda: None)
+    assert end is not None, "there is no time limit"
+    return end.code
+
+
+def _shipped(results, starter: Path, truth: Path) -> None:
     """Run the shipped model on pictures and objects outside its training set."""
     model, views, data = results.shipped, results.views, starter / "data"
-    stages.gamba(
+    _gamba(
         *("reconstruct", results.icons, "--checkpoint", model, "--out", results.results),
         *("--turntable", "none", "--no-page"),
-        makes=[results.results],
-        reads=[model],
     )
-    stages.gamba(
+    _gamba(
         *("eval-views", "--checkpoint", model, "--data", data, "--views", 9),
         *("--out", views, "--save-gaussians"),
-        makes=[views / "report.json"],
-        reads=[model],
     )
     # The true meshes of the predicted objects, so that the folders pair by name.
     output_folder(truth)
     for ply in (views / "gaussians").glob("*.ply"):
         shutil.copyfile(starter / "meshes" / ply.name, truth / ply.name)
-    stages.gamba(
+    _gamba(
         *("eval-geometry", views / "gaussians", truth),
         # The starter set's meshes are in the world of its views.
         *("--frame", "reference", "--data", data, "--up", "z", "--out", results.shapes),
-        makes=[results.shapes / "report.json"],
         may_fail=True,
     )
 
 
-def _train_here(stages, results, data: Path, minutes: float) -> None:
+def _train_here(results, data: Path, minutes: float) -> None:
     """Train a model from random weights, and evaluate it on the same objects."""
-    model = results.run / "model.safetensors"
-    stages.gamba(
+    _gamba(
         *("train", data, "--preset", "rays", "--minutes", minutes, "--out", results.run),
         # LPIPS in the loss would take most of a short CPU run; the evaluation has it.
-        *("--resume", "auto", "--lpips", "off", "--no-radial-mask", "--ssim-weight", "0.2"),
+        *("--resume", "never", "--lpips", "off", "--no-radial-mask", "--ssim-weight", "0.2"),
         *("--batch-size", "4", "--views-per-object", "3", "--front-share", "0.5"),
         *("--mirror", "0.5", "--lr", "2e-3", "--warmup-steps", "30", "--cache"),
         *("--val-every", "40", "--val-objects", "4", "--save-every", "50", "--no-tensorboard"),
-        makes=[model],
     )
-    stages.gamba(
-        *("eval-views", "--checkpoint", model, "--data", data, "--views", 9),
-        *("--out", results.views_here, "--no-baselines"),
-        makes=[results.views_here / "report.json"],
-        name="eval-views of the model trained here",
+    _gamba(
+        *("eval-views", "--checkpoint", results.run / "model.safetensors", "--data", data),
+        *("--views", 9, "--out", results.views_here, "--no-baselines"),
     )
 
 

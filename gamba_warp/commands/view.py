@@ -1,4 +1,4 @@
-"""``gamba view``: a file of Gaussians, or a training run, in the browser."""
+"""``gamba view``: a file of Gaussians in the browser."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def view_command(
     distance: Distance | None = None,
     drop_bad: bool = False,
 ) -> None:
-    """Show Gaussians or a training run in a browser, as one self-contained HTML page.
+    """Show Gaussians in a browser, as one self-contained HTML page.
 
     Args:
-        file: Gaussians (.ply, .splat, .spz, .glb), or the folder of a training run.
+        file: Gaussians (.ply, .splat, .spz, .glb).
         out: File for the page; a temporary file by default.
         mesh: A mesh of the same object, shown too (.glb, .obj, .ply, .stl).
         mesh_frame: Axes of the mesh; opengl is y up, gamba's default for meshes.
@@ -52,7 +52,6 @@ def view_command(
     import tempfile
 
     from ..pages.export import read_with_warning
-    from ..pages.run import write_run_page
     from ..pages.serve import page_server
     from ..trajectories.paths import Viewpoint
     from ..viewer.pack import read_viewed_mesh
@@ -61,9 +60,7 @@ def view_command(
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"--out {out}: the page is an .html file")
-    if mesh is not None and file.is_dir():
-        raise UserError(f"--mesh {mesh}: a training run has no mesh")
-    gaussians = None if file.is_dir() else read_with_warning(file, drop_bad)
+    gaussians = read_with_warning(file, drop_bad)
     surface = None
     if mesh is not None:
         surface = read_viewed_mesh(mesh, mesh_frame)
@@ -71,12 +68,9 @@ def view_command(
     if out is not None:
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"
-    if gaussians is None:
-        write_run_page(file, page)
-    else:
-        start = Viewpoint().changed(elevation, distance, fov)
-        view = (start.distance, start.fov, start.elevation)
-        write_viewer(page, file.name, gaussians, mesh=surface, view=view)
+    start = Viewpoint().changed(elevation, distance, fov)
+    view = (start.distance, start.fov, start.elevation)
+    write_viewer(page, file.name, gaussians, mesh=surface, view=view)
     if not serve:
         print(page)
         if open_browser:

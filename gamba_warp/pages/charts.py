@@ -1,4 +1,4 @@
-"""Charts as inline SVG with points, lines, bands and logarithmic axes; the page sets colours."""
+"""Charts as inline SVG with points, lines and logarithmic axes; the page sets colours."""
 
 from __future__ import annotations
 
@@ -27,14 +27,12 @@ class Point:
         y: the figure.
         label: drawn beside it.
         mark: "", "default" (a ring) or "peer" (a square).
-        spread: low and high end of its band.
     """
 
     x: float
     y: float
     label: str = ""
     mark: str = ""
-    spread: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -44,14 +42,12 @@ class Series:
     Attributes:
         name: in the legend, unless empty.
         points: in the order of the line.
-        line: "" or "straight"; "steps", "guide" and "curve" hide the points.
-        colour: number of its colour; None: its index among the series.
+        line: "" or "straight"; "steps" hides the points.
     """
 
     name: str
     points: Sequence[Point]
     line: str = ""
-    colour: int | None = None
 
 
 @dataclass(frozen=True)
@@ -62,15 +58,11 @@ class Axis:
         label: with the unit.
         logarithmic: False for a linear axis.
         values: ticks, if given.
-        ends: limits; None: those of the points, with a margin.
-        rows: ticks in several rows, each with its name: positions and texts.
     """
 
     label: str
     logarithmic: bool = True
     values: Sequence[float] = ()
-    ends: tuple[float, float] | None = None
-    rows: Sequence[tuple[str, Sequence[tuple[float, str]]]] = ()
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
@@ -86,10 +78,7 @@ def chart(
     series: Sequence[Series],
     x: Axis,
     y: Axis,
-    *,
-    name: str = "",
     size: tuple[int, int] = (WIDTH, HEIGHT),
-    tooltips: Sequence[tuple[float, str]] = (),
 ) -> Markup | str:
     """Draw a chart.
 
@@ -99,9 +88,7 @@ def chart(
         series: drawn in order, later ones on top.
         x: the horizontal axis.
         y: the vertical axis, whose label is the chart's title.
-        name: accessible name; by default the title.
         size: width and height in user units.
-        tooltips: texts of columns of the chart by their x, rising.
 
     Returns:
         The ``<svg>`` element, or an empty text without points.
@@ -116,45 +103,35 @@ def chart(
     shown = [point for _, points, _ in found for point in points]
     left, right, top, bottom = _LEFT, size[0] - _RIGHT, _TOP, size[1] - _BOTTOM
     to_x = _Scale([p.x for p in shown], x, left, right)
-    ends = [value for p in shown for value in (p.y, *(p.spread or ()))]
-    to_y = _Scale([value for value in ends if _fits(value, y)], y, bottom, top)
+    to_y = _Scale([p.y for p in shown], y, bottom, top)
     drawn, named = [], []
     for s, points, index in found:
-        colour = (index if s.colour is None else s.colour) % COLOURS
         placed = [(to_x(p.x), to_y(p.y)) for p in points]
         path = placed
         if s.line == "steps":  # the line shows the least y reached at most x
             corners = [(after[0], at[1]) for at, after in zip(placed, placed[1:])]
             path = [p for pair in zip(placed, [*corners, placed[-1]]) for p in pair]
-        spreads = [(at[0], p.spread) for at, p in zip(placed, points) if p.spread]
-        band = [(at, to_y(spread[1])) for at, spread in spreads]
-        band += [(at, to_y(spread[0])) for at, spread in reversed(spreads)]
-        dots = [] if s.line in ("steps", "guide", "curve") else list(zip(placed, points))
+        dots = [] if s.line == "steps" else list(zip(placed, points))
         named += [(at, p.label) for at, p in dots if p.label]
         drawn.append(
             {
-                "colour": f"var(--s{colour})",
+                "colour": f"var(--s{index % COLOURS})",
                 "name": s.name,
                 "line": s.line,
                 "path": _path(path),
-                "band": _path(band),
                 "radius": 4.5 if not s.line else 3 if len(points) <= _FEW else 2.2,
                 "dots": [
                     (at, p, f"{p.label}: {p.x:.4g}, {p.y:.3g}".lstrip(": ")) for at, p in dots
                 ],
             }
         )
-    edges = [to_x(at) for at, _ in tooltips]
-    edges = [left, *((a + b) / 2 for a, b in zip(edges, edges[1:])), right]
-    ticks = [("", [(value, number(value)) for value in x.values or to_x.ticks()])]
     return render(
         "chart.svg",
         **{"size": size, "left": left, "right": right, "top": top, "bottom": bottom},
-        **{"x": x, "y": y, "name": name or y.label, "series": drawn},
-        rows=[(text, [(to_x(v), t) for v, t in marks]) for text, marks in x.rows or ticks],
-        ticks=[(to_y(value), number(value)) for value in y.values or to_y.ticks()],
+        **{"x": x, "y": y, "series": drawn},
+        columns=[(to_x(value), number(value)) for value in x.values or to_x.ticks()],
+        rows=[(to_y(value), number(value)) for value in y.values or to_y.ticks()],
         labels=_labels(named, size[0], bottom),
-        slots=[(a, max(1.0, b - a), text) for a, b, (_, text) in zip(edges, edges[1:], tooltips)],
     )
 
 
@@ -168,7 +145,6 @@ text { fill: var(--text); font: 12px system-ui, sans-serif; }
 .axis { fill: var(--soft); font-weight: 600; }
 .grid { stroke: var(--line); }
 .line { fill: none; stroke-width: 2; stroke-linejoin: round; }
-.guide { stroke-dasharray: 3 4; }
 """
 
 
@@ -219,13 +195,12 @@ class _Scale:
     def __init__(self, values: Sequence[float], axis: Axis, start: float, end: float) -> None:
         self._start, self._end, self._logarithmic = start, end, axis.logarithmic
         self._bend = math.log10 if axis.logarithmic else float
-        self._only = values[0] if min(values) == max(values) and axis.ends is None else None
-        low, high = (self._bend(value) for value in axis.ends or (min(values), max(values)))
-        if axis.ends is None:
-            margin = 0.08 * (high - low) or (0.3 if axis.logarithmic else abs(high) or 1.0)
-            if axis.logarithmic:  # at least a factor of 2.5, so that noise is not exaggerated
-                margin = max(margin, (0.4 - high + low) / 2)
-            low, high = low - margin, high + margin
+        self._only = values[0] if min(values) == max(values) else None
+        low, high = self._bend(min(values)), self._bend(max(values))
+        margin = 0.08 * (high - low) or (0.3 if axis.logarithmic else abs(high) or 1.0)
+        if axis.logarithmic:  # at least a factor of 2.5, so that noise is not exaggerated
+            margin = max(margin, (0.4 - high + low) / 2)
+        low, high = low - margin, high + margin
         self._low, self._high = low, high
         # Untrusted figures may exceed the range of floats.
         self.low = 10 ** max(low, -300.0) if axis.logarithmic else low

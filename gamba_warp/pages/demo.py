@@ -17,9 +17,7 @@ from ..formats.ply import load_ply
 from ..photo.cutout import cut_out
 from ..untrusted.documents import read_document
 from .card import OF_GROUNDS, OF_PICTURES, ModelCard, about_model, read_card
-from .curves import curves_section
 from .page import Section, demo_page
-from .run_log import read_run_log
 from .sheet import tiles
 from .turntable import turntable_frames
 
@@ -180,18 +178,18 @@ def _cell(value: float | None) -> str:
 def _trained_here(
     results: DemoResults, strips: list[Path], card: ModelCard | None
 ) -> list[Section]:
-    """Return the training of the demo, and two held-out objects by both models."""
-    log = results.run / "log.jsonl"
-    if not log.exists():
+    """Describe the demo's training, and show two held-out objects by both models."""
+    latest = results.run / "latest.json"
+    if not latest.exists():
         return [Section("Trained here", "This part is not done yet.")]
-    record = read_run_log(log)
+    steps = read_document(latest, dict[str, Any])["step"]
     compared = f"; the shipped one took {card.steps:,}" if card else ""
     text = (
         "A model of the preset rays, trained by this demo from random weights on the training "
-        f"objects of the starter set, for {record.step:,} steps{compared}. Its curves show that "
-        "training works, its pictures the effect of more steps."
+        f"objects of the starter set, for {steps:,} steps{compared}. Its pictures show the effect "
+        "of more steps."
     )
-    sections = [curves_section("Trained here", text, record)]
+    sections = [Section("Trained here", text)]
     both = ((strip, results.views_here / "strips" / strip.name) for strip in strips)
     for strip, other in [pair for pair in both if pair[1].exists()][:2]:
         shipped, here = tiles(strip), tiles(other)

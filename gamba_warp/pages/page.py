@@ -48,7 +48,6 @@ class Section:
             numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval, and "reached" and
             "missed" have colours.
         header: names of the table's columns.
-        code: lines of a terminal.
         details: long texts by name, initially hidden.
         distance: of the viewer's camera from the origin, object units.
         fov: field of view of the viewer's camera, degrees.
@@ -68,7 +67,6 @@ class Section:
     charts: Sequence[str] = ()
     table: Sequence[Sequence[str | int | float]] = ()
     header: Sequence[str] = ()
-    code: str = ""
     details: Mapping[str, str] = field(default_factory=dict)
     distance: float = DEFAULT_DISTANCE
     fov: float = DEFAULT_FOV

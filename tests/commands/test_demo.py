@@ -6,9 +6,9 @@ import shutil
 import pytest
 
 from gamba_warp.cli import run
+from gamba_warp.commands import demo as command
 from gamba_warp.commands.demo import STARTER
 from gamba_warp.model import checkpoint
-from gamba_warp.pages import stages
 
 OBJECTS = {"train": "scopia-dog", "val": "scopia-cat", "test": "scopia-toaster"}
 
@@ -39,13 +39,13 @@ def short(tmp_path, monkeypatch):
     surface = {"voxels": 48, "views": 16, "pixels": 96}
     protocol.write_text(json.dumps({"num_points": 2000, "iou_voxels": 16, "surface": surface}))
     more = {"eval-geometry": ["--protocol", str(protocol)]}
-    process = stages._call
+    process = command._call
 
     def call(words):
         name, *rest = words
         return process(words) if name == "reconstruct" else run(name, rest + more.get(name, []))
 
-    monkeypatch.setattr(stages, "_call", call)
+    monkeypatch.setattr(command, "_call", call)
 
 
 @pytest.mark.slow
@@ -67,7 +67,6 @@ def test_demo(starter, short, tmp_path, monkeypatch):
         "Truth",
         "Icon: fire-hydrant",
         "chamfer",
-        "<polyline",
     ):
         assert part in page, part
     # what was shipped comes before what was trained here, and the page says which is which
@@ -100,7 +99,7 @@ class Calls:
 
     def __init__(self, monkeypatch, out):
         self.stages, self.out, self.codes, self.pages = [], out, {}, []
-        monkeypatch.setattr(stages, "_call", self)
+        monkeypatch.setattr(command, "_call", self)
         monkeypatch.setattr(
             "gamba_warp.pages.demo.write_demo",
             lambda path, results, text: self.pages.append((len(self.stages), text)),
@@ -121,20 +120,14 @@ class Calls:
 ALL = ["reconstruct", "eval-views", "eval-geometry", "train", "eval-views here"]
 
 
-def test_an_interrupted_demo_goes_on(starter, tmp_path, monkeypatch, capsys):
+def test_a_command_that_fails_ends_the_demo(starter, tmp_path, monkeypatch, capsys):
     out = tmp_path / "demo"
     calls = Calls(monkeypatch, out)
-    calls.codes = {"eval-views": 143}
-    assert demo(starter, out) == 143 and calls.stages == ALL[:2] and not calls.pages
-    assert "the same command resumes" in capsys.readouterr().out
-    calls.codes, calls.stages = {"train": 1}, []
-    assert demo(starter, out) == 2 and calls.stages == ALL[1:4]
-    calls.codes, calls.stages = {}, []
-    assert demo(starter, out) == 0 and calls.stages == ALL[3:]
-    calls.stages = []
-    assert demo(starter, out) == 0 and calls.stages == []
-    (out / "run" / "model.safetensors").unlink()  # what follows from it is made again, too
-    assert demo(starter, out) == 0 and calls.stages == ALL[3:]
+    calls.codes = {"train": 1}
+    assert demo(starter, out) == 2 and calls.stages == ALL[:4]
+    assert "the command above ended with exit code 1" in capsys.readouterr().err
+    calls.codes, calls.stages = {"eval-geometry": 1}, []
+    assert demo(starter, out) == 0 and calls.stages == ALL
 
 
 def test_the_page_is_there_before_the_training(starter, tmp_path, monkeypatch):
@@ -146,20 +139,3 @@ def test_the_page_is_there_before_the_training(starter, tmp_path, monkeypatch):
     assert "Training still runs" in first and "The whole demo took" in second
     name = checkpoint.DEFAULT_CHECKPOINT.name
     assert all(name in text and "for 2 minutes" in text for text in (first, second))
-
-
-def test_a_demo_of_other_options_is_refused_unless_fresh(starter, tmp_path, monkeypatch, capsys):
-    out, model = tmp_path / "demo", tmp_path / "new.safetensors"
-    monkeypatch.setattr(checkpoint, "DEFAULT_CHECKPOINT", model)
-    model.write_bytes(b"one")
-    calls = Calls(monkeypatch, out)
-    assert demo(starter, out) == 0
-    (out / "mine.txt").write_text("not a demo's")
-    calls.stages = []
-    assert demo(starter, out, "--minutes", "1") == 2 and calls.stages == []
-    assert "holds a demo of other options or of another model" in capsys.readouterr().err
-    model.write_bytes(b"two")
-    assert demo(starter, out) == 2 and calls.stages == []
-    assert "of another model; give --fresh" in capsys.readouterr().err
-    assert demo(starter, out, "--minutes", "1", "--fresh") == 0 and calls.stages == ALL
-    assert (out / "mine.txt").exists()

@@ -129,17 +129,17 @@ def test_pictures_come_back_from_the_page(tmp_path):
 
 def test_text_is_escaped(tmp_path):
     nasty = '</script><b onload="x">&'
-    section = Section(nasty, text=nasty, header=(nasty, nasty), code=nasty)
+    section = Section(nasty, text=nasty, header=(nasty, nasty))
     section.table, section.details = [(nasty, 1), (1.5, nasty)], {nasty: nasty}
     section.views, section.files = {nasty: pictures(1, 4, 4, 3)}, [nasty]
     section.links = {nasty: frames(1)[0]}
     points = [Point(0, 1, nasty), Point(1, 2)]
     axes = Axis(nasty, False), Axis(nasty, False)
-    section.charts = [chart([Series(nasty, points)], *axes, name=nasty, tooltips=[(0.5, nasty)])]
+    section.charts = [chart([Series(nasty, points)], *axes)]
     demo_page(tmp_path / "a.html", [section], title=nasty, text=nasty)
     page = Page(tmp_path / "a.html")
     assert not page.all("b") and "</script><b" not in page.source
-    assert page.text.count(nasty) == 21
+    assert page.text.count(nasty) == 19
     assert page.all("svg")[0]["aria-label"] == nasty
     assert "&lt;b&gt;" in page_text("", "", [Section("", charts=["<b>"])]), "a text is no SVG"
 
@@ -157,16 +157,16 @@ def test_tables_show_numbers_to_four_digits():
     assert '<td class="reached">reached</td>' in written
 
 
-def drawn(ends=None, logarithmic=False, **lines):
+def drawn(logarithmic=False, **lines):
     """A chart of lines of pairs, and the places of their points."""
-    series = [Series(name, [Point(*p) for p in pairs], "curve") for name, pairs in lines.items()]
-    svg = chart(series, Axis("steps", False, ends=ends), Axis("y", logarithmic))
+    series = [Series(name, [Point(*p) for p in pairs], "straight") for name, pairs in lines.items()]
+    svg = chart(series, Axis("steps", False), Axis("y", logarithmic))
     found = [re.findall(r"[^ ,]+", line) for line in re.findall(r'points="([^"]*)"', svg)]
     return svg, [list(zip(map(float, at[::2]), map(float, at[1::2]))) for at in found]
 
 
 def test_charts_place_their_points():
-    svg, (first, second) = drawn((0, 100), a=[(0, 0), (50, 5), (100, 10)], b=[(100, 0)])
+    svg, (first, second) = drawn(a=[(0, 0), (50, 5), (100, 10)], b=[(100, 0)])
     left, middle, right = first
     assert left[0] < middle[0] < right[0] and left[1] > middle[1] > right[1]  # y grows downwards
     assert left[0] > 0 and right[0] < 600 and left[1] < 380 and right[1] > 31  # inside the viewBox
