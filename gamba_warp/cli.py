@@ -81,7 +81,9 @@ COMMANDS = {
     "render": Command("Gaussians to pictures and movies along a path.", "", (), _DRAWING),
     "app": Command("Pictures to 3D on a page of this machine.", "app", _GRADIO, _PICTURES, _APP),
     "bench": Command("Run time against error, on this machine.", "", (), _MODEL, _MACHINE),
-    "stress": Command("Random hostile cases against float64.", "all", (), ("kernels",), _MACHINE),
+    "stress": Command(
+        "Random hostile cases against float64.", "stress", ("hypothesis",), ("kernels",), _MACHINE
+    ),
     "import-released": Command(
         "The authors' public weights to ours.", "train", ("timm",), (), _WEIGHTS
     ),

@@ -38,6 +38,7 @@ EXTRA_OF = {
     "gradio": "app",
     "gsplat": "fit",
     "huggingface_hub": "hub",
+    "hypothesis": "stress",
     "imageio_ffmpeg": "video",
     "kornia": "eval",
     "manifold3d": "mesh",
@@ -70,6 +71,7 @@ HOLDS = {
         *SHAPES,
     },
     "shards": {"webdataset"},
+    "stress": {"hypothesis"},
     "all": set(EXTRA_OF),
 }
 

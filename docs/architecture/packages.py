@@ -37,12 +37,11 @@ _GROUPS = {
     "kernels.ssim kernels.triangles",
     "KERNELS": "versions kernels.runtime OPS kernels",
     "BENCH": "kernels.bench kernels.bench.core kernels.bench.cases",
-    "STRESS": "kernels.stress kernels.stress.core kernels.stress.oracles kernels.stress.cases",
     "READERS": "KERNELS core untrusted",
     "MODEL": "model.config model.parts",
     "LIBRARY": "READERS data formats vision MODEL model",
     "RESULTS": "LIBRARY photo trajectories surfaces viewer fitting pages",
-    "MEASURES": "RESULTS BENCH STRESS",
+    "MEASURES": "RESULTS BENCH kernels.cases kernels.stress",
     "TRAIN_DATA": "train.data train.data.made train.sources",
     "TRAIN": "train.config train.objective train TRAIN_DATA",
     "EVAL": "eval eval.views eval.shapes",
@@ -60,10 +59,8 @@ kernels | the public operators, loaded when used | versions | OPS
 kernels.bench.core | definition of a case, the clock, reports | versions kernels.runtime |
 kernels.bench | comparisons with other packages | KERNELS kernels.bench.core |
 kernels.bench.cases | one file per subject | KERNELS kernels.bench.core kernels.bench |
-kernels.stress.core | definition of a case, the runner, reports | versions kernels.runtime |
-kernels.stress.oracles | the formulas in float64 | kernels.stress.core kernels.rasterize |
-kernels.stress.cases | one file per subject | KERNELS kernels.stress.core kernels.stress.oracles |
-kernels.stress | parent of its three packages | |
+kernels.cases | inputs by name and seed, formulas in float64, limits | KERNELS |
+kernels.stress | the runner of random cases | versions kernels.runtime kernels.cases |
 core | Gaussians, cameras, images, rendering, files, errors | KERNELS |
 compat | other packages' interfaces over our kernels | READERS |
 untrusted | validation of untrusted files | KERNELS core |
@@ -119,8 +116,8 @@ KERNEL_LIBRARIES = {"numpy", "torch", "warp"}
 ONLY_INSIDE_FUNCTIONS = {"open3d", "pymeshlab"}
 # An oracle shares only constants with its kernel (and the torch formula of the harmonics, which is
 # itself an oracle).
-ORACLES = ("kernels.stress.oracles", "reference")
-ORACLES_MAY = ("constants", "harmonics.formula", "kernels.stress.core", "kernels.stress.oracles")
+ORACLES = ("_oracle", "reference")
+ORACLES_MAY = ("constants", "harmonics.formula", "kernels.cases")
 
 
 def short(module: str) -> str:
@@ -163,8 +160,10 @@ def _library(entry: Import) -> str | None:
         return f"write gamba_warp.{entry.name}: by its folder's name it would be loaded twice"
     if root in ONLY_INSIDE_FUNCTIONS and not entry.lazy:
         return f"{root} may be imported only inside functions"
+    source = short(entry.source)
     known = root in KERNEL_LIBRARIES or root in sys.stdlib_module_names
-    if short(entry.source).startswith("kernels") and not known:
+    known |= root == "hypothesis" and source.startswith("kernels.stress")
+    if source.startswith("kernels") and not known:
         return f"kernels import only {', '.join(sorted(KERNEL_LIBRARIES))}, not {root}"
     return None
 
@@ -178,7 +177,7 @@ def _ours(entry: Import, target: str) -> str | None:
     if mine and theirs and mine != theirs:
         return f"code of one device imports {target}, of the other"
     source = short(entry.source)
-    if source.startswith(ORACLES[0]) or source.endswith(ORACLES[1]):
+    if source.endswith(ORACLES):
         if not any(part in short(entry.name) for part in ORACLES_MAY):
             return f"an oracle shares only constants with its kernel, not {entry.name}"
     here, there = package_of(entry.source), package_of(target)
@@ -195,7 +194,8 @@ def _ours(entry: Import, target: str) -> str | None:
 def edges(entries: Iterable[Import], by_package: bool) -> dict[str, set[str]]:
     """Return the graph of imports of packages, or of files, inside functions too.
 
-    Strings count for packages alone: a suffix such as ``.gltf`` looks like a module. A package's ``__init__`` loads its public names on demand, so no file depends on it.
+    Strings count for packages alone: a suffix such as ``.gltf`` looks like a module. A package's
+    ``__init__`` loads its public names on demand, so no file depends on it.
     """
     found: dict[str, set[str]] = defaultdict(set)
     entries = list(entries)

@@ -12,9 +12,10 @@ from typing import Annotated
 import tyro
 from msgspec import Meta
 
+from ..batch import progress_bar
 from ..conventions import DeviceChoice
 from ..devices import pick_device
-from ..files import output_folder
+from ..files import output_folder, write_json, write_text
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 from ..versions import used_versions
 
@@ -25,6 +26,13 @@ SUITES = {
     "raster": "gamba_warp.kernels.bench.cases.raster",
     "block": "gamba_warp.measure.blocks",
     "model": "gamba_warp.measure.inference",
+}
+
+# Suite -> modules with an ``OP``, imported when needed.
+STRESS = {
+    "scan": ("gamba_warp.kernels.cases.scan", "gamba_warp.kernels.cases.conv"),
+    "raster": ("gamba_warp.kernels.cases.raster",),
+    "model": ("gamba_warp.measure.stress",),
 }
 
 
@@ -98,44 +106,43 @@ def stress_command(
     device: DeviceChoice = "auto",
     threads: Threads | None = None,
     out: Path = Path("out/stress"),
-    shrink_seconds: Annotated[float, Meta(ge=0, le=86_400)] = 30.0,
-    replay: tuple[Path, ...] = (),
 ) -> int:
     """Compare kernels and model with float64 on random and hostile cases.
 
-    Checks forward results and all gradients. A failing case is shrunk and written to a file for
-    --replay. Writes stress.json and stress.md. Ctrl-C keeps the results so far.
+    Checks forward results and all gradients. A failing case is made smaller. Writes stress.json and
+    stress.md. Ctrl-C keeps the results so far.
 
     Args:
         what: scan (with the convolution), raster, model, or all (of these).
         seed: The same seed gives the same cases in the same order.
         minutes: Time limit; by default 1, or none with --cases.
-        cases: Number of cases; by default as many as fit in --minutes.
+        cases: Number of cases of each operator; by default as many as fit in --minutes.
         device: Device of the kernels; auto is the GPU if there is one.
         threads: Number of CPU threads; by default torch's.
-        out: Folder for the summary and the failing cases.
-        shrink_seconds: Time limit for shrinking one failing case.
-        replay: Run only these files of failing cases.
+        out: Folder for the results.
     """
     import torch
 
-    from ..measure import stress_run
+    from ..kernels.stress.run import StressRun
+    from ..measure import suites
 
     chosen = pick_device(device)
     if threads is not None:
         torch.set_num_threads(threads)
-    if replay:
-        code = 0
-        for passes, text in stress_run.replay(replay, chosen):
-            print(text)
-            code = code if passes else 1
-        return code
-    endless = minutes is None and cases is not None
-    ops = stress_run.choose_ops(what)
-    run = stress_run.StressRun(ops, chosen, output_folder(out), seed, shrink_seconds)
-    run.run(cases, math.inf if endless else 60 * (minutes or 1.0))
-    run.write()
-    print(f"{run.summary()}; wrote {out / 'stress.json'}")
+    names = suites.choose(what, STRESS, {"all": tuple(STRESS)})
+    ops = [importlib.import_module(module).OP for name in names for module in STRESS[name]]
+    folder, run = output_folder(out), StressRun(ops, chosen, seed)
+    seconds = math.inf if minutes is None and cases is not None else 60 * (minutes or 1.0)
+    with progress_bar(unit="case", desc="stress") as bar:
+
+        def say(text: str) -> None:
+            bar.set_postfix_str(text)
+            bar.update()
+
+        run.run(cases, seconds, say)
+    write_json(folder / "stress.json", run.document())
+    write_text(folder / "stress.md", run.markdown())
+    print(f"{run.summary()}; wrote {folder / 'stress.json'} and stress.md")
     if run.about["interrupted"]:
         print("interrupted; the results so far are kept")
         return 130

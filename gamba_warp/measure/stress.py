@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, orbit, plucker_rays
-from ..kernels.stress.core.case import Case, Op, Option, Outcome, Runs, generator
-from ..kernels.stress.core.rounding import SAMPLES, Rounding, samples_of
-from ..kernels.stress.oracles.scan import EXP_ULPS, conv, scan
+from ..kernels.cases.case import Case, Op, Outcome, Runs, generator
+from ..kernels.cases.rounding import SAMPLES, Rounding, samples_of
+from ..kernels.cases.scan_oracle import EXP_ULPS, conv, scan
 from ..model.config import GambaConfig
 from ..model.gamba import Gamba
 from ..model.parts.block import GambaBlock, prefix_states
@@ -24,23 +24,23 @@ KINDS = (
 _BFLOAT16 = 2.0**16  # half the last bit of bfloat16, in last bits of float32
 _IMAGE_CHANNELS = 6
 OPTIONS = {
-    "batch": Option(1, (1, 2, 3), span=(0, 4)),
-    "patches": Option(1, (1, 2, 3, 4), span=(1, 6)),
-    "patch_size": Option(1, (1, 2, 4), span=(1, 4)),
-    "width": Option(1, (4, 8, 12, 16, 20, 24), span=(1, 32)),
-    "depth": Option(1, (1, 1, 2, 3), span=(1, 4)),
-    "state_size": Option(1, (1, 2, 4, 5, 16), span=(1, 16)),
-    "conv_size": Option(2, (2, 3, 4, 4), span=(2, 4)),
-    "expand": Option(1, (1, 2, 2), span=(1, 3)),
-    "dt_rank": Option(1, (1, 2, 3), span=(1, 4)),
-    "norm": Option("rms", ("layer", "rms")),
-    "discretization": Option("mamba", ("mamba", "mamba", "bilinear", "zoh")),
-    "additive_image_tokens": Option(False, 0.8),
-    "camera_token": Option(False, 0.7),
-    "image_tokens": Option(0, (0, 1, 3, 9), span=(0, 16)),
-    "predict_rotation": Option(False, 0.3),
-    "position_bins": Option(2, (2, 5, 21), span=(2, 21)),
-    "autocast": Option(False, 0.3),
+    "batch": (1, 2, 3),
+    "patches": (1, 2, 3, 4),
+    "patch_size": (1, 2, 4),
+    "width": (1, 4, 8, 12, 16, 20, 24),
+    "depth": (1, 1, 2, 3),
+    "state_size": (1, 2, 4, 5, 16),
+    "conv_size": (2, 3, 4, 4),
+    "expand": (1, 2, 2),
+    "dt_rank": (1, 2, 3),
+    "norm": ("rms", "layer"),
+    "discretization": ("mamba", "mamba", "bilinear", "zoh"),
+    "additive_image_tokens": (False, *[True] * 4),
+    "camera_token": (False, True, True),
+    "image_tokens": (0, 1, 3, 9),
+    "predict_rotation": (False, False, True),
+    "position_bins": (2, 5, 21),
+    "autocast": (False, False, True),
 }
 
 

@@ -462,7 +462,6 @@ NONSENSE = {
     "bench scan": {"threads": "0 -1 1000000"},
     "stress scan": {
         "seed": "-1", "minutes": "0 nan inf", "cases": "0 -1", "threads": "0 1000000",
-        "shrink-seconds": "nan -1 inf",
     },
     "data render DATA --out OUT": {
         "views": "0 1000000", "size": "0 100000", "fov": "0 nan 180", "seed": "-1", "limit": "0",
@@ -532,18 +531,6 @@ def test_names_that_are_not_utf_8_can_be_printed(tmp_path):
     result = run("export", name, program=python(), stdout=subprocess.PIPE, cwd=tmp_path)
     assert result.returncode == 2 and "Traceback" not in result.stderr
     assert result.stderr.endswith("caf\\udce9.ply: no such file\n")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (["--replay", "none.json"], "No such file"),
-        (["files"], "unknown 'files'; there are scan, raster, model and all"),
-    ],
-)
-def test_bad_options_of_stress(arguments, reason, capsys):
-    assert exit_code(["stress", *arguments]) == 2
-    assert reason in capsys.readouterr().err
 
 
 def test_warnings_of_files_are_one_line(monkeypatch):

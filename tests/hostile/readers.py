@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from gamba_warp.ablation import jobs
 from gamba_warp.ablation.plan import named, read_plan
@@ -35,7 +34,6 @@ from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import find_pictures, load_rgba
-from gamba_warp.measure.stress_run import replay
 from gamba_warp.measure.suites import read_document, write_pages
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.config import GambaConfig
@@ -258,10 +256,6 @@ def _bench(path: Path, out: Path) -> Any:
     return [page.read_text(encoding="utf-8") for page in write_pages([read_document(path)], out)]
 
 
-def _numeric(path: Path, out: Path) -> Any:
-    return list(replay([path], torch.device("cpu")))
-
-
 def _encoder(path: Path, out: Path) -> Any:
     vit = {"encoder": "vit_tiny_patch16_224", "encoder_size": 16}
     return build_encoder(replace(seeds.tiny_config(), **vit), path)
@@ -343,7 +337,6 @@ READERS = {
     "plan": Reader(_plan, checks.plan, seeds.plans, 2),
     "compare": Reader(_compare, checks.pages, seeds.reports, 4),
     "bench": Reader(_bench, checks.pages, seeds.benches, 4),
-    "stress": Reader(_numeric, checks.nothing, seeds.numeric, 2),
     "released": Reader(_released, checks.released, seeds.released, 2),
     "encoder": Reader(_encoder, checks.nothing, seeds.weights, 1),
     "sam": Reader(alone(SamSegmenter), checks.nothing, seeds.weights, 1),

@@ -34,9 +34,6 @@ from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.names import splat_suffix
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench.core.measure import FORMAT as BENCH
-from gamba_warp.kernels.stress.cases.conv import OP
-from gamba_warp.kernels.stress.core.case import Case, Outcome
-from gamba_warp.measure.stress_run import reproducer
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.encoders import ImageEncoder
@@ -648,12 +645,6 @@ def benches() -> Kinds:
     document = {"format": BENCH, "machine": machine, "interrupted": False}
     document |= {"records": [record, record | {"variant": "b"}], "targets": [target]}
     return {"bench": {"bench.json": as_json(document)}}
-
-
-def numeric() -> Kinds:
-    """The file of a case of ``gamba stress``."""
-    case = reproducer(Case("conv", OP.kinds[0], 7, OP.valid(OP.plain)), Outcome())
-    return {"numeric": {"failure.json": as_json(case)}}
 
 
 def networks() -> Kinds:

@@ -22,6 +22,7 @@ ALL_OF_IT = {
     *(ROOT / "train" / "data" / "made").glob("*.py"),
     ROOT / "gamba_warp" / "compat" / "gsplat" / "strategy.py",
     ROOT / "gamba_warp" / "photo" / "plain.py",
+    ROOT / "kernels" / "stress" / "run.py",
     *(ROOT / "gamba_warp" / "app" / f"{name}.py" for name in ("actions", "interface", "look")),
 }
 # The name on the command line of an installer, or as an address there.

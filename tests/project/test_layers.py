@@ -55,7 +55,7 @@ def test_every_package_is_there():
         ("kernels/runtime/a.py", "try:\n    import kornia\nexcept: ...", "kernels import only"),
         ("kernels/rasterize/cuda/a.py", "from ..cpu import b", "code of one device"),
         ("kernels/rasterize/reference.py", "from . import function", "shares only constants"),
-        ("kernels/stress/oracles/a.py", "from ...rasterize import function", "only constants"),
+        ("kernels/cases/a_oracle.py", "from ..rasterize import function", "only constants"),
         ("kernels/bench/core/a.py", "from ..cases import scan", "kernels.bench.cases not"),
         ("gamba_warp/files.py", "import kernels.rasterize", "write gamba_warp.kernels"),
         ("gamba_warp/files.py", "from .model import gamba", "may import model not"),

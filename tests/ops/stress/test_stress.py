@@ -1,28 +1,27 @@
-"""``gamba stress``: a short run, limits that can fail, small reproducers, and what it refuses."""
+"""``gamba stress``: a short run, limits that can fail, and failing cases that are made smaller."""
 
 import json
-import math
-import random
+from dataclasses import replace
 
+import hypothesis
 import pytest
 import torch
 from helpers import assert_rel_rms
 
 from gamba_warp import cli
+from gamba_warp.kernels.cases import conv, raster, scan
+from gamba_warp.kernels.cases import scan_oracle as oracle
+from gamba_warp.kernels.cases.case import Case, run_case
+from gamba_warp.kernels.cases.rounding import Rounding, samples_of
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import selective_scan_fn, selective_scan_state
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
-from gamba_warp.kernels.stress.cases import conv, raster, scan
-from gamba_warp.kernels.stress.core.case import Case, draw_cases, run_case, shrink
-from gamba_warp.kernels.stress.core.rounding import Rounding, samples_of
-from gamba_warp.kernels.stress.oracles import scan as oracle
+from gamba_warp.kernels.stress import run as stress
 from gamba_warp.measure import stress as stress_model
-from gamba_warp.measure import stress_run
 
 CPU = torch.device("cpu")
-OPS = {op.name: op for op in stress_run.choose_ops(("all",))}
-SHORT = {"scan": 18, "conv": 11, "raster": 19, "model": 3}  # cases; but for the model each kind
+OPS = {module.OP.name: module.OP for module in (scan, conv, raster, stress_model)}
 
 
 def exit_code(*arguments):
@@ -47,21 +46,46 @@ def broken_scan(monkeypatch):
     monkeypatch.setattr(scan, "selective_scan", wrong)
 
 
-@pytest.mark.parametrize("name", SHORT)
-def test_short_run(name):
-    cases = draw_cases([OPS[name]], seed=0)
-    for _ in range(SHORT[name]):
-        op, case = next(cases)
-        outcome = run_case(op, case, CPU)
-        assert outcome.failure() is None, (outcome.failure(), case)
+# Small but for these: each kind is run, and each of a few dtypes and layouts.
+SMALL = {
+    "scan": dict(length=65, channels=5, states=3, use_z=True, use_D=True, softplus=True, last=True),
+    "conv": dict(length=33, channels=5, width=4, silu=True, use_bias=True, use_state=True),
+    "raster": dict(num=30, width=17, height=9, channels=3, use_quats=True, mode="RGB+D"),
+    "model": dict(patches=2, width=8, state_size=2, camera_token=True),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [(name, kind) for name in ("scan", "conv", "raster") for kind in OPS[name].kinds]
+    + [("model", kind) for kind in ("uniform", "long steps", "saturated heads")],
+)
+def test_every_kind_passes(name, kind):
+    op = OPS[name]
+    fixed = {k: v[-1] if isinstance(v, tuple) else v for k, v in op.kinds[kind].items()}
+    case = Case(name, kind, 1, op.fit(op.plain | SMALL[name] | fixed))
+    outcome = run_case(op, case, CPU)
+    assert outcome.failure() is None, (outcome.failure(), case)
+
+
+@pytest.mark.parametrize("name", OPS)
+def test_a_short_run_passes_and_is_the_same_again(name):
+    runs = []
+    for _ in range(2):
+        run = stress.StressRun([OPS[name]], CPU, seed=0)
+        run.run(3 if name == "model" else 6, 1e9)
+        assert run.failures == []
+        rows = [{k: v for k, v in row.items() if k != "seconds"} for row in run.document()["rows"]]
+        runs.append(rows)
+    assert runs[0] == runs[1] and sum(row["cases"] for row in runs[0]) >= 3
 
 
 @pytest.mark.parametrize("discretization", scan.DISCRETIZATIONS)
 def test_scan_oracle_is_the_reference(discretization):
-    case = Case("scan", "uniform", 5, scan.OP.valid(scan.OP.plain | dict(
+    case = Case("scan", "uniform", 5, scan.OP.plain | dict(
         batch=2, length=29, channels=6, states=3, groups=2, use_D=True, use_z=True, use_bias=True,
         use_state=True, softplus=True,
-    )))  # fmt: skip
+    ))  # fmt: skip
     inputs = scan.build(case, CPU)
     samples = {k: samples_of(x) for k, x in inputs.items()}
     out, last = oracle.scan(samples, True, discretization, Rounding(0))
@@ -172,60 +196,43 @@ def test_model_with_a_small_error_fails(monkeypatch):
     assert run_case(stress_model.OP, case, CPU).failure()["what"] == "limit"
 
 
-def test_same_seed_same_cases():
-    ops = list(OPS.values())
-    first, again, other = (draw_cases(ops, seed) for seed in (3, 3, 4))
-    for _ in range(40):
-        case = next(first)[1]
-        assert case == next(again)[1] != next(other)[1]
-        op = OPS[case.op]
-        assert op.valid(case.options) == case.options, "shrinking would change it"
-        assert case.options.keys() == op.plain.keys()
-        json.dumps(vars(case))
+@pytest.mark.parametrize("op", OPS.values(), ids=OPS)
+def test_what_is_drawn_fits_and_is_data(op):
+    """Also that the kinds are drawn, and that a case that fits is not changed again."""
+    seen = set()
+
+    @hypothesis.seed(1)
+    @hypothesis.settings(max_examples=300, database=None, deadline=None)
+    @hypothesis.given(stress.cases_of(op))
+    def look(case):
+        seen.add(case.kind)
+        assert op.fit(case.options) == case.options
+        assert case.options.keys() == op.plain.keys() and json.dumps(case)
+
+    look()
+    assert len(seen) > 0.8 * len(op.kinds)
 
 
-@pytest.mark.parametrize("op", OPS.values(), ids=lambda op: op.name)
-def test_every_kind_draws_what_a_file_may_hold(op):
-    for kind in op.kinds:
-        options = op.draw(random.Random(1), kind)
-        for name, allowed in op.choices.items():
-            assert options[name] in allowed and op.plain[name] in allowed, (kind, name)
-
-
-def test_a_failing_case_is_made_small(broken_scan):
-    options = scan.OP.plain | dict(
-        length=40, channels=5, states=4, groups=5, use_z=True, use_D=True, last=True, softplus=True,
-        layout="part", batch=2, A="wide",
-    )  # fmt: skip
-    case = Case("scan", "long", 1, scan.OP.valid(options))
-    small, outcome, tried = shrink(scan.OP, case, CPU, seconds=120)
-    assert outcome.failure()["what"] == "limit" and tried < 60
-    changed = {k for k, v in small.options.items() if v != scan.OP.plain[k]}
-    assert changed == {"use_z"} and small.kind == "uniform"
-
-
-def test_a_small_error_is_caught_written_and_replayed(tmp_path, broken_scan, capsys):
-    code = exit_code("scan", "--cases", 24, "--out", tmp_path, "--shrink-seconds", 1)
-    assert code == 1
-    path = next(tmp_path.glob("failure-scan-*.json"))
-    content = json.loads(path.read_text())
-    options = content["case"]["options"]
-    assert content["failure"]["what"] == "limit" and options["use_z"]
-    assert len(path.read_text()) < 2000
-    summary = json.loads((tmp_path / "stress.json").read_text())
-    assert summary["failures"] and sum(row["failures"] for row in summary["rows"]) > 0
+def test_a_small_error_is_caught_and_reported(monkeypatch, tmp_path, broken_scan, capsys):
+    monkeypatch.setattr(stress, "_SHRUNK", 0)
+    assert exit_code("scan", "--cases", 60, "--out", tmp_path) == 1
+    document = json.loads((tmp_path / "stress.json").read_text())
+    (failure,) = document["failures"]
+    assert failure["text"].startswith("scan, ") and "times its limit off" in failure["text"]
+    assert run_case(scan.OP, Case(**failure["case"]), CPU).failure()["what"] == "limit"
+    assert sum(row["failures"] for row in document["rows"]) == 1
     assert "## Failures" in (tmp_path / "stress.md").read_text()
-    assert exit_code("--replay", path) == 1
-    assert "fails" in capsys.readouterr().out
+    assert failure["text"] in capsys.readouterr().out
 
 
-def test_a_mended_error_passes_its_replay(tmp_path, capsys):
-    case = Case("scan", "uniform", 1, scan.OP.plain)
-    content = stress_run.reproducer(case, run_case(scan.OP, case, CPU))
-    path = tmp_path / "case.json"
-    path.write_text(json.dumps(content))
-    assert exit_code("--replay", path) == 0
-    assert "passes" in capsys.readouterr().out
+def test_a_failing_case_is_made_small(monkeypatch, broken_scan):
+    monkeypatch.setattr(stress, "_SHRINK", 300.0)
+    op = replace(scan.OP, kinds={kind: scan.OP.kinds[kind] for kind in ("uniform", "spread")})
+    run = stress.StressRun([op], CPU, seed=0)
+    run.run(60, 1e9)
+    case = Case(**run.failures[0]["case"])
+    changed = {k for k, v in case.options.items() if v != op.plain[k]}
+    assert changed == {"use_z"} and (case.kind, case.seed) == ("uniform", 0)
 
 
 @pytest.mark.parametrize("value, what", [(float("nan"), "not finite"), (None, "fault")])
@@ -242,8 +249,6 @@ def test_not_finite_and_exceptions_are_failures(monkeypatch, value, what):
     outcome = run_case(scan.OP, case, CPU)
     assert outcome.failure()["what"] == what
     assert (outcome.nonfinite >= 9) == (value is not None)
-    small, found, _ = shrink(scan.OP, case, CPU, seconds=2)
-    assert found.failure()["what"] == what and small.options["length"] <= 1
 
 
 def test_two_runs_that_differ_are_a_failure(monkeypatch):
@@ -263,73 +268,15 @@ def test_interrupted_keeps_what_was_found(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(scan, "selective_scan", interrupted)
     assert exit_code("scan", "--cases", 24, "--out", tmp_path) == 130
-    summary = json.loads((tmp_path / "stress.json").read_text())
-    assert summary["interrupted"] and 0 < sum(row["cases"] for row in summary["rows"]) < 50
+    document = json.loads((tmp_path / "stress.json").read_text())
+    assert document["interrupted"] and 0 < sum(row["cases"] for row in document["rows"]) < 24
     assert "interrupted" in capsys.readouterr().out
-
-
-GOOD = {
-    "format": "gamba_warp.stress.1",
-    "case": {"op": "scan", "kind": "uniform", "seed": 1, "options": scan.OP.plain},
-}
-
-
-@pytest.mark.parametrize(
-    "content, reason",
-    [
-        (None, "No such file"),
-        ("{", "not valid JSON"),
-        ("[]", "not a case"),
-        (GOOD | {"format": "gamba_warp.stress.9"}, "format is not"),
-        (GOOD | {"case": {}}, "Object missing required field `op`"),
-        (GOOD | {"case": GOOD["case"] | {"op": "sort"}}, "no case 'sort, uniform'"),
-        (GOOD | {"case": GOOD["case"] | {"options": {}}}, "no option 'A'"),
-        ({"options": {"speed": 1}}, "an unknown option 'speed'"),
-        ({"options": {"length": "9"}}, "option 'length' is '9'"),
-        ({"options": {"length": -1}}, "option 'length' is -1"),
-        ({"options": {"dtype": "int8"}}, "option 'dtype' is 'int8'"),
-        ({"options": {"groups": 7}}, "do not fit"),
-        ({"options": {"length": 10**6}}, "'length' is 1000000, and 125000 is the nearest"),
-        ({"options": {"length": 10**6, "states": 16}}, "'length' is 1000000"),  # was endless
-        ({"options": {"length": 0, "batch": 10**6, "channels": 10**6}}, "do not fit"),
-        ({"seed": -1}, "seed is not in 0 to 2147483647"),
-        ({"kind": "x" * 10**5}, "no case 'scan, xxx"),
-        ("[" * 10**5, "nested deeper than 32 levels"),
-    ],
-)
-def test_bad_files_are_told_in_one_line(tmp_path, capsys, content, reason):
-    path = tmp_path / "case.json"
-    if isinstance(content, dict):
-        if "options" in content:
-            options = scan.OP.plain | content["options"]
-            content = GOOD | {"case": GOOD["case"] | {"options": options}}
-        elif "format" not in content:
-            content = GOOD | {"case": GOOD["case"] | content}
-        content = json.dumps(content)
-    if content is not None:
-        path.write_text(content)
-    assert exit_code("--replay", path) == 2
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1
-    assert captured.err.startswith(f"gamba: {path}: ") and reason in captured.err
-
-
-@pytest.mark.parametrize("op", OPS.values(), ids=OPS)
-def test_no_options_take_much_memory_or_no_end(op):
-    sizes = [name for name, value in op.plain.items() if type(value) is int]
-    for chosen in ([], *([name] for name in sizes), sizes[:1], sizes[1:]):
-        for other in (0, 10**6):
-            options = op.plain | dict.fromkeys(sizes, other) | dict.fromkeys(chosen, 10**6)
-            fitting = op.valid(options)
-            names = ("batch", "views", "length", "channels", "states", "num", "width", "height")
-            product = math.prod(max(1, fitting.get(name, 1)) for name in names)
-            assert product <= 500_000 and op.valid(fitting) == fitting
 
 
 @pytest.mark.parametrize(
     "arguments, reason",
     [
-        (["sort"], "unknown 'sort'"),
+        (["sort"], "unknown case 'sort'; there are scan, raster, model and all"),
         (["--cases", "0"], "--cases 0: must be at least 1"),
         (["--minutes", "0"], "--minutes 0.0: must be above 0"),
         (["--threads", "0"], "--threads 0: must be at least 1"),

@@ -8,32 +8,30 @@ from pathlib import Path
 import pytest
 import torch
 
+from gamba_warp.kernels.cases import conv, raster, scan
+from gamba_warp.kernels.cases.case import Case, Comparison, Outcome, judge, run_case
+from gamba_warp.kernels.cases.rounding import SAMPLES, UNDERFLOW, Rounding, samples_of
+from gamba_warp.kernels.cases.scan_oracle import states
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
-from gamba_warp.kernels.stress.cases import raster
-from gamba_warp.kernels.stress.core.case import Case, Comparison, Outcome, judge, run_case
-from gamba_warp.kernels.stress.core.rounding import SAMPLES, UNDERFLOW, Rounding, samples_of
-from gamba_warp.kernels.stress.oracles.scan import states
-from gamba_warp.measure import stress_run
+from gamba_warp.measure import stress as model
 
 CPU = torch.device("cpu")
-CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
+OPS = {module.OP.name: module.OP for module in (conv, scan, raster, model)}
+# Cases that failed once.
+CORPUS = json.loads(Path(__file__).with_name("corpus.json").read_text())
 
 
-@pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.stem)
-def test_cases_that_failed_once_pass(path):
-    """``corpus/`` holds cases that failed, as they were written; each is judged again."""
-    case = Case(**json.loads(path.read_text())["case"])
-    op = {op.name: op for op in stress_run.choose_ops(("all",))}[case.op]
-    outcome = run_case(op, case, CPU)
+@pytest.mark.parametrize("name", CORPUS)
+def test_cases_that_failed_once_pass(name):
+    case = Case(**CORPUS[name])
+    outcome = run_case(OPS[case.op], case, CPU)
     assert outcome.comparisons and outcome.failure() is None, outcome.failure()
 
 
-@pytest.mark.parametrize(
-    "path", [x for x in CORPUS if x.stem.startswith("raster")], ids=lambda path: path.stem
-)
-def test_cases_of_the_rasterizer_pass_on_cuda(from_ptx, path):
+@pytest.mark.parametrize("name", [name for name in CORPUS if name.startswith("raster")])
+def test_cases_of_the_rasterizer_pass_on_cuda(from_ptx, name):
     from_ptx()
-    test_cases_that_failed_once_pass(path)
+    test_cases_that_failed_once_pass(name)
 
 
 def spread_of(samples):
@@ -192,8 +190,7 @@ def test_the_slope_of_a_decay_may_lose_a_small_product():
 
 def test_a_gradient_that_is_not_finite_beside_poison_is_a_failure(monkeypatch):
     """Only numbers beyond the dtype's range may be infinite, and only those of the right row."""
-    path = next(path for path in CORPUS if path.stem == "raster-gradient-beyond-float16")
-    case = Case(**json.loads(path.read_text())["case"])
+    case = Case(**CORPUS["raster-gradient-beyond-float16"])
     right = raster.gradients_of
     for row in range(9):
 

@@ -1,7 +1,7 @@
 """The rasterizer in float64, dense, rounded sample by sample; and what rounding decides.
 
 Which pairs of pixel and Gaussian count, and in which order, is decided by sample 0. Where another
-sample comes near a decision, the pixel is undecided: README.md, "Cuts".
+sample comes near a decision, the pixel is undecided (README.md of kernels/stress).
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...rasterize.constants import ALPHA_MAX, COMPENSATION_MIN, FRUSTUM_MARGIN, T_MIN
-from ...rasterize.harmonics.formula import colors_by_formula
-from ..core.case import FACTOR
-from ..core.rounding import UNIT, Rounding
-from .scan import EXP_ULPS
+from ..rasterize.constants import ALPHA_MAX, COMPENSATION_MIN, FRUSTUM_MARGIN, T_MIN
+from ..rasterize.harmonics.formula import colors_by_formula
+from .case import FACTOR
+from .rounding import UNIT, Rounding
+from .scan_oracle import EXP_ULPS
 
 _RANGE = 3.4e38  # largest float32
 

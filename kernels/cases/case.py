@@ -1,13 +1,11 @@
-"""A case as plain data: drawn, run, judged, and made small if it fails."""
+"""A random case as plain data: its values, its run, and its comparison with float64."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from random import Random
 from typing import Any, NamedTuple
 
 import torch
@@ -34,26 +32,25 @@ RANGES = (
 COTANGENTS = ("normal", "normal", "ones", "spikes", "zeros")
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """All that is needed to build the tensors again.
 
     Attributes:
         op: name of an ``Op``.
         kind: one of the op's kinds of extreme values.
         seed: seed of the values.
-        options: sizes, dtype and switches as JSON values by name; the keys of the op's ``plain``.
+        options: sizes, dtype and switches by name; those not named are plain.
     """
 
     op: str
     kind: str
     seed: int
-    options: dict
+    options: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One result compared with float64.
+    """Comparison of one result with float64.
 
     Attributes:
         name: name of the result, such as "out" or "gradient of u".
@@ -123,93 +120,44 @@ class Outcome:
         return {"what": "limit", "name": worst.name, "error": worst.error, "ratio": worst.ratio}
 
 
-class Option(NamedTuple):
-    """One option of an op's cases.
-
-    Attributes:
-        plain: its simplest value, at which the shrinking of a case aims.
-        drawn: values of which one is drawn; the chance of a switch; or a function of the source of
-            chance and the options before it. Without any it is always plain.
-        chance: how often it is drawn and not plain.
-        others: values, besides those drawn, of an option that is neither a number nor a switch.
-        span: least and largest value of a size.
-    """
-
-    plain: Any
-    drawn: Any = ()
-    chance: float = 1.0
-    others: Sequence = ()
-    span: tuple[int, int] = (0, 10**6)
-
-    def draw(self, rng: Random, before: dict) -> Any:
-        """Draws a value."""
-        if self.drawn == () or (self.chance < 1 and rng.random() >= self.chance):
-            return self.plain
-        if isinstance(self.drawn, float):
-            return rng.random() < self.drawn
-        return self.drawn(rng, before) if callable(self.drawn) else rng.choice(self.drawn)
-
-
 @dataclass(frozen=True)
 class Op:
-    """Something to be stressed.
+    """An operator, or a model, with its random cases.
 
     Attributes:
         name: name of the op.
-        fixed: options of each kind of values, drawn where they are a tuple; the first kind is
-            the plain one.
-        options: its options, drawn and shrunk in this order.
+        kinds: by kind of values, the options that it fixes: a value, or a tuple of values of which
+            one is drawn. The first kind is the plain one.
+        options: by name the values to draw from, of which the first is the plain one.
         fit: function that returns the nearest options that make sense together.
         evaluate: function that runs a case on a device; each trial has other random roundings.
     """
 
     name: str
-    fixed: dict[str, dict]
-    options: dict[str, Option]
+    kinds: dict[str, dict[str, Any]]
+    options: dict[str, Sequence[Any]]
     fit: Callable[[dict], dict]
     evaluate: Callable[[Case, torch.device, int], Outcome]
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        """The kinds of values."""
-        return tuple(self.fixed)
-
-    @property
-    def plain(self) -> dict:
+    def plain(self) -> dict[str, Any]:
         """The simplest value of every option."""
-        return {name: option.plain for name, option in self.options.items()}
+        return {name: values[0] for name, values in self.options.items()}
 
-    @property
-    def choices(self) -> dict[str, set]:
-        """The allowed values of those options that are neither a size nor a switch."""
-        found = {k: o for k, o in self.options.items() if not isinstance(o.plain, int)}
-        drawn = {k: () if callable(o.drawn) else o.drawn for k, o in found.items()}
-        return {k: {o.plain, *drawn[k], *o.others} for k, o in found.items()}
 
-    def draw(self, rng: Random, kind: str) -> dict:
-        """Draws random options for a kind."""
-        made: dict[str, Any] = {}
-        for name, option in self.options.items():
-            made[name] = option.draw(rng, made)
-        for name, value in self.fixed[kind].items():
-            made[name] = rng.choice(value) if isinstance(value, tuple) else value
-        return self.valid(made)
-
-    def valid(self, options: dict) -> dict:
-        """Returns the nearest options that are within their spans and make sense together."""
-        sizes = {k: o.span for k, o in self.options.items() if type(o.plain) is int}
-        held = {k: max(low, min(options[k], high)) for k, (low, high) in sizes.items()}
-        return self.fit(options | held)
+def mostly(plain: Any, values: Sequence[Any]) -> tuple:
+    """Return values of which ``plain`` is drawn in seven cases of ten, and stands first."""
+    return (plain,) * (7 * len(values) // 3) + (*values,)
 
 
 def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
-    """Runs a case and turns an exception into a fault.
+    """Run a case and turn an exception into a fault.
 
     A case that is over its limit is run ``TRIALS`` times, and the middle one of these counts. If it
-    is steep, up to ``STEEP_TRIALS`` count, each result by its widest limit. README.md says why.
-    An option that the case does not name is plain.
+    is steep, up to ``STEEP_TRIALS`` count, each result by its widest limit. README.md of
+    kernels/stress says why.
     """
-    case = replace(case, options=op.plain | case.options)
+    case = case._replace(options=op.plain | case.options)
     try:
         found = [op.evaluate(case, device, 0)]
         if not found[0].over:
@@ -239,79 +187,13 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
         return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
 
 
-def draw_cases(ops: Sequence[Op], seed: int) -> Iterator[tuple[Op, Case]]:
-    """Draws cases endlessly, the same ones for the same ops and seed; ops and kinds take turns."""
-    count = 0
-    while True:
-        op = ops[count % len(ops)]
-        kind = op.kinds[count // len(ops) % len(op.kinds)]
-        rng = Random(f"{seed} {op.name} {count}")
-        options = op.draw(rng, kind)
-        yield op, Case(op.name, kind, rng.randrange(2**31), options)
-        count += 1
-
-
-def shrink(
-    op: Op, case: Case, device: torch.device, seconds: float = 30.0
-) -> tuple[Case, Outcome, int]:
-    """Looks greedily, for at most ``seconds``, for a smaller case that fails in the same way.
-
-    Returns:
-        The case, its outcome, and the number of cases tried.
-    """
-    outcome, tried, end = run_case(op, case, device), 0, time.monotonic() + seconds
-    failure = outcome.failure() or {}
-
-    def size(case: Case) -> float:  # how far it is from plain; it only ever falls
-        pairs = [(case.options[name], plain) for name, plain in op.plain.items()]
-        far = (abs(a - b) if type(a) in (int, float) else float(a != b) for a, b in pairs)
-        return sum(far, float(case.kind != op.kinds[0]))
-
-    def simpler(case: Case, name: str) -> Iterator[Case]:  # the largest step first
-        value, plain = case.options[name], op.plain[name]
-        for step in (plain, (value + plain) // 2, value - 1) if type(value) is int else (plain,):
-            yield replace(case, options=op.valid(case.options | {name: step}))
-
-    improved = bool(failure)
-    while improved:
-        improved = False
-        for name in ("kind", *op.plain):
-            plain_kind = [replace(case, kind=op.kinds[0])]
-            for candidate in plain_kind if name == "kind" else simpler(case, name):
-                if time.monotonic() >= end:
-                    return case, outcome, tried
-                if size(candidate) >= size(case):
-                    continue
-                tried += 1
-                found = run_case(op, candidate, device)
-                if (other := found.failure()) and other["what"] == failure["what"]:
-                    case, outcome, improved = candidate, found, True
-                    break
-    return case, outcome, tried
-
-
-def fitted(options: dict, sizes: tuple[str, ...], largest: int) -> dict:
-    """Halves the largest of some sizes until their product is small enough; a 0 counts as 1.
-
-    Args:
-        options: of a case.
-        sizes: names of options that are numbers.
-        largest: product of the sizes, at most.
-    """
-    o = dict(options)
-    while math.prod(max(1, o[name]) for name in sizes) > largest:
-        widest = max(sizes, key=lambda name: o[name])
-        o[widest] //= 2
-    return o
-
-
 def generator(case: Case, name: str) -> torch.Generator:
-    """Makes the source of chance for one tensor of a case, independent of its other tensors."""
+    """Make the source of chance for one tensor of a case, independent of its other tensors."""
     return torch.Generator().manual_seed(case.seed * 1009 + sum(name.encode()))
 
 
 def fill(shape: Sequence[int], kind: str, g: torch.Generator) -> Tensor:
-    """Draws float32 numbers of one of ``RANGES``.
+    """Draw float32 numbers of one of ``RANGES``.
 
     "alternating" changes sign along dimension 1, "tiny" is around 1e-12, "denormal" around 1e-40
     and "huge" around 1e4. "spread" is log-uniform in 1e-6..1e4 with either sign. "spikes" is 0,
@@ -335,7 +217,7 @@ def fill(shape: Sequence[int], kind: str, g: torch.Generator) -> Tensor:
 
 
 def fits(truth: Tensor, dtype: torch.dtype) -> Tensor:
-    """Mask of a truth's numbers that a dtype holds; beyond them a result may be infinite."""
+    """Return the mask of a truth's numbers that a dtype holds; others may come out infinite."""
     return truth.detach().abs() < 0.99 * torch.finfo(dtype).max
 
 
@@ -347,7 +229,7 @@ def judge(
     extra: Tensor | None = None,
     shown: Tensor | None = None,
 ) -> Comparison:
-    """Compares a result with the samples of its formula; README.md explains the limit.
+    """Compare a result with the samples of its formula; kernels/stress/README.md has the limit.
 
     Args:
         name: name of the result.
@@ -395,7 +277,7 @@ def judge(
 
 
 def gradients_of(results: dict, leaves: dict, cotangents: dict) -> dict[str, Tensor]:
-    """Gradients by leaf; zeros where a result does not depend on it."""
+    """Return gradients by leaf; zeros where a result does not depend on it."""
     names = [n for n in results if results[n].requires_grad and results[n].numel()]
     if not names:
         return {k: torch.zeros_like(x) for k, x in leaves.items()}
@@ -445,7 +327,7 @@ class Runs:
         self.true_grads = gradients_of(self.truths, samples, self.cotangents)
 
     def outcome(self, parts: dict[str, tuple[int, ...]], **extra: dict[str, Any]) -> Outcome:
-        """Judges all results, then all gradients.
+        """Judge all results, then all gradients.
 
         Args:
             parts: of ``judge`` by name; () without parts.

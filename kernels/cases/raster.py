@@ -1,4 +1,4 @@
-"""Random and hostile cases of the rasterizer: what each kind does to Gaussians and cameras."""
+"""Random and hostile cases of the rasterizer."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...rasterize import Skip, rasterization
-from ..core.case import (
+from ..rasterize import Skip, rasterization
+from .case import (
     COTANGENTS,
     DTYPES,
     RANGES,
     Case,
     Op,
-    Option,
     Outcome,
     Runs,
     fill,
     fits,
-    fitted,
     generator,
     gradients_of,
+    mostly,
 )
-from ..core.rounding import SAMPLES, Rounding, samples_of
-from ..oracles.raster import Lens, View, render_view
+from .raster_oracle import Lens, View, render_view
+from .rounding import SAMPLES, Rounding, samples_of
 
 _PLAIN_KINDS = (
     "uniform", "needles", "discs", "points", "all sizes", "huge on screen", "around the camera",
@@ -46,32 +45,32 @@ MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _SIDES = (1, 2, 3, 5, 8, 15, 16, 17, 18, 23, 31, 33, 40, 48)
 _LARGEST = 100_000  # most pairs of pixel and Gaussian, times channels
 OPTIONS = {
-    "lead": Option("none", ("none", "none", *LEADS)),
-    "views": Option(1, (1, 1, 2, 3)),
-    "num": Option(1, (1, 2, 3, 10, 30, 64, 100, 200, 300)),
-    "width": Option(1, _SIDES, span=(1, 10**6)),
-    "height": Option(1, _SIDES, span=(1, 10**6)),
-    "channels": Option(1, (1, 2, 3, 3, 3, 4, 5, 7, 16, 33), span=(1, 10**6)),
-    "dtype": Option("float32", ("float32", "float32", "float32", "bfloat16", "float16")),
-    "mode": Option("RGB", ("RGB", *MODES)),
-    "antialiased": Option(False, 0.3),
-    "sh_degree": Option("none", ("none", "1", "3"), 0.3),
-    "backgrounds": Option(False, 0.5),
-    "colors_per_view": Option(False, 0.2),
-    "use_quats": Option(False, 0.8),
-    "skip": Option(127, range(128), 0.2, span=(0, 127)),
-    "alpha_min": Option(1 / 255, (1 / 255, 1e-4, 0.02), 0.3),
-    "alpha_max": Option(0.99, (0.99, 0.999, 0.9), 0.3),
-    "eps2d": Option(0.3, (0.3, 0.1, 1.0), 0.3),
-    "radius_clip": Option(0.0, (0.0, 2.0), 0.3),
-    "poison": Option(0, span=(0, 100)),
-    "colors": Option("uniform", RANGES, 0.2),
-    "cotangent": Option("normal", COTANGENTS, others=RANGES),
+    "lead": ("none", "none", "none", *LEADS),
+    "views": (1, 1, 2, 3),
+    "num": (1, 2, 3, 10, 30, 64, 100, 200, 300),
+    "width": _SIDES,
+    "height": _SIDES,
+    "channels": (1, 2, 3, 3, 3, 4, 5, 7, 16, 33),
+    "dtype": ("float32", "float32", "float32", "bfloat16", "float16"),
+    "mode": ("RGB", *MODES),
+    "antialiased": (False, False, True),
+    "sh_degree": mostly("none", ("none", "1", "3")),
+    "backgrounds": (False, True),
+    "colors_per_view": (*[False] * 4, True),
+    "use_quats": (False, *[True] * 4),
+    "skip": mostly(127, range(128)),
+    "alpha_min": mostly(1 / 255, (1 / 255, 1e-4, 0.02)),
+    "alpha_max": mostly(0.99, (0.99, 0.999, 0.9)),
+    "eps2d": mostly(0.3, (0.3, 0.1, 1.0)),
+    "radius_clip": mostly(0.0, (0.0, 2.0)),
+    "poison": (0,),
+    "colors": mostly("uniform", RANGES),
+    "cotangent": COTANGENTS,
 }
 
 
 def _fit(options: dict) -> dict:
-    """Sizes that the oracle can hold, options that go together."""
+    """Return sizes that the oracle can hold, and options that go together."""
     o = dict(options)
     if o["sh_degree"] != "none":
         o |= {"channels": 3, "colors_per_view": False}
@@ -82,11 +81,11 @@ def _fit(options: dict) -> dict:
             break
         largest = max(names, key=lambda k: o[k] / (8 if k == "num" else 1))
         o[largest] = (o[largest] + 1) // 2
-    return fitted(o, ("views", "num", "width", "height", "channels"), 5 * _LARGEST)
+    return o
 
 
 def _points(kind: str, batch: int, num: int, g: torch.Generator) -> Tensor:
-    """Centres ``[B, N, 3]`` in the first camera's frame (float64)."""
+    """Return centres ``[B, N, 3]`` in the first camera's frame (float64)."""
     normal = torch.randn(batch, num, 3, generator=g).double()
     uniform = torch.rand(batch, num, generator=g).double()
     points = 0.3 * normal
@@ -110,7 +109,7 @@ def _points(kind: str, batch: int, num: int, g: torch.Generator) -> Tensor:
 
 
 def _cameras(o: dict, kind: str, batch: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
-    """``viewmats [B, V, 4, 4]`` (float64) that look at the scene, ``Ks [B, V, 3, 3]``."""
+    """Return ``viewmats [B, V, 4, 4]`` (float64) that face the scene, and ``Ks [B, V, 3, 3]``."""
     views, width, height = o["views"], o["width"], o["height"]
     rotation, _ = torch.linalg.qr(torch.randn(batch, views, 3, 3, generator=g).double())
     if kind in ("equal depths", "close depths"):
@@ -129,7 +128,7 @@ def _cameras(o: dict, kind: str, batch: int, g: torch.Generator) -> tuple[Tensor
 
 
 def _shapes(o: dict, kind: str, sizes: tuple[int, int], g: dict) -> dict[str, Tensor | None]:
-    """Quaternions, scales (log-normal around 0.06 if the kind asks for nothing), opacities."""
+    """Return quaternions, scales (log-normal around 0.06 unless the kind says else), opacities."""
     quats = torch.randn(*sizes, 4, generator=g["quats"])
     if kind == "odd quaternions":  # of any length, 0 included; some have one entry only
         uniform = torch.rand(*sizes, 1, generator=g["quats"])
@@ -165,7 +164,7 @@ def _shapes(o: dict, kind: str, sizes: tuple[int, int], g: dict) -> dict[str, Te
 
 
 def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
-    """The leaves by argument (Ks asks for no gradient), leading dimensions as the case has them."""
+    """Return the leaves by argument, with the case's leading dimensions; Ks needs no gradient."""
     o, kind = case.options, case.kind
     lead, num = LEADS[o["lead"]], o["num"]
     batch = int(torch.tensor(lead).prod()) if lead else 1
@@ -196,7 +195,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
 
 
 def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor | None], Tensor]:
-    """More Gaussians, each with one number that is not finite.
+    """Add Gaussians, each with one number that is not finite.
 
     Returns:
         The leaves with ``poison`` Gaussians strewn in, and where the old ones are, ``[N]``.
@@ -228,12 +227,12 @@ def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor 
 
 
 def gaussians_axis(o: dict, name: str) -> int:
-    """The dimension of a leaf along which the Gaussians lie."""
+    """Return the dimension of a leaf along which the Gaussians lie."""
     return len(LEADS[o["lead"]]) + (name == "colors" and o["colors_per_view"])
 
 
 def truth(case: Case, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict, View]:
-    """The leaves by name, and all views in float64, as ``rasterization`` renders them.
+    """Return the leaves by name, and all views in float64, as ``rasterization`` renders them.
 
     Each of the view's tensors is ``[.., *lead, V, H, W, C + 1]``; the last channel is alpha.
     """
@@ -261,7 +260,7 @@ def truth(case: Case, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict
 
 
 def _view(o: dict, x: dict[str, Tensor], v: int, K: Tensor, r: Rounding) -> View:
-    """One object in one view: the channels of the mode on the background, and alpha."""
+    """Render one object in one view: the channels of the mode on the background, and alpha."""
     gaussians: dict[str, Any] = {k: x.get(k) for k in GAUSSIAN}
     if o["colors_per_view"]:
         gaussians["colors"] = gaussians["colors"][:, v]
@@ -299,7 +298,7 @@ _PARTS = {
 
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
-    """Runs the operator; pictures pixel by pixel, gradients Gaussian by Gaussian."""
+    """Run the operator; compare pictures pixel by pixel, gradients Gaussian by Gaussian."""
     o, x = case.options, build(case, device)
     leaves = {k: t for k, t in x.items() if t is not None and k != "Ks"}
     samples, picture = truth(case, x, trial)
@@ -330,7 +329,7 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
 
 
 def _poison_faults(case: Case, x: dict, run, runs: Runs) -> list[str]:
-    """Gaussians that are not finite must change no bit of the picture, nor of the gradients."""
+    """List what Gaussians that are not finite change in picture and gradients: no bit may."""
     bad, old = poisoned(case, x)
     again = run(bad)
     others = gradients_of(again, {k: bad[k] for k in runs.grads}, runs.cotangents)

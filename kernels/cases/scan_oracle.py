@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..core.rounding import UNDERFLOW, Rounding
+from .rounding import UNDERFLOW, Rounding
 
 TOKENS = ("u", "delta", "B", "C", "z", "x")  # leaves that have a value for each token
 EXP_ULPS = 5.0  # the kernels' exponential: 3e-7 relative to its argument's fraction

@@ -8,44 +8,32 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...causal_conv1d import causal_conv1d, causal_conv1d_fn
-from ..core.case import (
-    COTANGENTS,
-    DTYPES,
-    RANGES,
-    Case,
-    Op,
-    Option,
-    Outcome,
-    Runs,
-    fill,
-    fitted,
-    generator,
-)
-from ..core.rounding import Rounding, samples_of
-from ..oracles import scan as scan_oracle
+from ..causal_conv1d import causal_conv1d, causal_conv1d_fn
+from . import scan_oracle
+from .case import COTANGENTS, DTYPES, RANGES, Case, Op, Outcome, Runs, fill, generator, mostly
+from .rounding import Rounding, samples_of
 from .scan import LAYOUTS, SEQUENCES, borders, laid
 
 OPTIONS = {
-    "api": Option("conv", ("conv", "causal-conv1d")),
-    "batch": Option(1, (1, 2, 3)),
-    "length": Option(1, (0, 1, 2, 3, 4, 15, 16, 17, 63, 64, 65, 129, 300)),
-    "channels": Option(1, (1, 2, 5, 15, 16, 17, 31, 33, 65)),
-    "width": Option(2, (2, 3, 4), span=(2, 4)),
-    "dtype": Option("float32", ("float32", "float32", "bfloat16", "float16")),
-    "layout": Option("dense", LAYOUTS),
-    "silu": Option(False, 0.7),
-    "use_bias": Option(False, 0.5),
-    "use_state": Option(False, 0.5),
-    "final": Option(False, 0.5),
-    "weight": Option("normal", RANGES, 0.3),
-    "cotangent": Option("normal", COTANGENTS, others=RANGES),
+    "api": ("conv", "causal-conv1d"),
+    "batch": (1, 2, 3),
+    "length": (1, 0, 2, 3, 4, 15, 16, 17, 63, 64, 65, 129, 300),
+    "channels": (1, 2, 5, 15, 16, 17, 31, 33, 65),
+    "width": (2, 3, 4),
+    "dtype": ("float32", "float32", "bfloat16", "float16"),
+    "layout": LAYOUTS,
+    "silu": (False, True, True),
+    "use_bias": (False, True),
+    "use_state": (False, True),
+    "final": (False, True),
+    "weight": mostly("normal", RANGES),
+    "cotangent": COTANGENTS,
     "sequences": SEQUENCES,
 }
 
 
 def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
-    """The leaves by argument, channels last."""
+    """Return the leaves by argument, channels last."""
     o, dtype = case.options, DTYPES[case.options["dtype"]]
     batch, length, channels, width = (o[k] for k in ("batch", "length", "channels", "width"))
     g = {name: generator(case, name) for name in ("x", "weight", "rest")}
@@ -63,7 +51,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
 
 
 def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
-    """The results by name, channels last."""
+    """Return the results by name, channels last."""
     values = x["weight"], x["bias"]
     rest: dict[str, Any] = {"activation": "silu" if o["silu"] else None}
     state = x["initial_state"]
@@ -79,7 +67,7 @@ def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
 
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
-    """Runs the operator and compares output, final state and all gradients with float64."""
+    """Run the operator and compare output, final state and all gradients with float64."""
     o, x = case.options, build(case, device)
     samples: dict[str, Any] = {k: samples_of(t) for k, t in x.items()}
     r = Rounding(case.seed, trial)
@@ -93,10 +81,9 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
 
 
 def _fit(options: dict) -> dict:
-    o = fitted(options, ("batch", "length", "channels"), 60_000)  # more than draw can give
-    if o["api"] != "conv":
-        o["sequences"] = 1
-    return o | {"batch": 1} if o["sequences"] > 1 else o
+    if options["api"] != "conv":
+        return options | {"sequences": 1}
+    return options | {"batch": 1} if options["sequences"] > 1 else options
 
 
 OP = Op("conv", dict.fromkeys(RANGES, {}), OPTIONS, _fit, evaluate)

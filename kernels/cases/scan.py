@@ -9,27 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...selective_scan import selective_scan, selective_scan_fn, selective_scan_state
-from ..core.case import (
-    COTANGENTS,
-    DTYPES,
-    RANGES,
-    Case,
-    Op,
-    Option,
-    Outcome,
-    Runs,
-    fill,
-    fitted,
-    generator,
-)
-from ..core.rounding import Rounding, samples_of
-from ..oracles import scan as scan_oracle
+from ..selective_scan import selective_scan, selective_scan_fn, selective_scan_state
+from . import scan_oracle
+from .case import COTANGENTS, DTYPES, RANGES, Case, Op, Outcome, Runs, fill, generator, mostly
+from .rounding import Rounding, samples_of
 
 DISCRETIZATIONS = ("mamba", "bilinear", "zoh")
 APIS = ("scan", "state", "prefix", "mamba-ssm")
 LAYOUTS = ("dense", "expanded", "channels first", "part")
-SEQUENCES = Option(1, (1, 1, 1, 2, 3, 7, 20), span=(1, 20))  # packed in one row
+SEQUENCES = (1, 1, 1, 2, 3, 7, 20)  # packed in one row
 _LARGEST = 60_000  # B L D N: the oracle holds some dozen of these eight times
 
 # kind -> options that it fixes or draws; the ranges of delta and A: see _steps, _rates
@@ -58,41 +46,39 @@ KINDS: dict[str, dict] = {
     },
 }  # fmt: skip
 OPTIONS = {
-    "dtype": Option("float32", ("float32", "float32", "bfloat16", "float16")),
-    "api": Option("scan", APIS),
-    "batch": Option(1, (1, 1, 2, 3)),
-    "length": Option(1, (0, 1, 2, 3, 4, 15, 16, 17, 63, 64, 65, 100, 127, 129, 200, 300, 577)),
-    "channels": Option(1, (1, 2, 3, 5, 8, 15, 16, 17, 31, 32, 33, 48, 65, 130)),
-    "states": Option(1, (1, 2, 3, 4, 5, 8, 16, 16, 17, 32, 33, 64, 128, 255, 256)),
-    "groups": Option(1, (1, 1, 2, 3)),
-    "delta_dtype": Option(
-        "float32", lambda rng, o: "float32" if rng.random() < 0.2 else o["dtype"], others=[*DTYPES]
-    ),
-    "layout": Option("dense", LAYOUTS),
-    "discretization": Option("mamba", ("mamba", *DISCRETIZATIONS)),
-    "softplus": Option(False, 0.6),
-    "use_D": Option(False, 0.5),
-    "use_z": Option(False, 0.5),
-    "use_bias": Option(False, 0.5),
-    "use_state": Option(False, 0.5),
-    "last": Option(False, 0.5),
-    "split": Option(0, range(577)),
-    "constant_B": Option(False, 0.2),
-    "u": Option("normal", RANGES, 0.3),
-    "delta": Option(
-        "steps", ("steps", "steps", "wide", "constant"), others=("off", "on", "at 20", "signed")
-    ),
-    "A": Option("model", ("model", "model", "wide", "slow"), others=("zero", "fast")),
-    "B": Option("normal", others=RANGES),
-    "C": Option("normal", RANGES, 0.2),
-    "cotangent": Option("normal", COTANGENTS, others=RANGES),
+    "dtype": ("float32", "float32", "bfloat16", "float16"),
+    "api": APIS,
+    "batch": (1, 1, 2, 3),
+    "length": (1, 0, 2, 3, 4, 15, 16, 17, 63, 64, 65, 100, 127, 129, 200, 300, 577),
+    "channels": (1, 2, 3, 5, 8, 15, 16, 17, 31, 32, 33, 48, 65, 130),
+    "states": (1, 2, 3, 4, 5, 8, 16, 16, 17, 32, 33, 64, 128, 255, 256),
+    "groups": (1, 1, 2, 3),
+    "delta_dtype": ("float32", *["as dtype"] * 4),
+    "layout": LAYOUTS,
+    "discretization": ("mamba", *DISCRETIZATIONS),
+    "softplus": (False, False, True, True, True),
+    "use_D": (False, True),
+    "use_z": (False, True),
+    "use_bias": (False, True),
+    "use_state": (False, True),
+    "last": (False, True),
+    "split": range(577),
+    "constant_B": (*[False] * 4, True),
+    "u": mostly("normal", RANGES),
+    "delta": ("steps", "steps", "wide", "constant"),
+    "A": ("model", "model", "wide", "slow"),
+    "B": ("normal",),
+    "C": mostly("normal", RANGES),
+    "cotangent": COTANGENTS,
     "sequences": SEQUENCES,
 }
 
 
 def _fit(options: dict) -> dict:
-    """Sizes that fit each other and the oracle; options that the API takes."""
+    """Return sizes that fit each other and the oracle, and options that the API takes."""
     o = dict(options)
+    if o["delta_dtype"] == "as dtype":
+        o["delta_dtype"] = o["dtype"]
     if o["api"] in ("prefix", "mamba-ssm"):
         o["sequences"] = 1
     if o["sequences"] > 1:
@@ -105,7 +91,6 @@ def _fit(options: dict) -> dict:
             if o["channels"] == 1 and o["states"] == 1:
                 o["batch"] = 1
                 break
-    o = fitted(o, ("batch", "length", "channels", "states"), 4 * _LARGEST)
     o["groups"] = math.gcd(o["groups"], o["channels"])
     if o["api"] != "prefix":
         o["split"] = 0
@@ -127,7 +112,7 @@ def _fit(options: dict) -> dict:
 
 
 def _steps_and_rates(o: dict, shape: tuple[int, ...], g: dict) -> tuple[Tensor, Tensor]:
-    """The steps, before a softplus or as they are used, and ``A [D, N]``, by their ranges."""
+    """Return the steps, before a softplus or as used, and ``A [D, N]``, by their ranges."""
     uniform = torch.rand(shape, generator=g["delta"])
     normal = torch.randn(shape, generator=g["delta"])
     if o["softplus"]:
@@ -150,7 +135,7 @@ def _steps_and_rates(o: dict, shape: tuple[int, ...], g: dict) -> tuple[Tensor, 
 
 
 def laid(x: Tensor, layout: str) -> Tensor:
-    """The same shape with another layout; "expanded" repeats batch element 0."""
+    """Return the same values with another layout; "expanded" repeats batch element 0."""
     if layout == "expanded":
         return x[:1].expand_as(x)
     if layout == "channels first":
@@ -161,7 +146,7 @@ def laid(x: Tensor, layout: str) -> Tensor:
 
 
 def borders(case: Case, device: torch.device) -> Tensor | None:
-    """``cu_seqlens`` of the packed sequences, some without tokens; None of a single one."""
+    """Return ``cu_seqlens`` of the packed sequences, some without tokens; None of a single one."""
     length, count = case.options["length"], case.options["sequences"]
     if count == 1:
         return None
@@ -170,7 +155,7 @@ def borders(case: Case, device: torch.device) -> Tensor | None:
 
 
 def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
-    """The leaves by argument, channels last; a constant B is ``[D, N]``."""
+    """Return the leaves by argument, channels last; a constant B is ``[D, N]``."""
     o = case.options
     batch, length, channels, n = (o[k] for k in ("batch", "length", "channels", "states"))
     token, grouped = (batch, length, channels), (batch, length, o["groups"], n)
@@ -204,7 +189,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
 
 
 def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
-    """The results by name, channels last."""
+    """Return the results by name, channels last."""
     common: dict[str, Any] = dict(delta_softplus=o["softplus"])
     if o["api"] == "mamba-ssm":
         u, delta = x["u"].mT, x["delta"].mT
@@ -231,7 +216,7 @@ def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
 
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
-    """Runs the operator and compares outputs and all gradients with float64."""
+    """Run the operator and compare outputs and all gradients with float64."""
     o, r, x = case.options, Rounding(case.seed, trial), build(case, device)
     samples: dict[str, Any] = {name: samples_of(t) for name, t in x.items()}
     used = dict(samples)

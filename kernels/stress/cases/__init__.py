@@ -1,1 +1,0 @@
-"""Random and hostile cases, one file an operator."""

@@ -1,1 +1,0 @@
-"""The parts that every stress test uses: cases, ranges of values, rounding, runs and reports."""

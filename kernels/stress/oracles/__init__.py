@@ -1,1 +1,0 @@
-"""The operators' formulas in float64, rounded sample by sample."""
