@@ -2,44 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import json
+import shlex
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
-from .. import image_metrics
 from ..errors import UserError
-from ..files import write_json
-from ..fitting.config import Count, FitConfig, RasterizeMode, Steps, Strategy
-from ..untrusted.documents import parse_document, read_bytes, read_document
+from ..image_metrics import METRICS
+from ..untrusted.documents import parse_document, read_bytes
 from ..untrusted.names import plain_name
 from ..untrusted.ranges import Seed
 
+if TYPE_CHECKING:
+    from gamba_warp.train.config import TrainConfig
+
 PLANS = Path(__file__).parent / "plans"
 MAX_PLAN = 1 << 20  # bytes; the shipped plans have 5,000
-METRICS = (*image_metrics.METRICS, "chamfer", "iou")
+# Set by the command for all rows, or they would give rows different samples.
+RESERVED = ("data", "set", "preset", "out", "config", "resume", "init", "seed", "device")
+RESERVED += ("threads", "tensorboard")
+BUDGET = ("steps", "minutes")
 
-Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}\Z")]
-Text = Annotated[str, Meta(max_length=1000)]
-Word = Annotated[str, Meta(min_length=1, max_length=200)]
+_Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}\Z")]
+_Text = Annotated[str, Meta(max_length=1000)]
+_Word = Annotated[str, Meta(min_length=1, max_length=200)]
 _Scalar = bool | int | float | Annotated[str, Meta(max_length=200)]
-Value = _Scalar | Annotated[list[_Scalar], Meta(max_length=100)] | None
-Values = Annotated[dict[Word, Value], Meta(max_length=200)]
-
-
-class FitOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of ``gamba fit`` that a plan may set, with the same meaning."""
-
-    gaussians: Count = FitConfig.gaussians
-    steps: Steps = FitConfig.steps
-    strategy: Strategy = FitConfig.strategy
-    rasterize_mode: RasterizeMode = "classic"
-    held_out: Annotated[int, Meta(ge=2, le=100_000)] = 6
-    size: Annotated[int, Meta(ge=8, le=4096)] | None = None
-    limit: Annotated[int, Meta(ge=1, le=1_000_000)] = 12
+_Value = _Scalar | Annotated[list[_Scalar], Meta(max_length=100)] | None
+_Values = Annotated[dict[_Word, _Value], Meta(max_length=200)]
+_Seeds = Annotated[list[Seed], Meta(min_length=1, max_length=100)]
 
 
 class Evaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,14 +44,12 @@ class Evaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         objects: their number, evenly spaced in the order of names.
         views: per object, including the input, evenly spaced.
         size: height of the pictures compared, pixels; None: the files' own.
-        geometry_objects: number of objects whose shapes are evaluated; None: all.
     """
 
     split: Literal["val", "test"] = "test"
     objects: Annotated[int, Meta(ge=1, le=1_000_000)] = 27
     views: Annotated[int, Meta(ge=2, le=100_000)] = 4
     size: Annotated[int, Meta(ge=16, le=4096)] | None = None
-    geometry_objects: Annotated[int, Meta(ge=1, le=1_000_000)] | None = None
 
 
 class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,13 +59,11 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         preset: of ``gamba train``.
         set: fields of ``GambaConfig``.
         options: of ``gamba train``; one of ``steps`` and ``minutes`` is the budget of every row.
-        fit: options of ``gamba fit``, for rows of that kind.
     """
 
-    preset: Word = "tiny"
-    set: Values = {}
-    options: Values = {}
-    fit: Values = {}
+    preset: _Word = "tiny"
+    set: _Values = {}
+    options: _Values = {}
 
 
 class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,30 +72,23 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         name: of its folder.
         title: in the table; the name, if empty.
-        kind: "train" trains and evaluates a model, "fit" fits objects one by one.
         set: fields of ``GambaConfig`` that differ from the base's.
-        options: of ``gamba train``, or of ``gamba fit``, that differ; null removes one of the
-            base's.
-        seeds: in place of the plan's.
+        options: of ``gamba train`` that differ; null removes one of the base's.
         compare_with: name of the reference row, in place of the plan's.
-        series: name of the row's series of numbers of Gaussians.
         background_margin: evaluate the model without tokens of plain background farther than this
             many patches from the object; None: with all.
         paper: figures of the paper, by the metric's name.
         note: a sentence below the table.
     """
 
-    name: Name
-    title: Text = ""
-    kind: Literal["train", "fit"] = "train"
-    set: Values = {}
-    options: Values = {}
-    seeds: Annotated[list[Seed], Meta(min_length=1, max_length=100)] | None = None
-    compare_with: Name | None = None
-    series: Name | None = None
+    name: _Name
+    title: _Text = ""
+    set: _Values = {}
+    options: _Values = {}
+    compare_with: _Name | None = None
     background_margin: Annotated[int, Meta(ge=0, le=4096)] | None = None
-    paper: Annotated[dict[Word, float], Meta(max_length=10)] = {}
-    note: Text = ""
+    paper: Annotated[dict[_Word, float], Meta(max_length=10)] = {}
+    note: _Text = ""
 
     @property
     def label(self) -> str:
@@ -118,25 +101,23 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: of the plan.
-        title: of its page.
+        title: of its table.
         rows: of the table, in its order.
-        note: sentences at the head of the page.
+        note: sentences at its head.
         seeds: of every row.
         base: defaults of all rows.
         evaluation: objects and views of the evaluation.
         compare_with: name of the reference row; None without one.
     """
 
-    name: Name
-    title: Text
+    name: _Name
+    title: _Text
     rows: Annotated[list[Row], Meta(min_length=1, max_length=200)]
-    note: Text = ""
-    seeds: Annotated[list[Seed], Meta(min_length=1, max_length=100)] = msgspec.field(
-        default_factory=lambda: [0, 1]
-    )
+    note: _Text = ""
+    seeds: _Seeds = msgspec.field(default_factory=lambda: [0, 1])
     base: Base = Base()
     evaluation: Evaluation = Evaluation()
-    compare_with: Name | None = None
+    compare_with: _Name | None = None
 
     def row(self, name: str) -> Row:
         """Return the row of a name. Raises UserError, which lists the names, if it is missing."""
@@ -146,90 +127,118 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         names = ", ".join(row.name for row in self.rows)
         raise UserError(f"plan {self.name} has no row {name}; it has {names}")
 
-    def seeds_of(self, row: Row) -> list[int]:
-        """Return the seeds of a row."""
-        return list(self.seeds if row.seeds is None else row.seeds)
 
-
-def shipped() -> list[str]:
-    """Return the names of the shipped plans."""
-    return sorted(path.stem for path in PLANS.glob("*.json"))
-
-
-def open_plan(text: str) -> Plan:
-    """Read a shipped plan by name, or a plan file.
+def open_plan(text: str, data: Path) -> Plan:
+    """Read a shipped plan by name, or a plan file, and check the commands of its rows.
 
     Raises:
-        UserError: neither exists, or the plan is invalid.
+        UserError: it does not exist or is invalid; names the row.
     """
-    if text in shipped():
-        return read_plan(PLANS / f"{text}.json")
-    if not Path(text).exists():
-        raise UserError(f"{text}: no such plan; give {', '.join(shipped())}, or a file")
-    return read_plan(text)
-
-
-def read_plan(path: str | Path) -> Plan:
-    """Read a plan and check it by itself; ``jobs.check`` checks its options.
-
-    Raises:
-        UserError: the file cannot be read, or the plan is invalid; names the row.
-    """
+    shipped = sorted(path.stem for path in PLANS.glob("*.json"))
+    path = PLANS / f"{text}.json" if text in shipped else Path(text)
+    if not path.exists():
+        raise UserError(f"{text}: no such plan; give {', '.join(shipped)}, or a file")
     plan = parse_document(read_bytes(path, MAX_PLAN), Plan, str(path))
-    with named(path):
-        _check(plan)
-    return plan
-
-
-@contextmanager
-def named(source: str | Path) -> Iterator[None]:
-    """Prefix the message of a UserError with the plan's name."""
     try:
-        yield
+        _check(plan)
+        for row in plan.rows:
+            train_config(plan, row, data)
     except UserError as error:
-        raise UserError(f"{source}: {error}") from error
+        raise UserError(f"{path}: {error}") from error
+    return plan
 
 
 def _check(plan: Plan) -> None:
     plain_name(plan.name, "name")
-    known: set[str] = set()
     for text in (plan.title, plan.note, *(t for row in plan.rows for t in (row.title, row.note))):
         if not text.isprintable():  # a table has lines
             raise UserError(f"{text[:80]!r}: a title or note has an unprintable character")
+    names = [plain_name(row.name, "row") for row in plan.rows]
     for row in plan.rows:
-        plain_name(row.name, "row")
-        if row.name in known:
+        if names.count(row.name) > 1:
             raise UserError(f"row {row.name}: there are two of this name")
-        known.add(row.name)
-        of_models = {"set": bool(row.set), "background_margin": row.background_margin is not None}
-        for name in (name for name, given in of_models.items() if given and row.kind == "fit"):
-            raise UserError(f"row {row.name}: a fit has no model, so it has no {name}")
-        for name in row.paper.keys() - {*METRICS}:
-            known_metrics = ", ".join(METRICS)
-            raise UserError(f"row {row.name}: paper: no metric {name}; known: {known_metrics}")
-        if len({*plan.seeds_of(row)}) != len(plan.seeds_of(row)):
-            raise UserError(f"row {row.name}: a seed is repeated")
-    others = {plan.compare_with, *(row.compare_with for row in plan.rows)}
-    for name in filter(None, others):
-        if plan.row(name).kind != "train":
-            raise UserError(f"compare_with {name}: rows can be compared with a model only")
-    for name in {row.series for row in plan.rows} - {None}:
-        kinds = {row.kind for row in plan.rows if row.series == name}
-        if len(kinds) > 1:
-            raise UserError(f"series {name}: it mixes models and fits")
+        if unknown := row.paper.keys() - {*METRICS}:
+            known = ", ".join(METRICS)
+            raise UserError(f"row {row.name}: paper: no metric {min(unknown)}; known: {known}")
+        if budget := [name for name in BUDGET if name in _merged(row.options)]:
+            raise UserError(f"row {row.name}: {budget[0]}: the budget is the same for every row")
+    if len({*plan.seeds}) != len(plan.seeds):
+        raise UserError("a seed is repeated")
+    for name in filter(None, {plan.compare_with, *(row.compare_with for row in plan.rows)}):
+        plan.row(name)
 
 
-def save_plan(plan: Plan, out: Path) -> None:
-    """Write the plan into the folder, which from then on belongs to it.
+def _merged(*groups: _Values) -> _Values:
+    """Merge groups of values; later ones win, null removes; names get underscores."""
+    both = {name.replace("-", "_"): value for group in groups for name, value in group.items()}
+    return {name: value for name, value in both.items() if value is not None}
+
+
+def train_config(
+    plan: Plan, row: Row, data: Path, budget: dict[str, float] | None = None
+) -> TrainConfig:
+    """Return the options of a row's training.
+
+    Args:
+        plan: the plan.
+        row: one of its rows.
+        data: the dataset.
+        budget: ``steps`` or ``minutes`` in place of the plan's; None: the plan's.
 
     Raises:
-        UserError: the folder belongs to another plan, or cannot be written.
+        UserError: an option is unknown, its value is invalid, or there is no single budget; names
+            the row.
     """
-    path = out / "plan.json"
-    if path.exists():
-        name = read_document(path, dict[str, Any], MAX_PLAN).get("name")
-        if name != plan.name:
-            raise UserError(
-                f"{out}: holds the ablation {name}, not {plan.name}; give another --out"
-            )
-    write_json(path, msgspec.to_builtins(plan))
+    from gamba_warp.train.config import GROUPS, config_of
+
+    source = f"row {row.name}"
+    of = {f.name: group for group, kind in GROUPS.items() for f in fields(kind) if group != "model"}
+    changes = _merged(plan.base.set, row.set)
+    for name in changes.keys() - {field.name for field in fields(GROUPS["model"])}:
+        raise UserError(f"{source}: set: GambaConfig has no field {name}")
+    options = _merged(plan.base.options, row.options)
+    if budget:
+        options = {name: v for name, v in options.items() if name not in BUDGET} | budget
+    if len(options.keys() & {*BUDGET, "epochs"}) != 1 or "epochs" in options:
+        raise UserError("the budget of a row: expected steps or minutes, once")
+    values: dict[str, Any] = {
+        "data": str(data),
+        "preset": plan.base.preset,
+        "set": [f"{n}={v if isinstance(v, str) else json.dumps(v)}" for n, v in changes.items()],
+    }
+    for name, value in options.items():
+        if name in RESERVED:
+            raise UserError(f"{source}: options: {name} cannot be set by a plan")
+        for item in value if isinstance(value, list) else [value]:
+            if isinstance(item, str) and (item.startswith("-") or not item.isprintable()):
+                raise UserError(f"{source}: {name}: {item!r} is not a valid value of an option")
+        values.setdefault(of.get(name, "run"), {})[name] = value
+    return config_of(values, source)
+
+
+def commands(
+    plan: Plan, row: Row, data: Path, folder: Path, budget: dict[str, float] | None
+) -> dict[str, list[str]]:
+    """Return the words of a row's training and of its evaluation, by the file that each makes.
+
+    Args:
+        plan: the plan.
+        row: one of its rows.
+        data: the dataset.
+        folder: of the row with one seed.
+        budget: as for ``train_config``.
+    """
+    from gamba_warp.train.config import command_line
+
+    config = train_config(plan, row, data, budget)
+    training = shlex.split(command_line(config.to_dict()))[1:]
+    of, model = plan.evaluation, folder / "run" / "model.safetensors"
+    views: list[object] = ["eval-views", "--checkpoint", model, "--data", data, "--split", of.split]
+    views += ["--limit", of.objects, "--views", of.views, *(["--size", of.size] if of.size else [])]
+    views += ["--strips", 4, "--sheet", 0, "--no-baselines", "--out", folder / "views"]
+    if row.background_margin is not None:
+        views += ["--background-margin", row.background_margin]
+    return {
+        "run/model.safetensors": [*training, "--no-tensorboard", "--out", str(folder / "run")],
+        "views/report.json": [*map(str, views)],
+    }

@@ -1,154 +1,171 @@
-"""Table of an ablation: means over objects and seeds, paired differences, series."""
+"""Table of an ablation: means over objects and seeds, and paired differences."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+import msgspec
 from msgspec import to_builtins
 
-from .figures import METRICS, RowResult
-from .jobs import Settings
-from .series import DEFINITION, series_of
+from ..image_metrics import METRICS
+from ..untrusted.documents import read_document, read_lines
+from ..versions import used_versions
+from .plan import Plan, Row
 
-Empty = Mapping[str, Mapping[str, float]]  # by row, PSNR of an empty picture by object
+Objects = dict[str, dict[str, float]]  # metrics by object
 
 
-def make_table(settings: Settings, results: list[RowResult], empty: Empty) -> dict[str, Any]:
-    """Make the content of ``table.json``.
+class _Report(msgspec.Struct):
+    objects: list[dict[str, Any]]
 
-    Args:
-        settings: the plan, and the settings shared by all rows.
-        results: of its rows.
-        empty: PSNR of an empty picture, for the rows of series.
 
-    Returns:
-        ``rows`` with their figures, ``series``, and the settings of the evaluation.
-    """
-    from gamba_warp.eval.averages import LEVEL, RESAMPLES
+class _Line(msgspec.Struct):
+    event: str
+    seconds: float | None = None
 
-    from ..versions import used_versions
 
-    plan, (name, value) = settings.plan, settings.budget
-    known = {result.row.name: result for result in results}
-    others = [known.get(result.row.compare_with or plan.compare_with or "") for result in results]
+def _seeds(out: Path, row: Row) -> dict[str, Objects]:
+    """Return the metrics of novel views by seed and object, of the evaluations that are there."""
+    found = {}
+    for path in sorted((out / "rows" / row.name).glob("seed-*/views/report.json")):
+        records = read_document(path, _Report).objects
+        found[path.parents[1].name.removeprefix("seed-")] = {
+            str(record["name"]): {
+                key: record[key] for key in METRICS if record.get(key) is not None
+            }
+            for record in records
+            if record.get("status") == "ok"
+        }
+    return found
+
+
+def _over_seeds(seeds: dict[str, Objects]) -> Objects:
+    """Average over seeds the metrics that all seeds have."""
+    first, *_ = parts = [*seeds.values()] or [{}]
+    names = [name for name in first if all(name in part for part in parts)]
     return {
-        "plan": plan.name,
-        "title": plan.title,
-        "note": plan.note,
-        "data": settings.data.name,
-        "budget": {name: value},
-        "compare_with": plan.compare_with,
-        "evaluation": to_builtins(settings.evaluation) | {"shapes": settings.meshes is not None},
-        "bootstrap": {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"},
-        "rows": [_row(*pair) for pair in zip(results, others)],
-        "series": _series(results, empty),
-        "series_definition": DEFINITION,
-        "versions": used_versions(),
+        name: {
+            key: sum(part[name][key] for part in parts) / len(parts)
+            for key in first[name]
+            if all(key in part[name] for part in parts)
+        }
+        for name in names
     }
 
 
-def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
-    row, seeds = result.row, result.seeds
-    logs = [seed.log for seed in seeds.values()]
-    records = [seed.task.record.ended for seed in seeds.values()]
-    ended = [part for of in records if (part := of.get("fit" if row.kind == "fit" else "train"))]
-    on_gpu = any(log.device.startswith("cuda") for log in logs)
-    memory = [part.peak_memory for part in ended]
-    if on_gpu:
-        memory = [log.device_memory for log in logs]
-    figures = _figures(result)
-    status = "failed" if result.failed else "incomplete" if result.absent else "ok"
+def make_table(plan: Plan, out: Path) -> dict[str, Any]:
+    """Make the content of ``table.json``.
+
+    Args:
+        plan: the plan.
+        out: folder of the ablation.
+
+    Returns:
+        ``plan``, ``versions`` and ``rows``: each with ``seeds``, ``objects``, ``step_seconds`` (a
+        median), and by metric the mean over objects of the means over seeds, its bootstrap interval
+        over objects, the seeds' standard deviation, and the paired difference to the reference row.
+    """
+    results = {row.name: _seeds(out, row) for row in plan.rows}
+    rows = [
+        _row(out, row, results[row.name], results.get(row.compare_with or plan.compare_with or ""))
+        for row in plan.rows
+    ]
+    return {"plan": to_builtins(plan), "versions": used_versions(), "rows": rows}
+
+
+def _row(
+    out: Path, row: Row, seeds: dict[str, Objects], others: dict[str, Objects] | None
+) -> dict[str, Any]:
+    from gamba_warp.eval.averages import summary_of
+
+    values, figures = _over_seeds(seeds), {}
+    common = seeds.keys() & (others or {}).keys()  # the same seeds see the same samples
+    ours, theirs = (
+        _over_seeds({seed: part for seed, part in (some or {}).items() if seed in common})
+        for some in (seeds, others)
+    )
+    for key in METRICS:
+        known = [record[key] for record in values.values() if key in record]
+        if not known:
+            continue
+        means = [
+            statistics.fmean(record[key] for record in part.values() if key in record)
+            for part in seeds.values()
+        ]
+        both = [n for n in ours if key in ours[n] and key in theirs.get(n, {})]
+        pairs = [ours[n][key] - theirs[n][key] for n in both]
+        figures[key] = {
+            **summary_of(known),
+            "spread": statistics.stdev(means) if len(means) > 1 else None,
+            "difference": summary_of(pairs) if pairs and others is not seeds else None,
+        }
+    times = [
+        line.seconds
+        for path in (out / "rows" / row.name).glob("seed-*/run/log.jsonl")
+        for line in read_lines(path, _Line)
+        if line.event == "train" and line.seconds is not None
+    ]
     return {
         "name": row.name,
         "title": row.label,
-        "kind": row.kind,
-        "status": status if seeds or result.failed else "not run",
-        "seeds": sorted(seeds),
-        "failed": {str(seed): reason for seed, reason in result.failed.items()},
-        "absent": result.absent,
-        "gaussians": result.gaussians,
-        "objects": max((figure["objects"] for figure in figures.values()), default=0),
+        "seeds": [*seeds],
+        "objects": len(values),
         "figures": figures,
-        "difference": _difference(result, reference),
-        "step_seconds": _median([seed.step_seconds for seed in seeds.values()]),
-        "steps": _median([log.step for log in logs]) if row.kind == "train" else None,
-        "seconds": _median([part.seconds for part in ended]),
-        "peak_memory": max(filter(None, memory), default=None),
-        "peak_memory_of": "GPU" if on_gpu else "process",
-        "parameters": next((log.parameters for log in logs), None),
-        "threads": sorted({part.threads for part in ended}),
-        "jobs": sorted({part.jobs for part in ended}),
-        "missing": {str(n): s.missing for n, s in seeds.items() if s.missing},
-        "series": row.series,
+        "step_seconds": statistics.median(times) if times else None,
         "paper": dict(row.paper),
         "note": row.note,
     }
 
 
-def _median(values: list[Any]) -> float | None:
-    known = [value for value in values if value is not None]
-    return statistics.median(known) if known else None
+def markdown_table(table: dict[str, Any]) -> str:
+    """Return the text of ``table.md``."""
+    from ..kernels.runtime.tables import cell, markdown
 
+    rows, plan = table["rows"], table["plan"]
+    shown = [key for key in METRICS if any(key in row["figures"] for row in rows)]
+    heads = [METRICS[key].head for key in shown]
 
-def _figures(result: RowResult) -> dict[str, Any]:
-    """Return by metric the mean and interval over objects, the seeds' means and their spread."""
-    from gamba_warp.eval.averages import summary_of
+    def line(row: dict[str, Any], part: str) -> list[str]:
+        found = []
+        for key in shown:
+            figure = row["figures"].get(key, {})
+            figure = figure if part == "mean" else figure.get("difference") or {}
+            digits = METRICS[key].digits
+            found.append(
+                cell(figure["mean"], figure["interval"], digits, part != "mean") if figure else "-"
+            )
+        return found
 
-    values, found = result.values(), {}
-    for metric in METRICS:
-        names = [name for name, record in values.items() if metric in record]
-        if not names:
-            continue
-        by_seed = {
-            str(number): sum(seed.objects[name][metric] for name in names) / len(names)
-            for number, seed in result.seeds.items()
-        }
-        summary = summary_of([values[name][metric] for name in names])
-        found[metric] = {
-            "mean": summary["mean"],
-            "interval": summary["interval"],
-            "objects": len(names),
-            "by_seed": by_seed,
-            "spread": statistics.stdev(by_seed.values()) if len(by_seed) > 1 else None,
-        }
-    return found
+    def seconds(row: dict[str, Any]) -> str:
+        return "-" if row["step_seconds"] is None else f"{row['step_seconds']:.3g}"
 
-
-def _difference(result: RowResult, reference: RowResult | None) -> dict[str, Any] | None:
-    """Return by metric the paired difference to the reference row, averaged over seeds."""
-    from gamba_warp.eval.averages import summary_of
-
-    if reference is None or reference is result or result.row.kind != "train":
-        return None
-    common = {*result.seeds} & {*reference.seeds}
-    seeds = common or None  # the same seeds see the same samples
-    ours, theirs = result.values(seeds), reference.values(seeds)
-    found = {}
-    for metric in METRICS:
-        both = [n for n in ours if metric in ours[n] and metric in theirs.get(n, {})]
-        if both:
-            summary = summary_of([ours[n][metric] - theirs[n][metric] for n in both])
-            found[metric] = {key: summary[key] for key in ("mean", "interval")}
-            found[metric]["objects"] = len(both)
-    named = {"to": reference.row.name, "seeds": sorted(common)}
-    return {**named, "figures": found} if found else None
-
-
-def _series(results: list[RowResult], empty: Empty) -> dict[str, Any]:
-    found = {}
-    for name in dict.fromkeys(r.row.series for r in results if r.row.series):
-        members = [r for r in results if r.row.series == name and r.seeds]
-        members.sort(key=lambda result: result.gaussians)
-        rows = [
-            {uid: record["psnr"] for uid, record in r.values().items() if "psnr" in record}
-            for r in members
-        ]
-        base = empty.get(members[-1].row.name, {}) if members else {}
-        made = series_of([r.gaussians for r in members], rows, base)
-        if made is not None:
-            absent = [r.row.name for r in results if r.row.series == name and not r.seeds]
-            names = [r.row.name for r in members]
-            found[name] = {"rows": names, "absent": absent, "kind": members[0].row.kind, **made}
-    return found
+    counts = [[row["title"], ", ".join(row["seeds"]) or "-", str(row["objects"])] for row in rows]
+    main = [[*c, *line(row, "mean"), seconds(row)] for c, row in zip(counts, rows)]
+    parts = [f"# {plan['title']}", plan["note"]]
+    parts += [markdown(["", "seeds", "objects", *heads, "s a step"], main, True)]
+    parts += [
+        "New views: means over the seeds for each object, then over objects, with 95 % bootstrap "
+        "intervals over objects."
+    ]
+    spread = [
+        [row["title"], *(f"{row['figures'][k]['spread']:.2g}" for k in shown)]
+        for row in rows
+        if row["figures"] and all(row["figures"][k]["spread"] is not None for k in shown)
+    ]
+    changes = [[row["title"], *line(row, "difference")] for row in rows]
+    published = [row for row in rows if row["paper"]]
+    for text, head, lines in (
+        ("Differences to the reference row, object by object:", heads, changes),
+        ("Standard deviation of the seeds' means:", heads, spread),
+        (
+            "The paper's own figures, of other data and sizes: compare the order of the rows.",
+            heads,
+            [[row["title"], *(str(row["paper"].get(k, "-")) for k in shown)] for row in published],
+        ),
+    ):
+        if any(word != "-" for each in lines for word in each[1:]):
+            parts += [text, markdown(["", *head], lines, True)]
+    parts += [f"{row['title']}: {row['note']}" for row in rows if row["note"]]
+    return "\n\n".join(filter(None, parts)) + "\n"

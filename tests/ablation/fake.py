@@ -70,27 +70,6 @@ def views(words, out):
     more = {"status": "ok", "views": [0, 1, 2], "ssim": 0.5, "lpips": None, "mask_iou": 0.25}
     figures = {n: {"psnr": p + 100 * rate + seed, "psnr_black": p - 3} for n, p in OBJECTS.items()}
     write_report(out, figures, more)
-    if "--save-gaussians" in words:
-        (out / "gaussians").mkdir()
-        for name in OBJECTS:
-            (out / "gaussians" / f"{name}.ply").write_text(name)
-    return 0
-
-
-def shapes(words, out):
-    found = sorted(path.stem for path in Path(words[1]).iterdir())
-    write_report(out, {n: {"chamfer": 0.01 * len(n)} for n in found}, {"status": "ok", "iou": 0.5})
-    return 1  # some of the true meshes have no prediction
-
-
-def fit(words, out):
-    number = int(option(words, "--gaussians"))
-    more = {"ssim_held_out": None, "seconds": 10.0, "steps": 5, "views_held_out": [5]}
-    figures = {
-        name: {"psnr_held_out": psnr + number / 100, "psnr_grey_held_out": psnr - 1}
-        for name, psnr in OBJECTS.items()
-    }
-    write_report(out, figures, more)
     return 0
 
 
@@ -99,8 +78,7 @@ def main(words):
         file.write(" ".join(words) + "\n")
     out = Path(option(words, "--out"))
     out.mkdir(parents=True, exist_ok=True)
-    commands = {"train": train, "eval-views": views, "eval-geometry": shapes, "fit": fit}
-    return commands[words[0]](words, out)
+    return {"train": train, "eval-views": views}[words[0]](words, out)
 
 
 if __name__ == "__main__":

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gamba_warp.ablation import jobs
-from gamba_warp.ablation.plan import named, read_plan
+from gamba_warp.ablation.plan import commands, open_plan
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.data.preprocess import SamSegmenter
@@ -237,12 +236,8 @@ def _protocol(path: Path, out: Path) -> Any:
 
 def _plan(path: Path, out: Path) -> Any:
     """The plan of an ablation, and the commands of its rows."""
-    found = read_plan(path)
-    with named(path):
-        budget = jobs.budget_of(found, None, None)
-        settings = jobs.Settings(found, path.parent, out, found.evaluation, budget, None, "cpu")
-        jobs.check(settings)
-    return found, [jobs.stages(settings, row, 0) for row in found.rows]
+    found = open_plan(str(path), path.parent)
+    return found, [commands(found, row, path.parent, out, None) for row in found.rows]
 
 
 def _compare(path: Path, out: Path) -> Any:
