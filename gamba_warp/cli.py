@@ -18,11 +18,12 @@ from functools import partial, wraps
 from itertools import dropwhile, takewhile
 from typing import Any, Literal, NamedTuple, TextIO, cast
 
+import tyro
+
 from .batch import STAGES
 from .devices import keep_memory, quiet_warp, share_cores, use_fastest_products
 from .errors import FileWarning, PrintableStream, UserError
 from .files import DISK_ERRORS
-from .usage import completions, help_text, read_words
 from .versions import MADE, SHAPES, __version__, advice, require
 
 
@@ -91,7 +92,6 @@ COMMANDS = {
     "doctor": Command(
         "Check this machine's libraries and devices.", "", (), ("kernels",), _MACHINE
     ),
-    "completion": Command("Completion by Tab for bash, zsh or fish."),
 }
 
 
@@ -131,19 +131,16 @@ def run(name: str, arguments: list[str]) -> int:
     """
     verbose = False
     try:
-        row, everything = COMMANDS[name], "--help-all" in arguments
-        if everything or {"-h", "--help"} & {*arguments}:
-            command = load_command(name)
-            arguments = _expanded(command, arguments)
-            print(help_text(name, command, everything))
+        row, command = COMMANDS[name], load_command(name)
+        if {"-h", "--help"} & {*arguments}:
+            print(help_text(name, command, _expanded(command, arguments)), end="")
             return 0
         require(*row.needs)
-        command = load_command(name)
         if name == "train":
             arguments = sys.modules[command.__module__].take_address(arguments)
-        words = read_words(arguments, command)
-        arguments, verbose = _expanded(command, words.arguments), words.verbose
-        if name == "app" and not words.quiet:  # which takes long to start
+        arguments, quiet, verbose = _common(arguments)
+        arguments = _expanded(command, arguments)
+        if name == "app" and not quiet:  # which takes long to start
             print("loading torch", flush=True)
         if "cores" in row.uses:
             share_cores()
@@ -152,7 +149,7 @@ def run(name: str, arguments: list[str]) -> int:
             use_fastest_products()
         if "kernels" in row.uses and not verbose:
             quiet_warp()
-        with _quiet() if words.quiet else nullcontext():
+        with _quiet() if quiet else nullcontext():
             code = _parsed(command, arguments, f"gamba {name}")() or 0
         if verbose:
             table = [STAGES.table()] if STAGES.seconds else []
@@ -173,14 +170,54 @@ def run(name: str, arguments: list[str]) -> int:
         return 2
 
 
+def _common(arguments: list[str]) -> tuple[list[str], bool, bool]:
+    """Take the options that every command has out of the arguments; write ``-o`` as ``--out``.
+
+    Returns:
+        The other arguments, and whether ``--quiet`` and ``--verbose`` were given.
+
+    Raises:
+        UserError: an option is repeated, of which tyro would silently keep the last.
+    """
+    found: dict[str, list[str]] = {"-q": [], "-v": []}
+    left, seen = [], set()
+    for at, word in enumerate(arguments):
+        if word == "--":  # no options follow
+            left += arguments[at:]
+            break
+        word = re.sub("^-o(?==|$)", "--out", word)
+        if (short := word.replace("--quiet", "-q").replace("--verbose", "-v")) in found:
+            found[short].append(word)
+            continue
+        if word.startswith("--"):
+            name = word.partition("=")[0].replace("_", "-")
+            if (key := name.replace("--no-", "--", 1)) in seen:
+                raise UserError(f"give {name} once")
+            seen.add(key)
+        left.append(word)
+    return left, bool(found["-q"]), bool(found["-v"])
+
+
+# A missing option has the default None, which is no value that anybody can give.
+_CONFIG = (tyro.conf.DisallowNone, tyro.conf.HelptextFromCommentsOff)
+
+
+def help_text(name: str, command: Callable, arguments: list[str]) -> str:
+    """Return the help of a command, by tyro, and the options that every command has."""
+    shown = io.StringIO()
+    with redirect_stdout(shown), suppress(SystemExit):
+        tyro.cli(command, args=[*arguments, "--help"], prog=f"gamba {name}", config=_CONFIG)
+    lines = [line.rstrip() for line in shown.getvalue().splitlines()]
+    common = "-q, --quiet: errors and warnings only; -v, --verbose: times, and errors in full"
+    return "\n".join([*lines, f"every command: {common}", ""])
+
+
 def _parsed(command: Callable, arguments: list[str], program: str) -> Callable[[], int | None]:
     """Return the command with its arguments.
 
     Raises:
         UserError: they are invalid; what tyro prints in a box, in one line.
     """
-    import tyro
-
     calls: list[Callable[[], int | None]] = []
 
     @wraps(command)
@@ -190,9 +227,7 @@ def _parsed(command: Callable, arguments: list[str], program: str) -> Callable[[
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            # None marks an option that is left out; the word "None" is not a valid value.
-            config = (tyro.conf.DisallowNone, tyro.conf.HelptextFromCommentsOff)
-            tyro.cli(keep, args=arguments, prog=program, config=config)
+            tyro.cli(keep, args=arguments, prog=program, config=_CONFIG)
     except SystemExit as error:
         # A title, perhaps a rule, the message, a rule, and how to get help; in a box, perhaps.
         rows = [re.sub("[│╭╮╰╯]", " ", line)[2:] for line in said.getvalue().splitlines()[1:]]
@@ -289,9 +324,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _main(arguments: list[str]) -> int:
-    if arguments[:1] == ["--complete"]:  # called by the script of ``gamba completion``
-        print("\n".join(_candidates(arguments[1:])))
-        return 0
     if arguments[:1] == ["help"]:
         arguments = [*arguments[1:], "--help"]
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -309,17 +341,3 @@ def _main(arguments: list[str]) -> int:
         _print_error(str(error))
         return 2
     return run(name, rest)
-
-
-def _candidates(words: list[str]) -> list[str]:
-    """Return completions of the last word; none where a file's name is expected."""
-    *before, last = words
-    before = before[1:] if before[:1] == ["help"] else before
-    try:
-        name, given = _find_command(before)
-    except (UserError, IndexError):
-        known = [name.split() for name in COMMANDS if name.split()[: len(before)] == before]
-        found = [parts[len(before)] for parts in known] + ([] if before else ["help"])
-    else:
-        found = completions(load_command(name), given, last)
-    return [word for word in dict.fromkeys(found) if word.startswith(last)]

@@ -12,7 +12,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
@@ -261,17 +261,6 @@ def plain_file(path: str | Path, links: bool = True) -> os.stat_result:
 def write_json(path: str | Path, value: object) -> None:
     """Write ``value`` as indented JSON, atomically; NaN and infinity are refused."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
-
-
-def write_options(folder: Path, options: Mapping[str, object]) -> None:
-    """Write the options of a command into the folder of its results, for ``--config FOLDER``.
-
-    Args:
-        folder: of the results.
-        options: values by name; those that were not given (None, or an empty tuple) are left out.
-    """
-    given = {name: value for name, value in options.items() if value not in (None, ())}
-    write_text(folder / CONFIG, json.dumps(given, indent=2, default=str) + "\n")
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -51,18 +51,16 @@ EXTRA_OF = {
     "skimage": "mesh",
     "tensorboard": "train",
     "timm": "train",
-    "tomli": "train",
     "trimesh": "mesh",
     "webdataset": "shards",
     "xatlas": "mesh",
-    "yaml": "train",
 }
 # Libraries of the evaluation of shapes, and of the made objects.
 SHAPES = ("kornia", "manifold3d", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 MADE = ("trimesh", "manifold3d", "skimage")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
-    "train": {"kornia", "tensorboard", "timm", "tomli", "yaml"},
+    "train": {"kornia", "tensorboard", "timm"},
     "mesh": {*SHAPES, "xatlas"},
     "eval": {*SHAPES, "xatlas"},
     "fit": {"gsplat", "kornia"},

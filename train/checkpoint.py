@@ -22,7 +22,7 @@ from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_folder, reason_of, remove_folder, sha256, sweep, write_json
 from gamba_warp.model.checkpoint import outline, read_config, read_weights, save_model
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.untrusted.documents import check_no_code, read_document
+from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 from gamba_warp.untrusted.torch_files import read_torch
 
@@ -217,7 +217,6 @@ def check_state(state: dict[str, Any], source: str) -> State:
     except (ValueError, TypeError, RuntimeError, AttributeError) as error:
         # msgspec raises a ValueError, but it treats a tensor as a mapping without keys
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
-    check_no_code(fields.config, source)
     return fields
 
 

@@ -107,9 +107,8 @@ def on_shutdown():
 def command_reference() -> str:
     """Return the help of every command, from its parser, as Markdown."""
     from gamba_warp import cli
-    from gamba_warp.usage import help_text
 
-    helps = ((name, help_text(name, cli.load_command(name), True)) for name in cli.COMMANDS)
+    helps = ((name, cli.help_text(name, cli.load_command(name), [])) for name in cli.COMMANDS)
     return "".join(f"\n## gamba {name}\n\n```text\n{text}\n```\n" for name, text in helps)
 
 

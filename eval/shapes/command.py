@@ -6,13 +6,11 @@ Slow imports are inside the command, so that ``--help`` is quick.
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
 from typing import Annotated
 
 import tyro
 
 from gamba_warp.errors import UserError
-from gamba_warp.files import write_options
 from gamba_warp.untrusted.ranges import ranged
 
 from .options import ShapesOptions
@@ -50,14 +48,12 @@ def eval_geometry_command(
         from .sensitivity import evaluate_variants
 
         table, records = evaluate_variants(options, protocol)
-        _save(options)
         print(table, end="")
         failed = [record for record in records if record["status"] == FAILED]
         for record in failed:
             print(f"failed: {record['name']}: {record['reason']}", file=sys.stderr)
         return 1 if failed else 0
     report = evaluate_shapes(options, protocol)
-    _save(options)
     parts = {"": report} | report["baselines"]
     for name, part in parts.items():
         for text in part["warnings"]:
@@ -70,12 +66,6 @@ def eval_geometry_command(
     beside = sum(len(part["failures"]) for part in report["baselines"].values())
     print(count_line(report, options.out, beside))
     return code
-
-
-def _save(options: ShapesOptions) -> None:
-    """Write the options into the folder of the results, if there is one."""
-    if options.out is not None:
-        write_options(options.out, asdict(options))
 
 
 def _explain(options: ShapesOptions) -> int:

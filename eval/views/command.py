@@ -6,13 +6,11 @@ Slow imports are inside the command, so that ``--help`` is quick.
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
 from typing import Annotated
 
 import tyro
 
 from gamba_warp.errors import UserError
-from gamba_warp.files import write_options
 from gamba_warp.untrusted.ranges import ranged
 
 from .options import ViewsOptions
@@ -39,8 +37,6 @@ def eval_views_command(
     from .table import page
 
     report = evaluate_views(filled)
-    if options.out is not None:
-        write_options(options.out, asdict(options))
     text = json_of(report) if json else csv_of(report) if csv else page(report)
     print(text, end="")
     for name, reason in report["left_out_baselines"].items():

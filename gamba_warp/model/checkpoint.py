@@ -209,9 +209,6 @@ def read_config(path: Path) -> tuple[GambaConfig, str | None]:
     if metadata.get("format") != FORMAT or "config" not in metadata:
         found = "".join(filter(str.isprintable, metadata.get("format", "none")[:40]))
         raise UserError(f"{path}: not a Gamba checkpoint (format {found}, not {FORMAT})")
-    from ..untrusted.documents import check_no_code  # not at the top: msgspec is optional
-
-    check_no_code(metadata, str(path))
     return GambaConfig.from_json(metadata["config"], str(path)), metadata.get("encoder_sha256")
 
 

@@ -1,24 +1,18 @@
-"""Untrusted JSON and config files: bounded in size and depth, decoded into declared types."""
+"""Untrusted JSON files: bounded in size and depth, decoded into declared types."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import msgspec
 
-from ..errors import UserError, first_line
-from ..files import CONFIG
-from ..versions import require
+from ..errors import UserError
 
 MAX_BYTES = 64 << 20  # a file of 100,000 views takes 60 MB; ours take a few kB
 MAX_DEPTH = 32  # levels of lists and objects; ours have up to 6
 MAX_LINE = 1 << 20  # bytes of a line of JSON Lines; ours have a few hundred, or a few thousand
-
-_CODE = {"plugin", "plugins"}
-_MAX_CONFIG = 16 << 10  # bytes; few, because aliases of YAML may repeat a long list
 
 Kind = TypeVar("Kind")
 
@@ -75,14 +69,13 @@ def parse_document(data: bytes | str, kind: Any, source: str) -> Any:
         source: origin of the text, for the error message.
 
     Raises:
-        UserError: the text is not JSON, nested deeper than ``MAX_DEPTH``, names code, or is not of
-            ``kind``; the message gives the position in the document.
+        UserError: the text is not JSON, nested deeper than ``MAX_DEPTH``, or not of ``kind``; the
+            message gives the position in the document.
     """
     try:
         text = (data.encode() if isinstance(data, str) else data).removeprefix(b"\xef\xbb\xbf")
         value = msgspec.json.decode(text)
         check_depth(value, source)
-        check_no_code(value, source)
         return msgspec.json.decode(text, type=kind)
     except msgspec.ValidationError as error:
         raise UserError(f"{source}: {error}") from error
@@ -123,64 +116,12 @@ def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
         raise UserError(f"{path}: {error.strerror}") from error
 
 
-def read_config(path: str | Path) -> dict[str, Any]:
-    """Read a config file of a command, ``.yaml``, ``.toml`` or ``.json``: values, groups of values.
-
-    Args:
-        path: of the file, or of the folder of an earlier run, which has a ``config.json``.
-
-    Raises:
-        UserError: as for ``read_bytes``; or another suffix, invalid, or nested deeper.
-        ModuleNotFoundError: the reader of the format is not installed.
-    """
-    path = Path(path) / CONFIG if Path(path).is_dir() else Path(path)
-    kinds = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml", ".json": "json"}
-    kind = kinds.get(path.suffix.lower())
-    if kind is None:
-        raise UserError(
-            f"--config {path}: expected a .yaml, .toml or .json file, or the folder of a run"
-        )
-    data = read_bytes(path, _MAX_CONFIG)
-    if kind != "json":
-        toml = "tomllib" if sys.version_info >= (3, 11) else "tomli"
-        require(toml if kind == "toml" else "yaml")
-    try:
-        values = getattr(msgspec, kind).decode(data, type=_CONFIG)
-    except (msgspec.MsgspecError, UnicodeError, ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not a valid config file ({first_line(error)})") from error
-    check_no_code(values, str(path))
-    return values
-
-
-_VALUE: Any = str | int | float | bool | None
-_CONFIG: Any = dict[str, _VALUE | list[_VALUE] | dict[str, _VALUE | list[_VALUE]]]
-
-
 def value_of(text: str) -> Any:
     """Parse an option's text as JSON; return the text itself if it is not JSON."""
     try:
         return parse_document(text, Any, "")
     except UserError:
         return text
-
-
-def check_no_code(values: Any, source: str) -> None:
-    """Check that a file's values and groups of values have no key that names code to run.
-
-    Older versions wrote such keys, and ``--config`` and plans then executed what they name.
-
-    Raises:
-        UserError: there is such a key.
-    """
-    groups = [values] if isinstance(values, dict) else []
-    groups += [value for group in groups for value in group.values() if isinstance(value, dict)]
-    for group in groups:
-        for key in _CODE & group.keys():
-            if group[key]:
-                raise UserError(
-                    f"{source}: its key '{key}' names code, which no file can load; a script of "
-                    "yours can (docs/change-the-training.md)"
-                )
 
 
 def check_depth(value: Any, source: str) -> None:

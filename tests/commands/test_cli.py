@@ -1,12 +1,11 @@
 import os
 import re
-import shutil
 import subprocess
 import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import pytest
 import tyro
@@ -117,42 +116,28 @@ def _with_lists(
     print(files, change, number, place.axes)
 
 
-def test_a_repeated_option_of_several_values_is_joined(command, capsys):
-    command(_with_lists)
-    for words, want in (
-        ("f --change a=1 b=2 --number -1", (("f",), ("a=1", "b=2"), -1, ())),
-        ("f --change a=1 --number -1 --change=b=2", (("f",), ("a=1", "b=2"), -1, ())),
-        ("--axes x --change --axes=y z --change c -- -n", (("-n",), ("c",), 3, tuple("xyz"))),
-    ):  # fmt: skip
-        assert exit_code(["try", *words.split()]) == 0
-        assert capsys.readouterr().out == " ".join(map(str, want)) + "\n"
-
-
 @pytest.mark.parametrize(
     "words, said",
     [
         ("--number 1 --change a --number 1", "give --number once"),
-        ("-n 1 -n 2", "give -n once"),
-        ("-n=1 --number 2", "give -n or --number"),
-        ("--page --no-page", "give --page or --no-page"),
+        ("--change a --change=b", "give --change once"),
+        ("--page --no-page", "give --no-page once"),
         ("--number=1 --number", "give --number once"),
     ],
 )
-def test_a_repeated_option_of_one_value_is_refused(command, capsys, words, said):
+def test_a_repeated_option_is_refused(command, capsys, words, said):
     command(_with_lists)
     assert exit_code(["try", "f", *words.split()]) == 2
     read = capsys.readouterr()
-    assert read.out == "" and read.err == f"gamba: {said}: this option takes one value\n"
+    assert read.out == "" and read.err == f"gamba: {said}\n"
 
 
 @pytest.mark.parametrize(
     "words, said",
     [
-        ("f --nmber 1", "unknown option --nmber; did you mean --number?"),
-        ("f --nonsense", "unknown option --nonsense"),
-        ("f -o out", "unknown option -o"),
-        ("https://host/f.ply --number 1", "https://host/f.ply is a URL; download it"),
-        ("--place-file=https://host/f f", "https://host/f is a URL; download it"),
+        ("f --nmber 1", "Unrecognized options: --nmber"),
+        ("f --nonsense", "Unrecognized options: --nonsense"),
+        ("f -o out", "Unrecognized options: --out"),
     ],
 )
 def test_wrong_words_are_told_in_one_line(command, capsys, words, said):
@@ -178,12 +163,6 @@ def test_values_that_are_wrong_are_told_in_one_line(words, said, capsys):
     assert read.out == "" and read.err.startswith(f"gamba: {said}") and read.err.count("\n") == 1
 
 
-def test_a_url_is_taken_where_text_is(command, capsys):
-    command(_with_lists)
-    assert exit_code(["try", "f", "--change", "https://host/a"]) == 0
-    assert "https://host/a" in capsys.readouterr().out
-
-
 def test_common_options(command, capsys, monkeypatch):
     monkeypatch.setattr(STAGES, "seconds", {})  # of the commands before
 
@@ -204,129 +183,7 @@ def test_common_options(command, capsys, monkeypatch):
     assert "give --out once" in capsys.readouterr().err
     assert exit_code(["help", "try"]) == 0
     out = capsys.readouterr().out
-    assert "-o, --out PATH" in out and "(default: here)" in out and "-q, --quiet" in out
-
-
-def _configured(
-    data: tyro.conf.Positional[Path],
-    names: tuple[str, ...] = (),
-    steps: int | None = None,
-    dry_run: bool = False,
-    page: bool = True,
-    lpips: Literal["on", "off"] = "on",
-    place: Annotated[Place, tyro.conf.OmitArgPrefixes] = Place(),
-) -> None:
-    print(data, names, steps, dry_run, page, place.axes, lpips)
-
-
-@pytest.mark.parametrize(
-    "name, text",
-    [
-        (
-            "a.yaml",
-            "data: here\nsteps: 3\nnames: [a, b]\ndry_run: true\nlpips: off\nplace:\n  axes: [x]\n",
-        ),
-        (
-            "a.toml",
-            'data="here"\nsteps=3\nnames=["a","b"]\ndry-run=true\nlpips="off"\n[place]\naxes=["x"]\n',
-        ),
-        (
-            "run/config.json",
-            '{"data": "here", "steps": 3, "names": ["a", "b"], "dry_run": true, "lpips": "off",'
-            ' "axes": ["x"], "page": false}',
-        ),
-    ],
-)
-def test_a_config_file_holds_options(command, capsys, tmp_path, name, text):
-    command(_configured)
-    path = tmp_path / name
-    path.parent.mkdir(exist_ok=True)
-    ends = {"a.yaml": "page: false\n", "a.toml": "page=false\n"}
-    path.write_text(text + ends.get(name, ""))
-    path = path.parent if path.suffix == ".json" else path
-    if name == "a.toml":  # a key after a table belongs to it
-        assert exit_code(["try", "--config", str(path), "--page"]) == 0
-        assert capsys.readouterr().out == "here ('a', 'b') 3 True True ('x',) off\n"
-    assert exit_code(["try", "--config", str(path)]) == 0
-    assert capsys.readouterr().out == "here ('a', 'b') 3 True False ('x',) off\n"
-    words = ["there", f"--config={path}", "--steps", "4", "--names", "c", "--no-dry-run"]
-    assert exit_code(["try", *words]) == 0
-    assert capsys.readouterr().out == "there ('c',) 4 False False ('x',) off\n"
-
-
-@pytest.mark.parametrize(
-    "name, text, said",
-    [
-        ("a.yaml", "stps: 3", "unknown option stps; did you mean steps?"),
-        ("a.yaml", "steps: [", "not a valid config file"),
-        ("a.yaml", "[3]", "not a valid config file"),
-        ("a.yaml", "a: {b: {c: 1}}", "not a valid config file"),
-        ("a.toml", "steps = ", "not a valid config file"),
-        ("a.toml", 'names = ["--page"]', "is not a valid value"),
-        ("a.yaml", "x: " + "y" * 20_000, "the limit for such a file"),
-        ("a.ini", "", "expected a .yaml, .toml or .json file, or the folder of a run"),
-        ("a.json", '{"steps": [[3]]}', "not a valid config file"),
-        ("b.yaml", None, "No such file"),
-        ("", None, "config.json: No such file"),
-    ],
-)
-def test_bad_config_files_are_one_line(command, capsys, tmp_path, name, text, said):
-    command(_configured)
-    if text is not None:
-        (tmp_path / name).write_text(text)
-    assert exit_code(["try", "data", "--config", str(tmp_path / name)]) == 2
-    read = capsys.readouterr()
-    assert read.out == "" and said in read.err and read.err.count("\n") == 1, read.err
-
-
-def test_help_of_many_options_names_them_and_help_all_explains_them(capsys):
-    assert exit_code(["train", "--help"]) == 0
-    short = capsys.readouterr().out
-    assert exit_code(["train", "--help-all"]) == 0
-    long = capsys.readouterr().out
-    assert len(short.splitlines()) < 70 < len(long.splitlines())
-    assert "--beta2" in short and "Second-moment" not in short and "Second-moment" in long
-
-
-@pytest.mark.parametrize(
-    "words, found",
-    [
-        ("", {"train", "data", "help"}),
-        ("re", {"reconstruct", "render"}),
-        ("data ma", {"made"}),
-        ("help data ren", {"render"}),
-        ("export x.ply --me", {"--mesh"}),
-        ("view x.ply --no-o", {"--no-open-browser"}),
-        ("export x.ply --mesh glb st", {"stl"}),
-        ("export x.ply --surface d", {"density"}),
-        ("export x.ply --out ", set()),
-        ("nonsense ", set()),
-    ],
-)
-def test_completion(words, found, capsys):
-    assert exit_code(["--complete", *words.split(" ")]) == 0
-    given = {*capsys.readouterr().out.split()}
-    assert given >= found if words == "" else given == found
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_a_shell_completes(shell, tmp_path):
-    program = shutil.which(shell)
-    if program is None:
-        pytest.skip(f"{shell} is not installed")
-    (tmp_path / "gamba").write_text(f'#!/bin/sh\nexec {sys.executable} -m gamba_warp "$@"\n')
-    (tmp_path / "gamba").chmod(0o755)
-    ask = {
-        "bash": 'eval "$(gamba completion bash)"; COMP_WORDS=(gamba export x --me); COMP_CWORD=3; '
-        '_gamba; echo "${COMPREPLY[@]}"',
-        "zsh": 'compdef() { }; compadd() { echo $found }; eval "$(gamba completion zsh)"; '
-        "words=(gamba export x --me); CURRENT=4; _gamba",
-        "fish": 'gamba completion fish | source; complete -C "gamba export x --me"',
-    }[shell]
-    room = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "HOME": str(tmp_path)}
-    room["PYTHONPATH"] = str(ROOT)
-    done = subprocess.run([program, "-c", ask], env=room, capture_output=True, text=True)
-    assert done.stdout.strip() == "--mesh", done
+    assert "--out PATH" in out and "(default: here)" in out and "-q, --quiet" in out
 
 
 def test_help_of_a_command(command, capsys):
@@ -385,14 +242,13 @@ def test_every_command_explains_itself_at_once(name):
     assert float(seconds) < 2  # 0.2 where nothing else runs
 
 
-def test_help_shows_no_value_none_and_one_size_of_the_lpips_weights(capsys):
+def test_help_shows_no_choice_none_and_one_size_of_the_lpips_weights(capsys):
     helps = {}
     for name in ("reconstruct", "train", "demo", "weights lpips"):
         assert exit_code([*name.split(), "--help"]) == 0
         helps[name] = capsys.readouterr().out
     assert not any("{None}" in text for text in helps.values())
     assert "none" in helps["reconstruct"].split("--mesh ")[1].split("}")[0]
-    assert not any(re.search(r"default: (None)?\)|'None'", text) for text in helps.values())
     page = (ROOT / "docs" / "evaluate.md").read_text(encoding="utf-8")
     for text in (helps["demo"], helps["weights lpips"], page.split("gamba weights lpips")[1]):
         assert re.search(r"(\d+) MB", text)[1] == str(DOWNLOAD_MB), text

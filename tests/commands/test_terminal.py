@@ -64,7 +64,7 @@ COMMANDS = {
     "eval-views": "eval-views --checkpoint {model} --data set --split all --out out --no-lpips",
     "fit": "fit set --out out --steps 1",
     "compare": "compare {odd}.yaml {odd}.glb",
-    "configuration": "train set --config {odd}.yaml",
+    "configuration": "train set --config {odd}",
     "unknown command": "{odd}",
     "unknown option": "render {odd}.ply --{odd}",
     "missing file": "export {odd}.missing.ply",

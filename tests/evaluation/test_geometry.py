@@ -261,20 +261,6 @@ def export(path, source):
     source.export(path)
 
 
-def test_the_folder_of_an_evaluation_repeats_it(tmp_path):
-    export(tmp_path / "gt" / "a.obj", trimesh.creation.box((1.0, 1, 2)))
-    export(tmp_path / "pred" / "a.obj", trimesh.creation.box((1.0, 1, 1.9)))
-    code, report = run_geometry(tmp_path, "--align", "none", "--set", "iou_voxels=32")
-    again = ("--config", tmp_path / "out")
-    _, same = evaluated("eval-geometry", tmp_path / "again", *again)
-    _, other = evaluated("eval-geometry", tmp_path / "other", *again, "--points", 1000)
-    assert code == 0 and same["mean"]["chamfer"] == report["mean"]["chamfer"]
-    assert same["protocol"] == report["protocol"]
-    assert other["protocol"]["num_points"] == 1000
-    assert other["protocol"] == report["protocol"] | {"num_points": 1000}
-    assert evaluated("eval-geometry", tmp_path / "gt2", "--config", tmp_path / "gt") == (2, None)
-
-
 def test_batch_lists_every_failure(tmp_path):
     box = trimesh.creation.box((1.0, 1, 1))
     for name in ("good.ply", "sub/cloud.ply", "faceless.obj", "nan.ply", "noise.ply", "lone.obj"):

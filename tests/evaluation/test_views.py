@@ -1,4 +1,3 @@
-import json
 import math
 import subprocess
 import sys
@@ -103,21 +102,6 @@ def test_perfect_predictions(data, painted):
     assert report["protocol"]["lpips_reason"] == "not asked for"
     source = report["protocol"]["source"]
     assert (source["kind"], source["path"], len(source["sha256"])) == ("ply", "pred", 64)
-
-
-def test_the_folder_of_an_evaluation_repeats_it(data, painted):
-    """Options of the command line override its own; those of a protocol are no options given."""
-    code, report = evaluate(data, "--no-baselines", "--protocol", "gamba", "--size", "32")
-    again = ("--config", data / "out")
-    assert code == 0
-    _, same = evaluated("eval-views", data / "again", *again)
-    _, other = evaluated("eval-views", data / "other", *again, "--reference", 1)
-    psnr = [each["mean"]["psnr"] for each in (report, same, other)]
-    assert psnr[0] == psnr[1] != psnr[2] and same["protocol"] == report["protocol"]
-    assert other["protocol"]["reference"] == 1
-    kept, second = (json.loads((data / n / "config.json").read_text()) for n in ("out", "again"))
-    assert kept["size"] == 32 and "reference" not in kept
-    assert second == kept | {"out": str(data / "again")}
 
 
 def test_a_wrong_distance_shows(data, painted):
