@@ -13,7 +13,7 @@ EDIT := PYTHONWARNINGS='ignore:Editable installation' \
 	$(BIN)/python -m pip install $(addprefix --constraint ,$(LOCK)) --editable
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test ptx debug hostile endurance bench study docs lint format figures \
+.PHONY: setup demo test ptx debug hostile endurance bench docs lint format figures \
         scanned architecture constraints clean
 
 setup: $(STAMP)
@@ -94,11 +94,6 @@ endurance: $(TOOLS)
 
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench
-
-# Choices inside the kernels, times of a scan, a training step by parts, the loader
-# (docs/lab/studies): make study WHAT="scan --quick".
-study: $(TOOLS)
-	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
 
 # The site, in site/: a broken link, anchor or docstring is an error.
 docs: $(TOOLS)

@@ -19,11 +19,10 @@ from pathlib import Path
 
 import torch
 
-from .kernels.bench.cases import conv, raster, scan
-from .kernels.bench.core.case import Settings
-from .kernels.bench.core.measure import measure
-from .kernels.bench.core.report import markdown
-from .measure import blocks, inference
+from .kernels.bench import conv, raster, scan
+from .kernels.bench.measure import Settings, measure
+from .kernels.bench.report import markdown
+from .measure import models
 
 MINUTES = 10.0  # of the whole run, kernels compiled included
 _SHARE = 0.5  # of the time for the tests
@@ -51,12 +50,10 @@ def bench(device: str, folder: str) -> int:
     settings = Settings(torch.device(device), "quick" if device == "cpu" else "normal")
     cases = conv.cases(settings)
     if device == "cuda":
-        suites = scan, raster, blocks, inference
-        cases += [case for suite in suites for case in suite.cases(settings)]
-        cases += inference.full_size(settings)
+        cases += [case for suite in (scan, raster, models) for case in suite.cases(settings)]
     document = measure(cases, settings)
     Path(folder, "bench.json").write_text(json.dumps(document, indent=2), encoding="utf-8")
-    Path(folder, "bench.md").write_text(markdown([document]), encoding="utf-8")
+    Path(folder, "bench.md").write_text(markdown(document), encoding="utf-8")
     failed = [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
     for r in failed:
         print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")

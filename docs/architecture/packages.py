@@ -36,12 +36,12 @@ _GROUPS = {
     "OPS": "kernels.selective_scan kernels.causal_conv1d kernels.rasterize "
     "kernels.ssim kernels.triangles",
     "KERNELS": "versions kernels.runtime OPS kernels",
-    "BENCH": "kernels.bench kernels.bench.core kernels.bench.cases",
+    "BENCH": "kernels.cases kernels.bench",
     "READERS": "KERNELS core untrusted",
     "MODEL": "model.config model.parts",
     "LIBRARY": "READERS data formats vision MODEL model",
     "RESULTS": "LIBRARY photo trajectories surfaces viewer fitting pages",
-    "MEASURES": "RESULTS BENCH kernels.cases kernels.stress",
+    "MEASURES": "RESULTS BENCH kernels.stress",
     "TRAIN_DATA": "train.data train.data.made train.sources",
     "TRAIN": "train.config train.objective train TRAIN_DATA",
     "EVAL": "eval eval.views eval.shapes",
@@ -56,9 +56,7 @@ kernels.ssim | 1 - SSIM of pictures and its gradient | versions kernels.runtime 
 kernels.triangles | intersecting faces | versions kernels.runtime |
 kernels.rasterize | Gaussians to pictures | versions kernels.runtime |
 kernels | the public operators, loaded when used | versions | OPS
-kernels.bench.core | definition of a case, the clock, reports | versions kernels.runtime |
-kernels.bench | comparisons with other packages | KERNELS kernels.bench.core |
-kernels.bench.cases | one file per subject | KERNELS kernels.bench.core kernels.bench |
+kernels.bench | the clock, suites, reports, other packages | KERNELS kernels.cases |
 kernels.cases | inputs by name and seed, formulas in float64, limits | KERNELS |
 kernels.stress | the runner of random cases | versions kernels.runtime kernels.cases |
 core | Gaussians, cameras, images, rendering, files, errors | KERNELS |
@@ -82,7 +80,7 @@ train.data | furniture, rendering of meshes | LIBRARY train.data.made |
 train.sources | published datasets, shards; commands of data | LIBRARY train.data train.data.made |
 train.config | the options of a run | LIBRARY |
 train.objective | the losses | LIBRARY train.config |
-train | batches, loop, checkpoints | LIBRARY train.config train.objective TRAIN_DATA | pages
+train | batches, loop, checkpoints | LIBRARY BENCH train.config train.objective TRAIN_DATA | pages
 eval | the report that both evaluations share | RESULTS |
 eval.views | PSNR, SSIM, LPIPS; baselines | RESULTS eval |
 eval.shapes | Chamfer, IoU, F-score | RESULTS eval |

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated
@@ -15,25 +15,36 @@ from msgspec import Meta
 from ..batch import progress_bar
 from ..conventions import DeviceChoice
 from ..devices import pick_device
+from ..errors import UserError
 from ..files import output_folder, write_json, write_text
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 from ..versions import used_versions
 
 # Suite -> the module with its ``cases(settings)``, imported when needed.
-SUITES = {
-    "scan": "gamba_warp.kernels.bench.cases.scan",
-    "conv": "gamba_warp.kernels.bench.cases.conv",
-    "raster": "gamba_warp.kernels.bench.cases.raster",
-    "block": "gamba_warp.measure.blocks",
-    "model": "gamba_warp.measure.inference",
+BENCH = {
+    "scan": "gamba_warp.kernels.bench.scan",
+    "conv": "gamba_warp.kernels.bench.conv",
+    "raster": "gamba_warp.kernels.bench.raster",
+    "model": "gamba_warp.measure.models",
+    "step": "gamba_warp.train.timing",
 }
-
 # Suite -> modules with an ``OP``, imported when needed.
 STRESS = {
     "scan": ("gamba_warp.kernels.cases.scan", "gamba_warp.kernels.cases.conv"),
     "raster": ("gamba_warp.kernels.cases.raster",),
     "model": ("gamba_warp.measure.stress",),
 }
+
+
+def choose(what: Sequence[str], known: Mapping[str, object]) -> list[str]:
+    """Return the selected names of ``known``, in its order; "all" selects all.
+
+    Raises:
+        UserError: a name is not known.
+    """
+    if unknown := [name for name in what if name not in (*known, "all")]:
+        raise UserError(f"unknown case '{unknown[0]}'; there are {', '.join(known)} and all")
+    return [name for name in known if name in what or "all" in what]
 
 
 @ranged
@@ -48,50 +59,66 @@ def bench_command(
     peers: bool = False,
     out: Path = Path("out/bench"),
     threads: Threads | None = None,
-    compare: Path | None = None,
-    render: tuple[Path, ...] = (),
     only: tuple[str, ...] = (),
 ) -> int:
     """Measure run time and error, also of other installed packages.
 
     Every variant is compared with float64 before it is timed; a failed one is not timed. Writes
-    bench.json, bench.md and bench.html. Ctrl-C keeps the results so far.
+    bench.json, bench.md and the chart bench.svg. Ctrl-C keeps the results so far.
 
     Args:
-        what: scan, conv, raster, block, model, or all.
+        what: scan, conv, raster, model, step (of a training), or all.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, in seconds.
         full: All sizes, many rounds, and the torch loop at full length.
         peers: Also measure mambapy, mamba-ssm, causal-conv1d, gsplat and gswarp, if installed.
-        out: Folder for the results. With --render it may be a .md or .html file.
+        out: Folder for the results.
         threads: Number of CPU threads; by default torch's.
-        compare: An older bench.json; prints the ratios of the times.
-        render: Measure nothing; make the tables and the page of these JSON files.
         only: Measure only these cases, by full name, such as "one call".
     """
-    from ..measure import suites
+    import torch
 
-    if render:
-        first, *others = suites.write_pages([suites.read_document(path) for path in render], out)
-        print(" and ".join([f"wrote {first}", *(path.name for path in others)]))
-        return 0
-    chosen = suites.choose(what, SUITES, {"all": tuple(SUITES)})
-    settings = suites.make_settings(pick_device(device), quick, full, peers, threads)
-    old = suites.read_document(compare) if compare is not None else None
+    from ..kernels.bench.measure import Settings, measure
+    from ..kernels.bench.peers import versions
+    from ..kernels.bench.report import chart, markdown
+
+    if quick and full:
+        raise UserError("--quick and --full: choose one")
+    chosen = choose(what, BENCH)
+    level = "quick" if quick else "full" if full else "normal"
+    settings = Settings(pick_device(device), level, peers, threads or torch.get_num_threads())
     folder = output_folder(out)
-    document = suites.run_suites({op: load_suite(op) for op in chosen}, settings, only)
-    suites.write_document(document, folder)
-    written = f"wrote {folder / 'bench.json'}, bench.md and bench.html"
-    print(f"{suites.summary(document, old)}; {written}")
+    cases = [case for op in chosen for case in load_suite(op).cases(settings)]
+    if only:
+        names = list(dict.fromkeys(case.name for case in cases))
+        if unknown := [name for name in only if name not in names]:
+            raise UserError(f"--only {unknown[0]}: no such case; there are {'; '.join(names)}")
+        cases = [case for case in cases if case.name in only]
+    with progress_bar(unit="variant", desc="bench") as bar:
+
+        def say(case: str, variant: str) -> None:
+            bar.set_postfix_str(f"{case}, {variant}")
+            bar.update()
+
+        document = measure(cases, settings, say)
+    document["machine"]["peers"] = versions() if peers else {}
+    write_json(folder / "bench.json", document)
+    write_text(folder / "bench.md", markdown(document))
+    write_text(folder / "bench.svg", chart(document))
+    failed = [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
+    for r in failed:
+        print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
+    measured = sum(r["status"] == "ok" for r in document["records"])
+    print(f"{measured} measured; wrote {folder / 'bench.json'}, bench.md and bench.svg")
     if document["interrupted"]:
         print("interrupted; the results so far are kept")
         return 130
-    return 1 if suites.failed_records(document) else 0
+    return 1 if failed else 0
 
 
 def load_suite(op: str) -> ModuleType:
-    """Import the module with the cases of one of ``SUITES``."""
-    return importlib.import_module(SUITES[op])
+    """Import the module with the cases of one of ``BENCH``."""
+    return importlib.import_module(BENCH[op])
 
 
 @ranged
@@ -124,12 +151,11 @@ def stress_command(
     import torch
 
     from ..kernels.stress.run import StressRun
-    from ..measure import suites
 
     chosen = pick_device(device)
     if threads is not None:
         torch.set_num_threads(threads)
-    names = suites.choose(what, STRESS, {"all": tuple(STRESS)})
+    names = choose(what, STRESS)
     ops = [importlib.import_module(module).OP for name in names for module in STRESS[name]]
     folder, run = output_folder(out), StressRun(ops, chosen, seed)
     seconds = math.inf if minutes is None and cases is not None else 60 * (minutes or 1.0)

@@ -10,9 +10,9 @@ import torch
 import warp as wp
 
 from ..errors import first_line
-from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from ..kernels.bench.cases.scan_problem import make_inputs, scan_problem
-from ..kernels.bench.core.measure import synchronize
+from ..kernels.bench.measure import synchronize
+from ..kernels.cases.raster import Scene, orbit_cameras, shell
+from ..kernels.cases.scan import make_inputs, scan_problem
 from ..model.checkpoint import DEFAULT_CHECKPOINT
 from ..versions import EXTRA_OF, import_open3d, to_install
 from ..vision.weights import FETCH, cache_folder, lpips_available

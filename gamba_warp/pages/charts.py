@@ -26,13 +26,11 @@ class Point:
         x: horizontal value.
         y: the figure.
         label: drawn beside it.
-        mark: "", "default" (a ring) or "peer" (a square).
     """
 
     x: float
     y: float
     label: str = ""
-    mark: str = ""
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Series:
     Attributes:
         name: in the legend, unless empty.
         points: in the order of the line.
-        line: "" or "straight"; "steps" hides the points.
+        line: "" or "straight".
     """
 
     name: str
@@ -63,15 +61,6 @@ class Axis:
     label: str
     logarithmic: bool = True
     values: Sequence[float] = ()
-
-
-def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return, sorted by x, the points that no other equals or beats in both x and y (less wins)."""
-    front: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.x, p.y)):
-        if not front or point.y < front[-1].y:
-            front.append(point)
-    return front
 
 
 def chart(
@@ -107,22 +96,16 @@ def chart(
     drawn, named = [], []
     for s, points, index in found:
         placed = [(to_x(p.x), to_y(p.y)) for p in points]
-        path = placed
-        if s.line == "steps":  # the line shows the least y reached at most x
-            corners = [(after[0], at[1]) for at, after in zip(placed, placed[1:])]
-            path = [p for pair in zip(placed, [*corners, placed[-1]]) for p in pair]
-        dots = [] if s.line == "steps" else list(zip(placed, points))
+        dots = list(zip(placed, points))
         named += [(at, p.label) for at, p in dots if p.label]
         drawn.append(
             {
                 "colour": f"var(--s{index % COLOURS})",
                 "name": s.name,
                 "line": s.line,
-                "path": _path(path),
+                "path": _path(placed),
                 "radius": 4.5 if not s.line else 3 if len(points) <= _FEW else 2.2,
-                "dots": [
-                    (at, p, f"{p.label}: {p.x:.4g}, {p.y:.3g}".lstrip(": ")) for at, p in dots
-                ],
+                "dots": [(at, f"{p.label}: {p.x:.4g}, {p.y:.3g}".lstrip(": ")) for at, p in dots],
             }
         )
     return render(

@@ -45,8 +45,7 @@ class Section:
         files: names of files beside the page, for download.
         charts: results of ``charts.chart``.
         table: rows of cells; text is left-aligned, numbers right-aligned. Below a header, texts of
-            numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval, and "reached" and
-            "missed" have colours.
+            numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval.
         header: names of the table's columns.
         details: long texts by name, initially hidden.
         distance: of the viewer's camera from the origin, object units.
@@ -185,7 +184,7 @@ def _cells(section: Section) -> list[list[_Cell]]:
             return _Cell(value, "number")
         if section.header and (found := _WITH_INTERVAL.fullmatch(value)):
             return _Cell(found[1], "", found[2])
-        return _Cell(value, value if value in ("reached", "missed") else "")
+        return _Cell(value)
 
     columns = [[cell(value) for value in column] for column in zip(*section.table)]
     for column in columns:  # missing values are aligned like numbers

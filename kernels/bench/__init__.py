@@ -1,1 +1,1 @@
-"""Benchmarks of run time against error: cases, and how they are measured, for ``gamba bench``."""
+"""Benchmark of the operators: run time against error, for ``gamba bench``."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gamba_warp.versions import installed
 
-from .core.case import NotInstalled
+from .measure import NotInstalled
 
 PACKAGES = ("mambapy", "mamba-ssm", "causal-conv1d", "gsplat", "gswarp")
 

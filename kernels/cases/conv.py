@@ -1,7 +1,8 @@
-"""Random and hostile cases of the causal convolution."""
+"""Cases of the causal convolution: at realistic sizes, and random and hostile ones."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -9,10 +10,69 @@ import torch
 from torch import Tensor
 
 from ..causal_conv1d import causal_conv1d, causal_conv1d_fn
+from ..causal_conv1d.reference import causal_conv1d_reference
 from . import scan_oracle
 from .case import COTANGENTS, DTYPES, RANGES, Case, Op, Outcome, Runs, fill, generator, mostly
+from .problem import BOTH, Operator
 from .rounding import Rounding, samples_of
 from .scan import LAYOUTS, SEQUENCES, borders, laid
+
+LIMITS = {"forward": 1e-6, BOTH: 1e-5}
+HALF_LIMITS = {torch.bfloat16: 1e-2, torch.float16: 2e-3}
+TOKENS = 2048  # that the oracle looks at
+
+
+def _reference(**inputs: Tensor) -> Tensor:
+    return causal_conv1d_reference(**inputs, activation="silu")[0]
+
+
+silu = partial(causal_conv1d, activation="silu")
+
+
+def conv_problem(
+    device: torch.device,
+    sizes: tuple[int, int, int, int],
+    function: Callable[..., Tensor] = silu,
+    turned: bool = False,
+    state: bool = False,
+) -> Operator:
+    """Return ``function(x, weight, bias)``; the oracle sees all channels of the first tokens.
+
+    Args:
+        device: of the operator.
+        sizes: batch, tokens, channels and taps.
+        function: the operator, or another package's.
+        turned: True if it takes ``x [B, D, L]``.
+        state: True if ``initial_state`` is an input too.
+    """
+    batch, length, width, taps = sizes
+    tokens = min(length, TOKENS)
+    g = torch.Generator().manual_seed(0)
+    inputs = {
+        "x": torch.randn(batch, length, width, generator=g),
+        "weight": torch.rand(width, taps, generator=g) - 0.5,
+        "bias": torch.rand(width, generator=g) - 0.5,
+    }
+    cotangent = torch.randn(batch, length, width, generator=g)
+    if state:
+        inputs["initial_state"] = torch.randn(batch, taps - 1, width, generator=g)
+    return Operator(
+        function,
+        _reference,
+        inputs,
+        cotangent,
+        device,
+        "float64 sum" + (f", first {tokens} tokens" if tokens < length else ""),
+        {"B": batch, "L": length, "D": width, "taps": taps},
+        LIMITS,
+        HALF_LIMITS,
+        cast=("x", "out"),
+        corner=dict.fromkeys(("x", "out"), (slice(None), slice(tokens))),
+        turned=("x", "out") if turned else (),
+    )
+
+
+# Random and hostile cases.
 
 OPTIONS = {
     "api": ("conv", "causal-conv1d"),

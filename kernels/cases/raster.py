@@ -1,14 +1,16 @@
-"""Random and hostile cases of the rasterizer."""
+"""Cases of the rasterizer: Gaussians on a shell, and random and hostile ones."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..rasterize import Skip, rasterization
+from ..rasterize.reference import rasterization_reference
 from .case import (
     COTANGENTS,
     DTYPES,
@@ -23,8 +25,195 @@ from .case import (
     gradients_of,
     mostly,
 )
+from .problem import BOTH, Error, compare
 from .raster_oracle import Lens, View, render_view
 from .rounding import SAMPLES, Rounding, samples_of
+
+LEAVES = ("means", "quats", "scales", "opacities", "colors")
+WORK = ("pairs_box", "pairs", "pairs_walked", "blocks_walked", "blocks_used")
+WORK += ("tiles", "tiles_empty")
+_HALF_FOV = math.radians(49.1) / 2
+_FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # width and height, pixels
+
+# Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
+FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 10.0
+
+
+def shell(count: int, scale: float = 1.0, seed: int = 0) -> dict[str, Tensor]:
+    """Return Gaussians on a shell of radius 0.35, standard deviations 0.01·scale, log-normal.
+
+    ``means, quats, scales [N, ·]``, ``opacities [N]`` in 0.3..1, ``colors [N, 3]``.
+    """
+    g = torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
+    means = direction * 0.35 * (0.9 + 0.1 * torch.rand(count, 1, generator=g))
+    scales = torch.exp(0.4 * torch.randn(count, 3, generator=g) + math.log(0.010)) * scale
+    quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1)
+    opacities = 0.7 * torch.rand(count, 1, generator=g) + 0.3
+    colors = torch.rand(count, 3, generator=g)
+    return dict(means=means, quats=quats, scales=scales, opacities=opacities[:, 0], colors=colors)
+
+
+def orbit_cameras(views: int, size: int) -> tuple[Tensor, Tensor]:
+    """Return ``viewmats [V, 4, 4]`` at distance 1.5 around the y axis, and ``Ks [V, 3, 3]``."""
+    angle = torch.arange(views) * (2 * math.pi / views)
+    viewmats = torch.eye(4).repeat(views, 1, 1)
+    viewmats[:, 0, 0] = viewmats[:, 2, 2] = angle.cos()
+    viewmats[:, 0, 2], viewmats[:, 2, 0] = angle.sin(), -angle.sin()
+    viewmats[:, 2, 3] = 1.5
+    focal = size / 2 / math.tan(_HALF_FOV)
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    return viewmats, K.repeat(views, 1, 1)
+
+
+@dataclass(eq=False)
+class Scene:
+    """Gaussians and cameras, run and checked in several ways.
+
+    The dense oracle sees all Gaussians in a small crop of the first view, as a separate camera
+    with the principal point moved; the operator renders the same crop for the check.
+
+    Attributes:
+        gaussians: float32, ``[N, ·]`` or ``[B, N, ·]``.
+        viewmats: ``[.., V, 4, 4]``.
+        Ks: ``[.., V, 3, 3]``.
+        size: side of the picture, pixels.
+        device: of the operator.
+        options: of ``rasterization``.
+        wanted: names of the needed gradients.
+        exact: options of the oracle where it shall not have ours, as ``alpha_min``.
+        truth: Gaussians of the oracle, where ours are others; where fewer, without gradients.
+        cotangent: of the picture, ``[.., V, H, W, 3]``; None: drawn at random.
+    """
+
+    gaussians: dict[str, Tensor]
+    viewmats: Tensor
+    Ks: Tensor
+    size: int
+    device: torch.device
+    options: dict = field(default_factory=dict)
+    wanted: tuple[str, ...] = LEAVES
+    exact: dict = field(default_factory=dict)
+    truth: dict[str, Tensor] | None = None
+    cotangent: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        self.gaussians = {
+            k: x if x is None else x.to(self.device) for k, x in self.gaussians.items()
+        }
+        self.viewmats, self.Ks = self.viewmats.to(self.device), self.Ks.to(self.device)
+        upstream = self.cotangent
+        if upstream is None:
+            g = torch.Generator().manual_seed(3)
+            shape = (*self.viewmats.shape[:-2], self.size, self.size, 3)
+            upstream = torch.randn(shape, generator=g)
+        self.upstream = upstream.to(self.device)
+        count, views = self.gaussians["opacities"].shape[-1], self.viewmats.shape[:-2].numel()
+        self.sizes = {"N": count, "side": self.size, "views": views}
+
+    def changed(self, **changes) -> Scene:
+        """Return a copy with other attributes."""
+        return replace(self, **changes)
+
+    def arguments(self) -> dict:
+        """Return the arguments of the operator."""
+        cameras = dict(viewmats=self.viewmats, Ks=self.Ks, width=self.size, height=self.size)
+        return self.gaussians | cameras | self.options
+
+    def forward(self, function=rasterization) -> tuple[Tensor, Tensor, dict]:
+        """Render without gradients (timed)."""
+        with torch.no_grad():
+            return function(**self.arguments())
+
+    def leaves(self) -> dict[str, Tensor]:
+        """Return the Gaussians' parameters that need a gradient."""
+        wanted = [k for k in self.wanted if self.gaussians[k] is not None]
+        return {k: self.gaussians[k].detach().requires_grad_() for k in wanted}
+
+    def backward(self, function=rasterization) -> tuple[Tensor, ...]:
+        """Render and compute the wanted gradients (timed)."""
+        leaves = self.leaves()
+        given: dict[str, Any] = {**self.arguments(), **leaves}
+        image, _, _ = function(**given)
+        return torch.autograd.grad(
+            image, list(leaves.values()), self.upstream[..., : image.shape[-1]]
+        )
+
+    def work(self, backward: bool = False) -> dict[str, int]:
+        """Return the operator's own counts."""
+        leaves = self.leaves()
+        given: dict[str, Any] = {**self.arguments(), **leaves}
+        image, _, meta = rasterization(**given)
+        if backward:
+            cotangent = self.upstream[..., : image.shape[-1]]
+            torch.autograd.grad(image, list(leaves.values()), cotangent)
+        counts = {name: int(meta[name]) for name in (*WORK, *["tiles_skipped"] * backward)}
+        return counts | {"gaussians": self.gaussians["opacities"].numel()}
+
+    def oracle(self, direction: str) -> str:
+        """Return a description of the reference."""
+        width, height = self.crop(direction == BOTH)[2:]
+        text = f"float64, all Gaussians dense, a crop of {width} x {height} pixels"
+        return text + (" without thresholds" if "t_min" in self.exact else "")
+
+    def crop(self, backward: bool) -> tuple[int, int, int, int]:
+        """Return left, top, width and height of a crop within the object, off its centre."""
+        width, height = _BACKWARD_CROP if backward else _FORWARD_CROP
+        left, top = round(0.58 * self.size), round(0.39 * self.size)
+        return left, top, min(width, self.size - left), min(height, self.size - top)
+
+    def limit(self, direction: str) -> float:
+        """Return the largest error that is allowed."""
+        return BACKWARD_LIMIT if direction == BOTH else FORWARD_LIMIT
+
+    def check(self, direction: str) -> Error:
+        """Return the error of picture, alpha and the wanted gradients on the crop."""
+        backward = direction == BOTH
+        left, top, width, height = self.crop(backward)
+        first = (0,) * (self.viewmats.dim() - 3)  # the first object
+        Ks = self.Ks[first][:1].clone()
+        Ks[:, 0, 2] -= left
+        Ks[:, 1, 2] -= top
+        g = torch.Generator().manual_seed(4)
+        shape = (1, height, width)
+        cotangents = [torch.randn(*shape, c, generator=g) for c in (3, 1)]
+        gaussians, truth = (
+            {k: None if x is None else x[first] for k, x in g.items()}
+            for g in (self.gaussians, self.truth or self.gaussians)
+        )
+        rest = dict(viewmats=self.viewmats[first][:1], Ks=Ks, width=width, height=height)
+        got = self._run(rasterization, gaussians, rest, self.options, cotangents, backward)
+        exact = dict(self.options)
+        if exact.pop("rasterize_mode", "classic") == "antialiased":
+            exact["antialiased"] = True
+        exact.pop("radius_clip", None)
+        exact.pop("skip", None)
+        truth = {k: None if x is None else x.double().cpu() for k, x in truth.items()}
+        rest = {k: x.double().cpu() if isinstance(x, Tensor) else x for k, x in rest.items()}
+        want = self._run(
+            rasterization_reference, truth, rest, exact | self.exact, cotangents, backward
+        )
+        if not want["alpha"].any():
+            raise ValueError("the crop of the check sees no Gaussian")
+        return compare(got, want)
+
+    def _run(self, function, gaussians, rest, options, cotangents, backward) -> dict[str, Tensor]:
+        wanted = [k for k in self.wanted if gaussians[k] is not None] if backward else []
+        leaves = {k: gaussians[k].detach().requires_grad_() for k in wanted}
+        with torch.set_grad_enabled(backward):
+            results = function(**(gaussians | leaves), **rest, **options)
+        picture = results[0]
+        alphas = results[2] if function is rasterization_reference else results[1]
+        named = {"picture": picture.detach(), "alpha": alphas.detach()}
+        if backward:
+            pairs = [(x, c.to(x)) for x, c in zip((picture, alphas), cotangents) if x.requires_grad]
+            outputs, cotangents = zip(*pairs)  # alpha does not depend on colours
+            grads = torch.autograd.grad(outputs, list(leaves.values()), cotangents)
+            named |= {f"gradient of {k}": v for k, v in zip(leaves, grads)}
+        return named
+
+
+# Random and hostile cases.
 
 _PLAIN_KINDS = (
     "uniform", "needles", "discs", "points", "all sizes", "huge on screen", "around the camera",
@@ -39,7 +228,6 @@ KINDS: dict[str, dict] = {
     "empty": {"num": (0, 0, 10), "views": (0, 1)},
 }
 LEADS = {"none": (), "one": (1,), "two": (2,), "two by one": (2, 1)}
-GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
 _DISTANCE = 1.6
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _SIDES = (1, 2, 3, 5, 8, 15, 16, 17, 18, 23, 31, 33, 40, 48)
@@ -168,7 +356,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     o, kind = case.options, case.kind
     lead, num = LEADS[o["lead"]], o["num"]
     batch = int(torch.tensor(lead).prod()) if lead else 1
-    g = {name: generator(case, name) for name in (*GAUSSIAN, "camera", "rest")}
+    g = {name: generator(case, name) for name in (*LEAVES, "camera", "rest")}
     viewmats, Ks = _cameras(o, kind, batch, g["camera"])
     points = _points(kind, batch, num, g["means"])
     if o["views"]:  # to the world: Rᵀ (p - t)
@@ -205,7 +393,7 @@ def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor 
     place = torch.randperm(num + more, generator=g)
     fresh, old = place[num:], place[:num].sort().values
     rows: dict[str, Tensor] = {}  # the axis of the Gaussians first
-    for name in GAUSSIAN:
+    for name in LEAVES:
         if (known := x[name]) is not None:
             before = known.detach().cpu().movedim(gaussians_axis(o, name), 0)
             rows[name] = torch.full((num + more, *before.shape[1:]), 0.5, dtype=before.dtype)
@@ -261,7 +449,7 @@ def truth(case: Case, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict
 
 def _view(o: dict, x: dict[str, Tensor], v: int, K: Tensor, r: Rounding) -> View:
     """Render one object in one view: the channels of the mode on the background, and alpha."""
-    gaussians: dict[str, Any] = {k: x.get(k) for k in GAUSSIAN}
+    gaussians: dict[str, Any] = {k: x.get(k) for k in LEAVES}
     if o["colors_per_view"]:
         gaussians["colors"] = gaussians["colors"][:, v]
     names = ("width", "height", "alpha_min", "alpha_max", "eps2d", "radius_clip", "antialiased")
@@ -336,7 +524,7 @@ def _poison_faults(case: Case, x: dict, run, runs: Runs) -> list[str]:
     moved = [name for name, x in runs.results.items() if not torch.equal(x, again[name])]
     faults = [f"{name} changed by Gaussians that are not finite" for name in moved]
     for name, gradient in runs.grads.items():
-        other, of_gaussian = others[name], name in GAUSSIAN
+        other, of_gaussian = others[name], name in LEAVES
         axis = gaussians_axis(case.options, name)
         kept = other.index_select(axis, old.to(other.device)) if of_gaussian else other
         # A gradient beyond its dtype's range is infinite, beside whatever Gaussians.

@@ -71,7 +71,7 @@ def test_nothing_to_start_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, 
 
 
 def test_a_wrong_result_fails(monkeypatch, tmp_path, capsys):
-    from gamba_warp.kernels.bench.core.problem import Operator
+    from gamba_warp.kernels.cases.problem import Operator
 
     call = Operator.call
     monkeypatch.setattr(Operator, "call", lambda *a, **k: call(*a, **k) * 1.001)

@@ -92,7 +92,7 @@ JOBS = {
     "data furniture": Job("data furniture --tree {world}/libraries --out {out}"),
     "view": Job("view {world}/gaussians/ball.ply --out {out}/page.html --no-open-browser"),
     "stress": Job("stress scan --cases 2 --device cpu --out {out}", "--seed 1"),
-    "bench": Job("bench --render {world}/bench/bench.json --out {out}"),
+    "bench": Job("bench conv --only knobs --quick --device cpu --out {out}"),
 }
 
 
@@ -139,9 +139,6 @@ def make_world(folder: Path, commands: list[str]) -> None:
         make_library(folder / "libraries", folder / "pictures" / "a.png")
     if "import-released" in commands:
         make_released(folder / "released")
-    if "bench" in commands:
-        quick = "bench conv --quick --device cpu --out {out}"
-        undisturbed(*Job(quick).words(folder, folder / "bench"))
 
 
 def ball(points: np.ndarray) -> Gaussians:

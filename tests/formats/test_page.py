@@ -3,8 +3,10 @@
 import base64
 import html.parser
 import json
+import math
 import re
 import urllib.parse
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -149,12 +151,11 @@ def test_tables_show_numbers_to_four_digits():
     source = page_text("", "", [Section("t", table=rows, header=("", "x", "n"))])
     for text in ("<td>a</td>", ">24.35<", ">1e-07<", ">12,345<"):
         assert text in source
-    rows = [("-1.5", "2 to 3", "0.5 [0.4, 0.6]", "reached"), ("5 %", "n/a", "-", "b [c]")]
+    rows = [("-1.5", "2 to 3", "0.5 [0.4, 0.6]", "best"), ("5 %", "n/a", "-", "b [c]")]
     written = page_text("", "", [Section("t", table=rows, header="abcd"), Section("", table=rows)])
     for text in ("-1.5", "2 to 3", "5 %"):
         assert f'<td class="number">{text}</td>' in written and f"<td>{text}</td>" in written
     assert "<td>0.5 <span>[0.4, 0.6]</span></td>" in written and "<td>b [c]</td>" in written
-    assert '<td class="reached">reached</td>' in written
 
 
 def drawn(logarithmic=False, **lines):
@@ -212,3 +213,28 @@ def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):
     phone = browser_page(path, 390, 800).page
     assert phone.query_selector(".viewer").bounding_box()["width"] > 300
     assert phone.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_charts_leave_out_what_they_cannot_place():
+    points = [Point(math.nan, 1), Point(1, 0), Point(-1, 1)]
+    assert chart([Series("", points)], Axis("x"), Axis("y")) == ""
+    assert chart([Series("", [*points, Point(1, 1, "ok")])], Axis("x"), Axis("y")).count("<g>") == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 30])
+def test_charts_are_whole_svg(count):
+    points = [Point(10.0**i % 97 + 1, 1e-7 * (i + 1), f"<{i}>") for i in range(count)]
+    svg = chart([Series("a&b", points), Series("line", points, "straight")], *2 * [Axis("x")])
+    root = ElementTree.fromstring(svg)
+    numbers = re.findall(r' (?:x|y|cx|cy|x1|x2|y1|y2)="([^"]+)"', svg)
+    assert all(math.isfinite(float(n)) for n in numbers)
+    assert len(root.findall(".//g")) == 2 * count and "&lt;0&gt;" in svg
+
+
+@pytest.mark.parametrize("low, high", [(75.8, 81.7), (5.1, 5.2), (0.097, 0.099), (88, 150)])
+def test_narrow_axes_have_ticks_and_room(low, high):
+    axis = Axis("ms")
+    svg = chart([Series("", [Point(low, low), Point(high, high)])], axis, axis)
+    assert svg.count('text-anchor="middle"') >= 3 and svg.count('text-anchor="end"') >= 3
+    left, right = (float(x) for x in re.findall(r'cx="([^"]+)"', svg))
+    assert (right - left) / 522 == pytest.approx(math.log10(high / low) / 0.4, rel=0.2)

@@ -5,22 +5,26 @@ PTX, and ``tests/graphs`` those of CUDA graphs with a graph that runs its functi
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.bench.cases.conv import conv_problem
-from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from gamba_warp.kernels.bench.cases.scan_problem import allowances, make_inputs, scan_problem
-from gamba_warp.kernels.bench.core.case import BOTH, Error, Settings, compare
-from gamba_warp.kernels.bench.core.problem import Operator
+from gamba_warp.kernels.cases.conv import conv_problem
+from gamba_warp.kernels.cases.problem import BOTH, Error, Operator, compare
+from gamba_warp.kernels.cases.raster import Scene, orbit_cameras, shell
+from gamba_warp.kernels.cases.scan import allowances, make_inputs, scan_problem
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import lists_outgrown, rasterization
 from gamba_warp.kernels.runtime.stand_in import kind_of
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
-from gamba_warp.measure.inference import Inference, build_model, captured
+from gamba_warp.measure.models import captured, without_encoder
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.posing import reference_cameras
+from gamba_warp.render import render
 
 # Allowed relative rms errors: of float32 sums over a few hundred terms; for the scan plus the error
 # of a GPU's exponential; of half precision, which rounds inputs and outputs; and of pictures, where
@@ -153,7 +157,7 @@ def check_layer_graph(device: torch.device) -> None:
     """Check that replays equal plain runs bit for bit, also with changed inputs."""
     layer, inputs = layer_of((1, 577, 70, 16, 1), device)
     with torch.no_grad():
-        graph, out, _ = captured(lambda: layer(*inputs), device)
+        graph, out = captured(lambda: layer(*inputs), device)
         for scale in (1.0, 0.5):
             inputs[0].mul_(scale)
             out.fill_(torch.nan)
@@ -191,7 +195,7 @@ def check_raster_graph(device: torch.device) -> list[int]:
     Returns the numbers of pairs.
     """
     scene = scene_of(700, 75, 3, {"render_mode": "RGB+D"}, device)
-    graph, made, _ = captured(partial(render_all, scene), device)
+    graph, made = captured(partial(render_all, scene), device)
     found = []
     for factor in (1.0, 0.8, 6.0, 0.25):
         scene.gaussians["scales"].mul_(factor)  # and with the sizes the number of pairs
@@ -212,9 +216,14 @@ class TrainingStep:
 
     def __init__(self, device: torch.device):
         torch.manual_seed(0)
-        model, _ = build_model(Settings(device, level="quick"))
-        self.inputs = Inference(model.train(), device, 2)
-        self.parameters = [p for p in model.parameters() if p.requires_grad]
+        config = without_encoder(PRESETS["paper"])
+        config = replace(config, image_size=32, patch_size=4, width=64, depth=2, dt_rank=4)
+        self.model = Gamba(config).to(device)
+        self.image = torch.rand(2, 32, 32, config.input_channels).to(device)
+        self.cameras = reference_cameras(config, 2).to(device)
+        viewmats, Ks = self.cameras.viewmats[:, None], self.cameras.Ks[:, None]
+        self.views = replace(self.cameras, viewmats=viewmats, Ks=Ks)
+        self.parameters = [p for p in self.model.parameters() if p.requires_grad]
         rate = torch.tensor(1e-3, device=device) if device.type == "cuda" else 1e-3
         self.optimizer = torch.optim.AdamW(
             self.parameters, lr=rate, capturable=device.type == "cuda", fused=True
@@ -223,9 +232,8 @@ class TrainingStep:
     def run(self) -> Tensor:
         """Make a step and return its loss."""
         self.optimizer.zero_grad(set_to_none=True)
-        x = self.inputs
-        picture = x.view(x.model(x.image, x.cameras))[:, 0]
-        loss = (picture - x.image).square().mean()
+        picture = render(self.model(self.image, self.cameras), self.views).rgb[:, 0]
+        loss = (picture - self.image).square().mean()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, 1.0)
         self.optimizer.step()
@@ -256,7 +264,7 @@ def check_step_graph(device: torch.device) -> None:
     """Check that replays of a captured training step train like plain steps."""
     steps = TrainingStep(device)
     first = steps.weights()
-    graph, loss, _ = captured(steps.run, device)
+    graph, loss = captured(steps.run, device)
 
     def replay() -> Tensor:
         graph.replay()

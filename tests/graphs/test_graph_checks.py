@@ -31,7 +31,7 @@ def graph(monkeypatch):
     def switch(spoil=None):
         def captured(run, device):
             graph = Graph(run, spoil)
-            return graph, graph.made, 0
+            return graph, graph.made
 
         monkeypatch.setattr(checks, "captured", captured)
         monkeypatch.setattr(checks, "lists_outgrown", lambda: True)

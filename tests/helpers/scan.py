@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gamba_warp.kernels.bench.cases.scan_problem import allowances
+from gamba_warp.kernels.cases.scan import allowances
 from gamba_warp.kernels.runtime.stand_in import kind_of
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.problem import DISCRETIZATIONS

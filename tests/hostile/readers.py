@@ -33,7 +33,6 @@ from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import find_pictures, load_rgba
-from gamba_warp.measure.suites import read_document, write_pages
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.encoders import build_encoder, read_state
@@ -247,10 +246,6 @@ def _compare(path: Path, out: Path) -> Any:
     return [markdown_page(joined, True)]
 
 
-def _bench(path: Path, out: Path) -> Any:
-    return [page.read_text(encoding="utf-8") for page in write_pages([read_document(path)], out)]
-
-
 def _encoder(path: Path, out: Path) -> Any:
     vit = {"encoder": "vit_tiny_patch16_224", "encoder_size": 16}
     return build_encoder(replace(seeds.tiny_config(), **vit), path)
@@ -331,7 +326,6 @@ READERS = {
     "protocol": Reader(_protocol, checks.protocol, seeds.protocols),
     "plan": Reader(_plan, checks.plan, seeds.plans, 2),
     "compare": Reader(_compare, checks.pages, seeds.reports, 4),
-    "bench": Reader(_bench, checks.pages, seeds.benches, 4),
     "released": Reader(_released, checks.released, seeds.released, 2),
     "encoder": Reader(_encoder, checks.nothing, seeds.weights, 1),
     "sam": Reader(alone(SamSegmenter), checks.nothing, seeds.weights, 1),

@@ -33,7 +33,6 @@ from gamba_warp.eval.shapes.protocol import PRESETS as PROTOCOLS
 from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.names import splat_suffix
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench.core.measure import FORMAT as BENCH
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.encoders import ImageEncoder
@@ -629,22 +628,6 @@ def reports() -> Kinds:
         report = {"protocol": rules[name], "objects": objects, "versions": {"torch": "2"}}
         made[name] = {"report.json": as_json(report)}
     return made
-
-
-def benches() -> Kinds:
-    """A small bench.json."""
-    texts = dict.fromkeys(("cpu", "simd", "system", "python", "torch", "warp", "gamba_warp"), "x")
-    machine = texts | {"gpu": None, "cuda": None, "cores": 2, "threads": 2, "date": "2026-01-01"}
-    record: dict[str, Any] = {"op": "scan", "case": "small", "variant": "ours", "device": "cpu"}
-    record |= {"dtype": "float32", "direction": "forward", "status": "ok", "oracle": "float64"}
-    record |= {"text": "a case", "ms_p20": 1.0, "ms_p50": 1.1, "ms_p80": 1.2, "jit_ms": 3.0}
-    record |= {"rel_rms_error": 1e-7, "max_error": 1e-6, "peer_ms": None, "peer": None}
-    record |= {"axis": None, "work": {"flops": 1e6}, "parameters": {"L": 8}}
-    record |= {"is_peer": False, "is_default": True}
-    target = {"op": "scan", "text": "quick", "wanted": "2x", "value": 2.5, "reached": True}
-    document = {"format": BENCH, "machine": machine, "interrupted": False}
-    document |= {"records": [record, record | {"variant": "b"}], "targets": [target]}
-    return {"bench": {"bench.json": as_json(document)}}
 
 
 def networks() -> Kinds:

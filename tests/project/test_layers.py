@@ -56,7 +56,7 @@ def test_every_package_is_there():
         ("kernels/rasterize/cuda/a.py", "from ..cpu import b", "code of one device"),
         ("kernels/rasterize/reference.py", "from . import function", "shares only constants"),
         ("kernels/cases/a_oracle.py", "from ..rasterize import function", "only constants"),
-        ("kernels/bench/core/a.py", "from ..cases import scan", "kernels.bench.cases not"),
+        ("kernels/cases/a.py", "from ..bench import scan", "kernels.bench not"),
         ("gamba_warp/files.py", "import kernels.rasterize", "write gamba_warp.kernels"),
         ("gamba_warp/files.py", "from .model import gamba", "may import model not"),
         ("gamba_warp/files.py", "import open3d", "only inside functions"),
@@ -85,7 +85,7 @@ def test_each_rule_can_fail(tmp_path, name, text, reason):
     there = ("train/loop.py", "eval/report.py", "gamba_warp/commands/view.py", "gamba_warp/cli.py")
     there += ("gamba_warp/files.py", "gamba_warp/model/gamba.py", "gamba_warp/data/layouts.py")
     there += ("kernels/rasterize/function.py", "kernels/rasterize/cpu/b.py")
-    there += ("kernels/selective_scan/__init__.py", "kernels/bench/cases/scan.py")
+    there += ("kernels/selective_scan/__init__.py", "kernels/bench/scan.py")
     files = dict.fromkeys((*there, "train/__init__.py", "gamba_warp/commands/__init__.py"), "")
     refusals = _refusals(tmp_path, {**files, "eval/__init__.py": "", name: text})
     assert len(refusals) == 1

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
+from gamba_warp.kernels.cases.scan import make_inputs
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 
 from .dry_run import MULTIPROCESSORS

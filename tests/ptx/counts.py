@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from gamba_warp.files import write_json, write_text
-from gamba_warp.kernels.bench.cases.raster_scene import LEAVES, orbit_cameras, shell
+from gamba_warp.kernels.cases.raster import LEAVES, orbit_cameras, shell
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from

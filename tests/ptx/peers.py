@@ -12,7 +12,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.bench.cases.raster_scene import LEAVES, orbit_cameras, shell
+from gamba_warp.kernels.cases.raster import LEAVES, orbit_cameras, shell
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.harmonics import sums_seen_from

@@ -8,7 +8,7 @@ import os
 
 import pytest
 
-from gamba_warp.kernels.bench.cases.scan_problem import EX2
+from gamba_warp.kernels.cases.scan import EX2
 
 from .launch import interpreted
 

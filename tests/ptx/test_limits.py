@@ -4,7 +4,7 @@ import pytest
 import torch
 from gpu.checks import check_scan
 
-from gamba_warp.kernels.bench.core.problem import Operator
+from gamba_warp.kernels.cases.problem import Operator
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 

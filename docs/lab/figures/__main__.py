@@ -9,7 +9,7 @@ import tyro
 
 from gamba_warp.errors import UserError
 
-from . import model_card, times
+from . import model_card
 
 
 def figures(
@@ -23,7 +23,6 @@ def figures(
         retrieval: likewise, report of eval-geometry of the retrieval.
     """
     model_card.main(views, geometry, retrieval)
-    times.main()
 
 
 if __name__ == "__main__":

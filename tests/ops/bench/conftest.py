@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gamba_warp.kernels.bench.core.case import LEVELS, Level
+from gamba_warp.kernels.bench.measure import LEVELS, Level
 
 
 @pytest.fixture(autouse=True)

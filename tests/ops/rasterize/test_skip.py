@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gamba_warp.kernels.bench.cases.raster_scene import LEAVES, orbit_cameras, shell
+from gamba_warp.kernels.cases.raster import LEAVES, orbit_cameras, shell
 from gamba_warp.kernels.rasterize import Skip, rasterization
 
 WIDTH, HEIGHT, VIEWS = 150, 139, 2

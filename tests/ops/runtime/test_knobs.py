@@ -7,8 +7,8 @@ import torch
 from helpers import rel_rms
 
 from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
-from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
+from gamba_warp.kernels.cases.raster import Scene, orbit_cameras, shell
+from gamba_warp.kernels.cases.scan import make_inputs
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import selective_scan

@@ -1,59 +1,54 @@
-"""Problems timed forward and with gradients, after a comparison with a formula in float64."""
+"""Operators at realistic sizes: inputs by name, runs, and the error to a formula in float64."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from .case import BOTH, DIRECTIONS, Error, Variant, compare, dtype_name
+BOTH = "forward+backward"
+DIRECTIONS = ("forward", BOTH)
 
 
-class Problem:
-    """Something that runs in both directions; a subclass gives the parts of a variant.
+class Error(NamedTuple):
+    """Distance of results from the truth.
 
-    It has ``sizes`` for tables and charts; ``forward`` and ``backward``, which are timed; and
-    ``check``, ``oracle`` and ``limit`` of a direction (see ``Variant``).
+    Attributes:
+        rel_rms: rms of the difference over rms of the truth, of the worst tensor.
+        maximum: largest difference over the largest value of the truth, of the worst tensor.
+        worst: name of the tensor with that ``rel_rms``.
     """
 
-    sizes: dict[str, Any]
-    forward: Callable[..., object]
-    backward: Callable[..., object]
-    check: Callable[..., Error]
-    oracle: Callable[[str], str]
+    rel_rms: float
+    maximum: float
+    worst: str
 
-    def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
-        """The largest error that is allowed."""
-        raise NotImplementedError
 
-    def variant(
-        self, name: str, direction: str = "forward", options: dict | None = None, **changes: Any
-    ) -> Variant:
-        """A variant that runs with ``options``; ``changes`` are of its attributes."""
-        options = options or {}
-        dtype = options.get("dtype", torch.float32)
-        run = self.forward if direction == "forward" else self.backward
-        given: dict[str, Any] = {
-            "run": partial(run, **options),
-            "check": partial(self.check, direction, **options),
-            "limit": self.limit(direction, dtype),
-            "oracle": self.oracle(direction),
-            "dtype": dtype_name(dtype),
-            "parameters": dict(self.sizes),
-        }
-        return Variant(name, direction=direction, **(given | changes))
-
-    def pair(self, name: str, options: dict | None = None, **changes: Any) -> list[Variant]:
-        """Forward, and forward with all gradients."""
-        return [self.variant(name, d, options, **changes) for d in DIRECTIONS]
+def compare(got: Mapping[str, Tensor], want: Mapping[str, Tensor]) -> Error:
+    """Return the error of named results in float64; NaN or a wrong shape makes it infinite."""
+    rel_rms, maximum, worst = 0.0, 0.0, ""
+    for name, truth in want.items():
+        value, truth = got[name].detach().double().cpu(), truth.detach().double().cpu()
+        if value.shape != truth.shape or not value.isfinite().all():
+            return Error(math.inf, math.inf, name)
+        if not truth.numel():
+            continue
+        difference = value - truth
+        # If the truth is all zeros, the difference is taken as it is.
+        rms = truth.square().mean().sqrt().item() or 1.0
+        relative = difference.square().mean().sqrt().item() / rms
+        if relative >= rel_rms:
+            rel_rms, worst = relative, name
+        maximum = max(maximum, (difference.abs().max() / (truth.abs().max() or 1.0)).item())
+    return Error(rel_rms, maximum, worst)
 
 
 @dataclass(eq=False)
-class Operator(Problem):
+class Operator:
     """An operator of tensors by name, and its formula.
 
     The oracle may see a corner of the problem, as the first tokens and a few channels, if the
@@ -65,9 +60,9 @@ class Operator(Problem):
         reference: the formula, likewise, of the corner.
         inputs: float32 on the CPU, the truth that every dtype is compared with.
         cotangent: of the output, for the clock; the check draws its own.
-        device: where the operator runs.
+        device: device of the operator.
         text: the oracle in words.
-        sizes: for tables and charts.
+        sizes: for the records.
         limits: largest relative rms error to float64 by direction.
         half_limits: those of half precision, explained by the rounding of inputs and output.
         cast: names of the inputs that a dtype holds for.
@@ -95,15 +90,15 @@ class Operator(Problem):
     _laid: dict = field(default_factory=dict, init=False)
 
     def oracle(self, direction: str) -> str:
-        """Description of the reference."""
+        """Return a description of the reference."""
         return self.text + (", output only" if direction == BOTH and not self.compared else "")
 
     def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
-        """The largest error that is allowed."""
+        """Return the largest error that is allowed."""
         return self.half_limits.get(dtype, self.limits[direction])
 
     def at(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-        """The inputs on the device, as ``function`` wants them, with ``cast`` in a dtype; kept."""
+        """Return the inputs on the device, as ``function`` wants them, with ``cast`` in a dtype."""
         if dtype not in self._laid:
             self._laid[dtype] = {
                 k: self._turn(k, x).to(self.device, dtype if k in self.cast else None)
@@ -115,32 +110,31 @@ class Operator(Problem):
         return x.mT.contiguous() if name in self.turned else x
 
     def call(self, inputs: dict[str, Tensor], **options: Any) -> Tensor:
-        """The operator as a caller calls it."""
+        """Call the operator."""
         return self.function(**inputs, **options)
 
     @torch.no_grad()
     def forward(self, dtype: torch.dtype = torch.float32, **options: Any) -> Tensor:
-        """The output, without a gradient."""
+        """Compute the output, without a gradient (timed)."""
         return self.call(self.at(dtype), **options)
 
     def leaves(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-        """The inputs, asking for gradients."""
+        """Return the inputs, which require gradients unless they are ``fixed``."""
         return {
             k: x.detach().requires_grad_(k not in self.fixed) for k, x in self.at(dtype).items()
         }
 
     def backward(self, dtype: torch.dtype = torch.float32, **options: Any) -> tuple[Tensor, ...]:
-        """Forward and all gradients."""
+        """Compute the output and all gradients (timed)."""
         leaves = self.leaves(dtype)
         out = self.call(leaves, **options)
         wanted = [x for x in leaves.values() if x.requires_grad]
         return torch.autograd.grad(out, wanted, self._laid[dtype]["out"].to(out.dtype))
 
     def check(self, direction: str, dtype: torch.dtype = torch.float32, **options: Any) -> Error:
-        """Error of the output, and of every gradient if the direction has them."""
+        """Return the error of the output, and of every gradient if the direction has them."""
         gradients = direction == BOTH and self.compared
-        got = self.results(gradients, dtype, **options)
-        return compare(got, self.truth(gradients, **options))
+        return compare(self.results(gradients, dtype, **options), self.truth(gradients, **options))
 
     def results(
         self, gradients: bool, dtype: torch.dtype = torch.float32, **options: Any
@@ -160,14 +154,14 @@ class Operator(Problem):
         return {k: self.cut(k, x) for k, x in got.items()}
 
     def cut(self, name: str, x: Tensor) -> Tensor:
-        """The corner of a result, laid out as the reference's."""
+        """Return the corner of a result, laid out as the reference's."""
         return self._turn(name, x).cpu()[self.corner.get(name, ...)]
 
     def _drawn(self, like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=torch.Generator().manual_seed(1))
 
     def truth(self, gradients: bool, **options: Any) -> dict[str, Tensor]:
-        """Output, and if asked for the gradients, of the corner in float64; kept."""
+        """Return the output, and if asked for the gradients, of the corner in float64; kept."""
         key = gradients, *sorted(options.items())
         if key not in self.truths:
             leaves = {

@@ -1,0 +1,283 @@
+"""Benchmark of whole models: a picture to Gaussians, and the blocks against float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TypeVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..errors import UserError
+from ..gaussians import Gaussians
+from ..kernels.bench.measure import Case, Settings, Variant, synchronize, variant
+from ..kernels.cases.problem import BOTH, Error, compare
+from ..kernels.causal_conv1d.reference import causal_conv1d_reference
+from ..kernels.selective_scan.reference import selective_scan_reference
+from ..model.config import PRESETS, GambaConfig
+from ..model.gamba import Gamba
+from ..model.parts.block import GambaBlock, prefix_states, run_blocks
+from ..model.posing import reference_cameras
+
+Result = TypeVar("Result")
+LIMITS = {"forward": 1e-5, BOTH: 1e-4}  # allowed relative rms error of blocks to float64
+# Under capture torch may choose other kernels for a matrix product, and then the results differ by
+# the dtype's rounding.
+GRAPH_LIMITS = {torch.float32: 1e-4, torch.bfloat16: 1e-2}
+HALF_LIMIT = 0.03  # allowed error of bfloat16 to float32 in the worst attribute; a CPU has 0.007
+_IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # as of DINOv2 ViT-B/14 at 336 pixels
+TOKENS = 128  # number of first tokens compared with the oracle
+
+
+def cases(settings: Settings) -> list[Case]:
+    """Return the cases of models."""
+    made = [Case("model", "backbone", backbone), Case("model", "one picture", pictures)]
+    graphs = [Case("model", "CUDA graph", cuda_graphs)]
+    return made + graphs * (settings.device.type == "cuda")
+
+
+class Backbone:
+    """Blocks of the paper's size with the condition of one image."""
+
+    def __init__(self, settings: Settings, depth: int) -> None:
+        quick = settings.level == "quick"
+        config = GambaConfig(dt_rank=8, width=128) if quick else PRESETS["paper"]
+        torch.manual_seed(0)
+        blocks = (GambaBlock(config, _IMAGE_CHANNELS, _IMAGE_CHANNELS) for _ in range(depth))
+        self.blocks = [block.to(settings.device) for block in blocks]
+        self.length = 1024 if quick else config.num_gaussians
+        shapes = (self.length, config.width), (1, _IMAGE_CHANNELS), (_IMAGE_TOKENS, _IMAGE_CHANNELS)
+        tensors = [torch.randn(1, *shape).to(settings.device) for shape in shapes]
+        self.tokens, self.camera, self.image = tensors
+        self.sizes = {"L": self.length, "D": config.width, "depth": depth}
+
+    def run(self, tokens: Tensor) -> Tensor:
+        """Run the blocks like ``Gamba.forward``: the prefix states, then the tokens."""
+        states = prefix_states(self.blocks, self.camera, self.image)
+        return run_blocks(self.blocks, tokens, states)
+
+    @torch.no_grad()
+    def forward(self) -> Tensor:
+        """Run the blocks without gradients (timed)."""
+        return self.run(self.tokens)
+
+    @torch.no_grad()
+    def prepended(self) -> Tensor:
+        """Run the paper's eq. 2 literally, prepending and dropping (timed)."""
+        tokens = self.tokens
+        for block in self.blocks:
+            assert block.project_camera is not None and block.project_image is not None
+            prefix = [block.project_camera(self.camera), block.project_image(self.image)]
+            hidden, _ = block.mamba(block.norm(torch.cat([*prefix, tokens], dim=1)))
+            tokens = tokens + hidden[:, -self.length :]
+        return tokens
+
+    def backward(self) -> tuple[Tensor, ...]:
+        """Compute the gradients of tokens and weights, with the tokens as cotangent (timed)."""
+        tokens = self.tokens.detach().requires_grad_()
+        leaves = [tokens, *(p for block in self.blocks for p in block.parameters())]
+        return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
+
+    def oracle(self, direction: str) -> str:
+        """Return a description of the check's reference."""
+        text = f"float64 with the condition prepended, first {TOKENS} of {self.length} tokens"
+        return text + (", gradient of these tokens" if direction == BOTH else "")
+
+    def limit(self, direction: str) -> float:
+        """Return the largest allowed error."""
+        return LIMITS[direction]
+
+    def check(self, direction: str, run: Callable[[], Tensor] | None = None) -> Error:
+        """Measure the error of the update of the first tokens, which depend on no later one.
+
+        Or of their gradient, with a cotangent of 0 after them.
+        """
+        first = self.tokens[:, :TOKENS].double().cpu().requires_grad_(direction == BOTH)
+        with torch.set_grad_enabled(direction == BOTH):
+            tokens = first
+            for block in self.blocks:
+                tokens = _reference_block(block, tokens, self.camera, self.image)
+        if direction != BOTH:
+            got = (run or self.forward)()[:, :TOKENS].double().cpu()
+            return compare({"update": got - first}, {"update": tokens - first})
+        leaf = self.tokens.detach().requires_grad_()
+        cotangent = self.tokens.clone()
+        cotangent[:, TOKENS:] = 0
+        (got,) = torch.autograd.grad(self.run(leaf), [leaf], cotangent)
+        (want,) = torch.autograd.grad(tokens, [first], first.detach())
+        name = "gradient of the tokens"
+        return compare({name: got[:, :TOKENS]}, {name: want})
+
+
+def _reference_block(block: GambaBlock, tokens: Tensor, camera: Tensor, image: Tensor) -> Tensor:
+    """Run one Gamba block in float64 torch on the CPU, prepending and dropping (paper eq. 2).
+
+    Args:
+        block: with the weights.
+        tokens: ``[B, L, width]`` float64.
+        camera: ``[B, 1, channels]``.
+        image: ``[B, K, channels]``.
+
+    Returns:
+        ``[B, L, width]`` float64.
+    """
+    weights = {name: p.detach().double().cpu() for name, p in block.named_parameters()}
+
+    def linear(x: Tensor, name: str) -> Tensor:
+        return F.linear(x, weights[f"{name}.weight"], weights.get(f"{name}.bias"))
+
+    mamba, width = block.mamba, tokens.shape[2]
+    conditions = {"project_camera": camera, "project_image": image}
+    prefix = [linear(x.double().cpu(), name) for name, x in conditions.items()]
+    x = torch.cat([*prefix, tokens], dim=1)
+    if isinstance(block.norm, nn.RMSNorm):
+        x = F.rms_norm(x, (width,), weights["norm.weight"], block.norm.eps)
+    else:
+        x = F.layer_norm(x, (width,), weights["norm.weight"], weights["norm.bias"], block.norm.eps)
+    x, z = linear(x, "mamba.in_proj").chunk(2, dim=-1)
+    conv = weights["mamba.conv_weight"], weights["mamba.conv_bias"]
+    x, _ = causal_conv1d_reference(x, *conv, activation="silu")
+    low_rank, B, C = linear(x, "mamba.x_proj").split(mamba.split, dim=-1)
+    y, _ = selective_scan_reference(
+        x,
+        linear(low_rank, "mamba.dt_proj"),
+        -torch.exp(weights["mamba.A_log"]),
+        B,
+        C,
+        D=weights["mamba.D"],
+        z=z,
+        delta_softplus=True,
+        discretization=mamba.discretization,
+    )
+    return tokens + linear(y, "mamba.out_proj")[:, -tokens.shape[1] :]
+
+
+def backbone(settings: Settings) -> list[Variant]:
+    """One block and all blocks of the paper's size on one picture's tokens. Prefix states off:
+    condition prepended and dropped in each block, as the paper has it.
+    """
+    made = []
+    for depth in (1, 2 if settings.level == "quick" else 14):
+        blocks, rest = Backbone(settings, depth), {"rounds": 3 if depth > 2 else None}
+        name = f"{depth} block{'s' * (depth > 1)}"
+        made.append(variant(blocks, name, default=True, **rest))
+        run = blocks.prepended
+        check = partial(blocks.check, "forward", run)
+        made.append(variant(blocks, f"{name}, prefix states off", run=run, check=check, **rest))
+        if depth == 1:
+            made.append(variant(blocks, name, BOTH, default=True))
+    return made
+
+
+def without_encoder(config: GambaConfig) -> GambaConfig:
+    """Return the configuration without an image encoder and its prepended tokens."""
+    return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
+
+
+def captured(
+    run: Callable[[], Result], device: torch.device
+) -> tuple[torch.cuda.CUDAGraph, Result]:
+    """Capture a function as a CUDA graph.
+
+    Returns:
+        The graph, and the function's result, which each ``replay`` overwrites.
+    """
+    stream = torch.cuda.Stream(device)
+    stream.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(stream):  # warm-up before the capture
+        for _ in range(3):
+            run()
+    torch.cuda.current_stream(device).wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = run()
+    return graph, result
+
+
+class Inference:
+    """A model with a posed picture on its device, run eagerly or by a CUDA graph."""
+
+    def __init__(self, model: Gamba, device: torch.device) -> None:
+        self.model, self.device = model.to(device).eval(), device
+        size, channels = model.config.image_size, model.config.input_channels
+        # With random alpha there is no background, so the decoder "rays" computes every token.
+        g = torch.Generator().manual_seed(1)
+        self.image = torch.rand((1, size, size, channels), generator=g).to(device)
+        self.cameras = reference_cameras(model.config, 1).to(device)
+        self.sizes = {"N": model.config.num_gaussians, "side": size}
+        self._graphs: dict[torch.dtype, tuple] = {}
+
+    @torch.no_grad()
+    def eager(self, dtype: torch.dtype = torch.float32) -> Gaussians:
+        """Run the model's forward; bfloat16 means autocast."""
+        mixed = dtype != torch.float32
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed, cache_enabled=False):
+            return self.model(self.image, self.cameras)
+
+    def graph(self, dtype: torch.dtype) -> Gaussians:
+        """Run the same by a CUDA graph, which the first call captures."""
+        if dtype not in self._graphs:
+            self._graphs[dtype] = captured(partial(self.eager, dtype), self.device)
+        graph, result = self._graphs[dtype]
+        graph.replay()
+        return result
+
+    def check(self, run: Callable[[], Gaussians], truth: torch.dtype = torch.float32) -> Error:
+        """Measure the error of the Gaussians of ``run`` against those of ``eager`` in ``truth``."""
+        got = run()
+        synchronize(self.device)
+        got, want = (
+            {name: x for name, x in vars(found).items() if x is not None}
+            for found in (got, self.eager(truth))
+        )
+        return compare(got, want)
+
+
+def pictures(settings: Settings) -> list[Variant]:
+    """A posed picture to Gaussians by preset, without the image encoder. The models are whole and
+    have fresh weights; two runs must give the same bits.
+    """
+    made = []
+    for name in ("tiny", "rays") if settings.level == "quick" else PRESETS:
+        torch.manual_seed(0)
+        model = Inference(Gamba(without_encoder(PRESETS[name])), settings.device)
+        check = partial(model.check, model.eager)
+        oracle = "a second run (0: the same bits); the blocks have the float64 oracle"
+        rest = dict(default=True, rounds=10, parameters=model.sizes)
+        made.append(Variant(name, model.eager, check, 0.0, oracle, **rest))
+    return made
+
+
+def cuda_graphs(settings: Settings) -> list[Variant]:
+    """The paper's model, with its untrained encoder if timm is installed: a posed picture to
+    Gaussians launch by launch, and by a CUDA graph.
+    """
+    torch.manual_seed(0)
+    config = PRESETS["paper"]
+    if settings.level == "quick":
+        config = replace(config, image_size=32, patch_size=4, width=64, depth=2, dt_rank=4)
+    try:
+        model, encoder = Gamba(config, "random"), config.encoder
+    except (ImportError, UserError):
+        model, encoder = Gamba(without_encoder(config)), "none"
+    inference, full, half = Inference(model, settings.device), torch.float32, torch.bfloat16
+    eager, graph = inference.eager, inference.graph
+    # Name: function and dtype; dtype, limit and name of the run that it is compared with.
+    runs = {
+        "eager, float32": (eager, full, full, 0.0, "a second run"),
+        "eager, bfloat16": (eager, half, full, HALF_LIMIT, "float32"),
+        "CUDA graph, float32": (graph, full, full, GRAPH_LIMITS[full], "eager"),
+        "CUDA graph, bfloat16": (graph, half, half, GRAPH_LIMITS[half], "eager, bfloat16"),
+    }
+    made = []
+    for name, (function, dtype, truth, limit, oracle) in runs.items():
+        run = partial(function, dtype)
+        check = partial(inference.check, run, truth)
+        made.append(Variant(name, run, check, limit, f"{oracle} (0: the same bits)"))
+        made[-1].dtype = str(dtype).removeprefix("torch.")
+        made[-1].default = name == "CUDA graph, bfloat16"
+        made[-1].parameters = inference.sizes | {"encoder": encoder}
+    return made

@@ -1,1 +1,0 @@
-"""Benchmark cases, one subject a file: problems and knobs of each operator."""

@@ -1,0 +1,38 @@
+"""Benchmark of the causal convolution."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+
+from ..cases.conv import conv_problem
+from . import peers
+from .measure import Case, Settings, Variant, pair
+
+_SIZES = {"quick": (1, 1024, 256, 4)}  # of ``conv_problem``
+_FULL = (1, 16961, 1024, 4)
+
+
+def cases(settings: Settings) -> list[Case]:
+    """Return the cases of the convolution."""
+    return [Case("conv", "operator", operator), Case("conv", "knobs", knobs)]
+
+
+def operator(settings: Settings) -> list[Variant]:
+    """Convolution and SiLU beside torch's grouped convolution in its own layout."""
+    problem = partial(conv_problem, settings.device, _SIZES.get(settings.level, _FULL))
+    made = pair(problem(), "default", default=True)
+    made += pair(problem(peers.torch_conv, True), "torch conv1d", peer=True, rounds=10)
+    if settings.peers and settings.device.type == "cuda":
+        made += pair(problem(peers.causal_conv1d, True), "causal-conv1d", peer=True)
+    return made
+
+
+def knobs(settings: Settings) -> list[Variant]:
+    """Half precision, compared with the truth of the float32 inputs."""
+    problem = conv_problem(settings.device, _SIZES.get(settings.level, _FULL))
+    made = pair(problem, "float32", default=True)
+    for dtype in (torch.bfloat16, torch.float16):
+        made += pair(problem, str(dtype).removeprefix("torch."), options={"dtype": dtype})
+    return made

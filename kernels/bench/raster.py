@@ -1,0 +1,247 @@
+"""Benchmark of the rasterizer, and of its colours from harmonics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import torch
+
+from ..cases.problem import BOTH, DIRECTIONS, Error, Operator, compare
+from ..cases.raster import LEAVES, TRADE_LIMIT, Scene, orbit_cameras, shell
+from ..rasterize.harmonics import colors_seen_from
+from ..rasterize.harmonics.formula import colors_by_formula
+from . import measure, peers
+from .measure import Case, Settings, Variant
+
+# An alpha or transmittance below these does not show in float64's picture of 16,384 Gaussians.
+_NO_THRESHOLDS = {"alpha_min": 1e-9, "t_min": 1e-30}
+
+
+def cases(settings: Settings) -> list[Case]:
+    """Return the cases of the rasterizer."""
+    builders = {
+        "scene": scenes,
+        "knobs": knobs,
+        "skipping": skipping,
+        "one call": one_call,
+        "Gaussians": counts,
+        "views": views,
+    }
+    if settings.device.type == "cuda":
+        builders["32 views"] = many_views
+    builders["harmonics"] = harmonics
+    return [Case("raster", name, build) for name, build in builders.items()]
+
+
+def make_scene(
+    settings: Settings,
+    scale: float = 1.0,
+    count: int | None = None,
+    size: int | None = None,
+    views: int = 1,
+) -> Scene:
+    """Return the shell; a quick run has an eighth of the Gaussians and a quarter of the pixels."""
+    quick = settings.level == "quick"
+    count = count or (2048 if quick else 16384)
+    size = size or (256 if quick else 512)
+    return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
+
+
+def _variant(scene: Scene, name: str, direction: str = "forward", **changes) -> Variant:
+    work = partial(scene.work, direction == BOTH)
+    return measure.variant(scene, name, direction, **({"work": work} | changes))
+
+
+def _pair(scene: Scene, name: str, **changes) -> list[Variant]:
+    return [_variant(scene, name, direction, **changes) for direction in DIRECTIONS]
+
+
+def scenes(settings: Settings) -> list[Variant]:
+    """The probe scene: 16,384 Gaussians on a shell, one view of 512², whole operator (project,
+    sort, bin, blend), with standard deviations of 0.01, 0.02 and 0.04 of the object's size.
+    """
+    made = []
+    for scale in (1, 2, 4):
+        scene = make_scene(settings, scale)
+        variants = _pair(scene, f"scale {scale}", default=True)
+        variants += _peers(scene, f"scale {scale}") * settings.peers
+        for variant in variants:
+            variant.parameters["scale"] = scale
+        made += variants
+    return made
+
+
+def _peers(scene: Scene, name: str) -> list[Variant]:
+    """Return the variants of gsplat and gswarp, the whole operator, which run on CUDA."""
+    if scene.device.type != "cuda":
+        return []
+    packages = {"gsplat": peers.gsplat_rasterization, "gswarp": peers.gswarp_rasterization}
+
+    def error(function) -> Error:
+        got, want = scene.forward(function)[0], scene.forward()[0]
+        return compare({"picture": got}, {"picture": want})
+
+    return [
+        Variant(
+            name=f"{package}, {name}",
+            run=partial(run, function),
+            check=partial(error, function),
+            limit=1e-2,
+            oracle="our float32 picture",
+            direction=direction,
+            peer=True,
+            parameters=dict(scene.sizes),
+        )
+        for package, function in packages.items()
+        for direction, run in (("forward", scene.forward), (BOTH, scene.backward))
+    ]
+
+
+def knobs(settings: Settings) -> list[Variant]:
+    """Accuracy traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
+    threshold of alpha or T and no radius clip. The defaults are those of trained Gaussians and
+    other renderers.
+    """
+    scene = make_scene(settings, 2).changed(exact=_NO_THRESHOLDS)
+    default = "default: alpha 1/255, T 1e-4"
+    made = _pair(scene, default, limit=TRADE_LIMIT, default=True)
+    quick = settings.level == "quick"
+    trades = {f"alpha 1/{n}": {"alpha_min": 1 / n} for n in (4096, 1024, 64, 32, 16)}
+    trades |= {f"T {limit:g}": {"t_min": limit} for limit in (1e-6, 1e-3, 1e-2, 1e-1)}
+    if quick:
+        trades = {name: trades[name] for name in ("alpha 1/64", "T 0.01")}
+    trades["alpha 1/4096, T 1e-6"] = {"alpha_min": 1 / 4096, "t_min": 1e-6}
+    for radius in (scene.size / 32, scene.size / 16):
+        trades[f"radius clip {radius:g}"] = {"radius_clip": radius}
+    for name, options in trades.items():
+        made += _pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
+    for opacity in (0.35, 0.4):
+        kept = scene.gaussians["opacities"] >= opacity
+        pruned = {k: x[kept] for k, x in scene.gaussians.items()}
+        pruned = scene.changed(gaussians=pruned, truth=scene.gaussians)
+        made.append(_variant(pruned, f"no opacities < {opacity}", limit=TRADE_LIMIT))
+    for dtype in (torch.bfloat16, torch.float16):
+        name = str(dtype).removeprefix("torch.")
+        rounded = {k: x.to(dtype) for k, x in scene.gaussians.items()}
+        rounded = scene.changed(gaussians=rounded, truth=scene.gaussians)
+        made += _pair(rounded, f"{name} inputs", limit=TRADE_LIMIT, dtype=name)
+    return made
+
+
+def skipping(settings: Settings) -> list[Variant]:
+    """Work left out because no result needs it, at scale 2, against the same call that needs
+    all. Skipped: share of the pairs of Gaussians and tiles, or of the gradients.
+    """
+    scene = make_scene(settings, 2)
+    made = [_variant(scene, "all gradients, whole picture", BOTH, default=True)]
+    for name in ("colors", "means"):
+        made.append(_variant(scene.changed(wanted=(name,)), f"gradient of {name} alone", BOTH))
+        made[-1].work = lambda: scene.work(True) | {"skipped": 1 - 1 / len(LEAVES)}
+    half = scene.size // 2
+    for name, rows in (("half", scene.size), ("a quarter", half)):
+        part = torch.zeros_like(scene.upstream)
+        part[:, :rows, :half] = scene.upstream[:, :rows, :half]
+        part = scene.changed(cotangent=part)
+        made.append(_variant(part, f"upstream gradient on {name} of the picture", BOTH))
+        made[-1].work = partial(_tiles_skipped, part)
+    return made
+
+
+def _tiles_skipped(scene: Scene) -> dict[str, float]:
+    counts = scene.work(True)
+    occupied = counts["tiles"] - counts["tiles_empty"]
+    skipped = counts["tiles_skipped"] - counts["tiles_empty"]
+    return counts | {"skipped": skipped / max(occupied, 1)}
+
+
+def one_call(settings: Settings) -> list[Variant]:
+    """8 objects of 4,096 Gaussians in 4 views of 128² each: in one call, and in 32."""
+    objects, views, size = (2, 2, 64) if settings.level == "quick" else (8, 4, 128)
+    shells = [shell(4096, 2, seed) for seed in range(objects)]
+    cameras = orbit_cameras(views, size)
+    together = Scene(
+        {k: torch.stack([x[k] for x in shells]) for k in LEAVES},
+        *(x.expand(objects, *x.shape) for x in cameras),
+        size,
+        settings.device,
+    )
+    made = _pair(together, "one call", default=True)
+    single = [
+        Scene(gaussians, *(x[v : v + 1] for x in cameras), size, settings.device)
+        for gaussians in shells
+        for v in range(views)
+    ]
+    for direction in DIRECTIONS:
+        runs = [s.forward if direction == "forward" else s.backward for s in single]
+        run = partial(_call_all, runs)
+        made.append(_variant(single[0], f"{len(single)} calls", direction, run=run, work=None))
+        made[-1].parameters["views"] = len(single)
+    return made
+
+
+def _call_all(runs: list) -> None:
+    for run in runs:
+        run()
+
+
+def counts(settings: Settings) -> list[Variant]:
+    """Cost against the number of Gaussians, which get smaller so that they cover the same area."""
+    numbers = {"quick": (1024, 4096), "normal": (16384, 65536)}.get(settings.level)
+    made = []
+    for count in numbers or (16384, 65536, 262144):
+        scene = make_scene(settings, math.sqrt((numbers or (16384,))[0] / count), count)
+        made += _pair(scene, f"{count} Gaussians")
+    return made
+
+
+def views(settings: Settings) -> list[Variant]:
+    """Cost against the number of views of 256² in one call."""
+    quick, made = settings.level == "quick", []
+    for number in (1, 2) if quick else (1, 2, 4, 8, 16):
+        scene = make_scene(settings, size=64 if quick else 256, views=number)
+        made += _pair(scene, f"{number} view{'s' * (number > 1)}")
+    return made
+
+
+def many_views(settings: Settings) -> list[Variant]:
+    """32 views of 512² in one launch, beside gsplat."""
+    scene = make_scene(settings, views=32)
+    return _pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
+
+
+def harmonics(settings: Settings) -> list[Variant]:
+    """Colours of Gaussians in views from harmonics, alone and with the gradients of coefficients,
+    means and centres: our kernels, the formula in torch and gsplat's torch.
+    """
+    quick = settings.level == "quick"
+    sizes = [(2048 if quick else 16384, 1, degree) for degree in range(5)]
+    sizes.append((2048, 2, 3) if quick else (262144, 4, 3))
+    made = []
+    for count, views, degree in sizes:
+        g = torch.Generator().manual_seed(0)
+        inputs = {
+            "coefficients": 0.3 * torch.randn(1, count, (degree + 1) ** 2, 3, generator=g),
+            "means": torch.randn(1, count, 3, generator=g),
+            "centers": 3 * torch.randn(1, views, 3, generator=g),
+        }
+        problem = Operator(
+            partial(colors_seen_from, degree),
+            partial(colors_by_formula, degree),
+            inputs,
+            torch.randn(1, views, count, 3, generator=g),
+            settings.device,
+            "the formula in float64",
+            {"N": count, "views": views, "degree": degree},
+            dict.fromkeys(DIRECTIONS, 1e-5),
+            fixed=() if degree else ("means", "centers"),
+        )
+        name = f"degree {degree}, {count} Gaussians, {views} view{'s' * (views > 1)}"
+        made += measure.pair(problem, f"ours, {name}", default=True)
+        formula = replace(problem, function=problem.reference)
+        made += measure.pair(formula, f"the formula in torch, {name}")
+        if settings.peers:
+            gsplat = replace(problem, function=partial(peers.gsplat_colors, degree))
+            made += measure.pair(gsplat, f"gsplat's torch, {name}", peer=True)
+    return made

@@ -1,0 +1,159 @@
+"""Benchmark of the selective scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+
+from ..cases.problem import BOTH, DIRECTIONS, Operator
+from ..cases.scan import make_inputs, scan_problem
+from . import peers
+from .measure import Case, Settings, Variant, pair, saved_bytes, variant
+
+# Tokens, channels, and tokens that the oracle looks at.
+SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (16961, 1024, 16961)}
+_HALF = {"dtype": torch.bfloat16}
+
+
+def cases(settings: Settings) -> list[Case]:
+    """Return the cases of the scan."""
+    builders = {
+        "operator": operator,
+        "knobs": knobs,
+        "length": lengths,
+        "layers": layers,
+        "packed": packed,
+        "states": states,
+    }
+    if settings.device.type == "cuda":
+        builders["training batch"] = training_batch
+    return [Case("scan", name, build) for name, build in builders.items()]
+
+
+def make_problem(settings: Settings, channels_seen: int = 32, **changes: int) -> Operator:
+    """Return a problem of the level's size, but for ``changes`` of ``make_inputs``."""
+    length, width, tokens = SIZES[settings.level]
+    inputs = make_inputs(**({"batch": 1, "length": length, "channels": width} | changes))
+    return scan_problem(inputs, settings.device, tokens, channels_seen)
+
+
+def operator(settings: Settings) -> list[Variant]:
+    """The whole operator: softplus, bias, skip and gate."""
+    return pair(make_problem(settings), "default", default=True)
+
+
+def _peer(problem: Operator, function: Callable, channels_first: bool = True) -> Operator:
+    """Return another package's scan on the same inputs, laid out for it; its output is checked."""
+    return replace(
+        problem,
+        function=function,
+        limits=dict.fromkeys(problem.limits, 1e-4),
+        turned=("u", "delta", "B", "C", "z", "out") if channels_first else (),
+        compared=False,
+    )
+
+
+def knobs(settings: Settings) -> list[Variant]:
+    """Every choice that a caller has. Half precision is compared with the truth of the float32
+    inputs. The discretisations are different models, each compared with its own formula.
+    """
+    problem = make_problem(settings)
+    made = pair(problem, "float32", default=True)
+    for dtype in (torch.bfloat16, torch.float16):
+        name = f"{str(dtype).removeprefix('torch.')} inputs and output"
+        made += pair(problem, name, options={"dtype": dtype})
+    for discretization in ("bilinear", "zoh"):
+        made += pair(problem, discretization, options={"discretization": discretization})
+    batch, _, width = problem.inputs["u"].shape
+    state = torch.randn(batch, width, 16, generator=torch.Generator().manual_seed(2))
+    tokens = SIZES[settings.level][2]
+    start = scan_problem(problem.inputs, problem.device, tokens, initial_state=state)
+    made += pair(start, "with an initial state")
+    return made + pair(make_problem(settings, groups=4), "4 groups of B and C")
+
+
+def lengths(settings: Settings) -> list[Variant]:
+    """Cost against the number of tokens. Saved: tensors of the forward pass beside its inputs;
+    history: the states of all tokens.
+    """
+    made = []
+    for length in (256, 1024) if settings.level == "quick" else (4096, 16384, 65536):
+        problem = make_problem(settings, 8 if length > 16961 else 32, length=length)
+        for direction in DIRECTIONS:
+            work = partial(count_memory, problem, direction)
+            made.append(variant(problem, f"L {length}", direction, rounds=20, work=work))
+    return made
+
+
+def count_memory(problem: Operator, direction: str) -> dict[str, int]:
+    """Return the bytes of all states, and of the tensors saved for the gradient."""
+    counts = {"state_history_bytes": 4 * math.prod(problem.sizes.values())}
+    if direction == BOTH:
+        leaves = problem.leaves()
+        counts["saved_bytes"] = saved_bytes(lambda: problem.call(leaves), leaves.values())
+    return counts
+
+
+def layers(settings: Settings) -> list[Variant]:
+    """Scans of layers, by tokens and channels: 512 channels of this project's preset rays, 1,536 of
+    mamba-130m, 5,120 of mamba-2.8b; beside the formula as a torch loop (Mamba's reference does it
+    so), and beside peers where they are installed, on the same inputs.
+    """
+    quick, made = settings.level == "quick", []
+    for length in (256,) if quick else (512, 2048, 8192):
+        for width in (64,) if quick else (512, 1536, 5120):
+            problem = scan_problem(make_inputs(1, length, width), settings.device, 512)
+            name = f"{length} x {width}"
+            made += pair(problem, name) + pair(problem, f"{name}, bfloat16", options=_HALF)
+            if settings.peers and settings.device.type == "cuda":
+                made += pair(_peer(problem, peers.mamba_ssm_scan), f"mamba-ssm, {name}", peer=True)
+            if length * width <= 2048 * 1536:  # others' code in torch takes seconds
+                loop, slow = _peer(problem, peers.scan_loop), {"peer": True, "rounds": 3}
+                made.append(variant(loop, f"torch loop, {name}", **slow))
+                if settings.peers:
+                    mambapy = _peer(problem, peers.mambapy_scan, channels_first=False)
+                    made += pair(mambapy, f"mambapy, {name}", **slow)
+    return made
+
+
+def packed(settings: Settings) -> list[Variant]:
+    """Sequences of many lengths in one packed row beside one sequence as long. The oracle sees the
+    first of them.
+    """
+    length, width, _ = SIZES[settings.level]
+    first = length // 8
+    problem = scan_problem(make_inputs(1, length, width), settings.device, first)
+    made = pair(problem, "one sequence", default=True)
+    for count in (8, 64):
+        g = torch.Generator().manual_seed(count)
+        cuts = first + torch.randperm(length - first, generator=g)[: count - 1].sort().values
+        cuts[0] = first
+        cuts = torch.tensor([0, *cuts.tolist(), length], dtype=torch.int32, device=settings.device)
+        cut = replace(problem, function=partial(problem.function, cu_seqlens=cuts))
+        made += pair(cut, f"{count} sequences")
+    return made
+
+
+def states(settings: Settings) -> list[Variant]:
+    """Cost against the number of states per channel; 16 is the tuned one."""
+    quick, made = settings.level == "quick", []
+    for count in (4, 16) if quick else (4, 8, 16, 32, 64):
+        problem = make_problem(settings, length=512 if quick else 4096, states=count)
+        made += pair(problem, f"N {count}")
+    return made
+
+
+def training_batch(settings: Settings) -> list[Variant]:
+    """A layer of the paper's training: 16 sequences in bfloat16, beside mamba-ssm."""
+    length, width, tokens = SIZES[settings.level]
+    inputs = make_inputs(2 if settings.level == "quick" else 16, length, width)
+    problem = scan_problem(inputs, settings.device, min(tokens, 2048))
+    made = pair(problem, "default", options=_HALF, default=True)
+    made.append(variant(make_problem(settings), "one sequence", options=_HALF))
+    if settings.peers:
+        made += pair(_peer(problem, peers.mamba_ssm_scan), "mamba-ssm", options=_HALF, peer=True)
+    return made

@@ -1,0 +1,91 @@
+"""Benchmark of a training step: samples per second, for ``gamba bench step``."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.kernels.bench.measure import Case, Settings, Variant
+from gamba_warp.kernels.cases.problem import BOTH
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.posing import reference_cameras
+
+from .config import OptimConfig
+from .data.samples import Batch
+from .optim import Ema, build_optimizer
+from .step import Objective, compute_gradients
+
+_VIEWS, _SIZE = 4, 128  # of an object, the input view included
+
+
+def cases(settings: Settings) -> list[Case]:
+    """Return the case of a step."""
+    return [Case("step", "batch", steps)]
+
+
+class Step:
+    """A model with its optimizer and a batch of random pictures, as in a training run."""
+
+    def __init__(self, preset: str, objects: int, device: torch.device) -> None:
+        torch.manual_seed(0)
+        config = PRESETS[preset]
+        self.model, options = Gamba(config).to(device), OptimConfig()
+        self.optimizer, self.clip = build_optimizer(self.model, options), options.clip
+        for group in self.optimizer.param_groups:
+            group["lr"] = 1e-6  # the weights hardly move, so every round does the same work
+        self.ema = Ema(self.model, options.ema)
+        self.objective = Objective({"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "rdist": 0.0})
+        views = orbit(90.0 * torch.arange(_VIEWS), 20.0, 1.8).expand(objects, -1, -1, -1)
+        Ks = intrinsics(_SIZE, _SIZE).expand(objects, _VIEWS, 3, 3)
+        size = config.image_size
+        self.batch = Batch(
+            [str(i) for i in range(objects)],
+            torch.rand(objects, size, size, config.input_channels),
+            reference_cameras(config, objects),
+            torch.rand(objects, _VIEWS, _SIZE, _SIZE, 4),
+            Cameras(views, Ks, _SIZE, _SIZE),
+            torch.ones(objects, 1, 3),
+        ).to(device)
+
+    def run(self) -> Tensor:
+        """Make the whole step and return the gradient's norm (timed)."""
+        made = compute_gradients(
+            self.model, self.optimizer, [self.batch], self.objective, clip=self.clip
+        )
+        self.optimizer.step()
+        self.ema.update()
+        return made.norm
+
+    def check(self) -> None:
+        """Check that the gradient is finite and not 0, without an oracle."""
+        value = self.run().item()
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"gradient is {value}")
+
+
+def steps(settings: Settings) -> list[Variant]:
+    """One optimizer step on objects in four views of 128²: network, rendering, MSE + mask +
+    0.2 (1 - SSIM), gradients, clipping, AdamW and the running average; fresh weights, random
+    pictures without background, no LPIPS. The only check is that the gradient is finite.
+    """
+    made = []
+    for preset in ("tiny", "rays"):
+        for objects in (1,) if settings.level == "quick" else (1, 4):
+            step = Step(preset, objects, settings.device)
+            name = f"{preset}, {objects} object{'s' * (objects > 1)}"
+            made.append(
+                Variant(
+                    name,
+                    step.run,
+                    step.check,
+                    direction=BOTH,
+                    rounds=5,
+                    parameters={"B": objects, "views": _VIEWS, "side": _SIZE},
+                    work=lambda count=objects: {"samples": count},
+                )
+            )
+    return made
