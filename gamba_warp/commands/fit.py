@@ -14,7 +14,7 @@ from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
-from ..fitting.config import Count, FitConfig, RasterizeMode, Steps, Strategy
+from ..fitting.config import Count, FitConfig, RasterizeMode, Steps
 from ..untrusted.ranges import Minutes, Seed, ranged
 
 
@@ -29,7 +29,6 @@ def fit_command(
     steps: Steps = FitConfig.steps,
     minutes: Minutes | None = None,
     gaussians: Count = FitConfig.gaussians,
-    strategy: Strategy = FitConfig.strategy,
     size: Annotated[int, Meta(ge=8, le=4096)] | None = None,
     rasterize_mode: RasterizeMode = "classic",
     seed: Seed = 0,
@@ -46,9 +45,7 @@ def fit_command(
         held_out: Every so many views one is held out for the metrics; 0 for none.
         steps: Number of Adam steps.
         minutes: Time limit of each object; the learning rates then decay with time.
-        gaussians: Number of Gaussians per object; the maximum with mcmc and default.
-        strategy: Fixed relocates nearly invisible Gaussians and keeps the number. Mcmc and default
-            are those of gsplat, which must be installed; they start with half the number and grow.
+        gaussians: Number of Gaussians per object.
         size: Height of the pictures; the files' own by default.
         rasterize_mode: Antialiased fits small pictures better, but files do not store the mode, and
             most viewers (and eval-views) are classic.
@@ -56,14 +53,10 @@ def fit_command(
         device: Device that computes; auto is the GPU if there is one.
     """
     from ..data.dataset import background_note, open_dataset
-    from ..fitting.densify import make_strategy
     from ..fitting.objects import FitJob, choose_objects, fit_objects, object_paths
 
     if held_out == 1:
         raise UserError("--held-out 1: would leave no view for the fit; 2 or more, or 0 for none")
-    if minutes is not None and strategy != "fixed":
-        reason = "its schedule counts steps, which a time limit would cut off; give only --steps"
-        raise UserError(f"--minutes {minutes:g} with --strategy {strategy}: {reason}")
     chosen = pick_device(device)
     dataset = open_dataset(folder, split)
     if note := background_note(dataset):
@@ -75,12 +68,9 @@ def fit_command(
         gaussians=gaussians,
         steps=steps,
         seconds=None if minutes is None else 60 * minutes,
-        strategy=strategy,
         rasterize_mode=rasterize_mode,
         seed=seed,
     )
-    if strategy != "fixed":
-        make_strategy(config)  # fails without gsplat, before anything is written
     job = FitJob(dataset, output_folder(out), config, held_out, size, chosen)
     text, failures = fit_objects(job, uids)
     print(text)

@@ -190,7 +190,6 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
         "ssim_held_out": _mean(similar),
         "psnr_by_view": by_view,
         "gaussians": result.gaussians.num,
-        "relocated": result.relocated,
         "steps": len(result.losses),
         "loss_first": result.losses[0],
         "loss_last": result.losses[-1],
@@ -228,7 +227,7 @@ def _write_object(
     reference = cameras.viewmats[0]
     _, scale = relative_to_reference(cameras.viewmats[:1], reference)
     moved = gaussians.transformed(reference[:3, :3], reference.new_zeros(3), scale.item())
-    how = f"strategy {job.config.strategy}, rasterize_mode {job.config.rasterize_mode}"
+    how = f"rasterize_mode {job.config.rasterize_mode}"
     note = f"fitted to {record['name']} by gamba fit, {how}"
     save_ply(paths["gaussians"], moved, comments=[note])
     save_image(paths["strips"], rows[:4].flatten(0, 1).cpu().numpy())

@@ -1,10 +1,8 @@
 """Fits the Gaussians of one object to posed views, by gradient descent through the rasterizer.
 
 Points start at random in the visual hull of the pictures. Every step renders a few views in one
-call on random backgrounds, and Adam follows the gradient of the error. At intervals the Gaussians
-that are hardly visible in any view are moved to where the pictures still differ, and their number
-stays; or a strategy of gsplat adds, moves and removes Gaussians (``densify``). No prior is learned:
-the quality on held-out views shows the limit of the representation and of the views.
+call on random backgrounds, and Adam follows the gradient of the error. No prior is learned: the
+quality on held-out views shows the limit of the representation and of the views.
 """
 
 from __future__ import annotations
@@ -20,9 +18,8 @@ from torch import Tensor
 from ..cameras import Cameras
 from ..conventions import over_background
 from ..gaussians import Gaussians
-from .config import MAX_SCALE, MIN_SCALE, FitConfig
-from .densify import Densified, start_count
-from .relocate import Fixed
+from ..render import render
+from .config import BETAS, MAX_SCALE, MIN_SCALE, FitConfig
 from .start import activate, random_start
 
 
@@ -33,13 +30,10 @@ class Fit:
     Attributes:
         gaussians: ``[N]``, in the world of the cameras.
         losses: the loss of each step.
-        relocated: number of Gaussians moved by ``relocate`` in all steps; 0 with a strategy of
-            gsplat.
     """
 
     gaussians: Gaussians
     losses: list[float]
-    relocated: int
 
 
 def fit(
@@ -65,56 +59,47 @@ def fit(
         FloatingPointError: a loss is not finite.
     """
     rng = torch.Generator(images.device).manual_seed(config.seed)
-    model: Fixed | Densified
-    if config.strategy == "fixed":
-        start = random_start(images, cameras, config.gaussians, rng)
-        model = Fixed(start, images, cameras, config, rng)
-    else:
-        start = random_start(images, cameras, start_count(config), rng)
-        model = Densified(start, config, rng)
-    result = Fit(activate(model.parameters).detach(), [], 0)
+    parameters = random_start(images, cameras, config.gaussians, rng)
+    groups = [{"params": [p.requires_grad_()], "name": name} for name, p in parameters.items()]
+    # The gradients of single Gaussians are far below Adam's default eps.
+    optimizer = torch.optim.Adam(groups, betas=BETAS, eps=1e-15)
+    result = Fit(activate(parameters).detach(), [])
     began, done, pending = time.perf_counter(), 0.0, []
     while len(result.losses) < config.steps and done < 1:
-        for optimizer in model.optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = getattr(config, f"lr_{group['name']}") * config.lr_end**done
+        for group in optimizer.param_groups:
+            group["lr"] = getattr(config, f"lr_{group['name']}") * config.lr_end**done
         if len(pending) < min(config.views, len(images)):
             pending = torch.randperm(len(images), generator=rng, device=images.device).tolist()
         views, pending = pending[: config.views], pending[config.views :]
-        result.losses.append(_step(model, images[views], cameras[views], config, rng))
-        step = len(result.losses)
-        result.relocated += model.after(step, done)
-        done = step / config.steps
+        loss = _loss(parameters, images[views], cameras[views], config, rng)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        with torch.no_grad():
+            parameters["scales"].clamp_(math.log(MIN_SCALE), math.log(MAX_SCALE))
+        result.losses.append(loss.item())
+        if not math.isfinite(result.losses[-1]):
+            raise FloatingPointError("the loss is not finite")
+        done = len(result.losses) / config.steps
         if config.seconds is not None:
             done = max(done, (time.perf_counter() - began) / config.seconds)
         if progress is not None:
             progress(min(done, 1.0), result.losses[-1])
-    result.gaussians = activate(model.parameters).detach()
+    result.gaussians = activate(parameters).detach()
     return result
 
 
-def _step(
-    model: Fixed | Densified,
+def _loss(
+    parameters: dict[str, Tensor],
     images: Tensor,
     cameras: Cameras,
     config: FitConfig,
     rng: torch.Generator,
-) -> float:
-    """Make one step of Adam; return the loss before it."""
-    # A random background distinguishes transparency from the background's colour.
+) -> Tensor:
+    """Return the loss on some views, on random backgrounds: they tell clear from coloured."""
     backgrounds = torch.rand(len(images), 3, generator=rng, device=images.device)
-    rgb, alpha = model.draw(cameras, backgrounds)
-    difference = rgb - over_background(images, backgrounds[:, None, None])
+    mode = config.rasterize_mode
+    picture = render(activate(parameters), cameras, backgrounds, rasterize_mode=mode)
+    difference = picture.rgb - over_background(images, backgrounds[:, None, None])
     loss = difference.square().mean() + config.weight_l1 * difference.abs().mean()
-    loss = loss + config.weight_alpha * (alpha - images[..., 3:]).square().mean()
-    value = loss.item()
-    for optimizer in model.optimizers.values():
-        optimizer.zero_grad()
-    (loss + model.penalty()).backward()
-    for optimizer in model.optimizers.values():
-        optimizer.step()
-    with torch.no_grad():
-        model.parameters["scales"].clamp_(math.log(MIN_SCALE), math.log(MAX_SCALE))
-    if not math.isfinite(value):
-        raise FloatingPointError("the loss is not finite")
-    return value
+    return loss + config.weight_alpha * (picture.alpha - images[..., 3:]).square().mean()

@@ -19,14 +19,13 @@ from gamba_warp.fitting import objects
 from gamba_warp.fitting.config import FitConfig
 from gamba_warp.fitting.objects import choose_objects, split_views
 from gamba_warp.fitting.optimize import activate, fit
-from gamba_warp.fitting.relocate import relocate, shares
 from gamba_warp.fitting.start import random_start, sample_views, visual_hull
 from gamba_warp.image_metrics import METRICS, psnr
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.render import render
 
 VIEWS = 12
-QUICK = FitConfig(gaussians=300, steps=80, views=4, relocate_every=20)
+QUICK = FitConfig(gaussians=300, steps=80, views=4)
 STILL = dict.fromkeys(("lr_means", "lr_scales", "lr_quats", "lr_opacities", "lr_colors"), 0.0)
 
 
@@ -54,18 +53,16 @@ def test_known_scene_is_found_from_a_random_start():
 def test_each_gradient_has_its_part(frozen):
     """No fit without learning, and a worse one without one attribute's gradient."""
     rates = STILL if frozen == "all" else {frozen: 0.0}
-    config = replace(QUICK, relocate_every=0)
-    reached, _ = held_out_psnr(replace(config, **rates))
-    assert reached < (20 if frozen == "all" else held_out_psnr(config)[0] - 0.5)
+    reached, _ = held_out_psnr(replace(QUICK, **rates))
+    assert reached < (20 if frozen == "all" else held_out_psnr(QUICK)[0] - 0.5)
 
 
 def test_same_seed_same_bits():
     cameras = views_around(4)
     images = photograph(cloud(1), cameras)
-    config = replace(QUICK, gaussians=101, steps=12, relocate_every=5, min_weight=20.0)
+    config = replace(QUICK, gaussians=101, steps=12)
     first, again = (fit(images, cameras, config) for _ in range(2))
     other = fit(images, cameras, replace(config, seed=1))
-    assert first.relocated > 0
     for name in ("means", "quats", "scales", "opacities", "colors"):
         assert torch.equal(getattr(first.gaussians, name), getattr(again.gaussians, name)), name
         assert not torch.equal(getattr(first.gaussians, name), getattr(other.gaussians, name)), name
@@ -78,7 +75,7 @@ def test_the_mode_reaches_the_fit():
     truth = over_background(images, 1.0)
     modes = ("classic", "antialiased")
     for mode, other in (modes, modes[::-1]):
-        config = replace(QUICK, relocate_every=10, rasterize_mode=mode)
+        config = replace(QUICK, rasterize_mode=mode)
         gaussians = fit(images, cameras, config).gaussians
         own, cross = (
             psnr(render(gaussians, cameras, torch.ones(3), rasterize_mode=m).rgb, truth).mean()
@@ -157,72 +154,6 @@ def test_start_lies_in_the_hull():
     # one hue: the views' mean colour is near the scene's
     true = cloud(2).colors.mean(0)
     assert (gaussians.colors.mean(0) - true).abs().max() < 0.1
-
-
-def test_shares_add_up():
-    """Weights add up to alpha; an error drawn in one Gaussian's place is its own."""
-    cameras = views_around(3)
-    scene = cloud(4, num=30)
-    picture = render(scene, cameras)
-    images = photograph(scene, cameras)
-    images[0, 5, 7] = torch.tensor([0.0, 1.0, 0.0, 1.0])
-    weight, error = shares(scene, images, cameras)
-    # float32 sums over 3072 pixels
-    torch.testing.assert_close(weight.sum(), picture.alpha.sum(), rtol=1e-4, atol=1e-3)
-    square = (render(scene, cameras, torch.ones(3)).rgb - over_background(images, 1.0)).square()
-    want = (square.mean(-1, keepdim=True) * picture.alpha).sum()
-    torch.testing.assert_close(error.sum(), want, rtol=1e-4, atol=1e-6)
-    assert (weight >= 0).all() and (error >= 0).all()
-
-
-def test_relocation_moves_the_unseen_onto_the_error():
-    parameters = {
-        "means": torch.randn(10, 3),
-        "quats": torch.randn(10, 4),
-        "scales": torch.full((10, 3), -6.0),
-        "opacities": torch.linspace(-1, 1, 10),
-        "colors": torch.randn(10, 3),
-    }
-    parameters = {name: value.requires_grad_() for name, value in parameters.items()}
-    optimizer = torch.optim.Adam(parameters.values())
-    sum(value.square().sum() for value in parameters.values()).backward()
-    optimizer.step()
-    before = {name: value.detach().clone() for name, value in parameters.items()}
-    weight = torch.full((10,), 50.0)
-    weight[[2, 5]] = 0.0
-    error = torch.zeros(10)
-    error[7] = 3.0
-    error[2] = 9.0  # on its way itself: nobody may be moved onto it
-    generator = torch.Generator().manual_seed(0)
-    assert relocate(parameters, optimizer, weight, error, QUICK, generator) == 2
-    copies = [2, 5, 7]
-    for name in ("quats", "scales", "opacities", "colors"):
-        value = parameters[name].detach()
-        assert torch.equal(value[[2, 5]], value[[7, 7]]), name
-    opacity = parameters["opacities"].detach().sigmoid()
-    # three copies on top of one another let through what the one did
-    torch.testing.assert_close(
-        (1 - opacity[copies]).prod(), 1 - before["opacities"][7].sigmoid(), rtol=1e-5, atol=0
-    )
-    distance = (parameters["means"][[2, 5]] - before["means"][7]).norm(dim=-1)
-    assert (distance > 0).all() and (distance < 6 * torch.tensor(-6.0).exp()).all()
-    rest = [0, 1, 3, 4, 6, 8, 9]
-    for name, value in parameters.items():
-        assert torch.equal(value.detach()[rest], before[name][rest]), name
-        assert optimizer.state[value]["exp_avg"][copies].eq(0).all(), name
-        assert optimizer.state[value]["exp_avg"][rest].ne(0).any(), name
-
-
-def test_relocation_has_a_limit():
-    cameras = views_around(2)
-    images = photograph(cloud(1), cameras)
-    start = random_start(images, cameras, 50, torch.Generator().manual_seed(0))
-    optimizer = torch.optim.Adam([value.requires_grad_() for value in start.values()])
-    sum(value.square().sum() for value in start.values()).backward()
-    optimizer.step()
-    generator = torch.Generator().manual_seed(0)
-    assert relocate(start, optimizer, torch.zeros(50), torch.ones(50), QUICK, generator) == 10
-    assert relocate(start, optimizer, torch.zeros(50), torch.zeros(50), QUICK, generator) == 0
 
 
 def test_psnr_is_that_of_eval():
