@@ -29,17 +29,16 @@ from gamba_warp.model.config import GambaConfig
 
 from .config import TrainConfig
 from .data.order import ShardOrder
+from .data.pool import VIEWS as MADE_VIEWS
 from .data.pool import Pool, PoolOptions
 from .data.poses import front_views
 from .data.samples import Batch, choose_views, draw_change, join, load_sample
 from .data.settings import VARIED_CAMERAS, Settings
 from .ddp import World
-from .optim import NewBatch
 
 _FETCHED = 256  # samples of a process for which shards are fetched ahead
 _TRIES = 100  # objects tried in turn until one can be read
-# With --overfit all views share one forward pass of the network; rendering them is cheap beside it.
-_OVERFIT_VIEWS = 9
+VAL_VIEWS = 4  # novel views of an object in a validation
 
 
 # By name: positions of an epoch in the list of objects, as many as there are objects. Arguments: a
@@ -71,32 +70,16 @@ class TrainingData:
     Attributes:
         train: dataset with the objects to train on.
         objects: indices into ``train``, possibly repeated; one pass over the list is an epoch.
-        reference: the input view, or None for any.
-        batch_size: objects per batch and process.
-        novel: novel views per object at every step; None means the schedule's number.
         held_out: validation objects by dataset; datasets without any are left out.
-        val_views: novel views per object in a validation; None means all.
         notes: lines for the user.
-        weights: for each of ``objects``, how often it is taken relative to others; None: alike.
         shards: for each of ``objects``, the SHA-256 of its shard, if the order is by shards.
     """
 
     train: ViewDataset
     objects: list[int]
-    reference: int | None = None
-    batch_size: int = 8
-    novel: int | None = None
     held_out: list[HeldOut] = field(default_factory=list)
-    val_views: int | None = None
     notes: list[str] = field(default_factory=list)
-    weights: np.ndarray | None = None
     shards: list[str] | None = None
-
-    @property
-    def scanned(self) -> list[str]:
-        """Uids of the objects named as in Google Scanned Objects."""
-        taken = [(self.train, self.objects), *((p.dataset, p.objects) for p in self.held_out)]
-        return scanned({dataset.uids[index] for dataset, indices in taken for index in indices})
 
     @property
     def fingerprint(self) -> str:
@@ -110,53 +93,34 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
 
     Args:
         config: options of the run.
-        device: device on which ``--cache-device`` keeps the training pictures; None disables it.
+        device: the training device; on a GPU it keeps the pictures of ``--cache``.
 
     Raises:
-        UserError: the folder or the object of ``--overfit`` does not exist, no object can be read,
-            the pictures do not fit on the device, or the data has Google Scanned Objects.
+        UserError: a folder does not exist, no object can be read, the pictures do not fit on the
+            device, or the data has Google Scanned Objects.
     """
-    one, sampler = config.views.overfit, config.views.sampler
+    views, sampler = config.views, config.views.sampler
     if sampler not in (known := (*SAMPLERS, "shards")):
         raise UserError(f"--sampler {sampler[:60]}: expected one of {', '.join(known)}")
-    data = _open_all(config) if one is None else _open_one(config, one)
-    if data.scanned and not config.views.train_on_gso:
-        names = ", ".join(data.scanned[:3]) + (", ..." if len(data.scanned) > 3 else "")
-        raise UserError(
-            f"the data has Google Scanned Objects, which are for evaluation ({names})"
-            ": leave them out, or give --train-on-gso, which the model's card then states"
-        )
-    sizes = sorted({config.views.size, config.model_config().image_size})
-    packed = data.train.packed_size
-    if packed is not None and sizes[-1] > packed:
-        data.notes.append(
-            f"{config.data} has shards of {packed} pixels; pictures are enlarged to {sizes[-1]}"
-        )
-    if config.views.cache_device and device is not None:
-        data.train.preload(sorted(set(data.objects)), sizes, device, config.views.workers)
-    return data
-
-
-def _open_all(config: TrainConfig) -> TrainingData:
-    views = config.views
-    train = open_dataset(config.data, "train", cache=views.cache)
-    ends = [len(train)]
+    on_gpu = device is not None and device.type == "cuda"
+    train = open_dataset(config.data, "train", cache=views.cache and not on_gpu)
+    taken = [range(len(train))]  # objects of DATA, then of each of --extra
+    known = {config.data.resolve(): taken[0]}
     for folder in views.extra:
-        train = train.joined(folder.resolve().name, open_dataset(folder, "train"))
-        ends.append(len(train))
+        if folder.resolve() not in known:
+            first = len(train)
+            train = train.joined(folder.resolve().name, open_dataset(folder, "train"))
+            known[folder.resolve()] = range(first, len(train))
+        taken.append(known[folder.resolve()])
     bad = train.check()
-    objects = [i for i, uid in enumerate(train.uids) if uid not in bad]
+    objects = [i for part in taken for i in part if train.uids[i] not in bad]
     notes = [f"{uid} is left out: {reason}" for uid, reason in bad.items()]
     if not objects:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
     notes += filter(None, [background_note(train)])
-    shards = _shards_of(train, objects, config)
-    weights, held_out = None, []
-    if views.extra_weights:
-        each = np.array([1.0, *views.extra_weights])
-        weights = each[np.searchsorted(ends, objects, side="right")]
+    shards, held_out = _shards_of(train, objects, config), []
     try:
         held_out.append(_held_out("", config.data, config.run.val_objects))
     except UserError as error:
@@ -169,18 +133,24 @@ def _open_all(config: TrainConfig) -> TrainingData:
             held_out.append(_held_out(name, folder, config.run.val_objects))
         except UserError as error:
             raise UserError(f"--val-extra: {error}") from error
-    return TrainingData(
-        train,
-        objects,
-        reference=0 if views.reference == "first" else None,
-        batch_size=views.objects,
-        novel=views.views_per_object,
-        held_out=[part for part in held_out if part.objects],
-        val_views=config.run.val_views,
-        notes=notes,
-        weights=weights,
-        shards=shards,
-    )
+    used = {train.uids[i] for i in objects}
+    used |= {part.dataset.uids[i] for part in held_out for i in part.objects}
+    if names := scanned(used):
+        shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        raise UserError(
+            f"the data has Google Scanned Objects, which are for evaluation ({shown}): leave them "
+            "out"
+        )
+    sizes = sorted({views.size, config.model_config().image_size})
+    packed = train.packed_size
+    if packed is not None and sizes[-1] > packed:
+        notes.append(
+            f"{config.data} has shards of {packed} pixels; pictures are enlarged to {sizes[-1]}"
+        )
+    if views.cache and on_gpu:
+        train.preload(sorted(set(objects)), sizes, device, views.workers)
+    held_out = [part for part in held_out if part.objects]
+    return TrainingData(train, objects, held_out, notes, shards)
 
 
 def _shards_of(train: ViewDataset, objects: list[int], config: TrainConfig) -> list[str] | None:
@@ -217,26 +187,6 @@ def _held_out(name: str, folder: Path, count: int) -> HeldOut:
     return HeldOut(name, dataset, evenly(good, count))
 
 
-def _open_one(config: TrainConfig, name: str) -> TrainingData:
-    """Open the object of ``--overfit``; an epoch is a pass over its views."""
-    views = config.views
-    dataset = open_dataset(config.data, "all", cache=True)
-    if name in dataset.uids:
-        index = dataset.uids.index(name)
-    elif name.isdigit() and int(name) < len(dataset):
-        index = int(name)
-    else:
-        raise UserError(f"--overfit {name}: no such uid, nor a number under {len(dataset)}")
-    return TrainingData(
-        dataset,
-        objects=[index] * dataset.num_views(index),
-        reference=None if views.reference == "random" else 0,
-        batch_size=views.objects,
-        novel=_OVERFIT_VIEWS if views.views_per_object is None else views.views_per_object,
-        held_out=[HeldOut("", dataset, [index])],
-    )
-
-
 class Prepared(NamedTuple):
     """Batch prepared by threads, before its failures are counted.
 
@@ -259,7 +209,6 @@ class Batches:
         failures: reasons by uid, of the objects that could not be read so far.
         waited: seconds spent in ``take``, until it is set to 0.
         model: configuration of the model.
-        since: last change of the number of objects a step.
     """
 
     def __init__(
@@ -283,7 +232,7 @@ class Batches:
         self.data, self.config, self.model = data, config, config.model_config()
         self.world, self.novel, self.last = world, novel, last
         self.failures: dict[str, str] = {}
-        self.waited, self.since = 0.0, NewBatch()
+        self.waited = 0.0
         self._made: Pool | None = None  # started with the first batch
         self._by_shard: ShardOrder | None = None
         if data.shards is not None:
@@ -335,7 +284,7 @@ class Batches:
         Raises:
             UserError: as ``take``.
         """
-        self._begin_made(number // self.data.batch_size // self.world.size)
+        self._begin_made(number // self.config.views.batch_size // self.world.size)
         return self._record_failures(self.prepare(number, novel))
 
     def prepare(self, number: int, novel: int) -> Prepared:
@@ -347,8 +296,7 @@ class Batches:
             background = torch.from_numpy(rng.random(3, dtype=np.float32))
         # A separate generator, so that runs without augmentation stay the same.
         chance = np.random.default_rng([seed, 3, number])
-        reference = self.data.reference
-        front = reference is None and chance.random() < views.front_share
+        front = chance.random() < views.front_share
         pick = int(chance.integers(2**32))
         change = None
         if views.mirror or views.recolor:
@@ -356,7 +304,7 @@ class Batches:
         surfaces = self.config.loss.depth_weight > 0
 
         def loaded(dataset: ViewDataset, index: int) -> Batch:
-            first = reference
+            first = None
             if front:
                 found = front_views(dataset.files(index).camera_to_world)
                 first = found[pick % len(found)]
@@ -381,7 +329,7 @@ class Batches:
 
     def _made_sample(self, number: int) -> int | None:
         """Number among the made samples of this process; None if the sample is of a dataset."""
-        share, size = self.config.views.made, self.data.batch_size
+        share, size = self.config.views.made, self.config.views.batch_size
         batch, position = number // size // self.world.size, number % size
         local = batch * size + position  # among the samples of this process
         before, after = math.floor(local * share), math.floor((local + 1) * share)
@@ -393,11 +341,11 @@ class Batches:
         if not views.made or self._made is not None:
             return
         pictures = Settings(
-            views=views.made_views,
+            views=MADE_VIEWS,
             size=max(views.size, self.model.image_size),
             seed=self.config.run.seed,
             depth=self.config.loss.depth_weight > 0,
-            fronts=views.made_views // 3,
+            fronts=MADE_VIEWS // 3,
             light="varied",
             up="y",
             **VARIED_CAMERAS,
@@ -406,11 +354,9 @@ class Batches:
             seed=self.config.run.seed,
             rank=world.rank,
             world=world.size,
-            uses=views.made_uses,
-            workers=views.made_workers,
             views=pictures,
         )
-        self._made = Pool(options, math.floor(number * self.data.batch_size * views.made))
+        self._made = Pool(options, math.floor(number * views.batch_size * views.made))
 
     def _place(self, number: int) -> int:
         """Return the place of the ``number``-th sample in the order of the run.
@@ -419,9 +365,9 @@ class Batches:
         """
         if self._by_shard is None:
             return number
-        share, before = self.data.batch_size, self.since.samples
-        batch, position = divmod(number - before, share)
-        return before // self.world.size + batch // self.world.size * share + position
+        share = self.config.views.batch_size
+        batch, position = divmod(number, share)
+        return batch // self.world.size * share + position
 
     def _object(self, place: int) -> int:
         """Return the object of a place in the order; each epoch has its own permutation."""
@@ -450,16 +396,8 @@ class Batches:
     def _epoch(self, rng: np.random.Generator) -> np.ndarray:
         """Positions of an epoch in the list of objects."""
         count, name = len(self.data.objects), self.config.views.sampler
-        weights = self.data.weights
-        if weights is not None:
-            # Systematic sampling: an object comes its expected number of times, rounded up or down.
-            order = rng.permutation(count)
-            edges = weights[order].cumsum()
-            taken = np.searchsorted(edges, (np.arange(count) + rng.random()) * edges[-1] / count)
-            return rng.permutation(order[np.minimum(taken, count - 1)])
-        # With --overfit, which has one object, "shards" is like "shuffled".
-        sampler = SAMPLERS["shuffled" if name == "shards" else name]
-        order = np.asarray(sampler(rng, [self.data.train.uids[i] for i in self.data.objects]))
+        uids = [self.data.train.uids[i] for i in self.data.objects]
+        order = np.asarray(SAMPLERS[name](rng, uids))
         if (
             order.shape != (count,)
             or order.dtype.kind not in "iu"
@@ -470,9 +408,8 @@ class Batches:
 
     def _numbers(self, number: int) -> range:
         """Samples of the ``number``-th batch for this process."""
-        share, since = self.data.batch_size, self.since
-        number -= since.step * self.config.views.accumulate
-        first = since.samples + (number * self.world.size + self.world.rank) * share
+        share = self.config.views.batch_size
+        first = (number * self.world.size + self.world.rank) * share
         return range(first, first + share)
 
     def _join_samples(self, parts: list[Future[Prepared]]) -> Prepared:
@@ -498,18 +435,17 @@ class Batches:
 
 
 def fixed_batches(
-    part: HeldOut, views: int | None, config: GambaConfig, size: int, failures: dict[str, str]
+    part: HeldOut, config: GambaConfig, size: int, failures: dict[str, str]
 ) -> Iterator[Batch]:
     """Yield the batches of a validation: one object each, fixed views, on white.
 
-    View 0 is the input, followed by ``views`` others, evenly spaced, or by all. An unreadable
-    object is skipped, with its reason in ``failures``.
+    View 0 is the input, followed by ``VAL_VIEWS`` others, evenly spaced. An unreadable object is
+    skipped, with its reason in ``failures``.
     """
     dataset = part.dataset
     for index in part.objects:
         try:
-            others = range(1, dataset.num_views(index))
-            novel = evenly(others, len(others) if views is None else views)
+            novel = evenly(range(1, dataset.num_views(index)), VAL_VIEWS)
             batch = load_sample(dataset, index, [0, *novel], size, config, torch.ones(3))
         except Unreachable:
             raise

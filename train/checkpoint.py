@@ -7,20 +7,19 @@ load; ``state.pt``, the further tensors and plain values of a bit-identical cont
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import msgspec
 import torch
 
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_folder, reason_of, remove_folder, sha256, sweep, write_json
-from gamba_warp.model.checkpoint import outline, read_config, read_weights, save_model
+from gamba_warp.model.checkpoint import read_config, read_weights, save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
@@ -30,13 +29,12 @@ from .config import (
     STEP_SIZE,
     DataConfig,
     LengthConfig,
-    OptimConfig,
     TrainConfig,
     config_differences,
 )
-from .optim import NewBatch, NewLength
+from .optim import NewLength
 
-STATE_VERSION = 1
+STATE_VERSION = 2
 CHECKSUMS = "checksums.json"
 _NAME = re.compile(r"step_(\d+)")
 _NEEDED = {"model.safetensors": "", "state.pt": ""}  # required even if not in the checksums
@@ -59,10 +57,8 @@ class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     optimizer: dict[str, Any]
     rng: Any
     rng_cuda: list[Any]
-    new_length: NewLength = NewLength()  # missing in older versions, like those below
-    new_batch: NewBatch = NewBatch()
-    scores: dict[str, tuple[_Count, float]] = {}  # values of Trainer.scores, by name
-    best: float = -math.inf  # of older versions, a PSNR, without its step
+    new_length: NewLength
+    scores: dict[str, tuple[_Count, float]]  # values of Trainer.scores, by name
 
 
 def step_of(checkpoint: Path) -> int:
@@ -220,30 +216,14 @@ def check_state(state: dict[str, Any], source: str) -> State:
     return fields
 
 
-class StoredRun(NamedTuple):
-    """State of a resumed run, and what it was made with.
-
-    Attributes:
-        state: content of ``state.pt``.
-        length: the planned length.
-        optim: the optimizer's options.
-        step_size: objects per optimizer step, over all processes.
-        changed: a line for each option that ``--override`` changes.
-    """
-
-    state: State
-    length: LengthConfig
-    optim: OptimConfig
-    step_size: int
-    changed: list[str]
-
-
-def read_run(checkpoint: Path, config: TrainConfig, objects: str, processes: int) -> StoredRun:
-    """Read and check the ``state.pt`` of a resumed run.
+def read_run(
+    checkpoint: Path, config: TrainConfig, objects: str, processes: int
+) -> tuple[State, LengthConfig]:
+    """Read and check the ``state.pt`` of a resumed run; also return its planned length.
 
     Args:
         checkpoint: the checkpoint's folder.
-        config: options of the resumed run, with those of ``--override``.
+        config: options of the resumed run.
         objects: ``TrainingData.fingerprint`` of the resumed run.
         processes: their number in the resumed run.
 
@@ -258,38 +238,31 @@ def read_run(checkpoint: Path, config: TrainConfig, objects: str, processes: int
     state = check_state(stored, source)
     there, here = state.config, config.to_dict()
     try:
-        kinds = {"length": LengthConfig, "optim": OptimConfig, "views": DataConfig}
+        kinds = {"length": LengthConfig, "views": DataConfig}
         groups = {
             name: msgspec.convert(there.get(name), kind, dec_hook=lambda kind, value: kind(value))
             for name, kind in kinds.items()
         }
     except (ValueError, TypeError) as error:
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
-    views, overridden = groups["views"], {*config.changes()}
-    step_size = views.objects * views.accumulate * state.world_size
-    if bool(groups["optim"].ema) != bool(config.optim.ema):
-        overridden -= {"optim.ema"}  # there is no average to continue, or it would be lost
-    free = overridden if config.views.made else overridden | STEP_SIZE
-    differing = config_differences(there, here, ignored=free)
+    views = groups["views"]
+    step_size = views.batch_size * views.accumulate * state.world_size
+    differing = config_differences(there, here, ignored=() if config.views.made else STEP_SIZE)
     if state.objects != objects:
         differing.append(f"objects ({state.objects[:80]} there, {objects} here)")
     if config.views.made and state.world_size != processes:
         differing.append(f"world_size ({state.world_size} there, {processes} here)")
-    mine = config.views.objects * config.views.accumulate * processes
-    if mine != step_size and not STEP_SIZE & overridden:
-        way = f"--override batch_size={config.views.objects} changes it"
+    mine = config.views.batch_size * config.views.accumulate * processes
+    if mine != step_size:
         each, rest = divmod(step_size, config.views.accumulate * processes)
-        if not rest:
-            way = f"--batch-size {each} keeps it, {way}"
-        differing.append(f"objects a step ({step_size} there, {mine} here: {way})")
+        way = "" if rest else f": --batch-size {each} keeps it"
+        differing.append(f"objects a step ({step_size} there, {mine} here{way})")
     if differing:
         raise UserError(
             f"{checkpoint}: belongs to another run: {', '.join(differing[:20])}; to start from its "
             f"weights alone: --init {checkpoint}, and another --out"
         )
-    kept = config_differences(there, here, ignored=overridden)
-    changed = [f"--override: {d}" for d in config_differences(there, here) if d not in kept]
-    return StoredRun(state, groups["length"], groups["optim"], step_size, changed)
+    return state, groups["length"]
 
 
 def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Path:
@@ -365,32 +338,3 @@ def load_weights(path: Path, model: Gamba) -> None:
         UserError: as for ``read_weights_of``; the model is then unchanged.
     """
     model.load_stored_state(read_weights_of(path, model))
-
-
-def load_partial(path: Path, model: Gamba) -> dict[str, list[str]]:
-    """Load those tensors of a model file that have the name and shape of the model's.
-
-    Returns:
-        Names: ``taken``; ``other shape``, in both; ``not in the model``; ``not in the file``, which
-        keep their fresh values, like those of another shape.
-
-    Raises:
-        UserError: the file is missing or damaged, has non-finite numbers, or no tensor fits; the
-            model is then unchanged.
-    """
-    config, _ = read_config(path)
-    try:
-        theirs = read_weights(path, outline(config))
-    except ValueError as error:
-        raise UserError(f"{path}: does not fit its own configuration: {error}") from error
-    ours = model.stored_state()
-    same = {name for name in ours.keys() & theirs.keys() if ours[name].shape == theirs[name].shape}
-    if not same:
-        raise UserError(f"--init-partial {path}: none of its tensors fits this model")
-    model.load_stored_state({name: theirs[name] if name in same else ours[name] for name in ours})
-    return {
-        "taken": sorted(same),
-        "other shape": sorted((ours.keys() & theirs.keys()) - same),
-        "not in the model": sorted(theirs.keys() - ours.keys()),
-        "not in the file": sorted(ours.keys() - theirs.keys()),
-    }

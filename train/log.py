@@ -1,4 +1,4 @@
-"""Log of a run: one JSON object per line, boards, and sample pictures."""
+"""Log of a run: one JSON object per line, TensorBoard, and sample pictures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
@@ -25,8 +25,6 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import reason_of
 from gamba_warp.images import save_image, to_uint8
 
-from .boards import TensorBoard, Wandb, open_board
-
 
 class RunLog:
     """Append to ``RUN/log.jsonl``; every line has ``event``, ``step`` and ``time`` (Unix, s).
@@ -34,12 +32,8 @@ class RunLog:
     Errors of the log never stop a run: each writer's first error is reported, then it is dropped.
     """
 
-    def __init__(self, run: Path, boards: Sequence[str] = ()) -> None:
-        """Open the log in the run folder.
-
-        Args:
-            run: the run folder.
-            boards: names for ``open_board``.
+    def __init__(self, run: Path) -> None:
+        """Open the log in the run folder, and TensorBoard's files if it is installed.
 
         Raises:
             UserError: the file cannot be written.
@@ -52,25 +46,24 @@ class RunLog:
             self._truncate(self._file.read(size).rfind(b"\n") + 1)
         except OSError as error:
             raise UserError(f"cannot write {run / 'log.jsonl'}: {error.strerror}") from error
-        self._run = run
         self._said: set[str] = set()
-        self._boards: dict[str, TensorBoard | Wandb] = {}
-        for name in boards:
-            with self._guarded(name):
-                board = open_board(name, run)
-                if board is not None:
-                    self._boards[name] = board
+        self._board: Any = None  # a ``SummaryWriter``
+        with self._guarded("tensorboard"), suppress(ImportError):
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._board = SummaryWriter(str(run / "tensorboard"))
 
     @contextmanager
     def _guarded(self, name: str) -> Iterator[None]:
         """Report the first error of each writer in one line, and continue."""
         try:
             yield
-        except Exception as error:  # a board's thread may raise anything
+        except Exception as error:  # TensorBoard's thread may raise anything
             if name not in self._said:
                 self._said.add(name)
                 say(f"gamba train: {name} cannot be written, the run goes on: {reason_of(error)}")
-            self._boards.pop(name, None)
+            if name == "tensorboard":
+                self._board = None
 
     def _truncate(self, size: int) -> None:
         """Remove a partial line left by a full disk or a kill."""
@@ -92,9 +85,11 @@ class RunLog:
             except OSError:
                 self._truncate(size)
                 raise
-        for name, board in [*self._boards.items()]:
-            with self._guarded(name):
-                board.write(event, step, values)
+        if self._board is not None:
+            with self._guarded("tensorboard"):
+                for name, value in values.items():
+                    if isinstance(value, (int, float)) and not isinstance(value, bool):
+                        self._board.add_scalar(f"{event}/{name}", value, step)
 
     def warn(self, step: int, message: str) -> None:
         """Print one line above the progress bar and log it."""
@@ -102,22 +97,22 @@ class RunLog:
         self.write("warning", step, message=message)
 
     def sample(self, step: int, path: Path, rows: list[Tensor]) -> None:
-        """Write sample pictures, see ``strip_of``, also on the boards; warn if that fails."""
+        """Write sample pictures, see ``strip_of``, also to TensorBoard; warn if that fails."""
         strip = strip_of(rows)
         try:
             save_image(path, strip)
         except UserError as error:
             self.warn(step, str(error))
-        for name, board in [*self._boards.items()]:
-            with self._guarded(name):
-                board.picture("val/pictures", step, to_uint8(strip))
+        if self._board is not None:
+            with self._guarded("tensorboard"):
+                self._board.add_image("val/pictures", to_uint8(strip), step, dataformats="HWC")
 
     def close(self) -> None:
         """Close the files."""
         self._file.close()
-        for name, board in [*self._boards.items()]:
-            with self._guarded(name):
-                board.close()
+        if self._board is not None:
+            with self._guarded("tensorboard"):
+                self._board.close()
 
 
 def say(text: str, file: TextIO | None = None) -> None:

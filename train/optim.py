@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,9 +14,8 @@ from msgspec import Meta
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from gamba_warp.errors import UserError, first_line
+from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.untrusted.documents import value_of
 
 from .config import OptimConfig
 
@@ -30,92 +29,32 @@ SCHEDULES: dict[str, Callable[[OptimConfig, float, float, float], float]] = {
         (total - step) / (optim.decay_share * total)
     ),
 }
+WEIGHT_DECAY = 0.05  # paper, §4.1
+BETAS = (0.9, 0.95)
+FIRST_VIEWS, LAST_VIEWS = 2, 6  # novel views at the start and at the end (paper, §3.3)
 # After a change of length, a learning rate below the share _LOW of the new schedule's first rises
 # over the share _RISE of the remaining steps.
 _LOW, _RISE = 0.1, 0.1
 
 
-def rate_factors(model: Gamba, lr_of: Sequence[str]) -> dict[str, float]:
-    """Return the factors of ``--lr-of`` by parameter name, and freeze the parameters of factor 0.
+def build_optimizer(model: Gamba) -> torch.optim.AdamW:
+    """Make AdamW, with weight decay on the matrices that are not flagged ``_no_weight_decay``.
 
-    Args:
-        model: the model.
-        lr_of: each NAME=FACTOR; NAME is a parameter or the beginning of some, up to a dot. The
-            longest counts.
-
-    Raises:
-        UserError: a name is that of no parameter, a factor no number from 0 to 1,000, or all
-            parameters are frozen.
-    """
-    given: dict[str, float] = {}
-    for text in lr_of:
-        name, _, value = text.partition("=")
-        try:
-            given[name] = float(value)
-        except ValueError:
-            given[name] = math.nan
-        if not 0 <= given[name] <= 1000:
-            raise UserError(f"--lr-of {text[:80]}: expected NAME=FACTOR, FACTOR from 0 to 1000")
-    factors, used = {}, set()
-    for name, parameter in model.named_parameters():
-        fits = [part for part in given if name == part or name.startswith(f"{part}.")]
-        used |= {*fits}
-        factors[name] = given[max(fits, key=len)] if fits else 1.0
-        if factors[name] == 0:
-            parameter.requires_grad_(False)
-    if unknown := [name for name in given if name not in used]:
-        parts = dict.fromkeys(name.split(".")[0] for name in factors)
-        raise UserError(
-            f"--lr-of {unknown[0][:80]}: no such parameter; there are {', '.join(parts)}"
-        )
-    if not any(parameter.requires_grad for parameter in model.parameters()):
-        raise UserError("--lr-of: all parameters are frozen")
-    return factors
-
-
-def build_optimizer(
-    model: Gamba, optim: OptimConfig, factors: Mapping[str, float] = {}
-) -> torch.optim.Optimizer:
-    """Make the optimizer, with weight decay on the matrices not flagged ``_no_weight_decay``.
-
-    The loop sets the learning rate of each group before each step: its ``factor`` times the rate.
+    The loop sets the learning rate of each group before each step.
 
     Args:
         model: the model; parameters without gradient are left out.
-        optim: the options.
-        factors: result of ``rate_factors``; missing names have 1.
-
-    Raises:
-        UserError: torch has no such optimizer, or it rejects the options.
     """
-    parts: dict[tuple[float, bool], list[Tensor]] = {}
-    for factor in dict.fromkeys((1.0, *factors.values())):
-        parts |= {(factor, True): [], (factor, False): []}
-    for name, p in model.named_parameters():
+    parts: dict[bool, list[Tensor]] = {True: [], False: []}
+    for p in model.parameters():
         if p.requires_grad:
-            decays = p.ndim >= 2 and not getattr(p, "_no_weight_decay", False)
-            parts[factors.get(name, 1.0), decays].append(p)
-    groups: list[dict[str, Any]] = [
-        {"params": params, "weight_decay": optim.weight_decay if decays else 0.0, "factor": factor}
-        for (factor, decays), params in parts.items()
+            parts[p.ndim >= 2 and not getattr(p, "_no_weight_decay", False)].append(p)
+    groups = [
+        {"params": params, "weight_decay": WEIGHT_DECAY if decays else 0.0}
+        for decays, params in parts.items()
         if params
     ]
-    if optim.optimizer == "AdamW" and not optim.optimizer_options:
-        return torch.optim.AdamW(groups, lr=0.0, betas=(0.9, optim.beta2), fused=True)
-    kind = getattr(torch.optim, optim.optimizer, None)
-    if not (isinstance(kind, type) and issubclass(kind, torch.optim.Optimizer)):
-        raise UserError(f"--optimizer {optim.optimizer[:60]}: not one of torch.optim")
-    options: dict[str, Any] = {"lr": 0.0}
-    for text in optim.optimizer_options:
-        name, _, value = text.partition("=")
-        if name == "lr":
-            raise UserError("--optimizer-options lr: the rate is that of --lr")
-        found = value_of(value)
-        options[name] = tuple(found) if isinstance(found, list) else found
-    try:
-        return kind(groups, **options)
-    except (TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"--optimizer {optim.optimizer}: {first_line(error)}") from error
+    return torch.optim.AdamW(groups, lr=0.0, betas=BETAS, fused=True)
 
 
 def checked_moments(
@@ -144,10 +83,6 @@ def checked_moments(
             if type(index) is not int or not 0 <= index < len(parameters):
                 raise ValueError(f"the optimizer has a state of parameter {str(index)[:40]!r}")
             names = set(entry) if isinstance(entry, dict) else set()
-            if type(optimizer) is not torch.optim.AdamW:
-                if not all(map(_plain_moment, entry.values())):
-                    raise ValueError(f"the optimizer's state of parameter {index} is not finite")
-                continue
             if names != {"step", "exp_avg", "exp_avg_sq"}:
                 raise ValueError(f"the optimizer's state of parameter {index} has other fields")
             for name, value in entry.items():
@@ -161,13 +96,6 @@ def checked_moments(
     except ValueError as error:
         raise UserError(f"{source}: damaged, {error}") from error
     return {"state": moments, "param_groups": optimizer.state_dict()["param_groups"]}
-
-
-def _plain_moment(value: object) -> bool:
-    """True for what the optimizers of torch keep: finite tensors and numbers, or nothing."""
-    if isinstance(value, Tensor):
-        return bool(value.isfinite().all())
-    return value is None or (isinstance(value, (int, float)) and math.isfinite(value))
 
 
 class Ema:
@@ -197,17 +125,13 @@ class Ema:
         self.updates += 1
 
 
-def novel_views(progress: float, first: int, last: int) -> int:
-    """Return the number of novel views per object, which grows evenly over the run (paper: 2 to 6).
+def novel_views(progress: float) -> int:
+    """Return the number of novel views per object, which grows evenly over the run.
 
     Args:
         progress: share of the run that is done, 0 to 1.
-        first: number at the start.
-        last: number at the end; if it is below ``first``, it holds for the whole run.
     """
-    if last < first:
-        return last
-    return min(last, first + int(progress * (last - first + 1)))
+    return min(LAST_VIEWS, FIRST_VIEWS + int(progress * (LAST_VIEWS - FIRST_VIEWS + 1)))
 
 
 def ema_decay(updates: int, decay: float) -> float:
@@ -230,23 +154,6 @@ class NewLength:
     elapsed: Annotated[float, Meta(ge=0, le=1e12)] = 0.0
     share: Annotated[float, Meta(ge=0, le=1)] = 1.0
     rises: bool = False
-
-
-@dataclass(frozen=True)
-class NewBatch:
-    """State of a run when it was last resumed with another number of objects a step.
-
-    Attributes:
-        step: optimizer steps done; 0 if the number never changed.
-        samples: samples taken by all processes in these steps.
-    """
-
-    step: Annotated[int, Meta(ge=0, le=10**12)] = 0
-    samples: Annotated[int, Meta(ge=0, le=10**15)] = 0
-
-    def taken(self, step: int, size: int) -> int:
-        """Return the samples taken after ``step`` steps, of ``size`` samples each since then."""
-        return self.samples + (step - self.step) * size
 
 
 @dataclass(frozen=True)

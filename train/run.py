@@ -20,13 +20,11 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.versions import __version__, installed
 
 from .batches import TrainingData, open_data
-from .boards import check_boards
 from .checkpoint import (
     find_checkpoint,
     find_initial,
     initial_differences,
     list_checkpoints,
-    load_partial,
     load_weights,
     step_of,
 )
@@ -55,26 +53,18 @@ def train(config: TrainConfig, world: World) -> int:
     Raises:
         UserError: invalid data, options or run folder, or they differ between processes.
     """
-    run, notes, started = config.run, [], ""
-    log, partial = None, {}
+    run, notes, started, log = config.run, [], "", None
     there = run.out.is_dir()  # a missing folder is made only after all checks
     with contextlib.ExitStack() as held:
 
         def claim() -> Path | None:
-            check_boards(run.log)
             if there:
                 held.enter_context(only_process(run.out, "trains"))
-            found = find_checkpoint(run.out, run.resume, notes.append)
-            if run.override and found is None:
-                raise UserError(f"--override: {run.out} has no checkpoint to resume from")
-            return found
+            return find_checkpoint(run.out, run.resume, notes.append)
 
         with world.together():
-            config = config.overridden()
             data = open_data(config, world.device)
             lpips, warning = open_lpips(config, world.device.type)
-            if run.best_by == "lpips" and lpips is None:
-                raise UserError(f"--best-by lpips: {warning or 'the run has no LPIPS'}")
         world.agree(lambda: _facts(config, data, world, lpips is not None))
         checkpoint = world.on_main(claim)  # the others use its result
         if run.resume == "auto":
@@ -96,16 +86,11 @@ def train(config: TrainConfig, world: World) -> int:
                     others = f"other {', '.join(differing[:20])}"
                     whose = f", of a run with {others if differing else 'the same options'}"
                 started = f"starts from the weights of {path}{whose}"
-            if run.init_partial is not None and checkpoint is None and world.main:
-                path = find_initial(run.init_partial, notes.append)
-                partial = load_partial(path, model)
-                counts = ", ".join(f"{len(names)} {what}" for what, names in partial.items())
-                started = f"starts from tensors of {path}: {counts}; {run.out / 'init.json'}"
             model.to(world.device)
             if lpips is not None:
                 lpips.to(world.device)
         trainer = Trainer(config, model, data, world, lpips)
-        changed = [] if checkpoint is None else trainer.restore(checkpoint)
+        changed = None if checkpoint is None else trainer.restore(checkpoint)
         with world.together():  # all checks have passed: from here on files are written
             if world.main:
                 output_folder(run.out / "samples")
@@ -117,15 +102,13 @@ def train(config: TrainConfig, world: World) -> int:
                         )
                 for folder in (run.out, run.out / "samples", run.out / "checkpoints"):
                     sweep(folder, age=0)
-                log = held.enter_context(contextlib.closing(RunLog(run.out, run.boards)))
+                log = held.enter_context(contextlib.closing(RunLog(run.out)))
         trainer.log = log
         if log is not None:
-            notes = [*data.notes, *notes, *filter(None, (warning,)), *changed]
+            notes = [*data.notes, *notes, *filter(None, (warning, changed))]
             _announce(trainer, log, checkpoint, notes)
             if started:
                 say(started)
-            if partial:
-                write_json(run.out / "init.json", partial)
         code = trainer.run()
         failures = {u: why for each in world.gather(trainer.failures) for u, why in each.items()}
         if log is not None:

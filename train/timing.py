@@ -16,6 +16,7 @@ from gamba_warp.model.posing import reference_cameras
 
 from .config import OptimConfig
 from .data.samples import Batch
+from .loop import CLIP
 from .optim import Ema, build_optimizer
 from .step import Objective, compute_gradients
 
@@ -33,11 +34,11 @@ class Step:
     def __init__(self, preset: str, objects: int, device: torch.device) -> None:
         torch.manual_seed(0)
         config = PRESETS[preset]
-        self.model, options = Gamba(config).to(device), OptimConfig()
-        self.optimizer, self.clip = build_optimizer(self.model, options), options.clip
+        self.model = Gamba(config).to(device)
+        self.optimizer = build_optimizer(self.model)
         for group in self.optimizer.param_groups:
             group["lr"] = 1e-6  # the weights hardly move, so every round does the same work
-        self.ema = Ema(self.model, options.ema)
+        self.ema = Ema(self.model, OptimConfig.ema)
         self.objective = Objective({"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "rdist": 0.0})
         views = orbit(90.0 * torch.arange(_VIEWS), 20.0, 1.8).expand(objects, -1, -1, -1)
         Ks = intrinsics(_SIZE, _SIZE).expand(objects, _VIEWS, 3, 3)
@@ -54,7 +55,7 @@ class Step:
     def run(self) -> Tensor:
         """Make the whole step and return the gradient's norm (timed)."""
         made = compute_gradients(
-            self.model, self.optimizer, [self.batch], self.objective, clip=self.clip
+            self.model, self.optimizer, [self.batch], self.objective, clip=CLIP
         )
         self.optimizer.step()
         self.ema.update()

@@ -24,7 +24,7 @@ PLANS = Path(__file__).parent / "plans"
 MAX_PLAN = 1 << 20  # bytes; the shipped plans have 5,000
 # Set by the command for all rows, or they would give rows different samples.
 RESERVED = ("data", "set", "preset", "out", "config", "resume", "init", "seed", "device")
-RESERVED += ("threads", "tensorboard")
+RESERVED += ("threads",)
 BUDGET = ("steps", "minutes")
 
 _Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}\Z")]
@@ -239,6 +239,6 @@ def commands(
     if row.background_margin is not None:
         views += ["--background-margin", row.background_margin]
     return {
-        "run/model.safetensors": [*training, "--no-tensorboard", "--out", str(folder / "run")],
+        "run/model.safetensors": [*training, "--out", str(folder / "run")],
         "views/report.json": [*map(str, views)],
     }

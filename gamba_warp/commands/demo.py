@@ -114,7 +114,7 @@ def _train_here(results, data: Path, minutes: float) -> None:
         *("--resume", "never", "--lpips", "off", "--no-radial-mask", "--ssim-weight", "0.2"),
         *("--batch-size", "4", "--views-per-object", "3", "--front-share", "0.5"),
         *("--mirror", "0.5", "--lr", "2e-3", "--warmup-steps", "30", "--cache"),
-        *("--val-every", "40", "--val-objects", "4", "--save-every", "50", "--no-tensorboard"),
+        *("--val-every", "40", "--val-objects", "4", "--save-every", "50"),
     )
     _gamba(
         *("eval-views", "--checkpoint", results.run / "model.safetensors", "--data", data),

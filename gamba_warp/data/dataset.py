@@ -447,7 +447,7 @@ class ViewDataset:
             free, _ = torch.cuda.mem_get_info(device)
             if needed > free:
                 raise UserError(
-                    f"--cache-device: {views} views take {needed / 2**30:.1f} GB, of which the GPU "
+                    f"--cache: {views} views take {needed / 2**30:.1f} GB, of which the GPU "
                     f"has {free / 2**30:.1f} free"
                 )
 

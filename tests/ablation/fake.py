@@ -35,21 +35,21 @@ def write_report(out, figures, more):
 
 
 def train(words, out):
-    """``--clip`` selects the outcome: 6 waits for a signal, 7 to 9 are failures."""
-    clip = option(words, "--clip", "").removesuffix(".0")
+    """``--novel-weight`` selects the outcome: 6 waits for a signal, 7 to 9 are failures."""
+    kind = option(words, "--novel-weight", "").removesuffix(".0")
     lines = [{"event": "start", "step": 0, "parameters": 1234, "device": "cpu"}]
     for step in range(1, 5):
-        loss = None if clip == "7" else 1.0 / step
+        loss = None if kind == "7" else 1.0 / step
         line = {"event": "train", "step": step, "minutes": step / 60, "loss": loss, "psnr": 10.0}
         lines.append({**line, "seconds": 0.1 * step, "skipped": 0})
     lines.append({"event": "val", "step": 4, "minutes": 4 / 60, "loss": 0.5, "psnr_novel": 15.0})
     (out / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    if clip == "8":
+    if kind == "8":
         print("gamba: 20 steps in a row were not finite (step 20); lower --lr")
         return 2
-    if clip == "9":
+    if kind == "9":
         os.kill(os.getpid(), signal.SIGSEGV)
-    if clip == "6" and not (out / "saved").exists():
+    if kind == "6" and not (out / "saved").exists():
 
         def save(number, frame):
             (out / "saved").write_text("x")

@@ -78,7 +78,7 @@ def test_errors_end_the_command_before_it_writes(tmp_path, capsys, monkeypatch):
 def test_the_row_changes_the_base(tmp_path):
     row = {"name": "b", "set": {"depth": 2}, "options": {"lr": None, "radial-mask": False}}
     row["background_margin"] = 0
-    base = {"options": {"minutes": 3, "lr": 0.5, "clip": 2, "extra": ["x", "y"]}}
+    base = {"options": {"minutes": 3, "lr": 0.5, "novel_weight": 2, "extra": ["x", "y"]}}
     chosen = open_plan(str(write_plan(tmp_path, "a", row, base=base)), tmp_path / "data")
     made = [commands(chosen, r, tmp_path, tmp_path, {"minutes": 1.5}) for r in chosen.rows]
     (first, views), (second, dropped) = (words.values() for words in made)

@@ -89,7 +89,7 @@ def test_rows_run_once_and_have_these_figures(gamba, tmp_path, capsys):
 
 
 def test_a_failed_row_stops_no_other(gamba, tmp_path, capsys):
-    rows = ["a", *({"name": f"b{clip}", "options": {"clip": clip}} for clip in (8, 9)), "c"]
+    rows = ["a", *({"name": f"b{kind}", "options": {"novel_weight": kind}} for kind in (8, 9)), "c"]
     path = write_plan(tmp_path, *rows)
     code, called = gamba(path)
     said = capsys.readouterr().out
@@ -111,7 +111,7 @@ def test_a_dry_run_prints_the_commands(gamba, tmp_path, capsys):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_ablation_resumes(gamba, tmp_path, number):
     """The training is asked to stop, and saves."""
-    path = write_plan(tmp_path, {"name": "a", "options": {"clip": 6}}, "b")
+    path = write_plan(tmp_path, {"name": "a", "options": {"novel_weight": 6}}, "b")
     (tmp_path / "calls").write_text("")
     words = [path, tmp_path / "data", "--out", tmp_path / "out", "--device", "cpu"]
     run = tmp_path / "out" / "rows" / "a" / "seed-0" / "run"

@@ -278,15 +278,13 @@ def test_ctrl_c_ends_training_in_one_line(tmp_path, words):
 
 NONSENSE = {
     "train DATA": {
-        "seed": "-1 4294967296", "beta2": "2 1 -0.1 nan", "lr": "inf nan 0 -1 11",
-        "minutes": "inf nan 0 -1", "weight-decay": "-1 nan inf", "size": "0 -8 100000",
+        "seed": "-1 4294967296", "lr": "inf nan 0 -1 11",
+        "minutes": "inf nan 0 -1", "size": "0 -8 100000",
         "steps": "0 -1", "epochs": "0 nan inf", "batch-size": "0 -1", "accumulate": "0",
-        "views-first": "-1 1001", "views-last": "-1", "views-per-object": "-1", "workers": "0",
-        "threads": "0 -1 1000000", "mask-weight": "nan -1", "lpips-weight": "nan inf -1",
-        "lpips-after": "-1", "rdist-weight": "nan", "rdist-epochs": "nan inf -1",
-        "rdist-steps": "-1", "warmup-steps": "-1", "clip": "nan 0 inf", "ema": "nan 1 -1",
-        "max-skipped": "0", "log-every": "0", "val-every": "-1", "val-objects": "-1",
-        "val-views": "-1", "save-every": "0 -1", "keep": "0",
+        "views-per-object": "-1 1001", "workers": "0",
+        "threads": "0 -1 1000000", "lpips-weight": "nan inf -1",
+        "lpips-after": "-1", "warmup-steps": "-1", "ema": "nan 1 -1",
+        "log-every": "0", "val-every": "-1", "val-objects": "-1", "save-every": "0 -1",
         "set": "image_size=100000000 depth=1000000000 width=-8 fov=1e999 fov=NaN depth=[[",
     },
     "train DATA --lpips on": {"size": "8 15"},

@@ -110,7 +110,7 @@ def test_a_file_that_names_code_runs_nothing(files, capsys, reader, key):
         words = [*words, "--out", out]
     if command == "train":
         words += ["--preset", "tiny", "--set", *micro.MODEL, "--lpips", "off", "--device", "cpu"]
-        words += ["--no-tensorboard", "--size", micro.SIZE, "--steps", "1"]
+        words += ["--size", micro.SIZE, "--steps", "1"]
     if reader in REFUSED:
         refused_command(capsys, command, words, key)
     else:

@@ -51,7 +51,7 @@ def test_the_queue_gives_the_batches_of_the_source(data, workers):
 
 
 def test_a_run_has_the_same_weights_for_any_number_of_threads(data, tmp_path):
-    views = {"background": "random", "views_last": 5, "accumulate": 2, "mirror": 0.5}
+    views = {"background": "random", "views_per_object": None, "accumulate": 2, "mirror": 0.5}
     for workers in (1, 3):
         changed = {"views": {**views, "workers": workers}, "length": {"steps": 4}}
         assert run(data, tmp_path / str(workers), **changed) == 0
@@ -177,22 +177,29 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
     assert not asked, "the CPU's way is left alone"
 
 
-def test_pictures_kept_on_the_device_train_as_the_files_do(data, tmp_path):
+def test_pictures_kept_on_the_device_train_as_the_files_do(data, tmp_path, monkeypatch):
     """With a model size other than that of the targets, so that both are kept."""
     views = {"background": "random", "mirror": 0.5, "recolor": 0.5, "size": 12}
+
+    def opened(config, device):
+        made = open_data(config, device)
+        made.train.preload(made.objects, (12, micro.SIZE), device)
+        return made
+
     for kept in (False, True):
-        changed = {"views": {**views, "cache_device": kept}, "length": {"steps": 3}}
-        assert run(data, tmp_path / str(kept), **changed) == 0
+        if kept:
+            monkeypatch.setattr("gamba_warp.train.run.open_data", opened)
+        assert run(data, tmp_path / str(kept), views=views, length={"steps": 3}) == 0
     assert same_weights(*(tmp_path / f"{kept}/model.safetensors" for kept in (False, True)))
 
 
 def test_kept_pictures_need_no_file_any_more(tmp_path):
     root = micro.write_dataset(tmp_path / "clouds", objects=4)
     (root / "clouda" / "002.png").write_bytes(b"no picture")
-    config = micro.options(root, root, views={"cache_device": True, "size": 12})
     before = open_dataset(root, "train")
     want = before.load("cloudb", [3, 1], 12)
-    kept = open_data(config, torch.device("cpu")).train
+    kept = open_dataset(root, "train")
+    kept.preload(range(len(kept)), (12, micro.SIZE), torch.device("cpu"))
     for path in root.rglob("*.png"):
         path.unlink()
     got = kept.load("cloudb", [3, 1], 12)
@@ -205,12 +212,12 @@ def test_kept_pictures_need_no_file_any_more(tmp_path):
 
 
 def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
-    config = micro.options(data, data, views={"cache_device": True})
+    config = micro.options(data, data, views={"cache": True})
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 2000))
     monkeypatch.setattr(
         torch, "tensor", lambda *a, device=None, real=torch.tensor, **k: real(*a, **k)
     )
-    refused(r"^--cache-device: 30 views take 0.0 GB", open_data, config, GPU)
+    refused(r"^--cache: 30 views take 0.0 GB", open_data, config, GPU)
 
 
 def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):

@@ -99,9 +99,9 @@ JOBS = {
 def training(world: Path, out: Path, steps: int) -> list[str]:
     """Command that trains a tiny model, or resumes the training."""
     line = (
-        f"train {{world}}/data --preset tiny --set {MODEL} --size 16 --lpips off --views-last 2 "
-        "--val-every 10 --device cpu --workers 1 --no-tensorboard --batch-size 2 --save-every 3 "
-        f"--log-every 1 --out {{out}} --steps {steps}"
+        f"train {{world}}/data --preset tiny --set {MODEL} --size 16 --lpips off "
+        "--views-per-object 2 --val-every 10 --device cpu --workers 1 --batch-size 2 "
+        f"--save-every 3 --log-every 1 --out {{out}} --steps {steps}"
     )
     return Job(line).words(world, out)
 

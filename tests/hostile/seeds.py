@@ -555,7 +555,7 @@ def trainer(folder: Path) -> Trainer:
     """A trainer on a dataset of one object, written into a folder."""
     parts = {"version": 1, "train": ["chair"], "val": [], "test": []}
     put({**transforms("chair"), "split.json": as_json(parts)}, folder / "data")
-    views = {"batch_size": 1, "size": 8, "views_first": 1, "views_last": 1}
+    views = {"batch_size": 1, "size": 8, "views_per_object": 1}
     config = micro.options(folder / "data", folder / "run", TINY_SET, views=views)
     torch.manual_seed(0)
     model = Gamba(config.model_config())
@@ -598,7 +598,7 @@ def protocols() -> Kinds:
 def plans() -> Kinds:
     """Plans of an ablation: a shipped one, and one with each kind of value."""
     fit = {"name": "fit", "kind": "fit", "options": {"gaussians": 50}, "series": "n", "seeds": [3]}
-    options = {"minutes": 2.5, "lr": 0.1, "radial_mask": False, "extra": ["more"], "clip": None}
+    options = {"minutes": 2.5, "lr": 0.1, "radial_mask": False, "extra": ["more"], "ema": None}
     plan = {
         **{"name": "mixed", "title": "Each kind of value", "seeds": [0, 7]},
         "base": {"preset": "tiny", "set": {"norm": "rms"}, "options": options, "fit": {"steps": 9}},

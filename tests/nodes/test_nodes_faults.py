@@ -17,7 +17,7 @@ from gamba_warp.files import PART
 from gamba_warp.train.checkpoint import damage, list_checkpoints
 
 FULL = 20_000  # bytes: enough for the log, not for a checkpoint
-FIVE = ("--views-first", 5, "--views-last", 5)  # all of them, at every step
+FIVE = ("--views-per-object", 5)  # all of them, at every step
 pytestmark = pytest.mark.slow  # a process takes seconds to import torch
 
 
@@ -40,9 +40,7 @@ def ends(data, tmp_path_factory):
 
     def step(name, out, steps, *, data=(data, data), outs=None, limits=(None, None), more=()):
         pairs = zip(data, outs or (root / out, root / out))
-        own = [
-            words(d, o, "--steps", steps, "--save-every", 3, "--keep", 9, *more) for d, o in pairs
-        ]
+        own = [words(d, o, "--steps", steps, "--save-every", 3, *more) for d, o in pairs]
         plan.append([name, own, limits])
 
     def begin(name):

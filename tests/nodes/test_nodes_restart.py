@@ -29,7 +29,8 @@ def test_killed_processes_start_anew_and_end_as_if_nothing_was(tmp_path):
     assert {line["step"] for line in lines(tmp_path / "two", "train")} == {*range(1, steps + 1)}
     assert [line["code"] for line in lines(tmp_path / "two", "end")] == [0]
     with on_threads(1):  # two halves of each batch in turn are the same sums, see test_nodes.py
-        options = {"length": {"steps": steps}, "views": {"batch_size": 2, "accumulate": 2}}
+        views = {"batch_size": 2, "accumulate": 2, "views_per_object": None}
+        options = {"length": {"steps": steps}, "views": views}
         assert run(data, tmp_path / "one", **options) == 0
     one, two = (load_file(tmp_path / name / "model.safetensors") for name in ("one", "two"))
     assert one.keys() == two.keys() and all(torch.equal(one[n], two[n]) for n in one)

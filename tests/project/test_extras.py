@@ -128,7 +128,7 @@ def test_training_loads_without_what_makes_objects(monkeypatch):
     real = versions.find_spec
     monkeypatch.setattr(versions, "find_spec", lambda n: n != "manifold3d" and real(n) or None)
     with pytest.raises(ModuleNotFoundError) as found:
-        Pool(PoolOptions(0, 0, 1, 1, 1, None), 0)
+        Pool(PoolOptions(0, 0, 1, None), 0)
     assert found.value.name == "manifold3d"
 
 

@@ -10,9 +10,10 @@ from helpers.refusals import refused
 
 from gamba_warp import cli
 from gamba_warp.model.config import PRESETS
-from gamba_warp.train import command
+from gamba_warp.train import command, loop, optim
 from gamba_warp.train.command import expand
 from gamba_warp.train.config import TrainConfig, command_line
+from gamba_warp.train.objective import losses
 from gamba_warp.train.recipes import RECIPES, recipe_words, table_of
 
 # Each number of the paper's training, quoted from its text.
@@ -20,22 +21,25 @@ PAPER = [
     ("views.size", 512, "not stated; the side of the input, §4.1, and of G-Objaverse"),
     ("length.epochs", 400, "§4.1: for totally 400 epochs"),
     ("optim.lr", 1e-3, "§4.1: AdamW ... with an initial learning rate of 1e-3"),
-    ("optim.weight_decay", 0.05, "§4.1: and a weight decay of 0.05"),
-    ("optim.clip", 1.0, "§4.1: Gradient clipping of value 1.0 ... the L2 norm of gradients"),
-    ("views.views_first", 2, "§3.3: we progressively increase the number of views from 2"),
-    ("views.views_last", 6, "§3.3: to 6 during training"),
-    ("loss.mask_weight", 1.0, "§4.1: λ_mask = 1 for the mask loss"),
+    ("views.views_per_object", None, "§3.3: we progressively increase the number of views"),
     ("loss.lpips_weight", 0.5, "§4.1: and λ_LPIPS = 0.5 for LPIPS loss"),
     ("loss.lpips", "on", "§3.3: the VGG-based perceptual loss"),
     ("loss.radial_mask", True, "§3.2: radial mask constraint"),
-    ("loss.rdist_weight", 0.1, "§4.1: λ_rdist ... is initially set at 0.1"),
-    ("loss.rdist_epochs", 10.0, "§4.1: gradually decayed to 0 over the first 10 epochs"),
     ("loss.ssim_weight", 0.0, "eq. L_train has no such term"),
     ("loss.depth_weight", 0.0, "eq. L_train has no such term"),
     ("loss.novel_weight", 1.0, "eq. L_train: one mean over V + 1 views"),
     ("loss.lpips_crop", 0, "eq. L_train: whole views"),
     ("optim.schedule", "cosine", "not stated"),
     ("optim.precision", "bfloat16", "not stated; the public code's"),
+]
+CONSTANTS = [
+    (optim.WEIGHT_DECAY, 0.05, "§4.1: and a weight decay of 0.05"),
+    (loop.CLIP, 1.0, "§4.1: Gradient clipping of value 1.0 ... the L2 norm of gradients"),
+    (optim.FIRST_VIEWS, 2, "§3.3: we progressively increase the number of views from 2"),
+    (optim.LAST_VIEWS, 6, "§3.3: to 6 during training"),
+    (losses.RDIST_WEIGHT, 0.1, "§4.1: λ_rdist ... is initially set at 0.1"),
+    (losses.RDIST_EPOCHS, 10.0, "§4.1: gradually decayed to 0 over the first 10 epochs"),
+    (losses.TERMS["mask"].weight(None, None), 1.0, "§4.1: λ_mask = 1 for the mask loss"),
 ]
 NETWORK = [
     ("image_size", 512, "§4.1: the reference image, with a spatial resolution of 512 × 512"),
@@ -62,6 +66,11 @@ def paper():
 def test_the_recipe_has_the_papers_number(paper, field, value, source):
     group, name = field.split(".")
     assert getattr(getattr(paper, group), name) == value, source
+
+
+@pytest.mark.parametrize("constant, value, source", CONSTANTS)
+def test_the_constants_are_the_papers(constant, value, source):
+    assert constant == value, source
 
 
 @pytest.mark.parametrize("field, value, source", NETWORK, ids=[row[0] for row in NETWORK])
@@ -99,7 +108,7 @@ def test_a_given_option_wins_wherever_it_stands():
     for words in (["data", "--lr", 1, "--recipe", "paper"], ["--recipe=paper", "data", "--lr", 1]):
         config = parse(*words, "--size", 128, "--no-radial-mask", "--batch_size", 3)
         assert (config.optim.lr, config.views.size, config.views.batch_size) == (1, 128, 3)
-        assert not config.loss.radial_mask and config.optim.weight_decay == 0.05
+        assert not config.loss.radial_mask
         assert config.data.name == "data" and config.run.recipe == "paper"
         # The recorded command is equivalent without the recipe, even if a default was given.
         text = command_line(config.to_dict())
@@ -121,7 +130,7 @@ def test_a_run_records_its_recipe(tmp_path, capsys):
     data = micro.write_dataset(tmp_path / "data")
     words = [str(data), "--recipe", "paper", "--preset", "tiny", "--set", *micro.MODEL]
     words += ["--batch-size", "1", "--steps", "1", "--size", "16", "--lpips", "off"]
-    words += ["--precision", "float32", "--val-every", "0", "--no-tensorboard", "--device", "cpu"]
+    words += ["--precision", "float32", "--val-every", "0", "--device", "cpu"]
     assert cli.run("train", [*words, "--out", str(tmp_path / "one")]) == 0
     assert "recipe paper: --preset paper --size 512 --epochs 400" in capsys.readouterr().out
     assert json.loads((tmp_path / "one/config.json").read_text())["run"]["recipe"] == "paper"

@@ -20,7 +20,7 @@ def test_a_copy_of_gobjaverse_trains(tmp_path):
     words = [tmp_path / "data", "--recipe", "paper", "--accumulate", 128]
     # A small model instead of the paper's, without downloaded weights.
     words += ["--preset", "tiny", "--set", *MODEL, "--size", 16, "--lpips", "off", "--steps", 1]
-    words += ["--precision", "float32", "--device", "cpu", "--no-tensorboard", "--log-every", 1]
+    words += ["--precision", "float32", "--device", "cpu", "--log-every", 1]
     assert run("train", [str(word) for word in [*words, "--out", tmp_path / "run"]]) == 0
     record = lines(tmp_path / "run", "train")[-1]
     assert record["loss_rdist"] > 0 and record["loss"] > 0

@@ -23,7 +23,7 @@ def spoil(root, *names):
 
 
 def source_of(root):
-    views = {"background": "white", "batch_size": 1, "reference": "first"}
+    views = {"background": "white", "batch_size": 1}
     config = micro.options(root, root, views=views)
     return Batches(open_data(config), config, ALONE)
 
@@ -76,7 +76,7 @@ def test_a_validation_passes_over_what_it_cannot_read(root):
     config, failures = micro.options(root, root), {}
     part = HeldOut("other", open_data(config).train, [0, 1, 2])
     spoil(root, "b")
-    found = fixed_batches(part, 1, config.model_config(), micro.SIZE, failures)
+    found = fixed_batches(part, config.model_config(), micro.SIZE, failures)
     assert [batch.uids for batch in found] == [["clouda"], ["cloudc"]]
     assert list(failures) == ["other/cloudb"]
 

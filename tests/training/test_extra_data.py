@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import micro
-from helpers.refusals import refused
 
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
@@ -51,28 +50,22 @@ def test_a_set_of_another_layout_is_read_by_its_own_rules(roots, tmp_path):
     assert joined.load("third/some").images.shape == (micro.VIEWS, side, side, 4)
 
 
-def test_the_objects_of_another_set_are_taken_by_weight(roots, tmp_path):
-    """Of five samples an epoch, 3 of weight 1 and 2 of weight 3: 9 epochs have 15 and 30."""
+def test_the_objects_of_a_set_named_twice_come_twice_in_an_epoch(roots, tmp_path):
     first, second = roots
-    views = {"extra": (second,), "extra_weights": (3.0,)}
-    config = micro.options(first, tmp_path, views=views)
-    batches = Batches(open_data(config), config, micro.ALONE)
-    epochs = [[batches._object(5 * epoch + n) for n in range(5)] for epoch in range(90)]
-    counts = np.bincount(np.concatenate(epochs))
-    # Each comes its expected 50 or 150 times, a draw more or less in a few epochs.
-    np.testing.assert_allclose(counts, [50, 50, 50, 150, 150], atol=15)
-    for epoch in epochs:
-        assert all(epoch.count(index) in (1, 2) for index in (3, 4))
-    assert len({tuple(epoch) for epoch in epochs}) > 60
-    again = Batches(open_data(config), config, micro.ALONE)
-    assert [again._object(5 * 89 + n) for n in range(5)] == epochs[-1]
-    refused("--extra-weights: 1 numbers for 0", micro.options, first, tmp_path,
-            views={"extra_weights": (3.0,)})  # fmt: skip
+    config = micro.options(first, tmp_path, views={"extra": (second, second, first)})
+    data = open_data(config)
+    assert data.objects == [0, 1, 2, 3, 4, 3, 4, 0, 1, 2]
+    batches = Batches(data, config, micro.ALONE)
+    epochs = [[batches._object(10 * epoch + n) for n in range(10)] for epoch in range(9)]
+    assert all(sorted(epoch) == sorted(data.objects) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) == 9
+    assert data.fingerprint != open_data(micro.options(first, tmp_path)).fingerprint
 
 
-def test_one_set_twice_is_refused(roots, tmp_path):
+def test_two_sets_of_one_name_are_refused(roots, tmp_path):
+    other = micro.write_dataset(tmp_path / "other" / "second", 3)
     with pytest.raises(UserError, match="two objects are called 'second/clouda'"):
-        open_data(micro.options(roots[0], tmp_path, views={"extra": (roots[1], roots[1])}))
+        open_data(micro.options(roots[0], tmp_path, views={"extra": (roots[1], other)}))
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])

@@ -65,12 +65,13 @@ def test_a_log_is_of_whole_lines_whatever_happens(tmp_path, capsys):
 
 
 def test_tensorboard_never_stops_a_run(tmp_path, capsys):
-    log = RunLog(tmp_path, ["tensorboard"])
+    pytest.importorskip("tensorboard")
+    log = RunLog(tmp_path)
 
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    log._boards["tensorboard"].writer.add_scalar = full
+    log._board.add_scalar = full
     for step in range(3):
         log.write("train", step, loss=1.0)
     log.close()

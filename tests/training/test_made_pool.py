@@ -20,13 +20,14 @@ from gamba_warp.train.data.render import draw_views
 from gamba_warp.train.data.settings import Settings
 
 VIEWS = Settings(views=3, size=16, seed=3, depth=True, fronts=1, up="y")
-OPTIONS = PoolOptions(seed=3, rank=0, world=1, uses=3, workers=1, views=VIEWS)
+OPTIONS = PoolOptions(seed=3, rank=0, world=1, views=VIEWS)
 
 
 @pytest.fixture
 def slots(monkeypatch):
     monkeypatch.setattr(pools, "SLOTS", 5)
     monkeypatch.setattr(pools, "AHEAD", 2)
+    monkeypatch.setattr(pools, "USES", 3)
 
 
 @pytest.fixture
@@ -114,7 +115,7 @@ def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeyp
 @pytest.mark.parametrize("share, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])
 def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, share, expected):
     def batches(made):
-        views = {"made": made, "made_views": 3, "batch_size": 8}
+        views = {"made": made, "batch_size": 8}
         options = micro.options(data, data, views=views)
         return Batches(open_data(options), options, micro.ALONE)
 
@@ -132,7 +133,7 @@ def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, sha
 
 
 def test_a_resumed_run_has_the_same_bits_and_another_share_is_refused(data, tmp_path, in_process):
-    views = {"made": 0.5, "made_views": 3, "made_uses": 2}
+    views = {"made": 0.5}
     assert run(data, tmp_path / "whole", length={"steps": 4}, views=views) == 0
     half = tmp_path / "half"
     assert run(data, half, length={"steps": 4}, views=views, run={"save_every": 2}) == 0
@@ -150,8 +151,7 @@ def test_a_resumed_run_has_the_same_bits_and_another_share_is_refused(data, tmp_
     "views, reason",
     [
         ({"made": 1.5}, "--made"),
-        ({"made": 0.5, "overfit": "0"}, "--made: --overfit trains on one object"),
-        ({"made": 0.5, "made_uses": 0}, "--made-uses"),
+        ({"made": -0.5}, "--made"),
     ],
 )
 def test_absurd_options_are_refused(data, tmp_path, views, reason):

@@ -2,11 +2,9 @@
 
 import json
 import runpy
-import shutil
 from pathlib import Path
 
 import pytest
-import torch
 from helpers import micro
 from helpers.micro import lines, run
 from helpers.refusals import refused
@@ -18,11 +16,11 @@ from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.encoders import ENCODERS
 from gamba_warp.model.gamba import DECODERS
 from gamba_warp.train.batches import SAMPLERS
-from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.objective.losses import TERMS
 from gamba_warp.train.optim import SCHEDULES
 
-SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "examples" / "own_parts.py"
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
+SCRIPT, LOOP = EXAMPLES / "own_parts.py", EXAMPLES / "own_loop.py"
 TABLES = (LAYOUTS, METRICS, ENCODERS, DECODERS, SAMPLERS, TERMS, SCHEDULES)
 
 
@@ -70,7 +68,7 @@ def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, scri
     words = ["train", data, "--out", out, "--preset", "tiny", "--set", *micro.MODEL]
     words += ["encoder=patches", "encoder_size=16", "encoder_frozen=false", "decoder=cloud"]
     words += ["--sampler", "hard_first", "--schedule", "linear", "--size", micro.SIZE]
-    words += ["--lpips", "off", "--no-tensorboard", "--device", "cpu", "--log-every", "1"]
+    words += ["--lpips", "off", "--device", "cpu", "--log-every", "1", "--views-per-object", "2"]
     words += ["--warmup-steps", "1", "--batch-size", "2", "--val-every", "6"]
     assert script(*words, "--steps", "6") == 0
     assert open_dataset(data).layout == "orbit"
@@ -115,45 +113,13 @@ def test_an_invalid_order_is_refused(tmp_path):
     refused("--sampler far: expected 2 positions", run, data, tmp_path / "run", **options)
 
 
-def test_rates_by_name_other_optimizers_and_partial_weights(tmp_path):
-    data = micro.write_dataset(tmp_path / "set", 3)
-    options = {"lr_of": ("blocks=0", "blocks.0.norm=1", "decoder=0.1"), "optimizer": "SGD"}
-    options |= {"optimizer_options": ("momentum=0.9",), "weight_decay": 0.0, "ema": 0.0}
-    out = tmp_path / "run"
-    assert run(data, out, optim=options, run={"save_every": 1, "keep": 9}) == 0
-    first, *_, last = (load_model(p / "model.safetensors") for p in list_checkpoints(out))
-    moved = {
-        name: not torch.equal(a, b)
-        for (name, a), b in zip(first.named_parameters(), last.parameters())
-    }
-    assert {n for n, m in moved.items() if n.startswith("blocks.") and m} <= {
-        "blocks.0.norm.weight", "blocks.0.norm.bias"}  # fmt: skip
-    assert any(m for n, m in moved.items() if n.startswith("decoder"))
-    # Momentum is kept: a run that goes on has the bits of one that was not cut.
-    cut = tmp_path / "cut"
-    shutil.copytree(out, cut)
-    for checkpoint in list_checkpoints(cut)[3:]:
-        shutil.rmtree(checkpoint)
-    assert run(data, cut, optim=options) == 0
-    assert micro.same_weights(cut / "model.safetensors", out / "model.safetensors")
-    for lr_of, words in (("nothing=1", "no such parameter; there are"), ("blocks", "expected NAME"),
-                         ("blocks=-1", "FACTOR from 0")):  # fmt: skip
-        refused(words, run, data, tmp_path / "x", optim={"lr_of": (lr_of,)})
-    refused("not one of torch.optim", run, data, tmp_path / "x", optim={"optimizer": "os"})
-    bad = {"optimizer": "SGD", "optimizer_options": ("speed=1",)}
-    refused("--optimizer SGD: .*speed", run, data, tmp_path / "x", optim=bad)
-
-    wider = tuple(change.replace("depth=1", "depth=2") for change in micro.MODEL)
-    wider = tuple(change.replace("state_size=4", "state_size=8") for change in wider)
-    still = {"lr": 1e-30, "weight_decay": 0.0, "ema": 0.0}
-    partial = {"init_partial": out / "model.safetensors", "val_every": 100}
-    wide = tmp_path / "wide"
-    assert run(data, wide, wider, run=partial, optim=still, length={"steps": 1}) == 0
-    named = json.loads((wide / "init.json").read_text())
-    assert "decoder.mlp.0.weight" in named["taken"] or named["taken"]
-    assert "blocks.0.mamba.A_log" in named["other shape"] and not named["not in the model"]
-    assert any(name.startswith("blocks.1.") for name in named["not in the file"])
-    got, source = load_model(wide / "model.safetensors"), load_model(out / "model.safetensors")
-    theirs = source.state_dict()
-    assert all(torch.equal(got.state_dict()[name], theirs[name]) for name in named["taken"])
-    assert [line["step"] for line in lines(wide, "val")] == [0, 1]
+def test_the_example_of_a_loop_trains(tmp_path, monkeypatch, capsys):
+    data, out = micro.write_dataset(tmp_path / "clouds", 4), tmp_path / "run"
+    words = ["--steps", "2", "--out", str(out)]
+    for more in ([str(data)], [str(data)] * 2 + ["--weights", "2", "1", "--init", str(out)]):
+        monkeypatch.setattr("sys.argv", [str(LOOP), *more, *words])
+        runpy.run_path(str(LOOP), run_name="__main__")
+        step, *figures = capsys.readouterr().out.splitlines()[-1].split()
+        assert step == "2" and all(0 < float(figure) < 100 for figure in figures)
+    assert load_model(out).config.depth == 2
+    assert len(LOOP.read_text().splitlines()) <= 60

@@ -20,7 +20,7 @@ from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.config import command_line, config_differences
 from gamba_warp.train.step import weigh_views
 
-STILL = {"optim": {"lr": 1e-30, "weight_decay": 0.0, "ema": 0.0}, "length": {"steps": 1}}
+STILL = {"optim": {"lr": 1e-30, "ema": 0.0}, "length": {"steps": 1}}
 
 
 def times(folder):
@@ -41,7 +41,7 @@ def test_another_length_goes_on_at_the_rate_of_the_checkpoint(data, done, tmp_pa
     """A cosine over 8 steps, at step 4: the rest is shortened or lengthened, with a note."""
     source = str(list_checkpoints(done)[0])
     groups = {"length": {"steps": total}, "optim": {"ema": 0.5}}
-    resumed = {"resume": source, "save_every": 1, "keep": 9}
+    resumed = {"resume": source, "save_every": 1}
     assert run(data, tmp_path, run=resumed, **groups) == 0
     (note,) = (line["message"] for line in lines(tmp_path, "warning"))
     assert f"length is now {total} steps, not 8 steps" in note and "goes on from" in note
@@ -67,22 +67,22 @@ def test_a_finished_run_says_that_its_rate_rises_again(data, done, tmp_path, cap
 
 def test_other_losses_are_refused_and_init_is_named(data, done, tmp_path, capsys):
     shutil.copytree(done, tmp_path / "run")
-    other = {"loss": {"mask_weight": 0.5}, "length": {"steps": 9}, "optim": {"ema": 0.5}}
+    other = {"loss": {"novel_weight": 0.5}, "length": {"steps": 9}, "optim": {"ema": 0.5}}
     before = times(tmp_path / "run")
-    with pytest.raises(UserError, match=r"loss\.mask_weight \(1\.0 there, 0\.5 here\).*") as caught:
+    with pytest.raises(UserError, match=r"novel_weight \(1\.0 there, 0\.5 here\)") as caught:
         run(data, tmp_path / "run", **other)
     way = f"--init {list_checkpoints(tmp_path / 'run')[-1]}, and another --out"
     assert way in str(caught.value) and "\n" not in str(caught.value)
     assert times(tmp_path / "run") == before, "nothing is written by a run that is refused"
     resumed = {"resume": str(list_checkpoints(done)[-1])}
-    refused(r"loss\.mask_weight", run, data, tmp_path / "other", run=resumed, **other)
+    refused(r"loss\.novel_weight", run, data, tmp_path / "other", run=resumed, **other)
     assert not (tmp_path / "other").exists()
     init = list_checkpoints(done)[-1]
     capsys.readouterr()
     assert run(data, tmp_path / "new", run={"init": init}, **other) == 0
     (said,) = [s for s in capsys.readouterr().out.splitlines() if s.startswith("starts from")]
     assert f"weights of {init / 'ema.safetensors'}, of a run with other " in said
-    assert "loss.mask_weight (1.0 there, 0.5 here)" in said and "length.steps (8" in said
+    assert "loss.novel_weight (1.0 there, 0.5 here)" in said and "length.steps (8" in said
     assert "optim" not in said and "run." not in said
 
 

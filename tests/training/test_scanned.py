@@ -1,13 +1,10 @@
-"""Training rejects Google Scanned Objects unless requested; then the card states it."""
+"""Training rejects Google Scanned Objects, which are for evaluation."""
 
 import json
 
 import pytest
 from helpers import micro
 from helpers.refusals import refused
-
-from gamba_warp.pages.card import about_model, read_card
-from gamba_warp.train.batches import open_data
 
 
 @pytest.fixture
@@ -22,7 +19,7 @@ def sets(tmp_path):
     return first, things
 
 
-SAID = "the data has Google Scanned Objects.*\\({}\\): leave them out, or give --train-on-gso"
+SAID = "the data has Google Scanned Objects.*\\({}\\): leave them out"
 
 
 @pytest.mark.parametrize(
@@ -31,9 +28,8 @@ SAID = "the data has Google Scanned Objects.*\\({}\\): leave them out, or give -
         (1, {}, ["Dino_4", "Elephant"]),
         (0, {"views": {"extra": True}}, ["things/Dino_4"]),
         (0, {"run": {"val_extra": True}}, ["Elephant"]),
-        (1, {"views": {"overfit": "Dino_4"}}, ["Dino_4"]),
     ],
-    ids=["data", "extra", "val-extra", "overfit"],
+    ids=["data", "extra", "val-extra"],
 )
 def test_their_names_are_refused_wherever_they_come_from(sets, tmp_path, place, groups, names):
     out = tmp_path / "run"
@@ -43,21 +39,3 @@ def test_their_names_are_refused_wherever_they_come_from(sets, tmp_path, place, 
     }
     refused(SAID.format(", ".join(names)), micro.run, sets[place], out, **groups)
     assert not out.exists()
-    views = {**groups.get("views", {}), "train_on_gso": True}
-    asked = micro.options(sets[place], out, **{**groups, "views": views})
-    assert open_data(asked).scanned == names
-
-
-def test_the_card_states_what_was_asked_for(sets, tmp_path):
-    views = {"extra": (sets[1],), "train_on_gso": True}
-    changes = {"val_every": 6, "val_extra": (sets[1],)}
-    assert micro.run(sets[0], tmp_path / "run", views=views, run=changes) == 0
-    for name in ("model", "best"):
-        path = tmp_path / "run" / f"{name}.safetensors"
-        card = read_card(path)
-        assert card is not None and (card.objects, card.steps) == (4, 6)
-        assert "--train-on-gso" in card.command and card.data == "first, things"
-        told = dict(about_model(path))["Limits"]
-        assert "2 of Google Scanned Objects" in told and told.endswith("Elephant, things/Dino_4")
-    assert micro.run(sets[0], tmp_path / "other", run={"val_every": 6}) == 0
-    assert read_card(tmp_path / "other" / "model.safetensors") is None

@@ -124,30 +124,20 @@ def test_minutes_go_on_without_a_jump():
 
 
 def test_novel_views_grow_from_first_to_last_in_equal_shares():
-    views = [novel_views(i / 100, 2, 6) for i in range(101)]
+    views = [novel_views(i / 100) for i in range(101)]
     assert [views.count(n) for n in (2, 3, 4, 5, 6)] == [20, 20, 20, 20, 21]
     assert views == sorted(views)
-    assert novel_views(0.0, 3, 3) == novel_views(1.0, 3, 3) == 3
-
-
-def test_radial_weight_falls_to_zero_in_steps():
-    loss = LossConfig(rdist_weight=0.1, rdist_steps=40)
-    assert radial_weight(loss, Progress(0, 0, 0)) == 0.1
-    # Epochs and share do not count.
-    assert radial_weight(loss, Progress(20, 9, 0.9)) == pytest.approx(0.05)
-    assert radial_weight(loss, Progress(40, 0, 0)) == radial_weight(loss, Progress(400, 0, 0)) == 0
-    assert radial_weight(replace(loss, rdist_steps=0), Progress(0, 0, 0)) == 0
-    assert radial_weight(replace(loss, radial_mask=False), Progress(0, 0, 0)) == 0
 
 
 def test_radial_weight_falls_in_epochs_or_a_share_of_the_run():
     """The paper's 10 of 400 epochs stay; of 20 epochs a quarter is 5."""
-    loss = LossConfig(rdist_weight=0.1)
+    loss = LossConfig()
     for epochs, run, want in ((0, 400, 0.1), (5, 400, 0.05), (10, 400, 0), (2.5, 20, 0.05)):
         got = radial_weight(loss, Progress(7, epochs, epochs / run))
         assert got == pytest.approx(want, abs=1e-12)
     ends = Progress(7, 5, 0.25), Progress(7, 19, 0.95)
     assert [radial_weight(loss, at) for at in ends] == [0, 0]
+    assert radial_weight(replace(loss, radial_mask=False), Progress(0, 0, 0)) == 0
 
 
 def test_ema_decay_is_short_at_first():

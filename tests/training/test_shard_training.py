@@ -178,10 +178,6 @@ def test_the_order_by_shards_needs_shards(data, tmp_path):
     refused("clouda is in no shard", run, data, tmp_path / "run", views=BY_SHARD)
 
 
-def test_one_object_needs_no_order_by_shards(data, tmp_path):
-    assert run(data, tmp_path / "run", views={**BY_SHARD, "overfit": "clouda"}) == 0
-
-
 def test_shards_of_a_server_train_like_local_ones(packed, tmp_path, capsys):
     assert run(packed, tmp_path / "local", views=BY_SHARD) == 0
     with served(packed, broken=(1, 3)) as (address, asked):

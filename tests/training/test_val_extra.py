@@ -25,11 +25,11 @@ def sets(tmp_path_factory):
 def test_figures_of_a_further_set_are_those_of_eval_views(sets, tmp_path, capsys):
     first, things = sets
     out = tmp_path / "run"
-    changes = {"val_every": 3, "val_extra": (things,), "val_views": 5, "tensorboard": True}
+    changes = {"val_every": 3, "val_extra": (things,)}
     assert micro.run(first, out, run=changes) == 0
     assert [line["step"] for line in micro.lines(out, "val/things")] == [3, 6]
     for event, data in (("val", first), ("val/things", things)):
-        options = "--split", "val", "--no-baselines", "--strips", 0, "--sheet", 0
+        options = "--split", "val", "--no-baselines", "--strips", 0, "--sheet", 0, "--views", 5
         _, report = eval_views(out / "model.safetensors", data, tmp_path / data.name, *options)
         means = {"novel": report["mean"], "input": report["mean"]["input"]}
         last = micro.lines(out, event)[-1]
@@ -64,7 +64,7 @@ def test_the_best_is_by_the_mean_over_the_sets(sets, tmp_path, monkeypatch, caps
     # At step 5 the other has no figure, and at step 6 none is a number.
     figures = [(20, 10), (19, 12), (25, 5), (10, 20), (40, 0), (float("nan"), 30)]
     scripted(monkeypatch, figures)
-    changes = {"val_every": 1, "save_every": 1, "keep": 9, "val_extra": (sets[1],)}
+    changes = {"val_every": 1, "save_every": 1, "val_extra": (sets[1],)}
     assert micro.run(sets[0], tmp_path, run=changes) == 0
     assert [(line["step"], line["psnr"]) for line in micro.lines(tmp_path, "best")] == [
         (1, 15.0),
@@ -107,6 +107,3 @@ def test_sets_that_cannot_be_validated_on_are_refused(sets, tmp_path):
     bare = micro.write_dataset(tmp_path / "bare", 2)
     (bare / "split.json").write_text(json.dumps({"version": 2, "train": ["clouda", "cloudb"]}))
     refused("--val-extra: .*bare: none of its 2 objects is in the val split", opened, bare)
-    views = {"overfit": "clouda"}
-    refused("--val-extra: --overfit", micro.options, first, tmp_path, views=views,
-            run={"val_extra": (things,)})  # fmt: skip

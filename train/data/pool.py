@@ -1,7 +1,7 @@
 """Made objects for training: other processes make and render them while the model trains.
 
 The pool has ``SLOTS`` slots. A round takes one sample from each slot, in its own order, and an
-object stays in its slot for ``uses`` rounds. The slots change their objects at staggered rounds, so
+object stays in its slot for ``USES`` rounds. The slots change their objects at staggered rounds, so
 every round needs the same number of new ones. The object of a sample is a function of the sample's
 number, so a resumed run continues with the same objects.
 """
@@ -9,10 +9,10 @@ number, so a resumed run continues with the same objects.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import count, islice
+from itertools import count
 
 import numpy as np
 import torch
@@ -29,6 +29,8 @@ from .settings import Settings
 
 SLOTS = 64  # objects in use at a time; one has 2 MB at 12 views of 128² with depth
 AHEAD = 8  # objects prepared ahead
+USES = 16  # samples of an object
+VIEWS = 12  # of an object
 
 
 @dataclass(frozen=True)
@@ -39,16 +41,12 @@ class PoolOptions:
         seed: seed of all objects, their cameras and lights.
         rank: rank of this training process; each has its own objects.
         world: number of training processes.
-        uses: samples of an object.
-        workers: number of processes that make and render.
         views: options of the pictures.
     """
 
     seed: int
     rank: int
     world: int
-    uses: int
-    workers: int
     views: Settings
 
 
@@ -108,14 +106,13 @@ class Pool:
         """Number of the object of a sample."""
         round_number, position = divmod(sample, SLOTS)
         slot = int(_order(self.options.seed, round_number)[position])
-        generation = (round_number + slot % self.options.uses) // self.options.uses
+        generation = (round_number + slot % USES) // USES
         return (generation * SLOTS + slot) * self.options.world + self.options.rank
 
     def _last_round(self, number: int) -> int:
         """Last round that uses an object."""
         generation, slot = divmod(number // self.options.world, SLOTS)
-        uses = self.options.uses
-        return (generation + 1) * uses - slot % uses - 1
+        return (generation + 1) * USES - slot % USES - 1
 
     def _needed(self) -> Iterator[int]:
         """Yield the numbers of all objects, each once, in the order of first use."""
@@ -129,38 +126,33 @@ class Pool:
 
     def _make(self) -> None:
         """Make objects until the pool is closed or one fails; runs in its own thread."""
-        needed = self._needed()
         try:
-            while not self._closed:
-                numbers = [*islice(needed, self.options.workers)]
-                if failed := self._make_all(numbers):
-                    failed = self._make_all([*failed])  # memory may have been short for a moment
-                if failed and not self._closed:
-                    number, reason = failed.popitem()
+            for number in self._needed():
+                if reason := self._make_one(number):
+                    reason = self._make_one(number)  # memory may have been short for a moment
+                if self._closed:
+                    return
+                if reason:
                     raise UserError(f"made object {number}: {reason}")
         except Exception as error:  # ``take`` raises it in the caller's thread
             with self._changed:
                 self._failure = str(error)
                 self._changed.notify_all()
 
-    def _make_all(self, numbers: Sequence[int]) -> dict[int, str]:
-        """Make these objects; return the failures, reasons by number."""
-        failed = {}
+    def _make_one(self, number: int) -> str | None:
+        """Make an object in another process; return the reason of a failure."""
         made = partial(_make_views, seed=self.options.seed, settings=self.options.views)
-        for index, result in run_each(made, numbers, workers=self.options.workers):
-            if isinstance(result, Failed):
-                failed[numbers[index]] = result.reason
-                continue
-            uid = f"made-{self.options.seed}-{numbers[index]}"
-            dataset = ViewDataset({uid: partial(_files, result)}, "made", cache=False)
-            with self._changed:
-                self._ready[numbers[index]] = dataset
-                self._untaken.add(numbers[index])
-                self._changed.notify_all()
-                self._changed.wait_for(lambda: len(self._untaken) < AHEAD or self._closed)
-                if self._closed:
-                    break
-        return failed
+        _, result = next(iter(run_each(made, [number], workers=1)))
+        if isinstance(result, Failed):
+            return result.reason
+        uid = f"made-{self.options.seed}-{number}"
+        dataset = ViewDataset({uid: partial(_files, result)}, "made", cache=False)
+        with self._changed:
+            self._ready[number] = dataset
+            self._untaken.add(number)
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: len(self._untaken) < AHEAD or self._closed)
+        return None
 
 
 @lru_cache(maxsize=8)

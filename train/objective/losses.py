@@ -26,6 +26,9 @@ from ..config import LossConfig, TrainConfig
 from .radial_mask import contour_distances, project_means, radial_mask_loss
 
 DEPTH_BETA = 0.02  # object units; see ``depth_loss``
+# Of the radial mask constraint: its weight at the start and the epochs over which it falls to 0
+# (paper, §4.1), but over this share of a run at most, so that short runs end without it.
+RDIST_WEIGHT, RDIST_EPOCHS, RDIST_SHARE = 0.1, 10.0, 0.25
 SLOPE_STEPS, SLOPE_WEIGHT = (1, 2, 4, 8), 1.0  # pixels; beside the distances
 
 
@@ -232,21 +235,18 @@ class Term(NamedTuple):
 def radial_weight(loss: LossConfig, at: Progress) -> float:
     """Return the radial mask constraint's weight, which falls linearly to 0.
 
-    It falls over ``rdist_steps``, or else over ``rdist_epochs``, but over ``rdist_share`` of the
-    run at most; 0 without the constraint, and in a validation.
+    It falls over ``RDIST_EPOCHS``, but over ``RDIST_SHARE`` of the run at most; 0 without the
+    constraint, and in a validation.
     """
-    spans = [(at.epochs, loss.rdist_epochs), (at.done, loss.rdist_share)]
-    if loss.rdist_steps is not None:
-        spans = [(at.step, loss.rdist_steps)]
-    left = min(1.0 - now / span if span > 0 else 0.0 for now, span in spans)
-    return loss.rdist_weight * max(0.0, left) if loss.radial_mask and not at.validates else 0.0
+    left = 1.0 - max(at.epochs / RDIST_EPOCHS, at.done / RDIST_SHARE)
+    return RDIST_WEIGHT * max(0.0, left) if loss.radial_mask and not at.validates else 0.0
 
 
 # In the order of summation. A script may add to it (docs/change-the-training.md).
 TERMS: dict[str, Term] = {
     "rgb": Term(lambda loss, at: 1.0, lambda s: mse(s.rgb, s.target), "MSE and mask", True),
     "mask": Term(
-        lambda loss, at: loss.mask_weight,
+        lambda loss, at: 1.0,
         lambda s: mse(s.alpha, s.target_alpha),
         "MSE and mask",
         True,

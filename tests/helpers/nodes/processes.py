@@ -41,10 +41,10 @@ def environment(**more: object) -> dict[str, str]:
 def words(data: Path, out: Path, *more: object) -> list[str]:
     """Arguments of ``gamba train`` for a quick run of a narrow network; ``more`` replaces them."""
     quick = {"--preset": "tiny", "--lpips": "off", "--device": "cpu", "--size": micro.SIZE}
-    quick |= {"--views-first": 1, "--views-last": 3, "--batch-size": 2, "--warmup-steps": 1}
+    quick |= {"--batch-size": 2, "--warmup-steps": 1}
     quick |= {"--val-every": 0, "--log-every": 1, "--threads": 1, "--out": out}
     kept = [word for pair in quick.items() if pair[0] not in more for word in pair]
-    return [*map(str, [data, "--set", *micro.MODEL, "--no-tensorboard", *kept, *more])]
+    return [*map(str, [data, "--set", *micro.MODEL, *kept, *more])]
 
 
 def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -> list[End]:
@@ -60,6 +60,7 @@ def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -
     commands = []
     for rank, own in enumerate(arguments):
         script = f"{(patch or {}).get(rank, '')}\nimport sys\nfrom gamba_warp import cli\n"
+        script += "from gamba_warp.train import loop\nloop.KEPT = 9\n"
         script += "cli.main(['train', *sys.argv[1:]])\n"
         commands.append([python(), "-c", script, *own])
     return run_all(commands)

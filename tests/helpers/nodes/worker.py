@@ -25,6 +25,7 @@ from helpers.disk import full_at
 def main() -> None:
     plan, result = map(Path, sys.argv[1:])
     torch.set_num_threads(1)
+    loop.KEPT = 9
     ends = {}
     with world("cpu") as place:
         if not place.main:  # as if each had its own disk: only the first can read a checkpoint
