@@ -20,7 +20,6 @@ from ..runtime.tables import markdown
 
 _SLICE = 10.0  # seconds for an operator before the next one has its turn
 _SHRINK = 30.0  # seconds for making a failing case smaller
-_SHRUNK = 5  # failures that are made smaller; all are reported
 _HEAD = (
     *("op", "kind", "cases", "forward error", "of", "gradient error", "of", "error / limit"),
     *("undecided pixels", "steep", "non-finite", "failures"),
@@ -105,7 +104,9 @@ class StressRun:
     def run(
         self, cases: int | None, seconds: float, say: Callable[[str], None] = lambda text: None
     ) -> None:
-        """Run cases until their number, the time limit or Ctrl-C; operators take turns.
+        """Run cases until their number, the time limit or Ctrl-C.
+
+        Operators take turns; one that fails has no more turns.
 
         Args:
             cases: of each operator; None for no limit.
@@ -114,14 +115,16 @@ class StressRun:
         """
         began = time.monotonic()
         try:
+            ops, slice_ = self._ops, math.inf if cases else min(_SLICE, seconds / len(self._ops))
             for turn in count():
-                for op in self._ops:
+                for op in ops:
                     now = time.monotonic()
                     if now - began >= seconds:
                         return
-                    slice_ = math.inf if cases else min(_SLICE, seconds / len(self._ops))
                     self._take_turn(op, turn, cases, min(began + seconds, now + slice_), say)
-                if cases:
+                failed = {failure["case"]["op"] for failure in self.failures}
+                ops = [op for op in ops if op.name not in failed]
+                if cases or not ops:
                     return
         except KeyboardInterrupt:
             self.about["interrupted"] = True
@@ -149,10 +152,9 @@ class StressRun:
                 raise _FAILURES[failure["what"]]
             say(f"worst {max(r['ratio'] for r in self._rows.values()):.2f} of its limit")
 
-        shrink = len(self.failures) < _SHRUNK
         options = settings(
             max_examples=cases or 10**6,
-            phases=[Phase.generate, *[Phase.shrink] * shrink],
+            phases=[Phase.generate, Phase.shrink],
             deadline=None,
             database=None,
             report_multiple_bugs=False,

@@ -44,14 +44,10 @@ class Executed(NamedTuple):
             the launch had not touched, the sectors of threads' "own" memory, and of shared memory
             "passes", "conflicts" among them, and "together", the passes if a warp's lanes could be
             served at once.
-        lanes: mean number of active lanes of 32 per instruction.
-        splits: share of branches that diverge in a warp.
     """
 
     name: str
     counts: dict[str, float]
-    lanes: float
-    splits: float
 
 
 Counts = dict[str, dict[str, Executed]]  # by direction and entry
@@ -70,7 +66,6 @@ def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
     read = {x for i in program.code for x in (*i.given[: i.reads], i.guard)}
     counts: Counter[str] = Counter()
     fields = [name for name, _ in Count._fields_]
-    steps = lanes = jumps = splits = 0
     for i, warps, row in zip(program.code, times, asked):
         kind, more = units()[i.op], dict(zip(fields, map(int, row)))
         memory = kind in ("load", "store")
@@ -84,14 +79,11 @@ def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
             continue
         twice = kind == "integer" and names[i.op].endswith("64")  # 32 bits at a time
         counts[kind] += warps * (1 + twice)
-        steps, lanes = steps + warps, lanes + more["lanes"]
-        jumps, splits = jumps + warps * (kind == "jump"), splits + more["splits"]
         if memory or kind == "atomic":
             more["own"] = more.pop("sectors") if kind == "local" else 0
             counts.update({name: more.get(name, 0) for name in ASKED})
     found = _NAME.fullmatch(program.name)
-    share = splits / jumps if jumps else 0.0
-    return Executed(found[1] if found else program.name, dict(counts), lanes / steps, share)
+    return Executed(found[1] if found else program.name, dict(counts))
 
 
 def count(

@@ -114,7 +114,6 @@ def rows_of(op: str, case: str, seen: set[str]) -> Iterator[dict]:
                 yield {
                     **dict(op=op, kernel=ran.name, case=case, direction=direction, per=unit),
                     **dict(number=number, each={"all": counting.instructions(each)} | each),
-                    **dict(lanes=ran.lanes, splits=ran.splits),
                 }
 
 
@@ -128,9 +127,8 @@ _KINDS = ("all", "float", "special", "integer", "multiply", "convert", "global",
 _KINDS += ("shuffle", "barrier", "jump", "atomic", "routine")
 _TEXT = f"""# What the CUDA kernels execute
 
-Written by `python -m ptx.counts`: the kernels' PTX was executed without a GPU
-([how](../../../tests/ptx/README.md)), and every instruction counted. **These are counts, not
-times.**
+Counts, not times: the kernels' PTX was executed without a GPU
+([`python -m ptx.counts`](../../../tests/ptx/README.md)).
 
 The scan and the convolution have {TOKENS:,} tokens and {WIDTH} channels, the scan 16 states and, in
 segments, two; the rasterizer one view of 512 x 512 of {GAUSSIANS:,} Gaussians. A kernel is listed
@@ -145,13 +143,12 @@ many instructions. Machine code of the scan has 4 to 8 % fewer, mostly integers.
 
 """
 _MEMORY = """
-## Memory and lanes
+## Memory
 Per the same units. **sectors** of 32 bytes of global memory that warps' accesses take from the L1
 cache; **first**, those that the launch had not touched before; **own**, those of threads' own
 memory; **used**, the requested share of the sectors' bytes (above 100 % lanes share them).
 **passes** of shared memory: 32 lanes at a time for 4 bytes, 16 for 8, 8 for 16; **conflicts** of
-banks among them; **together**, the passes if all 32 lanes could be served at once. **lanes** of 32
-that are active in an instruction, on average; **split**, the share of branches that diverge.
+banks among them; **together**, the passes if all 32 lanes could be served at once.
 
 """
 
@@ -164,8 +161,7 @@ def markdown(document: dict) -> str:
     """Return the page of a document.
 
     A row of its ``kernels`` has ``op, kernel, case, direction, per`` (the unit), ``number`` (warps'
-    worth of units), ``each`` (counts per unit), ``lanes`` and ``splits`` (as ``Executed``). Its
-    ``peers`` are of ``peers.compare``.
+    worth of units) and ``each`` (counts per unit). Its ``peers`` are of ``peers.compare``.
     """
     counts, memory = [], []
     for row in document["kernels"]:
@@ -176,10 +172,9 @@ def markdown(document: dict) -> str:
         used = f"{each['bytes'] / SECTOR / each['sectors']:.0%}"
         sectors = [_figure(each[name]) for name in ("sectors", "first", "own")]
         passes = [_figure(each[name]) for name in ("passes", "conflicts", "together")]
-        lanes = [f"{row['lanes']:.1f}", f"{row['splits']:.0%}"]
-        memory.append([*names, *sectors, used, *passes, *lanes])
+        memory.append([*names, *sectors, used, *passes])
     names = ["kernel", "case", "per"]
-    header = [*names, "sectors", "first", "own", "used", *ASKED[-3:], "lanes", "split"]
+    header = [*names, "sectors", "first", "own", "used", *ASKED[-3:]]
     first = tables.markdown([*names, *_KINDS], counts)
     second = tables.markdown(header, memory)
     return _TEXT + first + "\n" + _MEMORY + second + "\n\n" + peers.markdown(document["peers"])

@@ -441,11 +441,10 @@ def compare(folder: Path) -> dict:
 
 
 _TEXT = """## Compared with other libraries
-Written by `python -m ptx.counts --peers`: the sources of {packages} were compiled by nvcc {nvcc},
-with the flags of their setup.py (but C++20) and the template arguments that their host code
-chooses, and executed in the same interpreter on the same inputs; their results agree with ours. The
-scan and the convolution have {channels:,} channels, the scan {states} states, softplus and gate,
-the convolution {width} weights and SiLU; the rasterizer draws the view of above.
+Written by `python -m ptx.counts --peers` ({sources}): sources are compiled with the flags of their
+setup.py (but C++20) and the template arguments that their host code chooses, and executed in the
+same interpreter on the same inputs; their results agree with ours. Scan and convolution have
+{channels:,} channels, {states} states, softplus and gate, {width} weights and SiLU.
 
 **Ratios, ours to theirs: below 1 is less.** Ours add the rows of gradients in a fixed order, theirs
 with atomics. Neither count includes the sort of the lists by a library and torch's own operations
@@ -456,10 +455,8 @@ before and after a kernel: zeros, sums of parts, the directions of gsplat's harm
 
 def markdown(document: dict) -> str:
     """Return the section of a page, of the document of ``compare``."""
-    versions = dict(document["versions"])
-    nvcc = versions.pop("nvcc")
-    packages = ", ".join(f"{name} {version}" for name, version in versions.items())
-    text = _TEXT.format(packages=packages, nvcc=nvcc, channels=CHANNELS, states=STATES, width=WIDTH)
+    sources = ", ".join(f"{name} {version}" for name, version in document["versions"].items())
+    text = _TEXT.format(sources=sources, channels=CHANNELS, states=STATES, width=WIDTH)
     table = []
     for row in document["rows"]:
         ours, theirs = row["ours"], row["theirs"]

@@ -56,7 +56,7 @@ def test_known_counts(kernels):
     for row in kernels.values():
         each = row["each"]
         assert each["together"] <= each["passes"] and each["conflicts"] < each["passes"]
-        assert 0 < each["first"] <= each["sectors"] and 8 < row["lanes"] <= 32
+        assert 0 < each["first"] <= each["sectors"]
 
 
 def test_bounds(kernels):
@@ -123,7 +123,7 @@ def test_all_channels_from_two_runs():
 
     def run(channels):
         counts = {"first": 100 + 3 * channels, "float": 2 * channels}
-        return {"forward": [Executed("k", counts, 32.0, 0.0)]}
+        return {"forward": [Executed("k", counts)]}
 
     ((whole,),) = at_full_width(run, 4, 16).values()
     assert whole.counts == {"first": 16 * (100 + 3 * 1024), "float": 16 * 2 * 1024}
