@@ -31,10 +31,9 @@ from .dry_run import MULTIPROCESSORS
 from .machine import Missing
 
 PAGE = Path(__file__).parents[2] / "docs" / "lab" / "benchmarks" / "counts.md"
-LENGTH = 16961  # of the scan in the paper's model
+LENGTH, LANES = 16961, 32  # of the scan in the paper's model; of a warp
 # The executed part of it: whole chunks, two blocks of channels; one segment, or two for several.
 TOKENS, WIDTH, SEGMENTS = 1024, 128, 2
-LANES = 32
 # One ends at once where the lists have room, the other is a single thread.
 _LEFT_OUT = ("composite_unlisted", "composite_vjp_unlisted", "note")
 # By kernel, or for all (""), the unit of the counts: a text, and the number of units in warps.

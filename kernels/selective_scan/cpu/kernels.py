@@ -36,7 +36,7 @@ _WORK = wp.array2d(dtype=lanes)  # a row for each piece of the launch
 
 
 class Tuning(NamedTuple):
-    """Constants of a compiled kernel; ``make study WHAT=scan`` has the cost of each choice.
+    """Constants of a compiled kernel; the scan's README has the cost of the choices.
 
     Attributes:
         chunk: tokens between saved states, which the gradient walks at once; a multiple of
