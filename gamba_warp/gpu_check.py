@@ -7,7 +7,6 @@ own with a time limit, so that a crash or an endless kernel ends that part only.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import subprocess
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import torch
 
+from .files import write_json, write_text
 from .kernels.bench import conv, raster, scan
 from .kernels.bench.measure import Settings, measure
 from .kernels.bench.report import markdown
@@ -42,7 +42,7 @@ def test_files() -> list[Path]:
 
 
 def bench(device: str, folder: str) -> int:
-    """Run the benchmark; write bench.json and bench.md.
+    """Run the benchmark, and write bench.json and bench.md after every case.
 
     Returns:
         1 if a result is wrong or could not be computed, else 0, also after an interrupt.
@@ -50,11 +50,17 @@ def bench(device: str, folder: str) -> int:
     settings = Settings(torch.device(device), "quick" if device == "cpu" else "normal")
     cases = conv.cases(settings)
     if device == "cuda":
-        cases += [case for suite in (scan, raster, models) for case in suite.cases(settings)]
-    document = measure(cases, settings)
-    Path(folder, "bench.json").write_text(json.dumps(document, indent=2), encoding="utf-8")
-    Path(folder, "bench.md").write_text(markdown(document), encoding="utf-8")
-    failed = [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
+        cases += [case for suite in (models, raster, scan) for case in suite.cases(settings)]
+    records: list[dict] = []
+    for case in cases:  # a crash loses only the current one
+        document = measure([case], settings)
+        records += document["records"]
+        document["records"] = records
+        write_json(Path(folder, "bench.json"), document)
+        write_text(Path(folder, "bench.md"), markdown(document))
+        if document["interrupted"]:
+            break
+    failed = [r for r in records if r["status"].startswith(("failed", "check"))]
     for r in failed:
         print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
     return int(bool(failed))

@@ -84,7 +84,7 @@ train | batches, loop, checkpoints | LIBRARY BENCH train.config train.objective 
 eval | the report that both evaluations share | RESULTS |
 eval.views | PSNR, SSIM, LPIPS; baselines | RESULTS eval |
 eval.shapes | Chamfer, IoU, F-score | RESULTS eval |
-gpu_check | the tests and the benchmark on a GPU | KERNELS BENCH measure |
+gpu_check | the tests and the benchmark on a GPU | KERNELS BENCH core measure |
 ablation | rows trained and evaluated alike | RESULTS | measure TRAIN EVAL
 commands | commands, by subject | MEASURES measure ablation | TRAIN EVAL
 app | the local web app | RESULTS |
