@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 import torch
 from hypothesis import HealthCheck, Phase, Verbosity, given, seed, settings
 from hypothesis import strategies as st
+from hypothesis.configuration import set_hypothesis_home_dir
 
 from gamba_warp.versions import __version__, installed
 
@@ -113,7 +115,8 @@ class StressRun:
             seconds: may be infinite.
             say: function that gets the state of the run after each case.
         """
-        began = time.monotonic()
+        began, home = time.monotonic(), tempfile.TemporaryDirectory()
+        set_hypothesis_home_dir(home.name)  # else it makes a folder in the current one
         try:
             ops, slice_ = self._ops, math.inf if cases else min(_SLICE, seconds / len(self._ops))
             for turn in count():
@@ -129,6 +132,8 @@ class StressRun:
         except KeyboardInterrupt:
             self.about["interrupted"] = True
         finally:
+            set_hypothesis_home_dir(None)
+            home.cleanup()
             self.about["minutes"] = round((time.monotonic() - began) / 60, 2)
 
     def _take_turn(

@@ -214,8 +214,12 @@ def test_what_is_drawn_fits_and_is_data(op):
 
 
 def test_a_small_error_is_caught_and_reported(monkeypatch, tmp_path, broken_scan, capsys):
+    """And nothing is written but into the folder of the results."""
     monkeypatch.setattr(stress, "_SHRINK", 0.0)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     assert exit_code("scan", "--cases", 60, "--out", tmp_path) == 1
+    assert not [*(tmp_path / "here").iterdir()]
     document = json.loads((tmp_path / "stress.json").read_text())
     (failure,) = document["failures"]  # the first of the scan; the convolution goes on
     assert failure["text"].startswith("scan, ") and "times its limit off" in failure["text"]
