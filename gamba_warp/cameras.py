@@ -187,3 +187,17 @@ def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tenso
     moments = torch.linalg.cross(origin[..., None, :].expand_as(directions), directions)
     rays = torch.cat([moments, directions], -1)
     return rays.reshape(*viewmats.shape[:-2], height, width, 6)
+
+
+def view_angles(cameras: Cameras) -> Tensor:
+    """Return the angles between the viewpoints and the first one, seen from the origin.
+
+    Args:
+        cameras: ``[.., V]``, none at the origin.
+
+    Returns:
+        ``[.., V]``, degrees from 0 to 180.
+    """
+    rotations, shifts = cameras.viewmats[..., :3, :3], cameras.viewmats[..., :3, 3:]
+    centers = torch.nn.functional.normalize((rotations.mT @ shifts)[..., 0], dim=-1)
+    return torch.rad2deg((centers * centers[..., :1, :]).sum(-1).clamp(-1, 1).acos())

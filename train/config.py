@@ -101,14 +101,19 @@ class LossConfig:
         lpips_weight: Weight of LPIPS.
         lpips_after: Leave LPIPS out for this many steps; early in training it can keep the model
             in a white collapse.
-        lpips_crop: Side of a random square, in pixels, that LPIPS compares in one view of each
-            object; 0 compares all views whole, which on a CPU would take most of a step.
+        lpips_crop: Side of a square around a random pixel of the object that LPIPS compares in one
+            novel view of each object; 0 compares all views whole, which on a CPU would take most of
+            a step.
         ssim_weight: Weight of 1 - SSIM; not in the paper.
         novel_weight: Weight of each novel view relative to the input view, in all terms but LPIPS
             of crops; the result is a weighted mean over the views.
         depth_weight: Weight of the depth loss: the first layer of "rays" is pulled to the first
             surface of the input view, the last layer to the last surface. The data needs depth
             pictures (gamba data render --depth); not in the paper.
+        mask_l1_weight: Weight of the absolute error of alpha, beside its squared error: where a
+            position is unknown, its least value is at 0 or 1 and not between. Not in the paper.
+        translucency_weight: Weight of 4 alpha (1 - alpha) of rendered alpha beyond that of the true
+            one, in views more than 20 degrees from the input. Not in the paper.
         radial_mask: The radial mask constraint on the projected centres (paper Table 2).
     """
 
@@ -119,6 +124,8 @@ class LossConfig:
     ssim_weight: _Weight = 0.0
     novel_weight: _Weight = 1.0
     depth_weight: _Weight = 0.0
+    mask_l1_weight: _Weight = 0.0
+    translucency_weight: _Weight = 0.0
     radial_mask: bool = True
 
 

@@ -12,19 +12,21 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from gamba_warp.conventions import WHITE, over_another, over_background
+from gamba_warp.cameras import view_angles
+from gamba_warp.conventions import GROUNDS, WHITE, over_another, over_background
 from gamba_warp.devices import network_precision
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import all_figures, measure
+from gamba_warp.image_metrics import all_figures, mask_iou, measure
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 from gamba_warp.vision.lpips import LPIPS
 
 from .data.samples import Batch
-from .objective.losses import LossInputs, loss_terms, rendered_psnr, total_loss
+from .objective.losses import LossInputs, loss_terms, rendered_psnr, total_loss, translucency
 from .objective.radial_mask import NEAR, project_means
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
+FAR_VIEW, CLEAR = 60.0, 0.02  # degrees; alpha: see ``_far_figures``
 STRIP_VIEWS, STRIP_OBJECTS = 6, 4  # views and objects of a validation's sample pictures
 
 
@@ -235,12 +237,46 @@ def validate(
             figures[f"{key}_input"] = values[0].item()
             if len(values) > 1:
                 figures[f"{key}_novel"] = values[1:].mean().item()
+        figures |= _far_figures(result, batch, objective.lpips)
         for name, value in figures.items():
             sums.setdefault(name, []).append(value)
         if len(rows) < 2 * STRIP_OBJECTS:
             rows += [result.target[0, :STRIP_VIEWS], result.rendering.rgb[0, :STRIP_VIEWS]]
     model.train(was_training)
     return {name: sum(values) / len(values) for name, values in sums.items()}, rows
+
+
+def _far_figures(
+    result: StepResult, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
+) -> dict[str, float]:
+    """Figures of views of one object more than ``FAR_VIEW`` degrees from the input; may be empty.
+
+    ``translucency_far`` is the mean over pixels that are not clear: of rendered alpha, which shows
+    a body of many faint Gaussians, and for scale of true alpha. LPIPS is on grey and on black.
+    """
+    far = view_angles(batch.cameras)[0] > FAR_VIEW
+    if not far.any():
+        return {}
+    rgb, alpha, true = (
+        result.rendering.rgb[0][far],
+        result.rendering.alpha[0][far],
+        batch.targets[0][far],
+    )
+    figures = {
+        "mask_iou_far": mask_iou(alpha[..., 0] > 0.5, true[..., 3] > 0.5).mean().item(),
+        "translucency_far": _mean_translucency(alpha[..., 0]),
+        "translucency_far_true": _mean_translucency(true[..., 3]),
+    }
+    for name, grey in GROUNDS.items() if lpips is not None else ():
+        got = over_another(rgb, alpha, WHITE, grey).clamp(0, 1)
+        figures[f"lpips_{name}_far"] = lpips(got, over_background(true, grey)).mean().item()
+    return figures
+
+
+def _mean_translucency(alphas: Tensor) -> float:
+    """Mean over views ``[V, H, W]`` of the mean over pixels that are not clear."""
+    values = [translucency(a[a > CLEAR]).mean().item() for a in alphas if (a > CLEAR).any()]
+    return sum(values) / max(1, len(values))
 
 
 def _measures(

@@ -8,6 +8,7 @@ from helpers.micro import to_opengl
 from torch.testing import assert_close
 
 from gamba_warp import cameras as C
+from gamba_warp.cameras import Cameras, intrinsics, orbit, view_angles
 from gamba_warp.gaussians import quat_multiply
 
 
@@ -131,3 +132,15 @@ def test_plucker_rays_pass_through_the_pixels(lead):
     want = torch.stack([torch.arange(7) + 0.5, torch.full((7,), 4.5)], -1).double()
     assert_close(pixels, want.expand(*lead, 7, 2))
     assert (seen[..., 2] > 0).all()
+
+
+def test_angles_between_viewpoints():
+    """From the first one, whatever the world's axes and the distances."""
+    viewmats = orbit(torch.tensor([0.0, 60.0, 180.0, 0.0]), torch.tensor([0.0, 0.0, 0.0, 30.0]))
+    viewmats[1, :3, 3] *= 3
+    turn = orbit(torch.tensor([40.0]), 25.0)[0].clone()
+    turn[:3, 3] = 0
+    for moved in (viewmats, viewmats @ turn):
+        cameras = Cameras(moved, intrinsics(8, 8).expand(4, 3, 3), 8, 8)
+        want = torch.tensor([0.0, 60.0, 180.0, 30.0])
+        torch.testing.assert_close(view_angles(cameras), want, atol=0.1, rtol=0)

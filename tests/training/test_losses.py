@@ -5,11 +5,13 @@ import math
 import pytest
 import torch
 
+from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.conventions import over_background
 from gamba_warp.image_metrics import ssim
 from gamba_warp.kernels.ssim import products
 from gamba_warp.train.objective.losses import (
     LossInputs,
+    excess_translucency,
     loss_terms,
     mse,
     random_crops,
@@ -115,25 +117,44 @@ def test_pictures_taken_together_are_those_taken_alone(monkeypatch):
     assert made[2].isnan() and made[[0, 1, 3, 4]].isfinite().all()
 
 
-def test_crops_are_of_one_place_in_both_and_lie_inside():
+def test_crops_are_of_one_place_in_both_around_the_object():
     torch.manual_seed(0)
     values = torch.arange(2 * 3 * 8 * 9.0).view(2, 3, 8, 9, 1)
+    alpha = torch.zeros(2, 3, 8, 9, 1)
+    alpha[:, 0] = 1  # the input view gets no crop
+    alpha[:, 1, 4, 5:7] = 1  # the third view has no object: its crops may be anywhere
     seen, pairs = set(), []
-    for _ in range(200):
-        got, want = random_crops(values, values + 1000, 7)
+    for _ in range(300):
+        got, want = random_crops(values, values + 1000, alpha, 5)
         places = []
-        assert got.shape == (2, 7, 7, 1) and want.equal(got + 1000)
+        assert got.shape == (2, 5, 5, 1) and want.equal(got + 1000)
         for index, crop in enumerate(got[..., 0]):
             corner = int(crop[0, 0]) - index * 216
             view, rest = divmod(corner, 72)
             y, x = divmod(rest, 9)
-            assert crop.equal(values[index, view, y : y + 7, x : x + 7, 0])
+            assert crop.equal(values[index, view, y : y + 5, x : x + 5, 0])
             places.append((view, y, x))
         seen |= {*places}
         pairs.append(places)
     # Each object has its own view, row and column.
     assert all(any(a[k] != b[k] for a, b in pairs) for k in range(3))
-    assert seen == {(v, y, x) for v in range(3) for y in range(2) for x in range(3)}
+    around = {(1, 2, x) for x in (3, 4)}
+    assert seen == around | {(2, y, x) for y in range(4) for x in range(5)}
+    only = random_crops(values[:, :1], values[:, :1], alpha[:, :1], 5)[0]
+    assert (only[0] < 72).all(), "without novel views it is the input"
+
+
+def test_translucency_beyond_the_true_one():
+    viewmats = orbit(torch.tensor([0.0, 10.0, 90.0]))
+    cameras = Cameras(viewmats, intrinsics(2, 2).expand(3, 3, 3), 2, 2)[None]
+    alpha = torch.tensor([0.5, 1.0, 0.0, 0.5]).view(1, 1, 2, 2, 1).expand(1, 3, 2, 2, 1)
+    target = torch.tensor([1.0, 1.0, 0.5, 0.5]).view(1, 1, 2, 2, 1).expand(1, 3, 2, 2, 1)
+    got = excess_translucency(alpha, target, cameras)
+    torch.testing.assert_close(got, torch.tensor([[0.0, 0.0, 0.25]]))
+    given = LossInputs(alpha.expand(-1, -1, -1, -1, 3), alpha, alpha, target, cameras=cameras)
+    terms = loss_terms(given, {"mask_l1": 1.0, "translucency": 1.0})
+    torch.testing.assert_close(terms["translucency"], got)
+    torch.testing.assert_close(terms["mask_l1"], torch.full((1, 3), 0.25))
 
 
 def test_loss_terms_have_the_terms_that_are_asked_for():

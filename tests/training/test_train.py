@@ -25,6 +25,7 @@ from safetensors.torch import load_file
 from torch.utils.checkpoint import checkpoint
 
 from gamba_warp import batch, cli
+from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
 from gamba_warp.model.gamba import Gamba
@@ -241,7 +242,9 @@ def test_validation_is_on_held_out_objects(data, tmp_path, monkeypatch):
 def test_a_validation_is_of_pictures_in_range(monkeypatch):
     target = torch.ones(1, 2, 4, 4, 3)
     shown = SimpleNamespace(rgb=target + 5, alpha=target[..., :1])
-    batch = SimpleNamespace(targets=torch.ones(1, 2, 4, 4, 4), to=lambda device: batch)
+    front = Cameras(orbit(torch.zeros(2)), intrinsics(4, 4).expand(2, 3, 3), 4, 4)[None]
+    targets = torch.ones(1, 2, 4, 4, 4)
+    batch = SimpleNamespace(targets=targets, cameras=front, to=lambda device: batch)
     result = SimpleNamespace(loss=torch.zeros(()), rendering=shown, target=target, terms={})
     monkeypatch.setattr(step, "forward", lambda *_: result)
     figures, _ = step.validate(

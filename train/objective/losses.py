@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import smooth_l1_loss
 from torch.profiler import record_function
 
-from gamba_warp.cameras import Cameras
+from gamba_warp.cameras import Cameras, view_angles
 from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import psnr
@@ -30,6 +30,7 @@ DEPTH_BETA = 0.02  # object units; see ``depth_loss``
 # (paper, §4.1), but over this share of a run at most, so that short runs end without it.
 RDIST_WEIGHT, RDIST_EPOCHS, RDIST_SHARE = 0.1, 10.0, 0.25
 SLOPE_STEPS, SLOPE_WEIGHT = (1, 2, 4, 8), 1.0  # pixels; beside the distances
+NEAR_VIEW = 20.0  # degrees; see ``excess_translucency``
 
 
 def mse(got: Tensor, want: Tensor) -> Tensor:
@@ -140,27 +141,54 @@ def _smooth_l1_mean(errors: Tensor, known: Tensor) -> Tensor:
     return (losses * known).flatten(1).sum(1) / known.flatten(1).sum(1).clamp_min(1)
 
 
-def random_crops(got: Tensor, want: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Crop the same random square of the same random view of each object from both.
+def random_crops(got: Tensor, want: Tensor, alpha: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Crop from both the same square around a random pixel of the object, in a random novel view.
 
     Uses torch's global generator, whose state is in the checkpoints.
 
     Args:
-        got: ``[B, V, H, W, C]``.
+        got: ``[B, V, H, W, C]``, the input view first; it is taken if there is no other.
         want: the same shape.
+        alpha: ``[B, V, H, W, 1]``, true; without an object in a view any pixel is taken.
         size: side of the squares, pixels; at most H and W.
 
     Returns:
         Two ``[B, size, size, C]``.
     """
     batch, views, height, width = got.shape[:4]
-    limits = torch.tensor([views, height - size + 1, width - size + 1])
-    origins = (torch.rand(batch, 3) * limits).long().tolist()
-    crops = [
-        torch.stack([p[i, v, y : y + size, x : x + size] for i, (v, y, x) in enumerate(origins)])
-        for p in (got, want)
-    ]
-    return crops[0], crops[1]
+    each = torch.arange(batch, device=got.device)
+    view = torch.randint(min(1, views - 1), views, (batch,)).to(got.device)
+    inside = (alpha[each, view].flatten(1) > 0.5).float()
+    pixel = torch.multinomial(inside + 1e-9, 1)[:, 0]
+    steps = torch.arange(size, device=got.device)
+    rows = (pixel // width - size // 2).clamp(0, height - size)[:, None] + steps
+    columns = (pixel % width - size // 2).clamp(0, width - size)[:, None] + steps
+    at = each[:, None, None], view[:, None, None], rows[:, :, None], columns[:, None]
+    return got[at], want[at]
+
+
+def translucency(alpha: Tensor) -> Tensor:
+    """Compute ``4 alpha (1 - alpha)``: 0 for clear and opaque pixels, 1 for half-transparent ones.
+
+    Args:
+        alpha: any shape, in [0, 1].
+    """
+    return 4 * alpha * (1 - alpha)
+
+
+def excess_translucency(alpha: Tensor, target: Tensor, cameras: Cameras) -> Tensor:
+    """Average the translucency beyond the true one, whose rims are half transparent too.
+
+    Args:
+        alpha: ``[B, V, H, W, 1]``, rendered; the input view first.
+        target: the same shape, true.
+        cameras: ``[B, V]``.
+
+    Returns:
+        ``[B, V]``; 0 for views at most ``NEAR_VIEW`` degrees from the input.
+    """
+    excess = (translucency(alpha) - translucency(target)).clamp_min(0).mean((-3, -2, -1))
+    return excess * (view_angles(cameras) > NEAR_VIEW)
 
 
 class LossInputs(NamedTuple):
@@ -172,8 +200,7 @@ class LossInputs(NamedTuple):
         target: as ``rgb``, true.
         target_alpha: as ``alpha``, true.
         lpips: ``(got, want) -> [..]``; None omits this term.
-        lpips_crop: if not 0, side of the square that LPIPS compares in one view of each object; see
-            ``random_crops``.
+        lpips_crop: if not 0, side of the squares of ``random_crops`` that LPIPS compares.
         gaussians: predicted, ``[B]``.
         cameras: ``[B, V+1]``.
         input_cameras: ``[B]``.
@@ -195,8 +222,9 @@ class LossInputs(NamedTuple):
 
     def compared(self) -> tuple[Tensor, Tensor]:
         """Return the rendered and true pictures for LPIPS; each call draws new crops."""
-        pair = self.rgb, self.target
-        return random_crops(*pair, self.lpips_crop) if self.lpips_crop else pair
+        if not self.lpips_crop:
+            return self.rgb, self.target
+        return random_crops(self.rgb, self.target, self.target_alpha, self.lpips_crop)
 
 
 class Progress(NamedTuple):
@@ -265,6 +293,16 @@ TERMS: dict[str, Term] = {
             else depth_loss(s.gaussians, s.config.ray_layers, s.input_cameras, s.surfaces)
         ),
         "depth",
+    ),
+    "mask_l1": Term(
+        lambda loss, at: 0.0 if at.validates else loss.mask_l1_weight,
+        lambda s: (s.alpha - s.target_alpha).abs().mean((-3, -2, -1)),
+        "mask L1",
+    ),
+    "translucency": Term(
+        lambda loss, at: 0.0 if at.validates else loss.translucency_weight,
+        lambda s: excess_translucency(s.alpha, s.target_alpha, s.cameras),
+        "translucency",
     ),
     "rdist": Term(
         radial_weight,
