@@ -10,7 +10,7 @@ from torch import Tensor
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.kernels.bench.measure import Case, Settings, Variant
 from gamba_warp.kernels.cases.problem import BOTH
-from gamba_warp.model.config import PRESETS
+from gamba_warp.model.config import PRESETS, Preset
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 
@@ -31,7 +31,7 @@ def cases(settings: Settings) -> list[Case]:
 class Step:
     """A model with its optimizer and a batch of random pictures, as in a training run."""
 
-    def __init__(self, preset: str, objects: int, device: torch.device) -> None:
+    def __init__(self, preset: Preset, objects: int, device: torch.device) -> None:
         torch.manual_seed(0)
         config = PRESETS[preset]
         self.model = Gamba(config).to(device)
@@ -73,8 +73,9 @@ def steps(settings: Settings) -> list[Variant]:
     0.2 (1 - SSIM), gradients, clipping, AdamW and the running average; fresh weights, random
     pictures without background, no LPIPS. The only check is that the gradient is finite.
     """
-    made = []
-    for preset in ("tiny", "rays"):
+    made: list[Variant] = []
+    presets: tuple[Preset, ...] = "tiny", "rays"
+    for preset in presets:
         for objects in (1,) if settings.level == "quick" else (1, 4):
             step = Step(preset, objects, settings.device)
             name = f"{preset}, {objects} object{'s' * (objects > 1)}"

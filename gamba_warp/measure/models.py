@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -161,12 +161,12 @@ def backbone(settings: Settings) -> list[Variant]:
     """
     made = []
     for depth in (1, 2 if settings.level == "quick" else 14):
-        blocks, rest = Backbone(settings, depth), {"rounds": 3 if depth > 2 else None}
+        blocks, rounds = Backbone(settings, depth), 3 if depth > 2 else None
         name = f"{depth} block{'s' * (depth > 1)}"
-        made.append(variant(blocks, name, default=True, **rest))
-        run = blocks.prepended
-        check = partial(blocks.check, "forward", run)
-        made.append(variant(blocks, f"{name}, prefix states off", run=run, check=check, **rest))
+        made.append(variant(blocks, name, default=True, rounds=rounds))
+        check = partial(blocks.check, "forward", blocks.prepended)
+        changes: dict[str, Any] = {"run": blocks.prepended, "check": check, "rounds": rounds}
+        made.append(variant(blocks, f"{name}, prefix states off", **changes))
         if depth == 1:
             made.append(variant(blocks, name, BOTH, default=True))
     return made
@@ -246,8 +246,8 @@ def pictures(settings: Settings) -> list[Variant]:
         model = Inference(Gamba(without_encoder(PRESETS[name])), settings.device)
         check = partial(model.check, model.eager)
         oracle = "a second run (0: the same bits); the blocks have the float64 oracle"
-        rest = dict(default=True, rounds=10, parameters=model.sizes)
-        made.append(Variant(name, model.eager, check, 0.0, oracle, **rest))
+        made.append(Variant(name, model.eager, check, 0.0, oracle, default=True, rounds=10))
+        made[-1].parameters = model.sizes
     return made
 
 

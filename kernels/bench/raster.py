@@ -160,16 +160,13 @@ def one_call(settings: Settings) -> list[Variant]:
     """8 objects of 4,096 Gaussians in 4 views of 128² each: in one call, and in 32."""
     objects, views, size = (2, 2, 64) if settings.level == "quick" else (8, 4, 128)
     shells = [shell(4096, 2, seed) for seed in range(objects)]
-    cameras = orbit_cameras(views, size)
-    together = Scene(
-        {k: torch.stack([x[k] for x in shells]) for k in LEAVES},
-        *(x.expand(objects, *x.shape) for x in cameras),
-        size,
-        settings.device,
-    )
+    viewmats, Ks = orbit_cameras(views, size)
+    stacked = {k: torch.stack([x[k] for x in shells]) for k in LEAVES}
+    all_cameras = (x.expand(objects, *x.shape) for x in (viewmats, Ks))
+    together = Scene(stacked, *all_cameras, size=size, device=settings.device)
     made = _pair(together, "one call", default=True)
     single = [
-        Scene(gaussians, *(x[v : v + 1] for x in cameras), size, settings.device)
+        Scene(gaussians, viewmats[v : v + 1], Ks[v : v + 1], size, settings.device)
         for gaussians in shells
         for v in range(views)
     ]
