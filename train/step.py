@@ -267,9 +267,10 @@ def _far_figures(
         "translucency_far": _mean_translucency(alpha[..., 0]),
         "translucency_far_true": _mean_translucency(true[..., 3]),
     }
-    for name, grey in GROUNDS.items() if lpips is not None else ():
-        got = over_another(rgb, alpha, WHITE, grey).clamp(0, 1)
-        figures[f"lpips_{name}_far"] = lpips(got, over_background(true, grey)).mean().item()
+    if lpips is not None:
+        for name, grey in GROUNDS.items():
+            got = over_another(rgb, alpha, WHITE, grey).clamp(0, 1)
+            figures[f"lpips_{name}_far"] = lpips(got, over_background(true, grey)).mean().item()
     return figures
 
 
