@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -106,13 +108,26 @@ def is_gone(number):
     return not stat.exists() or stat.read_text().rsplit(")", 1)[1].split()[0] == "Z"
 
 
-def test_a_part_is_ended_with_what_it_started(tmp_path, capsys):
-    started = time.time()
-    assert not run_part("x", ("-c", ANOTHER, str(tmp_path / "n")), tmp_path / "log", 3)
-    assert time.time() - started < 30
-    assert "x: stopped after 3 s, failed with" in capsys.readouterr().out
+@pytest.mark.parametrize("how", ["interrupted", "late"])
+def test_a_part_is_ended_with_what_it_started(tmp_path, capsys, how):
+    number, words = tmp_path / "number", ("-c", ANOTHER, str(tmp_path / "number"))
+
+    def interrupt():
+        while not (number.exists() and number.read_text()):
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    if how == "interrupted":
+        threading.Thread(target=interrupt, daemon=True).start()
+        with pytest.raises(KeyboardInterrupt):
+            run_part("x", words, tmp_path / "log", 60)
+    else:
+        started = time.time()
+        assert not run_part("x", words, tmp_path / "log", 3)
+        assert time.time() - started < 30
+        assert "x: stopped after 3 s, failed with" in capsys.readouterr().out
     time.sleep(0.5)
-    assert is_gone((tmp_path / "n").read_text())
+    assert is_gone(number.read_text())
 
 
 @pytest.mark.parametrize(
