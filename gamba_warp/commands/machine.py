@@ -87,13 +87,13 @@ def bench_command(
     chosen = choose(what, BENCH)
     level = "quick" if quick else "full" if full else "normal"
     settings = Settings(pick_device(device), level, peers, threads or torch.get_num_threads())
-    folder = output_folder(out)
     cases = [case for op in chosen for case in load_suite(op).cases(settings)]
     if only:
         names = list(dict.fromkeys(case.name for case in cases))
         if unknown := [name for name in only if name not in names]:
             raise UserError(f"--only {unknown[0]}: no such case; there are {'; '.join(names)}")
         cases = [case for case in cases if case.name in only]
+    folder = output_folder(out)
     with progress_bar(unit="variant", desc="bench") as bar:
 
         def say(case: str, variant: str) -> None:
