@@ -44,7 +44,7 @@ def world(tmp_path_factory):
 
 
 def tell(command, fault, tried, hit, left):
-    """Print a line of the table in docs/security.md, if nothing was lost."""
+    """Print a line of the results, if nothing was lost."""
     print(f"\n| {command} | {fault} | {tried} | {hit} | 0 | 0 | 0 | {left} | 0 |")
 
 
