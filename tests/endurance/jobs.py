@@ -86,7 +86,7 @@ JOBS = {
         undo=remove_folder,
     ),
     "ablate": Job(
-        "ablate {world}/plan.json {world}/data --out {out} --rows fit --device cpu",
+        "ablate {world}/plan.json {world}/data --out {out} --rows model --device cpu",
         undo=lambda out: remove_folder(out / "rows"),
     ),
     "data furniture": Job("data furniture --tree {world}/libraries --out {out}"),
@@ -153,19 +153,18 @@ def ball(points: np.ndarray) -> Gaussians:
     )
 
 
-# An ablation of one fit of a few steps.
+# An ablation of one row of a few steps.
 PLAN = {
     "name": "small",
-    "title": "One fit",
+    "title": "One row",
     "seeds": [0],
     "base": {
         "preset": "tiny",
         "options": {"steps": 2, "batch_size": 2},
-        "fit": {"steps": 3, "limit": 1, "held_out": 3, "size": 16},
     },
     "evaluation": {"split": "val", "objects": 1, "views": 3, "size": 16},
     "compare_with": "model",
-    "rows": [{"name": "model"}, {"name": "fit", "kind": "fit", "options": {"gaussians": 20}}],
+    "rows": [{"name": "model"}],
 }
 
 

@@ -4,7 +4,6 @@
 full disk is simulated by a limit on the size of a file (``RLIMIT_FSIZE``).
 """
 
-import json
 import os
 import random
 import shutil
@@ -22,6 +21,7 @@ from gamba_warp.files import PART, output_folder, sha256, sha256_of_all
 from gamba_warp.formats.gaussians.glb import save_glb
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
+from gamba_warp.model.checkpoint import read_config
 from gamba_warp.train.checkpoint import damage, list_checkpoints
 
 from .child import End, gamba, run_child
@@ -210,5 +210,5 @@ def test_a_made_up_released_file_is_imported(tmp_path):
     make_released(tmp_path / "released")
     name, *words = JOBS["import-released"].words(tmp_path, tmp_path / "out")
     assert run(name, words) == 0
-    config = json.loads((tmp_path / "out" / "config.json").read_text())
-    assert {name: config[name] for name in SIZES} == SIZES
+    config = read_config(tmp_path / "out" / "model.safetensors")[0]
+    assert {name: getattr(config, name) for name in SIZES} == SIZES

@@ -351,11 +351,11 @@ def plan(result, path, out):
     found, commands = result
     for row, stages in zip(found.rows, commands):
         assert _FOLDER.fullmatch(row.name), f"the name {row.name[:40]!r} is no folder's"
-        for stage in stages:
-            startable = not any("\0" in word for word in stage.words)
+        for words in stages.values():
+            startable = not any("\0" in word for word in words)
             assert startable, "a word with a NUL, with which no process can be started"
-            outs = [i for i, word in enumerate(stage.words) if word.startswith("--out")]
-            inside = len(outs) == 1 and stage.words[outs[0] + 1].startswith("ROW/")
+            outs = [i for i, word in enumerate(words) if word.startswith("--out")]
+            inside = len(outs) == 1 and Path(words[outs[0] + 1]).parent == out
             assert inside, "a command that writes elsewhere"
 
 
