@@ -66,10 +66,7 @@ COMMANDS = {
     "data furniture": Command("Get 820 models.", "", (), (), _DATA),
     "data made": Command("Make models of random parts.", "mesh", MADE, (), _DATA),
     "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),
-    "data pack": Command("Posed views to a few large files.", "", (), (), _DATA),
-    "data fetch": Command(
-        "Shards of a server, fetched when used.", "shards", ("webdataset",), (), _DATA
-    ),
+    "data pack": Command("Posed views to shards.", "shards", ("webdataset",), (), _DATA),
     "data index": Command("Check a dataset once, for all later starts.", "", (), (), _DATA),
     "data objaverse": Command("Objaverse, and its G-Objaverse views.", "", (), (), _DATA),
     "data gso": Command("Google Scanned Objects, for evaluation.", "mesh", _RENDERS, (), _DATA),
@@ -136,8 +133,6 @@ def run(name: str, arguments: list[str]) -> int:
             print(help_text(name, command, _expanded(command, arguments)), end="")
             return 0
         require(*row.needs)
-        if name == "train":
-            arguments = sys.modules[command.__module__].take_address(arguments)
         arguments, quiet, verbose = _common(arguments)
         arguments = _expanded(command, arguments)
         if name == "app" and not quiet:  # which takes long to start

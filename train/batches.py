@@ -12,10 +12,10 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from threading import Lock
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,30 +23,20 @@ import torch
 from gamba_warp.batch import EXPECTED
 from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_dataset
 from gamba_warp.data.gso import scanned
-from gamba_warp.data.shard_cache import Source, Unreachable
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 
 from .config import TrainConfig
-from .data.order import ShardOrder
 from .data.pool import VIEWS as MADE_VIEWS
 from .data.pool import Pool, PoolOptions
 from .data.poses import front_views
 from .data.samples import Batch, choose_views, draw_change, join, load_sample
 from .data.settings import VARIED_CAMERAS, Settings
+from .data.shards import Shards, Unreachable, dataset_of, shards_at
 from .ddp import World
 
-_FETCHED = 256  # samples of a process for which shards are fetched ahead
 _TRIES = 100  # objects tried in turn until one can be read
 VAL_VIEWS = 4  # novel views of an object in a validation
-
-
-# By name: positions of an epoch in the list of objects, as many as there are objects. Arguments: a
-# generator of the seed and the epoch, and the objects' uids. A script may add to it
-# (docs/change-the-training.md).
-SAMPLERS: dict[str, Callable[[np.random.Generator, list[str]], np.ndarray]] = {
-    "shuffled": lambda rng, uids: rng.permutation(len(uids))
-}
 
 
 class HeldOut(NamedTuple):
@@ -72,19 +62,23 @@ class TrainingData:
         objects: indices into ``train``, possibly repeated; one pass over the list is an epoch.
         held_out: validation objects by dataset; datasets without any are left out.
         notes: lines for the user.
-        shards: for each of ``objects``, the SHA-256 of its shard, if the order is by shards.
+        shards: the shards to train on; ``train`` is then empty, and ``objects`` are numbers.
     """
 
     train: ViewDataset
     objects: list[int]
     held_out: list[HeldOut] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    shards: list[str] | None = None
+    shards: Shards | None = None
 
     @property
     def fingerprint(self) -> str:
         """Hash of the objects' names in order; a run with another list is another run."""
-        names = "\n".join([*(self.train.uids[i] for i in self.objects), *(self.shards or ())])
+        names = "\n".join(
+            [self.train.uids[i] for i in self.objects]
+            if self.shards is None
+            else [str(self.shards.count), *(url.rpartition("/")[2] for url in self.shards.urls)]
+        )
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
@@ -99,11 +93,11 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
         UserError: a folder does not exist, no object can be read, the pictures do not fit on the
             device, or the data has Google Scanned Objects.
     """
-    views, sampler = config.views, config.views.sampler
-    if sampler not in (known := (*SAMPLERS, "shards")):
-        raise UserError(f"--sampler {sampler[:60]}: expected one of {', '.join(known)}")
-    on_gpu = device is not None and device.type == "cuda"
-    train = open_dataset(config.data, "train", cache=views.cache and not on_gpu)
+    if (source := shards_at(config.data)) is not None:
+        return _open_shards(config, source)
+    views = config.views
+    gpu = device if device is not None and device.type == "cuda" else None
+    train = open_dataset(config.data, "train", cache=views.cache and gpu is None)
     taken = [range(len(train))]  # objects of DATA, then of each of --extra
     known = {config.data.resolve(): taken[0]}
     for folder in views.extra:
@@ -120,19 +114,12 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
     notes += filter(None, [background_note(train)])
-    shards, held_out = _shards_of(train, objects, config), []
+    held_out = []
     try:
         held_out.append(_held_out("", config.data, config.run.val_objects))
     except UserError as error:
         notes.append(f"no validation: {error}")
-    for folder in config.run.val_extra:
-        name = folder.resolve().name
-        if name in [part.name for part in held_out]:
-            raise UserError(f"--val-extra: two folders are called '{name}'; rename one of them")
-        try:
-            held_out.append(_held_out(name, folder, config.run.val_objects))
-        except UserError as error:
-            raise UserError(f"--val-extra: {error}") from error
+    held_out += _further_sets(config)
     used = {train.uids[i] for i in objects}
     used |= {part.dataset.uids[i] for part in held_out for i in part.objects}
     if names := scanned(used):
@@ -141,42 +128,44 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
             f"the data has Google Scanned Objects, which are for evaluation ({shown}): leave them "
             "out"
         )
-    sizes = sorted({views.size, config.model_config().image_size})
-    packed = train.packed_size
-    if packed is not None and sizes[-1] > packed:
-        notes.append(
-            f"{config.data} has shards of {packed} pixels; pictures are enlarged to {sizes[-1]}"
-        )
-    if views.cache and on_gpu:
-        train.preload(sorted(set(objects)), sizes, device, views.workers)
+    if views.cache and gpu is not None:
+        sizes = sorted({views.size, config.model_config().image_size})
+        train.preload(sorted(set(objects)), sizes, gpu, views.workers)
     held_out = [part for part in held_out if part.objects]
-    return TrainingData(train, objects, held_out, notes, shards)
+    return TrainingData(train, objects, held_out, notes)
 
 
-def _shards_of(train: ViewDataset, objects: list[int], config: TrainConfig) -> list[str] | None:
-    """Return the shard of each object if the order is by shards, else None.
+def _open_shards(config: TrainConfig, source: str) -> TrainingData:
+    """Open shards of ``gamba data pack``.
 
     Raises:
-        UserError: an object is in no shard, or the cache of remote shards is too small for an order
-            in which any shard may come next.
+        UserError: the index is invalid, or an option needs a folder of objects.
     """
-    uids = [train.uids[index] for index in objects]
-    if config.views.sampler == "shards":
-        if missing := next((uid for uid in uids if uid not in train.shards), None):
-            raise UserError(f"--sampler shards: {missing} is in no shard (gamba data pack)")
-        return [train.shards[uid].sha256 for uid in uids]
-    remote = {
-        train.shards[uid] for uid in uids if uid in train.shards and train.shards[uid].address
-    }
-    for folder in {source.folder for source in remote}:
-        parts = [source for source in remote if source.folder == folder]
-        size, room = sum(source.bytes for source in parts), parts[0].cache_bytes
-        if size > room:
-            raise UserError(
-                f"{folder}: its shards take {size / 1e9:.3g} GB, its cache {room / 1e9:.3g}: give "
-                "--sampler shards, or a larger cache (gamba data fetch --cache-gb)"
-            )
-    return None
+    needs_folders = {"--extra": config.views.extra, "--cache": config.views.cache}
+    for name in (name for name, given in needs_folders.items() if given):
+        raise UserError(f"{name}: needs a folder of objects, and {config.data} has shards")
+    shards, notes, held_out = Shards(source, "train"), [], []
+    try:
+        first = Shards(source, "val").first(config.run.val_objects)
+        held_out.append(HeldOut("", first, [*range(len(first))]))
+    except UserError as error:
+        notes.append(f"no validation: {error}")
+    held_out = [part for part in (*held_out, *_further_sets(config)) if part.objects]
+    return TrainingData(dataset_of(), [*range(shards.count)], held_out, notes, shards)
+
+
+def _further_sets(config: TrainConfig) -> list[HeldOut]:
+    """Open the datasets of ``--val-extra``."""
+    found: list[HeldOut] = []
+    for folder in config.run.val_extra:
+        name = folder.resolve().name
+        if name in [part.name for part in found]:
+            raise UserError(f"--val-extra: two folders are called '{name}'; rename one of them")
+        try:
+            found.append(_held_out(name, folder, config.run.val_objects))
+        except UserError as error:
+            raise UserError(f"--val-extra: {error}") from error
+    return found
 
 
 def _held_out(name: str, folder: Path, count: int) -> HeldOut:
@@ -234,13 +223,8 @@ class Batches:
         self.failures: dict[str, str] = {}
         self.waited = 0.0
         self._made: Pool | None = None  # started with the first batch
-        self._by_shard: ShardOrder | None = None
-        if data.shards is not None:
-            self._by_shard = ShardOrder(
-                data.shards, config.views.shuffle_buffer, config.run.seed, world.size
-            )
-        self._fetched: Source | None = None
-        self._fetching = ThreadPoolExecutor(1, thread_name_prefix="shards")
+        self._stream: Iterator[dict[str, Any] | Unreachable] | None = None  # begins with a batch
+        self._reading = Lock()
         self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # epoch and its permutation
         self._pool = ThreadPoolExecutor(config.views.workers, thread_name_prefix="batches")
         self._waiting: dict[int, Future[Prepared]] = {}
@@ -252,7 +236,7 @@ class Batches:
             UserError: more than half of the objects, or 100 in a row, cannot be read.
         """
         began, end = time.perf_counter(), number + self.config.views.workers + 1
-        self._begin_made(number)
+        self._begin(number)
         for following in range(number, end if self.last is None else min(end, self.last)):
             if following not in self._waiting:
                 # Threads take work in this order. When one reaches the join, others have begun all
@@ -271,11 +255,10 @@ class Batches:
         if self._made is not None:
             self._made.close()
         self._pool.shutdown(cancel_futures=True)
-        self._fetching.shutdown(cancel_futures=True)
 
     def batch(self, number: int, novel: int) -> Batch:
         """Load the ``number``-th batch synchronously, with ``novel`` novel views."""
-        self._begin_made(number)
+        self._begin(number)
         return join([self.sample(n, novel) for n in self._numbers(number)])
 
     def sample(self, number: int, novel: int) -> Batch:
@@ -284,7 +267,7 @@ class Batches:
         Raises:
             UserError: as ``take``.
         """
-        self._begin_made(number // self.config.views.batch_size // self.world.size)
+        self._begin(number // self.config.views.batch_size // self.world.size)
         return self._record_failures(self.prepare(number, novel))
 
     def prepare(self, number: int, novel: int) -> Prepared:
@@ -318,13 +301,19 @@ class Batches:
             return Prepared(loaded(self._made.take(made), 0), [])
         failed: list[tuple[str, str]] = []
         for attempt in range(_TRIES):
-            index = self._object(self._place(number) + attempt)
+            dataset, index = self.data.train, 0
+            if self._stream is not None:
+                with self._reading:
+                    taken = next(self._stream)
+                if isinstance(taken, Unreachable):  # no fault of the object
+                    raise taken
+                dataset = dataset_of(taken)
+            else:
+                index = self._object(number + attempt)
             try:
-                return Prepared(loaded(self.data.train, index), failed)
-            except Unreachable:  # no fault of the object
-                raise
+                return Prepared(loaded(dataset, index), failed)
             except EXPECTED as error:
-                failed.append((self.data.train.uids[index], first_line(error)))
+                failed.append((dataset.uids[index], first_line(error)))
         return Prepared(None, failed)
 
     def _made_sample(self, number: int) -> int | None:
@@ -335,9 +324,13 @@ class Batches:
         before, after = math.floor(local * share), math.floor((local + 1) * share)
         return before if after > before else None
 
-    def _begin_made(self, number: int) -> None:
-        """Start the pool of made objects at the ``number``-th batch, unless running or unused."""
+    def _begin(self, number: int) -> None:
+        """Start made objects and the stream of shards at the ``number``-th batch, once."""
         views, world = self.config.views, self.world
+        if self.data.shards is not None and self._stream is None:
+            # A resumed run begins with another order.
+            order = np.random.SeedSequence([self.config.run.seed, 4, number])
+            self._stream = self.data.shards.stream(int(order.generate_state(1)[0]))
         if not views.made or self._made is not None:
             return
         pictures = Settings(
@@ -358,53 +351,16 @@ class Batches:
         )
         self._made = Pool(options, math.floor(number * views.batch_size * views.made))
 
-    def _place(self, number: int) -> int:
-        """Return the place of the ``number``-th sample in the order of the run.
-
-        By shards, each process has an order of its own, and this sample is of this process.
-        """
-        if self._by_shard is None:
-            return number
-        share = self.config.views.batch_size
-        batch, position = divmod(number, share)
-        return batch // self.world.size * share + position
-
     def _object(self, place: int) -> int:
         """Return the object of a place in the order; each epoch has its own permutation."""
-        objects, by_shard = self.data.objects, self._by_shard
-        length = len(objects) if by_shard is None else by_shard.length
-        epoch, position = divmod(place, length)
+        objects = self.data.objects
+        epoch, position = divmod(place, len(objects))
         known, order = self._order  # read both at once: other threads replace them
         if known != epoch:
-            if by_shard is None:
-                order = self._epoch(np.random.default_rng([self.config.run.seed, 1, epoch]))
-            else:
-                order = by_shard(epoch)
+            rng = np.random.default_rng([self.config.run.seed, 1, epoch])
+            order = rng.permutation(len(objects))
             self._order = epoch, order
-        if by_shard is not None:
-            self._fetch_ahead(objects[order[min(position + _FETCHED, length - 1)]])
         return objects[order[position]]
-
-    def _fetch_ahead(self, index: int) -> None:
-        """Fetch the shard of a later object, if it lies on a server; it raises when it is used."""
-        source = self.data.train.shards[self.data.train.uids[index]]
-        if source.address and source != self._fetched:
-            self._fetched = source
-            with suppress(RuntimeError):  # the run ends
-                self._fetching.submit(source.path)
-
-    def _epoch(self, rng: np.random.Generator) -> np.ndarray:
-        """Positions of an epoch in the list of objects."""
-        count, name = len(self.data.objects), self.config.views.sampler
-        uids = [self.data.train.uids[i] for i in self.data.objects]
-        order = np.asarray(SAMPLERS[name](rng, uids))
-        if (
-            order.shape != (count,)
-            or order.dtype.kind not in "iu"
-            or not 0 <= order.min() <= order.max() < count
-        ):
-            raise UserError(f"--sampler {name}: expected {count} positions from 0 to {count - 1}")
-        return order
 
     def _numbers(self, number: int) -> range:
         """Samples of the ``number``-th batch for this process."""
@@ -447,8 +403,6 @@ def fixed_batches(
         try:
             novel = evenly(range(1, dataset.num_views(index)), VAL_VIEWS)
             batch = load_sample(dataset, index, [0, *novel], size, config, torch.ones(3))
-        except Unreachable:
-            raise
         except EXPECTED as error:
             uid = f"{part.name}/{dataset.uids[index]}" if part.name else dataset.uids[index]
             failures[uid] = first_line(error)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from gamba_warp.errors import UserError
 from .config import FOLLOWING, TrainConfig, command_line, config_of
 from .recipes import announce, recipe_words, table_of
 
-_CACHE_GB = 100  # of the shards of an address; ``gamba data fetch`` takes other sizes
 _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 4,000
 
 
@@ -36,31 +33,6 @@ def train_command(config: tyro.conf.OmitArgPrefixes[TrainConfig]) -> int:
         torch.set_num_threads(config.run.threads)
     with world(config.run.device) as joined:
         return train(config, joined)
-
-
-def take_address(arguments: list[str]) -> list[str]:
-    """Replace DATA, if it is an address of shards, by a folder of the cache that fetches them.
-
-    Args:
-        arguments: of ``gamba train``; DATA is replaced where it comes first.
-
-    Raises:
-        UserError: as ``take_index``.
-    """
-    if not arguments or not re.match("[a-z][a-z0-9+]+://", arguments[0]):
-        return arguments
-    from gamba_warp.vision.weights import cache_folder
-
-    from .sources.pack import take_index
-
-    address = arguments[0].rstrip("/")
-    name = hashlib.sha256(os.fsencode(address)).hexdigest()[:16]
-    folder = cache_folder() / "shards" / name
-    take_index(address, folder, _CACHE_GB * 10**9)
-    if os.environ.get("RANK", "0") == "0":
-        kept = f"shards of {address} are kept in {folder}, at most {_CACHE_GB} GB"
-        print(f"{kept}; gamba data fetch takes another folder or size")
-    return [str(folder), *arguments[1:]]
 
 
 def expand(arguments: list[str]) -> list[str]:

@@ -68,9 +68,6 @@ class DataConfig:
             make and render during the training; the others are of the datasets.
         cache: Keep decoded pictures in memory; on a GPU, decode all at the start and keep them in
             the GPU's, with 8 bits a channel. Depth pictures are read when they are used.
-        sampler: Order of the objects: "shuffled" anew for each epoch; "shards", by whole shards, of
-            which each process takes its own (docs/training-data.md).
-        shuffle_buffer: With --sampler shards: objects of a process that are mixed at a time.
         workers: Threads that decode pictures ahead of the training; also the largest number of
             batches kept ready. The number does not change the result.
     """
@@ -86,8 +83,6 @@ class DataConfig:
     recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
     made: Annotated[float, Meta(ge=0, le=1)] = 0.0
     cache: bool = False
-    sampler: str = "shuffled"
-    shuffle_buffer: Annotated[int, Meta(ge=1, le=10**9)] = 2000
     workers: Annotated[int, Meta(ge=1, le=1024)] = 1
 
 
@@ -208,7 +203,8 @@ class TrainConfig:
     """Train a model on posed views (``gamba data render`` makes them).
 
     Attributes:
-        data: Dataset folder; or, as the first word, the address of shards on a server.
+        data: Dataset folder; or a folder of shards (gamba data pack), or its address on a server,
+            http(s):// or gs://.
         preset: Preset of the model.
         set: Changes to the preset, e.g. prepend=false depth=4; the fields are GambaConfig's.
     """

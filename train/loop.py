@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gamba_warp.data.shard_cache import Unreachable
 from gamba_warp.errors import UserError
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
@@ -22,6 +21,7 @@ from gamba_warp.processes import stop_requests
 from .batches import Batches, HeldOut, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
+from .data.shards import Unreachable
 from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Progress, term_weights

@@ -124,13 +124,13 @@ def _facts(
     For the data: a hash per object, or of several, of the cameras and, for some objects, of the
     first picture.
     """
-    chosen, contents = sorted(set(data.objects)), {}
+    chosen, contents = sorted(set(data.objects)) if data.shards is None else [], {}
     read, size = evenly(chosen, _PICTURES), max(1, math.ceil(len(chosen) / _DIGESTS))
     for part in (chosen[at : at + size] for at in range(0, len(chosen), size)):
         digest = hashlib.sha256()
         for index in part:
             digest.update(data.train.digest(index).encode())
-            if index in read and data.train.uids[index] not in data.train.shards:
+            if index in read:
                 with contextlib.suppress(*EXPECTED):  # the training reports it when it matters
                     picture = data.train.load(index, [0], depths=0).images
                     digest.update(picture.numpy().tobytes())

@@ -1,6 +1,6 @@
 """Every ``gamba`` command with parts of one's own; docs/change-the-training.md explains it.
 
-python docs/examples/own_parts.py train DATA --preset tiny --schedule linear --sampler hard_first
+python docs/examples/own_parts.py train DATA --preset tiny --schedule linear
 """
 
 import json
@@ -15,7 +15,6 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import METRICS, Metric
 from gamba_warp.model.encoders import ENCODERS
 from gamba_warp.model.gamba import DECODERS
-from gamba_warp.train.batches import SAMPLERS
 from gamba_warp.train.objective.losses import TERMS, Term
 from gamba_warp.train.optim import SCHEDULES
 
@@ -79,12 +78,6 @@ class Cloud(nn.Module):
         )
 
 
-def hard_first(rng, uids):
-    """Names in their order, every second one twice, for an epoch of the same length."""
-    order = np.concatenate([np.arange(len(uids)), np.arange(0, len(uids), 2)])
-    return rng.permutation(order)[: len(uids)]
-
-
 def linear(optim, step, warmup, total):
     """Fall along a line from the end of the warm-up to the end of the run."""
     return (total - step) / (total - warmup)
@@ -95,7 +88,6 @@ METRICS["mae"] = Metric("MAE", mean_error, digits=4, more_is_better=False)
 LAYOUTS["orbit"] = "orbit.json", read_orbit
 ENCODERS["patches"] = build_patches
 DECODERS["cloud"] = Cloud
-SAMPLERS["hard_first"] = hard_first
 SCHEDULES["linear"] = linear
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 #!/bin/bash
 # Trains on 2 machines with 8 GPUs each: sbatch slurm.sh DATA RUN [options of gamba train]
-# With shards (gamba data pack, gamba data fetch): sbatch slurm.sh SHARDS RUN --sampler shards
+# With shards (gamba data pack): sbatch slurm.sh SHARDS RUN
 # The same command goes on from the newest checkpoint, also after the time is up.
 #SBATCH --job-name=gamba
 #SBATCH --nodes=2

@@ -1,8 +1,8 @@
 """Posed views on disk; ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
 
-Layouts are described in ``layouts.py``, shards in ``shards.py``, lists of checked objects in
-``manifest.py``. ``split.json`` in the root lists the
-uids of ``train``, ``val`` and ``test``; ``split_of`` places other uids by the hash of the name.
+Layouts are described in ``layouts.py``, lists of checked objects in ``manifest.py``. ``split.json``
+in the root lists the uids of ``train``, ``val`` and ``test``; ``split_of`` places other uids by the
+hash of the name.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from .layouts import (
     GOBJAVERSE_DEPTH,
     LAYOUTS,
     DecodedPicture,
+    EncodedPicture,
     ObjectFiles,
     find_objects,
     one_line,
@@ -49,8 +50,6 @@ from .manifest import (
     read_manifest,
     write_manifest,
 )
-from .shard_cache import Source
-from .shards import INDEX, ShardPicture, Shards, read_index
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of written files; version 1 had fewer objects in one group
@@ -137,17 +136,12 @@ def _read_split(root: Path) -> tuple[int, dict[str, str]]:
 
 
 def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
-    """Return the split of each object, by ``split.json`` or the index of shards, else by hash.
+    """Return the split of each object, by ``split.json``, else by hash.
 
     Raises:
-        UserError: that file, or the index, is invalid.
+        UserError: that file is invalid.
     """
-    root = Path(folder)
-    if (root / INDEX).exists():
-        index = read_index(root)
-        stated = {uid: shard.split for shard in index.shards for uid, _, _ in shard.objects}
-    else:
-        _, stated = _read_split(root)
+    _, stated = _read_split(Path(folder))
     return {uid: stated.get(uid) or split_of(uid) for uid in uids}
 
 
@@ -157,14 +151,14 @@ def open_dataset(
     """Find the objects under a folder, without decoding anything yet.
 
     Args:
-        folder: a dataset, shards of one, or the folder of a single object.
+        folder: a dataset, or the folder of a single object.
         split: "all", "train", "val" or "test".
         layout: "auto", "transforms", "nerf", "gobjaverse" or "openlrm".
         cache: keep decoded views in memory, with 8 bits a channel.
 
     Raises:
         UserError: the folder does not exist, has no objects or none of the split, or its
-            ``split.json`` or the index of the shards is invalid.
+            ``split.json`` is invalid.
     """
     root = Path(folder)
     if split not in ("all", *SPLITS):
@@ -173,17 +167,6 @@ def open_dataset(
         raise UserError(f"layout '{layout}': expected auto, {', '.join(LAYOUTS)}")
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
-    if layout == "auto" and (root / INDEX).exists():
-        shards = Shards(root)
-        chosen = shards.uids(split)
-        if not chosen:
-            raise UserError(f"{root}: none of its {len(shards.places)} objects is in split {split}")
-        readers = dict.fromkeys(chosen, shards.read)
-        dataset = ViewDataset(readers, "shards", cache, shards.split_version, shards.size)
-        dataset.shards = {uid: shards.sources[shards.places[uid].shard] for uid in chosen}
-        # Its objects were checked when they were packed.
-        dataset._digests = {uid: shards.digest(uid) for uid in chosen}
-        return dataset
     manifest = None
     if layout == "auto" and (root / MANIFEST).exists():
         manifest = read_manifest(root)
@@ -229,13 +212,11 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
         The file, the number of objects, and the reasons by uid of those that cannot be read.
 
     Raises:
-        UserError: the folder has shards or is one object, has no objects, or cannot be written.
+        UserError: the folder is one object, has no objects, or cannot be written.
     """
     root = Path(folder)
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
-    if (root / INDEX).exists():
-        raise UserError(f"{root}: has shards, with their own index")
     layout, folders, others = find_objects(root, "auto")
     if not folders or folders == [root]:
         raise UserError(f"{root}: {'is one object' if folders else 'no objects found'}")
@@ -285,7 +266,6 @@ def content_digest(files: ObjectFiles) -> str:
 def _check_pictures(files: ObjectFiles) -> None:
     """Raise UserError if a picture is missing; folders with many pictures are listed once."""
     kinds = filter(None, (files.images, files.masks, files.depths, files.backs))
-    # Pictures in a shard are located when its cameras are read.
     paths = [path for path in chain.from_iterable(kinds) if isinstance(path, Path)]
     parents = Counter(path.parent for path in paths)
     plain: dict[Path, set[str]] = {}
@@ -304,8 +284,6 @@ class ViewDataset:
         uids: names of the objects, their paths under the root, sorted.
         layout: layout of the folders, or "shards".
         split_version: version of the rule or of the file that defines the split.
-        packed_size: height of pictures that were resized in shards; None for files, of any size.
-        shards: the tar of each object that lies in one.
     """
 
     def __init__(
@@ -314,13 +292,11 @@ class ViewDataset:
         layout: str,
         cache: bool,
         split_version: int = SPLIT_VERSION,
-        packed_size: int | None = None,
         manifest: Manifest | None = None,
     ) -> None:
         """Make a dataset of the reader of each uid; ``cache`` as for ``open_dataset``."""
         self.uids = list(readers)
-        self.layout, self.split_version, self.packed_size = layout, split_version, packed_size
-        self.shards: dict[str, Source] = {}
+        self.layout, self.split_version = layout, split_version
         self._readers = dict(readers)
         # Of objects that were checked before; by uid.
         self._digests: dict[str, str] = {} if manifest is None else manifest.digests
@@ -347,16 +323,9 @@ class ViewDataset:
         added = {f"{name}/{uid}": renamed[id(read)] for uid, read in other._readers.items()}
         if twice := sorted(added.keys() & self._readers.keys()):
             raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
-        sizes = [size for size in (self.packed_size, other.packed_size) if size is not None]
-        both = ViewDataset(
-            self._readers | added,
-            self.layout,
-            self._pictures is not None,
-            self.split_version,
-            min(sizes, default=None),
-        )
+        cache = self._pictures is not None
+        both = ViewDataset(self._readers | added, self.layout, cache, self.split_version)
         for known, mine, theirs in (
-            (both.shards, self.shards, other.shards),
             (both._digests, self._digests, other._digests),
             (both._bad, self._bad, other._bad),
         ):
@@ -404,18 +373,9 @@ class ViewDataset:
     def check(self) -> dict[str, str]:
         """Return reasons by uid, for objects with invalid cameras or missing pictures.
 
-        Objects of a manifest and of shards were checked before, so of local shards only the size is
-        compared; the others are read, with a progress bar.
+        Objects of a manifest were checked before; the others are read, with a progress bar.
         """
         bad = {uid: self._bad[uid] for uid in self.uids if uid in self._bad}
-        damaged: dict[Source, str] = {}
-        for source in {source for source in self.shards.values() if not source.address}:
-            try:
-                source.path()
-            except UserError as error:
-                damaged[source] = str(error)
-        sources = {uid: self.shards[uid] for uid in self.uids if uid in self.shards}
-        bad |= {uid: damaged[source] for uid, source in sources.items() if source in damaged}
         unknown = [uid for uid in self.uids if uid not in self._digests]
         for uid in progress_bar(unknown, lines=True, delay=2.0, desc="checking", unit="object"):
             try:
@@ -643,11 +603,10 @@ def _masked(picture: np.ndarray, path: Path | DecodedPicture) -> np.ndarray:
 def background_note(dataset: ViewDataset) -> str | None:
     """Warning if the pictures of a dataset have no transparent background, else None.
 
-    Checks the first view of up to eight objects, skipping unreadable ones. ``gamba data pack`` has
-    checked those of shards.
+    Checks the first view of up to eight objects, skipping unreadable ones.
     """
     checked = False
-    for uid in evenly([uid for uid in dataset.uids if uid not in dataset.shards], 8):
+    for uid in evenly(dataset.uids, 8):
         with suppress(*EXPECTED):
             pixels, _ = dataset.pictures(uid, [0])
             if (pixels[..., 3] < 255).any():
@@ -660,7 +619,7 @@ def background_note(dataset: ViewDataset) -> str | None:
 
 def _read_depth(path: Path | DecodedPicture, width: int, height: int) -> np.ndarray:
     """Read depth ``[height, width]`` float32 in steps of the file, by nearest samples."""
-    if isinstance(path, ShardPicture):
+    if isinstance(path, EncodedPicture):
         opened = path.open()
     elif isinstance(path, DecodedPicture):
         opened = nullcontext(Image.fromarray(path.read()))

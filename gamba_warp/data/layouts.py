@@ -18,6 +18,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections import Counter
@@ -32,7 +33,7 @@ from msgspec import Meta, Struct
 
 from ..errors import UserError
 from ..files import walk
-from ..images import PICTURE_SUFFIXES, picture_size
+from ..images import PICTURE_SUFFIXES, load_rgba8, open_picture, picture_size
 from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
 from ..untrusted.names import Within, inside
@@ -65,7 +66,7 @@ PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
 class DecodedPicture:
-    """Picture in memory or inside a larger file (``shards.py``).
+    """Picture in memory.
 
     Attributes:
         stem: empty, in place of a path's.
@@ -80,6 +81,24 @@ class DecodedPicture:
             UserError: the picture is damaged.
         """
         raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedPicture(DecodedPicture):
+    """Content of a picture's file, of a shard."""
+
+    name: str
+    content: bytes
+
+    def __str__(self) -> str:
+        return self.name
+
+    def read(self) -> np.ndarray:
+        return load_rgba8(self.name, self.content)
+
+    def open(self):
+        """Open it as ``images.open_picture``."""
+        return open_picture(io.BytesIO(self.content), self.name)
 
 
 Sizes = list[tuple[int, int] | None]
@@ -120,7 +139,7 @@ class ObjectFiles:
     """Files and cameras of the views of one object.
 
     Attributes:
-        images: the V pictures: paths, or pictures in a shard or in memory.
+        images: the V pictures: paths, or pictures in memory.
         camera_to_world: ``[V, 4, 4]`` float64, OpenGL frame, object units.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: width and height of each of the V pictures as stated by the file, or None.

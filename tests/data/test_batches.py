@@ -218,13 +218,3 @@ def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
         torch, "tensor", lambda *a, device=None, real=torch.tensor, **k: real(*a, **k)
     )
     refused(r"^--cache: 30 views take 0.0 GB", open_data, config, GPU)
-
-
-def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):
-    from gamba_warp.train.sources.pack import PackSettings, write_pack
-
-    write_pack(data, tmp_path / "pack", PackSettings(size=8), 1)
-    config = micro.options(tmp_path / "pack", tmp_path)
-    assert "has shards of 8 pixels" in open_data(config).notes[-1]
-    write_pack(data, tmp_path / "large", PackSettings(size=16), 1)
-    assert not open_data(micro.options(tmp_path / "large", tmp_path)).notes

@@ -81,10 +81,7 @@ JOBS = {
         "import-released {world}/released/theirs.pth --out {out} "
         "--encoder-weights {world}/released/vit.safetensors --depth 1"
     ),
-    "data pack": Job(
-        "data pack {world}/data {out} --size 16 --workers 1",
-        undo=remove_folder,
-    ),
+    "data pack": Job("data pack {world}/data {out} --size 16 --workers 1"),
     "ablate": Job(
         "ablate {world}/plan.json {world}/data --out {out} --rows model --device cpu",
         undo=lambda out: remove_folder(out / "rows"),

@@ -43,6 +43,7 @@ from gamba_warp.train.checkpoint import find_checkpoint, load_weights
 from gamba_warp.train.config import TrainConfig
 from gamba_warp.train.data.furniture import get_furniture
 from gamba_warp.train.data.render import Settings, render_object
+from gamba_warp.train.data.shards import Shards
 from gamba_warp.train.sources.gso import take_models
 from gamba_warp.train.sources.objaverse_lists import Lists
 from gamba_warp.train.sources.objaverse_views import find_rendered, take_views
@@ -137,6 +138,11 @@ def _dataset(path: Path, out: Path) -> Any:
     dataset = open_dataset(path)
     bad = dataset.check()
     return [attempt(dataset.load, uid) for uid in dataset.uids], list(bad.values())
+
+
+def _shards(path: Path, out: Path) -> Any:
+    dataset = Shards(str(path), "train").first(9)
+    return [attempt(dataset.load, uid) for uid in dataset.uids], []
 
 
 def _split(path: Path, out: Path) -> Any:
@@ -309,7 +315,7 @@ READERS = {
     "shape": Reader(alone(load_shape), checks.shape, seeds.shapes, 12),
     "evaluation": Reader(_evaluation, checks.report, seeds.compared, 1),
     "dataset": Reader(_dataset, checks.views, seeds.datasets, 8, True),
-    "shards": Reader(_dataset, checks.views, seeds.shards, 6, True),
+    "shards": Reader(_shards, checks.views, seeds.shards, 6, True),
     "shown": Reader(_shown, checks.each(checks.shown), seeds.shown, 3, True),
     "split": Reader(_split, checks.nothing, seeds.split, 2, True),
     "catalogue": Reader(alone(find_meshes), checks.catalogue, seeds.catalogues, 4, True),

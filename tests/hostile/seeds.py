@@ -39,7 +39,7 @@ from gamba_warp.model.encoders import ImageEncoder
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.batches import open_data
 from gamba_warp.train.loop import Trainer
-from gamba_warp.train.sources.pack import PackSettings, write_pack
+from gamba_warp.train.sources.pack import write_pack
 from gamba_warp.versions import import_open3d
 
 Files = dict[str, bytes]
@@ -421,7 +421,7 @@ def shards() -> Kinds:
         folder = Path(name)
         put(split()["transforms"], folder / "data")
         for kind, size in (("bytes", None), ("resized", _SIZE // 2)):
-            write_pack(folder / "data", folder / kind, PackSettings(size), 1)
+            write_pack(folder / "data", folder / kind, size)
             files = sorted((folder / kind).iterdir())
             made[kind] = {path.name: path.read_bytes() for path in files if path.is_file()}
     return made

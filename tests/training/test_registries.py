@@ -15,13 +15,12 @@ from gamba_warp.image_metrics import METRICS
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.encoders import ENCODERS
 from gamba_warp.model.gamba import DECODERS
-from gamba_warp.train.batches import SAMPLERS
 from gamba_warp.train.objective.losses import TERMS
 from gamba_warp.train.optim import SCHEDULES
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 SCRIPT, LOOP = EXAMPLES / "own_parts.py", EXAMPLES / "own_loop.py"
-TABLES = (LAYOUTS, METRICS, ENCODERS, DECODERS, SAMPLERS, TERMS, SCHEDULES)
+TABLES = (LAYOUTS, METRICS, ENCODERS, DECODERS, TERMS, SCHEDULES)
 
 
 def restore(saved):
@@ -67,7 +66,7 @@ def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, scri
     out = tmp_path / "run"
     words = ["train", data, "--out", out, "--preset", "tiny", "--set", *micro.MODEL]
     words += ["encoder=patches", "encoder_size=16", "encoder_frozen=false", "decoder=cloud"]
-    words += ["--sampler", "hard_first", "--schedule", "linear", "--size", micro.SIZE]
+    words += ["--schedule", "linear", "--size", micro.SIZE]
     words += ["--lpips", "off", "--device", "cpu", "--log-every", "1", "--views-per-object", "2"]
     words += ["--warmup-steps", "1", "--batch-size", "2", "--val-every", "6"]
     assert script(*words, "--steps", "6") == 0
@@ -94,23 +93,12 @@ def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, scri
 
 def test_unknown_names_are_refused(tmp_path):
     data = micro.write_dataset(tmp_path / "clouds")
-    for group, name, known in (
-        ("optim", "schedule", "cosine, trapezoid"),
-        ("views", "sampler", "shuffled, shards"),
-    ):
-        refused(f"--{name} linear: expected one of {known}", run, data, tmp_path / "run",
-                **{group: {name: "linear"}})  # fmt: skip
+    refused("--schedule linear: expected one of cosine, trapezoid", run, data, tmp_path / "run",
+            optim={"schedule": "linear"})  # fmt: skip
     model = (*micro.MODEL, "decoder=cloud")
     refused("decoder is 'cloud', expected one of bins, rays, triplane", run, data,
             tmp_path / "run", model)  # fmt: skip
     assert not (tmp_path / "run").exists()
-
-
-def test_an_invalid_order_is_refused(tmp_path):
-    data = micro.write_dataset(tmp_path / "clouds")
-    SAMPLERS["far"] = lambda rng, uids: [9, 9]
-    options = {"views": {"sampler": "far"}}
-    refused("--sampler far: expected 2 positions", run, data, tmp_path / "run", **options)
 
 
 def test_the_example_of_a_loop_trains(tmp_path, monkeypatch, capsys):

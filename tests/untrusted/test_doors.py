@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Allowed callers; ``vision.weights`` opens a wheel whose digest pip has checked, ``pack`` its own
-# new tar.
+# Allowed callers; ``vision.weights`` opens a wheel whose digest pip has checked.
 DOORS = {
     "Image.open": {"gamba_warp/images.py"},
-    "tarfile.open": {"gamba_warp/untrusted/archives.py", "train/sources/pack.py"},
+    "tarfile.open": {"gamba_warp/untrusted/archives.py"},
     "zipfile.ZipFile": {
         "gamba_warp/untrusted/archives.py",
         "gamba_warp/untrusted/torch_files.py",

@@ -170,69 +170,31 @@ def data_pack_command(
     data: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     size: Annotated[int, Meta(ge=1, le=4096)] | None = None,
-    split: Literal["all", "train", "val", "test"] = "all",
     shard_mb: Annotated[int, Meta(ge=1, le=100_000)] = 1000,
-    limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
 ) -> int:
-    """Write the views of a dataset into a few tar files, shards in the format of WebDataset.
-
-    The pictures keep their bytes. Every command that takes a dataset also takes the shards. A
-    stopped command continues with the next shard.
+    """Write the views of a dataset into a few tar files for training, in the format of WebDataset.
 
     Args:
         data: the dataset.
-        out: folder of the shards to make or to continue.
-        size: height of the pictures, pixels: they are resized once, and are lossless WebP. Its
-            views at SIZE are bit-identical to those of the files; larger ones are enlarged.
-        split: pack only the objects of this part of the set.
+        out: folder of the shards; older ones are replaced.
+        size: height of the pictures, pixels: they are resized once, and are lossless WebP; without
+            it they keep their bytes.
         shard_mb: a shard ends with the object that exceeds this size, megabytes.
-        limit: stop after this many objects.
         workers: number of threads that read; 0 means one per core.
     """
     from gamba_warp.data.dataset import background_note, open_dataset
     from gamba_warp.kernels.runtime.system import cores
 
-    from .pack import PackSettings, write_pack
+    from .pack import write_pack
 
-    settings = PackSettings(size, split, shard_mb << 20)
-    done = write_pack(data, out, settings, workers or cores(), limit)
-    if done.there:
-        print(f"{counted(done.there, 'object')} already in {out}")
-    made = f"packed {counted(done.written, 'object')} into {out}, {counted(done.shards, 'shard')}"
-    print(f"{made}, {len(done.failures)} failed")
-    if split == "all":
-        _report_empty_splits(out)
+    counts, failures = write_pack(data, out, size, shard_mb, workers or cores())
+    made = f"packed {counted(counts.total(), 'object')} into {counted(len(counts), 'shard')}"
+    print(f"{made} in {out}, {len(failures)} failed; next: gamba train {out}")
+    _report_empty_splits(data)
     if note := background_note(open_dataset(data)):
         print(f"warning: {data}: {note}", file=sys.stderr)
-    return _report(done.failures, "failed", {})
-
-
-@ranged
-def data_fetch_command(
-    out: tyro.conf.Positional[Path],
-    address: str,
-    cache_gb: Annotated[float, Meta(ge=0.001, le=1e6)] = 100.0,
-) -> int:
-    """Use the shards of a server: OUT then is a dataset, whose shards are fetched when needed.
-
-    Writes OUT/shards.json. Fetched shards stay in OUT/cache; the ones used longest ago make room.
-    Run it again with another address or cache; what is in the cache stays.
-
-    Args:
-        out: folder of the index and the cache, on this machine's own disk.
-        address: folder of the shards: http(s)://, s3:// (needs the program aws) or gs:// (gsutil).
-        cache_gb: largest size of the cache, gigabytes.
-    """
-    from .pack import take_index
-
-    index = take_index(address, out, int(cache_gb * 1e9))
-    size = sum(shard.bytes for shard in index.shards) / 1e9
-    objects = sum(len(shard.objects) for shard in index.shards)
-    counts = f"{counted(objects, 'object')} in {counted(len(index.shards), 'shard')}, {size:.3g} GB"
-    print(f"{counts}, at {index.address}")
-    print(f"next: gamba train {out} --sampler shards ...")
-    return 0
+    return _report(failures, "failed", {})
 
 
 @ranged
