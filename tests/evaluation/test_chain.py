@@ -17,7 +17,6 @@ from gamba_warp.eval.shapes.pairs import find_pairs, open_objects
 from gamba_warp.eval.views.baselines import NearestView, TrainingMeshes
 from gamba_warp.files import STARTER
 from gamba_warp.formats.meshes import Y_TO_Z_UP
-from gamba_warp.train.sources.pack import PackSettings, write_pack
 
 NAMES = ("bench", "lamp", "table")
 QUICK = ("--points", 1000, "--voxels", 24, "--views", 8, "--pixels", 32)
@@ -149,10 +148,6 @@ def test_truths_and_retrieved_meshes_lie_where_the_views_show_them(rendered):
         placed.save(rendered / "placed" / f"{name}.ply", NearestView(name, 0, 0.0), 1.5)
     code, report = geometry(rendered / "out", rendered / "placed", meshes, data)
     assert code == 0 and report["mean"]["chamfer"] < 1e-5  # float32 in the .ply
-    # A pack says it too.
-    write_pack(data, rendered / "pack", PackSettings(), 1)
-    code, packed = geometry(rendered / "out", rendered / "placed", meshes, rendered / "pack")
-    assert code == 0 and packed["mean"]["chamfer"] == report["mean"]["chamfer"]
 
 
 def test_what_contradicts_a_set_is_told(tmp_path, capsys):

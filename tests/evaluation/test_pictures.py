@@ -11,7 +11,6 @@ from PIL import Image
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views.compare import Shown, ViewsProtocol, load_truth, shown
 from gamba_warp.eval.views.pictures import PicturePredictions, save_pictures
-from gamba_warp.train.sources.pack import PackSettings, write_pack
 
 SIZE, VIEWS = 24, 4
 UIDS = ("a", "group/b")
@@ -95,25 +94,25 @@ def test_by_name_by_number_and_by_camera_is_the_same(data):
     assert found["mean"]["psnr"] == named["mean"]["psnr"] == 100
 
 
-def test_a_pack_has_no_names_so_pictures_of_it_go_by_number(data):
-    write_pack(data / "data", data / "pack", PackSettings(size=None), workers=1)
-    (data / "data").rename(data / "files")
-    (data / "pack").rename(data / "data")
-    assert evaluate(data)[0] == 1  # of names that a pack does not keep
+def test_views_of_one_name_in_several_folders_go_by_number(data):
+    for uid in UIDS:
+        folder = data / "data" / uid
+        names = [f"camera{v}/view.png" for v in range(VIEWS)]
+        (folder / "transforms.json").write_text(poses(names, AZIMUTHS))
+        for v, name in enumerate(names):
+            (folder / name).parent.mkdir()
+            (folder / f"view{v}.png").rename(folder / name)
+    assert evaluate(data)[0] == 1  # view0.png has the name of no view
     for uid in UIDS:
         for v in range(VIEWS):
             path = data / "pred" / uid / f"view{v}.png"
-            Image.open(path).resize((2 * SIZE, 2 * SIZE), 0).save(path.with_name(f"{v:03d}.png"))
-            path.unlink()
-    assert "is 48x48" in evaluate(data)[1]["failures"][0]["reason"]
-    code, report = evaluate(data, "--resize-pictures")
+            path.rename(path.with_name(f"{v:03d}.png"))
+    code, report = evaluate(data)
     assert code == 0 and report["objects"][1]["pictures"]["matched_by"] == "number"
     assert report["mean"]["psnr"] == 100
-    dataset = open_dataset(data / "data")
-    one = Image.open(data / "files" / "a" / "view0.png")
-    rgb = torch.from_numpy(np.asarray(one)[..., :3] / np.float32(255))[None]
-    shown = Shown(rgb, torch.ones(1, SIZE, SIZE))
-    save_pictures(data / "saved", dataset.files("a"), [2], shown)
+    files = open_dataset(data / "data").files("a")
+    rgb = torch.from_numpy(rgba(0)[..., :3] / np.float32(255))[None]
+    save_pictures(data / "saved", files, [2], Shown(rgb, torch.ones(1, SIZE, SIZE)))
     assert [path.name for path in (data / "saved").iterdir()] == ["2.png"]
 
 
