@@ -204,7 +204,7 @@ class TrainConfig:
 
     Attributes:
         data: Dataset folder; or a folder of shards (gamba data pack), or its address on a server,
-            http(s):// or gs://.
+            http(s)://.
         preset: Preset of the model.
         set: Changes to the preset, e.g. prepend=false depth=4; the fields are GambaConfig's.
     """

@@ -174,6 +174,8 @@ def open_dataset(
     else:
         layout, folders, _ = find_objects(root, layout)
         if not folders:
+            if any(root.glob("shards-*.json")):
+                raise UserError(f"{root}: shards, which only gamba train reads")
             marks = ", ".join(mark for mark, _ in LAYOUTS.values())
             raise UserError(f"{root}: no objects found (none of {marks} in any folder)")
         uids = [folder.relative_to(root).as_posix() for folder in folders]

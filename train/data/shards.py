@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
+from http.client import HTTPException
 from itertools import repeat
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import unquote
+from urllib.request import urlopen
 
 import msgspec
 from msgspec import Meta
@@ -24,12 +27,13 @@ from msgspec import Meta
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.data.gso import scanned
 from gamba_warp.data.layouts import EncodedPicture, ObjectFiles, object_of
-from gamba_warp.errors import UserError, first_line
+from gamba_warp.errors import FileWarning, UserError, first_line, one_line
 from gamba_warp.untrusted.documents import MAX_BYTES, parse_document, read_bytes
 
 INDEX = "shards-{}.json"  # of a split
 BUFFER = 100  # objects mixed at a time, with the bytes of their pictures
-_ADDRESS = re.compile("(https?|gs)://[A-Za-z0-9][A-Za-z0-9_.:/@%~+-]{0,999}")
+SILENCE = 60.0  # seconds without a byte that end a transfer
+_ADDRESS = re.compile("https?://[A-Za-z0-9][A-Za-z0-9_.:/@%~+-]{0,999}")
 
 
 class Unreachable(UserError):
@@ -46,10 +50,16 @@ class _Index(msgspec.Struct):
 
 
 def shards_at(source: Path) -> str | None:
-    """Return a folder of shards, or their address on a server; None for any other path."""
-    address = re.sub("^([a-z]+):/+", r"\1://", str(source))  # a path has lost one of the slashes
+    """Return a folder of shards, or their address on a server; None for any other path.
+
+    Raises:
+        UserError: an address of another kind.
+    """
+    address = re.sub("^([a-z0-9]+):/+", r"\1://", str(source))  # a path has lost one slash
     if _ADDRESS.fullmatch(address):
         return address
+    if "://" in address and not source.is_dir():
+        raise UserError(f"{address}: only http:// and https:// addresses can be read")
     folder = source.absolute()  # no name of a folder is then an address to the library
     return str(folder) if (folder / INDEX.format("train")).is_file() else None
 
@@ -73,14 +83,16 @@ class Shards:
             UserError: the index cannot be read, or is invalid.
             ModuleNotFoundError: ``webdataset`` is not installed.
         """
-        from webdataset.gopen import gopen
+        from webdataset.gopen import gopen_schemes
 
+        gopen_schemes.update(http=_open, https=_open)  # its own, by curl, tries for 16 minutes
         name, there = f"{source}/{INDEX.format(split)}", "://" in source
         try:
-            with gopen(name) if there else io.BytesIO(read_bytes(name)) as stream:
+            with _open(name) if there else io.BytesIO(read_bytes(name)) as stream:
                 data = stream.read(MAX_BYTES)
-        except (OSError, ValueError) as error:
-            raise UserError(f"{name}: cannot be read ({first_line(error)})") from error
+        except (OSError, ValueError, HTTPException) as error:
+            reason = first_line(getattr(error, "reason", error))
+            raise UserError(f"{name}: cannot be read ({reason})") from error
         index = parse_document(data, _Index, name).shardlist
         self.urls = [f"{source}/{shard.url}" for shard in index]
         for url in self.urls:
@@ -125,6 +137,10 @@ class Shards:
         yield from _read(dataset.compose(detshuffle(BUFFER, BUFFER, seed)).repeat())
 
 
+def _open(url: str, *_: object) -> Any:
+    return urlopen(url, timeout=SILENCE)
+
+
 def _read(dataset: Any) -> Iterator[dict[str, Any] | Unreachable]:
     try:
         yield from dataset
@@ -145,12 +161,17 @@ def _read_object(sample: dict[str, Any], uid: str) -> ObjectFiles:
     if scanned({uid}):
         raise UserError(f"{source}: one of Google Scanned Objects, which are for evaluation")
     contents = {name: value for name, value in sample.items() if isinstance(value, bytes)}
+    document = parse_document(contents.pop("json", b""), object, source)
     pictures = {name: EncodedPicture(f"{source}.{name}", c) for name, c in contents.items()}
 
     def find(name: object, where: str) -> EncodedPicture:
         if not isinstance(name, str) or name not in pictures:
             raise UserError(f"{where}: the shard has no {repr(name)[:80]} of this object")
+        contents.pop(name, None)
         return pictures[name]
 
-    document = parse_document(contents.get("json", b""), object, source)
-    return object_of([(source, document, find)])
+    files = object_of([(source, document, find)])
+    if contents:
+        line = f"{sample['__url__']}: files that no .json of their object names are not read"
+        warnings.warn(one_line(line), FileWarning, stacklevel=2)
+    return files
