@@ -3,10 +3,9 @@
 import sys
 import unicodedata
 
-import numpy as np
 import pytest
 from helpers.images import cut_out
-from helpers.meshes import glb
+from helpers.meshes import glb, gltf
 from helpers.micro import cloud, write_dataset
 
 from gamba_warp import batch, cli
@@ -25,18 +24,7 @@ def obeyed(text):
 @pytest.fixture
 def folder(tmp_path):
     """A folder of good and bad files of many kinds, with odd names and contents."""
-    points = np.eye(3, dtype="<f4").tobytes()
-    tree = {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 0}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "buffers": [{"byteLength": 36}],
-        "extensionsUsed": [ODD],
-    }
-    (tmp_path / f"{ODD}.glb").write_bytes(glb(tree, points))
+    (tmp_path / f"{ODD}.glb").write_bytes(glb(gltf(extensionsUsed=[ODD]), b""))
     (tmp_path / f"{ODD}-broken.obj").write_text(f"v 0 0 0\nf {ODD}\n")
     write_gaussians(tmp_path / f"{ODD}.ply", cloud(0), "ply")
     (tmp_path / f"{ODD}-broken.ply").write_text(f"ply\nformat {ODD}\n")

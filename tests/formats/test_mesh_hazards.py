@@ -1,6 +1,5 @@
 """Mesh files with false headers, with names outside their folder, or far too large."""
 
-import base64
 import contextlib
 import io
 import json
@@ -12,7 +11,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import trimesh
-from helpers.meshes import MTL, write_quad
+from helpers.meshes import MTL, gltf, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -154,20 +153,6 @@ def test_sizes_beside_a_mesh_have_a_limit(tmp_path, monkeypatch):
     os.unlink(tmp_path / "quad.mtl")
     os.mkfifo(tmp_path / "quad.mtl")  # reading one waits for ever
     assert any("quad.mtl: not found" in line for line in load_mesh(path).warnings)
-
-
-def gltf(**changes):
-    points = np.eye(3, dtype="<f4").tobytes()
-    uri = "data:;base64," + base64.b64encode(points).decode()
-    return {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 0}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "buffers": [{"byteLength": 36, "uri": uri}],
-    } | changes
 
 
 ACCESSOR = gltf()["accessors"][0]

@@ -1,5 +1,6 @@
 """A textured square as an .obj file, and the container of a .glb, for tests of meshes."""
 
+import base64
 import json
 import struct
 
@@ -50,3 +51,18 @@ def render_views(folder, out, **options):
     own = {name: options.pop(name) for name in ("split", "workers") if name in options}
     share = {name: options.pop(name) for name in ("shard", "limit") if name in options}
     return data_render_command(folder, out, Settings(**options), Share(**share), **own)
+
+
+def gltf(**changes):
+    """Return the document of one triangle, its buffer embedded, with other values."""
+    points = np.eye(3, dtype="<f4").tobytes()
+    uri = "data:;base64," + base64.b64encode(points).decode()
+    return {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 0}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36, "uri": uri}],
+    } | changes
