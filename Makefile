@@ -14,7 +14,7 @@ EDIT := PYTHONWARNINGS='ignore:Editable installation' \
 WHEEL := build/wheel-check
 
 .PHONY: setup demo test ptx debug hostile endurance bench docs lint format figures \
-        scanned architecture constraints clean
+        scanned constraints clean
 
 setup: $(STAMP)
 
@@ -100,7 +100,7 @@ docs: $(TOOLS)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "to read it (its search needs a server): $(BIN)/python -m http.server --bind 127.0.0.1 --directory site"
 
-# pyright reads what users get: the wheel, unpacked. (build/ goes first: setuptools would take
+# pyright and lint-imports read what users get: the wheel, unpacked. (build/ goes first: setuptools would take
 # files from it that are gone from the checkout.)
 lint: $(TOOLS)
 	$(BIN)/ruff check .
@@ -112,6 +112,7 @@ lint: $(TOOLS)
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build .
 	$(BIN)/python -m zipfile --extract build/*.whl $(WHEEL)
 	$(BIN)/pyright
+	cd $(WHEEL) && $(CURDIR)/$(BIN)/lint-imports --no-logo --no-cache $(CURDIR)/pyproject.toml
 
 format: $(TOOLS)
 	$(BIN)/ruff check --fix .
@@ -127,10 +128,6 @@ figures: $(TOOLS)
 # make scanned MESHES=FOLDER OPTIONS="--no-lpips --limit 8"
 scanned: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.scanned $(MESHES) $(OPTIONS)
-
-# The table of docs/architecture.md, from today's imports.
-architecture: $(TOOLS)
-	PYTHONPATH=docs $(BIN)/python -m architecture
 
 # After a green `make test`: constraints.txt from what is installed. Versions without the local
 # part that some wheels carry (torch's +cu130), which no index has; nothing installed from a folder.

@@ -229,7 +229,7 @@ def _loaded(
 ) -> LoadedShape:
     if isinstance(shape, Points):
         return LoadedShape(source, shape, [], motion, axes)
-    mesh, flags = clean_mesh(shape)
+    mesh, flags = clean_mesh(shape, protocol.strict)
     if len(mesh.faces) == 0:
         raise UserError("the mesh has no area")
     refused = [flag for flag in flags if flag in STRICT]

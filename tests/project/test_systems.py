@@ -1,14 +1,15 @@
 """Features that macOS lacks, taken away on the machine of the tests, and text encodings."""
 
 import ast
+import configparser
 import os
+import re
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 import warp as wp
-from architecture.imports import modules
 from helpers.refusals import refused
 
 from gamba_warp.errors import UserError
@@ -19,6 +20,12 @@ from gamba_warp.untrusted import children
 from gamba_warp.vision.weights import cache_folder, store_weights
 
 ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = {
+    "gamba_warp": "gamba_warp",
+    "kernels": "gamba_warp.kernels",
+    "train": "gamba_warp.train",
+    "eval": "gamba_warp.eval",
+}
 
 
 def test_json_ends_its_lines_alike_everywhere(tmp_path):
@@ -120,5 +127,25 @@ def test_text_has_an_encoding(tmp_path):
     wrong = 'open("a")\nopen("a", "rb")\np.read_text()\np.write_text(x)\nrun(a, text=True)\n'
     (tmp_path / "a.py").write_text(wrong, encoding="utf-8")
     assert _text_without_encoding(tmp_path / "a.py") == [1, 3, 4, 5]
-    found = {path: _text_without_encoding(path) for path in modules(ROOT).values()}
+    files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
+    found = {path: _text_without_encoding(path) for path in files}
     assert not {path: lines for path, lines in found.items() if lines}
+
+
+def test_every_package_is_listed():
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    folders = {
+        ".".join((package, *path.parent.relative_to(ROOT / folder).parts))
+        for folder, package in FOLDERS.items()
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    # The shipped model: files, and no code.
+    assert set(config["options"]["packages"].split()) == folders | {"gamba_warp.starter"}
+
+
+def test_modules_are_not_imported_by_their_folders_names():
+    by_folder = re.compile(r"^ *(from|import) (kernels|train|eval)\b", re.M)
+    for folder in (*FOLDERS, "tests", "docs"):
+        for path in (ROOT / folder).rglob("*.py"):
+            assert not by_folder.search(path.read_text(encoding="utf-8")), path

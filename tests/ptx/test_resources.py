@@ -100,7 +100,6 @@ def test_a_kernel_is_in_its_bounds(entries, key):
 ON_THE_HOST = {
     "runtime/launch.py",
     "ssim/lanes.py",
-    "triangles/function.py",
 }  # a CPU launches these; no path says so
 
 
