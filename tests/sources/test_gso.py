@@ -7,7 +7,6 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-import trimesh
 from helpers.published.gso import PBTXT, write_model, write_zip
 
 from gamba_warp.cli import run
@@ -137,53 +136,3 @@ def test_all_names_hold_the_evaluation_and_are_told_by_the_last_part():
     assert len(gso.all_names()) == 1033 and {*gso.NAMES} < gso.all_names()
     uids = ["things/Dino_4", "Dino_4", "dino_4", "my_Dino_4", "Dino_4/x", "chair"]
     assert gso.scanned(uids) == ["Dino_4", "things/Dino_4"]
-
-
-def write_glb(folder, name, up):
-    """Write a box of 2 x 1 x 4, whose longest side points up."""
-    folder.mkdir(parents=True, exist_ok=True)
-    box = trimesh.creation.box((2, 1, 4) if up == "z" else (2, 4, 1))
-    box.export(folder / name)
-
-
-@pytest.mark.parametrize(
-    "file, up, told",
-    [
-        ("{}.glb", "y", []),
-        ("{}.glb", "z", ["--up", "z"]),
-        ("{}/model.obj", "z", ["--up", "z"]),
-        ("{}/textured.obj", "y", ["--up", "y"]),
-    ],
-)
-def test_a_folder_of_meshes_that_is_there(tmp_path, capsys, file, up, told):
-    source = tmp_path / "there"
-    path = source / file.format(FIRST)
-    write_glb(path.parent, path.name, up)
-    write_glb(source, "Dino_4.glb", "y")  # of the set, and not of the evaluation
-    write_glb(source, "mine.glb", "y")
-    words = [str(tmp_path / "out"), "--source", str(source), "--size", "16", "--workers", "1"]
-    assert run("data gso", [*words, "--limit", "2", *told]) == 1
-    said = capsys.readouterr()
-    assert f"1 of 2 found: {FIRST}\n" in said.out
-    assert f"missing: {SECOND}: not in {source}" in said.err and "1 of 2 missing" in said.out
-    assert "1 other object of the set outside the evaluation" in said.out
-    assert f"eval-geometry EVAL/gaussians {source} --protocol gso --up {up} --data" in said.out
-    data = open_dataset(tmp_path / "out" / "views", "test")
-    assert data.uids == [FIRST] and data.num_views(0) == 24
-    # Upright in the picture, and seen from the broad side.
-    alpha = data.load(0, views=[0]).images[0, ..., 3] > 0.5
-    assert alpha.any(1).sum() > 1.5 * alpha.any(0).sum() > 0
-    assert not (tmp_path / "out" / "meshes").exists()
-
-
-def test_axes_that_a_file_does_not_tell_are_asked_for(tmp_path, capsys):
-    write_glb(tmp_path / "there" / FIRST, "model.obj", "z")
-    words = [str(tmp_path / "out"), "--source", str(tmp_path / "there"), "--size", "16"]
-    assert run("data gso", words) == 2
-    assert "model.obj: may have y or z up; choose with --up" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-    write_model(tmp_path / "set", FIRST)
-    words[2] = str(tmp_path / "set")
-    assert run("data gso", [*words, "--up", "y"]) == 2
-    assert "--up y: the set's own layout has z up" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -1,10 +1,7 @@
-"""``gamba data objaverse``: copies of G-Objaverse, its lists, and Objaverse's own package."""
+"""``gamba data objaverse``: copies of G-Objaverse and its lists."""
 
 import gzip
 import json
-import shutil
-import sys
-import types
 
 import pytest
 from helpers.published.gobjaverse import VIEWS, members, write_object, write_tar
@@ -13,7 +10,6 @@ from helpers.refusals import refused
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.files import PART
-from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.train.sources.objaverse_lists import Lists, read_index, read_list, read_quality
 
 # Names of four objects, in G-Objaverse and of Objaverse.
@@ -138,12 +134,6 @@ def test_lists_in_their_published_forms(published):
     csv = (published / "kiuisobj_v1_merged_80K.csv",)
     assert Lists(without=poor).choose(UIDS).names == ["0/10010", "0/10012", "0/10013"]
     assert Lists(index, uids=csv).choose(UIDS).names == ["0/10010", "0/10012"]
-    # Names of meshes: of lists by the other name, and without the poor.
-    both = (published / "gobjaverse_280k.json", *csv)
-    assert Lists(index, uids=both, without=poor).choose(None).names == sorted([uids[0], uids[2]])
-    quality = published / "category_annotation.json"
-    got = Lists(index, uids=both[:1], quality=quality).choose(None).names
-    assert got == sorted(u for u in uids if u != uids[1])
 
 
 @pytest.mark.parametrize(
@@ -202,73 +192,3 @@ def test_damaged_objects_leave_nothing(tmp_path, capsys):
     assert data(tmp_path / "set", "--source", tmp_path / "set") == 2
     assert data(tmp_path / "out", "--source", tmp_path / "nowhere") == 2
     assert data(tmp_path / "out", "--source", tmp_path / "out") == 2
-
-
-@pytest.fixture
-def package(tmp_path, monkeypatch):
-    """A stand-in for the package ``objaverse``: its functions, their arguments and results."""
-    made = types.ModuleType("objaverse")
-    cache = tmp_path / "cache"
-    cache.mkdir()
-    made.asked = []
-
-    def load_objects(uids, download_processes=1):
-        made.asked.append(list(uids))
-        for uid in uids:
-            (cache / f"{uid}.glb").write_bytes(b"glTF" + uid.encode())
-        return {uid: str(cache / f"{uid}.glb") for uid in uids if uid != "f" * 32}
-
-    def load_annotations(uids=None):
-        user = {"displayName": "Jay\nKay", "username": "jk"}
-        page = {"license": "by", "viewerUrl": "https://sketchfab.com/3d-models/x", "user": user}
-        return {uid: {"uid": uid, "name": f"Thing {uid[0]}", **page} for uid in uids[1:]}
-
-    made.load_objects, made.load_annotations = load_objects, load_annotations
-    monkeypatch.setitem(sys.modules, "objaverse", made)
-    return made
-
-
-def test_meshes_by_the_package(published, package, tmp_path, capsys):
-    out = tmp_path / "meshes"
-    words = [out, "--source", "objaverse", "--uids", published / "lvis-annotations.json.gz"]
-    assert data(*words, "--shard", "0/2") == 0
-    assert data(*words) == 1
-    said = capsys.readouterr()
-    assert f"left out: {'f' * 32}: Objaverse has no such object" in said.err
-    assert "next: gamba data render" in said.out
-    # Nothing is requested twice, except missing objects.
-    asked = [uid for batch in package.asked for uid in batch]
-    assert sorted(asked) == sorted({*asked}) and len(asked) == 4
-    meshes = {mesh.uid: mesh for mesh in find_meshes(out)}
-    uids = list(UIDS.values())
-    assert sorted(meshes) == sorted([uids[0], uids[1], uids[3]])
-    named = [mesh for mesh in meshes.values() if mesh.attribution]
-    assert named and named[0].attribution == {
-        "creator": "Jay Kay",
-        "licence": "by",
-        "source": "https://sketchfab.com/3d-models/x",
-    }
-    assert named[0].name.startswith("Thing ")
-    shutil.rmtree(tmp_path / "cache")  # the files are hard links or copies
-    assert all(mesh.path.read_bytes().startswith(b"glTF") for mesh in meshes.values())
-
-
-def test_without_the_package_or_the_network_it_is_one_line(
-    published, package, tmp_path, monkeypatch, capsys
-):
-    words = [tmp_path / "out", "--source", "objaverse", "--uids"]
-    words += [published / "lvis-annotations.json.gz"]
-
-    def broken(**_):
-        raise OSError("<urlopen error\nno network>")
-
-    package.load_objects = broken
-    assert data(*words) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "nothing can be downloaded (OSError: " in error
-    assert data(*words[:3]) == 2
-    assert "--uids: needed" in capsys.readouterr().err
-    monkeypatch.setitem(sys.modules, "objaverse", None)
-    assert data(*words) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "pip install objaverse" in error

@@ -21,7 +21,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
 from gamba_warp.untrusted.ranges import Seed, ranged, shard_numbers
 
-from ..data.settings import Settings, Up
+from ..data.settings import Settings
 from .objaverse_lists import Lists
 
 Item = TypeVar("Item")
@@ -200,15 +200,14 @@ def data_pack_command(
 @ranged
 def data_objaverse_command(
     out: tyro.conf.Positional[Path],
-    source: str,
+    source: Path,
     lists: tyro.conf.OmitArgPrefixes[Lists],
     share: tyro.conf.OmitArgPrefixes[Share],
     min_views: Annotated[int, Meta(ge=1, le=10_000)] = 40,
     copy: bool = False,
     depth: bool = False,
-    workers: Annotated[int, Meta(ge=1, le=256)] = 1,
 ) -> int:
-    """Make a dataset of a local copy of G-Objaverse, or download Objaverse's meshes.
+    """Make a dataset of a local copy of G-Objaverse.
 
     Folders are linked; of tars only the files for training are unpacked. Existing objects are
     skipped, so a stopped command can be continued. OUT/objaverse.json records the choice.
@@ -216,37 +215,35 @@ def data_objaverse_command(
 
     Args:
         out: folder to make or to continue.
-        source: folder of G-Objaverse (folders or tars); or "objaverse": meshes by that package.
+        source: folder of G-Objaverse (folders or tars).
         lists: lists of objects.
         share: selection of these objects.
-        min_views: complete views that an object of G-Objaverse must have; published are 40.
+        min_views: complete views that an object must have; published are 40.
         copy: copy the files of folders instead of linking them.
         depth: also make depth pictures from the _nd.exr files; needs the package OpenEXR.
-        workers: number of parallel downloads.
     """
-    from .objaverse_meshes import PACKAGE, load_package, take_meshes
     from .objaverse_views import check_package, find_rendered, take_views
 
     first, count = share.numbers
     if depth:
         check_package()
-    if meshes := source == PACKAGE:
-        load_package()
-    objects = {} if meshes else find_rendered(Path(source))
-    if not meshes and out.resolve() == Path(source).resolve():
+    objects = find_rendered(source)
+    if out.resolve() == source.resolve():
         raise UserError(f"{out}: is --source itself; choose another folder")
-    chosen = lists.choose(None if meshes else objects)
+    chosen = lists.choose(objects)
     names = share.of(chosen.names)
     out = output_folder(out)
     for what, number in chosen.counts.items():
         print(f"{number:>9,} {what}")
-    if meshes:
-        taken, failures = take_meshes(names, out, workers)
-    else:
-        taken, failures = take_views(objects, names, out, min_views, copy, depth)
+    taken, failures = take_views(objects, names, out, min_views, copy, depth)
     record = out / ("objaverse.json" if count == 1 else f"objaverse.{first}-{count}.json")
     known = {name: chosen.uids[name] for name in names if name in chosen.uids}
-    about = {"source": source, "counts": chosen.counts, "shard": share.shard, "objects": len(names)}
+    about = {
+        "source": str(source),
+        "counts": chosen.counts,
+        "shard": share.shard,
+        "objects": len(names),
+    }
     write_json(record, about | {"objaverse": known, "left_out": failures})
     there = len(names) - taken - len(failures)
     found = f"{there:,} existed, {len(failures):,} left out"
@@ -255,10 +252,8 @@ def data_objaverse_command(
         print(f"left out: {name}: {reason}", file=sys.stderr)
     if (rest := len(failures) - _MAX_SHOWN) > 0:
         print(f"left out: {rest:,} more, see {record}", file=sys.stderr)
-    if not meshes:
-        _report_empty_splits(out)
-    following = "gamba data render {} --size 512 --out DATA" if meshes else "gamba train {} ..."
-    print(f"next: {following.format(out)}")
+    _report_empty_splits(out)
+    print(f"next: gamba train {out} ...")
     return 1 if failures else 0
 
 
@@ -287,52 +282,39 @@ def data_gso_command(
     out: tyro.conf.Positional[Path],
     source: Path,
     share: tyro.conf.OmitArgPrefixes[Share],
-    up: Up = "auto",
     size: Annotated[int, Meta(ge=8, le=4096)] = 512,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
     objects: Path | None = None,
 ) -> int:
     """Make the evaluation "gso" from a copy of Google Scanned Objects: 60 objects, 24 views each.
 
-    Writes OUT/views (a dataset, all of it the test split; view 0 is the input) and, for the set's
-    own layout, OUT/meshes. Existing objects are skipped, so a stopped command can be continued.
+    Writes OUT/views (a dataset, all of it the test split; view 0 is the input) and OUT/meshes.
+    Existing objects are skipped, so a stopped command can be continued.
     Found and missing objects are listed; if any are missing, the exit code is 1.
 
     Args:
         out: folder to make or to continue.
-        source: folder of the set, with a folder or a zip of each model as the Fuel server has them;
-            or meshes with the set's names in any other layout, such as NAME.glb.
-        up: the axis that points up in files of another layout; auto: y for .glb and .gltf, required
-            for other formats. Those of the Fuel server have z.
+        source: folder of the set, with a folder or a zip of each model as the Fuel server has them.
         share: selection of objects.
         size: pixels a side; the evaluation's are 512.
         objects: text file of other objects, one name a line: the same poses, another list.
         workers: number of processes that render; 0 means one per core.
     """
-    from gamba_warp.data.gso import UP, names_of
+    from gamba_warp.data.gso import names_of
 
-    from .gso import find_meshes_of, make_views, others_of, take_models, taken, up_of
+    from .gso import make_views, others_of, take_models, taken
 
     listed = names_of(objects)
     names = share.of(listed)
-    meshes, truths, axis = find_meshes_of(source, names), source, ""
-    if meshes:
-        up = up_of(meshes, up)
-        axis = f" --up {up}"
-        out = output_folder(out)
-        failures = dict.fromkeys(names, f"not in {source}")
-    else:
-        if up not in ("auto", UP):
-            raise UserError(f"--up {up}: the set's own layout has z up")
-        out, up, truths = output_folder(out), UP, out / "meshes"
-        failures = take_models(source, out, names)
-        meshes = taken(out, names)
+    out = output_folder(out)
+    failures = take_models(source, out, names)
+    meshes = taken(out, names)
     failures = {name: why for name, why in failures.items() if name not in {m.uid for m in meshes}}
     print(f"{len(meshes)} of {len(names)} found: {', '.join(mesh.uid for mesh in meshes)}")
     if others := others_of(source, listed):
         left = f"{counted(others, 'other object')} of the set outside the evaluation"
         print(f"{left}: gamba data render {source} --out DATA")
-    made, warnings, failed = make_views(out, meshes, size, workers, up)
+    made, warnings, failed = make_views(out, meshes, size, workers)
     failures |= failed
     code = _report(failures, "missing", warnings)
     views, missing = out / "views", f"{len(failures)} of {len(names)} missing"
@@ -340,6 +322,6 @@ def data_gso_command(
     own = "" if objects is None else f" --objects {objects}"
     evaluation = f"--protocol gso{own} --checkpoint MODEL --data {views} --out EVAL"
     print(f"next: gamba eval-views {evaluation}")
-    geometry = f"gamba eval-geometry EVAL/gaussians {truths}"
-    print(f"      {geometry} --protocol gso{own}{axis} --data {views}")
+    geometry = f"gamba eval-geometry EVAL/gaussians {out / 'meshes'}"
+    print(f"      {geometry} --protocol gso{own} --data {views}")
     return code

@@ -24,7 +24,7 @@ from gamba_warp.untrusted.documents import read_bytes
 from gamba_warp.untrusted.names import inside
 
 from ..data.render import render_meshes, still_missing
-from ..data.settings import Settings, Up
+from ..data.settings import Settings
 
 MESH = "meshes/model.obj"
 METADATA = "metadata.pbtxt"
@@ -64,27 +64,9 @@ def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Pat
     if not found:
         raise UserError(
             f"--source {source}: holds none of the {len(names)} models "
-            f"(such as {names[0]}/{MESH}, {names[0]}.zip or {names[0]}.glb)"
+            f"(such as {names[0]}/{MESH} or {names[0]}.zip)"
         )
     return found
-
-
-def find_meshes_of(source: Path, names: Sequence[str]) -> list[Mesh]:
-    """Find meshes by name in a folder of another layout than the set's own.
-
-    Args:
-        source: the folder, read by ``find_meshes``.
-        names: names of the meshes.
-
-    Returns:
-        The meshes; empty if the folder has the set's own layout, or none of them.
-    """
-    with suppress(UserError):
-        find_models(source, names)
-        return []
-    with suppress(UserError):
-        return [mesh for mesh in find_meshes(source) if mesh.uid in names]
-    return []
 
 
 def others_of(source: Path, names: Sequence[str] = gso.NAMES) -> int:
@@ -92,24 +74,7 @@ def others_of(source: Path, names: Sequence[str] = gso.NAMES) -> int:
     others = sorted(gso.all_names() - {*names})
     with suppress(UserError):
         return len(find_models(source, others))
-    return len(find_meshes_of(source, others))
-
-
-def up_of(meshes: Sequence[Mesh], up: Up) -> Up:
-    """Return the axis that points up in meshes of another layout than the set's own.
-
-    Args:
-        meshes: their files.
-        up: the requested axis; auto takes it from the format.
-
-    Raises:
-        UserError: the format does not define it; only glTF does. .obj files of the set have z up,
-            others y.
-    """
-    for mesh in meshes:
-        if up == "auto" and mesh.path.suffix.lower() not in (".glb", ".gltf"):
-            raise UserError(f"{mesh.path}: may have y or z up; choose with --up y or --up z")
-    return "y" if up == "auto" else up
+    return 0
 
 
 def take_model(name: str, path: Path, out: Path) -> None:
@@ -221,7 +186,7 @@ def taken(out: Path, names: Sequence[str]) -> list[Mesh]:
 
 
 def make_views(
-    out: Path, meshes: Sequence[Mesh], size: int, workers: int, up: Up = gso.UP
+    out: Path, meshes: Sequence[Mesh], size: int, workers: int
 ) -> tuple[int, dict[str, list[str]], dict[str, str]]:
     """Render models into ``out/views``; all objects are its test split.
 
@@ -230,7 +195,6 @@ def make_views(
         meshes: meshes of the models.
         size: pixels a side.
         workers: processes; 0 means one per core.
-        up: the axis that points up in the files.
 
     Returns:
         The number of newly rendered objects, warnings by name about missing parts of a model's
@@ -243,7 +207,7 @@ def make_views(
     if not meshes:
         return 0, {}, {}
     # The same lights for an object in every run.
-    settings = Settings(gso.VIEWS, size, gso.FOV, format="png", up=up, spread=0.0, poses="gso")
+    settings = Settings(gso.VIEWS, size, gso.FOV, format="png", up=gso.UP, spread=0.0, poses="gso")
     todo, damaged = still_missing(meshes, views, settings)
     warnings, failures = render_meshes(todo, views, settings, workers)
     there = sorted(path.parent.name for path in views.glob("[!.]*/transforms.json"))

@@ -1,4 +1,4 @@
-"""Published lists of the objects of Objaverse and G-Objaverse.
+"""Published lists of the objects of G-Objaverse.
 
 An object has two names: Objaverse's uid, of 32 letters and digits, and in G-Objaverse
 ``dictionary_id/instance_id``, two numbers. ``gobjaverse_280k_index_to_objaverse.json`` maps the
@@ -114,7 +114,7 @@ class Choice:
     """Selected objects.
 
     Attributes:
-        names: in G-Objaverse, or of Objaverse for meshes; sorted.
+        names: in G-Objaverse, sorted.
         counts: number of objects in each list, and left after it; for the user and the record.
         uids: uid of Objaverse by the name in G-Objaverse, if known from an index.
     """
@@ -140,38 +140,33 @@ class Lists:
     without: tuple[Path, ...] = ()
     quality: Path | None = None
 
-    def choose(self, there: Iterable[str] | None) -> Choice:
+    def choose(self, there: Iterable[str]) -> Choice:
         """Choose objects.
 
         Args:
-            there: names in G-Objaverse of the objects of a local copy; None chooses objects of
-                Objaverse by uid, which needs a list in ``uids``.
+            there: names in G-Objaverse of the objects of a local copy.
 
         Raises:
-            UserError: a list cannot be read, names of the other kind need a missing index, or no
-                object is left.
+            UserError: a list cannot be read, names of Objaverse need a missing index, or no object
+                is left.
         """
         index = {} if self.index is None else read_index(self.index)
-        if there is None and not self.uids:
-            raise UserError("--uids: needed, so that not all of Objaverse is downloaded")
-        found, meshes = Choice(sorted(there or ()), {}, index), there is None
+        found = Choice(sorted(there), {}, index)
         counts = found.counts
-        if not meshes:
-            counts["in the source"] = len(found.names)
+        counts["in the source"] = len(found.names)
         for path in self.uids:
-            names = self._convert_names(read_list(path), index, meshes, path)
-            what = f"of them also in {path.name}" if counts else f"in {path.name}"
-            found.names = sorted(names & {*found.names} if counts else names)
-            counts[what] = len(found.names)
+            names = self._rendered(read_list(path), index, path)
+            found.names = sorted(names & {*found.names})
+            counts[f"of them also in {path.name}"] = len(found.names)
         for path in self.without:
-            names = self._convert_names(read_list(path), index, meshes, path)
+            names = self._rendered(read_list(path), index, path)
             found.names = [name for name in found.names if name not in names]
             counts[f"left without {path.name}"] = len(found.names)
         if self.quality is not None:
-            if not meshes and not index:
+            if not index:
                 raise UserError(f"{self.quality}: has names of Objaverse; give --index, too")
             labels = read_quality(self.quality)
-            label_of = {n: labels.get(n if meshes else index.get(n, "")) for n in found.names}
+            label_of = {n: labels.get(index.get(n, "")) for n in found.names}
             known = sum(label is not None for label in label_of.values())
             counts[f"with a category in {self.quality.name}"] = known
             found.names = [name for name in found.names if label_of[name] != POOR]
@@ -181,17 +176,10 @@ class Lists:
             raise UserError(f"no object is left ({listed})")
         return found
 
-    def _convert_names(
-        self, names: set[str], index: Mapping[str, str], meshes: bool, path: Path
-    ) -> set[str]:
-        """Convert names to the requested kind; names missing from the index are dropped."""
+    def _rendered(self, names: set[str], index: Mapping[str, str], path: Path) -> set[str]:
+        """Return names in G-Objaverse; those that are missing from the index are dropped."""
         rendered = {name for name in names if RENDERED.fullmatch(name)}
         others = names - rendered
-        if not (rendered if meshes else others):
-            return names
-        if not index:
-            kind = "G-Objaverse" if meshes else "Objaverse"
-            raise UserError(f"{path}: has names of {kind}; give --index, too")
-        if meshes:
-            return others | {index[name] for name in rendered if name in index}
+        if others and not index:
+            raise UserError(f"{path}: has names of Objaverse; give --index, too")
         return rendered | {name for name, uid in index.items() if uid in others}
