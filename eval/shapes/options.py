@@ -67,7 +67,7 @@ class ShapesOptions:
         pixels: Side of the TSDF's depth maps.
         seed: Seed of the random points.
         sensitivity: Evaluate under every protocol, and under each change of one field of this one:
-            a table and a chart of the effect of the protocol, in OUT.
+            a table of the effect of the protocol, in OUT.
         workers: Pairs evaluated at the same time, each in its own process.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.

@@ -23,7 +23,6 @@ from .protocol import PRESETS, GeometryProtocol
 from .shape import Similarity
 
 CHOSEN = "chosen"
-_SIZE = (1000, 640)  # of the chart, pixels
 _FILE_FIELDS = ("frame", "up", "pred_axes", "reference", "distance", "strict", "seed")
 # Alternative values by field. Those of "surface" matter only for Gaussians.
 _CHANGES: dict[str, tuple[Any, ...]] = {
@@ -132,7 +131,6 @@ def evaluate_variants(
         report = {"protocol": protocol.to_json(), "rows": rows, "objects": records}
         write_json(folder / "sensitivity.json", finite_or_none(report))
         write_text(folder / "sensitivity.md", page)
-        write_text(folder / "sensitivity.svg", _chart(rows))
     return page, records
 
 
@@ -214,22 +212,3 @@ def _page(rows: dict[str, dict[str, Any]], count: int) -> str:
         "longest side is the second number."
     )
     return f"{markdown(lines)}\n\n{note}\n"
-
-
-def _chart(rows: dict[str, dict[str, Any]]) -> str:
-    """Return the text of ``sensitivity.svg``: each row's Chamfer distance and F-score."""
-    from gamba_warp.pages.charts import Axis, Point, Series, chart, picture
-
-    kinds: dict[str, list[Point]] = {"a field changed": [], "a named protocol": []}
-    for label, row in rows.items():
-        if row["mean"]:
-            kind = "a named protocol" if label.startswith("protocol ") else "a field changed"
-            point = Point(row["mean"]["chamfer"], row["mean"]["fscore"], label)
-            kinds[kind].append(point)
-    drawn = chart(
-        [Series(name, points) for name, points in kinds.items()],
-        Axis("Chamfer distance, as the protocol has it"),
-        Axis("F-score at the protocol's least threshold", logarithmic=False),
-        size=_SIZE,
-    )
-    return picture([("The same predictions", drawn)], _SIZE)

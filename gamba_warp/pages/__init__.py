@@ -1,1 +1,1 @@
-"""Turntables, and HTML pages with charts and viewers."""
+"""Turntables, and HTML pages with viewers."""

@@ -43,7 +43,6 @@ class Section:
             such as "Predicted" above "Truth".
         links: thumbnails ``[H, W, 3]`` uint8 by name, which link to NAME.html beside the page.
         files: names of files beside the page, for download.
-        charts: results of ``charts.chart``.
         table: rows of cells; text is left-aligned, numbers right-aligned. Below a header, texts of
             numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval.
         header: names of the table's columns.
@@ -63,7 +62,6 @@ class Section:
     views: Mapping[str, np.ndarray] = field(default_factory=dict)
     links: Mapping[str, np.ndarray] = field(default_factory=dict)
     files: Sequence[str] = ()
-    charts: Sequence[str] = ()
     table: Sequence[Sequence[str | int | float]] = ()
     header: Sequence[str] = ()
     details: Mapping[str, str] = field(default_factory=dict)
