@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import shlex
 import signal
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from msgspec import Meta
 
-from .. import processes
 from ..batch import counted, say
 from ..conventions import DeviceChoice
 from ..errors import UserError, one_line
 from ..files import only_process, output_folder, write_json, write_text
-from ..processes import stop_requests
+from ..processes import run_gamba, stop_requests
 from ..untrusted.documents import read_document
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 
@@ -118,25 +116,18 @@ def _run(folder: Path, task: dict[str, list[str]]) -> tuple[str | None, int]:
             continue
         log = folder / f"{words[0]}.log"
         with stop_requests() as received, open(log, "ab") as output:
-            child = processes.Child([*processes.GAMBA, *words], output)
-            end = child.wait(partial(_pass_on, child, received))
+            code = run_gamba(words, output, received)
         if received:
             return None, received[0]
-        if end is None or not (folder / file).exists():
-            return f"failed: {words[0]}: {_reason(end.code if end else 1, log)}", 0
+        if not (folder / file).exists():
+            return f"failed: {words[0]}: {_reason(code, log)}", 0
     return None, 0
-
-
-def _pass_on(child: processes.Child, received: list[int]) -> None:
-    """Ask the child to stop once this process was: a terminal's Ctrl-C does not reach it."""
-    if received:
-        child.ask(signal.SIGTERM)
 
 
 def _reason(code: int, log: Path) -> str:
     """Return why a command failed, in one line, from its exit code and the end of its log."""
-    if code > 128:
-        return f"died of {signal.Signals(code - 128).name}"
+    if code < 0:
+        return f"died of {signal.Signals(-code).name}"
     with open(log, "rb") as file:
         file.seek(max(0, log.stat().st_size - _TAIL))
         lines = file.read().decode(errors="replace").split("\n")

@@ -6,9 +6,9 @@ import shutil
 import time
 from pathlib import Path
 
+from .. import processes
 from ..errors import UserError
 from ..files import STARTER, only_process, output_folder
-from ..processes import GAMBA, Child
 from ..untrusted.ranges import Minutes, ranged
 
 # An installed package has the shipped model and two pictures, but neither views nor meshes.
@@ -78,9 +78,7 @@ def _gamba(*words: object, may_fail: bool = False) -> None:
 
 
 def _call(words: list[str]) -> int:
-    end = Child([*GAMBA, *words]).wait(lambda: None)
-    assert end is not None, "there is no time limit"
-    return end.code
+    return processes.run_gamba(words, None, ())
 
 
 def _shipped(results, starter: Path, truth: Path) -> None:

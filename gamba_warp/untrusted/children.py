@@ -24,6 +24,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 from ..errors import UserError
+from ..processes import end_with_parent
 
 _EXIT_SECONDS = 10.0  # timeout for the end of a killed process
 _READY = "ready"
@@ -178,7 +179,15 @@ def _describe_exit(code: int | None) -> str:
 
 def _serve(pipe: Connection, parent: int) -> None:
     """Main loop of a child: run tasks until the parent ends."""
-    _end_with_parent(parent)
+
+    def watch() -> None:  # where the system does not do it
+        process = parent_process()
+        if process is not None:
+            process.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+    end_with_parent(parent)  # also if a native call never lets that thread run
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the parent ends its children
     os.dup2(2, 1)  # stdout belongs to the parent's command
     try:
@@ -188,25 +197,6 @@ def _serve(pipe: Connection, parent: int) -> None:
             pipe.send_bytes(_run_task(folder, memory, task))
     except (EOFError, OSError):
         return
-
-
-def _end_with_parent(parent: int) -> None:
-    """Make this process end with its parent, even if the parent is killed."""
-
-    def watch() -> None:
-        process = parent_process()
-        if process is not None:
-            process.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-    if sys.platform == "linux":  # also if a native call never lets that thread run
-        import ctypes
-
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # 1: PR_SET_PDEATHSIG
-        if os.getppid() != parent:
-            os._exit(1)
 
 
 def _run_task(folder: str, memory: int | None, data: bytes) -> bytes:

@@ -1,61 +1,65 @@
-"""Processes of commands: their time, their end, and what they started."""
+"""Commands in child processes: their output and end, and a request to stop."""
 
 import os
 import signal
 import sys
+import threading
 import time
-from pathlib import Path
 
 import pytest
 
-from gamba_warp.processes import Child
+from gamba_warp import processes
 
-# Starts a process that would live for a minute, writes its number, and waits.
-PARENT = """
-import pathlib, subprocess, sys, time
-child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-place = pathlib.Path(sys.argv[1])
-place.with_suffix(".new").write_text(str(child.pid))
-place.with_suffix(".new").rename(place)
-time.sleep(60)
+SCRIPT = """
+import os, signal, sys, time
+print(*sys.argv[1:], flush=True)
+if sys.argv[1] == "wait":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(5))
+    print("ready", flush=True)
+    time.sleep(60)
+sys.exit(3)
 """
 
 
-def ended_with_its_child(path):
-    """Runs ``PARENT`` until its child is there; whether that is gone a little later."""
-
-    def look():
-        if path.exists():
-            raise KeyboardInterrupt  # the time is up at once, and not before
-
-    with pytest.raises(KeyboardInterrupt):
-        Child([sys.executable, "-c", PARENT, str(path)]).wait(look)
-    stat = Path("/proc") / path.read_text() / "stat"
-    for _ in range(30):
-        try:
-            state = stat.read_text().rsplit(")", 1)[1].split()[0]
-        except OSError:
-            return True
-        if state == "Z":  # ended, and nobody has asked for it
-            return True
-        time.sleep(0.1)
-    os.kill(int(path.read_text()), signal.SIGKILL)
-    return False
+@pytest.fixture(autouse=True)
+def script(monkeypatch):
+    monkeypatch.setattr(processes, "GAMBA", (sys.executable, "-c", SCRIPT))
 
 
-def test_what_takes_too_long_is_ended_with_what_it_started(tmp_path):
-    assert ended_with_its_child(tmp_path / "by group")
-
-
-def test_a_process_ends_in_its_time_or_by_itself(tmp_path):
-    looks = []
-    sleeper = Child([sys.executable, "-c", "import time; time.sleep(60)"])
-    assert sleeper.wait(lambda: looks.append(1), 0.5) is None and looks
-    assert sleeper.poll().code == 128 + signal.SIGKILL
+def test_a_command_ends_with_its_code_and_output(tmp_path):
     with open(tmp_path / "said", "wb") as output:
-        words = "import os; print('it', os.environ['OWN']); raise SystemExit(3)"
-        child = Child([sys.executable, "-c", words], output, {"OWN": "x"})
-        end = child.wait(lambda: None)
-    assert (end.code, end.stopped) == (3, False) and end.seconds > 0
-    assert end.peak_memory is None or end.peak_memory > 1e6
-    assert (tmp_path / "said").read_text() == "it x\n"
+        assert processes.run_gamba(["a", "b c"], output, ()) == 3
+    assert (tmp_path / "said").read_text() == "a b c\n"
+
+
+def test_a_request_to_stop_is_passed_on(tmp_path):
+    received = []
+    said = tmp_path / "said"
+
+    def ask():
+        while "ready" not in said.read_text():
+            time.sleep(0.02)
+        received.append(signal.SIGTERM)
+
+    said.touch()
+    thread = threading.Thread(target=ask)
+    thread.start()
+    with open(said, "wb") as output:
+        assert processes.run_gamba(["wait"], output, received) == 5
+    thread.join()
+
+
+def test_a_child_ends_when_the_caller_is_interrupted(tmp_path, monkeypatch):
+    started = []
+
+    def interrupted(seconds):
+        raise KeyboardInterrupt
+
+    popen = processes.subprocess.Popen
+    monkeypatch.setattr(processes.time, "sleep", interrupted)
+    monkeypatch.setattr(
+        processes.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[0]
+    )
+    with pytest.raises(KeyboardInterrupt), open(os.devnull, "wb") as output:
+        processes.run_gamba(["wait"], output, ())
+    assert started[0].returncode == -signal.SIGKILL
