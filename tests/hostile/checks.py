@@ -38,10 +38,6 @@ def check_message(problem, folder, names):
     assert named, "the message names no file"
 
 
-def nothing(result, path, out):
-    """Accept any result."""
-
-
 def each(check):
     """Make a check of a list with errors in place of unreadable items."""
 
@@ -170,17 +166,6 @@ def shape(result, path, out):
         assert np.allclose(positions, wanted, 1e-4, 1e-30), "other points than the file's"
 
 
-def report(result, path, out):
-    """Records valid in JSON; failures with one line."""
-    for record in result:
-        _as_json("a record", record)
-        if record["status"] != "ok":
-            reason = record.get("reason", "")
-            raw = re.match(r"[A-Z]\w+(Error|Exception|Warning)\b", reason)
-            assert not raw, f"a raw exception: {reason[:100]}"
-            check_message(reason, path, [path.name])
-
-
 def views(result, path, out):
     """Finite, consistent views of objects; errors of one line for others."""
     loaded, reasons = result
@@ -217,42 +202,6 @@ def catalogue(result, path, out):
             turn = np.asarray(item.rotation, np.float64)
             right = turn.shape == (3, 3) and np.isfinite(turn).all()
             assert right, "a rotation that is no finite matrix"
-
-
-def rendered(result, path, out):
-    """Rendered objects, or one line."""
-    each(nothing)(result, path, out)
-    for folder in out.iterdir():
-        assert not folder.name.startswith("."), f"{folder.name} is left behind"
-        _our_json(folder / "transforms.json")
-
-
-def _our_json(path):
-    def no_number(text):
-        raise AssertionError(f"{text} in a file of ours")
-
-    return json.loads(path.read_bytes(), parse_constant=no_number)
-
-
-def furniture(result, path, out):
-    """Existing models inside the folder, with nothing beside it changed."""
-    target = out / "inner" / "furniture"
-    beside = sorted(p.name for p in (out / "inner").iterdir())
-    assert beside == ["furniture", "neighbour.txt"], "something beside the target was changed"
-    _no_links(target)
-    total = sum(inside.lstat().st_size for inside in target.rglob("*"))
-    assert total <= _UNPACKED, f"{total >> 20} MB were unpacked"
-    entries = _our_json(target / "catalogue.json")["objects"]
-    for entry in entries:
-        found = (target / entry["model"]).resolve()
-        there = found.is_relative_to(target.resolve()) and found.is_file()
-        assert there, f"the model {entry['model'][:60]!r} is not there"
-    assert len(entries) == result, "another number of models"
-
-
-def _no_links(folder):
-    for inside in folder.rglob("*"):
-        assert not inside.is_symlink(), f"{inside.name} is a link"
 
 
 def model(result, path, out):
@@ -317,11 +266,6 @@ def config(result, path, out):
     assert total <= 64 * _PARAMETERS, f"about {total:.0e} parameters"
 
 
-def protocol(result, path, out):
-    """A protocol valid in a report."""
-    _as_json("a protocol", result.to_json())
-
-
 def page(result, path, out):
     """A page in which no name became code."""
     assert not _CODE.search(result), "a name became code in a page"
@@ -357,21 +301,6 @@ def plan(result, path, out):
             outs = [i for i, word in enumerate(words) if word.startswith("--out")]
             inside = len(outs) == 1 and Path(words[outs[0] + 1]).parent == out
             assert inside, "a command that writes elsewhere"
-
-
-def shown(result, path, out):
-    """Pictures in place of true views: colours in [0, 1], and masks of their size or none."""
-    rgb, mask = result.shown.rgb, result.shown.alpha
-    _in_unit("colours", rgb)
-    assert mask is None or mask.shape == rgb.shape[:3], "masks of another size"
-
-
-def scans(result, path, out):
-    """Valid meshes, and only the model's own files in its folder."""
-    for folder in (out / "gso" / "meshes").iterdir():
-        assert not folder.name.startswith("."), f"{folder.name} is left behind"
-        _no_links(folder)
-    each(mesh)(result, path, out)
 
 
 def faulty(result, path, out):

@@ -7,8 +7,6 @@ import io
 import json
 import re
 import struct
-import tarfile
-import zipfile
 import zlib
 from typing import Any
 
@@ -19,7 +17,6 @@ from hypothesis import strategies as st
 
 from .mutations import (
     BOMB,
-    NAMES,
     Draw,
     any_plain,
     chance,
@@ -27,9 +24,8 @@ from .mutations import (
     changed_tree,
     choice,
     dump,
-    encode,
 )
-from .seeds import ar, npy, tarred, zipped
+from .seeds import npy
 
 
 def safetensors_header(draw: Draw, data: bytes) -> bytes:
@@ -122,95 +118,6 @@ def png_chunks(draw: Draw, data: bytes) -> bytes:
         out += struct.pack(">I", len(body)) + name + body
         out += struct.pack(">I", zlib.crc32(name + body))
     return out
-
-
-@functools.cache
-def _zip_bomb() -> bytes:
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        with archive.open(zipfile.ZipInfo("b/chair/chair.obj"), "w") as member:
-            for _ in range(BOMB >> 20):
-                member.write(bytes(1 << 20))
-    return content.getvalue()
-
-
-def zip_members(draw: Draw, data: bytes) -> bytes:
-    """Change names, contents or the number of members of a zip archive; links, and bombs."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    name = choice(draw, *sorted(members))
-    kinds = ("said", "said", "said", "name", "name", "plain", "plain", "delete")
-    kind = choice(draw, *kinds, "many", "link", "bomb", "sizes")
-    if kind == "said":  # the catalogue's text
-        name = next((n for n in members if n.endswith(".properties")), name)
-        members[name] = _hostile_properties(draw, members[name])
-    elif kind == "name":
-        members[_text_name(draw)] = members.pop(name)
-    elif kind == "plain":
-        members[name] = any_plain(draw, members[name])
-    elif kind == "delete":
-        del members[name]
-    elif kind == "many":
-        members |= {f"many/{i}": b"" for i in range(2000)}
-    elif kind == "bomb":
-        return _zip_bomb()
-    packed = zipped(members)
-    if kind == "link":
-        content = io.BytesIO(packed)
-        with zipfile.ZipFile(content, "a") as archive:
-            link = zipfile.ZipInfo(choice(draw, "b/chair/link.obj", "b/chair", "icons"))
-            link.external_attr = 0o120777 << 16
-            archive.writestr(link, choice(draw, "../../../canary", "/etc/passwd", "/etc"))
-        return content.getvalue()
-    if kind == "sizes":
-        at = packed.rindex(b"PK\x01\x02") + 20
-        packed = packed[:at] + choice(draw, b"\xff" * 8, bytes(8), b"\1" * 8) + packed[at + 8 :]
-    return packed
-
-
-def _text_name(draw: Draw) -> str:
-    return encode(choice(draw, *NAMES)).decode("utf-8", "replace") or "x"
-
-
-def _hostile_properties(draw: Draw, data: bytes) -> bytes:
-    if chance(draw, 30):
-        return any_plain(draw, data)
-    lines = data.split(b"\n")
-    at = choice(draw, *[i for i, line in enumerate(lines) if b"=" in line])
-    values = (*map(encode, NAMES), b"1 2 3", b"nan " * 9, b"1e999 " * 9, b"\\ud800")
-    lines[at] = lines[at].split(b"=")[0] + b"=" + choice(draw, *values)
-    return b"\n".join(lines)
-
-
-def deb_members(draw: Draw, data: bytes) -> bytes:
-    """Change the archive in an archive in a Debian package, or its header there."""
-    members, at = {}, 8
-    while at + 60 <= len(data):
-        name, size = data[at : at + 16].decode().strip(), int(data[at + 48 : at + 58])
-        members[name] = data[at + 60 : at + 60 + size]
-        at += 60 + size + size % 2
-    inner = members["data.tar.xz"]
-    kind = choice(draw, "inside", "inside", "sizes", "plain")
-    if kind == "sizes":
-        sizes = (b"-60", b"-61", b"-120", b"0", b"9999999999", b"60", b"x", b"1e3", b"")
-        size = choice(draw, *sizes).ljust(10)
-        return re.sub(rb"(?<=100644  )\d+ *(?=`)", lambda _: size, data)
-    if kind == "plain":
-        return ar(members | {"data.tar.xz": any_plain(draw, inner)})
-    with tarfile.open(fileobj=io.BytesIO(inner)) as tar:
-        files = {m.name: tar.extractfile(m).read() for m in tar if m.isfile()}
-    for name in list(files):
-        if draw(st.booleans()):
-            files[_text_name(draw) + ".sh3f"] = files.pop(name)
-        else:
-            files[name] = zip_members(draw, files[name])
-    odd = None
-    if chance(draw, 40):
-        odd = tarfile.TarInfo(choice(draw, "Odd.sh3f", "../Odd.sh3f", "...sh3f", "/tmp/Odd.sh3f"))
-        types = (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE)
-        odd.type = choice(draw, *types)
-        odd.linkname = choice(draw, "/etc/passwd", "../../canary/kept.txt", odd.name, "")
-    return ar(members | {"data.tar.xz": tarred(files, odd=odd)})
 
 
 def torch_values(draw: Draw, data: bytes) -> bytes:
@@ -308,8 +215,6 @@ BY_SUFFIX = {
     ".glb": (glb_tree,),
     ".npy": (npy_header,),
     ".png": (png_chunks,),
-    ".sh3f": (zip_members,),
-    ".deb": (deb_members,),
     ".pt": (torch_values,),
     ".pth": (torch_values,),
 }

