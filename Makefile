@@ -89,8 +89,7 @@ FULL ?= 10
 SEED ?= 1
 endurance: $(TOOLS)
 	GAMBA_ENDURANCE_KILLS=$(KILLS) GAMBA_ENDURANCE_FULL=$(FULL) GAMBA_ENDURANCE_SEED=$(SEED) \
-		GAMBA_ENDURANCE_NODES=10 $(BIN)/python -m pytest -s tests/endurance \
-		tests/nodes/test_nodes_restart.py
+		$(BIN)/python -m pytest -s tests/endurance
 
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench
