@@ -43,7 +43,7 @@ starter/data: starter/data.tar
 	@tar -xf $< -C starter && touch $@
 
 demo: $(STAMP)
-	@echo "Reconstructing, evaluating and training for 2 minutes; fetches 64 MB once (weights of LPIPS)."
+	@echo "Reconstructing 12 pictures and evaluating 4 objects with the shipped model."
 	$(BIN)/gamba demo
 
 # Two processes share the tests, a file each at a time, in the order of their names: by the number of

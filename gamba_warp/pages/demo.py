@@ -43,8 +43,6 @@ class DemoResults:
         results: of ``gamba reconstruct``; some may be missing.
         views: results of ``gamba eval-views`` of the shipped model.
         shapes: results of ``gamba eval-geometry``; the report may be missing.
-        run: run folder of ``gamba train``; may not exist yet.
-        views_here: results of ``gamba eval-views`` of that model; may not exist yet.
     """
 
     shipped: Path
@@ -52,8 +50,6 @@ class DemoResults:
     results: Path
     views: Path
     shapes: Path
-    run: Path
-    views_here: Path
 
 
 def write_demo(path: Path, results: DemoResults, text: str) -> None:
@@ -104,7 +100,6 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
         Section("Objects that the model has never seen", first, views=around),
         *_numbers(results, report, card),
         Section("The shipped model", table=about_model(results.shipped)),
-        *_trained_here(results, strips, card),
         *held_out,
         *icons,
     ]
@@ -138,8 +133,6 @@ def _around(section: Section) -> np.ndarray:
 def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | None) -> list[Section]:
     """Return metrics of models and baselines, on white and on other backgrounds."""
     models = {"the shipped model": report["mean"]}
-    if (here := results.views_here / "report.json").exists():
-        models["the model trained here"] = read_document(here, dict[str, Any])["mean"]
     others = {_BASELINES.get(name, name): mean for name, mean in report["baselines"].items()}
     figures = [(label, "new views", mean) for label, mean in (models | others).items()]
     figures += [(label, "input view", mean["input"]) for label, mean in models.items()]
@@ -173,26 +166,3 @@ def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | Non
 
 def _cell(value: float | None) -> str:
     return "absent" if value is None else f"{value:.3f}"
-
-
-def _trained_here(
-    results: DemoResults, strips: list[Path], card: ModelCard | None
-) -> list[Section]:
-    """Describe the demo's training, and show two held-out objects by both models."""
-    latest = results.run / "latest.json"
-    if not latest.exists():
-        return [Section("Trained here", "This part is not done yet.")]
-    steps = read_document(latest, dict[str, Any])["step"]
-    compared = f"; the shipped one took {card.steps:,}" if card else ""
-    text = (
-        "A model of the preset rays, trained by this demo from random weights on the training "
-        f"objects of the starter set, for {steps:,} steps{compared}. Its pictures show the effect "
-        "of more steps."
-    )
-    sections = [Section("Trained here", text)]
-    both = ((strip, results.views_here / "strips" / strip.name) for strip in strips)
-    for strip, other in [pair for pair in both if pair[1].exists()][:2]:
-        shipped, here = tiles(strip), tiles(other)
-        rows = {"Shipped": shipped[1], "Trained here": here[1], "Truth": shipped[2]}
-        sections.append(Section(f"{_name(strip)}: shipped, trained here, and true", views=rows))
-    return sections

@@ -29,7 +29,7 @@ def starter(tmp_path):
 
 
 def demo(starter, out, *options):
-    return run("demo", ["--no-lpips", "--starter", str(starter), "--out", str(out), *options])
+    return run("demo", ["--starter", str(starter), "--out", str(out), *options])
 
 
 @pytest.fixture
@@ -52,25 +52,20 @@ def short(tmp_path, monkeypatch):
 def test_demo(starter, short, tmp_path, monkeypatch):
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))  # as long with LPIPS at home
     out = tmp_path / "demo"
-    assert demo(starter, out, "--minutes", "0.02") == 0
+    assert demo(starter, out) == 0
     page = (out / "index.html").read_text()
     for part in (
         "Objects that the model has never seen",
         "the shipped model",
-        "the model trained here",
         "the input as a flat cut-out",
         "PSNR on black",
         "Trained on",
-        "Trained here",
-        "toaster: shipped, trained here, and true",
         "Predicted",
         "Truth",
         "Icon: fire-hydrant",
         "chamfer",
     ):
         assert part in page, part
-    # what was shipped comes before what was trained here, and the page says which is which
-    assert page.index("never seen</h2>") < page.index("Numbers") < page.index("Trained here</h2>")
     assert "it was not trained on this machine" in page
     card = json.loads(checkpoint.DEFAULT_CHECKPOINT.with_suffix(".json").read_text())
     shipped = [row for row in card["figures"] if (row["views"], row["name"]) == ("novel", "model")]
@@ -102,40 +97,29 @@ class Calls:
         monkeypatch.setattr(command, "_call", self)
         monkeypatch.setattr(
             "gamba_warp.pages.demo.write_demo",
-            lambda path, results, text: self.pages.append((len(self.stages), text)),
+            lambda path, results, text: self.pages.append(text),
         )
 
     def __call__(self, words):
-        stage = words[0] + (" here" if "--no-baselines" in words else "")
+        stage = words[0]
         self.stages.append(stage)
         code = self.codes.get(stage, 0)
-        folder = dict(zip(ALL, ("icons", "views", "geometry", "run", "views-here")))[stage]
+        folder = dict(zip(ALL, ("icons", "views", "geometry")))[stage]
         if code == 0:
             (self.out / folder).mkdir(parents=True, exist_ok=True)
-            made = "model.safetensors" if stage == "train" else "report.json"
-            (self.out / folder / made).touch()
+            (self.out / folder / "report.json").touch()
         return code
 
 
-ALL = ["reconstruct", "eval-views", "eval-geometry", "train", "eval-views here"]
+ALL = ["reconstruct", "eval-views", "eval-geometry"]
 
 
 def test_a_command_that_fails_ends_the_demo(starter, tmp_path, monkeypatch, capsys):
     out = tmp_path / "demo"
     calls = Calls(monkeypatch, out)
-    calls.codes = {"train": 1}
-    assert demo(starter, out) == 2 and calls.stages == ALL[:4]
+    calls.codes = {"eval-views": 1}
+    assert demo(starter, out) == 2 and calls.stages == ALL[:2]
     assert "the command above ended with exit code 1" in capsys.readouterr().err
     calls.codes, calls.stages = {"eval-geometry": 1}, []
     assert demo(starter, out) == 0 and calls.stages == ALL
-
-
-def test_the_page_is_there_before_the_training(starter, tmp_path, monkeypatch):
-    out = tmp_path / "demo"
-    calls = Calls(monkeypatch, out)
-    assert demo(starter, out) == 0
-    (early, first), (late, second) = calls.pages
-    assert (early, late) == (3, 5)
-    assert "Training still runs" in first and "The whole demo took" in second
-    name = checkpoint.DEFAULT_CHECKPOINT.name
-    assert all(name in text and "for 2 minutes" in text for text in (first, second))
+    assert len(calls.pages) == 1 and checkpoint.DEFAULT_CHECKPOINT.name in calls.pages[0]
