@@ -39,7 +39,7 @@ _RAYS = Recipe(
     settings={
         "--preset rays": "starter/rays.json: 128² input, Gaussians on the pixels' rays",
         "--size 128": "docs/lab/rays.md, all runs",
-        "--steps 19250": "docs/lab/rays.md: the steps of its first four runs together",
+        "--steps 19250": "docs/lab/rays.md: the steps of its runs 2 to 4 together",
         "--batch-size 4 --views-per-object 3": "docs/lab/rays.md, the first five runs",
         "--front-share 0.5 --mirror 0.5 --recolor 0.3": "docs/lab/rays.md, all runs",
         "--no-radial-mask": "docs/lab/rays.md, all runs: Gaussians begin on the object",
@@ -48,8 +48,8 @@ _RAYS = Recipe(
         "--lpips on --lpips-weight 0.25 --lpips-crop 48": "docs/lab/rays.md, the fourth run",
         "--lpips-after 6000": "docs/lab/rays.md, the second run, which began from nothing",
         "--lr 1.2e-3 --schedule trapezoid --decay-share 0.3": "docs/lab/rays.md, the fourth run",
-        "--background random": "docs/lab/rays.md, the last two runs: on white haze is free",
-        "--precision bfloat16": "docs/lab/rays.md, all runs but the first and the third",
+        "--background random": "docs/lab/rays.md, from the sixth run on: on white haze is free",
+        "--precision bfloat16": "docs/lab/rays.md, all runs but the 1st, 3rd and 11th",
     },
 )
 

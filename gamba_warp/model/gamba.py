@@ -125,7 +125,7 @@ class Gamba(nn.Module):
             background_margin: drop the 3DGS tokens of patches that are plain background in every
                 picture, except within this many patches of another one; 0 keeps only the object's
                 own patches. This is faster, but the model was not trained for it
-                (docs/lab/benchmarks.md, "background tokens", has the error). None drops nothing.
+                (docs/lab/benchmarks.md, "Blocks and models", has the error). None drops nothing.
                 On CUDA it reads one number back. The decoder ``rays`` is trained on, and always
                 uses, only the object's own patches, per picture; None is 0 there. A margin adds
                 patches to its network, but no Gaussians.

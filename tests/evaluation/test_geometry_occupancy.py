@@ -83,7 +83,7 @@ def drift(mesh, damage=lambda mesh: mesh):
 
 SHAPES = known_shapes()
 # IoU of the rule "solid" with the closed original, by the share of the area that is cut out, at
-# least: the table of eval/README.md less 0.02 for other places of the hole and coarser voxels
+# least: the figures of eval/README.md less 0.02 for other places of the hole and coarser voxels
 LEAST = {0.01: 0.97, 0.05: 0.95, 0.1: 0.89, 0.2: 0.78, 0.5: 0.44}
 
 

@@ -21,12 +21,11 @@ from gamba_warp.kernels.cases.raster import LEAVES, orbit_cameras, shell
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
-from gamba_warp.kernels.runtime import tables
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 
 from . import counting, peers
-from .counting import ASKED, GAUSSIANS, SECTOR, SIDE, STATES, Counts
+from .counting import GAUSSIANS, SIDE, STATES, Counts
 from .dry_run import MULTIPROCESSORS
 from .machine import Missing
 
@@ -122,38 +121,13 @@ def versions() -> dict[str, str]:
     return {"nvrtc": ".".join(map(str, toolkit)), "warp": wp.__version__}
 
 
-_KINDS = ("all", "float", "special", "integer", "multiply", "convert", "global", "shared", "local")
-_KINDS += ("shuffle", "barrier", "jump", "atomic", "routine")
-_TEXT = f"""# What the CUDA kernels execute
+_TEXT = """# What the CUDA kernels execute
 
-Counts, not times: the kernels' PTX was executed without a GPU
-([`python -m ptx.counts`](../../../tests/ptx/README.md)).
-
-The scan and the convolution have {TOKENS:,} tokens and {WIDTH} channels, the scan 16 states and, in
-segments, two; the rasterizer one view of 512 x 512 of {GAUSSIANS:,} Gaussians. A kernel is listed
-with the first case that launches it, all gradients requested.
-
-## Instructions
-PTX instructions per unit of the column **per**: of a warp for a pair of a Gaussian and a tile that
-is walked, else of a thread. Products that ptxas fuses with sums count once; moves of registers and
-reads of parameters are not counted. **integer** holds addresses, comparisons and selections, twice
-where they have 64 bits; **convert** is of numbers' types; a **routine** is a division or root of
-many instructions. Machine code of the scan has 4 to 8 % fewer, mostly integers.
+Counts, not times: the kernels' PTX was executed without a GPU, beside that of other libraries
+([`python -m ptx.counts`](../../../tests/ptx/README.md)). `counts.json` has each kernel's
+instructions by kind, sectors of global memory and passes of shared memory.
 
 """
-_MEMORY = """
-## Memory
-Per the same units. **sectors** of 32 bytes of global memory that warps' accesses take from the L1
-cache; **first**, those that the launch had not touched before; **own**, those of threads' own
-memory; **used**, the requested share of the sectors' bytes (above 100 % lanes share them).
-**passes** of shared memory: 32 lanes at a time for 4 bytes, 16 for 8, 8 for 16; **conflicts** of
-banks among them; **together**, the passes if all 32 lanes could be served at once.
-
-"""
-
-
-def _figure(value: float) -> str:
-    return "" if not value else f"{value:.3g}" if value < 100 else f"{value:.0f}"
 
 
 def markdown(document: dict) -> str:
@@ -162,21 +136,7 @@ def markdown(document: dict) -> str:
     A row of its ``kernels`` has ``op, kernel, case, direction, per`` (the unit), ``number`` (warps'
     worth of units) and ``each`` (counts per unit). Its ``peers`` are of ``peers.compare``.
     """
-    counts, memory = [], []
-    for row in document["kernels"]:
-        each = row["each"]
-        gradient = " (gradient)" if row["direction"] == "gradient" else ""
-        names = [f"`{row['kernel']}`{gradient}", row["case"], row["per"]]
-        counts.append([*names, *(_figure(each.get(kind, 0)) for kind in _KINDS)])
-        used = f"{each['bytes'] / SECTOR / each['sectors']:.0%}"
-        sectors = [_figure(each[name]) for name in ("sectors", "first", "own")]
-        passes = [_figure(each[name]) for name in ("passes", "conflicts", "together")]
-        memory.append([*names, *sectors, used, *passes])
-    names = ["kernel", "case", "per"]
-    header = [*names, "sectors", "first", "own", "used", *ASKED[-3:]]
-    first = tables.markdown([*names, *_KINDS], counts)
-    second = tables.markdown(header, memory)
-    return _TEXT + first + "\n" + _MEMORY + second + "\n\n" + peers.markdown(document["peers"])
+    return _TEXT + peers.markdown(document["peers"])
 
 
 def main() -> None:

@@ -444,11 +444,13 @@ _TEXT = """## Compared with other libraries
 Written by `python -m ptx.counts --peers` ({sources}): sources are compiled with the flags of their
 setup.py (but C++20) and the template arguments that their host code chooses, and executed in the
 same interpreter on the same inputs; their results agree with ours. Scan and convolution have
-{channels:,} channels, {states} states, softplus and gate, {width} weights and SiLU.
+{channels:,} channels, {states} states, softplus and gate, {width} weights and SiLU; the rasterizer
+one view of {side} x {side} of {gaussians:,} Gaussians.
 
-**Ratios, ours to theirs: below 1 is less.** Ours add the rows of gradients in a fixed order, theirs
-with atomics. Neither count includes the sort of the lists by a library and torch's own operations
-before and after a kernel: zeros, sums of parts, the directions of gsplat's harmonics.
+**Ratios, ours to theirs, forward / gradient: below 1 is less.** Sectors are of 32 bytes of global
+memory; **first** counts those that the launch had not touched before. Ours add the rows of
+gradients in a fixed order, theirs with atomics. Neither count includes the sort of the lists by a
+library and torch's own operations before and after a kernel.
 
 """
 
@@ -456,11 +458,12 @@ before and after a kernel: zeros, sums of parts, the directions of gsplat's harm
 def markdown(document: dict) -> str:
     """Return the section of a page, of the document of ``compare``."""
     sources = ", ".join(f"{name} {version}" for name, version in document["versions"].items())
-    text = _TEXT.format(sources=sources, channels=CHANNELS, states=STATES, width=WIDTH)
-    table = []
+    sizes = dict(channels=CHANNELS, states=STATES, width=WIDTH, side=SIDE, gaussians=GAUSSIANS)
+    ratios: dict[tuple[str, str], list[list[str]]] = {}
     for row in document["rows"]:
         ours, theirs = row["ours"], row["theirs"]
-        ratios = [f"{ours[x] / theirs[x]:.2f}" if theirs[x] else "" for x in ours]
-        table.append([row["op"], row["case"], row["direction"], *ratios])
-    header = ["operator", "case", "direction", "instructions", "sectors", "first"]
-    return text + tables.markdown(header, table) + "\n"
+        found = [f"{ours[x] / theirs[x]:.2f}" if theirs[x] else "" for x in ours]
+        ratios.setdefault((row["op"], row["case"]), []).append(found)
+    table = [[*names, *map(" / ".join, zip(*both))] for names, both in ratios.items()]
+    header = ["operator", "case", "instructions", "sectors", "first"]
+    return _TEXT.format(sources=sources, **sizes) + tables.markdown(header, table) + "\n"

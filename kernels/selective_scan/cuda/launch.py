@@ -67,7 +67,7 @@ def choose(
     k + 1/2 times as long as one would take at its full rate. P segments are walked (2 - 1/P) times
     in the forward; the gradient's walks are longer, so that they cost (4 - 1/P) / 3. Beginning
     and ending a segment costs as much as ``OVERHEAD`` tokens. In one pass the forward has twice
-    the threads, of half as many states: CUDA.md has the times.
+    the threads, of half as many states: docs/gpu.md has the times.
     """
     tuning = Tuning()
     if not batch or not length:
