@@ -21,12 +21,10 @@ def compare_command(
     ],
     *,
     against: str | None = None,
-    seconds: tuple[str, ...] = (),
-    paper: bool = False,
     out: Path | None = None,
     json: bool = False,
 ) -> int:
-    """PSNR, SSIM, LPIPS, Chamfer, Volume IoU and time of several methods, as the paper's Table 1.
+    """PSNR, SSIM, LPIPS, Chamfer and Volume IoU of several methods, as the paper's Table 1.
 
     First evaluate each method by eval-views, eval-geometry or both; give a name twice for both
     reports. Means are over the objects that all methods have. Reports of different protocols, or of
@@ -35,8 +33,6 @@ def compare_command(
     Args:
         reports: NAME=FILE: a report.json, or its folder.
         against: Baseline of the paired differences; by default the first method.
-        seconds: NAME=SECONDS: time of a method per object, if no report has measured it.
-        paper: Also print the paper's Table 1, which has other objects and another protocol.
         out: Folder for compare.json and compare.md.
         json: Print compare.json in place of the table.
     """
@@ -44,15 +40,13 @@ def compare_command(
         raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
     from gamba_warp.files import output_folder, write_json, write_text
 
-    from .compare import CAVEAT, TABLE_1, join, markdown_page, read_reports
+    from .compare import join, markdown_page, read_reports
     from .report import json_of
 
-    joined = join(read_reports(reports, seconds), against)
-    if paper:
-        joined["paper"] = {"caveat": CAVEAT, "table_1": TABLE_1}
+    joined = join(read_reports(reports), against)
     if out is not None:
         folder = output_folder(out)
         write_json(folder / "compare.json", joined)
-        write_text(folder / "compare.md", markdown_page(joined, paper))
-    print(json_of(joined) if json else markdown_page(joined, paper), end="")
+        write_text(folder / "compare.md", markdown_page(joined))
+    print(json_of(joined) if json else markdown_page(joined), end="")
     return 0

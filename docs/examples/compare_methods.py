@@ -114,7 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
         reports[name].append(place)
 
     words = [f"{name}={place}" for name, places in reports.items() for place in places]
-    gamba("compare", *words, "--against", "shipped", "--paper", "--out", out)
+    gamba("compare", *words, "--against", "shipped", "--out", out)
 
 
 if __name__ == "__main__":

@@ -134,9 +134,9 @@ def _plan(path: Path, out: Path) -> Any:
 
 def _compare(path: Path, out: Path) -> Any:
     """Table of ``gamba compare`` for a report and itself."""
-    joined = join(read_reports((f"a={path}", f"b={path}"), ()), None)
+    joined = join(read_reports((f"a={path}", f"b={path}")), None)
     json.dumps(joined, allow_nan=False)
-    return [markdown_page(joined, True)]
+    return [markdown_page(joined)]
 
 
 def _released(path: Path, out: Path) -> Any:
