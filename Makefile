@@ -123,7 +123,7 @@ format: $(TOOLS)
 figures: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.figures $(REPORTS)
 
-# The tables of docs/scanned.md: renders the meshes of a folder and evaluates the shipped model on them.
+# The table of scanned objects in docs/model-card.md: renders the meshes of a folder and evaluates the shipped model on them.
 # make scanned MESHES=FOLDER OPTIONS="--no-lpips --limit 8"
 scanned: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.scanned $(MESHES) $(OPTIONS)

@@ -59,7 +59,7 @@ _DRAWING: Any = ("kernels", "cores")
 _PICTURES: Any = (*_MODEL, "cores")
 # A command has one or two words.
 COMMANDS = {
-    "demo": Command("Train, reconstruct and evaluate on the starter set.", "all", SHAPES, _MODEL),
+    "demo": Command("Reconstruct and evaluate the starter set.", "all", SHAPES, _MODEL),
     "reconstruct": Command("Pictures to 3D Gaussians.", "photo", (), _PICTURES),
     "train": Command("Train a model on posed views.", "train", _METRICS, _MODEL, _TRAIN),
     "fit": Command("Posed views of an object to 3D Gaussians.", "fit", _METRICS, _MODEL),
@@ -68,7 +68,7 @@ COMMANDS = {
     "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),
     "data pack": Command("Posed views to shards.", "shards", ("webdataset",), (), _DATA),
     "data index": Command("Check a dataset once, for all later starts.", "", (), (), _DATA),
-    "data objaverse": Command("Objaverse, and its G-Objaverse views.", "", (), (), _DATA),
+    "data objaverse": Command("A copy of G-Objaverse.", "", (), (), _DATA),
     "data gso": Command("Google Scanned Objects, for evaluation.", "mesh", _RENDERS, (), _DATA),
     "eval-views": Command("PSNR, SSIM, LPIPS of views.", "eval", _METRICS, _MODEL, _VIEWS),
     "eval-geometry": Command("Chamfer, IoU, F-score.", "eval", SHAPES, (), _SHAPES),

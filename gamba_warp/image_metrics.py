@@ -120,7 +120,7 @@ class Metric(NamedTuple):
         return WHITE if self.ground is None else GROUNDS[self.ground]
 
 
-# By key in records. A script may add to it (docs/change-the-training.md).
+# By key in records. A script may add to it (docs/train-your-own.md).
 METRICS: dict[str, Metric] = {
     "psnr": Metric("PSNR", psnr, "dB", digits=2, on_grounds=True),
     "ssim": Metric("SSIM", ssim, least_side=SSIM_WINDOW),

@@ -20,7 +20,7 @@ from gamba_warp.model.gamba import Gamba
 from .config import OptimConfig
 
 # By name: the rate after the warm-up as a share of its peak. Arguments: the options, the step, the
-# steps of the warm-up and those of the run. A script may add to it (docs/change-the-training.md).
+# steps of the warm-up and those of the run. A script may add to it (docs/train-your-own.md).
 SCHEDULES: dict[str, Callable[[OptimConfig, float, float, float], float]] = {
     "cosine": lambda optim, step, warmup, total: _half_cosine(
         (step - warmup) / max(1e-12, total - warmup)

@@ -1,4 +1,4 @@
-"""A training loop of your own in place of ``gamba train`` (docs/change-the-training.md).
+"""A training loop of your own in place of ``gamba train`` (docs/train-your-own.md).
 
 python docs/examples/own_loop.py starter/data --steps 200 --out runs/own
 """

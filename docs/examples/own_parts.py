@@ -1,4 +1,4 @@
-"""Every ``gamba`` command with parts of one's own; docs/change-the-training.md explains it.
+"""Every ``gamba`` command with parts of one's own; docs/train-your-own.md explains it.
 
 python docs/examples/own_parts.py train DATA --preset tiny --schedule linear
 """

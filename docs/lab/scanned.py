@@ -1,4 +1,4 @@
-"""Evaluates a model on a folder of scanned objects, and writes the tables of docs/scanned.md.
+"""Evaluates a model on a folder of scanned objects, and writes the table of docs/model-card.md.
 
     make scanned MESHES=FOLDER
     PYTHONPATH=docs python -m lab.scanned FOLDER --checkpoint MODEL --page none
@@ -26,7 +26,7 @@ from gamba_warp.untrusted.documents import read_document
 
 from .figures.parts import with_parts
 
-PAGE = Path(__file__).parents[1] / "scanned.md"
+PAGE = Path(__file__).parents[1] / "model-card.md"
 SHAPES = {"chamfer": ("Chamfer", 4), "normal_consistency": ("normals", 3), "iou": ("Volume IoU", 3)}
 _SKIPPED = ("retrieval",)  # of the same set, so meaningless here
 
@@ -41,7 +41,7 @@ def main(
     up: Literal["auto", "y", "z"] = "auto",
     page: Path | Literal["none"] = PAGE,
 ) -> int:
-    """Renders, evaluates and writes the page's tables and its picture of all objects.
+    """Renders, evaluates and writes the page's table and its picture of all objects.
 
     Args:
         folder: of the meshes, named by object.
@@ -51,7 +51,7 @@ def main(
         limit: number of objects, evenly spaced by name.
         lpips: also compute LPIPS, which takes most of the time.
         up: the axis that points up in the files; auto depends on their format.
-        page: the page to update; none only prints the tables.
+        page: the page to update; none only prints the table.
 
     Returns:
         0, or the exit code of an evaluation in which objects failed.
@@ -70,7 +70,7 @@ def main(
         "eval-geometry", gaussians, folder, *words, *([] if up == "auto" else ["--up", up])
     )
     found = [read_document(out / n / "report.json", dict[str, Any]) for n in ("eval", "shapes")]
-    parts = {"figures": figures(*found), "objects": objects(*found)}
+    parts = {"figures": figures(*found)}
     if page == "none":
         print("\n\n".join(parts.values()))
     else:
@@ -113,31 +113,6 @@ def figures(views: dict[str, Any], shapes: dict[str, Any]) -> str:
         *(n for n, _ in SHAPES.values()),
     ]
     return f"{markdown(head, rows)}\n\nWeights `{source['path']}`, SHA-256 {source['sha256'][:16]}."
-
-
-def objects(views: dict[str, Any], shapes: dict[str, Any]) -> str:
-    """Table of all objects from best to worst, by the PSNR of new views.
-
-    Args:
-        views: report of eval-views.
-        shapes: report of eval-geometry.
-    """
-    of_shapes = {record["name"]: record for record in shapes["objects"]}
-    done = [record for record in views["objects"] if record["status"] == "ok"]
-    rows = []
-    for record in sorted(done, key=lambda record: -record["psnr"]):
-        shape = of_shapes.get(record["name"], {})
-        cells = [_text(record[key], metric.digits) for key, metric in METRICS.items()]
-        cells += [_text(shape.get(key), digits) for key, (_, digits) in SHAPES.items()]
-        billboard = record["baselines"].get("billboard", {}).get("psnr")
-        gain = None if billboard is None else record["psnr"] - billboard
-        rows.append([record["name"].replace("_", " "), *cells, _text(gain, 1)])
-    named = [*(m.head for m in METRICS.values()), *(name for name, _ in SHAPES.values())]
-    table = markdown(["object", *named, "PSNR over the billboard's"], rows)
-    failed = sorted(
-        {r["name"]: r["reason"] for r in (*views["failures"], *shapes["failures"])}.items()
-    )
-    return "\n".join([table, *(f"\nFailed: {name}: {reason}." for name, reason in failed)])
 
 
 def _text(value: float | None, digits: int) -> str:

@@ -58,6 +58,7 @@ def on_files(files: Files, config) -> Files:
             files.append(File.generated(config, page, content=_content(path)))
         if path.endswith(".md"):
             waiting += targets((ROOT / path).read_text(encoding="utf-8"), path)
+    files.append(File.generated(config, "commands.md", content=command_reference()))
     _keep_what_is_there(config.nav or [], files)
     return files
 
@@ -70,8 +71,6 @@ def on_page_markdown(markdown: str, page, config, files) -> str:
     if page.file.src_uri.startswith("lab/") or page.file.name in ("THIRD_PARTY", "ATTRIBUTION"):
         page.meta.setdefault("search", {"exclude": True})
     path = _origin.get(page.file.src_uri, f"docs/{page.file.src_uri}")
-    if path == "docs/commands.md":
-        markdown += command_reference()
     if is_code(path) or path.endswith(".ipynb"):
         return markdown
     return rewritten(markdown, path, page.file.src_uri)
@@ -109,7 +108,9 @@ def command_reference() -> str:
     from gamba_warp import cli
 
     helps = ((name, cli.help_text(name, cli.load_command(name), [])) for name in cli.COMMANDS)
-    return "".join(f"\n## gamba {name}\n\n```text\n{text}\n```\n" for name, text in helps)
+    return "# The commands\n" + "".join(
+        f"\n## gamba {name}\n\n```text\n{text}\n```\n" for name, text in helps
+    )
 
 
 def _content(path: str) -> str | bytes:

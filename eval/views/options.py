@@ -24,7 +24,7 @@ class ViewsOptions:
     Attributes:
         checkpoint: A model; a folder of .ply files named by object; or a folder with a folder of
             pictures for each object, rendered by any method at the dataset's
-            cameras (docs/compare-methods.md).
+            cameras (docs/evaluate.md).
         data: Dataset of posed views.
         out: Folder for report.json, objects.csv, table.md, contact_sheet.png and strips/ (input |
             prediction | truth); without it only the table is printed.

@@ -1,6 +1,6 @@
 """Reading and writing pictures rendered by any method, matched with the true views.
 
-Format (for users in docs/compare-methods.md): one folder for each object, named as in the dataset,
+Format (for users in docs/evaluate.md): one folder for each object, named as in the dataset,
 with pictures,
 
 - with a ``transforms.json``: a picture belongs to the true view with the same camera;

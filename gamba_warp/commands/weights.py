@@ -20,7 +20,7 @@ def import_released_command(
     """Turn the weights published by the authors of Gamba into a model folder.
 
     The folder serves as --checkpoint of the other commands. The network keeps the quirks of the
-    public code (docs/variants.md); no code of the file is run.
+    public code (docs/model-card.md); no code of the file is run.
 
     Args:
         file: Their file (.pth or .safetensors), in any float dtype.

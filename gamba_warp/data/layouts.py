@@ -561,7 +561,7 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
 
 
 # By name: the file or folder that marks an object's folder, and the folder's reader, which raises
-# UserError. A script may add to it (docs/change-the-training.md).
+# UserError. A script may add to it (docs/train-your-own.md).
 LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
     "transforms": ("transforms.json", _read_transforms),
     "nerf": ("transforms_train.json", _read_nerf),

@@ -116,7 +116,7 @@ def _vgg16(config: GambaConfig, weights: Weights | None) -> tuple[nn.Module, int
 
 # Encoders that are not ViTs of timm, by name: functions that return a network from pictures
 # ``[B, S, S, 3]`` in [0, 1], S = ``config.encoder_size``, to tokens ``[B, K, C]``, and C. A script
-# may add to it (docs/change-the-training.md).
+# may add to it (docs/train-your-own.md).
 ENCODERS: dict[str, Callable[[GambaConfig, Weights | None], tuple[nn.Module, int]]] = {
     "vgg16": _vgg16
 }

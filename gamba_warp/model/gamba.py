@@ -24,7 +24,7 @@ from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
 
 # By name: a module made of a ``GambaConfig`` that maps tokens ``[B, L, width]`` to ``Gaussians``
-# ``[B, N]``. A script may add to it (docs/change-the-training.md).
+# ``[B, N]``. A script may add to it (docs/train-your-own.md).
 DECODERS: dict[str, Any] = {
     "bins": GaussianDecoder,
     "rays": RayDecoder,

@@ -243,7 +243,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     warning, own = "", method in ("mask", "alpha", "none")
     doubts = [] if own else doubts_of(source, rgba[..., 3])
     doubts += [found.doubt] if found.doubt else []
-    if method == "grabcut":  # docs/photo.md has the figure
+    if method == "grabcut":  # docs/reconstruct.md has the figure
         doubts.append("colours alone fail for more than half of photographs")
     if doubts:
         warning = f"The cut-out may be wrong: {'; '.join(doubts)}."

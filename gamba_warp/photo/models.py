@@ -1,7 +1,7 @@
 """Matting networks: location, fetching and inference.
 
 Files and folders are those of rembg, so its copies are used. rembg itself is not used: its first
-import compiles numba functions for minutes (docs/photo.md).
+import compiles numba functions for minutes (docs/reconstruct.md).
 
 A file is an untrusted graph, which onnxruntime reads and runs in native code. It may crash, hang or
 exhaust memory, so ``matte.py`` calls ``alpha_of`` in a child process.

@@ -2,7 +2,7 @@
 
 The background's colour is a smooth function of the position, fitted to what is flooded from the
 border. An enclosed area is background too if it has exactly that colour: the matter of an object is
-lighter or darker by its shading. docs/photo.md has the figures.
+lighter or darker by its shading. docs/reconstruct.md has the figures.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The page of scanned objects: its tables are what the reports hold."""
+"""The table of scanned objects in the model card is what the reports hold."""
 
 import json
 
@@ -14,11 +14,6 @@ def figures_of(psnr):
     return {"psnr": psnr, "ssim": 0.8, "lpips": None, "mask_iou": 0.5}
 
 
-def record(name, psnr, flat):
-    baselines = {"billboard": {"psnr": flat}}
-    return {"name": name, "status": "ok", **figures_of(psnr), "baselines": baselines}
-
-
 def row(name, psnr, views="novel"):
     cells = {key: None if v is None else {"mean": v} for key, v in figures_of(psnr).items()}
     return {"views": views, "name": name, **cells}
@@ -29,14 +24,9 @@ VIEWS = {
     "num_ok": 2,
     "table": [row("model", 20.5), row("retrieval", 99.0), row("billboard", 17.0)]
     + [row("model", 38.0, "input")],
-    "objects": [record("a_cup", 19.0, 18.5), record("b", 22.0, 15.5)]
-    + [{"name": "c", "status": "failed"}],
-    "failures": [{"name": "c", "reason": "no such view"}],
 }
 SHAPES = {
     "mean": {"chamfer": 0.04321, "normal_consistency": 0.7, "iou": 0.5},
-    "objects": [{"name": "b", "chamfer": 0.03, "normal_consistency": 0.75, "iou": 0.6}],
-    "failures": [],
 }
 
 
@@ -52,16 +42,6 @@ def test_the_means_are_of_new_views_and_the_shapes_stand_with_the_model():
         ["billboard", "17.00", "0.800", "–", "0.500", "–", "–", "–"],
     ]
     assert scanned.figures(VIEWS, SHAPES).endswith("`m.safetensors`, SHA-256 0123456789abcdef.")
-
-
-def test_objects_stand_from_best_to_worst_and_failures_below():
-    text = scanned.objects(VIEWS, SHAPES)
-    table, _, failed = text.partition("\n\n")
-    _, _, *rows = cells(table)
-    assert [r[0] for r in rows] == ["b", "a cup"]
-    assert rows[0][-4:] == ["0.0300", "0.750", "0.600", "6.5"]
-    assert rows[1][1] == "19.00" and rows[1][-4:] == ["–", "–", "–", "0.5"]
-    assert failed == "Failed: c: no such view."
 
 
 def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch):
@@ -85,7 +65,7 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
     monkeypatch.setattr(scanned.cli, "run", run)
     (tmp_path / "pictures").mkdir()
     page = tmp_path / "page.md"
-    parts = "\n".join("\n".join(marks("make scanned", name)) for name in ("figures", "objects"))
+    parts = "\n".join(marks("make scanned", "figures"))
     page.write_text(f"before\n{parts}\nafter\n")
     assert scanned.main(tmp_path / "glb", out=tmp_path / "out", page=page) == 1
     assert [words[0] for words in ran] == ["data render", "eval-views", "eval-geometry"]
@@ -93,17 +73,16 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
     assert ran[2][1:3] == [str(tmp_path / "out" / "eval" / "gaussians"), str(tmp_path / "glb")]
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n")
-    assert "| b " in text and "**this project**" in text
+    assert "**this project**" in text
     assert Image.open(tmp_path / "pictures" / "scanned.webp").size == (5, 7)
 
 
 def test_the_page_that_is_there_has_its_marks_and_every_metric():
     text = scanned.PAGE.read_text(encoding="utf-8")
-    for name in ("figures", "objects"):
-        begin, end = marks("make scanned", name)
-        part = text.partition(begin)[2].partition(end)[0]
-        assert part.count("|") > 30
-        assert all(metric.head in part for metric in METRICS.values())
+    begin, end = marks("make scanned", "figures")
+    part = text.partition(begin)[2].partition(end)[0]
+    assert part.count("|") > 30
+    assert all(metric.head in part for metric in METRICS.values())
 
 
 @pytest.mark.parametrize("code", [2, 130])

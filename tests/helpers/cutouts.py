@@ -2,9 +2,9 @@
 
     PYTHONPATH=.:tests python -m helpers.cutouts
 
-prints the tables of docs/photo.md. Objects are those of ``gamba data made``, rendered, or drawn;
-half of them have enclosed background, the others matter of the background's colour. Further ones
-are light grey on white, and only their doubts are counted.
+prints the tables of docs/reconstruct.md. Objects are those of ``gamba data made``, rendered, or
+drawn; half of them have enclosed background, the others matter of the background's colour. Further
+ones are light grey on white, and only their doubts are counted.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Slurm script and count of operations of docs/sixteen-gpus.md."""
+"""Slurm script and count of operations of docs/train-your-own.md."""
 
 import os
 import re
@@ -13,7 +13,7 @@ from helpers.nodes.processes import environment
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "docs" / "examples" / "slurm.sh"
 ARRAY = SCRIPT.with_name("slurm_array.sh")
-PAGE = (ROOT / "docs" / "sixteen-gpus.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "train-your-own.md").read_text(encoding="utf-8")
 
 
 def slurm(folder, *arguments, script=SCRIPT, **more):

@@ -20,7 +20,7 @@ def scores(found):
 
 
 def test_enclosed_background_and_shadows_go_and_white_matter_stays(scores):
-    """Means of docs/photo.md, less a hundredth for other versions of the libraries."""
+    """Means of docs/reconstruct.md, less a hundredth for other versions of the libraries."""
     means = {}
     for case, score in scores:
         means.setdefault(case.white, []).append(score)
@@ -49,7 +49,7 @@ def test_holes_may_be_kept(scores):
 
 
 def test_an_object_like_its_background_is_doubted(found):
-    """Counts of docs/photo.md: 10 of 11 that are cut wrong, 1 of 43 that are cut right."""
+    """Counts of docs/reconstruct.md: 10 of 11 that are cut wrong, 1 of 43 that are cut right."""
     doubts = {True: [], False: []}
     for case, matte in (*found, *((case, plain_matte(case.rgb)) for case in near_white())):
         doubts[iou(matte.rgba[..., 3], case.alpha) >= 0.9].append(doubted(case, matte))

@@ -27,7 +27,7 @@ def test_a_user_installs_no_tools_of_developers(target, tmp_path):
     said = commands(target, tmp_path / "none")
     assert "--editable '.[all]'" in said and "[test]" not in said
     assert "--quiet" not in said, "each step has its line, and downloads pip's bars"
-    assert "pip fetches" in said and ("64 MB" in said) == (target == "demo")
+    assert "pip fetches" in said
 
 
 @pytest.mark.parametrize("target", ["test", "lint", "docs", "format", "hostile", "endurance"])

@@ -98,7 +98,7 @@ def own(words: list[str]) -> list[str] | None:
 def test_the_reader_of_blocks_sees_them():
     assert len(SHELL) > 25 and len(PYTHON) > 5 and README in PAGES
     assert sum(block.runs for block in SHELL) >= 5 and sum(block.runs for block in PYTHON) >= 2
-    (block,) = [b for b in SHELL if b.path.name == "sixteen-gpus.md" and "nnodes 2" in b.text]
+    (block,) = [b for b in SHELL if b.path.name == "train-your-own.md" and "nnodes 2" in b.text]
     assert own(commands(block)[0])[:4] == ["train", "DATA", "--out", "RUN"]
 
 

@@ -119,16 +119,16 @@ def test_the_folder_that_is_entered_is_the_one_that_the_clone_makes():
 
 
 def test_links_lead_to_the_pages_of_files():
-    assert page_of("docs/photo.md") == "photo.md" and page_of("README.md") == "index.md"
+    assert page_of("docs/gpu.md") == "gpu.md" and page_of("README.md") == "index.md"
     assert page_of("kernels/rasterize/README.md") == "repository/kernels/rasterize.md"
     assert page_of("docs/examples/slurm.sh") == "code/docs/examples/slurm.sh.md"
     text = "[a](../eval/README.md#b) ![p](pictures/x.webp) [c](#d) [e](https://f.org/g.md)\n"
-    new = rewritten(text, "docs/photo.md", "photo.md")
+    new = rewritten(text, "docs/gpu.md", "gpu.md")
     assert "(repository/eval.md#b)" in new and "(pictures/x.webp)" in new
     assert "(#d)" in new and "(https://f.org/g.md)" in new
-    assert targets(text, "docs/photo.md") == ["eval/README.md", "docs/pictures/x.webp"]
+    assert targets(text, "docs/gpu.md") == ["eval/README.md", "docs/pictures/x.webp"]
     block = "```text\n[a](../eval/README.md)\n```\n"
-    assert rewritten(block, "docs/photo.md", "photo.md") == block
+    assert rewritten(block, "docs/gpu.md", "gpu.md") == block
 
 
 def test_the_readme_is_short_and_its_links_lead_somewhere():
@@ -152,7 +152,8 @@ def test_the_picture_moves():
 
 
 def test_each_mark_beside_others_has_its_proof():
-    page = (ROOT / "docs" / "faq.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    page = text.partition("## Similar projects")[2]
     lines = [line for line in page.split("\n") if line.startswith("| ")]
     named = dict(re.findall(r"^\[(\w+)\]: (https://\S+)$", page, re.MULTILINE))
     assert len(lines) > 8

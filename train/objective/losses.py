@@ -270,7 +270,7 @@ def radial_weight(loss: LossConfig, at: Progress) -> float:
     return RDIST_WEIGHT * max(0.0, left) if loss.radial_mask and not at.validates else 0.0
 
 
-# In the order of summation. A script may add to it (docs/change-the-training.md).
+# In the order of summation. A script may add to it (docs/train-your-own.md).
 TERMS: dict[str, Term] = {
     "rgb": Term(lambda loss, at: 1.0, lambda s: mse(s.rgb, s.target), "MSE and mask", True),
     "mask": Term(

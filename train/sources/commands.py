@@ -211,7 +211,7 @@ def data_objaverse_command(
 
     Folders are linked; of tars only the files for training are unpacked. Existing objects are
     skipped, so a stopped command can be continued. OUT/objaverse.json records the choice.
-    docs/datasets.md has the commands for the paper's training set.
+    docs/data.md has the commands for the paper's training set.
 
     Args:
         out: folder to make or to continue.

@@ -124,7 +124,10 @@ def _tables(card: ModelCard) -> list[str]:
     tables, first = [], [key for key in METRICS if key not in OF_GROUNDS]
     for views, title in TITLES.items():
         rows = [row for row in card.figures if row.views == views]
-        for metrics, where in ((first, ""), (OF_GROUNDS, " on other grounds")):
+        both = [(first, ""), (OF_GROUNDS, " on other grounds")]
+        if views == "input":  # trivial for baselines that copy the input
+            rows, both = [row for row in rows if row.name == "model"], both[:1]
+        for metrics, where in both:
             keys = [key for key in metrics if any(getattr(row, key) for row in rows)]
             if not keys:
                 continue

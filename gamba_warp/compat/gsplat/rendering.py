@@ -91,7 +91,7 @@ def rasterization(
 
     The arguments, their order and defaults are those of gsplat 1.5.3; the keywords after the star
     came later. ``tile_size``, ``channel_chunk`` and ``segmented`` have no effect. Options that are
-    not listed below must have their defaults. docs/drop-in-gsplat.md lists the differences of each
+    not listed below must have their defaults. docs/drop-ins.md lists the differences of each
     argument.
 
     Args:
