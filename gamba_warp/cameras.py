@@ -150,8 +150,9 @@ def exact_product(rows: Tensor, matrix: Tensor) -> Tensor:
     Returns:
         ``[.., N, K]``.
     """
-    first, second, third = (rows[..., i : i + 1] * matrix[..., i : i + 1, :] for i in range(3))
-    return first + second + third
+    x, y, z = (column[..., None] for column in rows.unbind(-1))
+    first, second, third = (row[..., None, :] for row in matrix.unbind(-2))
+    return torch.addcmul(torch.addcmul(x * first, y, second), z, third)
 
 
 def _inverse(matrices: Tensor) -> Tensor:

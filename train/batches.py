@@ -259,7 +259,7 @@ class Batches:
     def batch(self, number: int, novel: int) -> Batch:
         """Load the ``number``-th batch synchronously, with ``novel`` novel views."""
         self._begin(number)
-        return join([self.sample(n, novel) for n in self._numbers(number)])
+        return join([self.sample(n, novel) for n in self._numbers(number)], self.model)
 
     def sample(self, number: int, novel: int) -> Batch:
         """Load the ``number``-th sample; an unreadable object is replaced by the next.
@@ -374,7 +374,7 @@ class Batches:
         good = [sample.batch for sample in samples if sample.batch is not None]
         if len(good) < len(samples):
             return Prepared(None, failures)
-        batch = join(good)
+        batch = join(good, self.model)
         return Prepared(batch.pinned() if self.world.device.type == "cuda" else batch, failures)
 
     def _record_failures(self, prepared: Prepared) -> Batch:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+import torch.distributed as dist
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
@@ -26,7 +29,7 @@ from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Progress, term_weights
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
-from .step import Objective, collapse_reason, compute_gradients, health, validate
+from .step import Gradients, Objective, collapse_reason, compute_gradients, health, validate
 
 CLIP = 1.0  # largest norm of the gradient (paper, §4.1)
 MAX_SKIPPED = 20  # a run ends after so many steps in a row that are not finite
@@ -72,6 +75,8 @@ class Trainer:
         self.precision = world.precision(config.optim.precision, model.config.width)
         self.accumulate = config.views.accumulate
         self.step = self.skipped = self.skipped_in_row = 0
+        # Step, and the tensor of ``_update``, of the steps whose numbers are not read yet.
+        self._unread_steps: deque[tuple[int, Tensor]] = deque()
         self.elapsed = 0.0  # seconds of training, resumed parts included
         self._collapsed = False
         self.scores: dict[str, Score] = {}  # of the "first", "best" and "last" validation
@@ -125,11 +130,14 @@ class Trainer:
         return term_weights(self.config.loss, Progress(self.step, self.epochs, done, validates))
 
     def train_step(self) -> dict[str, float]:
-        """Make one optimizer step; return its figures, some of them of the last batch only.
+        """Make one optimizer step.
 
-        With several processes, losses and the model's health are means over all of them.
+        A step with a non-finite loss or gradient leaves the weights unchanged and is counted. A GPU
+        is not waited for: its numbers are read with the next step, and those of a log step at once.
 
-        A step with a non-finite loss or gradient leaves the weights unchanged and is counted.
+        Returns:
+            On log steps the figures, some of them of the last batch only; with several processes,
+            losses and the model's health are means over all of them. Else nothing.
 
         Raises:
             UserError: too many such steps in a row, or data cannot be read.
@@ -148,41 +156,68 @@ class Trainer:
             clip=CLIP,
             count=self.accumulate,
         )
-        loss, norm = torch.stack([made.loss, made.norm]).tolist()
-        bad = not (math.isfinite(loss) and math.isfinite(norm))
-        number, total = self.world.total(bad, loss)  # all processes must act alike
-        self._apply(number > 0, "gradient" if math.isfinite(total) else "loss")
-        loss = total / self.world.size
+        self.step += 1
+        self._unread_steps.append((self.step, self._update(made)))
+        logs = self.step % config.run.log_every == 0
+        loss, norm = self._count_skipped(late=1 if self.world.device.type == "cuda" else 0)
+        if not logs:
+            return {}
+        if self._unread_steps:
+            loss, norm = self._count_skipped()
         seconds = time.perf_counter() - started
         views = made.batch.cameras.viewmats[..., 0, 0].numel() * self.accumulate * self.world.size
         figures = {"loss": loss, "grad_norm": norm, "lr": rate}
         figures |= {"seconds": seconds, "wait_share": batches.waited / seconds}
         figures["views_per_second"] = views / seconds
-        if self.step % config.run.log_every == 0:
-            terms = made.result.terms.items()
-            losses = {f"loss_{name}": term.mean().item() for name, term in terms}
-            state = health(made.result, made.batch).items()
-            figures |= self.world.mean(losses | {name: value.item() for name, value in state})
-        return figures
+        terms = {f"loss_{name}": term.mean() for name, term in made.result.terms.items()}
+        found = terms | health(made.result, made.batch)
+        values = torch.stack([value.double() for value in found.values()]).tolist()
+        return figures | self.world.mean(dict(zip(found, values)))
 
-    def _apply(self, bad: bool, what: str) -> None:
-        """Update the weights, or skip the step because its ``what`` is not finite; count it."""
-        self.step += 1
-        if not bad:
-            self.skipped_in_row = 0
-            self.optimizer.step()
+    def _update(self, made: Gradients) -> Tensor:
+        """Update the weights, unless loss or gradient is not finite on any process.
+
+        Returns:
+            ``[3]`` on the device: loss, norm of the gradient, and 1 if the step was skipped.
+        """
+        numbers = torch.stack([made.loss, made.norm])
+        bad = 1 - numbers.isfinite().all().float()
+        if isinstance(self.wrapped, DistributedDataParallel):  # all processes must act alike
+            dist.all_reduce(bad, dist.ReduceOp.MAX, self.wrapped.process_group)
+        vars(self.optimizer)["found_inf"] = bad  # as torch.amp.GradScaler sets it
+        self.optimizer.step()
+        if self.ema is not None:
+            self.ema.update(1 - bad)
+        return torch.cat([numbers, bad[None]])
+
+    def _count_skipped(self, late: int = 0) -> tuple[float, float]:
+        """Read the numbers of all steps but the last ``late``, and count those that were skipped.
+
+        Returns:
+            Loss, the mean over all processes, and norm of the gradient, of the last one read.
+        """
+        loss = norm = math.nan
+        while len(self._unread_steps) > late:
+            step, numbers = self._unread_steps.popleft()
+            own, norm, bad = numbers.tolist()
+            (total,) = self.world.total(own)
+            loss = total / self.world.size
+            if not bad:
+                self.skipped_in_row = 0
+                continue
+            self.skipped += 1
+            self.skipped_in_row += 1
             if self.ema is not None:
-                self.ema.update()
-            return
-        self.skipped += 1
-        self.skipped_in_row += 1
-        if self.log is not None:
-            self.log.warn(self.step, f"step {self.step} skipped: its {what} is not finite")
-        if self.skipped_in_row >= MAX_SKIPPED:
-            raise UserError(
-                f"{self.skipped_in_row} steps in a row were not finite (step {self.step}); "
-                "lower --lr, or resume from an older checkpoint"
-            )
+                self.ema.updates -= 1
+            if self.log is not None:
+                what = "gradient" if math.isfinite(total) else "loss"
+                self.log.warn(step, f"step {step} skipped: its {what} is not finite")
+            if self.skipped_in_row >= MAX_SKIPPED:
+                raise UserError(
+                    f"{self.skipped_in_row} steps in a row were not finite (step {step}); "
+                    "lower --lr, or resume from an older checkpoint"
+                )
+        return loss, norm
 
     def run(self) -> int:
         """Train until the end, the time limit or a signal, then save a checkpoint.
@@ -235,7 +270,7 @@ class Trainer:
         if minutes is None:
             bar.update(1)
         self._name_failures()
-        if self.log is not None and self.step % run.log_every == 0:
+        if self.log is not None and figures:
             shown = {"loss": f"{figures['loss']:.4f}", "psnr": f"{figures['psnr']:.1f}"}
             if minutes is not None:
                 shown = {"step": self.step, **shown}
@@ -336,6 +371,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint on the main process, once per step; the others wait."""
+        self._count_skipped()
 
         def write() -> None:
             if self._saved != self.step:

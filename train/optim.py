@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import torch
 from msgspec import Meta
 from torch import Tensor
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
@@ -117,11 +116,16 @@ class Ema:
             average.requires_grad_(False)
 
     @torch.no_grad()
-    def update(self) -> None:
-        """Move the average towards the model's current weights."""
+    def update(self, share: Tensor) -> None:
+        """Move the average towards the model's current weights.
+
+        Args:
+            share: scalar on their device, 1; or 0 to leave the average as it is.
+        """
         averages, weights = map(list, zip(*self._pairs))
-        move = get_ema_multi_avg_fn(ema_decay(self.updates, self.decay))
-        move(averages, weights, None)
+        steps = torch._foreach_sub(weights, averages)
+        torch._foreach_mul_(steps, share * (1 - ema_decay(self.updates, self.decay)))
+        torch._foreach_add_(averages, steps)
         self.updates += 1
 
 

@@ -78,7 +78,8 @@ def forward(model: Callable, batch: Batch, objective: Objective) -> StepResult:
     """
     weights, lpips, crop, precision = objective
     with network_precision(batch.inputs.device, precision):
-        gaussians = model(batch.inputs, batch.input_cameras)
+        own = {} if batch.foreground is None else {"foreground": batch.foreground}
+        gaussians = model(batch.inputs, batch.input_cameras, **own)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
     inputs = LossInputs(
@@ -109,11 +110,11 @@ def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str,
     """
     if novel == 1:
         return terms
-    shares = torch.full((views,), novel)
-    shares[0] = 1.0
-    shares *= views / shares.sum()  # the later mean divides by the number of views
+    first = views / (1 + novel * (views - 1))  # the later mean divides by the number of views
+    shares = terms["rgb"].new_full((views,), novel * first)
+    shares[:1].fill_(first)
     whole = {name: term for name, term in terms.items() if term.ndim == 2}  # not LPIPS of crops
-    return terms | {name: term * shares.to(term) for name, term in whole.items()}
+    return terms | {name: term * shares for name, term in whole.items()}
 
 
 class Gradients(NamedTuple):

@@ -46,7 +46,7 @@ for step in range(1, options.steps + 1):
         index = int(rng.integers(len(dataset := sets[number])))
         views = choose_views(dataset.num_views(index), 3, None, rng)
         samples.append(load_sample(dataset, index, views, config.image_size, config, torch.ones(3)))
-    loss = forward(model, join(samples).to(device), objective).loss
+    loss = forward(model, join(samples, config).to(device), objective).loss
     optimizer.zero_grad()
     loss.backward()
     torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)

@@ -39,7 +39,7 @@ from ..gaussians import Gaussians
 from ..kernels.rasterize.constants import ALPHA_MIN
 from ..render import render
 from .config import GambaConfig
-from .parts.patches import foreground_cells, premultiplied
+from .parts.patches import premultiplied
 from .parts.rays import EMPTY
 
 PLAIN = 6 / 255  # largest contrast of a plain cell, with its neighbours
@@ -129,9 +129,9 @@ def split_front(
     camera = camera.to(device)
     whole = fill_gaps(gaussians, config, camera)
     step = config.image_size // side
-    picture, front_cells = premultiplied(large[None]), foreground_cells(image[None], step)
+    picture = premultiplied(large[None])
     alpha = F.avg_pool2d(image[None, None, ..., 3], step)
-    cells = front_cells.row * side + front_cells.column  # of each front Gaussian
+    cells = alpha.flatten().nonzero()[:, 0]  # of each front Gaussian
     counts = _children_a_side(picture, alpha, detail).flatten()
     splits = counts[cells] > 1
     if not splits.any():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from ..cameras import Cameras
@@ -18,7 +17,7 @@ from .encoders import ImageEncoder, Weights, build_encoder
 from .parts.attention import AttentionBlock
 from .parts.block import GambaBlock, make_norm, prefix_states, run_blocks
 from .parts.decoder import GaussianDecoder
-from .parts.patches import foreground_patches
+from .parts.patches import Foreground, find_foreground
 from .parts.rays import RayDecoder
 from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
@@ -112,6 +111,7 @@ class Gamba(nn.Module):
         cameras: Cameras,
         condition: list[Any] | None = None,
         background_margin: int | None = None,
+        foreground: Foreground | None = None,
     ) -> Gaussians:
         """Predict the Gaussians of each picture's object.
 
@@ -129,6 +129,8 @@ class Gamba(nn.Module):
                 On CUDA it reads one number back. The decoder ``rays`` is trained on, and always
                 uses, only the object's own patches, per picture; None is 0 there. A margin adds
                 patches to its network, but no Gaussians.
+            foreground: with ``rays``, ``find_foreground`` of the pictures, on their device, if made
+                before; else alpha is read back from a GPU.
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or
@@ -142,7 +144,11 @@ class Gamba(nn.Module):
         if condition is None:
             condition = self.condition(images, cameras)
         if isinstance(self.decoder, RayDecoder):
-            return self._forward_rays(images, cameras, condition, background_margin or 0)
+            if foreground is None:
+                alpha = images[..., 3].cpu()
+                found = find_foreground(alpha, self.config, background_margin or 0)
+                foreground = found.to(images.device)
+            return self._forward_rays(images, cameras, condition, foreground)
         tokens = self.tokens(images, cameras)
         if background_margin is not None:
             background = self.config.background_color
@@ -155,18 +161,14 @@ class Gamba(nn.Module):
         return self.decoder(tokens, self.planes(len(images), plane_states, self.recompute))
 
     def _forward_rays(
-        self, rgba: Tensor, cameras: Cameras, condition: list[Any], margin: int
+        self, rgba: Tensor, cameras: Cameras, condition: list[Any], foreground: Foreground
     ) -> Gaussians:
         """Run ``forward`` for the decoder ``rays``."""
-        patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
         pixels = self.tokens.pixels(rgba, cameras)
-        tokens, positions = self.tokens.of_patches(pixels, patches)
-        cu_seqlens = None
-        if len(rgba) != 1:
-            counts = torch.tensor([0, *patches.counts], device=tokens.device)
-            cu_seqlens = self.config.num_orders * counts.cumsum(0)
-        tokens = run_blocks(self.blocks, tokens[None], condition, self.recompute, cu_seqlens)
-        return self.decoder(self.norm(tokens)[0, positions], pixels, patches, rgba, cameras)
+        tokens = self.tokens.of_patches(pixels, foreground)[None]
+        tokens = run_blocks(self.blocks, tokens, condition, self.recompute, foreground.packed)
+        tokens = self.norm(tokens)[0, foreground.positions]
+        return self.decoder(tokens, pixels, foreground, rgba, cameras)
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size

@@ -5,7 +5,7 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
-from ..runtime.packed import sequences
+from ..runtime.packed import Packed, sequences
 from ..runtime.views import tokens_first
 from .kernels import TAPS
 from .ops import conv
@@ -23,7 +23,7 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: Literal[False] = False,
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> Tensor: ...
 @overload
@@ -35,7 +35,7 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: Literal[True],
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]: ...
 @overload
@@ -47,7 +47,7 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: bool,
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]: ...
 def causal_conv1d(
@@ -58,7 +58,7 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: bool = False,
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Depthwise causal convolution along tokens, channels last (README, equation 1).

@@ -7,13 +7,35 @@ out.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 _DTYPES = (torch.int32, torch.int64)
 
 
-def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> Tensor | None:
+class Packed(NamedTuple):
+    """Sequences of one packed row, for several calls of operators; its values are not checked.
+
+    Attributes:
+        cu_seqlens: ``[S + 1]`` int64, ascending from 0 to L.
+        rows: ``[S, 3]`` int32, the list of sequences.
+    """
+
+    cu_seqlens: Tensor
+    rows: Tensor
+
+    @classmethod
+    def of(cls, cu_seqlens: Tensor) -> Packed:
+        """Make the list of sequences of their borders."""
+        begins, ends = cu_seqlens[:-1], cu_seqlens[1:]
+        return cls(cu_seqlens, torch.stack([torch.zeros_like(begins), begins, ends], 1).int())
+
+
+def sequences(
+    x: Tensor, cu_seqlens: Tensor | Packed | None, seq_idx: Tensor | None
+) -> Tensor | None:
     """The list of sequences of a call, or None where each row is one.
 
     Args:
@@ -21,7 +43,8 @@ def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> T
         cu_seqlens: ``[S + 1]`` int32 or int64, ascending from 0 to L, where B is 1: sequence s has
             the tokens from ``cu_seqlens[s]`` to before ``cu_seqlens[s + 1]``, perhaps none. On CUDA
             the values are not looked at, which would wait for the device, but bounded: by 0, L and
-            those before them. Results of tokens in no sequence are then undefined.
+            those before them. Results of tokens in no sequence are then undefined. Or a
+            ``Packed``, which costs no further operation.
         seq_idx: ``[B, L]`` int32 or int64: a sequence is a run of equal numbers in a row. To find
             the runs waits for a CUDA device.
 
@@ -35,6 +58,8 @@ def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> T
     if cu_seqlens is not None and seq_idx is not None:
         raise ValueError("cu_seqlens and seq_idx are given, allowed is one of them")
     batch, length = x.shape[:2]
+    if isinstance(cu_seqlens, Packed) and seq_idx is None:
+        return cu_seqlens.rows
     name, given = ("seq_idx", seq_idx) if cu_seqlens is None else ("cu_seqlens", cu_seqlens)
     if not isinstance(given, Tensor):
         raise TypeError(f"{name} is {type(given).__name__}, must be a tensor")

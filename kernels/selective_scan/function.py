@@ -7,7 +7,7 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
-from ..runtime.packed import sequences
+from ..runtime.packed import Packed, sequences
 from ..runtime.views import tokens_first
 from . import ops
 from .problem import DISCRETIZATIONS, Inputs, Options
@@ -95,7 +95,7 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: Literal[False] = False,
     discretization: str = "mamba",
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> Tensor: ...
 @overload
@@ -113,7 +113,7 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: Literal[True],
     discretization: str = "mamba",
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]: ...
 @overload
@@ -131,7 +131,7 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: bool,
     discretization: str = "mamba",
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]: ...
 def selective_scan(
@@ -148,7 +148,7 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: bool = False,
     discretization: str = "mamba",
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Mamba's selective scan, channels last (Gu and Dao 2023, algorithm 2; README for the maths).
@@ -211,7 +211,7 @@ def selective_scan_state(
     *,
     initial_state: Tensor | None = None,
     discretization: str = "mamba",
-    cu_seqlens: Tensor | None = None,
+    cu_seqlens: Tensor | Packed | None = None,
     seq_idx: Tensor | None = None,
 ) -> Tensor:
     """The state after the last token, where no output is needed: no C, D or gate is computed.

@@ -29,6 +29,11 @@ WAITS = {
     "aten::linalg_inv_ex", "aten::_linalg_check_errors", "aten::linalg_solve_ex",
     "aten::lift_fresh", "aten::repeat_interleave.Tensor",
 }  # fmt: skip
+# Views that are none to torch, and notes for its profiler.
+VIEWS = {
+    "aten::_unsafe_view", "aten::detach", "prim::device", "profiler::_record_function_enter_new",
+    "profiler::_record_function_exit",
+}  # fmt: skip
 INDEXING = {"aten::index.Tensor", "aten::index_put", "aten::index_put_"}
 
 
@@ -41,20 +46,25 @@ class Watch(TorchDispatchMode):
     Attributes:
         found: the recorded operators.
         names: names of all operators.
+        computed: number of calls of operators that are no views; ours count once.
     """
 
     def __init__(self):
         super().__init__()
-        self.found, self.names = [], set()
+        self.found, self.names, self.computed = [], set(), 0
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         body = OPDEFS.get(function.name()) if function.namespace == "gamba_warp" else None
         if body is not None:
             self.names.add(function.name())
+            before = self.computed
             with self:
-                return body._init_fn(*args, **(kwargs or {}))
+                out = body._init_fn(*args, **(kwargs or {}))
+            self.computed = before + 1
+            return out
         name = function.name()
         self.names.add(name)
+        self.computed += not (function.is_view or name in VIEWS)
         if name in WAITS:
             self.found.append(name)
         out = function(*args, **(kwargs or {}))

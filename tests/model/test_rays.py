@@ -15,7 +15,7 @@ from gamba_warp.eval.views.compare import Truth
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.parts.patches import foreground_cells, foreground_patches
+from gamba_warp.model.parts.patches import find_foreground
 from gamba_warp.model.parts.rays import RayDecoder
 from gamba_warp.model.predict import model_input, reconstruct
 from gamba_warp.render import render
@@ -123,11 +123,11 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
         alpha = torch.zeros(40, 40)
         alpha[rows, columns] = 1
         picture[..., 3] = alpha
-    patches = foreground_patches(rgba[..., 3], 4)
     pixels = torch.rand(3, model.config.pixel_channels, 40, 40)
-    seen = foreground_cells(rgba, 4 // cells)
-    got = decoder._stem(pixels, patches, seen)
-    want = decoder.stem(pixels).permute(0, 2, 3, 1)[seen.picture, seen.row, seen.column]
+    seen = find_foreground(rgba[..., 3], model.config)
+    picture, row, column = seen.cell
+    got = decoder._stem(pixels, seen)
+    want = decoder.stem(pixels).permute(0, 2, 3, 1)[picture, row, column]
     assert seen.counts[1] == 0 and sum(seen.counts) == len(got)
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
     grads = [
@@ -136,33 +136,30 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
     ]
     for ours, theirs in zip(*grads):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
-    assert patches.boxes() == [((5, 6), (4, 5)), ((0, 1), (0, 1)), ((2, 10), (0, 10))]
+    assert seen.boxes == [(5, 4, 6, 5), (0, 0, 1, 1), (2, 0, 10, 10)]
 
 
 @pytest.mark.parametrize("additive, orders", [(True, 4), (False, 4), (True, 2)])
 def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive, orders):
-    tokens = Gamba(rays(additive_image_tokens=additive, num_orders=orders)).tokens
-    rgba, cameras = cut_outs()
+    model = Gamba(rays(additive_image_tokens=additive, num_orders=orders))
+    tokens, (rgba, cameras) = model.tokens, cut_outs()
     whole = tokens(rgba, cameras)
-    patches = foreground_patches(rgba[..., 3], 4)
-    got, places = tokens.of_patches(tokens.pixels(rgba, cameras), patches)
-    own = [patches.position[patches.picture == index].tolist() for index in range(len(rgba))]
+    seen = find_foreground(rgba[..., 3], model.config)
+    got = tokens.of_patches(tokens.pixels(rgba, cameras), seen)
+    picture, row, column = seen.patch
     inside = torch.zeros(len(rgba), 9, dtype=torch.bool)
-    for index, places_of in enumerate(own):
-        inside[index, places_of] = True
-    assert patches.counts == [len(places_of) for places_of in own]
+    inside[picture, 3 * row + column] = True
+    assert (seen.cu_seqlens.diff() == orders * inside.sum(1)).all()
     torch.testing.assert_close(got, whole[inside[:, tokens.orders]])
-    for place, picture, patch in zip(places, patches.picture, patches.position):
+    for place, index, patch in zip(seen.positions, picture, 3 * row + column):
         for order in range(orders):
             number = 9 * order + tokens.orders.view(orders, 9)[order].tolist().index(patch)
-            torch.testing.assert_close(got[place[order]], whole[picture, number])
+            torch.testing.assert_close(got[place[order]], whole[index, number])
 
 
 def test_a_picture_without_background_keeps_every_token():
-    patches = foreground_patches(torch.ones(2, 12, 12), 4)
-    orders = Gamba(rays()).tokens.orders
-    kept, _ = patches.orders(orders)
-    assert kept.tolist() == [*range(36)] * 2 and patches.counts == [9, 9]
+    seen = find_foreground(torch.ones(2, 12, 12), rays())
+    assert seen.tokens.tolist() == [*range(36)] * 2 and seen.cu_seqlens.tolist() == [0, 36, 72]
 
 
 @pytest.mark.parametrize("rotation", [False, True])

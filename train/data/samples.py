@@ -14,6 +14,7 @@ from gamba_warp.cameras import Cameras
 from gamba_warp.data.dataset import ObjectViews, ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.parts.patches import Foreground, find_foreground
 from gamba_warp.model.posing import posed_input, relative_cameras
 
 MAX_GAMMA = 1.5  # colours become value^gamma, gamma between 1 / MAX_GAMMA and this
@@ -89,6 +90,7 @@ class Batch:
         background: ``[B, 1, 3]`` RGB that pictures are rendered and composited on.
         surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface behind each pixel of
             the inputs, in the model's world, 0 where unknown; None unless requested.
+        foreground: of the inputs, for the decoder ``rays``; None if not made yet.
     """
 
     uids: list[str]
@@ -98,6 +100,7 @@ class Batch:
     cameras: Cameras
     background: Tensor
     surfaces: Tensor | None = None
+    foreground: Foreground | None = None
 
     def to(self, device: torch.device) -> Batch:
         """Return the batch on a device; the copy to a GPU is asynchronous if it is pinned."""
@@ -113,9 +116,15 @@ class Batch:
         return _combined([self], lambda v: v[0].pin_memory() if v[0].device.type == "cpu" else v[0])
 
 
-def join(samples: list[Batch]) -> Batch:
-    """Join samples to one batch; all must have the same number of views."""
-    return _combined(samples, torch.cat)
+def join(samples: list[Batch], config: GambaConfig) -> Batch:
+    """Join samples to one batch, with the foreground that the model needs.
+
+    All must have the same number of views.
+    """
+    batch = _combined(samples, torch.cat)
+    if config.decoder == "rays":
+        batch.foreground = find_foreground(batch.inputs[..., 3].cpu(), config)
+    return batch
 
 
 def _combined(parts: list[Any], make: Callable[[list[Tensor]], Tensor]) -> Any:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import smooth_l1_loss
+from torch.nn import functional as F
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras, view_angles
@@ -108,37 +108,54 @@ def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Te
         difference; 0 where no depth is known.
     """
     height, width = surfaces.shape[-2:]
-    positions, depths = project_means(gaussians.means, cameras[:, None])
-    column, row = positions[:, 0].detach().floor().long().unbind(-1)
+
+    def ends(values: Tensor) -> Tensor:
+        """First and last layer ``[B, 2, T, ..]`` of values ``[B, N, ..]``."""
+        values = values.unflatten(1, (-1, layers))[:, :, :: max(1, layers - 1)].transpose(1, 2)
+        return values.expand(-1, 2, *values.shape[2:])
+
+    found = project_means(ends(gaussians.means).flatten(1, 2), cameras[:, None])
+    positions, depths = (x[:, 0].unflatten(1, (2, -1)) for x in found)
+    column, row = positions.detach().floor().long().unbind(-1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-    total = surfaces.new_zeros(len(surfaces))
-    for layer, surface in zip((0, layers - 1), surfaces.flatten(2).unbind(1)):
-        members = (slice(None), slice(layer, None, layers))
-        true = surface.gather(1, pixel[members])
-        known = inside[members] & (gaussians.opacities[members] > 0) & (true > 0)
-        errors = (depths[:, 0][members] - true) * known
-        total = total + _smooth_l1_mean(errors, known)
-        empty = torch.zeros_like(surface)
-        count = empty.scatter_add(1, pixel[members], known.to(errors.dtype))
-        count = count.view(-1, height, width)
-        error = empty.scatter_add(1, pixel[members], errors).view(-1, height, width)
-        error = error / count.clamp_min(1)
-        valid = count > 0
-        for step in SLOPE_STEPS:
-            for axis in (1, 2):
-                rest = error.shape[axis] - step
-                slopes = error.narrow(axis, step, rest) - error.narrow(axis, 0, rest)
-                both = valid.narrow(axis, step, rest) & valid.narrow(axis, 0, rest)
-                share = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
-                total = total + share * _smooth_l1_mean(slopes, both)
-    return total
+    true = surfaces.flatten(2).gather(2, pixel)
+    known = inside & (ends(gaussians.opacities) > 0) & (true > 0)
+    errors = (depths - true) * known
+    total = _smooth_l1_mean(errors, known, 1)
+    empty = torch.zeros_like(surfaces).flatten(2)
+    count = empty.scatter_add(2, pixel, known.to(errors.dtype))
+    error = empty.scatter_add(2, pixel, errors) / count.clamp_min(1)
+    error, valid = (x.unflatten(2, (height, width)) for x in (error, count))
+    slopes = _shifted(error) - error[:, :, None]
+    both = (_shifted(valid) > 0) & (valid > 0)[:, :, None]
+    share = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
+    total = total + share * _smooth_l1_mean(slopes, both, 2).sum(-1)
+    return total.sum(1)
 
 
-def _smooth_l1_mean(errors: Tensor, known: Tensor) -> Tensor:
-    """Mean smooth L1 of the known errors, with beta ``DEPTH_BETA``: ``[B, ..]`` to ``[B]``."""
-    losses = smooth_l1_loss(errors, torch.zeros_like(errors), beta=DEPTH_BETA, reduction="none")
-    return (losses * known).flatten(1).sum(1) / known.flatten(1).sum(1).clamp_min(1)
+def _shifted(maps: Tensor) -> Tensor:
+    """Return the values ``SLOPE_STEPS`` further down, and to the right; 0 beyond the map.
+
+    Args:
+        maps: ``[B, 2, h, w]``.
+
+    Returns:
+        ``[B, 2, S, h, w]``.
+    """
+    height, width = maps.shape[2:]
+    padded = F.pad(maps, (0, SLOPE_STEPS[-1], 0, SLOPE_STEPS[-1]))
+    down = [padded[:, :, step : step + height, :width] for step in SLOPE_STEPS]
+    right = [padded[:, :, :height, step : step + width] for step in SLOPE_STEPS]
+    return torch.stack(down + right, 2)
+
+
+def _smooth_l1_mean(errors: Tensor, known: Tensor, kept: int) -> Tensor:
+    """Mean smooth L1 of the known errors, beta ``DEPTH_BETA``, over the axes after ``kept``."""
+    zero = errors.new_zeros(()).expand_as(errors)
+    losses = F.smooth_l1_loss(errors, zero, beta=DEPTH_BETA, reduction="none")
+    sums = ((losses * known).flatten(kept + 1).sum(-1), known.flatten(kept + 1).sum(-1))
+    return sums[0] / sums[1].clamp_min(1)
 
 
 def random_crops(got: Tensor, want: Tensor, alpha: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -157,9 +174,10 @@ def random_crops(got: Tensor, want: Tensor, alpha: Tensor, size: int) -> tuple[T
     """
     batch, views, height, width = got.shape[:4]
     each = torch.arange(batch, device=got.device)
-    view = torch.randint(min(1, views - 1), views, (batch,)).to(got.device)
-    inside = (alpha[each, view].flatten(1) > 0.5).float()
-    pixel = torch.multinomial(inside + 1e-9, 1)[:, 0]
+    view = torch.randint(min(1, views - 1), views, (batch,), device=got.device)
+    inside = (alpha[each, view].flatten(1) > 0.5).float() + 1e-9
+    # One draw of each row by its weights, as by torch.multinomial, which reads the device back.
+    pixel = (inside / torch.empty_like(inside).exponential_()).argmax(1)
     steps = torch.arange(size, device=got.device)
     rows = (pixel // width - size // 2).clamp(0, height - size)[:, None] + steps
     columns = (pixel % width - size // 2).clamp(0, width - size)[:, None] + steps

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ...kernels.runtime.packed import Packed
 from ..config import GambaConfig
 from .block import Block, Blocks, make_norm, product, stacked
 
@@ -54,22 +55,26 @@ class AttentionBlock(Block):
                 layer.weight.div_(math.sqrt(2 * config.depth))
 
     def forward(
-        self, tokens: Tensor, state: Memory | None, cu_seqlens: Tensor | None = None
-    ) -> tuple[Tensor, Memory | None]:
+        self,
+        tokens: Tensor,
+        state: Memory | None,
+        packed: Packed | None = None,
+        keep: bool = False,
+    ) -> tuple[Tensor, None]:
         """Refine all 3DGS tokens: ``Block.forward``."""
         parts = self.kvq_proj(self.norm(tokens)).chunk(3, dim=-1)
         keys, values, queries = (_by_head(part, self.heads) for part in parts)
-        if cu_seqlens is None:
+        if packed is None:
             hidden = _attention(keys, values, queries, state)
         else:  # one picture after the other, each over its own tokens
-            counts = cu_seqlens.diff().tolist()
+            counts = packed.cu_seqlens.diff().tolist()
             pictures = zip(*(part.split(counts, 2) for part in (keys, values, queries)))
             hidden = torch.cat([
                 _attention(k, v, q, state and Memory(*(x[i : i + 1] for x in state)))
                 for i, (k, v, q) in enumerate(pictures)
             ], 2)  # fmt: skip
         tokens = tokens + self.out_proj(hidden.transpose(1, 2).flatten(2))
-        return tokens + self.mlp(self.mlp_norm(tokens)), state
+        return tokens + self.mlp(self.mlp_norm(tokens)), None
 
     @staticmethod
     def states_after(blocks: Blocks, prefix: Tensor) -> list[Memory]:

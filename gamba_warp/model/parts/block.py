@@ -21,6 +21,7 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from ...kernels.causal_conv1d import causal_conv1d
+from ...kernels.runtime.packed import Packed
 from ...kernels.selective_scan import selective_scan, selective_scan_state
 from ..config import GambaConfig
 
@@ -48,10 +49,12 @@ class State(NamedTuple):
     Attributes:
         conv: ``[B, conv_size - 1, inner_width]``, the convolution's last inputs.
         scan: ``[B, inner_width, state_size]`` float32, the SSM's state.
+        A: ``[inner_width, state_size]`` float32, -exp(A_log), if made for all blocks together.
     """
 
     conv: Tensor
     scan: Tensor
+    A: Tensor | None = None
 
 
 class Mamba(nn.Module):
@@ -98,34 +101,41 @@ class Mamba(nn.Module):
             vars(parameter)["_no_weight_decay"] = True
 
     def forward(
-        self, tokens: Tensor, state: State | None = None, cu_seqlens: Tensor | None = None
-    ) -> tuple[Tensor, State]:
+        self,
+        tokens: Tensor,
+        state: State | None = None,
+        packed: Packed | None = None,
+        keep: bool = False,
+    ) -> tuple[Tensor, State | None]:
         """Map ``[B, L, width]`` to ``[B, L, width]``; a token sees itself and earlier ones.
 
-        ``state`` is that of earlier tokens, or None without any. The state after the last token is
-        returned beside the tokens. ``cu_seqlens [S + 1]`` are the borders of S sequences packed in
-        one row; B of the states is then S.
+        ``state`` is that of earlier tokens, or None without any. With ``keep`` the state after the
+        last token is returned beside the tokens. ``packed`` are S sequences in one row; B of the
+        states is then S.
         """
-        conv_state, scan_state = state or (None, None)
+        conv_state, scan_state, A = state or (None, None, None)
+        if A is None:
+            A = -torch.exp(self.A_log.float())
         x, z = self.in_proj(tokens).chunk(2, dim=-1)
         if conv_state is not None:
             conv_state = conv_state.to(x.dtype)
-        x, conv_state = causal_conv1d(
+        convolved = causal_conv1d(
             x,
             self.conv_weight,
             self.conv_bias,
             activation="silu",
             initial_state=conv_state,
-            return_final_state=True,
-            cu_seqlens=cu_seqlens,
+            return_final_state=keep,
+            cu_seqlens=packed,
         )
+        x, conv_state = convolved if keep else (convolved, None)
         low_rank, B, C = self.x_proj(x).split(self.split, dim=-1)
         # The bias is added inside the scan, in float32: δ of 1e-3 does not survive bfloat16.
         delta = F.linear(low_rank, self.dt_proj.weight)
-        y, scan_state = selective_scan(
+        scanned = selective_scan(
             x,
             delta,
-            -torch.exp(self.A_log.float()),
+            A,
             B,
             C,
             D=self.D.float(),
@@ -133,11 +143,12 @@ class Mamba(nn.Module):
             delta_bias=self.dt_proj.bias.float(),
             delta_softplus=True,
             initial_state=scan_state,
-            return_last_state=True,
+            return_last_state=keep,
             discretization=self.discretization,
-            cu_seqlens=cu_seqlens,
+            cu_seqlens=packed,
         )
-        return self.out_proj(y), State(conv_state, scan_state)
+        y, scan_state = scanned if keep else (scanned, None)
+        return self.out_proj(y), State(conv_state, scan_state, A) if keep else None
 
 
 class Block(nn.Module):
@@ -158,17 +169,18 @@ class Block(nn.Module):
         self.norm = make_norm(config)
 
     def forward(
-        self, tokens: Tensor, state: Any, cu_seqlens: Tensor | None = None
+        self, tokens: Tensor, state: Any, packed: Packed | None = None, keep: bool = False
     ) -> tuple[Tensor, Any]:
         """Refine the 3DGS tokens, all of them or the next segment.
 
         Args:
             tokens: ``[B, L, width]``, or the tokens of all pictures in one row.
             state: this block's entry of ``prefix_states``, or its state after the previous segment.
-            cu_seqlens: ``[B + 1]``, borders of each picture's tokens in such a row.
+            packed: the B pictures' tokens in such a row.
+            keep: return the state after the last token, for a further segment.
 
         Returns:
-            ``[B, L, width]``, and the state after the last token.
+            ``[B, L, width]``, and this state, or None.
         """
         raise NotImplementedError
 
@@ -199,24 +211,30 @@ class GambaBlock(Block):
         self.mamba = Mamba(config)
 
     def forward(
-        self, tokens: Tensor, state: State | Mixed | None, cu_seqlens: Tensor | None = None
-    ) -> tuple[Tensor, State | Mixed]:
+        self,
+        tokens: Tensor,
+        state: State | Mixed | None,
+        packed: Packed | None = None,
+        keep: bool = False,
+    ) -> tuple[Tensor, State | None]:
         """Refine the 3DGS tokens: ``Block.forward``."""
         if isinstance(state, Mixed):
-            return tokens + self._mixing(self.norm(tokens), state.tokens, cu_seqlens), state
-        hidden, after = self.mamba(self.norm(tokens), state, cu_seqlens)
+            return tokens + self._mixing(self.norm(tokens), state.tokens, packed), None
+        hidden, after = self.mamba(self.norm(tokens), state, packed, keep)
         return tokens + hidden, after
 
-    def _mixing(self, tokens: Tensor, mixed: Tensor, cu_seqlens: Tensor | None) -> Tensor:
+    def _mixing(self, tokens: Tensor, mixed: Tensor, packed: Packed | None) -> Tensor:
         """Run the Mamba block over ``mixed [B, K, width]`` and 3DGS tokens; keep the latter."""
         count, length = mixed.shape[1], tokens.shape[1]
-        if cu_seqlens is None:
+        if packed is None:
             cu_seqlens = length * torch.arange(len(tokens) + 1, device=tokens.device)
+        else:
+            cu_seqlens = packed.cu_seqlens
         positions = mixed_positions(count, cu_seqlens)
         both = torch.cat([mixed.to(tokens.dtype).flatten(0, 1), tokens.flatten(0, 1)])
         row = torch.empty_like(both).index_copy(0, positions, both)[None]
         borders = cu_seqlens + count * torch.arange(len(cu_seqlens), device=tokens.device)
-        hidden, _ = self.mamba(row, cu_seqlens=borders)
+        hidden, _ = self.mamba(row, packed=Packed.of(borders))
         return hidden[0, positions[mixed.shape[:2].numel() :]].view_as(tokens)
 
     @staticmethod
@@ -243,17 +261,18 @@ class GambaBlock(Block):
         rows = stacked(blocks, "mamba.x_proj.weight", rank + states)
         low_rank, B = product(x.unflatten(2, (-1, inner)), rows).split([rank, states], dim=-1)
         delta = product(low_rank, stacked(blocks, "mamba.dt_proj.weight")).flatten(2)
+        A = -torch.exp(joined(blocks, "mamba.A_log").float())
         scan_state = selective_scan_state(
             x,
             delta,
-            -torch.exp(joined(blocks, "mamba.A_log").float()),
+            A,
             B,
             delta_bias=joined(blocks, "mamba.dt_proj.bias").float(),
             delta_softplus=True,
             discretization=mamba.discretization,
         )
-        pairs = zip(conv_state.split(inner, dim=2), scan_state.split(inner, dim=1))
-        return [State(*pair) for pair in pairs]
+        parts = conv_state.split(inner, dim=2), scan_state.split(inner, dim=1), A.split(inner)
+        return [State(*part) for part in zip(*parts)]
 
 
 def run_blocks(
@@ -261,7 +280,7 @@ def run_blocks(
     tokens: Tensor,
     states: Sequence[Any],
     recompute: bool = False,
-    cu_seqlens: Tensor | None = None,
+    packed: Packed | None = None,
 ) -> Tensor:
     """Run all blocks over the 3DGS tokens.
 
@@ -271,11 +290,11 @@ def run_blocks(
 
     Args:
         blocks: the network's blocks, all of one kind, in their order.
-        tokens: ``[B, L, width]``; with ``cu_seqlens`` ``[1, T, width]``, those of all pictures.
+        tokens: ``[B, L, width]``; with ``packed`` ``[1, T, width]``, those of all pictures.
         states: the result of ``prefix_states``, one entry per block.
         recompute: with gradients, keep only each block's input and recompute the block in the
             backward pass.
-        cu_seqlens: ``[B + 1]`` int64, borders of each picture's tokens in one row.
+        packed: each picture's tokens in one row.
 
     Returns:
         The shape of ``tokens``.
@@ -286,14 +305,16 @@ def run_blocks(
     if tokens.device.type == "cpu" and not gradients and first.in_segments:
         segments = list(tokens.split(SEGMENT, dim=1))
     for s, segment in enumerate(segments):
-        # The state of a picture without tokens in this segment is unchanged.
-        borders = None if cu_seqlens is None else (cu_seqlens - start).clamp(0, segment.shape[1])
+        own, keep = packed, s + 1 < len(segments)
+        if packed is not None and len(segments) > 1:
+            # The state of a picture without tokens in this segment is unchanged.
+            own = Packed.of((packed.cu_seqlens - start).clamp(0, segment.shape[1]))
         start += segment.shape[1]
         for i, block in enumerate(blocks):
             run = block
             if recompute and gradients:
                 run = partial(checkpoint, block, use_reentrant=False)
-            segment, states[i] = run(segment, states[i], borders)
+            segment, states[i] = run(segment, states[i], own, keep)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
@@ -330,7 +351,7 @@ def joined(blocks: Blocks, name: str) -> Tensor:
 
 def stacked(blocks: Blocks, name: str, rows: int | None = None) -> Tensor:
     """Stack the first ``rows`` of one parameter of all blocks: ``[depth, rows, ..]``."""
-    return torch.stack([attrgetter(name)(block)[:rows] for block in blocks])
+    return torch.stack([attrgetter(name)(block) for block in blocks])[:, :rows]
 
 
 def product(tokens: Tensor, matrices: Tensor) -> Tensor:

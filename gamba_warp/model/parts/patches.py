@@ -1,160 +1,186 @@
-"""Foreground patches and cells of a picture; only these are computed."""
+"""Foreground of pictures: the patches and cells that are not fully transparent.
+
+Only these are computed. Their lists are made on the CPU, from the pictures' alpha, so that no GPU
+is asked for their numbers; a training makes them beside the data.
+"""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ...kernels.runtime.packed import Packed
+from ..config import GambaConfig, Orders
 
-@dataclass
-class Patches:
-    """P foreground patches of B pictures.
 
-    They are sorted by picture, then by position in the grid.
+def scan_orders(height: int, width: int, orders: Orders = "backward", count: int = 4) -> Tensor:
+    """Return the first ``count`` of four scan orders of a map.
 
-    Attributes:
-        picture: ``[P]`` int64, index of the picture.
-        position: ``[P]`` int64, position in the row-major grid.
-        counts: number of patches of each picture.
-        grid: patches a side of a picture.
-        size: side of a patch, pixels.
+    These are: row by row from the top left, column by column from the top left, and both of them
+    backward (VMamba's cross-scan; paper §3.2), or "mirrored": row by row from the top right, column
+    by column from the bottom left (the authors' public code).
+
+    Returns:
+        ``[count, height·width]`` int64 positions in the row-major map; each row is a permutation.
     """
-
-    picture: Tensor
-    position: Tensor
-    counts: list[int]
-    grid: int
-    size: int
-
-    def cells(self, maps: Tensor, count: int) -> Tensor:
-        """Cut maps into the cells of the patches.
-
-        Args:
-            maps: ``[B, C, n, n]``, n = grid · count.
-            count: cells a side of a patch.
-
-        Returns:
-            ``[P, count², C]``, the cells of a patch row by row.
-        """
-        maps = maps.unflatten(3, (self.grid, count)).unflatten(2, (self.grid, count))
-        row, column = self.position // self.grid, self.position % self.grid
-        return maps[self.picture, :, row, :, column].flatten(2).mT
-
-    def number(self, cells: Cells, count: int) -> Tensor:
-        """Index of cells among those of all patches: ``[T]`` int64.
-
-        Args:
-            cells: cells in these patches.
-            count: cells a side of a patch; numbered row by row within a patch.
-        """
-        index = self.position.new_zeros(len(self.counts), self.grid**2)
-        index[self.picture, self.position] = torch.arange(len(self.position), device=index.device)
-        patch = cells.row // count * self.grid + cells.column // count
-        inside = cells.row % count * count + cells.column % count
-        return index[cells.picture, patch] * count**2 + inside
-
-    def boxes(self) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-        """Ranges of rows and of columns of each picture's patches.
-
-        For a picture without patches, those of position 0. On CUDA the numbers are read back.
-        """
-        found = []
-        for index in self.position.split(self.counts):
-            positions = index.tolist() or [0]
-            sides = [p // self.grid for p in positions], [p % self.grid for p in positions]
-            (top, bottom), (left, right) = ((min(side), max(side) + 1) for side in sides)
-            found.append(((top, bottom), (left, right)))
-        return found
-
-    def orders(self, scan: Tensor) -> tuple[Tensor, Tensor]:
-        """Tokens of these patches, in the order in which the network reads a picture.
-
-        Args:
-            scan: ``[O · grid²]`` int64, position of each token's patch in O orders; see
-                ``scan_orders``.
-
-        Returns:
-            ``[P O]`` int64, indices of the tokens among all of a picture, picture by picture; and
-            ``[P, O]`` int64, indices into this list of each patch's token of each order.
-        """
-        total, device = self.grid**2, scan.device
-        inside = torch.zeros(len(self.counts), total, dtype=torch.bool, device=device)
-        inside[self.picture, self.position] = True
-        inside = inside[:, scan]
-        number = inside.flatten().cumsum(0).view_as(inside) - 1
-        by_order = scan.view(-1, total)
-        starts = total * torch.arange(len(by_order), device=device)[:, None]
-        tokens = (by_order.argsort(1) + starts)[:, self.position].T
-        return inside.nonzero()[:, 1], number[self.picture[:, None], tokens]
+    rows = np.arange(height * width).reshape(height, width)
+    flipped = (0, 1) if orders == "backward" else 1
+    passes = [rows, rows.T, np.flip(rows, flipped), np.flip(rows.T, flipped)]
+    return torch.from_numpy(np.stack([order.flatten() for order in passes[:count]]))
 
 
 @dataclass
-class Cells:
-    """T foreground cells of B pictures.
+class Foreground:
+    """Index lists of B pictures, with P foreground patches and T foreground cells in all.
 
-    They are sorted by picture, then row by row.
+    Patches and cells are sorted by picture, then row by row. Each patch has O tokens, one in each
+    scan order. Tensors are int64 unless stated otherwise.
 
     Attributes:
-        picture: ``[T]`` int64, index of the picture.
-        row: ``[T]`` int64, from the top.
-        column: ``[T]`` int64, from the left.
-        alpha: ``[T, 1]``, mean over the cell.
-        color: ``[T, 3]``, mean of the colours, weighted by alpha.
+        patch: ``[3, P]``: picture, row and column of each patch.
+        tokens: ``[P O]``, indices of the tokens among all of a picture, picture by picture in the
+            order in which the network reads them.
+        patch_of: ``[P O]``, the patch of each of these tokens.
+        positions: ``[P, O]``, indices into ``tokens`` of each patch's tokens.
+        cu_seqlens: ``[B + 1]``, borders of each picture's tokens.
+        rows: ``[B, 3]`` int32, as of ``Packed``.
+        cell: ``[3, T]``: picture, row and column of each cell.
+        number: ``[T]``, index of each cell among all cells of all patches, patch by patch.
+        slot: ``[T]``, row of each cell among B times ``most`` rows.
         counts: number of cells of each picture.
+        boxes: for each picture the first row and column of its patches, and those behind the last.
     """
 
-    picture: Tensor
-    row: Tensor
-    column: Tensor
-    alpha: Tensor
-    color: Tensor
+    patch: Tensor
+    tokens: Tensor
+    patch_of: Tensor
+    positions: Tensor
+    cu_seqlens: Tensor
+    rows: Tensor
+    cell: Tensor
+    number: Tensor
+    slot: Tensor
     counts: list[int]
+    boxes: list[tuple[int, int, int, int]]
+
+    @property
+    def most(self) -> int:
+        """The largest number of cells of a picture."""
+        return max(self.counts, default=0)
+
+    @property
+    def packed(self) -> Packed | None:
+        """The pictures' tokens as sequences in one row; None for a single picture."""
+        return Packed(self.cu_seqlens, self.rows) if len(self.counts) != 1 else None
+
+    def to(self, device: torch.device) -> Foreground:
+        """Return the lists on a device."""
+        moved = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return Foreground(**vars(self) | moved)
+
+
+def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Foreground:
+    """Find the patches and cells in which a picture is not fully transparent.
+
+    Args:
+        alpha: ``[B, S, S]`` in [0, 1], on the CPU.
+        config: of a model with the decoder ``rays``; gives the sides of patches and cells.
+        margin: number of further patches around the object's, >= 0; they have no cells.
+
+    Returns:
+        The lists on the CPU; a picture may have no patch.
+
+    Raises:
+        ValueError: a negative margin.
+    """
+    size, count = config.patch_size, config.ray_cells
+    mask, side = alpha > 0, alpha.shape[-1] // size
+    near = near_patches(mask, size, margin)
+    picture, position = near.nonzero().unbind(1)
+    row, column = position // side, position % side
+    scan, inverse = _tokens_of(side, config.scan_orders, config.num_orders)
+    inside = near[:, scan]
+    number = (inside.flatten().cumsum(0) - 1).view_as(inside)
+    positions = number[picture[:, None], inverse[:, position].T]
+    patch_of = torch.empty(positions.numel(), dtype=torch.int64)
+    patch_of[positions] = torch.arange(len(positions))[:, None]
+    borders = F.pad(config.num_orders * near.sum(1).cumsum(0), (1, 0))
+    cell = (F.max_pool2d(mask.float()[:, None], size // count)[:, 0] > 0).nonzero().T
+    own = torch.zeros(near.shape, dtype=torch.int64)
+    own[picture, position] = torch.arange(len(position))
+    among = own[cell[0], cell[1] // count * side + cell[2] // count]
+    counts = torch.bincount(cell[0], minlength=len(alpha))
+    first = counts.max() * torch.arange(len(counts)) - counts.cumsum(0) + counts
+    return Foreground(
+        patch=torch.stack([picture, row, column]),
+        tokens=inside.nonzero()[:, 1],
+        patch_of=patch_of,
+        positions=positions,
+        cu_seqlens=borders,
+        rows=Packed.of(borders).rows,
+        cell=cell.contiguous(),
+        number=among * count**2 + cell[1] % count * count + cell[2] % count,
+        slot=torch.arange(cell.shape[1]) + first[cell[0]],
+        counts=counts.tolist(),
+        boxes=[_box(grid) for grid in near.view(-1, side, side)],
+    )
+
+
+def _box(grid: Tensor) -> tuple[int, int, int, int]:
+    """Return first row and column, and those behind the last; one cell without any patch."""
+    sides = [grid.any(1 - axis).nonzero()[:, 0].tolist() or [0] for axis in (0, 1)]
+    (top, *_, bottom), (left, *_, right) = ([side[0], side[-1] + 1] for side in sides)
+    return top, left, bottom, right
+
+
+@functools.lru_cache(8)
+def _tokens_of(side: int, orders: Orders, count: int) -> tuple[Tensor, Tensor]:
+    """Return each token's patch ``[O S²]``, and each patch's token in each order ``[O, S²]``."""
+    scan = scan_orders(side, side, orders, count)
+    inverse = scan.argsort(1) + scan.shape[1] * torch.arange(len(scan))[:, None]
+    return scan.flatten(), inverse
+
+
+def patch_pixels(maps: Tensor, patch: Tensor, size: int) -> Tensor:
+    """Cut the patches of ``Foreground.patch`` from maps.
+
+    Args:
+        maps: ``[B, C, S, S]``.
+        patch: ``[3, P]``.
+        size: side of a patch.
+
+    Returns:
+        ``[P, size², C]``, the pixels of a patch row by row.
+    """
+    picture, row, column = patch
+    maps = maps.unflatten(3, (-1, size)).unflatten(2, (-1, size))
+    return maps[picture, :, row, :, column].flatten(2).mT
+
+
+def cell_colors(rgba: Tensor, side: int, cell: Tensor) -> tuple[Tensor, Tensor]:
+    """Average the cells of ``Foreground.cell``.
+
+    Args:
+        rgba: ``[B, S, S, 4]`` in [0, 1], straight alpha.
+        side: side of a cell, pixels.
+        cell: ``[3, T]``.
+
+    Returns:
+        Colours ``[T, 3]``, weighted by alpha, and alpha ``[T, 1]``.
+    """
+    picture, row, column = cell
+    values = F.avg_pool2d(premultiplied(rgba), side)[picture, :, row, column]
+    return values[:, :3] / values[:, 3:].clamp_min(1e-3), values[:, 3:]
 
 
 def premultiplied(rgba: Tensor) -> Tensor:
     """Convert ``[B, H, W, 4]`` with straight alpha to premultiplied ``[B, 4, H, W]``."""
     return torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1).permute(0, 3, 1, 2)
-
-
-def foreground_cells(rgba: Tensor, side: int) -> Cells:
-    """Find the cells in which a picture is not fully transparent.
-
-    On CUDA the numbers of cells are read back.
-
-    Args:
-        rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha, H = W.
-        side: side of a cell, pixels.
-    """
-    means = F.avg_pool2d(premultiplied(rgba), side).permute(0, 2, 3, 1)
-    mask = means[..., 3] > 0
-    values = means[mask]
-    color = values[:, :3] / values[:, 3:].clamp_min(1e-3)
-    picture, row, column = mask.nonzero().unbind(1)
-    return Cells(picture, row, column, values[:, 3:], color, mask.sum((1, 2)).tolist())
-
-
-def foreground_patches(alpha: Tensor, size: int, margin: int = 0) -> Patches:
-    """Find the patches in which a picture is not fully transparent.
-
-    On CUDA their numbers are read back.
-
-    Args:
-        alpha: ``[B, H, W]`` in [0, 1], H = W.
-        size: side of a patch, pixels.
-        margin: number of further patches around these, >= 0.
-
-    Returns:
-        The patches; a picture may have none.
-
-    Raises:
-        ValueError: a negative margin.
-    """
-    near = near_patches(alpha > 0, size, margin)
-    picture, position = near.nonzero().unbind(1)
-    return Patches(picture, position, near.sum(1).tolist(), alpha.shape[-1] // size, size)
 
 
 def near_patches(mask: Tensor, size: int, margin: int) -> Tensor:

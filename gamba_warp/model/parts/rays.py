@@ -28,7 +28,7 @@ from torch.nn import functional as F
 from ...cameras import Cameras, exact_product
 from ...gaussians import Gaussians
 from ..config import GambaConfig
-from .patches import Cells, Patches, foreground_cells
+from .patches import Foreground, cell_colors
 
 FRONT_OPACITY = 3.0  # logit; overlapping neighbours are opaque together
 HIDDEN_OPACITY = -5.4  # logit; just over 1/255, below which a Gaussian has no gradient
@@ -90,14 +90,19 @@ class RayDecoder(nn.Module):
         return [1, 3, 1, 3, 3, *([4] if self.rotates else [])]
 
     def forward(
-        self, tokens: Tensor, pixels: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
+        self,
+        tokens: Tensor,
+        pixels: Tensor,
+        foreground: Foreground,
+        rgba: Tensor,
+        cameras: Cameras,
     ) -> Gaussians:
         """Decode the foreground cells, ``ray_layers`` Gaussians each.
 
         Args:
             tokens: ``[P, O, width]``, the token of each patch in each of the O orders.
             pixels: ``[B, pixel_channels, H, W]``, the network's input channels of the pictures.
-            patches: the P patches.
+            foreground: the P patches and their cells.
             rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha.
             cameras: ``[B]`` of the pictures.
 
@@ -108,50 +113,54 @@ class RayDecoder(nn.Module):
         """
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
         with torch.autocast(tokens.device.type, enabled=False):
-            cells = foreground_cells(rgba.float(), self.config.patch_size // self.config.ray_cells)
+            side = self.config.patch_size // self.config.ray_cells
+            colors, alpha = cell_colors(rgba.float(), side, foreground.cell)
         hidden = self.up(tokens.flatten(1)).unflatten(1, (self.upsampling.shape[1], -1))
         if self.config.ray_coarse:
             hidden = self.upsampling.to(hidden.dtype) @ hidden
-        hidden = hidden.flatten(0, 1).index_select(0, patches.number(cells, self.config.ray_cells))
-        hidden = hidden + self._stem(pixels, patches, cells)
+        hidden = hidden.flatten(0, 1).index_select(0, foreground.number)
+        hidden = hidden + self._stem(pixels, foreground)
         if self.mix is not None:
             hidden = self.mix(F.silu(hidden))
         with torch.autocast(tokens.device.type, enabled=False):
             out = self.head(F.silu(hidden.float())).unflatten(-1, (self.config.ray_layers, -1))
-            return _padded(self._activated(out, cells, cameras), cells)
+            made = self._activated(out, colors, alpha, foreground.cell, cameras)
+            return _padded(made, foreground)
 
-    def _stem(self, pixels: Tensor, patches: Patches, cells: Cells) -> Tensor:
+    def _stem(self, pixels: Tensor, foreground: Foreground) -> Tensor:
         """Apply ``stem`` to ``pixels``, at the cells: ``[T, C]``.
 
-        A CPU only computes each picture's rows and columns with cells; a GPU would have to wait for
-        their numbers.
+        A CPU only computes each picture's rows and columns with cells; a GPU is faster with all
+        pictures at once.
         """
         if pixels.device.type != "cpu":
-            return self.stem(pixels).permute(0, 2, 3, 1)[cells.picture, cells.row, cells.column]
+            picture, row, column = foreground.cell
+            return self.stem(pixels).permute(0, 2, 3, 1)[picture, row, column]
         count, found = self.config.ray_cells, []
-        step, side = self.config.patch_size // count, patches.grid * count
-        positions = (each.split(cells.counts) for each in (cells.row, cells.column))
-        for picture, box, row, column in zip(pixels.split(1), patches.boxes(), *positions):
-            (top, bottom), (left, right) = (
-                (max(0, first * count - STEM_REACH), min(side, last * count + STEM_REACH))
-                for first, last in box
-            )
+        step, side = self.config.patch_size // count, self.config.grid_size * count
+        positions = (each.split(foreground.counts) for each in foreground.cell[1:])
+        for picture, box, row, column in zip(pixels.split(1), foreground.boxes, *positions):
+            top, left = (max(0, first * count - STEM_REACH) for first in box[:2])
+            bottom, right = (min(side, last * count + STEM_REACH) for last in box[2:])
             cut = picture[..., top * step : bottom * step, left * step : right * step]
             rows = self.stem(cut)[0].flatten(1).T
             found.append(rows.index_select(0, (row - top) * (right - left) + column - left))
         return torch.cat(found)
 
-    def _activated(self, out: Tensor, cells: Cells, cameras: Cameras) -> Gaussians:
+    def _activated(
+        self, out: Tensor, colors: Tensor, alpha: Tensor, cell: Tensor, cameras: Cameras
+    ) -> Gaussians:
         """Apply the formulas above to ``out [T, layers, ·]``; return Gaussians ``[T, layers]``."""
+        picture, row, column = cell
         depth, offset, opacity, scale, color, *rotation = out.split(self._parts(), -1)
         opacity = opacity[..., 0]
         if self.config.ray_back == "opaque":
             opacity = F.pad(opacity[..., :-1], (0, 1))
-        base = torch.logit(cells.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
-        Ks, viewmats = cameras.Ks[cells.picture], cameras.viewmats[cells.picture]
+        base = torch.logit(colors.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
+        Ks, viewmats = cameras.Ks[picture], cameras.viewmats[picture]
         side = self.config.patch_size // self.config.ray_cells
-        x = (side * (cells.column.to(Ks) + 0.5) - Ks[:, 0, 2]) / Ks[:, 0, 0]
-        y = (side * (cells.row.to(Ks) + 0.5) - Ks[:, 1, 2]) / Ks[:, 1, 1]
+        x = (side * (column.to(Ks) + 0.5) - Ks[:, 0, 2]) / Ks[:, 0, 0]
+        y = (side * (row.to(Ks) + 0.5) - Ks[:, 1, 2]) / Ks[:, 1, 1]
         rotations, shift = viewmats[:, :3, :3], viewmats[:, None, :3, 3]
         distance = shift.norm(dim=-1, keepdim=True)
         footprint = side * distance / Ks[:, 1, 1, None, None]
@@ -165,21 +174,18 @@ class RayDecoder(nn.Module):
             means=exact_product(points - shift, rotations),
             quats=quats,
             scales=footprint * torch.exp((self.scale_bias[:, None] + scale).clamp(*SIZE_LIMITS)),
-            opacities=torch.sigmoid(self.opacity_bias + EMPTY * (cells.alpha - 1) + opacity),
+            opacities=torch.sigmoid(self.opacity_bias + EMPTY * (alpha - 1) + opacity),
             colors=torch.sigmoid(base[:, None] + 2 * color),
         )
 
 
-def _padded(made: Gaussians, cells: Cells) -> Gaussians:
+def _padded(made: Gaussians, foreground: Foreground) -> Gaussians:
     """Pad Gaussians ``[T, layers]`` of all cells to ``[B, N]``; the padding comes last."""
-    counts = torch.tensor(cells.counts, device=cells.picture.device)
-    shape = len(counts), max(cells.counts, default=0)
-    first = shape[1] * torch.arange(len(counts), device=counts.device) - counts.cumsum(0) + counts
-    rows = torch.arange(len(cells.picture), device=counts.device) + first[cells.picture]
+    shape = len(foreground.counts), foreground.most
 
     def padded(values: Tensor, value: float = 0.0) -> Tensor:
         out = values.new_full((shape[0] * shape[1], *values.shape[1:]), value)
-        return out.index_copy_(0, rows, values).unflatten(0, shape).flatten(1, 2)
+        return out.index_copy_(0, foreground.slot, values).unflatten(0, shape).flatten(1, 2)
 
     return Gaussians(
         means=padded(made.means),

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ...cameras import Cameras, plucker_rays
 from ...conventions import IMAGENET_MEAN, IMAGENET_STD, over_background
-from ..config import GambaConfig, Orders
-from .patches import Patches, near_patches
+from ..config import GambaConfig
+from .patches import Foreground, near_patches, patch_pixels, scan_orders
 
 
 def normalize_imagenet(images: Tensor) -> Tensor:
@@ -18,22 +17,6 @@ def normalize_imagenet(images: Tensor) -> Tensor:
     # A tensor of the constants would be copied from the host, which a CUDA graph cannot capture.
     planes = zip(images.unbind(-1), IMAGENET_MEAN, IMAGENET_STD)
     return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
-
-
-def scan_orders(height: int, width: int, orders: Orders = "backward", count: int = 4) -> Tensor:
-    """Return the first ``count`` of four scan orders of a map.
-
-    These are: row by row from the top left, column by column from the top left, and both of them
-    backward (VMamba's cross-scan; paper §3.2), or "mirrored": row by row from the top right, column
-    by column from the bottom left (the authors' public code).
-
-    Returns:
-        ``[count, height·width]`` int64 positions in the row-major map; each row is a permutation.
-    """
-    rows = np.arange(height * width).reshape(height, width)
-    flipped = (0, 1) if orders == "backward" else 1
-    passes = [rows, rows.T, np.flip(rows, flipped), np.flip(rows.T, flipped)]
-    return torch.from_numpy(np.stack([order.flatten() for order in passes[:count]]))
 
 
 class CameraToken(nn.Module):
@@ -123,27 +106,23 @@ class SplatTokens(nn.Module):
             parts = [normalize_imagenet(images), rays, 2 * alpha - 1]
             return torch.cat(parts, dim=-1).permute(0, 3, 1, 2)
 
-    def of_patches(self, pixels: Tensor, patches: Patches) -> tuple[Tensor, Tensor]:
+    def of_patches(self, pixels: Tensor, foreground: Foreground) -> Tensor:
         """Compute the tokens of some patches only, including the convolution.
 
         Args:
             pixels: result of ``pixels``.
-            patches: P patches of the pictures.
+            foreground: the patches.
 
         Returns:
-            Tokens ``[P O, width]`` in their order, picture by picture, and the indices ``[P, O]``
-            int64 among them of each patch's tokens in the O orders; see ``Patches.orders``.
+            ``[P O, width]``, in the order of ``foreground.tokens``.
         """
-        chosen, positions = patches.orders(self.orders)
-        tokens = self.embedding[chosen]
+        tokens = self.embedding.index_select(0, foreground.tokens)
         if self.patchify is None:
-            return tokens, positions
-        cut = patches.cells(pixels, self.patch_size).flatten(1)
+            return tokens
+        cut = patch_pixels(pixels, foreground.patch, self.patch_size).flatten(1)
         weight = self.patchify.weight.permute(0, 2, 3, 1).flatten(1)
         features = F.linear(cut, weight, self.patchify.bias)  # [P, width]
-        patch_of = torch.empty_like(chosen)
-        patch_of[positions] = torch.arange(len(positions), device=chosen.device)[:, None]
-        return tokens + features.index_select(0, patch_of), positions
+        return tokens + features.index_select(0, foreground.patch_of)
 
     def foreground(self, images: Tensor, background: float, margin: int) -> Tensor:
         """Find the tokens whose patch is not plain background, or is near such a patch.

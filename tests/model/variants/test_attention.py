@@ -8,6 +8,7 @@ from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.errors import UserError
+from gamba_warp.kernels.runtime.packed import Packed
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.gamba import make_blocks as blocks_of
@@ -115,12 +116,12 @@ def test_pictures_of_a_row_do_not_see_each_other():
     blocks, tokens = make_blocks(2, 7, 0), torch.randn(1, 14, 24)
     cuts = torch.tensor([0, 5, 14, 14])
     states = prefix_states(blocks, torch.randn(3, 1, 7), None)
-    got = run_blocks(blocks, tokens, states, cu_seqlens=cuts)
+    got = run_blocks(blocks, tokens, states, packed=Packed.of(cuts))
     for picture, (i, j) in enumerate(zip(cuts, cuts[1:])):
         own = slice(picture, picture + 1)
         given = [state._make(x[own] for x in state) for state in states]
         torch.testing.assert_close(got[:, i:j], run_blocks(blocks, tokens[:, i:j], given))
-    nothing = run_blocks(make_blocks(2, 0, 0), tokens, [None, None], cu_seqlens=cuts)
+    nothing = run_blocks(make_blocks(2, 0, 0), tokens, [None, None], packed=Packed.of(cuts))
     assert nothing.isfinite().all()
 
 
