@@ -130,7 +130,7 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
         )
     if views.cache and gpu is not None:
         sizes = sorted({views.size, config.model_config().image_size})
-        train.preload(sorted(set(objects)), sizes, gpu, views.workers)
+        train.preload(sorted(set(objects)), sizes, gpu, views.threads("cuda"))
     held_out = [part for part in held_out if part.objects]
     return TrainingData(train, objects, held_out, notes)
 
@@ -226,7 +226,8 @@ class Batches:
         self._stream: Iterator[dict[str, Any] | Unreachable] | None = None  # begins with a batch
         self._reading = Lock()
         self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # epoch and its permutation
-        self._pool = ThreadPoolExecutor(config.views.workers, thread_name_prefix="batches")
+        self.workers = config.views.threads(world.device.type)
+        self._pool = ThreadPoolExecutor(self.workers, thread_name_prefix="batches")
         self._waiting: dict[int, Future[Prepared]] = {}
 
     def take(self, number: int) -> Batch:
@@ -235,7 +236,7 @@ class Batches:
         Raises:
             UserError: more than half of the objects, or 100 in a row, cannot be read.
         """
-        began, end = time.perf_counter(), number + self.config.views.workers + 1
+        began, end = time.perf_counter(), number + self.workers + 1
         self._begin(number)
         for following in range(number, end if self.last is None else min(end, self.last)):
             if following not in self._waiting:

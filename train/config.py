@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from gamba_warp.conventions import DeviceChoice, Precision
 from gamba_warp.errors import UserError
+from gamba_warp.kernels.runtime.system import cores
 from gamba_warp.model.config import PRESETS, GambaConfig, Preset
 from gamba_warp.untrusted.documents import value_of
 from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options, option
@@ -69,7 +70,8 @@ class DataConfig:
         cache: Keep decoded pictures in memory; on a GPU, decode all at the start and keep them in
             the GPU's, with 8 bits a channel. Depth pictures are read when they are used.
         workers: Threads that decode pictures ahead of the training; also the largest number of
-            batches kept ready. The number does not change the result.
+            batches kept ready. By default 1, beside a GPU one per core but 8 at most. The number
+            does not change the result.
     """
 
     batch_size: Annotated[int, Meta(ge=1, le=100_000)] = 8
@@ -83,7 +85,11 @@ class DataConfig:
     recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
     made: Annotated[float, Meta(ge=0, le=1)] = 0.0
     cache: bool = False
-    workers: Annotated[int, Meta(ge=1, le=1024)] = 1
+    workers: Annotated[int, Meta(ge=1, le=1024)] | None = None
+
+    def threads(self, device: str) -> int:
+        """Return the number of workers beside a device of a type, "cpu" or "cuda"."""
+        return self.workers or (min(8, cores()) if device == "cuda" else 1)
 
 
 @dataclass(frozen=True, kw_only=True)
