@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
-from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
@@ -29,7 +27,7 @@ from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Progress, term_weights
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
-from .step import Gradients, Objective, collapse_reason, compute_gradients, health, validate
+from .step import Objective, collapse_reason, compute_gradients, health, update, validate
 
 CLIP = 1.0  # largest norm of the gradient (paper, §4.1)
 MAX_SKIPPED = 20  # a run ends after so many steps in a row that are not finite
@@ -75,7 +73,7 @@ class Trainer:
         self.precision = world.precision(config.optim.precision, model.config.width)
         self.accumulate = config.views.accumulate
         self.step = self.skipped = self.skipped_in_row = 0
-        # Step, and the tensor of ``_update``, of the steps whose numbers are not read yet.
+        # Step, and the tensor of ``update``, of the steps whose numbers are not read yet.
         self._unread_steps: deque[tuple[int, Tensor]] = deque()
         self.elapsed = 0.0  # seconds of training, resumed parts included
         self._collapsed = False
@@ -157,7 +155,7 @@ class Trainer:
             count=self.accumulate,
         )
         self.step += 1
-        self._unread_steps.append((self.step, self._update(made)))
+        self._unread_steps.append((self.step, update(self.optimizer, self.ema, made, self.wrapped)))
         logs = self.step % config.run.log_every == 0
         loss, norm = self._count_skipped(late=1 if self.world.device.type == "cuda" else 0)
         if not logs:
@@ -173,22 +171,6 @@ class Trainer:
         found = terms | health(made.result, made.batch)
         values = torch.stack([value.double() for value in found.values()]).tolist()
         return figures | self.world.mean(dict(zip(found, values)))
-
-    def _update(self, made: Gradients) -> Tensor:
-        """Update the weights, unless loss or gradient is not finite on any process.
-
-        Returns:
-            ``[3]`` on the device: loss, norm of the gradient, and 1 if the step was skipped.
-        """
-        numbers = torch.stack([made.loss, made.norm])
-        bad = 1 - numbers.isfinite().all().float()
-        if isinstance(self.wrapped, DistributedDataParallel):  # all processes must act alike
-            dist.all_reduce(bad, dist.ReduceOp.MAX, self.wrapped.process_group)
-        vars(self.optimizer)["found_inf"] = bad  # as torch.amp.GradScaler sets it
-        self.optimizer.step()
-        if self.ema is not None:
-            self.ema.update(1 - bad)
-        return torch.cat([numbers, bad[None]])
 
     def _count_skipped(self, late: int = 0) -> tuple[float, float]:
         """Read the numbers of all steps but the last ``late``, and count those that were skipped.

@@ -9,6 +9,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
+import torch.distributed as dist
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
@@ -24,6 +25,7 @@ from gamba_warp.vision.lpips import LPIPS
 from .data.samples import Batch
 from .objective.losses import LossInputs, loss_terms, rendered_psnr, total_loss, translucency
 from .objective.radial_mask import NEAR, project_means
+from .optim import Ema
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
 FAR_VIEW, CLEAR = 60.0, 0.02  # degrees; alpha: see ``_far_figures``
@@ -167,6 +169,33 @@ def compute_gradients(
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     norm = torch.nn.utils.clip_grad_norm_(parameters, clip)
     return Gradients(torch.stack(losses).mean(), norm, batch, result)
+
+
+def update(
+    optimizer: torch.optim.Optimizer, ema: Ema | None, made: Gradients, model: Callable
+) -> Tensor:
+    """Update the weights, unless loss or gradient is not finite on any process.
+
+    The device itself skips such a step, so the host need not wait for it.
+
+    Args:
+        optimizer: fused AdamW.
+        ema: the average of the weights, which is updated, too; or None.
+        made: the gradients, which the parameters have.
+        model: as for ``compute_gradients``.
+
+    Returns:
+        ``[3]``: loss, norm of the gradient, and 1 if the step was skipped.
+    """
+    numbers = torch.stack([made.loss, made.norm])
+    bad = 1 - numbers.isfinite().all().float()
+    if isinstance(model, DistributedDataParallel):  # all processes must act alike
+        dist.all_reduce(bad, dist.ReduceOp.MAX, model.process_group)
+    vars(optimizer)["found_inf"] = bad  # as torch.amp.GradScaler sets it
+    optimizer.step()
+    if ema is not None:
+        ema.update(1 - bad)
+    return torch.cat([numbers, bad[None]])
 
 
 @torch.no_grad()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -15,10 +13,10 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 
 from .config import OptimConfig
-from .data.samples import Batch
+from .data.samples import Batch, with_foreground
 from .loop import CLIP
 from .optim import Ema, build_optimizer
-from .step import Objective, compute_gradients
+from .step import Objective, compute_gradients, update
 
 _VIEWS, _SIZE = 4, 128  # of an object, the input view included
 
@@ -43,35 +41,38 @@ class Step:
         views = orbit(90.0 * torch.arange(_VIEWS), 20.0, 1.8).expand(objects, -1, -1, -1)
         Ks = intrinsics(_SIZE, _SIZE).expand(objects, _VIEWS, 3, 3)
         size = config.image_size
+        y, x = torch.meshgrid(*2 * [torch.linspace(-1, 1, size)], indexing="ij")
+        inputs = torch.rand(objects, size, size, config.input_channels)
+        if config.input_channels == 4:
+            inputs[..., 3] = (x.square() + y.square() < 0.5).float()  # 39 % of the picture
         self.batch = Batch(
             [str(i) for i in range(objects)],
-            torch.rand(objects, size, size, config.input_channels),
+            inputs,
             reference_cameras(config, objects),
             torch.rand(objects, _VIEWS, _SIZE, _SIZE, 4),
             Cameras(views, Ks, _SIZE, _SIZE),
             torch.ones(objects, 1, 3),
-        ).to(device)
+        )
+        self.batch = with_foreground(self.batch, config).to(device)
 
     def run(self) -> Tensor:
-        """Make the whole step and return the gradient's norm (timed)."""
+        """Make the whole step and return loss and norm of the gradient (timed)."""
         made = compute_gradients(
             self.model, self.optimizer, [self.batch], self.objective, clip=CLIP
         )
-        self.optimizer.step()
-        self.ema.update()
-        return made.norm
+        return update(self.optimizer, self.ema, made, self.model)
 
     def check(self) -> None:
         """Check that the gradient is finite and not 0, without an oracle."""
-        value = self.run().item()
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"gradient is {value}")
+        _, norm, skipped = self.run().tolist()
+        if skipped or norm == 0:
+            raise ValueError(f"gradient is {norm}")
 
 
 def steps(settings: Settings) -> list[Variant]:
     """One optimizer step on objects in four views of 128²: network, rendering, MSE + mask +
-    0.2 (1 - SSIM), gradients, clipping, AdamW and the running average; fresh weights, random
-    pictures without background, no LPIPS. The only check is that the gradient is finite.
+    0.2 (1 - SSIM), gradients, clipping, AdamW and the running average; fresh weights, discs of
+    random colours, no LPIPS. The only check is that the gradient is finite.
     """
     made: list[Variant] = []
     presets: tuple[Preset, ...] = "tiny", "rays"

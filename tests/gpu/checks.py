@@ -5,7 +5,6 @@ PTX, and ``tests/graphs`` those of CUDA graphs with a graph that runs its functi
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,20 +19,13 @@ from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import lists_outgrown, rasterization
 from gamba_warp.kernels.runtime.stand_in import kind_of
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
-from gamba_warp.measure.models import captured, without_encoder
-from gamba_warp.model.config import PRESETS
-from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.posing import reference_cameras
-from gamba_warp.render import render
+from gamba_warp.measure.models import captured
+from gamba_warp.train.timing import Step
 
 # Allowed relative rms errors: of float32 sums over a few hundred terms; for the scan plus the error
 # of a GPU's exponential; of half precision, which rounds inputs and outputs; and of pictures, where
 # a few pixels may cross the threshold of alpha.
 LIMIT, HALF_LIMIT, PICTURE_LIMIT = 2e-6, 3e-2, 1e-3
-# Under capture torch may choose other kernels for a matrix product. Adam's first steps follow the
-# sign of the gradient, so weights with a gradient near 0 diverge.
-LOSS_LIMIT, CHANGE_LIMIT = 1e-4, 0.05
-_STEPS = 4  # of training
 # Each is batch, tokens, channels, states and groups.
 SCANS = [
     (2, 139, 37, 3, 1), (1, 65, 40, 3, 2), (1, 1, 1, 1, 1), (1, 577, 70, 16, 1),
@@ -179,7 +171,7 @@ def render_all(scene: Scene) -> dict[str, Tensor]:
 def check_no_wait(device: torch.device) -> None:
     """Check that torch synchronises with the device in no call after the first."""
     scene = scene_of(700, 75, 3, {"render_mode": "RGB+D"}, device)
-    for run in (partial(render_all, scene), TrainingStep(device).run):
+    for run in (partial(render_all, scene), Step("rays", 2, device).run):
         run()
         before = torch.cuda.get_sync_debug_mode()
         torch.cuda.set_sync_debug_mode("error")
@@ -209,68 +201,3 @@ def check_raster_graph(device: torch.device) -> list[int]:
             assert lists_outgrown(), f"the lists have room for {found[-1]} pairs after {found[0]}"
         assert_same(tuple(replayed.values()), tuple(render_all(scene).values()))
     return found
-
-
-class TrainingStep:
-    """Training step of a small model with rendering, an image loss and AdamW, in fixed shapes."""
-
-    def __init__(self, device: torch.device):
-        torch.manual_seed(0)
-        config = without_encoder(PRESETS["paper"])
-        config = replace(config, image_size=32, patch_size=4, width=64, depth=2, dt_rank=4)
-        self.model = Gamba(config).to(device)
-        self.image = torch.rand(2, 32, 32, config.input_channels).to(device)
-        self.cameras = reference_cameras(config, 2).to(device)
-        viewmats, Ks = self.cameras.viewmats[:, None], self.cameras.Ks[:, None]
-        self.views = replace(self.cameras, viewmats=viewmats, Ks=Ks)
-        self.parameters = [p for p in self.model.parameters() if p.requires_grad]
-        rate = torch.tensor(1e-3, device=device) if device.type == "cuda" else 1e-3
-        self.optimizer = torch.optim.AdamW(
-            self.parameters, lr=rate, capturable=device.type == "cuda", fused=True
-        )
-
-    def run(self) -> Tensor:
-        """Make a step and return its loss."""
-        self.optimizer.zero_grad(set_to_none=True)
-        picture = render(self.model(self.image, self.cameras), self.views).rgb[:, 0]
-        loss = (picture - self.image).square().mean()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, 1.0)
-        self.optimizer.step()
-        return loss.detach()
-
-    @torch.no_grad()
-    def begin(self, weights: list[Tensor]) -> None:
-        """Reset weights and the optimizer's state in place."""
-        for parameter, weight in zip(self.parameters, weights):
-            parameter.copy_(weight)
-        for state in self.optimizer.state.values():
-            for value in state.values():
-                value.zero_()
-
-    def weights(self) -> list[Tensor]:
-        """Return a copy of the weights."""
-        return [p.detach().clone() for p in self.parameters]
-
-    def train(self, step: Callable[[], Tensor], first: list[Tensor]) -> dict[str, Tensor]:
-        """Make steps after a reset; return losses and the change of the weights."""
-        self.begin(first)
-        losses = torch.stack([step().clone() for _ in range(_STEPS)])
-        change = [(now - old).flatten() for now, old in zip(self.weights(), first)]
-        return {"losses": losses, "change": torch.cat(change)}
-
-
-def check_step_graph(device: torch.device) -> None:
-    """Check that replays of a captured training step train like plain steps."""
-    steps = TrainingStep(device)
-    first = steps.weights()
-    graph, loss = captured(steps.run, device)
-
-    def replay() -> Tensor:
-        graph.replay()
-        return loss
-
-    got, want = (steps.train(step, first) for step in (replay, steps.run))
-    assert want["losses"][-1] < want["losses"][0], "the loss does not fall"
-    assert_within(compare({"losses": got["losses"]}, {"losses": want["losses"]}), LOSS_LIMIT)
-    assert_within(compare({"change": got["change"]}, {"change": want["change"]}), CHANGE_LIMIT)

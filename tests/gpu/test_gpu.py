@@ -65,7 +65,6 @@ def test_compile(backend):
         checks.check_layer_graph,
         checks.check_no_wait,
         checks.check_raster_graph,
-        checks.check_step_graph,
     ],
 )
 def test_streams_and_graphs(check):

@@ -60,14 +60,6 @@ def test_layer(graph):
         checks.check_layer_graph(CPU)
 
 
-def test_training_step(graph):
-    graph()
-    checks.check_step_graph(CPU)
-    graph(lambda loss: loss.mul_(1.001))
-    with pytest.raises(AssertionError, match="losses: relative rms error 0.001"):
-        checks.check_step_graph(CPU)
-
-
 def test_no_wait(monkeypatch):
     """The first calls may wait, the second ones run under torch's own watch, which is put back."""
     modes, ran = ["default"], []
@@ -80,7 +72,7 @@ def test_no_wait(monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
     monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", modes.append)
     monkeypatch.setattr(checks, "render_all", lambda scene: run("splats"))
-    monkeypatch.setattr(checks.TrainingStep, "run", lambda self: run("steps"))
+    monkeypatch.setattr(checks.Step, "run", lambda self: run("steps"))
     with pytest.raises(RuntimeError, match="synchronizing"):
         checks.check_no_wait(CPU)
     assert ran == [(name, mode) for name in ("splats", "steps") for mode in ("default", "error")]

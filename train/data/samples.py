@@ -121,10 +121,14 @@ def join(samples: list[Batch], config: GambaConfig) -> Batch:
 
     All must have the same number of views.
     """
-    batch = _combined(samples, torch.cat)
-    if config.decoder == "rays":
-        batch.foreground = find_foreground(batch.inputs[..., 3].cpu(), config)
-    return batch
+    return with_foreground(_combined(samples, torch.cat), config)
+
+
+def with_foreground(batch: Batch, config: GambaConfig) -> Batch:
+    """Return the batch with the foreground of its inputs, if the model needs it."""
+    if config.decoder != "rays":
+        return batch
+    return replace(batch, foreground=find_foreground(batch.inputs[..., 3].cpu(), config))
 
 
 def _combined(parts: list[Any], make: Callable[[list[Tensor]], Tensor]) -> Any:
