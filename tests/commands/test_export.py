@@ -93,7 +93,7 @@ def test_frame_faces_and_colors_follow_the_options(ball, tmp_path):
 
 def test_formats_of_gaussians(ball, tmp_path, capsys):
     out = tmp_path / "out"
-    splats, kinds = ["ply", "splat", "glb"], ["ply", "splat", "glb", "html", "gif"]
+    splats, kinds = ["ply", "splat", "spz"], ["ply", "splat", "spz", "html", "gif"]
     options = ["--mesh", "--splats", *splats, "--page", "--turntable", "gif"]
     options += ["--size", "32", "--frames", "3"]
     assert export(ball, "--out", out, *options) == 0

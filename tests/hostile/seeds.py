@@ -16,6 +16,7 @@ import numpy as np
 import torch
 import trimesh
 from helpers import micro
+from helpers.gaussians import khr_glb
 from helpers.images import ADOBE_RGB, colour_profile
 from helpers.matting import matting_network
 from helpers.released import theirs
@@ -136,6 +137,8 @@ def gaussians(count: int = 12, kind: Any = "ply", degree: int = 0) -> bytes:
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("object" + splat_suffix(kind))
+        if kind == "glb":
+            return khr_glb(some)
         write_gaussians(path, some, kind)
         return path.read_bytes()
 
