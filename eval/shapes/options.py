@@ -32,13 +32,11 @@ class ShapesOptions:
     Attributes:
         pred: Gaussians (.ply), a mesh or a point cloud; or a folder of them.
         gt: A mesh or a point cloud; or a folder, paired with PRED by name.
-        out: Folder for report.json, objects.csv, table.md and table.tex. An interrupted evaluation
-            resumes there.
+        out: Folder for report.json, objects.csv and table.md. An interrupted evaluation resumes
+            there.
         limit: Number of objects, evenly spaced in the order of names; all by default.
         objects: Text file of the objects of --protocol gso in place of its own list, one name a
             line; the report states that.
-        baseline: Folders of other predictions of the same objects: PRED is compared with each,
-            object by object. Rows are named by the folders.
         protocol: default, gso (the objects of "gamba data gso", in the input camera's frame), a
             published protocol (triposr, sf3d, spar3d, syncdreamer, gamba), or a JSON file: a
             protocol, or the report.json of an evaluation to repeat.
@@ -76,7 +74,6 @@ class ShapesOptions:
     out: Path | None = None
     limit: Annotated[int, Meta(ge=1)] | None = None
     objects: Path | None = None
-    baseline: tuple[Path, ...] = ()
     protocol: str = "default"
     explain: bool = False
     set: tuple[str, ...] = ()
