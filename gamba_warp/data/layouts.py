@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -570,22 +570,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
 }
 
 
-class Found(NamedTuple):
-    """Objects under a folder.
-
-    Attributes:
-        layout: name of their layout.
-        objects: their folders, sorted.
-        others: the other folders that were searched.
-    """
-
-    layout: str
-    objects: list[Path]
-    others: list[Path]
-
-
-def find_objects(root: Path, layout: str) -> Found:
-    """Find the objects' folders at any depth.
+def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
+    """Find the objects' folders at any depth; return their layout, and the folders, sorted.
 
     ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
     Folders with a leading dot are skipped; linked folders are entered (``files.walk``).
@@ -594,7 +580,7 @@ def find_objects(root: Path, layout: str) -> Found:
         UserError: the folders are nested too deep.
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
-    found, others = [], []
+    found = []
     for folder, subfolders, files in walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _MAX_DEPTH:
             raise UserError(f"{root}: its folders are nested deeper than {_MAX_DEPTH}")
@@ -602,6 +588,4 @@ def find_objects(root: Path, layout: str) -> Found:
             subfolders.clear()  # objects are not nested
             marks, layout = {mark: marks[mark]}, marks[mark]
             found.append(Path(folder))
-        else:
-            others.append(Path(folder))
-    return Found(layout, sorted(found), others)
+    return layout, sorted(found)
