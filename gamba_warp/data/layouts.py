@@ -9,8 +9,7 @@
   ``transforms_test.json`` of the same form: all their frames are views of one object.
 - ``gobjaverse``: ``<uid>/campos_512_v4/NNNNN/NNNNN.png`` and ``.json``, whose ``x, y, z, origin``
   are the camera's OpenCV axes and position in the world, which is z-up. Views without one of the
-  two files, as in an unfinished download, are skipped. ``<uid>/depth/NNNNN.png``, if present for
-  all views, has their depth (``gamba data objaverse --depth`` makes it from ``_nd.exr``).
+  two files, as in an unfinished download, are skipped.
 - ``openlrm``: ``<uid>/rgba/NNN.png``, ``pose/NNN.npy`` (3x4, camera to world, OpenGL) and
   ``intrinsics.npy`` (3x2: focal lengths, principal point, width and height); the world's cube has
   side 2.
@@ -40,8 +39,6 @@ from ..untrusted.names import Within, inside
 
 GOBJAVERSE = "campos_512_v4"
 GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON states no x_fov
-GOBJAVERSE_DEPTH = "depth"  # folder beside that of the views
-GOBJAVERSE_DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
 MAX_VIEWS = 10_000  # of an object
 MAX_SIDE = 16_384  # pixels of a camera
 NEAREST, FARTHEST = 1e-3, 1e4  # camera's distance from the object's centre, in the file's units
@@ -525,18 +522,11 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
         focal_y = focal_x * aspect if camera.y_fov is None else _focal(camera.y_fov, name)
         Ks.append(_camera_matrix(focal_x, focal_y, 0.5, 0.5))
     check_cameras(np.stack(poses), np.stack(Ks), [None] * len(views), names)
-    depths = None
-    if (folder / GOBJAVERSE_DEPTH).is_dir():
-        within = Within(folder)
-        names = (f"{GOBJAVERSE_DEPTH}/{view.name}.png" for view in views)
-        depths = [within.path(name, str(folder)) for name in names]
     return ObjectFiles(
         [inside(view, f"{view.name}.png", str(view)) for view in views],
         np.stack(poses),
         np.stack(Ks),
         [None] * len(views),
-        depths=depths,
-        depth_unit=GOBJAVERSE_DEPTH_UNIT,
     )
 
 

@@ -205,7 +205,6 @@ def data_objaverse_command(
     share: tyro.conf.OmitArgPrefixes[Share],
     min_views: Annotated[int, Meta(ge=1, le=10_000)] = 40,
     copy: bool = False,
-    depth: bool = False,
 ) -> int:
     """Make a dataset of a local copy of G-Objaverse.
 
@@ -220,13 +219,10 @@ def data_objaverse_command(
         share: selection of these objects.
         min_views: complete views that an object must have; published are 40.
         copy: copy the files of folders instead of linking them.
-        depth: also make depth pictures from the _nd.exr files; needs the package OpenEXR.
     """
-    from .objaverse_views import check_package, find_rendered, take_views
+    from .objaverse_views import find_rendered, take_views
 
     first, count = share.numbers
-    if depth:
-        check_package()
     objects = find_rendered(source)
     if out.resolve() == source.resolve():
         raise UserError(f"{out}: is --source itself; choose another folder")
@@ -235,7 +231,7 @@ def data_objaverse_command(
     out = output_folder(out)
     for what, number in chosen.counts.items():
         print(f"{number:>9,} {what}")
-    taken, failures = take_views(objects, names, out, min_views, copy, depth)
+    taken, failures = take_views(objects, names, out, min_views, copy)
     record = out / ("objaverse.json" if count == 1 else f"objaverse.{first}-{count}.json")
     known = {name: chosen.uids[name] for name in names if name in chosen.uids}
     about = {
