@@ -195,7 +195,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     return lines + [f"failed: {item['name']}: {item['reason']}" for item in report["failures"]]
 
 
-def count_line(report: dict[str, Any], folder: Path | None, beside: int) -> str:
+def count_line(report: dict[str, Any], folder: Path | None, beside: int = 0) -> str:
     """Return the counts of evaluated and failed objects and the path of the report.
 
     Args:

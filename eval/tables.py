@@ -1,8 +1,7 @@
-"""Markdown and LaTeX tables of means or medians with intervals, shared by all evaluations."""
+"""Markdown tables of means or medians with intervals, shared by all evaluations."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -64,15 +63,3 @@ def figures(
 def markdown(lines: Lines) -> str:
     """Format lines as a Markdown table, aligned in plain text too."""
     return table(lines[0], lines[1:], aligned=True)
-
-
-def latex(lines: Lines) -> str:
-    """Format lines as a LaTeX ``tabular`` with the rules of booktabs."""
-    arrows = str.maketrans({"↑": r"$\uparrow$", "↓": r"$\downarrow$"})
-    escaped = [
-        [re.sub(r"([&%$#_{}])", r"\\\1", cell).translate(arrows) for cell in line] for line in lines
-    ]
-    head, *rows = (" & ".join(line) + r" \\" for line in escaped)
-    columns = "l" + "r" * (len(lines[0]) - 1)
-    parts = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", head, r"\midrule", *rows]
-    return "\n".join([*parts, r"\bottomrule", r"\end{tabular}"]) + "\n"

@@ -57,7 +57,7 @@ EXTRA_OF = {
 }
 # Libraries of the evaluation of shapes, and of the made objects.
 SHAPES = ("kornia", "manifold3d", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
-MADE = ("trimesh", "manifold3d", "skimage")
+MADE = ("trimesh", "manifold3d")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
     "train": {"kornia", "tensorboard", "timm"},

@@ -20,7 +20,6 @@ from .options import ShapesOptions
 def eval_geometry_command(
     options: Annotated[ShapesOptions, tyro.conf.arg(name="")],
     json: bool = False,
-    csv: bool = False,
 ) -> int:
     """Chamfer distance, F-score, normal consistency and Volume IoU of shapes.
 
@@ -30,42 +29,25 @@ def eval_geometry_command(
     Args:
         options: of the evaluation.
         json: Print report.json in place of the summary.
-        csv: Print objects.csv in place of the summary.
     """
-    if json and csv:
-        raise UserError("--json and --csv: give one of them")
     if options.explain:
         return _explain(options)
     if options.pred is None or options.gt is None:
         raise UserError("give PRED and GT: two files or two folders")
-    from ..report import FAILED, count_line, csv_of, json_of
+    from ..report import count_line, json_of
     from .pairs import evaluate_shapes
     from .protocol import chosen_protocol
     from .table import text_of
 
     protocol = chosen_protocol(options)
-    if options.sensitivity:
-        from .sensitivity import evaluate_variants
-
-        table, records = evaluate_variants(options, protocol)
-        print(table, end="")
-        failed = [record for record in records if record["status"] == FAILED]
-        for record in failed:
-            print(f"failed: {record['name']}: {record['reason']}", file=sys.stderr)
-        return 1 if failed else 0
     report = evaluate_shapes(options, protocol)
-    parts = {"": report} | report["baselines"]
-    for name, part in parts.items():
-        for text in part["warnings"]:
-            print(f"warning: {name}{': ' if name else ''}{text}", file=sys.stderr)
-    code = 1 if any(part["failures"] for part in parts.values()) else 0
-    if json or csv:
-        print(json_of(report) if json else csv_of(report), end="")
-        return code
-    print(text_of(report, protocol), end="")
-    beside = sum(len(part["failures"]) for part in report["baselines"].values())
-    print(count_line(report, options.out, beside))
-    return code
+    for text in report["warnings"]:
+        print(f"warning: {text}", file=sys.stderr)
+    if json:
+        print(json_of(report), end="")
+    else:
+        print(text_of(report, protocol), count_line(report, options.out), sep="")
+    return 1 if report["failures"] else 0
 
 
 def _explain(options: ShapesOptions) -> int:

@@ -32,13 +32,11 @@ class ShapesOptions:
     Attributes:
         pred: Gaussians (.ply), a mesh or a point cloud; or a folder of them.
         gt: A mesh or a point cloud; or a folder, paired with PRED by name.
-        out: Folder for report.json, objects.csv, table.md and table.tex. An interrupted evaluation
-            resumes there.
+        out: Folder for report.json, objects.csv and table.md. An interrupted evaluation resumes
+            there.
         limit: Number of objects, evenly spaced in the order of names; all by default.
         objects: Text file of the objects of --protocol gso in place of its own list, one name a
             line; the report states that.
-        baseline: Folders of other predictions of the same objects: PRED is compared with each,
-            object by object. Rows are named by the folders.
         protocol: default, gso (the objects of "gamba data gso", in the input camera's frame), a
             published protocol (triposr, sf3d, spar3d, syncdreamer, gamba), or a JSON file: a
             protocol, or the report.json of an evaluation to repeat.
@@ -66,8 +64,6 @@ class ShapesOptions:
         views: Number of views of the TSDF.
         pixels: Side of the TSDF's depth maps.
         seed: Seed of the random points.
-        sensitivity: Evaluate under every protocol, and under each change of one field of this one:
-            a table of the effect of the protocol, in OUT.
         workers: Pairs evaluated at the same time, each in its own process.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.
@@ -78,7 +74,6 @@ class ShapesOptions:
     out: Path | None = None
     limit: Annotated[int, Meta(ge=1)] | None = None
     objects: Path | None = None
-    baseline: tuple[Path, ...] = ()
     protocol: str = "default"
     explain: bool = False
     set: tuple[str, ...] = ()
@@ -95,6 +90,5 @@ class ShapesOptions:
     views: Views | None = None
     pixels: Pixels | None = None
     seed: Seed | None = None
-    sensitivity: bool = False
     workers: Annotated[int, Meta(ge=1, le=256)] = 1
     strict: bool = False

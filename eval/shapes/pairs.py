@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -35,14 +35,13 @@ from ..report import (
     failure,
     finite_or_none,
     make_report,
-    over_objects,
     save_report,
     stdout_to_stderr,
 )
 from .options import ShapesOptions
 from .protocol import GeometryProtocol
 from .shape import SUFFIXES, Similarity
-from .table import PREDICTED, differences_of, summaries, tables_of
+from .table import page, summaries
 
 if TYPE_CHECKING:
     from gamba_warp.data.dataset import ViewDataset
@@ -118,10 +117,7 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         protocol: of the comparison; see ``chosen_protocol``.
 
     Returns:
-        The report: that of ``make_report``, ``inputs``, ``flags``, ``axes`` and ``warnings``;
-        ``baselines``: the same entries for each baseline; and ``differences``: for each baseline
-        the prediction's value minus its value over the ``objects`` that both have: ``mean,
-        interval, median, median_interval``.
+        The report: that of ``make_report``, ``inputs``, ``flags``, ``axes`` and ``warnings``.
 
     Raises:
         UserError: something cannot be opened or written.
@@ -135,51 +131,37 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         raise UserError("--limit: --protocol gso has its own objects; --objects names others")
     assert options.pred is not None and options.gt is not None  # checked by the command
     dataset, known = open_objects(options.data)
-    found = find_all(options.pred, options.baseline, options.gt, listed, known)
-    names = {pair.name for pairs, _ in found.values() for pair in pairs}
-    names |= {each["name"] for _, failures in found.values() for each in failures}
+    pairs, failures = find_pairs(options.pred, options.gt, listed, known)
     if options.limit is not None:
         from gamba_warp.data.dataset import evenly
 
+        names = {pair.name for pair in pairs} | {each["name"] for each in failures}
         kept = {*evenly(sorted(names), options.limit)}
-        found = {name: only(*each, kept) for name, each in found.items()}
+        pairs = [pair for pair in pairs if pair.name in kept]
+        failures = [each for each in failures if each["name"] in kept]
     folder = output_folder(options.out) if options.out is not None else None
     cache = RecordCache(folder, protocol, options.data)
-    run = partial(
-        evaluate_pairs,
-        protocol=protocol,
-        dataset=dataset,
-        cache=cache,
-        workers=options.workers,
-    )
     with stdout_to_stderr():
-        objects = {name: failures + run(pairs) for name, (pairs, failures) in found.items()}
+        objects = failures + evaluate_pairs(
+            pairs, protocol, dataset, cache=cache, workers=options.workers
+        )
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
     versions = {"gamba_warp": __version__} | installed(*PACKAGES)
     inputs = {side: path.name if path else None for side, path in named.items()}
-    predicted = objects[PREDICTED]
     report = make_report(
         protocol.to_json(),
-        predicted,
+        objects,
         versions,
         left_out=_NO_MEAN,
         inputs=inputs,
-        **summaries(predicted),
-        baselines={},
-        differences={},
+        **summaries(objects),
     )
-    for name, records in objects.items():
-        if name != PREDICTED:
-            other = over_objects(records, _NO_MEAN) | summaries(records)
-            report["baselines"][name] = finite_or_none(other)
-            report["differences"][name] = differences_of(report["objects"], other["objects"])
     if listed:
         done = [record["name"] for record in report["objects"] if record["status"] == OK]
         report["evaluation"] = gso.protocol_of(done, listed)
     if folder is not None:
         save_report(report, folder)
-        for name, text in tables_of(report).items():
-            write_text(folder / name, text)
+        write_text(folder / "table.md", page(report))
         cache.end()
     return report
 
@@ -227,49 +209,6 @@ class RecordCache:
         """Remove the file, once the report is written."""
         if self._file is not None:
             self._file.unlink(missing_ok=True)
-
-
-PairsAndFailures = tuple[list[Pair], list[dict[str, str]]]  # result of find_pairs
-
-
-def find_all(
-    pred: Path,
-    baselines: Sequence[Path],
-    gt: Path,
-    listed: Iterable[str] = (),
-    known: Objects | None = None,
-) -> dict[str, PairsAndFailures]:
-    """Pair the predictions, and those of each baseline, with the truths.
-
-    Args:
-        pred: predicted shapes.
-        baselines: folders of other predictions.
-        gt: true shapes.
-        listed: names listed by the protocol; missing ones are failures.
-        known: objects of the dataset, or None.
-
-    Returns:
-        Results of ``find_pairs`` by name: ``PREDICTED``, and the names of the baselines' folders.
-
-    Raises:
-        UserError: as for ``find_pairs``; or a baseline is not a folder, or two have one name.
-    """
-    folders = {PREDICTED: pred}
-    for path in baselines:
-        if not path.is_dir() or not pred.is_dir():
-            raise UserError(f"--baseline {path}: it and PRED must be folders")
-        if folders.setdefault(path.resolve().name, path) is not path:
-            raise UserError(f"--baseline {path}: there is another row of this name; rename it")
-    expected = {name for path in folders.values() for name in _shapes_in(path)} if baselines else ()
-    wanted = {*expected, *listed}
-    return {name: find_pairs(path, gt, wanted, known) for name, path in folders.items()}
-
-
-def only(
-    pairs: list[Pair], failures: list[dict[str, str]], kept: Container[str]
-) -> PairsAndFailures:
-    """Keep the objects of these names."""
-    return [p for p in pairs if p.name in kept], [f for f in failures if f["name"] in kept]
 
 
 def find_pairs(

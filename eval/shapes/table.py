@@ -1,20 +1,15 @@
-"""Flags, axes, warnings and differences to baselines for a report of shapes, and its tables."""
+"""Flags, axes and warnings for a report of shapes, and its table."""
 
 from __future__ import annotations
 
 from collections import Counter
 from typing import Any
 
-from ..averages import LEVEL, intervals_of, mean_of, median, median_of, minus
+from ..averages import LEVEL, mean_of
 from ..report import OK, flat, summary_lines
-from ..tables import Column, Lines, Row, figures, latex, markdown
+from ..tables import Column, Row, figures, markdown
 from .protocol import GeometryProtocol
 
-PREDICTED = "predicted"  # name of the row under test
-METRICS = (
-    *("iou", "chamfer", "chamfer_squared", "accuracy", "completeness", "hausdorff"),
-    *("fscore", "normal_consistency"),
-)
 _SHOWN = {
     "iou": Column("Volume IoU", 4),
     "chamfer": Column("Chamfer", 4),
@@ -27,45 +22,23 @@ AS_IS = "as it is"  # key of the identity
 _NAMED = 3  # most objects named in a warning
 
 
-def differences_of(objects: list[dict[str, Any]], others: list[dict[str, Any]]) -> dict[str, Any]:
-    """Summarise metrics minus those of a baseline, over the objects that both have.
-
-    Args:
-        objects: records of ``eval-geometry``.
-        others: those of a baseline.
-
-    Returns:
-        ``objects`` (their number), ``mean``, ``interval``, ``median`` and ``median_interval``.
-    """
-    known = {record["name"]: record for record in others if record["status"] == OK}
-    pairs = [
-        minus({key: record.get(key) for key in METRICS}, known[record["name"]])
-        for record in objects
-        if record["status"] == OK and record["name"] in known
-    ]
-    return {
-        "objects": len(pairs),
-        "mean": mean_of(pairs),
-        "interval": intervals_of(pairs),
-        "median": median_of(pairs),
-        "median_interval": intervals_of(pairs, statistic=median),
-    }
-
-
 def page(report: dict[str, Any]) -> str:
     """Return the text of ``table.md`` from a report of ``eval-geometry``."""
-    note = (
-        f"Means over objects with {100 * LEVEL:g} % bootstrap intervals over objects; differences "
-        "object by object, over the objects that both have. Lengths: the truth's longest side is "
-        f"{report['protocol']['unit']:g}. Chamfer: less is better."
+    thresholds = sorted(report["protocol"]["thresholds"])
+    middle = thresholds[len(thresholds) // 2]
+    columns = _SHOWN | {f"fscore.{middle:g}": Column(f"F-score at {middle:g}", 4)}
+    found = {key: flat(report[key], lists=True) for key in ("mean", "interval", "median")}
+    shown = {key: {kind: values.get(key) for kind, values in found.items()} for key in columns}
+    count = str(report["num_ok"])
+    means, medians = (
+        figures(["", "objects"], columns, [Row([of, count], shown)], of)
+        for of in ("mean", "median")
     )
-    means, medians = (markdown(lines_of(report, of)) for of in ("mean", "median"))
-    return "\n\n".join([means, note, "Medians over objects:", medians]) + "\n"
-
-
-def tables_of(report: dict[str, Any]) -> dict[str, str]:
-    """Return the texts of table.md and table.tex, by these names."""
-    return {"table.md": page(report), "table.tex": latex(lines_of(report, "mean"))}
+    return (
+        f"{markdown([*means, medians[1]])}\n\nOver objects, with {100 * LEVEL:g} % bootstrap "
+        "intervals over objects. Lengths: the truth's longest side is "
+        f"{report['protocol']['unit']:g}. Chamfer: less is better.\n"
+    )
 
 
 def text_of(report: dict[str, Any], protocol: GeometryProtocol) -> str:
@@ -81,29 +54,7 @@ def text_of(report: dict[str, Any], protocol: GeometryProtocol) -> str:
         note = "unknown axes: coordinates are used as they are (--pred-axes, --up)"
         lines.append(f"{'':<24} {note}")
     lines += summary_lines(report)
-    if report["baselines"]:
-        lines += ["", page(report).rstrip("\n")]
-        for name, part in report["baselines"].items():
-            for item in part["failures"]:
-                lines.append(f"failed: {item['name']} ({name}): {item['reason']}")
     return "\n".join(lines) + "\n"
-
-
-def lines_of(report: dict[str, Any], of: str) -> Lines:
-    """Return the lines of a table of a report's "mean" or "median", as in ``page``."""
-    thresholds = sorted(report["protocol"]["thresholds"])
-    middle = thresholds[len(thresholds) // 2]
-    columns = _SHOWN | {f"fscore.{middle:g}": Column(f"F-score at {middle:g}", 4)}
-    parts = {PREDICTED: report, **report["baselines"]}
-    named = [(name, part["num_ok"], part) for name, part in parts.items()]
-    gains = report["differences"].items()
-    named += [(f"{PREDICTED} - {name}", part["objects"], part) for name, part in gains]
-    rows = []
-    for name, count, part in named:
-        found = {key: flat(part[key], lists=True) for key in ("mean", "interval", "median")}
-        shown = {key: {kind: values.get(key) for kind, values in found.items()} for key in columns}
-        rows.append(Row([name, str(count)], shown, " - " in name))
-    return figures(["", "objects"], columns, rows, of)
 
 
 def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from typing import Annotated
 
 import tyro
 
-from gamba_warp.errors import UserError
 from gamba_warp.untrusted.ranges import ranged
 
 from .options import ViewsOptions
@@ -20,31 +19,26 @@ from .options import ViewsOptions
 def eval_views_command(
     options: Annotated[ViewsOptions, tyro.conf.arg(name="")],
     json: bool = False,
-    csv: bool = False,
 ) -> int:
     """PSNR, SSIM, LPIPS and mask IoU of predicted views; the input view and novel views apart.
 
     Args:
         options: of the evaluation.
         json: Print report.json in place of the table.
-        csv: Print objects.csv in place of the table.
     """
     filled = options.filled()
-    if json and csv:
-        raise UserError("--json and --csv: give one of them")
-    from ..report import count_line, csv_of, json_of
+    from ..report import count_line, json_of
     from .evaluate import evaluate_views
     from .table import page
 
     report = evaluate_views(filled)
-    text = json_of(report) if json else csv_of(report) if csv else page(report)
-    print(text, end="")
+    print(json_of(report) if json else page(report), end="")
     for name, reason in report["left_out_baselines"].items():
         print(f"left out: {name}: {reason}", file=sys.stderr)
     for item in report["failures"]:
         print(f"failed: {item['name']}: {item['reason']}", file=sys.stderr)
     beside = len(report["failures"]) - report["num_failed"]
-    print(count_line(report, options.out, beside), file=sys.stderr if json or csv else sys.stdout)
+    print(count_line(report, options.out, beside), file=sys.stderr if json else sys.stdout)
     if report["interrupted"]:
         print("gamba: interrupted; the report has what was evaluated before", file=sys.stderr)
         return 130

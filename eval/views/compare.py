@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -216,50 +216,27 @@ def add_lpips(
     candidate with the same picture (an expanded tensor) in every view. A progress bar appears after
     two seconds.
     """
-    total = lpips_pictures(candidates, truth)
-    about = {"desc": f"LPIPS of {truth.uid}", "unit": "picture", "leave": False, "delay": 2}
-    with progress_bar(total=total, **about) as bar:
-        _add_lpips(values, candidates, truth, lpips, bar.update)
-
-
-def lpips_pictures(candidates: Mapping[str, Shown], truth: Truth) -> int:
-    """Return the number of pictures whose features ``add_lpips`` computes."""
-    count = 0
-    for metric in all_figures().values():
-        if metric.compare is None:
-            known = [c for c in candidates.values() if c.alpha is not None or metric.grey == WHITE]
-            count += len(truth.rgb)
-            count += sum(len(truth.rgb) if c.rgb.stride(0) else 1 for c in known)
-    return count
-
-
-def _add_lpips(
-    values: dict[str, list[Values]],
-    candidates: Mapping[str, Shown],
-    truth: Truth,
-    lpips: LPIPS,
-    done: Callable[[int], object],
-) -> None:
-    """Like ``add_lpips``; calls ``done`` with the number of pictures after each part."""
-    for key, metric in all_figures().items():
-        if metric.compare is not None:
-            continue
-        grey = metric.grey
-        known = {n: c for n, c in candidates.items() if c.alpha is not None or grey == WHITE}
-        shown = {name: pictures.on(grey) for name, pictures in known.items()}
-        fixed = {n: lpips.features(shown[n][0]) for n, c in known.items() if not c.rgb.stride(0)}
-        done(len(fixed))
-        true = truth.shown.on(grey)
-        for start in range(0, len(true), BATCH):
-            part = slice(start, start + BATCH)
-            features = lpips.features(true[part])
-            done(len(true[part]))
-            for name, rgb in shown.items():
-                found = fixed[name] if name in fixed else lpips.features(rgb[part])
-                distances = lpips.distance(found, features).tolist()
-                for row, value in zip(values[name][part], distances):
-                    row[key] = value
-                done(0 if name in fixed else len(distances))
+    about = {"desc": f"LPIPS of {truth.uid}", "unit": "batch", "leave": False, "delay": 2}
+    figures = {key: metric for key, metric in all_figures().items() if metric.compare is None}
+    starts = range(0, len(truth.rgb), BATCH)
+    with progress_bar(total=len(figures) * len(starts), **about) as bar:
+        for key, metric in figures.items():
+            grey = metric.grey
+            known = {n: c for n, c in candidates.items() if c.alpha is not None or grey == WHITE}
+            shown = {name: pictures.on(grey) for name, pictures in known.items()}
+            fixed = {
+                n: lpips.features(shown[n][0]) for n, c in known.items() if not c.rgb.stride(0)
+            }
+            true = truth.shown.on(grey)
+            for start in starts:
+                part = slice(start, start + BATCH)
+                features = lpips.features(true[part])
+                for name, rgb in shown.items():
+                    found = fixed[name] if name in fixed else lpips.features(rgb[part])
+                    distances = lpips.distance(found, features).tolist()
+                    for row, value in zip(values[name][part], distances):
+                        row[key] = value
+                bar.update()
 
 
 def summary(views: list[Values], coverage: list[float]) -> dict[str, Any]:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from gamba_warp.batch import check_not_read, progress_bar, say
+from gamba_warp.batch import check_not_read, progress_bar
 from gamba_warp.conventions import GREY, WHITE
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import ViewDataset, background_note, open_dataset
@@ -48,7 +45,6 @@ from .compare import (
     choose_views,
     compare,
     load_truth,
-    lpips_pictures,
     render_views,
     summary,
 )
@@ -59,7 +55,6 @@ from .pictures import PicturePredictions, Pictures, save_pictures
 from .predictions import Predictions, open_predictions
 from .table import page, tables_of, without_nearly_empty
 
-LONG = 60.0  # seconds of LPIPS from which the time is printed first
 SHEET_VIEWS = 4  # novel views of an object in the contact sheet
 # Errors that fail only one object.
 ERRORS = (UserError, OSError, MemoryError, ValueError, RuntimeError, ArithmeticError)
@@ -83,7 +78,6 @@ class Job:
         retrieval: the baseline of this name, if used.
         meshes: of the training objects, for the retrieval's shapes; or None.
         retrieval_data: names of the datasets of the retrieval, if they are others.
-        time_printed: True once the time of LPIPS was estimated.
     """
 
     predictions: Predictions
@@ -99,7 +93,6 @@ class Job:
     retrieval: Retrieval | None = None
     meshes: TrainingMeshes | None = None
     retrieval_data: list[str] = field(default_factory=list)
-    time_printed: bool = False
 
     def predict(self, truth: Truth) -> Gaussians | Pictures:
         """Return the Gaussians or pictures under test. Raises UserError if they are missing."""
@@ -315,8 +308,6 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         by_view = compare(candidates, truth)
     with stages("lpips"):
         if job.network:
-            if not job.time_printed:
-                print_lpips_time(job, candidates, truth, job.network)
             add_lpips(by_view, candidates, truth, job.network)
     if not pictures.has_input:
         by_view[""][0] = dict.fromkeys(by_view[""][0])
@@ -355,33 +346,6 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         "truth_sha256": truth.digest,
         "seconds": stages.seconds,
     }
-
-
-def print_lpips_time(job: Job, candidates: Mapping[str, Shown], truth: Truth, lpips: LPIPS) -> None:
-    """Print the time that LPIPS will take, estimated from one picture, if over a minute."""
-    job.time_printed = True
-    began = time.perf_counter()
-    with torch.no_grad():
-        lpips.features(truth.rgb[:1])[0].sum().item()  # .item() waits for a GPU
-    each, pictures = time.perf_counter() - began, lpips_pictures(candidates, truth)
-    one, whole = each * pictures, each * pictures * len(job.uids)
-    if whole < LONG:
-        return
-    height, width = truth.rgb.shape[1:3]
-    say(
-        f"LPIPS: {each:.2g} s a picture of {width} x {height}, {pictures} pictures an object: "
-        f"about {_duration(one)} an object and {_duration(whole)} for all {len(job.uids)}; "
-        "--no-lpips leaves it out",
-        sys.stderr,
-    )
-
-
-def _duration(seconds: float) -> str:
-    """Format a duration."""
-    for unit, size in (("hours", 3600), ("minutes", 60)):
-        if seconds >= 1.5 * size:
-            return f"{seconds / size:.2g} {unit}"
-    return f"{seconds:.0f} seconds"
 
 
 def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:

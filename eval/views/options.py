@@ -44,8 +44,7 @@ class ViewsOptions:
             the nearest training object.
         retrieval_data: Datasets whose training objects the nearest one is taken from; by default
             DATA.
-        lpips: LPIPS, if its weights are installed (gamba weights lpips). The time is printed first
-            if it is over a minute.
+        lpips: LPIPS, if its weights are installed (gamba weights lpips).
         strips: Number of objects with comparison pictures, from the first.
         sheet: Number of best, median and worst objects each in the contact sheet; 0 for none.
         save_gaussians: Also write OUT/gaussians/NAME.ply, in the input camera's

@@ -9,9 +9,9 @@ import asyncio
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from ..pages.serve import PIECE, READ_SECONDS
-
 CONNECTIONS = 64  # at once
+READ_SECONDS = 10.0  # time limit of reading a request, and of sending each piece
+PIECE = 1 << 16  # bytes
 
 
 class Connection(H11Protocol):

@@ -14,7 +14,7 @@ import re
 import secrets
 import shutil
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping, Sequence
 from pathlib import PurePath
 from typing import Annotated, Any
 
@@ -28,8 +28,8 @@ from starlette.responses import JSONResponse, Response
 
 from ..errors import UserError, first_line
 from ..images import PICTURE_SUFFIXES
-from ..pages.serve import READ_SECONDS, is_foreign
 from ..untrusted.documents import parse_document
+from .connections import READ_SECONDS
 from .cutting import examples
 from .visitor_files import KEEP_SECONDS, VisitorFiles
 
@@ -69,9 +69,39 @@ MAX_AT_ONCE = 16  # requests of one visitor
 # Others are ignored: gradio fails with several ranges, or with non-ASCII digits.
 _RANGE = re.compile(b"bytes=([0-9]{1,15}-[0-9]{0,15}|-[0-9]{1,15})")
 
+_HOSTS = ("127.0.0.1", "localhost")
+_CHECKED = ("host", "origin", "sec-fetch-mode", "sec-fetch-site")
+
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
+
+
+def is_foreign(method: str, headers: Iterable[tuple[str, str]]) -> bool:
+    """Return True if a request to a server on 127.0.0.1 is neither of its page nor of the user.
+
+    Another web page in the same browser can send requests there, and even read the answers by
+    resolving its own name to that address (DNS rebinding). The browser reveals it by these headers,
+    each of which comes once.
+
+    Args:
+        method: of the request, such as GET.
+        headers: all of the request, by name.
+    """
+    found: dict[str, str] = {}
+    for name, value in ((name.lower(), value) for name, value in headers):
+        if name in found and name in _CHECKED:
+            return True
+        found[name] = value
+    host, site = found.get("host", ""), found.get("sec-fetch-site")
+    name, colon, port = host.partition(":")
+    if name not in _HOSTS or (colon and not port.isdecimal()):
+        return True
+    if found.get("origin") not in (None, f"http://{host}"):
+        return True
+    # The page of a link sees no answer; a form of another page, without an Origin, would act.
+    followed = found.get("sec-fetch-mode") == "navigate" and method in ("GET", "HEAD")
+    return not followed and site not in (None, "none", "same-origin")
 
 
 class GivenFile(msgspec.Struct):

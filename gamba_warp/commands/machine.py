@@ -71,7 +71,7 @@ def bench_command(
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, in seconds.
         full: All sizes, many rounds, and the torch loop at full length.
-        peers: Also measure mambapy, mamba-ssm, causal-conv1d, gsplat and gswarp, if installed.
+        peers: Also measure mambapy, mamba-ssm, causal-conv1d and gsplat, if installed.
         out: Folder for the results.
         threads: Number of CPU threads; by default torch's.
         only: Measure only these cases, by full name, such as "one call".

@@ -45,7 +45,7 @@ def render_command(
     Args:
         inputs: Gaussians (.ply in the 3DGS layout), or folders of them.
         trajectory: turntable, spiral (two turns, up and down), or a file of cameras: gamba's
-            (docs/cameras.md), transforms.json, nerfstudio's camera path, 3DGS's cameras.json.
+            (docs/cameras.md), transforms.json, or nerfstudio's camera path.
         out: Folder for the results; for a single input also a .gif, an .mp4, or a .png of one view.
         kind: Kind of output; png is a folder of pictures with their cameras.json. By default that
             of --out, else gif.

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
 
 import tyro
-from msgspec import Meta
 
 from ..batch import check_not_read, warn
 from ..conventions import Axes
@@ -23,8 +21,6 @@ def view_command(
     out: Path | None = None,
     mesh: Path | None = None,
     mesh_frame: Axes = "opengl",
-    serve: bool = False,
-    port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
     elevation: Elevation = 0.0,
     fov: Fov | None = None,
@@ -38,8 +34,6 @@ def view_command(
         out: File for the page; a temporary file by default.
         mesh: A mesh of the same object, shown too (.glb, .obj, .ply, .stl).
         mesh_frame: Axes of the mesh; opengl is y up, gamba's default for meshes.
-        serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
-        port: Port of --serve; 0 picks a free one.
         open_browser: Open the browser.
         elevation: Initial elevation of the camera above the object, degrees.
         fov: Field of view, degrees; 49.1 by default. Without --distance the object keeps its size
@@ -50,9 +44,9 @@ def view_command(
             zero), and print their number; without it such a file is refused.
     """
     import tempfile
+    import webbrowser
 
     from ..pages.export import read_with_warning
-    from ..pages.serve import page_server
     from ..trajectories.paths import Viewpoint
     from ..viewer.pack import read_viewed_mesh
     from ..viewer.page import write_viewer
@@ -71,24 +65,6 @@ def view_command(
     start = Viewpoint().changed(elevation, distance, fov)
     view = (start.distance, start.fov, start.elevation)
     write_viewer(page, file.name, gaussians, mesh=surface, view=view)
-    if not serve:
-        print(page)
-        if open_browser:
-            _open(page.resolve().as_uri())
-        return
-    with page_server(page.read_bytes(), port) as server:
-        address = f"http://127.0.0.1:{server.server_port}/"
-        print(f"{address} (Ctrl-C ends it)", flush=True)
-        if open_browser:
-            _open(address)
-        server.serve_forever()
-
-
-def _open(address: str) -> None:
-    """Open the address in a browser, or print that none was found."""
-    import webbrowser
-
-    if not webbrowser.open(address):
-        print(
-            "gamba: no browser was found; open the page above in one", file=sys.stderr, flush=True
-        )
+    print(page, flush=True)
+    if open_browser and not webbrowser.open(page.resolve().as_uri()):
+        print("gamba: no browser was found; open the page above in one", file=sys.stderr)

@@ -9,8 +9,7 @@
   ``transforms_test.json`` of the same form: all their frames are views of one object.
 - ``gobjaverse``: ``<uid>/campos_512_v4/NNNNN/NNNNN.png`` and ``.json``, whose ``x, y, z, origin``
   are the camera's OpenCV axes and position in the world, which is z-up. Views without one of the
-  two files, as in an unfinished download, are skipped. ``<uid>/depth/NNNNN.png``, if present for
-  all views, has their depth (``gamba data objaverse --depth`` makes it from ``_nd.exr``).
+  two files, as in an unfinished download, are skipped.
 - ``openlrm``: ``<uid>/rgba/NNN.png``, ``pose/NNN.npy`` (3x4, camera to world, OpenGL) and
   ``intrinsics.npy`` (3x2: focal lengths, principal point, width and height); the world's cube has
   side 2.
@@ -26,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -40,8 +39,6 @@ from ..untrusted.names import Within, inside
 
 GOBJAVERSE = "campos_512_v4"
 GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON states no x_fov
-GOBJAVERSE_DEPTH = "depth"  # folder beside that of the views
-GOBJAVERSE_DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
 MAX_VIEWS = 10_000  # of an object
 MAX_SIDE = 16_384  # pixels of a camera
 NEAREST, FARTHEST = 1e-3, 1e4  # camera's distance from the object's centre, in the file's units
@@ -525,18 +522,11 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
         focal_y = focal_x * aspect if camera.y_fov is None else _focal(camera.y_fov, name)
         Ks.append(_camera_matrix(focal_x, focal_y, 0.5, 0.5))
     check_cameras(np.stack(poses), np.stack(Ks), [None] * len(views), names)
-    depths = None
-    if (folder / GOBJAVERSE_DEPTH).is_dir():
-        within = Within(folder)
-        names = (f"{GOBJAVERSE_DEPTH}/{view.name}.png" for view in views)
-        depths = [within.path(name, str(folder)) for name in names]
     return ObjectFiles(
         [inside(view, f"{view.name}.png", str(view)) for view in views],
         np.stack(poses),
         np.stack(Ks),
         [None] * len(views),
-        depths=depths,
-        depth_unit=GOBJAVERSE_DEPTH_UNIT,
     )
 
 
@@ -570,22 +560,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
 }
 
 
-class Found(NamedTuple):
-    """Objects under a folder.
-
-    Attributes:
-        layout: name of their layout.
-        objects: their folders, sorted.
-        others: the other folders that were searched.
-    """
-
-    layout: str
-    objects: list[Path]
-    others: list[Path]
-
-
-def find_objects(root: Path, layout: str) -> Found:
-    """Find the objects' folders at any depth.
+def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
+    """Find the objects' folders at any depth; return their layout, and the folders, sorted.
 
     ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
     Folders with a leading dot are skipped; linked folders are entered (``files.walk``).
@@ -594,7 +570,7 @@ def find_objects(root: Path, layout: str) -> Found:
         UserError: the folders are nested too deep.
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
-    found, others = [], []
+    found = []
     for folder, subfolders, files in walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _MAX_DEPTH:
             raise UserError(f"{root}: its folders are nested deeper than {_MAX_DEPTH}")
@@ -602,6 +578,4 @@ def find_objects(root: Path, layout: str) -> Found:
             subfolders.clear()  # objects are not nested
             marks, layout = {mark: marks[mark]}, marks[mark]
             found.append(Path(folder))
-        else:
-            others.append(Path(folder))
-    return Found(layout, sorted(found), others)
+    return layout, sorted(found)

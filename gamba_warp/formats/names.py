@@ -5,7 +5,7 @@ from typing import Literal, cast, get_args
 
 from ..errors import UserError
 
-SplatFormat = Literal["ply", "splat", "spz", "glb", "compressed-ply"]
+SplatFormat = Literal["ply", "splat", "spz", "compressed-ply"]
 MeshFormat = Literal["obj", "glb", "ply", "stl"]
 MeshChoice = Literal[MeshFormat, "none"]
 SPLAT_FORMATS: tuple[str, ...] = get_args(SplatFormat)

@@ -1,4 +1,4 @@
-"""Camera files: our own, NeRF's transforms.json, nerfstudio's camera path, 3DGS's cameras.json.
+"""Camera files: our own, NeRF's transforms.json, and nerfstudio's camera path.
 
 - ours (``gamba-cameras``): ``width, height``, optional ``fps``, and ``frames`` of ``viewmat`` (4x4,
   world to camera, OpenCV) and ``K`` (3x3, pixels) or ``fov`` (degrees, vertical), which may also be
@@ -6,8 +6,6 @@
 - ``transforms.json``: ``frames`` of ``transform_matrix``, read like ``data.layouts``.
 - nerfstudio's camera path: ``camera_path`` of ``camera_to_world`` (16 numbers by rows, OpenGL) and
   ``fov`` (degrees, vertical); ``render_width, render_height, fps, seconds``.
-- 3DGS's ``cameras.json``: a list of ``position, rotation`` (camera to world, OpenCV), ``fx, fy,
-  width, height``.
 
 All are in the frame of the Gaussians' file.
 """
@@ -74,18 +72,6 @@ class _Nerfstudio(Struct):
     seconds: Annotated[float, Meta(gt=0, le=1e6)] | None = None
 
 
-class _SplattingCamera(Struct):
-    position: _Triple
-    rotation: Annotated[list[_Triple], Meta(min_length=3, max_length=3)]
-    width: _Side
-    height: _Side
-    fx: Annotated[float, Meta(gt=0, le=1e9)]
-    fy: Annotated[float, Meta(gt=0, le=1e9)]
-
-
-_Views = Annotated[list[_SplattingCamera], Meta(min_length=1, max_length=MAX_FRAMES)]
-
-
 @dataclass
 class CameraPath:
     """Sequence of cameras.
@@ -114,18 +100,18 @@ def load_path(file: str | Path, size: tuple[int, int | None] | None = None) -> C
     """
     source, data = str(file), read_bytes(file)
     value = parse_document(data, object, source)
-    if isinstance(value, list):
-        path = _of_splatting(parse_document(data, _Views, source), source)
-    elif not isinstance(value, dict):
-        raise _unknown(source)
-    elif "camera_path" in value:
+    value = value if isinstance(value, dict) else {}
+    if "camera_path" in value:
         path = _of_nerfstudio(parse_document(data, _Nerfstudio, source), source)
     elif value.get("format") == FORMAT:
         path = _ours(parse_document(data, _GambaCameras, source), source)
     elif "frames" in value:
         path = _of_transforms(Path(file), source)
     else:
-        raise _unknown(source)
+        raise UserError(
+            f"{source}: not a known camera file: it has neither frames (gamba, transforms.json) "
+            "nor a camera_path (nerfstudio)"
+        )
     _check(path.cameras, source)
     return path if size is None else CameraPath(_sized(path.cameras, *size), path.fps)
 
@@ -153,13 +139,6 @@ def save_path(
         frame |= more
     lines = ",\n".join("  " + json.dumps(frame, allow_nan=False) for frame in frames)
     write_text(file, f'{json.dumps(head)[:-1]},\n "frames": [\n{lines}\n]}}\n')
-
-
-def _unknown(source: str) -> UserError:
-    return UserError(
-        f"{source}: not a known camera file: it has neither frames (gamba, transforms.json) nor a "
-        "camera_path (nerfstudio), and is not a list of views (3DGS)"
-    )
 
 
 def _ours(path: _GambaCameras, source: str) -> CameraPath:
@@ -192,32 +171,16 @@ def _of_nerfstudio(path: _Nerfstudio, source: str) -> CameraPath:
 
 def _of_transforms(file: Path, source: str) -> CameraPath:
     poses, Ks, sizes = read_cameras(file)
-    stated = {size or (DEFAULT_SIDE, DEFAULT_SIDE) for size in sizes}
-    width, height = _one_size(stated, source)
+    stated = sorted({size or (DEFAULT_SIDE, DEFAULT_SIDE) for size in sizes})
+    if len(stated) > 1:
+        names = " and ".join(f"{width}x{height}" for width, height in stated[:2])
+        raise UserError(f"{source}: cameras of different sizes ({names}); a path has one size")
+    ((width, height),) = stated
     for K, size in zip(Ks, sizes):
         if size is None:  # in fractions of the picture's side
             K[:2] *= DEFAULT_SIDE
     views = from_opengl(torch.from_numpy(poses))
     return CameraPath(Cameras(views, torch.from_numpy(Ks), width, height))
-
-
-def _of_splatting(views: list[_SplattingCamera], source: str) -> CameraPath:
-    width, height = _one_size({(view.width, view.height) for view in views}, source)
-    poses = torch.eye(4, dtype=torch.float64).repeat(len(views), 1, 1)
-    poses[:, :3, :3] = _tensor([view.rotation for view in views])
-    poses[:, :3, 3] = _tensor([view.position for view in views])
-    _check_rotations(poses, source)
-    Ks = torch.zeros(len(views), 3, 3, dtype=torch.float64)
-    Ks[:, 0, 0], Ks[:, 1, 1] = _tensor([[v.fx, v.fy] for v in views]).unbind(-1)
-    Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = width / 2, height / 2, 1.0
-    return CameraPath(Cameras(torch.linalg.inv(poses), Ks, width, height))
-
-
-def _one_size(sizes: set[tuple[int, int]], source: str) -> tuple[int, int]:
-    if len(sizes) > 1:
-        names = " and ".join(f"{width}x{height}" for width, height in sorted(sizes)[:2])
-        raise UserError(f"{source}: cameras of different sizes ({names}); a path has one size")
-    return next(iter(sizes))
 
 
 def _tensor(values: Any) -> Tensor:

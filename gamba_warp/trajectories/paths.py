@@ -1,10 +1,9 @@
-"""Camera paths about an object, or from a file."""
+"""Camera paths about an object."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,7 +11,6 @@ from torch import Tensor
 from ..cameras import Cameras, intrinsics, orbit
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..gaussians import Gaussians
-from .files import load_path
 
 SWING = 30.0  # amplitude of a spiral's elevation, degrees
 TURNS = 2  # of a spiral
@@ -116,22 +114,6 @@ def _around(
         K[[0, 1], [0, 1]] *= width / height
     viewmats = orbit(azimuths, elevation, distance)
     return Cameras(viewmats, K.expand(len(azimuths), 3, 3), width, height)
-
-
-def read_path(file: str | Path, size: tuple[int, int | None] | None = None) -> Cameras:
-    """Read the cameras of a file, in the frame of its Gaussians.
-
-    Args:
-        file: one of the formats of ``trajectories.files``.
-        size: width and height of the pictures, or only the width; by default the file's own.
-
-    Returns:
-        Cameras ``[V]`` float64.
-
-    Raises:
-        UserError: the file is invalid; one line names the place.
-    """
-    return load_path(file, size).cameras
 
 
 def upright(elevation: float) -> Tensor:

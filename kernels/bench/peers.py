@@ -12,7 +12,7 @@ from gamba_warp.versions import installed
 
 from .measure import NotInstalled
 
-PACKAGES = ("mambapy", "mamba-ssm", "causal-conv1d", "gsplat", "gswarp")
+PACKAGES = ("mambapy", "mamba-ssm", "causal-conv1d", "gsplat")
 
 
 def load(module: str, package: str):
@@ -117,79 +117,3 @@ def gsplat_rasterization(**arguments) -> tuple[Tensor, Tensor, dict]:
     """
     function = load("gsplat", "gsplat").rasterization
     return function(**arguments, packed=False)
-
-
-def gswarp_rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    **options,
-) -> tuple[Tensor, Tensor, dict]:
-    """Runs gswarp's whole operator, one view after the other, on CUDA only.
-
-    The arguments are those of ``rasterization``, without leading dimensions; the principal point
-    must be the centre. The alphas are those that gswarp returns beside the picture.
-
-    Raises:
-        NotInstalled: gswarp is not installed.
-        ValueError: gswarp does not have an option.
-    """
-    if options:
-        raise ValueError(f"gswarp has no {', '.join(options)}")
-    module = load("gswarp", "gswarp")
-    pictures, alphas = [], []
-    for view, K in zip(viewmats, Ks):
-        tangents = width / (2 * K[0, 0].item()), height / (2 * K[1, 1].item())
-        settings = module.GaussianRasterizationSettings(
-            image_height=height,
-            image_width=width,
-            tanfovx=tangents[0],
-            tanfovy=tangents[1],
-            bg=means.new_zeros(3),
-            scale_modifier=1.0,
-            viewmatrix=view.T.contiguous(),
-            projmatrix=(_perspective(*tangents).to(view) @ view).T.contiguous(),
-            sh_degree=0,
-            campos=torch.linalg.inv(view)[:3, 3],
-            prefiltered=False,
-            debug=False,
-        )
-        picture, _, meta = module.GaussianRasterizer(settings)(
-            means3D=means,
-            means2D=torch.zeros_like(means, requires_grad=True),
-            opacities=opacities[:, None],
-            colors_precomp=colors,
-            scales=scales,
-            rotations=quats,
-        )
-        pictures.append(picture.permute(1, 2, 0))
-        alphas.append(meta.alpha.reshape(height, width, 1))
-    return torch.stack(pictures), torch.stack(alphas), {}
-
-
-def _perspective(tangent_x: float, tangent_y: float, near: float = 0.01, far: float = 100.0):
-    """Makes the projection matrix of diff-gaussian-rasterization's callers: z forward, w = z."""
-    matrix = torch.zeros(4, 4)
-    matrix[0, 0], matrix[1, 1] = 1 / tangent_x, 1 / tangent_y
-    matrix[2, 2], matrix[2, 3], matrix[3, 2] = far / (far - near), -far * near / (far - near), 1
-    return matrix
-
-
-def gsplat_colors(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
-    """Runs gsplat's torch function, with the half and the clamp that its rasterizer adds.
-
-    The arguments are those of ``colors_seen_from``.
-
-    Raises:
-        NotInstalled: gsplat is not installed.
-    """
-    code = load("gsplat.cuda._torch_impl", "gsplat")
-    directions = means[:, None] - centers[:, :, None]
-    wide = coefficients[:, None].expand(*directions.shape[:3], *coefficients.shape[2:])
-    return (code._spherical_harmonics(degree, directions, wide) + 0.5).clamp_min(0)

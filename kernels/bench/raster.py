@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import partial
 
@@ -26,8 +25,6 @@ def cases(settings: Settings) -> list[Case]:
         "knobs": knobs,
         "skipping": skipping,
         "one call": one_call,
-        "Gaussians": counts,
-        "views": views,
     }
     if settings.device.type == "cuda":
         builders["32 views"] = many_views
@@ -74,27 +71,26 @@ def scenes(settings: Settings) -> list[Variant]:
 
 
 def _peers(scene: Scene, name: str) -> list[Variant]:
-    """Return the variants of gsplat and gswarp, the whole operator, which run on CUDA."""
+    """Return the variants of gsplat, the whole operator, which runs on CUDA."""
     if scene.device.type != "cuda":
         return []
-    packages = {"gsplat": peers.gsplat_rasterization, "gswarp": peers.gswarp_rasterization}
+    function = peers.gsplat_rasterization
 
-    def error(function) -> Error:
+    def error() -> Error:
         got, want = scene.forward(function)[0], scene.forward()[0]
         return compare({"picture": got}, {"picture": want})
 
     return [
         Variant(
-            name=f"{package}, {name}",
+            name=f"gsplat, {name}",
             run=partial(run, function),
-            check=partial(error, function),
+            check=error,
             limit=1e-2,
             oracle="our float32 picture",
             direction=direction,
             peer=True,
             parameters=dict(scene.sizes),
         )
-        for package, function in packages.items()
         for direction, run in (("forward", scene.forward), (BOTH, scene.backward))
     ]
 
@@ -183,25 +179,6 @@ def _call_all(runs: list) -> None:
         run()
 
 
-def counts(settings: Settings) -> list[Variant]:
-    """Cost against the number of Gaussians, which get smaller so that they cover the same area."""
-    numbers = {"quick": (1024, 4096), "normal": (16384, 65536)}.get(settings.level)
-    made = []
-    for count in numbers or (16384, 65536, 262144):
-        scene = make_scene(settings, math.sqrt((numbers or (16384,))[0] / count), count)
-        made += _pair(scene, f"{count} Gaussians")
-    return made
-
-
-def views(settings: Settings) -> list[Variant]:
-    """Cost against the number of views of 256² in one call."""
-    quick, made = settings.level == "quick", []
-    for number in (1, 2) if quick else (1, 2, 4, 8, 16):
-        scene = make_scene(settings, size=64 if quick else 256, views=number)
-        made += _pair(scene, f"{number} view{'s' * (number > 1)}")
-    return made
-
-
 def many_views(settings: Settings) -> list[Variant]:
     """32 views of 512² in one launch, beside gsplat."""
     scene = make_scene(settings, views=32)
@@ -210,7 +187,7 @@ def many_views(settings: Settings) -> list[Variant]:
 
 def harmonics(settings: Settings) -> list[Variant]:
     """Colours of Gaussians in views from harmonics, alone and with the gradients of coefficients,
-    means and centres: our kernels, the formula in torch and gsplat's torch.
+    means and centres: our kernels, and the formula in torch.
     """
     quick = settings.level == "quick"
     sizes = [(2048 if quick else 16384, 1, degree) for degree in range(5)]
@@ -238,7 +215,4 @@ def harmonics(settings: Settings) -> list[Variant]:
         made += measure.pair(problem, f"ours, {name}", default=True)
         formula = replace(problem, function=problem.reference)
         made += measure.pair(formula, f"the formula in torch, {name}")
-        if settings.peers:
-            gsplat = replace(problem, function=partial(peers.gsplat_colors, degree))
-            made += measure.pair(gsplat, f"gsplat's torch, {name}", peer=True)
     return made

@@ -27,7 +27,6 @@ def cases(settings: Settings) -> list[Case]:
         "length": lengths,
         "layers": layers,
         "packed": packed,
-        "states": states,
     }
     if settings.device.type == "cuda":
         builders["training batch"] = training_batch
@@ -135,15 +134,6 @@ def packed(settings: Settings) -> list[Variant]:
         cuts = torch.tensor([0, *cuts.tolist(), length], dtype=torch.int32, device=settings.device)
         cut = replace(problem, function=partial(problem.function, cu_seqlens=cuts))
         made += pair(cut, f"{count} sequences")
-    return made
-
-
-def states(settings: Settings) -> list[Variant]:
-    """Cost against the number of states per channel; 16 is the tuned one."""
-    quick, made = settings.level == "quick", []
-    for count in (4, 16) if quick else (4, 8, 16, 32, 64):
-        problem = make_problem(settings, length=512 if quick else 4096, states=count)
-        made += pair(problem, f"N {count}")
     return made
 
 

@@ -10,6 +10,7 @@ import pytest
 uvicorn = pytest.importorskip("uvicorn", reason="needs gradio: pip install '.[app]'")
 
 from gamba_warp.app import connections  # noqa: E402
+from gamba_warp.app.guard import is_foreign  # noqa: E402
 
 LARGE = 32 << 20  # bytes; more than the system's buffers take
 
@@ -124,3 +125,12 @@ def test_who_takes_slowly_gets_all(address):
             if got >= LARGE:
                 break
         assert got >= LARGE and time.monotonic() - started > 1
+
+
+@pytest.mark.parametrize("method, foreign", [("GET", False), ("HEAD", False), ("POST", True)])
+def test_a_form_of_another_page_is_refused(method, foreign):
+    """A browser may send a form of another page without an Origin; a link only asks."""
+    headers = {"Host": "127.0.0.1:9", "Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+    assert is_foreign(method, headers.items()) == foreign
+    own = headers | {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1:9"}
+    assert not is_foreign(method, own.items())

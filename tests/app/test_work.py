@@ -181,7 +181,7 @@ def test_names_of_strangers(name, stem):
 def test_every_kind_of_file(made, tmp_path):
     suffixes = {kind: suffix for kind, (_, suffix) in work.KINDS.items()}
     assert len(set(suffixes.values())) == len(suffixes), "no two files have one name"
-    assert {"ply", "splat", "spz", "glb", "compressed-ply", "gif", "html"} < set(suffixes)
+    assert {"ply", "splat", "spz", "compressed-ply", "gif", "html"} < set(suffixes)
     for kind in work.GAUSSIANS:
         path, note = work.write(made, kind, tmp_path)
         assert path.name == "My-thing-v2" + suffixes[kind]

@@ -149,9 +149,9 @@ def test_turntables_that_cannot_be_written(tmp_path):
 def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     out = tmp_path / "deep" / "out"
     arguments = [picture, "--checkpoint", checkpoint, "--out", out, "--size", 32, "--frames", 4]
-    assert run_reconstruct(*arguments, "--splats", "ply", "splat", "glb") == 0
+    assert run_reconstruct(*arguments, "--splats", "ply", "splat", "spz") == 0
     files = {path.name: path.stat().st_size for path in out.iterdir()}
-    names = ["thing.gif", "thing.glb", "thing.html", "thing.ply", "thing.splat"]
+    names = ["thing.gif", "thing.html", "thing.ply", "thing.splat", "thing.spz"]
     assert sorted(files) == names and all(files.values())
     gaussians = load_ply(out / "thing.ply")
     with torch.inference_mode():

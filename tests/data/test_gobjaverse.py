@@ -3,12 +3,10 @@
 import json
 import math
 
-import numpy as np
 import pytest
 import torch
 from helpers.published.gobjaverse import ELEVATION, VIEWS, camera, write_object
 from helpers.refusals import refused
-from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.model.posing import relative_cameras
@@ -75,19 +73,6 @@ def test_views_that_lack_a_file_are_passed_over(tmp_path, suffix):
         for path in view.glob("?????.png"):
             path.unlink()
     refused("no views with both picture and camera", open_dataset(tmp_path).load, 0)
-
-
-def test_depth_beside_the_views(tmp_path):
-    write_object(tmp_path / "0" / "10010", "readme")
-    depth = tmp_path / "0" / "10010" / "depth"
-    depth.mkdir()
-    for number in range(VIEWS):
-        values = np.full((32, 32), 14000 + number, np.uint16)
-        Image.fromarray(values).save(depth / f"{number:05d}.png")
-    got = open_dataset(tmp_path).load(0, [2, 9])
-    assert got.depths[:, 5, 5].tolist() == pytest.approx([1.4002, 1.4009], abs=1e-6)
-    (depth / "00003.png").unlink()
-    assert "00003.png: no such file" in open_dataset(tmp_path).check()["0/10010"]
 
 
 def test_the_cameras_file_is_as_published(tmp_path):

@@ -48,7 +48,7 @@ MODEL = "image_size=16 patch_size=4 width=16 depth=1 state_size=4 scale_init=0.0
 JOBS = {
     "reconstruct": Job(
         "reconstruct {world}/pictures --out {out} --checkpoint {world}/run/model.safetensors "
-        f"--splats ply splat glb {SMALL}",
+        f"--splats ply splat spz {SMALL}",
         "--elevation 20",
     ),
     "export": Job(

@@ -12,13 +12,12 @@ import time
 import numpy as np
 import pytest
 import torch
-from helpers.gaussians import some
+from helpers.gaussians import khr_glb, some
 from helpers.released import SIZES, make_released
 from safetensors.torch import save_file
 
 from gamba_warp.cli import run
 from gamba_warp.files import PART, output_folder, sha256, sha256_of_all
-from gamba_warp.formats.gaussians.glb import save_glb
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import read_config
@@ -137,7 +136,7 @@ def test_a_disturbed_command_loses_nothing(world, tmp_path, name, fault):
 
 def test_files_cut_short_are_not_whole(tmp_path):
     save_ply(tmp_path / "a.ply", some(9))
-    save_glb(tmp_path / "a.glb", some(9))
+    (tmp_path / "a.glb").write_bytes(khr_glb(some(9)))
     save_file({"a": torch.rand(3), "b": torch.rand(2, 2)}, tmp_path / "a.safetensors")
     save_image(tmp_path / "a.png", np.random.default_rng(0).random((9, 9, 3)))
     (tmp_path / "a.html").write_text("<p></p>\n</html>\n")

@@ -1,4 +1,4 @@
-"""The retrieval's meshes as predicted shapes, and predictions beside those of baselines."""
+"""The retrieval's meshes as predicted shapes."""
 
 import json
 
@@ -177,75 +177,3 @@ def test_a_truth_is_turned_as_its_catalogue_says(world):
     for wrong in ([1.0, 1, 2], [-1.0, 1, 1]):
         with pytest.raises(UserError, match="also stretches or mirrors"):
             load_truth(path, protocol, np.diag(wrong).tolist())
-
-
-def boxes(folder, **sides):
-    folder.mkdir(parents=True)
-    for name, side in sides.items():
-        trimesh.creation.box((side, side, side)).export(folder / f"{name}.ply")
-
-
-def evaluate_shapes(folder, *options):
-    words = (folder / "pred", folder / "gt", "--points", 2000, *options)
-    return evaluated("eval-geometry", folder / "out", *words)
-
-
-def test_differences_are_paired(tmp_path, capsys):
-    """Cubes in cubes: the IoU of one of side s in the truth is s³."""
-    boxes(tmp_path / "gt", a=1.0, b=1.0, c=1.0)
-    boxes(tmp_path / "pred", a=1.0, b=0.75, c=0.5)
-    boxes(tmp_path / "near", a=0.75, b=0.75)
-    boxes(tmp_path / "far", a=0.5, b=0.5, c=0.5)
-    options = ["--baseline", str(tmp_path / "near"), str(tmp_path / "far")]
-    code, report = evaluate_shapes(tmp_path, *options)
-    assert code == 1  # "near" lacks an object
-    assert report["failures"] == [] and list(report["baselines"]) == ["near", "far"]
-    assert report["baselines"]["near"]["failures"] == [{"name": "c", "reason": "no prediction"}]
-    near, far = report["differences"]["near"], report["differences"]["far"]
-    iou = [1.0, 0.75**3, 0.125]
-    assert (near["objects"], far["objects"]) == (2, 3)
-    assert near["mean"]["iou"] == pytest.approx((1 - iou[1]) / 2)
-    assert far["mean"]["iou"] == pytest.approx((iou[0] + iou[1] - 2 * iou[2]) / 3)
-    assert far["median"]["iou"] == pytest.approx(iou[1] - iou[2])
-    assert far["interval"]["iou"] == pytest.approx([0, 1 - iou[2]], abs=1e-6)
-    assert len(far["median_interval"]["iou"]) == 2 and far["mean"]["chamfer"] < 0
-    assert far["mean"]["fscore"].keys() == report["mean"]["fscore"].keys()
-    text = (tmp_path / "out" / "table.md").read_text()
-    printed = capsys.readouterr().out
-    assert text in printed and "failed: c (near): no prediction" in printed
-    assert "\n3 evaluated, 0 failed, 1 of baselines failed;" in printed
-    for row in ("predicted", "near", "far", "predicted - near", "predicted - far"):
-        assert text.count(f"| {row.ljust(16)} |") == 2  # means and medians
-    assert "F-score at 0.02" in text
-
-
-def test_an_object_that_only_a_baseline_has(tmp_path):
-    """A missing prediction is reported, also with a library."""
-    boxes(tmp_path / "gt", a=1.0, b=1.0, unused=1.0)
-    entries = [{"model": f"{name}.ply", "uid": name} for name in ("a", "b", "unused")]
-    (tmp_path / "gt" / "catalogue.json").write_text(json.dumps({"objects": entries}))
-    boxes(tmp_path / "pred", a=1.0)
-    boxes(tmp_path / "other", a=0.5, b=0.5)
-    code, report = evaluate_shapes(tmp_path)
-    assert code == 0 and report["num_ok"] == 1 and report["baselines"] == {}
-    code, report = evaluate_shapes(tmp_path, "--baseline", str(tmp_path / "other"))
-    assert code == 1 and report["failures"] == [{"name": "b", "reason": "no prediction"}]
-    assert report["differences"]["other"]["objects"] == 1
-
-
-@pytest.mark.parametrize("case", ["file", "twice", "predicted"])
-def test_baselines_that_are_refused(tmp_path, case, capsys):
-    boxes(tmp_path / "gt", a=1.0)
-    boxes(tmp_path / "pred", a=1.0)
-    boxes(tmp_path / "x" / "predicted", a=1.0)
-    boxes(tmp_path / "y" / "predicted", a=1.0)
-    boxes(tmp_path / "x" / "one", a=1.0)
-    boxes(tmp_path / "y" / "one", a=1.0)
-    folders = {
-        "file": [tmp_path / "pred" / "a.ply"],
-        "twice": [tmp_path / "x" / "one", tmp_path / "y" / "one"],
-        "predicted": [tmp_path / "x" / "predicted"],
-    }
-    assert evaluate_shapes(tmp_path, "--baseline", *map(str, folders[case])) == (2, None)
-    error = capsys.readouterr().err
-    assert "--baseline" in error and error.count("\n") == 1

@@ -1,16 +1,13 @@
-"""``eval-views --checkpoint`` measures the output of ``reconstruct``; LPIPS prints its time."""
+"""``eval-views --checkpoint`` measures the output of ``reconstruct``."""
 
 import re
-from contextlib import nullcontext
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from helpers.model import micro, run_reconstruct
-from helpers.views import around, eval_views, evaluated, write_split, write_views
+from helpers.views import around, eval_views, write_split, write_views
 
-from gamba_warp.eval.views import compare, evaluate
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
@@ -109,54 +106,3 @@ def test_a_detail_that_cannot_be_is_refused(model, tmp_path, capsys):
     ):
         assert eval_views(pred, data, tmp_path / "out", "--detail", 2)[0] == 2
         assert re.search(said, capsys.readouterr().err)
-
-
-class Counted:
-    """Stand-in of LPIPS that counts the pictures whose features it computes."""
-
-    def __init__(self):
-        self.calls = []
-
-    def to(self, device):
-        return self
-
-    def features(self, pictures):
-        shape = pictures.reshape(-1, *pictures.shape[-3:]).shape
-        self.calls.append(shape[0])
-        return [torch.zeros(shape[0], 1, 1, 1)]
-
-    def distance(self, a, b):
-        return torch.zeros(max(len(a[0]), len(b[0])))
-
-
-def test_lpips_says_its_time_once_and_shows_how_far_it_is(model, tmp_path, monkeypatch, capsys):
-    data = dataset(tmp_path / "data", CELLS)
-    write_views(data / "b", disc(CELLS).expand(3, -1, -1, -1), around([0, 90, 180], size=CELLS))
-    write_split(data, test=["a", "b"])
-    network, bars = Counted(), []
-
-    def bar(total, **about):
-        bars.append([total, 0])
-        return nullcontext(
-            SimpleNamespace(update=lambda n: bars[-1].__setitem__(1, bars[-1][1] + n))
-        )
-
-    monkeypatch.setattr(evaluate, "lpips_available", lambda: True)
-    monkeypatch.setattr(evaluate, "load_lpips", lambda: network)
-    monkeypatch.setattr(compare, "progress_bar", bar)
-    words = ("--checkpoint", model, "--data", data, "--device", "cpu", "--strips", 0, "--sheet", 0)
-    assert evaluated("eval-views", tmp_path / "quick", *words)[0] == 0
-    assert "LPIPS:" not in capsys.readouterr().err
-    # Three grounds of three views: truth, model and billboard; background and input copy are one
-    # picture in all views. The retrieval has no training objects.
-    pictures = 3 * (3 * 3 + 2)
-    assert bars == [[pictures, pictures]] * 2
-    assert sum(network.calls) == 2 * pictures + 1  # one for the clock
-    clock = iter([0.0, 2.0])
-    monkeypatch.setattr(evaluate, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    assert evaluated("eval-views", tmp_path / "slow", *words)[0] == 0
-    said = re.findall(r"LPIPS: .*", capsys.readouterr().err)
-    assert said == [
-        f"LPIPS: 2 s a picture of {CELLS} x {CELLS}, {pictures} pictures an object: about 66 "
-        "seconds an object and 2.2 minutes for all 2; --no-lpips leaves it out"
-    ]

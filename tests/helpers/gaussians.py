@@ -1,9 +1,14 @@
-"""Random Gaussians for tests of files and pages, and conversions of quaternions."""
+"""Random Gaussians for tests of files and pages, conversions of quaternions, and a .glb's bytes."""
+
+import json
 
 import numpy as np
 import torch
 
-from gamba_warp.gaussians import Gaussians
+from gamba_warp.formats.gaussians.arrays import flip_axes
+from gamba_warp.gaussians import SH_C0, Gaussians
+
+from .meshes import glb
 
 
 def some(n=37, rotated=True, degree=0):
@@ -39,3 +44,34 @@ def covariances(quats, scales):
     turns = rotations(torch.as_tensor(quats).double())
     half = (turns * torch.tensor(np.asarray(scales)).double()[..., None, :]).numpy()
     return half @ half.swapaxes(-1, -2)
+
+
+def khr_glb(gaussians):
+    """The bytes of a .glb with rotated Gaussians, by ``KHR_gaussian_splatting``."""
+    gaussians, name = flip_axes(gaussians), "KHR_gaussian_splatting"
+    arrays = {
+        "POSITION": gaussians.means,
+        f"{name}:ROTATION": torch.nn.functional.normalize(gaussians.quats).roll(-1, 1),  # xyzw
+        f"{name}:SCALE": gaussians.scales,
+        f"{name}:OPACITY": gaussians.opacities[:, None],
+        f"{name}:SH_DEGREE_0_COEF_0": (gaussians.colors - 0.5) / SH_C0,
+    }
+    orders = [(l, n) for l in range(1, gaussians.degree + 1) for n in range(2 * l + 1)]
+    for i, (l, n) in enumerate(orders):
+        arrays[f"{name}:SH_DEGREE_{l}_COEF_{n}"] = gaussians.harmonics[:, i]
+    views, accessors, binary = [], [], b""
+    for i, values in enumerate(arrays.values()):
+        data = values.numpy().astype("<f4").tobytes()
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
+        accessors.append({"bufferView": i, "componentType": 5126, "count": len(values)})
+        accessors[i]["type"], binary = kind, binary + data
+    options = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": 0, "attributes": {key: i for i, key in enumerate(arrays)}}
+    tree = {
+        **{"asset": {"version": "2.0"}, "extensionsUsed": [name], "scene": 0},
+        **{"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]},
+        "meshes": [{"primitives": [primitive | {"extensions": {name: options}}]}],
+        **{"buffers": [{"byteLength": len(binary)}], "bufferViews": views, "accessors": accessors},
+    }
+    return glb(json.dumps(tree).encode(), binary)

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 import trimesh
 from helpers import micro
+from helpers.gaussians import khr_glb
 from helpers.images import ADOBE_RGB, colour_profile
 from helpers.matting import matting_network
 from helpers.released import theirs
@@ -136,6 +137,8 @@ def gaussians(count: int = 12, kind: Any = "ply", degree: int = 0) -> bytes:
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("object" + splat_suffix(kind))
+        if kind == "glb":
+            return khr_glb(some)
         write_gaussians(path, some, kind)
         return path.read_bytes()
 
@@ -299,14 +302,9 @@ def cameras() -> Kinds:
     K = [[9.0, 0, 4], [0, 9.0, 3], [0, 0, 1]]
     frames = [{"viewmat": poses[0].tolist(), "K": K}, {"viewmat": poses[1].tolist()}]
     path = [{"camera_to_world": p.ravel().tolist(), "fov": 50.0, "aspect": 1.3} for p in poses]
-    views = [
-        {"id": i, "img_name": "a", "width": 8, "height": 6, "fx": 9.0, "fy": 9.0}
-        | {"position": p[:3, 3].tolist(), "rotation": p[:3, :3].tolist()}
-        for i, p in enumerate(poses)
-    ]
     nerfstudio = {"camera_type": "perspective", "render_height": 6, "render_width": 8}
     nerfstudio |= {"fps": 24, "seconds": 4, "keyframes": [], "camera_path": path}
-    forms = {"ours": head | {"frames": frames}, "nerfstudio": nerfstudio, "splatting": views}
+    forms = {"ours": head | {"frames": frames}, "nerfstudio": nerfstudio}
     made = {name: {"cameras.json": as_json(value)} for name, value in forms.items()}
     dataset = transforms("chair")["chair/transforms.json"]
     return made | {"transforms": {"transforms.json": dataset}}

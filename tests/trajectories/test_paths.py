@@ -14,7 +14,6 @@ from gamba_warp.trajectories.paths import (
     SWING,
     Viewpoint,
     placed,
-    read_path,
     spiral,
     to_unit,
     turntable,
@@ -117,11 +116,11 @@ def test_our_own_file_comes_back(tmp_path):
     assert torch.equal(path.cameras.Ks, cameras.Ks)
     one_fov = {"format": "gamba-cameras", "width": 30, "height": 20, "fov": 60}
     one_fov["frames"] = [{"viewmat": rigid(1)[0].tolist()}]
-    found = read_path(write(tmp_path / "b.json", one_fov)).Ks[0]
+    found = load_path(write(tmp_path / "b.json", one_fov)).cameras.Ks[0]
     torch.testing.assert_close(found, intrinsics(30, 20, 60.0).double(), rtol=1e-6, atol=1e-5)
 
 
-def test_four_forms_of_the_same_cameras(tmp_path):
+def test_three_forms_of_the_same_cameras(tmp_path):
     viewmats, width, height, fov = rigid(3), 64, 36, 50.0
     poses = torch.linalg.inv(viewmats)
     focal = 18 / math.tan(math.radians(25))
@@ -145,19 +144,6 @@ def test_four_forms_of_the_same_cameras(tmp_path):
             "fl_x": focal,
             "frames": [{"transform_matrix": pose.tolist()} for pose in opengl],
         },
-        "splatting": [
-            {
-                "id": number,
-                "img_name": "a",
-                "width": width,
-                "height": height,
-                "position": pose[:3, 3].tolist(),
-                "rotation": pose[:3, :3].tolist(),
-                "fx": focal,
-                "fy": focal,
-            }
-            for number, pose in enumerate(poses)
-        ],
     }
     points = torch.randn(7, 3)
     ours = Cameras(viewmats, intrinsics(width, height, fov).double().repeat(3, 1, 1), width, height)
@@ -173,17 +159,18 @@ def test_four_forms_of_the_same_cameras(tmp_path):
 def test_another_size_keeps_the_vertical_field_of_view(tmp_path):
     K = intrinsics(40, 20, 50.0).double()
     save_path(tmp_path / "a.json", Cameras(rigid(1), K[None], 40, 20))
-    same = read_path(tmp_path / "a.json", (80, None))
+    same = load_path(tmp_path / "a.json", (80, None)).cameras
     assert (same.width, same.height) == (80, 40)
     want = intrinsics(80, 40, 50.0).double()
     torch.testing.assert_close(same.Ks[0], want, rtol=1e-6, atol=1e-5)
-    square = read_path(tmp_path / "a.json", (60, 60))
+    square = load_path(tmp_path / "a.json", (60, 60)).cameras
     want = intrinsics(60, 60, 50.0).double()
     torch.testing.assert_close(square.Ks[0], want, rtol=1e-6, atol=1e-5)
 
 
 GOOD = {"viewmat": np.eye(4).tolist(), "fov": 50}
 HEAD = {"format": "gamba-cameras", "width": 32, "height": 32}
+BEHIND = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
 BAD = {
     "no form": ({"a": 1}, "not a known camera file"),
     "a number": (3, "not a known camera file"),
@@ -226,17 +213,10 @@ BAD = {
         "cx is in pixels, so w and h are needed",
     ),
     "sizes": (
-        [
-            {
-                "position": [0, 0, 0],
-                "rotation": np.eye(3).tolist(),
-                "width": side,
-                "height": 9,
-                "fx": 9,
-                "fy": 9,
-            }
-            for side in (8, 9)
-        ],
+        {
+            "camera_angle_x": 1,
+            "frames": [{"transform_matrix": BEHIND, "w": side, "h": 9} for side in (8, 9)],
+        },
         "cameras of different sizes",
     ),
 }

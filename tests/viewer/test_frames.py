@@ -1,6 +1,5 @@
 """The viewer in frames of other pages, and behind ``gamba view``."""
 
-import socket
 import webbrowser
 
 import numpy as np
@@ -110,13 +109,3 @@ def test_view_without_a_browser_says_so_in_one_line(ball, tmp_path, monkeypatch,
     out, err = capsys.readouterr()
     assert out.strip() == str(tmp_path / "page.html")
     assert err.count("\n") == 1 and "no browser was found" in err
-
-
-def test_view_on_a_port_in_use_says_so_in_one_line(ball, tmp_path, capsys):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = str(taken.getsockname()[1])
-        assert run(["view", str(ball), "--serve", "--port", port, "--no-open-browser"]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1 and f"--port {port}: Address already in use" in err

@@ -205,7 +205,6 @@ def data_objaverse_command(
     share: tyro.conf.OmitArgPrefixes[Share],
     min_views: Annotated[int, Meta(ge=1, le=10_000)] = 40,
     copy: bool = False,
-    depth: bool = False,
 ) -> int:
     """Make a dataset of a local copy of G-Objaverse.
 
@@ -220,13 +219,10 @@ def data_objaverse_command(
         share: selection of these objects.
         min_views: complete views that an object must have; published are 40.
         copy: copy the files of folders instead of linking them.
-        depth: also make depth pictures from the _nd.exr files; needs the package OpenEXR.
     """
-    from .objaverse_views import check_package, find_rendered, take_views
+    from .objaverse_views import find_rendered, take_views
 
     first, count = share.numbers
-    if depth:
-        check_package()
     objects = find_rendered(source)
     if out.resolve() == source.resolve():
         raise UserError(f"{out}: is --source itself; choose another folder")
@@ -235,7 +231,7 @@ def data_objaverse_command(
     out = output_folder(out)
     for what, number in chosen.counts.items():
         print(f"{number:>9,} {what}")
-    taken, failures = take_views(objects, names, out, min_views, copy, depth)
+    taken, failures = take_views(objects, names, out, min_views, copy)
     record = out / ("objaverse.json" if count == 1 else f"objaverse.{first}-{count}.json")
     known = {name: chosen.uids[name] for name in names if name in chosen.uids}
     about = {
@@ -255,26 +251,6 @@ def data_objaverse_command(
     _report_empty_splits(out)
     print(f"next: gamba train {out} ...")
     return 1 if failures else 0
-
-
-def data_index_command(data: tyro.conf.Positional[Path]) -> int:
-    """Check every object of a dataset once, and list them in DATA/gamba-manifest.jsonl.
-
-    Every command then opens the dataset by this list, with at most three system calls an object,
-    compares sizes and times, and refuses a list that is older than the dataset: run this again.
-
-    Args:
-        data: the dataset's folder.
-    """
-    from gamba_warp.data.dataset import index_dataset
-
-    path, count, bad = index_dataset(data)
-    print(f"{counted(count, 'object')}, {len(bad):,} left out, listed in {path}")
-    for uid, reason in list(bad.items())[:_MAX_SHOWN]:
-        print(f"left out: {uid}: {reason}", file=sys.stderr)
-    if (rest := len(bad) - _MAX_SHOWN) > 0:
-        print(f"left out: {rest:,} more, see {path}", file=sys.stderr)
-    return 1 if bad else 0
 
 
 @ranged

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 from ...errors import UserError
 from ...files import atomic_path
@@ -14,7 +15,7 @@ from ..ply import MAX_FILE, TURNED, header_bytes, load_ply, save_ply
 from ..ply_data import read_ply_header
 from .arrays import export_arrays
 from .compressed import WORDS, is_compressed, packed
-from .glb import holds_gaussians, load_glb, save_glb
+from .glb import holds_gaussians, load_glb
 from .splat import load_splat, save_splat
 from .spz import load_spz, save_spz
 from .spz_container import GZIP, MAGIC
@@ -23,7 +24,7 @@ from .spz_container import GZIP, MAGIC
 _GAUSSIAN_PROPERTIES = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
 
 
-def splat_kind(path: str | Path) -> SplatFormat | None:
+def splat_kind(path: str | Path) -> SplatFormat | Literal["glb"] | None:
     """Return the format of a file of Gaussians by its content; None for other files.
 
     A damaged file has the format that it seems to be in; ``.splat`` goes by its name, because it
@@ -148,4 +149,4 @@ def write_gaussians(
         with atomic_path(path) as temporary:
             temporary.write_bytes(header_bytes(comments, lines) + body)
         return f"{path}: the format clips harmonics to ±4." if clipped else None
-    return {"glb": save_glb, "splat": save_splat, "spz": save_spz}[kind](path, gaussians)
+    return (save_splat if kind == "splat" else save_spz)(path, gaussians)

@@ -1,14 +1,11 @@
-"""Gaussians in binary glTF by the Khronos extension ``KHR_gaussian_splatting``.
+"""Reader of Gaussians in binary glTF by the Khronos extension ``KHR_gaussian_splatting``.
 
 Scales are linear (early drafts of the extension stored logarithms), quaternions xyzw, axes +y up.
-Colours are display values, as the extension's ``srgb_rec709_display`` says; ``COLOR_0``, by which a
-viewer without the extension shows coloured points, is linear light, as glTF has it.
+Colours are display values, as the extension's ``srgb_rec709_display`` says.
 """
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,85 +14,21 @@ import torch
 from torch.nn import functional as F
 
 from ...errors import UserError
-from ...files import atomic_path
 from ...gaussians import SH_C0, Gaussians
-from ...versions import __version__
 from ..gltf_file import Entry, GltfFile, Index, open_gltf
 from ..headers import open_shape
-from ..materials import to_linear
-from .arrays import DEGREES, checked_gaussians, export_arrays, flip_axes
+from .arrays import checked_gaussians, flip_axes
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"
-FLOAT = 5126
 POINTS = 0
 _STRAIGHT = 1e-4  # largest deviation of a node's matrix from a rotation times a number
-_ARRAY_BUFFER = 34962
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def harmonic_names(degree: int) -> list[str]:
     """Names of the attributes of the harmonics of degrees 1 to ``degree``, in their order."""
     pairs = [(l, n) for l in range(1, degree + 1) for n in range(2 * l + 1)]
     return [f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}" for l, n in pairs]
-
-
-def save_glb(path: str | Path, gaussians: Gaussians) -> None:
-    """Write one object as ``.glb``, turned to glTF's axes (+y up, front towards +z), atomically.
-
-    Raises:
-        UserError: a value is not finite, there is no Gaussian, or the file cannot be written.
-        ValueError: there is a batch dimension.
-    """
-    arrays = export_arrays(path, gaussians, "opengl")
-    harmonics = arrays["harmonics"]
-    rgb = arrays["colors"] if harmonics.shape[1] else arrays["colors"].clip(0, 1)
-    opacities = arrays["opacities"].clip(0, 1)[:, None]
-    attributes = {
-        "POSITION": arrays["means"],
-        "COLOR_0": np.hstack([to_linear(rgb.clip(0, 1)), opacities]),
-        f"{EXTENSION}:ROTATION": np.roll(arrays["quats"], -1, axis=1),
-        f"{EXTENSION}:SCALE": arrays["scales"],
-        f"{EXTENSION}:OPACITY": opacities,
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (rgb - 0.5) / SH_C0,
-    }
-    names = harmonic_names(DEGREES[harmonics.shape[1]])
-    attributes |= {name: harmonics[:, i] for i, name in enumerate(names)}
-    views, accessors, parts, offset = [], [], [], 0
-    for value in attributes.values():
-        part = value.astype("<f4")
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": part.nbytes}
-        accessor = {"bufferView": len(views), "componentType": FLOAT, "count": len(part)}
-        views.append(view | {"target": _ARRAY_BUFFER})
-        accessors.append(accessor | {"type": _TYPES[part.shape[1]]})
-        parts.append(part.tobytes())
-        offset += part.nbytes
-    # glTF requires bounds of POSITION, of the rounded values.
-    means = attributes["POSITION"].astype("<f4")
-    accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
-    primitive = {
-        "mode": POINTS,
-        "attributes": {name: index for index, name in enumerate(attributes)},
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": COLOR_SPACE}},
-    }
-    document = {
-        "asset": {"version": "2.0", "generator": f"gamba_warp {__version__}"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": Path(path).stem}],
-        "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": offset}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    # The container: a header, a JSON chunk padded with spaces, and a BIN chunk of float32.
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", offset, b"BIN\0") + b"".join(parts)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
 def holds_gaussians(path: Path, file: BinaryIO, size: int) -> bool:

@@ -3,9 +3,6 @@
 ``published`` reads files with other packages and by the published layouts, without our code.
 """
 
-import json
-import struct
-
 import gaussforge
 import numpy as np
 import torch
@@ -46,10 +43,6 @@ ALLOWED = {
         **{"means": 0, "angle": 1e-3, "logs": 1e-6, "opacities": 1e-6},
         **{"colors": 1e-6, "harmonics": 0},
     },
-    "glb": {
-        **{"means": 0, "angle": 1e-3, "logs": 0, "opacities": 0},
-        **{"colors": 1e-6, "harmonics": 1e-6},
-    },
     # 8 bits: 1/128 of a number of the quaternion, which is twice that as an angle
     "splat": {
         "means": 0,
@@ -77,58 +70,22 @@ def check(kind, want, got):
         assert value <= ALLOWED[kind][name], (kind, name, value, ALLOWED[kind][name])
 
 
-def read_glb(path):
-    """The document and the bytes of a .glb, by glTF's own text."""
-    data = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON" and size % 4 == 0
-    document = json.loads(data[20 : 20 + size])
-    binary_size, kind = struct.unpack_from("<I4s", data, 20 + size)
-    binary = data[28 + size :]
-    assert kind == b"BIN\0" and binary_size == len(binary) and binary_size % 4 == 0
-    assert document["buffers"] == [{"byteLength": len(binary)}]
-    return document, binary
-
-
-def attributes(document, binary):
-    """The one primitive of a .glb, and the numbers ``[N, C]`` of its attributes."""
-    (primitive,) = document["meshes"][0]["primitives"]
-    out = {}
-    for name, index in primitive["attributes"].items():
-        accessor = document["accessors"][index]
-        view = document["bufferViews"][accessor["bufferView"]]
-        size = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        assert accessor["componentType"] == 5126
-        assert view["byteLength"] == accessor["count"] * size * 4 and view["byteOffset"] % 4 == 0
-        values = np.frombuffer(binary, "<f4", accessor["count"] * size, view["byteOffset"])
-        out[name.removeprefix("KHR_gaussian_splatting:")] = values.reshape(-1, size)
-    return primitive, out
-
-
 def published(path, kind):
     """The centres ``[N, 3]`` and covariances of a file, turned from its format's axes to OpenCV's.
 
     A .ply is read by plyfile; .splat, .spz and compressed .ply by gaussforge, which leaves the axes
-    as they are; .glb by glTF's text. The axes of .spz (right, up, back) and .glb (y up, the front
-    towards +z) are those that their specifications name; the others have none of their own, and
-    every viewer takes them for OpenCV's, as 3DGS wrote them.
+    as they are. The axes of .spz (right, up, back) are those that its specification names; the
+    others have none of their own, and every viewer takes them for OpenCV's, as 3DGS wrote them.
     """
-    if kind == "glb":
-        _, found = attributes(*read_glb(path))
-        centres, quats = found["POSITION"], np.roll(found["ROTATION"], 1, axis=1)  # from xyzw
-        scales = found["SCALE"]
-    else:
-        data = path
-        if kind != "ply":
-            name = kind.replace("-", ".")
-            data = path.with_name("theirs.ply")
-            theirs = gaussforge.GaussForge().convert(path.read_bytes(), name, "ply")
-            data.write_bytes(theirs["data"])
-        vertex = PlyData.read(data)["vertex"]
-        centres = np.stack([vertex[name] for name in "xyz"], 1)
-        quats = np.stack([vertex[f"rot_{i}"] for i in range(4)], 1)
-        scales = np.exp(np.stack([vertex[f"scale_{i}"] for i in range(3)], 1))
-    turn = np.array([1, -1, -1] if kind in ("spz", "glb") else [1, 1, 1])
+    data = path
+    if kind != "ply":
+        name = kind.replace("-", ".")
+        data = path.with_name("theirs.ply")
+        theirs = gaussforge.GaussForge().convert(path.read_bytes(), name, "ply")
+        data.write_bytes(theirs["data"])
+    vertex = PlyData.read(data)["vertex"]
+    centres = np.stack([vertex[name] for name in "xyz"], 1)
+    quats = np.stack([vertex[f"rot_{i}"] for i in range(4)], 1)
+    scales = np.exp(np.stack([vertex[f"scale_{i}"] for i in range(3)], 1))
+    turn = np.array([1, -1, -1] if kind == "spz" else [1, 1, 1])
     return centres * turn, covariances(quats, scales) * np.outer(turn, turn)

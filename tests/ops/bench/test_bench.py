@@ -13,7 +13,7 @@ from helpers import rel_rms
 from gamba_warp import cli
 from gamba_warp.commands import machine
 from gamba_warp.errors import UserError
-from gamba_warp.kernels.bench import conv, peers, raster, scan
+from gamba_warp.kernels.bench import conv, raster, scan
 from gamba_warp.kernels.bench.measure import (
     Case,
     NotInstalled,
@@ -327,7 +327,7 @@ def test_the_scene_and_its_crop():
 @pytest.mark.parametrize(
     "suite, name",
     [
-        *((raster, name) for name in ("one call", "skipping", "harmonics", "views")),
+        *((raster, name) for name in ("one call", "skipping", "harmonics")),
         (scan, "length"),
         (conv, "knobs"),
         (models, "backbone"),
@@ -369,18 +369,3 @@ def test_unwritable_result_is_one_line(monkeypatch, tmp_path):
     with pytest.raises(UserError, match="bench.md"):
         machine.bench_command(("scan",), quick=True, out=tmp_path)
     assert (tmp_path / "bench.json").is_file()
-
-
-def test_gsplats_harmonics_agree_with_ours():
-    pytest.importorskip("gsplat")
-    settings = QUICK._replace(peers=True)
-    records = [r for r in measured(raster, "harmonics", settings) if r["is_peer"]]
-    assert len(records) == 12 and all(r["rel_rms_error"] < 1e-5 for r in records), records
-
-
-def test_gswarp_is_reported_where_it_is_not():
-    scene = raster.make_scene(QUICK, count=8, size=16)
-    with pytest.raises(NotInstalled, match="gswarp"):
-        scene.forward(peers.gswarp_rasterization)
-    with pytest.raises(ValueError, match="alpha_min"):
-        scene.changed(options={"alpha_min": 0.1}).forward(peers.gswarp_rasterization)

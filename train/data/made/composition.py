@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from manifold3d import CrossSection, Manifold
+from manifold3d import Manifold
 
 from .looks import Maker
 from .solids import (
-    Blend,
     ball,
     bend,
     both,
@@ -17,24 +16,18 @@ from .solids import (
     extent,
     joined,
     lathe,
-    loft,
-    plate,
-    ring_of,
+    limb,
     ripple,
-    rod,
-    rounded,
     slab,
     spline,
     superquadric,
     taper,
-    tube,
-    twist,
 )
 
 ENOUGH = 8_000  # faces of the parts after which no more are added
-SCHEMES = (
-    *("toy", "toy", "pastel", "dark metal", "white metal", "wood earth"),
-    *("fur", "any", "any", "wide", "leather earth", "white dark"),
+SCHEMES = (  # kinds of colours
+    *("toy", "toy blue", "pastel", "dark metal", "white metal", "wood earth"),
+    *("any", "any", "wide", "white dark"),
 )
 
 
@@ -43,9 +36,7 @@ def composition(m: Maker) -> list[Manifold]:
     scheme = m.pick(*SCHEMES)
     looks = [m.fur(scheme) if m.chance(0.15) else m.surface(scheme) for _ in range(m.n(2, 4))]
     if m.chance(0.33):
-        looks[m.n(0, 1)] = m.printed(
-            m.pick("front", "label"), m.color(f"{scheme} white"), m.pick("fit", "round")
-        )
+        looks[m.n(0, 1)] = m.printed(f"{scheme} white")
     mirrored = m.chance(0.82)
     body = shape(m, mirrored)
     if m.chance(0.2):
@@ -63,7 +54,8 @@ def composition(m: Maker) -> list[Manifold]:
         else:
             parts.append(grown(m, host, mirrored, m.pick(*looks)))
     if m.chance(0.12):
-        parts = [whole_warped(m, parts, mirrored)]
+        whole = joined(parts)
+        parts = [warped(m, whole, mirrored)] if whole.num_tri() < 6_000 else [whole]
     return parts if m.chance(0.1) else [largest(joined(parts))]
 
 
@@ -80,28 +72,17 @@ def shape(m: Maker, mirrored: bool = True, fine: int = 32) -> Manifold:
         mirrored: make it symmetric about x = 0 if its kind allows it.
         fine: number of points around a round one.
     """
-    kind = m.n(0, 11)
+    kind = m.n(0, 8)
     a, b, c = np.exp(m.rng.uniform(math.log(0.25), math.log(0.95), 3))
-    if kind <= 1:
+    if kind <= 2:
         return superquadric([a, b, c], m.u(0.15, 1.3), m.u(0.15, 1.3), fine // 4 * 4)
-    if kind <= 3:
+    if kind <= 4:
         return box(2 * a, 2 * b, 2 * c, m.pick(0.0, m.u(0.02, 0.12), m.u(0.1, 0.5) * min(a, b, c)))
-    if kind <= 5:
+    if kind <= 6:
         return turned(m, a, 2 * b, fine)
-    if kind == 6:
-        return slab(outline(m, fine * 3 // 2), m.u(0.05, 0.6), m.u(0, 0.1)).scale(
-            [a / 0.6, b / 0.6, 1]
-        )
-    if kind <= 8:
-        return loafed(m, a, b, c, fine)
-    if kind == 9:
-        return lumps(m, mirrored, fine * 5 // 4)
-    if kind == 10:
-        path = m.rng.normal(0, 0.4, (m.n(3, 5), 3)) + np.linspace([0, -0.6, 0], [0, 0.6, 0], 5)[:1]
-        if mirrored:
-            path[:, 0] *= 0.0 if m.chance(0.7) else 1.0
-        return tube(path, m.rng.uniform(0.05, 0.3, 3), fine // 2, fine * 3 // 4, m.u(0.5, 1))
-    return plate(letter(m), m.u(0.1, 0.5))
+    if kind == 7:
+        return slab(outline(m, fine * 3 // 2) * [a, b], m.u(0.05, 0.6))
+    return limbs(m, mirrored)
 
 
 def turned(m: Maker, radius: float, height: float, fine: int) -> Manifold:
@@ -117,113 +98,56 @@ def turned(m: Maker, radius: float, height: float, fine: int) -> Manifold:
         end = profile[-1]
         cap = np.stack([end[0] * np.cos(angle), end[1] + end[0] * m.u(0.2, 1) * np.sin(angle)], 1)
         profile = np.concatenate([profile, np.maximum(cap, [0.005, -1])])
-    contour = [(0, profile[0, 1]), *profile.tolist(), (0, profile[-1, 1])]
-    made = lathe(contour, m.pick(6, 8, fine, fine, fine))
+    made = lathe(profile, m.pick(6, 8, fine, fine, fine))
     return made.translate([0, -height / 2, 0])
 
 
-def loafed(m: Maker, a: float, b: float, c: float, fine: int) -> Manifold:
-    """A solid through superellipses whose sizes, positions and forms change along z."""
-    count, sides = fine // 2, fine * 7 // 8
-    t = np.linspace(-1, 1, count)
-    ends = m.u(0.3, 0.95)
-    swell = 1 - (np.abs(t) ** m.u(2, 6)) * ends
-    wide = a * swell * spline(m.rng.uniform(0.6, 1.1, (4, 1)), count)[:, 0]
-    tall = b * swell * spline(m.rng.uniform(0.6, 1.1, (4, 1)), count)[:, 0]
-    lift = b * spline(m.rng.uniform(-0.4, 0.4, (3, 1)), count)[:, 0]
-    form = ring_of(m.u(1.7, 6), sides)
-    rings = np.empty((count, sides, 3))
-    rings[..., 0] = form[None, :, 0] * wide[:, None]
-    rings[..., 1] = form[None, :, 1] * tall[:, None] + lift[:, None]
-    rings[..., 2] = c * 1.3 * t[:, None]
-    tips = rings[[0, -1]].mean(1) + [[0, 0, -0.1 * c], [0, 0, 0.1 * c]]
-    return loft(rings, tips)
-
-
-def outline(m: Maker, sides: int = 48) -> np.ndarray:
-    """A smooth, starred or toothed outline ``[sides, 2]`` of radius .6 or so."""
+def outline(m: Maker, sides: int) -> np.ndarray:
+    """A smooth, starred, toothed or square outline ``[sides, 2]`` of radius 1 or so."""
     angle = np.arange(sides) * (2 * math.pi / sides)
-    kind = m.n(0, 4)
+    kind = m.n(0, 3)
     if kind == 0:
         r = 1 + sum(m.u(-0.25, 0.25) / k * np.cos(k * (angle - math.pi / 2)) for k in range(2, 6))
     elif kind == 1:
         r = 1 + m.u(0.1, 0.35) * np.cos(m.n(3, 8) * (angle - math.pi / 2))
     elif kind == 2:
-        teeth = m.n(6, 16)
-        r = 1 + m.u(0.05, 0.15) * np.tanh(4 * np.sin(teeth * angle))
-    elif kind == 3:
-        return 0.6 * ring_of(m.u(1.2, 8), sides)
-    else:
-        width = m.u(0.5, 1.3)
-        return rounded(width, m.u(0.5, 1.3), m.u(0.05, 0.6) * width, sides // 4)
-    return 0.6 * np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
+        r = 1 + m.u(0.05, 0.15) * np.tanh(4 * np.sin(m.n(6, 16) * angle))
+    else:  # a superellipse
+        power = m.u(1.2, 8)
+        r = (abs(np.cos(angle)) ** power + abs(np.sin(angle)) ** power) ** (-1 / power)
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
 
 
-def letter(m: Maker) -> CrossSection:
-    """A figure of bars and bows, as letters are."""
-    w = m.u(0.08, 0.2)
-    points = [
-        *((-0.4, -0.5), (0.4, -0.5), (-0.4, 0.0), (0.4, 0.0), (-0.4, 0.5), (0.4, 0.5), (0, -0.5)),
-        (0, 0.5),
-    ]
-    dot = (
-        CrossSection.circle(w, 12)
-        if m.chance(0.5)
-        else CrossSection.square([1.7 * w, 1.7 * w], True)
-    )
-    bars, here = [], points[m.n(0, 7)]
+def limbs(m: Maker, mirrored: bool) -> Manifold:
+    """Round cones from joint to joint."""
+    joints, radii = [np.zeros(3)], [m.u(0.15, 0.4)]
+    parts = [ball(radii[0])]
     for _ in range(m.n(2, 5)):
-        there = points[m.n(0, 7)]
-        bars.append(CrossSection.batch_hull([dot.translate(here), dot.translate(there)]))
-        here = there
-    made = bars[0]
-    for bar in bars[1:]:
-        made = made + bar
-    if m.chance(0.4):
-        bow = CrossSection.circle(0.35, 32) - CrossSection.circle(0.35 - w, 32)
-        made = made + bow.translate([m.u(-0.2, 0.2), m.pick(-0.2, 0.2)])
-    return made
-
-
-def lumps(m: Maker, mirrored: bool, cells: int) -> Manifold:
-    """Limbs and eggs that flow together."""
-    blend = Blend(m.u(0.03, 0.25), mirrored)
-    points = [np.zeros(3)]
-    blend.egg((0, 0, 0), m.rng.uniform(0.15, 0.5, 3))
-    for _ in range(m.n(2, 5)):
-        start = points[m.n(0, len(points) - 1)]
-        end = start + m.rng.normal(0, 0.4, 3) * [1, 1, 0.8]
+        start = m.n(0, len(joints) - 1)
+        end = joints[start] + m.rng.normal(0, 0.4, 3) * [1, 1, 0.8]
         if m.chance(0.35):
-            end[0] = start[0]
-        r = m.u(0.05, 0.22)
-        blend.limb([start, end], [r, r * m.u(0.4, 1.5)])
-        points.append(end)
-    return blend.solid(cells)
+            end[0] = joints[start][0]
+        joints.append(end)
+        radii.append(m.u(0.05, 0.22))
+        parts.append(limb([joints[start], end], [min(radii[start], 0.22), radii[-1]]))
+    return both(joined(parts)) if mirrored else joined(parts)
 
 
 def warped(m: Maker, solid: Manifold, mirrored: bool) -> Manifold:
-    """A solid that is refined, then bent, tapered, twisted or displaced."""
+    """A solid that is refined, then bent, tapered or displaced."""
     low, high = extent(solid)
     size = float((high - low).max())
     fine = solid.refine_to_length(size / 12) if solid.num_tri() < 2000 else solid
     for _ in range(m.n(1, 2)):
-        kind = m.n(0, 3)
+        kind = m.n(0, 2)
         if kind == 0:
             fine = bend(fine, m.u(-1, 1))
         elif kind == 1:
             fine = taper(fine, m.u(0.4, 1.5))
-        elif kind == 2:
-            fine = fine if mirrored and m.chance(0.7) else twist(fine, m.u(-1.5, 1.5))
         else:
             length = size * m.u(0.15, 0.6)
             fine = ripple(fine, m.rng, length * m.u(0.03, 0.1), length, mirrored)
     return fine
-
-
-def whole_warped(m: Maker, parts: list[Manifold], mirrored: bool) -> Manifold:
-    """All parts as one solid, warped."""
-    whole = joined(parts)
-    return warped(m, whole, mirrored) if whole.num_tri() < 6_000 else whole
 
 
 def surface_point(m: Maker, solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
@@ -327,9 +251,8 @@ def cut(m: Maker, solid: Manifold, mirrored: bool, look: int) -> Manifold:
         if not normal.any():
             normal[2] = 1.0
     r = size * m.u(0.04, 0.2)
-    tool = m.pick(
-        rod(r, size * m.u(0.05, 1.5)), box(r * m.u(0.5, 3), size * m.u(0.1, 0.5), r, 0.0), ball(r)
-    )
+    height = size * m.u(0.05, 1.5)
+    tool = m.pick(lathe([(r, 0), (r, height)], 24), box(r * m.u(0.5, 3), height / 2, r), ball(r))
     tool = m.stamp(turned_to(tool, -normal, point + 0.02 * size * normal), look)
     made = solid - (both(tool) if mirrored else tool)
     return made if made.volume() > 0.3 * solid.volume() else solid

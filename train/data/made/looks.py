@@ -6,7 +6,6 @@ Both survive booleans, turns and bends, so textures follow the parts as they wer
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -33,16 +32,13 @@ class Look:
     """Look of some of an object's parts.
 
     Attributes:
-        material: its material.
-        mapping: texture mapping on the skin: "box", repeated, projected from the side that a face
-            looks to; "fit", the same, once over the skin's extent; "round", once about y.
-        repeats: of the texture over a unit, for "box".
+        material: its material; its texture is projected from the side that a face looks to.
+        repeats: of the texture over a unit of the skin; 0: once over the skin's extent.
         low: least coordinates ``[3]`` of the skins stamped with it.
         high: greatest coordinates ``[3]``.
     """
 
     material: Material
-    mapping: str = "box"
     repeats: float = 1.0
     low: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(3, -np.inf))
@@ -53,11 +49,6 @@ def material(pixels: np.ndarray) -> Material:
     full = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     full[..., :3] = pixels
     return Material(np.ones(4, np.float32), full)
-
-
-def plain_material(value: np.ndarray) -> Material:
-    """A material of one display colour ``[3]``."""
-    return Material(np.append(to_linear(np.clip(value, 0, 1)), 1).astype(np.float32))
 
 
 class Maker:
@@ -100,53 +91,36 @@ class Maker:
         self.looks.append(look)
         return len(self.looks) - 1
 
-    def plain(self, kinds: str = "any") -> int:
-        """A look of one colour, of one of some kinds."""
-        return self.add(Look(plain_material(self.color(kinds))))
-
-    def pattern(
-        self, patterns: str, kinds: str = "any", *, contrast: float = 0.0, repeats: float = 0.0
-    ) -> int:
+    def pattern(self, patterns: str, kinds: str, contrast: float) -> int:
         """A look of a pattern of two colours.
 
         Args:
             patterns: names in ``textures.PATTERNS`` to choose from, separated by spaces.
             kinds: of the first colour.
             contrast: probability that the second is another colour, not a shade.
-            repeats: see ``Look``; 0: drawn.
         """
         name = self.pick(*patterns.split())
         first = self.color(kinds)
         second = self.color() if self.chance(contrast) else first * self.u(0.45, 0.85)
         picture = textures.mixed(textures.PATTERNS[name](self.rng), first, second)
-        return self.add(Look(material(picture), repeats=repeats or self.u(0.8, 2.5)))
+        return self.add(Look(material(picture), repeats=self.u(0.8, 2.5)))
 
     def surface(self, kinds: str = "any") -> int:
         """A look for anything: mostly one colour, sometimes a pattern."""
         if self.chance(0.42):
-            return self.plain(kinds)
-        quiet = "plain clouded speckled brushed woven paneled"
-        names = quiet if self.chance(0.6) else " ".join(textures.PATTERNS)
+            shade = np.append(to_linear(self.color(kinds)), 1)
+            return self.add(Look(Material(shade.astype(np.float32))))
+        names = "clouded speckled grained" if self.chance(0.6) else " ".join(textures.PATTERNS)
         return self.pattern(names, kinds, contrast=0.3)
 
     def fur(self, kinds: str) -> int:
         """Fur or plush, of one colour or in patches."""
-        names = "furry furry speckled plain spotted"
-        return self.pattern(names, kinds, contrast=0.35, repeats=self.u(1, 2.5))
+        return self.pattern("furry furry speckled spotted", kinds, contrast=0.35)
 
-    def printed(self, kind: str, ground: np.ndarray, mapping: str) -> int:
-        """A look of printed matter.
-
-        Args:
-            kind: see ``textures.package``.
-            ground: colour of the paper.
-            mapping: see ``Look``.
-        """
-        # A wrap-around print is four times as wide as high.
-        height = textures.PRINT * 3 // 8 if mapping == "round" else textures.PRINT
-        inks = [self.color("toy toy dark white any") for _ in range(3)]
-        pixels = textures.package(self.rng, ground, inks, kind, height)
-        return self.add(Look(material(pixels), mapping))
+    def printed(self, kinds: str) -> int:
+        """A look of printed matter on paper of one of some kinds of colours."""
+        inks = [self.color("toy blue dark white any") for _ in range(3)]
+        return self.add(Look(material(textures.package(self.rng, self.color(kinds), inks)), 0.0))
 
     def stamp(self, solid: Manifold, look: int) -> Manifold:
         """Stamp a solid at its current position with one look."""
@@ -258,23 +232,11 @@ def _mapped(
         look, mine = looks[index], np.flatnonzero(number == index)
         ids[mine] = len(materials)
         materials.append(look.material)
-        if look.mapping == "box":
-            uvs[mine] = uv[mine] * signs[mine][:, None] * look.repeats
+        sign = signs[mine][:, None]
+        if look.repeats:
+            uvs[mine] = uv[mine] * sign * look.repeats
             continue
-        size = np.maximum(look.high - look.low, 1e-6)
-        if look.mapping == "fit":
-            share = (uv[mine] - look.low[_ACROSS[axis[mine]]][:, None]) / size[_ACROSS[axis[mine]]][
-                :, None
-            ]
-            s = signs[mine][:, None]
-            uvs[mine] = np.where(s > 0, share, 1 - share)
-            continue
-        points = skin[mine]
-        turn = np.arctan2(points[..., 0], points[..., 2]) / (2 * math.pi) + 0.5
-        turn -= np.round(turn - turn[:, :1])  # the corners of a face lie on one side of the seam
-        uvs[mine, :, 0] = turn
-        uvs[mine, :, 1] = (points[..., 1] - look.low[1]) / size[1]
-        flat = axis[mine] == 1
-        if flat.any():
-            uvs[mine[flat]] = uv[mine[flat]] / size[[0, 2]].max()
+        size, sides = np.maximum(look.high - look.low, 1e-6), _ACROSS[axis[mine]]
+        share = (uv[mine] - look.low[sides][:, None]) / size[sides][:, None]
+        uvs[mine] = np.where(sign > 0, share, 1 - share)
     return uvs, ids, materials
