@@ -1,4 +1,4 @@
-"""Cut out the object of a photograph; tries mask, alpha, networks and a plain background.
+"""Cut out the object of a photograph; tries mask, alpha, networks, plain background, GrabCut.
 
 Masks and transparency from the user are used unchanged. Results of the other methods are checked:
 the next method is tried if they cannot be an object, and reasons to doubt them are said. Colours
@@ -32,9 +32,10 @@ from ..errors import UserError
 from ..images import load_rgba
 from . import models
 from .edges import local_colors, without_background, without_matte
+from .grabcut import grabcut
 from .matte import Matte, NoMatte, to_stderr
 
-Method = Literal["alpha", "mask", "plain", "matte", "sam", "none"]
+Method = Literal["alpha", "mask", "plain", "matte", "sam", "grabcut", "none"]
 
 MEND = (
     "If it is wrong: gamba reconstruct --save-inputs writes the cut-out as NAME-input.png; erase "
@@ -46,9 +47,10 @@ _HOW: dict[str, str] = {
     "plain": "The plain background was removed{holes}{why}.",
     "matte": "The matting model {model} cut the object out.",
     "sam": "Segment Anything cut the object out, expected in the middle.",
+    "grabcut": "GrabCut cut the object out by colours alone, expected in the middle{why}.",
     "none": "The whole picture is the object.",
 }
-_NAMES = {"sam": "Segment Anything", "matte": "matting model"}
+_NAMES = {"sam": "Segment Anything", "matte": "matting model", "grabcut": "GrabCut"}
 _LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the picture covered by an object
 _MOST_EDGE = 0.7  # share of the picture's border that an object may cover
 _UNSURE = 0.4  # largest share of alpha's sum in pixels that are neither object nor background
@@ -192,7 +194,8 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     """Read a picture and cut its object out.
 
     A given mask comes first; then the picture's own transparency, Segment Anything or a matting
-    model if given or in the cache, a plain background, and a matting model that is fetched.
+    model if given or in the cache, a plain background, a matting model that is fetched, and
+    GrabCut.
 
     Args:
         path: any picture that ``load_rgba`` reads.
@@ -240,9 +243,11 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     warning, own = "", method in ("mask", "alpha", "none")
     doubts = [] if own else doubts_of(source, rgba[..., 3])
     doubts += [found.doubt] if found.doubt else []
+    if method == "grabcut":  # docs/reconstruct.md has the figure
+        doubts.append("colours alone fail for more than half of photographs")
     if doubts:
         warning = f"The cut-out may be wrong: {'; '.join(doubts)}."
-        if method == "plain" and not ways.without_network:
+        if method in ("plain", "grabcut") and not ways.without_network:
             size = models.PUBLISHED[0].megabytes
             warning += f" Try a network: --cutout matte ({size} MB, fetched once)."
     colors = np.where(rgba[..., 3:] > 0, rgba[..., :3], source)
@@ -256,12 +261,12 @@ def _methods(ways: Ways) -> list[Method]:
     networks: list[Method] = ["matte"] if ways.sam is None else ["sam", "matte"]
     if ways.cutout == "matte":
         return networks if ways.sam is None or ways.matte_model is not None else ["sam"]
-    if ways.cutout == "plain":
-        return ["plain"]
+    if ways.cutout == "plain" or ways.cutout == "grabcut":
+        return [ways.cutout]
     here = find_spec("onnxruntime") is not None and models.cached() is not None
     if ways.sam is not None or ways.matte_model is not None or here:
-        return [*networks, "plain"]
-    return ["plain", "matte"]
+        return [*networks, "plain", "grabcut"]
+    return ["plain", "matte", "grabcut"]
 
 
 def _cut_by_methods(path: str | Path, rgb: np.ndarray, ways: Ways) -> _Found:
@@ -282,7 +287,7 @@ def _cut_by_methods(path: str | Path, rgb: np.ndarray, ways: Ways) -> _Found:
                 reasons.append("its border is not plain")
             continue
         try:
-            cut = ways.segmenter() if method == "sam" else ways.matte()
+            cut = {"sam": ways.segmenter, "matte": ways.matte}.get(method, lambda: grabcut)()
             alpha = None if cut is None else cut(rgb)
         except NoMatte as error:
             reasons.append(str(error))

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from helpers.images import disc_on_noise
 from helpers.matting import matting_network
-from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp import versions
@@ -67,9 +66,9 @@ def test_each_way_in_its_order(tmp_path, network, busy):
         assert found.note.startswith(found.how) and "--save-inputs" in found.note
     assert "red.onnx" in cut_out(path, ways).how
     said: list[str] = []
-    # conftest.py forbids the network; none is kept
-    refused("no matting model", cut_out, path, Ways(say=said.append))
-    assert len(said) == 1
+    found = cut_out(path, Ways(say=said.append))  # conftest.py forbids the network; none is kept
+    assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85
+    assert found.how.endswith(" (no matting model).") and len(said) == 1
     assert "no matting model is here" in said[0] and models.PUBLISHED[0].address in said[0]
     for file in (path, transparent, plain):  # a mask is somebody's word
         found = cut_out(file, Ways(mask=mask, matte_model=network))
@@ -85,6 +84,7 @@ def test_the_chosen_method_is_used(tmp_path, network, busy):
     for name, method, way in (
         ("noise", "alpha", Ways(matte_model=network)),
         ("noise", "matte", Ways(cutout="matte", matte_model=network)),
+        ("noise", "grabcut", Ways(cutout="grabcut")),
         ("plain", "plain", Ways(cutout="plain")),
         ("plain", "none", Ways(cutout="none")),
     ):
@@ -151,10 +151,14 @@ def test_a_matte_without_an_object_gives_way(tmp_path, busy):
     for name, options, reason in (
         ("none", dict(bias=-60.0), "nothing stands out"),
         ("all", dict(bias=60.0), "all of the picture would be the object"),
+        ("vague", dict(weights=(0.1, 0, 0), bias=0.05), "it has no clear border"),
     ):
         file = tmp_path / f"{name}.onnx"
         file.write_bytes(matting_network(size=352, **options))
-        refused(f"matting model: {reason}", cut_out, path, Ways(matte_model=file))
+        found = cut_out(path, Ways(matte_model=file))
+        # vague is over one half everywhere
+        assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85, name
+        assert reason in found.how or name == "vague"
 
 
 def test_sam_comes_before_the_matte(network, busy, monkeypatch):
@@ -195,7 +199,7 @@ def test_what_no_way_cuts_is_one_line(tmp_path):
     save_image(path, np.random.default_rng(0).random((40, 50, 3)))
     with pytest.raises(UserError) as caught:
         cut_out(path)
-    for word in (str(path), "cannot tell object", "--mask", "--matte-model", "--sam"):
+    for word in (str(path), "cannot tell object", "GrabCut", "--mask", "--matte-model", "--sam"):
         assert word in str(caught.value)
 
 
@@ -295,15 +299,15 @@ def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypat
         raise ConnectionError("no route")
 
     monkeypatch.setattr(pooch, "retrieve", retrieve)
-    refused("no matting model", cut_out, path, Ways(say=said.append))
+    assert cut_out(path, Ways(say=said.append)).method == "grabcut"
     assert not asked and "no matting model is here" in said.pop()  # GAMBA_OFFLINE
     monkeypatch.setenv("GAMBA_OFFLINE", "0")
-    refused("no matting model", cut_out, path, Ways(fetch=False, say=said.append))
-    assert not asked
+    assert cut_out(path, Ways(fetch=False, say=said.append)).method == "grabcut" and not asked
     assert "no matting model is here" in said.pop() and not said
     ways = Ways(say=said.append)
     for _ in range(2):
-        refused("no matting model", cut_out, path, ways)
+        found = cut_out(path, ways)
+        assert found.method == "grabcut" and found.how.endswith(" (no matting model).")
     ((address, digest, before),) = asked
     assert (
         address == models.PUBLISHED[0].address and digest == f"sha256:{models.PUBLISHED[0].sha256}"
@@ -385,14 +389,15 @@ def test_a_kept_model_that_is_damaged_gives_way(tmp_path, monkeypatch, busy):
     pytest.importorskip("onnxruntime")
     monkeypatch.setenv("U2NET_HOME", str(tmp_path))
     (tmp_path / "u2net.onnx").write_bytes(b"half of a fi")
-    refused("not a model in ONNX", cut_out, busy[0])
+    found = cut_out(busy[0])
+    assert found.method == "grabcut" and "not a model in ONNX" in found.how
 
 
-def test_without_the_extra_the_way_to_it_is_said(monkeypatch, busy):
+def test_without_the_extra_colours_alone_cut(monkeypatch, busy):
     for module in (cutout, matte, versions):
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     said = []
-    refused("no matting model", cut_out, busy[0], Ways(say=said.append))
-    assert len(said) == 1 and "pip install '.[photo]'" in said[0]
+    found = cut_out(busy[0], Ways(say=said.append))
+    assert found.method == "grabcut" and len(said) == 1 and "pip install '.[photo]'" in said[0]
     with pytest.raises(ModuleNotFoundError, match="onnxruntime"):
         Ways(matte_model="model.onnx").checked()

@@ -30,7 +30,7 @@ def test_outputs_that_cannot_be_written(tmp_path, capsys):
     if os.path.isdir("/proc/self"):  # where not even root may make a folder
         assert reconstruct(tmp_path / "a.png", "--out", "/proc/gamba") == 2
     (tmp_path / "out" / "a.ply").mkdir(parents=True)  # a folder where a result is to be
-    assert reconstruct(tmp_path / "a.png", "--cutout", "none", "--out", tmp_path / "out") == 1
+    assert reconstruct(tmp_path / "a.png", "--out", tmp_path / "out") == 1
     assert not any((tmp_path / "out" / "a.ply").iterdir())
     errors = capsys.readouterr().err
     assert "cannot write into" in errors and "a.ply" in errors
@@ -70,6 +70,7 @@ def test_other_colours_are_the_same_object(tmp_path, mode):
 def test_a_broken_exif_is_no_broken_picture(tmp_path, data):
     photo().save(tmp_path / "a.jpg", exif=data)
     assert load_rgba(tmp_path / "a.jpg").shape == (96, 128, 4)
+    assert cut_out(tmp_path / "a.jpg").method == "grabcut"
 
 
 def test_pictures_of_telephones(tmp_path):

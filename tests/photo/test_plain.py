@@ -27,7 +27,7 @@ def test_enclosed_background_and_shadows_go_and_white_matter_stays(scores):
         if case.shadow:
             means.setdefault("shadow", []).append(score)
     assert len(scores) == 40 and len(means[True]) == 20
-    floors = {False: 0.97, True: 0.86, "shadow": 0.87}
+    floors = {False: 0.97, True: 0.87, "shadow": 0.87}
     for group, floor in floors.items():
         assert np.mean(means[group]) > floor, group
 
@@ -49,9 +49,9 @@ def test_holes_may_be_kept(scores):
 
 
 def test_an_object_like_its_background_is_doubted(found):
-    """Counts of docs/reconstruct.md: 12 of 14 that are cut wrong, 2 of 40 that are cut right."""
+    """Counts of docs/reconstruct.md: 10 of 11 that are cut wrong, 1 of 43 that are cut right."""
     doubts = {True: [], False: []}
     for case, matte in (*found, *((case, plain_matte(case.rgb)) for case in near_white())):
         doubts[iou(matte.rgba[..., 3], case.alpha) >= 0.9].append(doubted(case, matte))
-    assert sum(doubts[True]) <= 2 and len(doubts[True]) > 30
+    assert sum(doubts[True]) <= 1 and len(doubts[True]) > 30
     assert np.mean(doubts[False]) > 0.75
