@@ -1,7 +1,8 @@
 """Posed views on disk; ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
 
-Layouts are described in ``layouts.py``. ``split.json`` in the root lists the uids of ``train``,
-``val`` and ``test``; ``split_of`` places other uids by the hash of the name.
+Layouts are described in ``layouts.py``, lists of checked objects in ``manifest.py``. ``split.json``
+in the root lists the uids of ``train``, ``val`` and ``test``; ``split_of`` places other uids by the
+hash of the name.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
@@ -26,11 +27,29 @@ from torch import Tensor
 
 from ..batch import EXPECTED, progress_bar
 from ..cameras import Cameras, from_opengl
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..files import write_json
 from ..images import check_size, load_rgba8, open_picture
 from ..untrusted.documents import read_document
-from .layouts import LAYOUTS, DecodedPicture, EncodedPicture, ObjectFiles, find_objects
+from .layouts import (
+    GOBJAVERSE,
+    GOBJAVERSE_DEPTH,
+    LAYOUTS,
+    DecodedPicture,
+    EncodedPicture,
+    ObjectFiles,
+    find_objects,
+    one_line,
+)
+from .manifest import (
+    MANIFEST,
+    Entry,
+    Manifest,
+    list_of,
+    marks_of,
+    read_manifest,
+    write_manifest,
+)
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of written files; version 1 had fewer objects in one group
@@ -148,13 +167,18 @@ def open_dataset(
         raise UserError(f"layout '{layout}': expected auto, {', '.join(LAYOUTS)}")
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
-    layout, folders = find_objects(root, layout)
-    if not folders:
-        if any(root.glob("shards-*.json")):
-            raise UserError(f"{root}: shards, which only gamba train reads")
-        marks = ", ".join(mark for mark, _ in LAYOUTS.values())
-        raise UserError(f"{root}: no objects found (none of {marks} in any folder)")
-    uids = [folder.relative_to(root).as_posix() for folder in folders]
+    manifest = None
+    if layout == "auto" and (root / MANIFEST).exists():
+        manifest = read_manifest(root)
+        layout, uids = manifest.layout, list(manifest.digests)
+    else:
+        layout, folders, _ = find_objects(root, layout)
+        if not folders:
+            if any(root.glob("shards-*.json")):
+                raise UserError(f"{root}: shards, which only gamba train reads")
+            marks = ", ".join(mark for mark, _ in LAYOUTS.values())
+            raise UserError(f"{root}: no objects found (none of {marks} in any folder)")
+        uids = [folder.relative_to(root).as_posix() for folder in folders]
     count, read = len(uids), partial(_read_folder, root, layout)
     if uids == ["."]:  # the root is an object
         uids, read = [root.resolve().name], partial(_read_root, root, layout)
@@ -164,7 +188,7 @@ def open_dataset(
         uids = [uid for uid in uids if stated.get(uid, split_of(uid)) == split]
         if not uids:
             raise UserError(f"{root}: none of its {count} objects is in the {split} split")
-    return ViewDataset(dict.fromkeys(uids, read), layout, cache, version)
+    return ViewDataset(dict.fromkeys(uids, read), layout, cache, version, manifest=manifest)
 
 
 def _read_folder(root: Path, layout: str, uid: str) -> ObjectFiles:
@@ -178,6 +202,58 @@ def _read_root(root: Path, layout: str, uid: str) -> ObjectFiles:
 def _read_renamed(read: Reader, prefix: int, uid: str) -> ObjectFiles:
     """Read the object of a joined dataset, whose name has ``prefix`` letters more."""
     return read(uid[prefix:])
+
+
+def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
+    """Check every object of a dataset, and write its manifest (``manifest.py``).
+
+    Args:
+        folder: the dataset; an older manifest is replaced.
+
+    Returns:
+        The file, the number of objects, and the reasons by uid of those that cannot be read.
+
+    Raises:
+        UserError: the folder is one object, has no objects, or cannot be written.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder")
+    layout, folders, others = find_objects(root, "auto")
+    if not folders or folders == [root]:
+        raise UserError(f"{root}: {'is one object' if folders else 'no objects found'}")
+    lists = {p.relative_to(root).as_posix().removeprefix("."): list_of(str(p)) for p in others}
+    bad: dict[str, str] = {}
+
+    def entries() -> Iterator[Entry]:
+        named = progress_bar(folders, lines=True, delay=2.0, desc="checking", unit="object")
+        for path in named:
+            uid = path.relative_to(root).as_posix()
+            # Before the objects are read: a change during the reading outdates the manifest.
+            names = _CAMERA_FILES.get(layout, LAYOUTS[layout][:1])
+            marks, digest = marks_of(path, (*names, ".")), "0" * 16
+            files = None
+            try:
+                files = _read_folder(root, layout, uid)
+                _check_pictures(files)
+                digest = content_digest(files)
+            except (UserError, OSError) as error:
+                bad[uid] = one_line(first_line(error))
+            if files is not None and layout == "transforms" and isinstance(files.images[0], Path):
+                pictures = files.images[0].parent.relative_to(path).as_posix()
+                marks = [*marks, *marks_of(path, [pictures])] if pictures != "." else marks
+            yield Entry(uid, digest, bad.get(uid, ""), marks)
+
+    return write_manifest(root, layout, lists, entries(), len(folders)), len(folders), bad
+
+
+# In an object's folder: files and folders whose size and time a manifest compares.
+_CAMERA_FILES = {
+    "transforms": ("transforms.json",),
+    "nerf": ("transforms_train.json", "transforms_val.json", "transforms_test.json"),
+    "gobjaverse": (GOBJAVERSE, GOBJAVERSE_DEPTH),
+    "openlrm": ("intrinsics.npy", "rgba", "pose"),
+}
 
 
 def content_digest(files: ObjectFiles) -> str:
@@ -218,11 +294,15 @@ class ViewDataset:
         layout: str,
         cache: bool,
         split_version: int = SPLIT_VERSION,
+        manifest: Manifest | None = None,
     ) -> None:
         """Make a dataset of the reader of each uid; ``cache`` as for ``open_dataset``."""
         self.uids = list(readers)
         self.layout, self.split_version = layout, split_version
         self._readers = dict(readers)
+        # Of objects that were checked before; by uid.
+        self._digests: dict[str, str] = {} if manifest is None else manifest.digests
+        self._bad: dict[str, str] = {} if manifest is None else manifest.bad
         self._files: dict[str, ObjectFiles] = {}  # the last ones used
         # By path and size: the picture, and the (width, height) of the file.
         self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
@@ -246,7 +326,14 @@ class ViewDataset:
         if twice := sorted(added.keys() & self._readers.keys()):
             raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
         cache = self._pictures is not None
-        return ViewDataset(self._readers | added, self.layout, cache, self.split_version)
+        both = ViewDataset(self._readers | added, self.layout, cache, self.split_version)
+        for known, mine, theirs in (
+            (both._digests, self._digests, other._digests),
+            (both._bad, self._bad, other._bad),
+        ):
+            known |= mine
+            known |= {f"{name}/{uid}": value for uid, value in theirs.items()}
+        return both
 
     def files(self, index: int | str) -> ObjectFiles:
         """Return paths, poses and intrinsics of one object.
@@ -271,7 +358,8 @@ class ViewDataset:
 
     def digest(self, index: int | str) -> str:
         """Return 16 hexadecimal digits of the cameras of an object; raises as ``files``."""
-        return content_digest(self.files(index))
+        uid = self._uid(index)
+        return self._digests.get(uid) or content_digest(self.files(uid))
 
     def _uid(self, index: int | str) -> str:
         if not isinstance(index, str):
@@ -285,9 +373,13 @@ class ViewDataset:
         return len(self.files(index).images)
 
     def check(self) -> dict[str, str]:
-        """Return reasons by uid, for objects with invalid cameras or missing pictures."""
-        bad = {}
-        for uid in progress_bar(self.uids, lines=True, delay=2.0, desc="checking", unit="object"):
+        """Return reasons by uid, for objects with invalid cameras or missing pictures.
+
+        Objects of a manifest were checked before; the others are read, with a progress bar.
+        """
+        bad = {uid: self._bad[uid] for uid in self.uids if uid in self._bad}
+        unknown = [uid for uid in self.uids if uid not in self._digests]
+        for uid in progress_bar(unknown, lines=True, delay=2.0, desc="checking", unit="object"):
             try:
                 _check_pictures(self.files(uid))
             except UserError as error:

@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -560,8 +560,22 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
 }
 
 
-def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
-    """Find the objects' folders at any depth; return their layout, and the folders, sorted.
+class Found(NamedTuple):
+    """Objects under a folder.
+
+    Attributes:
+        layout: name of their layout.
+        objects: their folders, sorted.
+        others: the other folders that were searched.
+    """
+
+    layout: str
+    objects: list[Path]
+    others: list[Path]
+
+
+def find_objects(root: Path, layout: str) -> Found:
+    """Find the objects' folders at any depth.
 
     ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
     Folders with a leading dot are skipped; linked folders are entered (``files.walk``).
@@ -570,7 +584,7 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
         UserError: the folders are nested too deep.
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
-    found = []
+    found, others = [], []
     for folder, subfolders, files in walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _MAX_DEPTH:
             raise UserError(f"{root}: its folders are nested deeper than {_MAX_DEPTH}")
@@ -578,4 +592,6 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
             subfolders.clear()  # objects are not nested
             marks, layout = {mark: marks[mark]}, marks[mark]
             found.append(Path(folder))
-    return layout, sorted(found)
+        else:
+            others.append(Path(folder))
+    return Found(layout, sorted(found), others)

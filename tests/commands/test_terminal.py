@@ -47,6 +47,7 @@ COMMANDS = {
     "folders": "eval-geometry . . --out out --points 100",
     "data render": "data render . --out out --views 1 --size 8 --workers 1",
     "data pack": "data pack set out",
+    "data index": "data index set",
     "train": "train set --preset tiny --out out --steps 1 --lpips off --batch-size 1",
     "eval-views": "eval-views --checkpoint {model} --data set --split all --out out --no-lpips",
     "fit": "fit set --out out --steps 1",

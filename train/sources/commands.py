@@ -253,6 +253,26 @@ def data_objaverse_command(
     return 1 if failures else 0
 
 
+def data_index_command(data: tyro.conf.Positional[Path]) -> int:
+    """Check every object of a dataset once, and list them in DATA/gamba-manifest.jsonl.
+
+    Every command then opens the dataset by this list, with at most three system calls an object,
+    compares sizes and times, and refuses a list that is older than the dataset: run this again.
+
+    Args:
+        data: the dataset's folder.
+    """
+    from gamba_warp.data.dataset import index_dataset
+
+    path, count, bad = index_dataset(data)
+    print(f"{counted(count, 'object')}, {len(bad):,} left out, listed in {path}")
+    for uid, reason in list(bad.items())[:_MAX_SHOWN]:
+        print(f"left out: {uid}: {reason}", file=sys.stderr)
+    if (rest := len(bad) - _MAX_SHOWN) > 0:
+        print(f"left out: {rest:,} more, see {path}", file=sys.stderr)
+    return 1 if bad else 0
+
+
 @ranged
 def data_gso_command(
     out: tyro.conf.Positional[Path],
