@@ -34,12 +34,21 @@ def eval_geometry_command(
         return _explain(options)
     if options.pred is None or options.gt is None:
         raise UserError("give PRED and GT: two files or two folders")
-    from ..report import count_line, json_of
+    from ..report import FAILED, count_line, json_of
     from .pairs import evaluate_shapes
     from .protocol import chosen_protocol
     from .table import text_of
 
     protocol = chosen_protocol(options)
+    if options.sensitivity:
+        from .sensitivity import evaluate_variants
+
+        table, records = evaluate_variants(options, protocol)
+        print(table, end="")
+        failed = [record for record in records if record["status"] == FAILED]
+        for record in failed:
+            print(f"failed: {record['name']}: {record['reason']}", file=sys.stderr)
+        return 1 if failed else 0
     report = evaluate_shapes(options, protocol)
     for text in report["warnings"]:
         print(f"warning: {text}", file=sys.stderr)

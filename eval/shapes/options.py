@@ -64,6 +64,8 @@ class ShapesOptions:
         views: Number of views of the TSDF.
         pixels: Side of the TSDF's depth maps.
         seed: Seed of the random points.
+        sensitivity: Evaluate under every protocol, and under each change of one field of this one:
+            a table of the effect of the protocol, in OUT.
         workers: Pairs evaluated at the same time, each in its own process.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.
@@ -90,5 +92,6 @@ class ShapesOptions:
     views: Views | None = None
     pixels: Pixels | None = None
     seed: Seed | None = None
+    sensitivity: bool = False
     workers: Annotated[int, Meta(ge=1, le=256)] = 1
     strict: bool = False
