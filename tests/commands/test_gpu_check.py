@@ -1,12 +1,19 @@
-"""``python -m tests.gpu.check`` on a CPU, and on a machine without other packages."""
+"""``python -m gamba_warp.gpu_check`` on a CPU: its parts, their end, and a machine without more."""
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
-from gpu import check
+import pytest
+import torch
+
+from gamba_warp import gpu_check
+from gamba_warp.gpu_check import main, run_part
 
 ROOT = Path(__file__).resolve().parents[2]
 HIDE = """
@@ -33,7 +40,7 @@ def test_torch_warp_and_pytest_are_enough(tmp_path):
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
     }
     out = tmp_path / "out"
-    words = ["-m", "tests.gpu.check", "--device", "cpu", "--out", out]
+    words = ["-m", "gamba_warp.gpu_check", "--device", "cpu", "--out", out]
     done = subprocess.run(
         [sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True
     )
@@ -48,6 +55,94 @@ def test_torch_warp_and_pytest_are_enough(tmp_path):
 
 
 def test_all_tests_of_the_kernels_are_found():
-    names = {path.name for path in check.test_files()}
+    names = {path.name for path in gpu_check.test_files()}
     assert {"test_gpu.py", "test_machine.py", "test_rasterize_cuda.py"} <= names
     assert "test_doctor.py" not in names
+
+
+@pytest.mark.parametrize(
+    "arguments, reason",
+    [([], "no CUDA device"), (["--device", "cpu", "--minutes", "0"], "--minutes 0.0")],
+)
+def test_nothing_to_start_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, arguments, reason):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main([*arguments, "--out", str(tmp_path / "new")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("gpu_check: ") and reason in said and said.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_wrong_result_fails(monkeypatch, tmp_path, capsys):
+    from gamba_warp.kernels.cases.problem import Operator
+
+    call = Operator.call
+    monkeypatch.setattr(Operator, "call", lambda *a, **k: call(*a, **k) * 1.001)
+    assert gpu_check.bench("cpu", str(tmp_path)) == 1
+    assert "conv: operator: default, forward: check failed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("tests, bench, code", [(1, 1, 0), (0, 1, 1), (1, 0, 1)])
+def test_both_parts_must_pass(monkeypatch, tmp_path, tests, bench, code):
+    given = []
+
+    def part(name, words, log, seconds):
+        given.append((name, seconds))
+        return bool({"tests": tests, "bench": bench}[name])
+
+    monkeypatch.setattr(gpu_check, "run_part", part)
+    assert main(["--device", "cpu", "--minutes", "2", "--out", str(tmp_path)]) == code
+    assert [name for name, _ in given] == ["tests", "bench"]
+    assert given[0][1] == 60 and 90 < given[1][1] <= 100  # less what a part may take to end
+
+
+ANOTHER = """
+import pathlib, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+pathlib.Path(sys.argv[1]).write_text(str(child.pid))
+time.sleep(60)
+"""
+
+
+def is_gone(number):
+    stat = Path("/proc") / number / "stat"
+    return not stat.exists() or stat.read_text().rsplit(")", 1)[1].split()[0] == "Z"
+
+
+@pytest.mark.parametrize("how", ["interrupted", "late"])
+def test_a_part_is_ended_with_what_it_started(tmp_path, capsys, how):
+    number, words = tmp_path / "number", ("-c", ANOTHER, str(tmp_path / "number"))
+
+    def interrupt():
+        while not (number.exists() and number.read_text()):
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    if how == "interrupted":
+        threading.Thread(target=interrupt, daemon=True).start()
+        with pytest.raises(KeyboardInterrupt):
+            run_part("x", words, tmp_path / "log", 60)
+    else:
+        started = time.time()
+        assert not run_part("x", words, tmp_path / "log", 3)
+        assert time.time() - started < 30
+        assert "x: stopped after 3 s, failed with" in capsys.readouterr().out
+    time.sleep(0.5)
+    assert is_gone(number.read_text())
+
+
+@pytest.mark.parametrize(
+    "code, said",
+    [
+        ("import os; os.write(1, b'first\\nlast\\n'); os.kill(os.getpid(), 11)",
+         "  first\n  last\nx: failed with signal SIGSEGV"),
+        ("import time; print(1)\ntry: time.sleep(9)\nexcept KeyboardInterrupt: print(2)",
+         "  1\n  2\nx: stopped after 2 s, passed"),
+        ("1 / 0", "ZeroDivisionError: division by zero\nx: failed with exit code 1"),
+        ("print('noise')", "  noise\nx: passed"),
+    ],
+    ids=["a crash", "an interrupt", "an exception", "nothing"],
+)  # fmt: skip
+def test_the_end_of_a_part(tmp_path, capsys, code, said):
+    passed = run_part("x", ("-c", code), tmp_path / "log", 2)
+    out = capsys.readouterr().out
+    assert said in out and passed == ("failed" not in said)
