@@ -132,13 +132,7 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     assert options.pred is not None and options.gt is not None  # checked by the command
     dataset, known = open_objects(options.data)
     pairs, failures = find_pairs(options.pred, options.gt, listed, known)
-    if options.limit is not None:
-        from gamba_warp.data.dataset import evenly
-
-        names = {pair.name for pair in pairs} | {each["name"] for each in failures}
-        kept = {*evenly(sorted(names), options.limit)}
-        pairs = [pair for pair in pairs if pair.name in kept]
-        failures = [each for each in failures if each["name"] in kept]
+    pairs, failures = limited(pairs, failures, options.limit)
     folder = output_folder(options.out) if options.out is not None else None
     cache = RecordCache(folder, protocol, options.data)
     with stdout_to_stderr():
@@ -209,6 +203,19 @@ class RecordCache:
         """Remove the file, once the report is written."""
         if self._file is not None:
             self._file.unlink(missing_ok=True)
+
+
+def limited(
+    pairs: list[Pair], failures: list[dict[str, str]], limit: int | None
+) -> tuple[list[Pair], list[dict[str, str]]]:
+    """Keep ``limit`` objects of ``find_pairs``, evenly spaced by name; None keeps all."""
+    if limit is None:
+        return pairs, failures
+    from gamba_warp.data.dataset import evenly
+
+    names = {pair.name for pair in pairs} | {each["name"] for each in failures}
+    kept = {*evenly(sorted(names), limit)}
+    return [p for p in pairs if p.name in kept], [f for f in failures if f["name"] in kept]
 
 
 def find_pairs(

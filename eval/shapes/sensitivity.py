@@ -18,7 +18,7 @@ from ..averages import mean_of
 from ..report import OK, check_finite, finite_or_none, stdout_to_stderr
 from ..tables import Lines, markdown
 from .options import ShapesOptions
-from .pairs import Pair, evaluate_pairs, find_pairs, only, open_objects
+from .pairs import Pair, evaluate_pairs, find_pairs, limited, open_objects
 from .protocol import PRESETS, GeometryProtocol
 from .shape import Similarity
 
@@ -84,7 +84,7 @@ def variants(protocol: GeometryProtocol) -> dict[str, GeometryProtocol]:
 def evaluate_variants(
     options: ShapesOptions, protocol: GeometryProtocol
 ) -> tuple[str, list[dict[str, Any]]]:
-    """Evaluate all pairs under all variants; write sensitivity.json, .md and .svg into OUT.
+    """Evaluate all pairs under all variants; write sensitivity.json and .md into OUT.
 
     Args:
         options: with the files to compare and the folder of the results.
@@ -102,11 +102,7 @@ def evaluate_variants(
     dataset, known = open_objects(options.data)
     folder = None if options.out is None else output_folder(options.out)
     pairs, failures = find_pairs(options.pred, options.gt, known=known)
-    if options.limit is not None:
-        from gamba_warp.data.dataset import evenly
-
-        names = {p.name for p in pairs} | {f["name"] for f in failures}
-        pairs, failures = only(pairs, failures, {*evenly(sorted(names), options.limit)})
+    pairs, failures = limited(pairs, failures, options.limit)
     protocols = variants(protocol)
     vary = partial(vary_pair, protocols=protocols)
     with stdout_to_stderr():

@@ -33,7 +33,6 @@ from ..images import check_size, load_rgba8, open_picture
 from ..untrusted.documents import read_document
 from .layouts import (
     GOBJAVERSE,
-    GOBJAVERSE_DEPTH,
     LAYOUTS,
     DecodedPicture,
     EncodedPicture,
@@ -251,7 +250,7 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
 _CAMERA_FILES = {
     "transforms": ("transforms.json",),
     "nerf": ("transforms_train.json", "transforms_val.json", "transforms_test.json"),
-    "gobjaverse": (GOBJAVERSE, GOBJAVERSE_DEPTH),
+    "gobjaverse": (GOBJAVERSE,),
     "openlrm": ("intrinsics.npy", "rgba", "pose"),
 }
 

@@ -14,7 +14,6 @@ from gamba_warp.eval.shapes.load import load_prediction, load_truth
 from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.pairs import Pair, RecordCache, evaluate_pairs, find_pairs
 from gamba_warp.eval.shapes.protocol import PRESETS
-from gamba_warp.eval.tables import latex
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.surfaces.options import SurfaceOptions
 
@@ -131,9 +130,3 @@ def test_an_interrupted_evaluation_goes_on(folders):
     assert changed.get(changed.key(Pair("gone", folders / "gone", folders / "gone"))) is None
     changed.end()
     assert not noted.exists()
-
-
-def test_rows_of_latex_are_escaped():
-    text = latex([["", "F-score at 50 %"], ["a_b & c#1", "0.5 [0.4, 0.6]"]])
-    assert r"a\_b \& c\#1 & 0.5 [0.4, 0.6] \\" in text and r"50 \%" in text
-    assert text.count("&") == 3 and text.startswith(r"\begin{tabular}{lr}")
