@@ -20,7 +20,6 @@ from gamba_warp.kernels.rasterize import lists_outgrown, rasterization
 from gamba_warp.kernels.runtime.stand_in import kind_of
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 from gamba_warp.measure.models import captured
-from gamba_warp.train.timing import Step
 
 # Allowed relative rms errors: of float32 sums over a few hundred terms; for the scan plus the error
 # of a GPU's exponential; of half precision, which rounds inputs and outputs; and of pictures, where
@@ -169,16 +168,26 @@ def render_all(scene: Scene) -> dict[str, Tensor]:
 
 
 def check_no_wait(device: torch.device) -> None:
-    """Check that torch synchronises with the device in no call after the first."""
-    scene = scene_of(700, 75, 3, {"render_mode": "RGB+D"}, device)
-    for run in (partial(render_all, scene), Step("rays", 2, device).run):
+    """Check that torch synchronises with the device in no rendering after the first."""
+    waits_for_nothing(partial(render_all, scene_of(700, 75, 3, {"render_mode": "RGB+D"}, device)))
+
+
+def check_step(device: torch.device) -> None:
+    """Check the same of a step of ``gamba train``."""
+    from gamba_warp.train.timing import Step  # it needs more packages than the other checks
+
+    waits_for_nothing(Step("rays", 2, device).run)
+
+
+def waits_for_nothing(run: Callable[[], Any]) -> None:
+    """Run a function twice, the second time with every synchronisation an error."""
+    run()
+    before = torch.cuda.get_sync_debug_mode()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
         run()
-        before = torch.cuda.get_sync_debug_mode()
-        torch.cuda.set_sync_debug_mode("error")
-        try:
-            run()
-        finally:
-            torch.cuda.set_sync_debug_mode(before)
+    finally:
+        torch.cuda.set_sync_debug_mode(before)
 
 
 def check_raster_graph(device: torch.device) -> list[int]:

@@ -69,3 +69,10 @@ def test_compile(backend):
 )
 def test_streams_and_graphs(check):
     check(DEVICE)
+
+
+@pytest.mark.gpu
+def test_a_training_step_waits_for_nothing():
+    for name in ("msgspec", "tyro"):
+        pytest.importorskip(name)
+    checks.check_step(DEVICE)

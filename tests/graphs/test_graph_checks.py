@@ -4,6 +4,8 @@ import pytest
 import torch
 from gpu import checks
 
+from gamba_warp.train import timing
+
 CPU = torch.device("cpu")
 
 
@@ -60,23 +62,23 @@ def test_layer(graph):
         checks.check_layer_graph(CPU)
 
 
-def test_no_wait(monkeypatch):
-    """The first calls may wait, the second ones run under torch's own watch, which is put back."""
+@pytest.mark.parametrize("check", ["check_no_wait", "check_step"])
+def test_no_wait(monkeypatch, check):
+    """The first call may wait, the second one runs under torch's own watch, which is put back."""
     modes, ran = ["default"], []
 
-    def run(name):
-        ran.append((name, modes[-1]))
-        if name == "steps" and modes[-1] == "error":
+    def run(*_):
+        ran.append(modes[-1])
+        if modes[-1] == "error":
             raise RuntimeError("called a synchronizing CUDA operation")
 
     monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
     monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", modes.append)
-    monkeypatch.setattr(checks, "render_all", lambda scene: run("splats"))
-    monkeypatch.setattr(checks.Step, "run", lambda self: run("steps"))
+    monkeypatch.setattr(checks, "render_all", run)
+    monkeypatch.setattr(timing.Step, "run", run)
     with pytest.raises(RuntimeError, match="synchronizing"):
-        checks.check_no_wait(CPU)
-    assert ran == [(name, mode) for name in ("splats", "steps") for mode in ("default", "error")]
-    assert modes[-1] == "default"
+        getattr(checks, check)(CPU)
+    assert ran == ["default", "error"] and modes[-1] == "default"
 
 
 def test_compiled():
