@@ -55,7 +55,6 @@ def reconstruct_command(
     save_inputs: bool = False,
     device: DeviceChoice = "auto",
     precision: Precision = "float32",
-    times: bool = False,
 ) -> int:
     """Turn pictures of single objects into 3D Gaussians, in one forward pass each.
 
@@ -80,7 +79,6 @@ def reconstruct_command(
         save_inputs: Also write each cut-out as NAME-input.png, which may be edited and used again.
         device: Device that computes; auto is the GPU if there is one.
         precision: Precision of the network's matrix products; auto is bfloat16 if that is faster.
-        times: Print the time of each stage.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, FILE_NAME, load_model
     from ..model.detail import checked_detail
@@ -140,8 +138,6 @@ def reconstruct_command(
     if outputs.sheet is not None:
         outputs.sheet.write()
     outputs.write_index()
-    if times:
-        print(STAGES.table())
     return report(len(pictures), "picture", failures, files.out)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -11,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ..selective_scan import selective_scan, selective_scan_fn, selective_scan_state
-from ..selective_scan.reference import EXACT, Off, selective_scan_reference
+from ..selective_scan.reference import selective_scan_reference
 from . import scan_oracle
 from .case import COTANGENTS, DTYPES, RANGES, Case, Op, Outcome, Runs, fill, generator, mostly
-from .problem import BOTH, Operator, compare
+from .problem import BOTH, Operator
 from .rounding import Rounding, samples_of
 
 # The relative rms errors to float64 that are allowed. Those of half precision are explained by the
@@ -23,28 +22,6 @@ LIMITS = {"forward": 1e-6, BOTH: 1e-5}
 # With the error of ex2.approx at 16,961 tokens (CUDA.md): 1.9e-6 of the output, 3.3e-5 of dA.
 CUDA_LIMITS = {"forward": 3e-6, BOTH: 4.5e-5}
 HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
-EX2 = 2.0**-22  # the largest relative error of ex2.approx, CUDA's own figure for exp2f
-
-
-def allowances(
-    results: Callable[[Off], Mapping[str, Tensor]], exponential: float = EX2
-) -> dict[str, float]:
-    """Return the error of results that an inexact exponential may cause (CUDA.md, Exponential).
-
-    Args:
-        results: the formulas in float64, their results by name.
-        exponential: its largest relative error.
-
-    Returns:
-        By name the relative rms difference that errors always to one side make: of the decays, and
-        of the steps, where a reciprocal adds half as much.
-    """
-    exact = results(EXACT)
-    found = dict.fromkeys(exact, 0.0)
-    for off in (Off(decay=exponential), Off(step=1.5 * exponential)):
-        for name, value in results(off).items():
-            found[name] += compare({name: value}, {name: exact[name]}).rel_rms
-    return found
 
 
 def make_inputs(

@@ -9,12 +9,13 @@ from functools import partial
 from typing import Any
 
 import torch
+from helpers.scan import allowances
 from torch import Tensor
 
 from gamba_warp.kernels.cases.conv import conv_problem
 from gamba_warp.kernels.cases.problem import BOTH, Error, Operator, compare
 from gamba_warp.kernels.cases.raster import Scene, orbit_cameras, shell
-from gamba_warp.kernels.cases.scan import allowances, make_inputs, scan_problem
+from gamba_warp.kernels.cases.scan import make_inputs, scan_problem
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import lists_outgrown, rasterization
 from gamba_warp.kernels.runtime.stand_in import kind_of

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from gamba_warp.kernels.cases.scan import allowances
+from gamba_warp.kernels.cases import problem
 from gamba_warp.kernels.runtime.stand_in import kind_of
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.problem import DISCRETIZATIONS
-from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+from gamba_warp.kernels.selective_scan.reference import EXACT, Off, selective_scan_reference
 from helpers import assert_rel_rms, on_threads
 
 FORWARD = 1e-6  # float32 rounding of a few hundred dependent steps; measured 1e-7 to 5e-7
@@ -75,6 +75,28 @@ def assert_gradients(ours, exact, limit, half=0.0, heads=None, tiny=0.0, more=No
             bound = limit if got.dtype == torch.float32 else half
             bound += (more or {}).get(name, 0)
             assert_rel_rms(got, want, bound, f"gradient of {name}")
+
+
+EX2 = 2.0**-22  # the largest relative error of ex2.approx, CUDA's own figure for exp2f
+
+
+def allowances(results, exponential=EX2):
+    """Return the error of results that an inexact exponential may cause (CUDA.md, Exponential).
+
+    Args:
+        results: the formulas in float64, their results by name.
+        exponential: its largest relative error.
+
+    Returns:
+        By name the relative rms difference that errors always to one side make: of the decays, and
+        of the steps, where a reciprocal adds half as much.
+    """
+    exact = results(EXACT)
+    found = dict.fromkeys(exact, 0.0)
+    for off in (Off(decay=exponential), Off(step=1.5 * exponential)):
+        for name, value in results(off).items():
+            found[name] += problem.compare({name: value}, {name: exact[name]}).rel_rms
+    return found
 
 
 # Error of a decay on CUDA, if larger than covered by the limits of float32; set by ptx.plugin.

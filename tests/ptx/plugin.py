@@ -8,8 +8,6 @@ import os
 
 import pytest
 
-from gamba_warp.kernels.cases.scan import EX2
-
 from .launch import interpreted
 
 _OPTIONS = {x: int(os.environ.get(f"GAMBA_PTX_{x.upper()}", "0")) for x in ("seed", "approximate")}
@@ -20,7 +18,7 @@ _seen = {"tests": 0, "launches": 0, "instructions of warps": 0}
 
 
 def pytest_collection_modifyitems(items):
-    from helpers.scan import approximate  # after conftest.py, which has its asserts rewritten
+    from helpers.scan import EX2, approximate  # after conftest.py, which has its asserts rewritten
 
     approximate["decay"] = EX2 if _OPTIONS["approximate"] else 0.0
     for item in items:
