@@ -26,6 +26,7 @@ def test_a_second_run_has_the_options_of_the_first(data, tmp_path, capsys):
     for group, values in changed.items():
         first[group] |= values
     assert first == second and len(lines(two, "train")) == 3
+    assert "loss_rdist" not in lines(two, "train")[0]
     # Without --out the same run is resumed, here with another length.
     assert _train(f"--config={one / 'config.json'}", "--steps", 4) == 0
     assert [record["step"] for record in lines(one, "train")] == [1, 2, 3, 4]

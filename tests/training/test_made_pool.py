@@ -7,8 +7,6 @@ import signal
 import numpy as np
 import pytest
 from helpers import micro
-from helpers.micro import run, same_weights
-from helpers.refusals import refused
 
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
@@ -130,29 +128,3 @@ def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, sha
     for number, is_made in enumerate(made):
         same = ours.targets[number].equal(theirs.targets[number])
         assert same == (not is_made)
-
-
-def test_a_resumed_run_has_the_same_bits_and_another_share_is_refused(data, tmp_path, in_process):
-    views = {"made": 0.5}
-    assert run(data, tmp_path / "whole", length={"steps": 4}, views=views) == 0
-    half = tmp_path / "half"
-    assert run(data, half, length={"steps": 4}, views=views, run={"save_every": 2}) == 0
-    resumed = {"resume": str(half / "checkpoints" / "step_000002")}
-    again = tmp_path / "again"
-    assert run(data, again, length={"steps": 4}, views=views, run=resumed) == 0
-    assert same_weights(tmp_path / "whole" / "model.safetensors", again / "model.safetensors")
-    with pytest.raises(UserError, match=r"views\.made \(0\.5 there, 0\.25 here\)"):
-        run(
-            data, tmp_path / "other", length={"steps": 4}, views=views | {"made": 0.25}, run=resumed
-        )
-
-
-@pytest.mark.parametrize(
-    "views, reason",
-    [
-        ({"made": 1.5}, "--made"),
-        ({"made": -0.5}, "--made"),
-    ],
-)
-def test_absurd_options_are_refused(data, tmp_path, views, reason):
-    refused(reason, micro.options, data, tmp_path, views=views)
