@@ -96,8 +96,7 @@ class Calls:
         self.stages, self.out, self.codes, self.pages = [], out, {}, []
         monkeypatch.setattr(command, "_call", self)
         monkeypatch.setattr(
-            "gamba_warp.pages.demo.write_demo",
-            lambda path, results, text: self.pages.append(text),
+            "gamba_warp.pages.demo.write_demo", lambda path, results, text: self.pages.append(text)
         )
 
     def __call__(self, words):

@@ -8,12 +8,7 @@ import torch
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.data.preprocess import (
-    SamSegmenter,
-    composite,
-    recenter,
-    shrink,
-)
+from gamba_warp.data.preprocess import SamSegmenter, composite, recenter, shrink
 from gamba_warp.errors import UserError
 from gamba_warp.images import save_image
 from gamba_warp.photo.cutout import Ways, cut_out

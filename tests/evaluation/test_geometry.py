@@ -12,13 +12,7 @@ from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
 from gamba_warp.eval.shapes.metrics import compare, syncdreamer_points
-from gamba_warp.eval.shapes.occupancy import (
-    VOTERS,
-    grid_around,
-    parity,
-    solid,
-    syncdreamer_grid,
-)
+from gamba_warp.eval.shapes.occupancy import VOTERS, grid_around, parity, solid, syncdreamer_grid
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, nearest, sample
 from gamba_warp.gaussians import Gaussians

@@ -9,13 +9,7 @@ from helpers.views import around, eval_views, straight, write_views
 
 from gamba_warp.cli import run
 from gamba_warp.conventions import over_another, over_background
-from gamba_warp.eval.report import (
-    failure,
-    intervals_of,
-    make_report,
-    mean_of,
-    save_report,
-)
+from gamba_warp.eval.report import failure, intervals_of, make_report, mean_of, save_report
 from gamba_warp.eval.shapes.metrics import surface_metrics, volume_iou
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Points

@@ -7,15 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
-from helpers.images import (
-    ADOBE_RGB,
-    DISPLAY_P3,
-    SRGB,
-    bad_files,
-    colour_profile,
-    colours,
-    encoded,
-)
+from helpers.images import ADOBE_RGB, DISPLAY_P3, SRGB, bad_files, colour_profile, colours, encoded
 from helpers.refusals import refused, refused_at
 from PIL import EpsImagePlugin, Image, ImageOps
 

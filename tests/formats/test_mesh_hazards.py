@@ -219,10 +219,7 @@ def _many(count, entry):
 
 
 _NONE = {"componentType": 5121, "bufferView": None}  # values without bytes are 0
-_SPREAD = {
-    "extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1}}},
-    "mesh": 0,
-}
+_SPREAD = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1}}}, "mesh": 0}
 _MORE = [ACCESSOR, ACCESSOR | {"bufferView": None, "count": 150_000}]
 # Documents of up to a megabyte that stand for much more.
 SMALL = {
@@ -255,10 +252,7 @@ SMALL = {
         "meshes": [{"primitives": [{"attributes": {"POSITION": 1}}] * 1_000}],
         "accessors": [ACCESSOR, ACCESSOR | {"bufferView": None, "count": 1_200}],
     },
-    "nodes": {
-        "nodes": [{"mesh": 0}] * 55_000,
-        "scenes": [{"nodes": list(range(55_000))}],
-    },
+    "nodes": {"nodes": [{"mesh": 0}] * 55_000, "scenes": [{"nodes": list(range(55_000))}]},
     "moved nodes": {
         "nodes": [{"mesh": 0, "translation": [1, 2, 3], "scale": [1, 1, 2]}] * 15_000,
         "scenes": [{"nodes": list(range(15_000))}],

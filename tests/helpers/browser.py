@@ -102,8 +102,7 @@ def browser_page(browser) -> Iterator[Callable[..., Opened]]:
         context.set_default_timeout(30_000)
         result = Opened(context.new_page())
         result.page.on(
-            "console",
-            lambda message: complains(message) and result.messages.append(message.text),
+            "console", lambda message: complains(message) and result.messages.append(message.text)
         )
         result.page.on("pageerror", lambda error: result.messages.append(str(error)))
         result.page.goto(place.resolve().as_uri() if isinstance(place, Path) else place)

@@ -14,13 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from gamba_warp.errors import UserError
-from gamba_warp.model.checkpoint import (
-    ENCODER_NAME,
-    FILE_NAME,
-    load_model,
-    save_folder,
-    save_model,
-)
+from gamba_warp.model.checkpoint import ENCODER_NAME, FILE_NAME, load_model, save_folder, save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.checkpoint import load_weights
 

@@ -239,11 +239,7 @@ def test_at_the_start_the_picture_is_the_billboard():
     config = rays(image_size=48, ray_cells=4, width=8)
     with torch.no_grad():
         made = Gamba(config)(rgba[None], one(cameras, 0))
-    shown = render(
-        made,
-        Cameras(cameras.viewmats[None], cameras.Ks[None], 48, 48),
-        torch.ones(3),
-    )
+    shown = render(made, Cameras(cameras.viewmats[None], cameras.Ks[None], 48, 48), torch.ones(3))
     rgb = shown.rgb[0].clamp(0, 1)
     # The smallest Gaussian blurs the rim, which is a tenth of this small disc.
     assert psnr(rgb, flat).min() > 27 and ssim(rgb, flat).min() > 0.94

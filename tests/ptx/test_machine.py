@@ -48,10 +48,7 @@ FAULTS = {
     "another warp after that": (PUT + "bar.warp.sync -1;" + FAR, {RACE}),
     "another warp after a barrier of the block": (PUT + "bar.sync 0;" + FAR, set()),
     "a vote orders no memory": (PUT + ODD + VOTE + NEXT, {RACE}),
-    "written after it was read": (
-        PUT + "bar.sync 0;" + FAR + "st.shared.u32 [%r4], %r2;",
-        {RACE},
-    ),
+    "written after it was read": (PUT + "bar.sync 0;" + FAR + "st.shared.u32 [%r4], %r2;", {RACE}),
     "never written": ("bar.sync 0;" + FAR, {UNWRITTEN}),
     "never written, never used": (
         "ld.shared.u32 %r7, [%r4+512]; mov.u32 %r8, %r7; st.global.u32 [%rd4], %r1;",
@@ -73,10 +70,7 @@ FAULTS = {
         {"divergent barrier"},
     ),
     "a guarded barrier": (ODD + "@%p1 bar.sync 0;", {"divergent barrier"}),
-    "half a warp votes": (
-        ODD + f"@%p1 bra $A; {VOTE} bra $B; $A: {VOTE} $B:",
-        {"deadlock"},
-    ),
+    "half a warp votes": (ODD + f"@%p1 bra $A; {VOTE} bra $B; $A: {VOTE} $B:", {"deadlock"}),
     "a vote without its lanes": (
         ODD + "vote.sync.ballot.b32 %r8, %p1, 15; st.global.u32 [%rd4], %r8;",
         {"mask of lanes that are not there"},
@@ -559,14 +553,7 @@ def test_operations_are_ptx(tmp_path):
     )
     path = tmp_path / "k.ptx"
     path.write_text("\n".join([HEAD, *entries]))
-    command = [
-        ptxas,
-        "--gpu-name=sm_90",
-        "-O0",
-        path,
-        "-o",
-        tmp_path / "k.cubin",
-    ]
+    command = [ptxas, "--gpu-name=sm_90", "-O0", path, "-o", tmp_path / "k.cubin"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

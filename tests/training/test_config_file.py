@@ -58,10 +58,7 @@ def test_data_may_be_another(tmp_path):
         (b'{"data": "x", "preset": "tiny", "optim": 3}', "optim: Expected `object`"),
         (b'{"data": "--out=/", "preset": "tiny"}', "'--out=/' is not a valid value"),
         (b'{"data": "x", "preset": "tiny", "optim": {"lr": "fast"}}', "lr: Expected `float`, got"),
-        (
-            b'{"data": "x", "preset": "tiny", "optim": {"lr": {}}}',
-            "lr: Expected `float`",
-        ),
+        (b'{"data": "x", "preset": "tiny", "optim": {"lr": {}}}', "lr: Expected `float`"),
     ],
 )
 def test_bad_files_are_one_line(tmp_path, content, words):

@@ -218,11 +218,7 @@ BAD = {
         "the pose has shape",
     ),
     "pixels of no size": (
-        {
-            "camera_angle_x": 1,
-            "cx": 9,
-            "frames": [{"transform_matrix": np.eye(4).tolist()}],
-        },
+        {"camera_angle_x": 1, "cx": 9, "frames": [{"transform_matrix": np.eye(4).tolist()}]},
         "cx is in pixels, so w and h are needed",
     ),
     "sizes": (
