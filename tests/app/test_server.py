@@ -97,12 +97,6 @@ def test_a_session_is_told_apart_by_its_visitor(place):
     assert not inside and sent[0]["status"] == 403
 
 
-@pytest.mark.parametrize("value", ["bytes=0-1", "bytes=7-", "bytes=-2"])
-def test_plain_ranges_are_let_in(value):
-    [scope] = answered("localhost", path="/theme.css", more=[(b"range", value.encode())])[1]
-    assert (b"range", value.encode()) in scope["headers"]
-
-
 @pytest.mark.parametrize(
     "values",
     [
