@@ -113,28 +113,3 @@ def test_a_picture_without_an_object_is_one_line(tmp_path, checkpoints, capsys, 
     assert len([s for s in said if "gamba: no matting model" not in s]) == 1
     assert line.startswith(f"gamba: failed: {path}: ") and reason in line
     assert not any(out.iterdir())
-
-
-@pytest.mark.parametrize("decoder", MODELS)
-@torch.inference_mode()
-def test_a_batch_may_hold_an_empty_object(decoder):
-    torch.manual_seed(0)
-    config = MODELS[decoder]
-    model = Gamba(config).eval()
-    channels = config.input_channels
-    full = torch.rand(1, 32, 32, channels)
-    empty = torch.ones(1, 32, 32, channels)
-    if channels == 4:
-        full[..., 3], empty[..., 3] = 1.0, 0.0
-    both = model(torch.cat([full, empty]), reference_cameras(config, 2))
-    alone = model(full, reference_cameras(config, 1))
-    # sums of another batch size may round otherwise
-    torch.testing.assert_close(both.means[:1], alone.means, rtol=0, atol=1e-5)
-    torch.testing.assert_close(both.opacities[:1], alone.opacities, rtol=0, atol=1e-5)
-    nothing = model(empty, reference_cameras(config, 1))
-    for gaussians in (both, nothing):
-        assert gaussians.means.isfinite().all() and gaussians.colors.isfinite().all()
-        picture = render(gaussians, reference_cameras(config, len(gaussians.means))[:, None])
-        assert picture.rgb.isfinite().all()
-    if decoder == "rays":
-        assert nothing.means.shape == (1, 0, 3) and both.opacities[1].max() == 0

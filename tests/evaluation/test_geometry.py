@@ -275,7 +275,6 @@ def test_what_a_protocol_needs_and_a_file_has_not(tmp_path, name):
         ("missing", [], "pred"),
         ("empty", [], "pred"),
         ("mixed", [], "two files"),
-        ("few", ["--voxels", "2"], "--voxels"),
         ("data", ["--frame", "reference"], "--data"),
     ],
 )

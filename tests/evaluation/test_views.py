@@ -184,8 +184,6 @@ def test_lpips_with_weights(data, painted):
         ("absent", [], "absent"),
         ("data", [], "no such folder"),
         ("empty", [], "neither"),
-        ("pred", ["--limit", "0"], "--limit"),
-        ("pred", ["--distance", "0"], "--distance"),
         ("split", ["--split", "test"], "test split"),
     ],
 )

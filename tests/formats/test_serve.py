@@ -3,6 +3,7 @@
 import socket
 import threading
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 
@@ -23,8 +24,8 @@ def address(monkeypatch) -> Iterator[tuple[str, int]]:
     server.server_close()
 
 
-def read(address) -> bytes:
-    with urllib.request.urlopen(f"http://{address[0]}:{address[1]}/", timeout=5) as answer:
+def read(address, path="") -> bytes:
+    with urllib.request.urlopen(f"http://{address[0]}:{address[1]}/{path}", timeout=5) as answer:
         return answer.read()
 
 
@@ -37,6 +38,8 @@ def test_it_serves_while_clients_stall(address):
     with socket.create_connection(address), socket.create_connection(address) as half:
         half.sendall(b"GET / HT")
         assert read(address) == b"hello" * 100_000
+        with pytest.raises(urllib.error.HTTPError):
+            read(address, "etc/passwd")
 
 
 @pytest.mark.parametrize(

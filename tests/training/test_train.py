@@ -307,9 +307,6 @@ def test_bad_data_and_bad_options(data, tmp_path):
     (tmp_path / "file").write_text("")
     refused("file", run, data, tmp_path / "file" / "run")
     refused("no such folder", run, tmp_path / "missing", tmp_path / "run")
-    refused("--lr -1.0: must be above 0", run, data, tmp_path / "run", optim={"lr": -1.0})
-    refused("--made", run, data, tmp_path / "run", views={"made": 1.5})
-    refused("--made", run, data, tmp_path / "run", views={"made": -0.5})
     with pytest.raises(UserError, match="nofield"):
         config = micro.options(data, tmp_path / "run")
         type(config)(**{**vars(config), "set": ("nofield=3",)}).model_config()
