@@ -141,28 +141,6 @@ def test_density_of_many_is_the_union():
     assert error.max() < 0.05 and error.mean() < 2e-3  # tails under 0.005 differ
 
 
-def test_density_of_a_shell():
-    """One closed surface, filled, outside the centres by about the Gaussians' width."""
-    sigma = 0.012
-    mesh = to_surface(shell(0.4, sigma=sigma), SurfaceOptions(method="density", voxels=64), 0, 0)
-    radii = np.linalg.norm(mesh.vertices, axis=1)
-    assert mesh.is_closed()
-    assert radii.min() > 0.4  # no inner wall
-    assert abs(radii.mean() - 0.4) < 2.5 * sigma
-    grid = grid_around(mesh, resolution=32)
-    assert abs(solid(mesh, grid).sum() / 32**3 - 4 / 3 * math.pi * radii.mean() ** 3) < 0.01
-
-
-def test_tsdf_of_a_shell():
-    options = SurfaceOptions(voxels=64, views=24, pixels=96)
-    mesh = to_surface(shell(0.4), options, 0, 0)
-    radii = np.linalg.norm(mesh.vertices, axis=1)
-    assert abs(np.median(radii) - 0.4) < 1 / 64  # within a voxel
-    assert np.mean(np.abs(radii - 0.4) < 2 / 64) > 0.98
-    grid = grid_around(mesh, resolution=32)
-    assert abs(solid(mesh, grid).sum() / 32**3 - 4 / 3 * math.pi * 0.4**3) < 0.03
-
-
 def test_centers_are_drawn_by_opacity():
     one = shell(0.4, count=2)
     one.opacities = torch.tensor([0.25, 0.75])
@@ -171,12 +149,11 @@ def test_centers_are_drawn_by_opacity():
     assert abs(share - 0.75) < 0.03  # four standard deviations of 4000 draws
 
 
-@pytest.mark.parametrize("method", ["density", "centers", "tsdf"])
-def test_nothing_visible(method):
+def test_nothing_visible():
     faint = shell(0.4, count=50)
     faint.opacities = torch.zeros(50)
     with pytest.raises(UserError, match="Gaussian"):
-        to_surface(faint, SurfaceOptions(method=method), 0, 10)
+        to_surface(faint, SurfaceOptions(method="centers"), 0, 10)
 
 
 def test_points_are_repeatable_and_area_uniform():

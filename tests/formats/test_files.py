@@ -200,6 +200,8 @@ def test_who_reads_the_older_file_reads_it_to_its_end(tmp_path):
             temporary.write_text("new")
         assert reader.read() == "old" * 99_999
     assert path.read_text() == "new"
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 def test_a_folder_has_no_files_name(tmp_path, monkeypatch):
