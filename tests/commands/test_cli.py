@@ -264,15 +264,20 @@ NONSENSE = {
         "voxels": "7 1000000", "views": "0 1000000", "pixels": "0 1000000", "faces": "-1",
         "close-holes": "-1", "smooth": "-1 100000", "min-component": "nan -1 1", "size": "8 100000",
         "min-opacity": "nan -1 2", "frames": "1 1000000000",
+        "elevation": "91 nan", "fov": "0 180", "distance": "nan 0",
     },
-    "reconstruct PICTURE": {"size": "8 100000", "frames": "1 1000000000", "min-opacity": "nan -1"},
-    "view FILE": {"port": "-1 65536"},
+    "reconstruct PICTURE": {
+        "size": "8 100000", "frames": "1 1000000000", "min-opacity": "nan -1",
+        "elevation": "91 nan", "fov": "0 180", "distance": "nan 0",
+    },
+    "view FILE": {"port": "-1 65536", "elevation": "91", "fov": "0 180", "distance": "nan 0"},
     "ablate ours DATA": {
         "steps": "0 -1", "minutes": "0 nan inf", "objects": "0 -1", "views": "1 1000000",
         "size": "15 100000", "geometry-objects": "0", "jobs": "0 1000", "threads": "0 1000000",
         "seeds": "-1 4294967296",
     },
     "demo": {"minutes": "0 -1 nan inf"},
+    "render FILE --out OUT": {"elevation": "91", "fov": "0 180", "distance": "nan 0"},
     "bench scan": {"threads": "0 -1 1000000"},
     "stress scan": {
         "seed": "-1", "minutes": "0 nan inf", "cases": "0 -1", "threads": "0 1000000",

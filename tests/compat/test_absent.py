@@ -2,11 +2,9 @@
 
 import importlib
 import importlib.util
-import re
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 from typing import Optional
 
 import pytest
@@ -14,7 +12,6 @@ import torch
 
 from gamba_warp.compat import causal_conv1d, gsplat, mamba_ssm
 
-DOCS = Path(__file__).parents[2] / "docs"
 PACKAGES = {"gsplat": gsplat, "mamba": mamba_ssm, "causal_conv1d": causal_conv1d}
 NAMES = [
     pytest.param(package, path, names, id=f"{key}.{path}")
@@ -119,22 +116,6 @@ def test_names_that_are_here_are_so_under_every_path():
     wrapper = importlib.import_module("gamba_warp.compat.gsplat.cuda._wrapper")
     assert wrapper.rasterize_to_pixels is gsplat.rasterize_to_pixels
     assert gsplat.cuda._wrapper is wrapper
-
-
-@pytest.mark.parametrize(
-    "page, packages",
-    [("drop-in-gsplat.md", [gsplat]), ("drop-in-mamba.md", [mamba_ssm, causal_conv1d])],
-)
-def test_the_pages_list_them_all(page, packages):
-    text = (DOCS / page).read_text(encoding="utf-8")
-    (section,) = re.findall(r"(?s)\n## Unsupported names\n(.*?)\n## ", text)
-    tables = re.findall(r"(?s)\| --- \| --- \|\n(.*?)\n\n", section + "\n\n")
-    for table, package in zip(tables, packages, strict=True):
-        listed = {}
-        for row in table.splitlines():
-            module, names = row.strip("| ").split(" | ")
-            listed[module.strip("`").replace("the package", "")] = re.findall(r"`(\w+)`", names)
-        assert listed == package.ABSENT
 
 
 def test_nothing_of_gsplat_is_missing():

@@ -1,8 +1,6 @@
 """``rasterization`` with gsplat's signature: pictures, ``meta``, options, refusals."""
 
 import inspect
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -262,14 +260,6 @@ def test_refusals(name):
     with pytest.raises(ValueError, match=rf"^{name} .*allowed (is|are) ") as error:
         rasterization(**{**scene_of(), name: OPTIONS[name]})
     assert len(str(error.value).splitlines()) == 1
-
-
-def test_the_page_says_what_is_refused():
-    text = (Path(__file__).parents[2] / "docs/drop-in-gsplat.md").read_text(encoding="utf-8")
-    rows = [row.split(" | ") for row in text.splitlines() if row.startswith("| ")]
-    refused = [row[0] for row in rows if len(row) > 1 and row[1].startswith("refused")]
-    names = {name for cell in refused[:8] for name in re.findall(r"`(\w+)`", cell)}
-    assert names == {*MUST_BE_DEFAULT, "rolling_shutter"}
 
 
 def test_signature():

@@ -331,30 +331,6 @@ def test_paths_of_the_original(path, names):
     assert list(mamba_ssm.__all__) == sorted(mamba_ssm.__all__)
 
 
-def test_generation_letter_by_letter_gives_what_the_whole_text_gives():
-    """A small language model: the prompt at once, then each letter from the states."""
-    prompt = torch.tensor([[3, 1, 4, 1, 5]])
-    embedding, head = torch.nn.Embedding(11, 16), torch.nn.Linear(16, 11, bias=False)
-    layers = [Mamba(16, layer_idx=i) for i in range(2)]
-
-    def model(letters, cache=None):
-        hidden = embedding(letters)
-        for layer in layers:
-            hidden = hidden + layer(hidden, inference_params=cache)
-        return head(hidden)
-
-    cache = InferenceParams(max_seqlen=17, max_batch_size=1)
-    given, written = prompt, [prompt]
-    with torch.no_grad():
-        for _ in range(12):
-            letter = model(given, cache)[:, -1].argmax(-1, keepdim=True)
-            cache.seqlen_offset += given.shape[1]
-            given = letter
-            written.append(letter)
-        text = torch.cat(written, 1)
-        assert torch.equal(model(text)[0, 4:-1].argmax(-1), text[0, 5:])
-
-
 def test_layers_of_one_kind_have_one_result(capsys):
     """docs/examples/layer_speed.py, small: mambapy's layer and the formula against ours."""
     pytest.importorskip("mambapy")

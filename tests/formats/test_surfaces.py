@@ -252,11 +252,6 @@ def test_unit_frame_passes_over_floaters():
     assert np.abs(center.numpy() - [3, 4, 5]).max() < 0.3 and abs(side / 40 - 1) < 0.03
 
 
-@pytest.mark.parametrize("options", [{"voxels": 4}, {"voxels": 4096}, {"views": 1}, {"pixels": 3}])
-def test_options_out_of_range(options):
-    refused("--" + next(iter(options)), SurfaceOptions(**options).check)
-
-
 def test_a_grid_that_is_too_large():
     corners = np.array([[x, y, z] for x in (-0.9, 0.9) for y in (-0.9, 0.9) for z in (-0.9, 0.9)])
     assert (1.8 * 1024) ** 3 > MOST_POINTS

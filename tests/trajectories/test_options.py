@@ -102,10 +102,3 @@ def test_export_and_view_start_from_there(tmp_path, monkeypatch):
     arguments = [str(tmp_path / "a.ply"), "--out", str(page), "--no-open-browser", *view]
     assert run("view", arguments) == 0
     assert camera_of(page.read_text()) == (3, 30, 25)
-
-
-@pytest.mark.parametrize("command", ["reconstruct", "export", "view"])
-@pytest.mark.parametrize("option", ["--elevation 91", "--fov 0", "--distance nan"])
-def test_numbers_out_of_range_are_one_line(tmp_path, command, option, capsys):
-    assert run(command, [str(tmp_path / "a.ply"), *option.split()]) == 2
-    assert capsys.readouterr().err.strip().splitlines()[-1].startswith(f"gamba: {option}")
