@@ -88,28 +88,3 @@ def test_a_white_object_on_white_is_seen_by_its_alpha(tmp_path, checkpoints):
         assert abs(longest - 0.8 * 32) <= 2
         if path.stem == "white":  # and no black comes through from behind
             assert (seen.rgb[0] / seen.alpha[0])[inside].min() > 0.9
-
-
-REFUSED = {
-    "empty": (np.zeros((SIDE, SIDE)), "no object found; pixels that are not background: 0,"),
-    "one": (
-        np.eye(SIDE)[:, :1] @ np.eye(SIDE)[:1],
-        "pixels that are not background: 1, needed: 16",
-    ),
-    "opaque": (np.ones((SIDE, SIDE)), "cannot tell object from background"),
-    "clear": (np.zeros((1, 1)), "no object found; pixels that are not background: 0,"),
-    "white": (np.ones((1, 1)), "no object found; pixels that are not background: 0,"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_picture_without_an_object_is_one_line(tmp_path, checkpoints, capsys, name):
-    alpha, reason = REFUSED[name]
-    path = save(tmp_path, name, alpha)
-    out = tmp_path / "out"
-    assert reconstruct(path, "--checkpoint", checkpoints / "rays.safetensors", "--out", out) == 1
-    said = [s for s in capsys.readouterr().err.splitlines() if s.startswith("gamba: ")]
-    *_, line = said
-    assert len([s for s in said if "gamba: no matting model" not in s]) == 1
-    assert line.startswith(f"gamba: failed: {path}: ") and reason in line
-    assert not any(out.iterdir())
