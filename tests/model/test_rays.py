@@ -73,18 +73,6 @@ def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
         assert together.opacities[index, alone.num :].eq(0).all()
 
 
-def test_what_fills_up_a_batch_gets_and_gives_no_gradient():
-    model, (rgba, cameras) = trained(rays()), cut_outs()
-    grads = []
-    for pictures, views in ((rgba[:1], one(cameras, 0)), (rgba, cameras)):
-        made = model(pictures, views)
-        loss = sum((value[0, : 9 * 3] ** 2).sum() for value in (made.means, made.colors))
-        grads.append(torch.autograd.grad(loss, list(model.parameters()), allow_unused=True))
-    for (name, _), alone, padded in zip(model.named_parameters(), *grads):
-        if alone is not None:
-            torch.testing.assert_close(padded, alone, rtol=1e-4, atol=1e-5, msg=name)
-
-
 @pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])
 def test_gradients_of_a_batch_are_those_of_its_pictures(encoder):
     """Of four pictures in one row of tokens, one of them empty."""

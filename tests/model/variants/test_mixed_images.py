@@ -3,19 +3,22 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.model import assert_each_alone, assert_recomputed_alike, inputs, micro
+from helpers.model import (
+    assert_each_alone,
+    assert_plain_form,
+    assert_recomputed_alike,
+    inputs,
+    micro,
+    moved_blocks,
+)
 from helpers.refusals import refused
 
-from gamba_warp.model.gamba import Gamba, make_blocks
+from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.block import mixed_positions, prefix_states, run_blocks
 
 
 def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
-    blocks = make_blocks(micro(image_tokens="mixed", depth=3, **changes), camera, image)
-    with torch.no_grad():
-        for parameter in blocks.parameters():  # none is 0 or 1 by chance, or as in another block
-            parameter += 0.1 * torch.randn_like(parameter)
-    return blocks
+    return moved_blocks(micro(image_tokens="mixed", depth=3, **changes), camera, image)
 
 
 def plain(blocks, tokens, camera, image):
@@ -45,21 +48,8 @@ def plain(blocks, tokens, camera, image):
 )
 def test_equals_the_plain_form(camera, count, length):
     blocks = blocks_of(camera, 11 if count else 0, norm="rms" if camera else "layer")
-    leaves = {"tokens": torch.randn(2, length, 16)}
-    if camera:
-        leaves["camera"] = torch.randn(2, 1, camera)
-    if count:
-        leaves["image"] = torch.randn(2, count, 11)
-    condition = leaves.get("camera"), leaves.get("image")
-    named = {n: x.requires_grad_() for n, x in leaves.items()} | dict(blocks.named_parameters())
-    want = plain(blocks, leaves["tokens"], *condition)
-    got = run_blocks(blocks, leaves["tokens"], prefix_states(blocks, *condition))
     # Float32 sums in another order, through three blocks.
-    assert_rel_rms(got, want, 1e-6, "tokens")
-    cotangent = torch.randn(2, length, 16)
-    wanted, gotten = (torch.autograd.grad(out, [*named.values()], cotangent) for out in (want, got))
-    for name, grad, other in zip(named, wanted, gotten):
-        assert_rel_rms(other, grad, 1e-5, name)
+    assert_plain_form(plain, blocks, length, camera, (count, 11 if count else 0), 1e-6)
 
 
 def test_places_known_answer():
