@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.app import FORM, form
+from helpers.refusals import refused
 
 from gamba_warp.app import guard, server, visitor_files
 from gamba_warp.app.main_thread import MainThread
@@ -360,8 +361,7 @@ def test_a_port_in_use_is_one_line():
     with server.listener(0) as taken:
         host, port = taken.getsockname()
         assert host == "127.0.0.1" and 0 < port < 65536
-        with pytest.raises(UserError, match=f"--port {port}: Address already in use"):
-            server.listener(port)
+        refused(f"--port {port}: Address already in use", server.listener, port)
     server.listener(port).close()
 
 

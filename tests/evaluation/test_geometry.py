@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.refusals import refused
 from helpers.views import cloud_of, evaluated
 
 from gamba_warp.cameras import fibonacci_sphere
-from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
 from gamba_warp.eval.shapes.metrics import compare, syncdreamer_points
 from gamba_warp.eval.shapes.occupancy import VOTERS, grid_around, parity, solid, syncdreamer_grid
@@ -152,8 +152,7 @@ def test_centers_are_drawn_by_opacity():
 def test_nothing_visible():
     faint = shell(0.4, count=50)
     faint.opacities = torch.zeros(50)
-    with pytest.raises(UserError, match="Gaussian"):
-        to_surface(faint, SurfaceOptions(method="centers"), 0, 10)
+    refused("Gaussian", to_surface, faint, SurfaceOptions(method="centers"), 0, 10)
 
 
 def test_points_are_repeatable_and_area_uniform():

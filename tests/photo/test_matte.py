@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.images import disc_on_noise
 from helpers.matting import matting_network
+from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp import cli
@@ -83,11 +84,9 @@ def test_files_that_are_no_matting_models(tmp_path, data, reason):
 
 def test_a_model_that_is_no_file(tmp_path):
     for path, reason in ((tmp_path / "none", "no such file"), (tmp_path, "not a plain file")):
-        with pytest.raises(UserError, match=reason):
-            Matte(path)
+        refused(reason, Matte, path)
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(UserError, match="not a plain file"):
-        Matte(tmp_path / "pipe")
+    refused("not a plain file", Matte, tmp_path / "pipe")
 
 
 def _die(task):
@@ -96,8 +95,7 @@ def _die(task):
 
 def test_a_crash_of_the_runtime_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(matte.models, "alpha_of", _die)
-    with pytest.raises(UserError, match=r"--matte-model .*its process died of signal 9"):
-        Matte(network(tmp_path))
+    refused(r"--matte-model .*its process died of signal 9", Matte, network(tmp_path))
 
 
 def test_the_command_says_the_way_and_writes_the_input(tmp_path, capsys):

@@ -7,9 +7,9 @@ import signal
 import numpy as np
 import pytest
 from helpers import micro
+from helpers.refusals import refused
 
 from gamba_warp.data.dataset import ViewDataset
-from gamba_warp.errors import UserError
 from gamba_warp.train.batches import Batches, open_data
 from gamba_warp.train.data import pool as pools
 from gamba_warp.train.data.made import make_object
@@ -106,8 +106,7 @@ class Deadly:
 
 def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeypatch):
     monkeypatch.setattr(pools, "_make_views", Deadly())
-    with pytest.raises(UserError, match=r"made object \d+: its process died of signal 9"):
-        opened(views=None).take(0)
+    refused(r"made object \d+: its process died of signal 9", opened(views=None).take, 0)
 
 
 @pytest.mark.parametrize("share, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])
