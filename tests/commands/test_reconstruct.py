@@ -312,10 +312,8 @@ def test_nothing_that_is_read_is_replaced(tmp_path, checkpoint, capsys, which):
     files = {"picture": photo, "mask": mask, "checkpoint": model} | {which: victim}
     before = {path: path.read_bytes() for path in files.values()}
     options = ["--mask", files["mask"], "--checkpoint", files["checkpoint"], "--out", tmp_path]
-    code = run_reconstruct(files["picture"], *options)
-    assert code == 2
-    said = capsys.readouterr().err
-    assert said == f"gamba: {victim}: would be overwritten by an output; give another --out\n"
+    said = f"gamba: {victim}: would be overwritten by an output; give another --out"
+    refused_command(capsys, "reconstruct", [files["picture"], *options], said)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 

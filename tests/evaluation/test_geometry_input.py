@@ -329,11 +329,6 @@ def test_an_evaluation_is_repeated_from_its_report(tmp_path, capfd):
     assert len(lines) == 2 and lines[0].startswith("name,status,chamfer") and "a,ok" in lines[1]
 
 
-def test_json_or_csv(tmp_path, capsys):
-    assert run("eval-geometry", [str(tmp_path), str(tmp_path), "--json", "--csv"]) == 2
-    assert "--json and --csv" in capsys.readouterr().err
-
-
 def test_one_crash_stops_no_other(tmp_path, capfd, monkeypatch):
     """Output of libraries does not get into the report on stdout either."""
     broken = partial(pairs.evaluate_pairs, evaluate=talking_pair)

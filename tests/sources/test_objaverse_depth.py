@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.published.gobjaverse import SIZE, camera, members, write_object, write_tar
+from helpers.refusals import refused_command
 
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
@@ -25,10 +26,8 @@ def test_without_the_package_it_is_one_line(tmp_path, monkeypatch, capsys):
     write_object(tmp_path / "set" / "0" / "1", "readme", VIEWS)
     monkeypatch.setattr(objaverse_views, "find_spec", lambda name: None)
     words = [str(tmp_path / "out"), "--source", str(tmp_path / "set"), "--depth"]
-    assert run("data objaverse", words) == 2
-    assert capsys.readouterr().err == "gamba: --depth: needs the package OpenEXR: " + (
-        "pip install OpenEXR\n"
-    )
+    said = "gamba: --depth: needs the package OpenEXR: pip install OpenEXR"
+    refused_command(capsys, "data objaverse", words, said)
     assert not (tmp_path / "out").exists()
 
 

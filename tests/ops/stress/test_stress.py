@@ -277,13 +277,6 @@ def test_interrupted_keeps_what_was_found(tmp_path, monkeypatch, capsys):
     assert "interrupted" in capsys.readouterr().out
 
 
-def test_an_unknown_case_is_told_in_one_line(capsys):
-    assert exit_code("sort") == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "unknown case 'sort'; there are scan, raster, model and all" in said
-
-
 def test_constant_input_matrix_sums_its_gradient_in_float32():
     """Found by this command: tokens and repeated groups were summed in bfloat16 and float16."""
     torch.manual_seed(0)
