@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers import assert_default_dtype_changes_nothing, assert_rel_rms, in_default_float64
-from helpers.mamba import block_in_float64, run, scan_in_float64
+from helpers.mamba import block_in_float64, layer_in_float64, run, scan_in_float64
 
 from gamba_warp.compat import mamba_ssm
 from gamba_warp.compat.mamba_ssm import (
@@ -221,11 +221,8 @@ def test_gradients_are_those_of_plain_torch(cached):
         layer.A_log += 0.1 * torch.randn_like(layer.A_log)
     tokens = torch.randn(2, 9, 6, requires_grad=True)
     out = layer(tokens, InferenceParams(9, 2) if cached else None)
-    w = {name.replace(".", "_"): p.double() for name, p in layer.named_parameters()}
-    given = {k: w.get(k) for k in ("conv1d_weight", "conv1d_bias", "x_proj_weight", "D")}
-    given |= {"xz": (tokens.double() @ w["in_proj_weight"].T).mT, "A": -w["A_log"].exp()}
-    given |= {"delta_proj_weight": w["dt_proj_weight"], "delta_bias": w["dt_proj_bias"]}
-    want = block_in_float64(**given, out_proj_weight=w["out_proj_weight"], out_proj_bias=0)
+    doubles = {name: p.double() for name, p in layer.named_parameters()}
+    want = layer_in_float64(doubles, tokens.double())
     assert_rel_rms(out, want, 1e-6, "out")
     leaves = {"tokens": tokens, **dict(layer.named_parameters())}
     cotangent = torch.randn_like(out)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from helpers.children import murderous_pair, talking_pair
 from helpers.gaussians import some
-from helpers.meshes import glb
+from helpers.meshes import glb, gltf
 from helpers.refusals import refused
 
 from gamba_warp.cli import run
@@ -64,15 +64,8 @@ def faces_of(count, kind="uchar"):
 
 
 def one_accessor(**accessor):
-    tree = {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        "accessors": [{"componentType": 5126, "type": "VEC3", **accessor}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "buffers": [{"byteLength": 36}],
-    }
+    accessors = [{"componentType": 5126, "type": "VEC3", **accessor}]
+    tree = gltf(accessors=accessors, buffers=[{"byteLength": 36}])
     return glb(tree, bytes(36))
 
 

@@ -10,7 +10,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from helpers.meshes import MTL, gltf, write_quad
+from helpers.meshes import FACET, MTL, gltf, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -21,9 +21,6 @@ from gamba_warp.formats.meshes import load_mesh
 
 V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OFF = "OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 1 2 3\n"
-FACET = (
-    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
-)
 STL = "solid a\n" + FACET * 3 + "endsolid a\n"
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n"
 

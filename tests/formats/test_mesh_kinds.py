@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from helpers.meshes import MTL, QUAD, write_quad
+from helpers.meshes import FACET, MTL, QUAD, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -257,9 +257,6 @@ def test_colours_of_the_faces_of_off(tmp_path):
     refused("names vertex 2.5 of 4", loaded, tmp_path, "a.off", text)
 
 
-FACET = (
-    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
-)
 SOLIDS = {
     "facet in the name": f"solid facetted endfacet vertex\n{FACET}endsolid facetted vertex\n",
     "upper case": f"solid a\n{FACET}endsolid a\n".upper(),

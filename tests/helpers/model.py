@@ -47,6 +47,14 @@ def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
     return torch.rand(batch, size, size, 3), cameras
 
 
+def cut_outs() -> tuple[torch.Tensor, Cameras]:
+    """Draw noise in boxes of 9, 1, 24 and no cells of transparent pictures."""
+    images, cameras = inputs(4)
+    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
+    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
+    return rgba, cameras
+
+
 def perturbed(blocks: torch.nn.Module) -> torch.nn.Module:
     """Move every parameter, so that none is 0 or 1 by chance, or as in another block."""
     with torch.no_grad():

@@ -8,13 +8,13 @@ from helpers.model import (
     assert_each_alone,
     assert_plain_form,
     assert_recomputed_alike,
+    cut_outs,
     inputs,
     micro,
     moved_blocks,
 )
 from helpers.refusals import refused
 
-from gamba_warp.cameras import Cameras
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
@@ -104,14 +104,6 @@ def test_pictures_of_a_row_do_not_see_each_other():
         torch.testing.assert_close(got[:, i:j], run_blocks(blocks, tokens[:, i:j], given))
     nothing = run_blocks(make_blocks(2, 0, 0), tokens, [None, None], cu_seqlens=cuts)
     assert nothing.isfinite().all()
-
-
-def cut_outs() -> tuple[torch.Tensor, Cameras]:
-    """Noise in boxes of 9, 1, 24 and no cells of transparent pictures."""
-    images, cameras = inputs(4)
-    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
-    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
-    return rgba, cameras
 
 
 @pytest.mark.parametrize("gradients", [True, False])

@@ -7,6 +7,7 @@ from helpers.model import (
     assert_each_alone,
     assert_plain_form,
     assert_recomputed_alike,
+    cut_outs,
     inputs,
     micro,
     moved_blocks,
@@ -75,10 +76,7 @@ def test_a_batch_on_rays_is_each_picture_alone():
     changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
     model = Gamba(micro(image_tokens="mixed", **changes), "random")
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
-    images, cameras = inputs(4)
-    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
-    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
-    assert_each_alone(model, rgba, cameras, (9, 1, 24, 0))
+    assert_each_alone(model, *cut_outs(), (9, 1, 24, 0))
 
 
 def test_condition_recomputation_and_autocast():
