@@ -2,16 +2,13 @@
 
 import pytest
 from ablation.fake import write_plan
+from helpers.refusals import refused, refused_command
 
-from gamba_warp import cli
 from gamba_warp.ablation.plan import PLANS, commands, open_plan
-from gamba_warp.errors import UserError
 
 
 def told(path, tmp_path):
-    with pytest.raises(UserError) as caught:
-        open_plan(str(path), tmp_path / "data")
-    return str(caught.value)
+    return refused(None, open_plan, str(path), tmp_path / "data")
 
 
 @pytest.mark.parametrize(
@@ -39,7 +36,7 @@ def told(path, tmp_path):
 )
 def test_errors_name_the_row(b, reason, tmp_path):
     text = told(write_plan(tmp_path, "a", {"name": "b", **b}), tmp_path)
-    assert reason in text and "\n" not in text and len(text) < 300
+    assert reason in text and len(text) < 300
 
 
 @pytest.mark.parametrize(
@@ -56,7 +53,7 @@ def test_errors_name_the_row(b, reason, tmp_path):
 )
 def test_errors_of_the_whole_plan(rows, more, reason, tmp_path):
     text = told(write_plan(tmp_path, *rows, **more), tmp_path)
-    assert reason in text and "\n" not in text and len(text) < 300
+    assert reason in text and len(text) < 300
 
 
 def test_errors_end_the_command_before_it_writes(tmp_path, capsys, monkeypatch):
@@ -69,9 +66,7 @@ def test_errors_end_the_command_before_it_writes(tmp_path, capsys, monkeypatch):
         ([path, data, "--rows", "z"], "has no row z; it has a"),
         ([path, data, "--steps", "1", "--minutes", "1"], "give one of them"),
     ):
-        assert cli.run("ablate", words) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert reason in line
+        refused_command(capsys, "ablate", words, reason)
     assert {path.name for path in tmp_path.iterdir()} == {"trial.json", "bad.json"}
 
 

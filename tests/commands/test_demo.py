@@ -55,9 +55,6 @@ def test_demo(starter, short, tmp_path, monkeypatch):
     assert demo(starter, out) == 0
     page = (out / "index.html").read_text()
     for part in (
-        "Objects that the model has never seen",
-        "the shipped model",
-        "the input as a flat cut-out",
         "PSNR on black",
         "Trained on",
         "Predicted",
@@ -96,8 +93,7 @@ class Calls:
         self.stages, self.out, self.codes, self.pages = [], out, {}, []
         monkeypatch.setattr(command, "_call", self)
         monkeypatch.setattr(
-            "gamba_warp.pages.demo.write_demo",
-            lambda path, results, text: self.pages.append(text),
+            "gamba_warp.pages.demo.write_demo", lambda path, results, text: self.pages.append(text)
         )
 
     def __call__(self, words):

@@ -124,13 +124,9 @@ def test_a_folder_and_failures(ball, tmp_path, capsys):
 @pytest.mark.parametrize(
     "options, reason",
     [
-        (["--voxels", "3"], "--voxels"),
         (["--mesh"], "--mesh, --splats"),
         (["--mesh", "none"], "--mesh, --splats"),
         (["--mesh", "none", "obj"], "--mesh none obj: none goes with no format"),
-        (["--min-component", "2"], "--min-component"),
-        (["--size", "3"], "--size"),
-        (["--close-holes", "-1"], "--close-holes"),
     ],
 )
 def test_what_cannot_start(ball, tmp_path, options, reason, capsys):

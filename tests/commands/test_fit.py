@@ -20,7 +20,7 @@ from gamba_warp.fitting.config import FitConfig
 from gamba_warp.fitting.objects import choose_objects, split_views
 from gamba_warp.fitting.optimize import activate, fit
 from gamba_warp.fitting.start import random_start, sample_views, visual_hull
-from gamba_warp.image_metrics import METRICS, psnr
+from gamba_warp.image_metrics import psnr
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.render import render
 
@@ -154,10 +154,6 @@ def test_start_lies_in_the_hull():
     # one hue: the views' mean colour is near the scene's
     true = cloud(2).colors.mean(0)
     assert (gaussians.colors.mean(0) - true).abs().max() < 0.1
-
-
-def test_psnr_is_that_of_eval():
-    assert objects.psnr is METRICS["psnr"].compare is psnr
 
 
 def test_views_and_objects_are_chosen_by_rule():

@@ -1,9 +1,8 @@
 """``rasterization`` with gsplat's signature: pictures, ``meta``, options, refusals."""
 
 import inspect
-import re
-from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers import assert_rel_rms
@@ -11,6 +10,7 @@ from helpers.raster import leaves, make, mapped
 
 from gamba_warp.compat.gsplat import (
     RollingShutterType,
+    SelectiveAdam,
     quat_scale_to_covar_preci,
     rasterization,
     rasterize_to_pixels,
@@ -162,6 +162,48 @@ def test_packing_changes_no_gradient():
         assert torch.equal(a, b), name
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_simple_trainer(packed):
+    """gsplat's simple_trainer: Adam of the Gaussians that a step has seen."""
+    scene = scene_of((), num=60, views=1)
+    del scene["backgrounds"]
+    scene["means"][:9] *= 30
+    params = {name: torch.nn.Parameter(scene[name].clone()) for name in ("means", "colors")}
+    lr, eps, betas = 0.01, 1e-8, (0.9, 0.999)
+    optimizers = [
+        SelectiveAdam([{"params": x, "lr": lr, "name": name}], eps=eps, betas=betas)
+        for name, x in params.items()
+    ]
+    want = {name: (x.detach().double(), 0.0, 0.0) for name, x in params.items()}
+    for _ in range(2):
+        given = {**scene, **params}
+        renders, _, info = rasterization(**given, packed=packed, backgrounds=torch.rand(1, 3))
+        renders.square().mean().backward()
+        if packed:
+            seen = torch.zeros(60, dtype=torch.bool)
+            seen.scatter_(0, info["gaussian_ids"], 1)
+        else:
+            seen = (info["radii"] > 0).all(-1).any(0)
+        assert 5 < (~seen).sum() < 30
+        for name, x in params.items():
+            value, mean, square = want[name]
+            rows, grad = seen[:, None], x.grad.double()
+            mean = torch.where(rows, betas[0] * mean + (1 - betas[0]) * grad, mean)
+            square = torch.where(rows, betas[1] * square + (1 - betas[1]) * grad**2, square)
+            value = value - torch.where(rows, lr * mean / (square.sqrt() + eps), 0.0)
+            want[name] = value, mean, square
+        for optimizer in optimizers:
+            optimizer.step(seen)
+            optimizer.zero_grad(set_to_none=True)
+    for name, x in params.items():
+        assert (x[~seen] == scene[name][~seen]).all()
+        # steps of lr, of which float32 keeps seven digits, on values of size 1
+        assert (x - want[name][0]).abs().max() < 1e-5, name
+    with pytest.raises(ValueError, match="^valid has 59 rows, allowed is 60"):
+        x.grad = torch.ones_like(x)
+        optimizers[-1].step(seen[1:])
+
+
 def test_depth_without_colors():
     scene = scene_of()
     scene.update(colors=None, backgrounds=None)
@@ -182,6 +224,27 @@ def test_no_gaussians():
         assert meta["flatten_ids"].numel() == 0
 
 
+def test_backgrounds_of_any_shape():
+    scene = scene_of()
+    for shape in ((3,), (3, 3)):
+        ground = torch.rand(shape, requires_grad=True)
+        results = []
+        for given in (ground, ground.expand(2, 3, 3)):
+            ground.grad = None
+            renders = rasterization(**scene | {"backgrounds": given})[0]
+            renders.square().sum().backward()
+            results.append([renders, ground.grad])
+        assert all(map(torch.equal, *results))
+
+
+def test_sizes_are_integers():
+    meta = rasterization(**scene_of() | {"width": np.int64(37), "height": torch.tensor(23)})[2]
+    assert type(meta["width"]) is int and type(meta["height"]) is int
+    for value in (0, True, 3.0, "7", torch.tensor(2.5), 2**15 + 1):
+        with pytest.raises(ValueError, match="^height is .*allowed are integers from 1 to 32768"):
+            rasterization(**scene_of() | {"height": value})
+
+
 DEFAULTS = {k: p.default for k, p in inspect.signature(rasterization).parameters.items()}
 OTHER = {None: torch.zeros(2, 3, 6), False: True, True: False, "pinhole": "fisheye"}
 OPTIONS = {name: OTHER[DEFAULTS[name]] for name in MUST_BE_DEFAULT} | dict(
@@ -197,14 +260,6 @@ def test_refusals(name):
     with pytest.raises(ValueError, match=rf"^{name} .*allowed (is|are) ") as error:
         rasterization(**{**scene_of(), name: OPTIONS[name]})
     assert len(str(error.value).splitlines()) == 1
-
-
-def test_the_page_says_what_is_refused():
-    text = (Path(__file__).parents[2] / "docs/drop-ins.md").read_text(encoding="utf-8")
-    rows = [row.split(" | ") for row in text.splitlines() if row.startswith("| ")]
-    refused = [row[0] for row in rows if len(row) > 1 and row[1].startswith("refused")]
-    names = {name for cell in refused for name in re.findall(r"`(\w+)`", cell)}
-    assert names == {*MUST_BE_DEFAULT, "rolling_shutter"}
 
 
 def test_signature():

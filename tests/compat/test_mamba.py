@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers import assert_default_dtype_changes_nothing, assert_rel_rms, in_default_float64
-from helpers.mamba import block_in_float64, run, scan_in_float64
+from helpers.mamba import block_in_float64, layer_in_float64, run, scan_in_float64
 
 from gamba_warp.compat import mamba_ssm
 from gamba_warp.compat.mamba_ssm import (
@@ -221,11 +221,8 @@ def test_gradients_are_those_of_plain_torch(cached):
         layer.A_log += 0.1 * torch.randn_like(layer.A_log)
     tokens = torch.randn(2, 9, 6, requires_grad=True)
     out = layer(tokens, InferenceParams(9, 2) if cached else None)
-    w = {name.replace(".", "_"): p.double() for name, p in layer.named_parameters()}
-    given = {k: w.get(k) for k in ("conv1d_weight", "conv1d_bias", "x_proj_weight", "D")}
-    given |= {"xz": (tokens.double() @ w["in_proj_weight"].T).mT, "A": -w["A_log"].exp()}
-    given |= {"delta_proj_weight": w["dt_proj_weight"], "delta_bias": w["dt_proj_bias"]}
-    want = block_in_float64(**given, out_proj_weight=w["out_proj_weight"], out_proj_bias=0)
+    doubles = {name: p.double() for name, p in layer.named_parameters()}
+    want = layer_in_float64(doubles, tokens.double())
     assert_rel_rms(out, want, 1e-6, "out")
     leaves = {"tokens": tokens, **dict(layer.named_parameters())}
     cotangent = torch.randn_like(out)
@@ -329,30 +326,6 @@ def test_paths_of_the_original(path, names):
     for name in names.split():
         assert getattr(module, name) is getattr(mamba_ssm, name)
     assert list(mamba_ssm.__all__) == sorted(mamba_ssm.__all__)
-
-
-def test_generation_letter_by_letter_gives_what_the_whole_text_gives():
-    """A small language model: the prompt at once, then each letter from the states."""
-    prompt = torch.tensor([[3, 1, 4, 1, 5]])
-    embedding, head = torch.nn.Embedding(11, 16), torch.nn.Linear(16, 11, bias=False)
-    layers = [Mamba(16, layer_idx=i) for i in range(2)]
-
-    def model(letters, cache=None):
-        hidden = embedding(letters)
-        for layer in layers:
-            hidden = hidden + layer(hidden, inference_params=cache)
-        return head(hidden)
-
-    cache = InferenceParams(max_seqlen=17, max_batch_size=1)
-    given, written = prompt, [prompt]
-    with torch.no_grad():
-        for _ in range(12):
-            letter = model(given, cache)[:, -1].argmax(-1, keepdim=True)
-            cache.seqlen_offset += given.shape[1]
-            given = letter
-            written.append(letter)
-        text = torch.cat(written, 1)
-        assert torch.equal(model(text)[0, 4:-1].argmax(-1), text[0, 5:])
 
 
 def test_layers_of_one_kind_have_one_result(capsys):

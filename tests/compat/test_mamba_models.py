@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.mamba import block_in_float64
+from helpers.mamba import layer_in_float64
 from torch import nn
 
 from gamba_warp.compat.mamba_ssm.models.mixer_seq_simple import _init_weights, create_block
@@ -33,15 +33,6 @@ class Stack(nn.Module):
         for layer in self.layers:
             x, residual = layer(x, residual)
         return of_2.add_norm(self, self.norm_f, x, residual)[0]
-
-
-def layer_in_float64(weights, tokens):
-    """A Mamba layer by the names of its weights."""
-    w = {name.replace(".", "_"): value for name, value in weights.items()}
-    given = {k: w[k] for k in ("conv1d_weight", "conv1d_bias", "x_proj_weight", "D")}
-    given |= {"xz": (tokens @ w["in_proj_weight"].T).mT, "A": -w["A_log"].exp()}
-    given |= {"delta_proj_weight": w["dt_proj_weight"], "delta_bias": w["dt_proj_bias"]}
-    return block_in_float64(**given, out_proj_weight=w["out_proj_weight"], out_proj_bias=0)
 
 
 def stack_in_float64(weights, x, rms):

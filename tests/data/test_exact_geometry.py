@@ -11,11 +11,7 @@ from helpers import micro
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gamba_warp import devices
-from gamba_warp.cameras import (
-    exact_product,
-    plucker_rays,
-    relative_to_reference,
-)
+from gamba_warp.cameras import exact_product, plucker_rays, relative_to_reference
 from gamba_warp.data.dataset import ObjectViews
 from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians

@@ -8,12 +8,7 @@ import torch
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.data.preprocess import (
-    SamSegmenter,
-    composite,
-    recenter,
-    shrink,
-)
+from gamba_warp.data.preprocess import SamSegmenter, composite, recenter, shrink
 from gamba_warp.errors import UserError
 from gamba_warp.images import save_image
 from gamba_warp.photo.cutout import Ways, cut_out
@@ -126,8 +121,9 @@ def test_a_mask_wins_over_all(tmp_path):
         np.ones((20, 30, 3)),
         np.full((1, 1), 0.3),
         np.ones((1, 500, 3)),
+        np.dstack([np.zeros((20, 30, 3)), np.eye(20)[:, :1] @ np.eye(30)[:1]]),
     ],
-    ids=["transparent", "nearly transparent", "white", "one pixel", "one row"],
+    ids=["transparent", "nearly transparent", "white", "one pixel", "one row", "one of many"],
 )
 def test_pictures_without_an_object(tmp_path, picture):
     path = write(tmp_path / "a.png", picture)

@@ -60,10 +60,7 @@ JOBS = {
         "render {world}/gaussians --out {out} --kind png --size 32 --frames 3 --depth --device cpu",
         "--elevation 20",
     ),
-    "fit": Job(
-        "fit {world}/data --out {out} --steps 4 --gaussians 60 --device cpu",
-        "--seed 1",
-    ),
+    "fit": Job("fit {world}/data --out {out} --steps 4 --gaussians 60 --device cpu", "--seed 1"),
     "data render": Job(
         "data render {world}/meshes --out {out} --views 2 --size 16 --workers 1",
         undo=without_one_object,
@@ -74,8 +71,7 @@ JOBS = {
         "--views 3",
     ),
     "eval-geometry": Job(
-        "eval-geometry {world}/meshes {world}/meshes --out {out} --points 500",
-        "--seed 1",
+        "eval-geometry {world}/meshes {world}/meshes --out {out} --points 500", "--seed 1"
     ),
     "import-released": Job(
         "import-released {world}/released/theirs.pth --out {out} "
@@ -155,10 +151,7 @@ PLAN = {
     "name": "small",
     "title": "One row",
     "seeds": [0],
-    "base": {
-        "preset": "tiny",
-        "options": {"steps": 2, "batch_size": 2},
-    },
+    "base": {"preset": "tiny", "options": {"steps": 2, "batch_size": 2}},
     "evaluation": {"split": "val", "objects": 1, "views": 3, "size": 16},
     "compare_with": "model",
     "rows": [{"name": "model"}],

@@ -23,7 +23,7 @@ from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import read_config
 from gamba_warp.train.checkpoint import damage, list_checkpoints
 
-from .child import End, gamba, run_child
+from .child import gamba, run_child
 from .folders import age, contents, is_whole, leftovers, lost
 from .jobs import JOBS, make_world, training, undisturbed
 
@@ -148,15 +148,6 @@ def test_files_cut_short_are_not_whole(tmp_path):
         assert not is_whole(name, b""), name
 
 
-def test_what_is_lost_is_missing_or_damaged():
-    before = {"a.json": b"1\n", "b.json": b"2\n", "c.csv": b"x"}
-    assert lost(before, before) == []
-    assert lost(before, before | {"a.json": b"3\n", "d.json": b"4\n"}) == []
-    assert lost(before, {"b.json": b"{", "c.csv": b"x", "d.json": b"["}) == [
-        *("a.json", "b.json", "d.json")
-    ]
-
-
 def test_leftovers_are_told_from_results(tmp_path):
     part = tmp_path / "sub" / f"{PART}abcd1234"
     part.mkdir(parents=True)
@@ -169,20 +160,6 @@ def test_leftovers_are_told_from_results(tmp_path):
     age(tmp_path)
     output_folder(tmp_path / "sub")
     assert not part.exists()
-
-
-@pytest.mark.parametrize(
-    "end, good",
-    [
-        (End(2, "gamba: cannot write a: full", 1, False), True),
-        (End(1, "failed: a: cannot write a", 1, False), True),
-        (End(1, "Traceback (most recent call last)\ngamba: a", 1, False), False),
-        (End(-11, "gamba: a", 1, False), False),
-        (End(1, "", 1, False), False),
-    ],
-)
-def test_which_ends_are_told_in_one_line(end, good):
-    assert end.is_one_line == good
 
 
 def say_and_exit():

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from gamba_warp.cli import run
 from gamba_warp.eval.averages import bootstrap
@@ -113,27 +112,6 @@ def test_methods_are_compared_by_their_shapes_alone(files):
     assert "true shape is 2." in said.out and "z lacks 1 object (a: the mesh" in said.out
     more = said.out.partition("Further metrics")[2]
     assert "F-score at 0.5 ↑" in more and "+0.0167 [" in more and "normals" not in more
-
-
-def test_reports_of_shapes_are_those_of_the_command(files, capsys):
-    """Two methods' folders, evaluated and compared by the commands themselves."""
-    words = []
-    for name, size in (("small", 0.8), ("right", 1.0)):
-        for folder, side in ((name, size), ("true", 1.0)):
-            (files.folder / folder).mkdir(exist_ok=True)
-            for uid, width in (("a", 0.5), ("b", 0.7)):
-                box = trimesh.creation.box((side, side * width, side))
-                box.export(files.folder / folder / f"{uid}.ply")
-        pred, true, out = (str(files.folder / part) for part in (name, "true", f"{name}-out"))
-        assert run("eval-geometry", [pred, true, "--points", "300", "--out", out]) == 0
-        words.append(f"{name}={out}")
-    capsys.readouterr()
-    code, _, joined = files.run(*words, "--against", "right")
-    assert code == 0
-    small, right = joined["rows"]
-    assert right["chamfer"]["mean"] == 0 and right["fscore.0.02"]["mean"] == 1
-    assert small["iou"]["mean"] < 0.7 and small["normal_consistency"]["mean"] < 1
-    assert joined["differences"][0]["fscore.0.02"]["interval"][1] < -0.1
 
 
 def test_what_a_method_lacks_counts_for_none_and_is_named(files):

@@ -10,7 +10,6 @@ import trimesh
 from helpers.views import cloud_of
 
 from gamba_warp.cli import run
-from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.table import turn_warnings
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.surfaces.extract import Surface
@@ -156,10 +155,3 @@ def test_one_turn_of_many_is_one_warning():
     assert turn_warnings([record(0.06, 0.058)] * 9) == []
     (said,) = turn_warnings([record(0.05, 0.06)] * 9 + [record(0.06, 0.03)])
     assert said.startswith("1 of 10 predictions") and "a 0.03 in place of 0.06" in said
-
-
-def test_every_protocol_states_the_axes():
-    for preset in PRESETS.values():
-        values = preset.to_json()
-        assert values["up"] and values["pred_axes"] == "auto"
-        assert "unknown" in values["definitions"]["axes"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.refusals import refused
 from helpers.views import (
     around,
     cloud_of,
@@ -18,7 +19,6 @@ from helpers.views import (
 
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.load import load_truth
 from gamba_warp.eval.shapes.pairs import find_pairs, out_of_reference
 from gamba_warp.eval.shapes.protocol import PRESETS
@@ -123,8 +123,7 @@ def test_distance_of_the_found_camera_does_not_matter(world):
     local = world_vertices @ viewmat[:3, :3].T * 2.5 / 1.6
     apart = np.linalg.norm(placed[:, None] - local[None], axis=-1).min(1)
     assert apart.max() < 1e-5
-    with pytest.raises(UserError, match="no mesh of the training object gone"):
-        meshes.place(NearestView("gone", 0, 0.1), 1.5)
+    refused("no mesh of the training object gone", meshes.place, NearestView("gone", 0, 0.1), 1.5)
 
 
 @pytest.mark.parametrize("case", ["out", "baselines", "absent", "others", "train"])
@@ -175,5 +174,4 @@ def test_a_truth_is_turned_as_its_catalogue_says(world):
     assert code == 0
     assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
     for wrong in ([1.0, 1, 2], [-1.0, 1, 1]):
-        with pytest.raises(UserError, match="also stretches or mirrors"):
-            load_truth(path, protocol, np.diag(wrong).tolist())
+        refused("also stretches or mirrors", load_truth, path, protocol, np.diag(wrong).tolist())

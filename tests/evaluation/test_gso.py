@@ -5,7 +5,7 @@ import json
 import pytest
 import trimesh
 from helpers import micro
-from helpers.refusals import refused
+from helpers.refusals import refused, refused_command
 from helpers.views import eval_views, evaluated
 
 from gamba_warp.cli import run
@@ -74,21 +74,20 @@ def test_another_list_of_objects(data, tmp_path, monkeypatch, capsys):
     for text, reason in refusals.items():
         own.write_bytes(text)
         refused(reason, gso.names_of, own)
-    assert run("eval-geometry", [*map(str, words), "--limit", "1"]) == 2
-    assert "--limit: --protocol gso has its own objects" in capsys.readouterr().err
+    own_objects = "--limit: --protocol gso has its own objects"
+    refused_command(capsys, "eval-geometry", [*words, "--limit", 1], own_objects)
     words = ["--checkpoint", str(data / "pred"), "--data", str(data / "views")]
-    assert run("eval-views", [*words, "--objects", str(own)]) == 2
-    assert "--objects: needs --protocol gso" in capsys.readouterr().err
+    said = "--objects: needs --protocol gso"
+    refused_command(capsys, "eval-views", [*words, "--objects", own], said)
 
 
 def test_its_options_are_its_own(data, capsys):
     words = ["--checkpoint", str(data / "pred"), "--data", str(data / "views"), "--protocol", "gso"]
     for option, value in (("--size", "64"), ("--reference", "1"), ("--split", "all")):
-        assert run("eval-views", [*words, option, value]) == 2
-        assert f"--protocol gso: has its own {option}" in capsys.readouterr().err
+        said = f"--protocol gso: has its own {option}"
+        refused_command(capsys, "eval-views", [*words, option, value], said)
     other = ["--checkpoint", str(data / "pred"), "--data", str(data / "views" / "not of the list")]
-    assert run("eval-views", [*other, "--protocol", "gso"]) == 2
-    capsys.readouterr()
+    refused_command(capsys, "eval-views", [*other, "--protocol", "gso"])
 
 
 def test_geometry(data, tmp_path):

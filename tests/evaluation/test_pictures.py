@@ -89,7 +89,7 @@ def test_by_name_by_number_and_by_camera_is_the_same(data):
     code, found = evaluate(data)
     assert code == 0
     assert found["objects"][0]["pictures"] == {
-        **{"matched_by": "camera", "unused": 1, "resized": 0, "alpha": True},
+        **{"matched_by": "camera", "unused": 1, "resized": 0, "alpha": True}
     }
     assert found["mean"]["psnr"] == named["mean"]["psnr"] == 100
 

@@ -10,7 +10,7 @@ from helpers.meshes import glb
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.formats.materials import to_display, to_linear
+from gamba_warp.formats.materials import to_linear
 from gamba_warp.formats.meshes import load_mesh
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
@@ -144,19 +144,6 @@ def test_alpha_of_vertices_counts_where_the_material_blends(tmp_path):
     assert document.load(tmp_path).colors[..., 3].max() == 102
     document.tree["materials"] = [{}]
     assert document.load(tmp_path).colors[..., 3].min() == 255
-
-
-def test_texture_transform(tmp_path):
-    change = {"offset": [0.5, 0.5], "scale": [0.4, 0.4]}
-    mesh = Document().paint({"extensions": {"KHR_texture_transform": change}}).load(tmp_path)
-    assert {tuple(seen(mesh, at)) for at in FOUR} == {tuple(WHITE)} and not mesh.warnings
-    # A quarter turn, by the matrix of the extension's text: (u, v) is seen at (v, 1 - u).
-    change = {"rotation": np.pi / 2, "offset": [0, 1]}
-    mesh = Document().paint({"extensions": {"KHR_texture_transform": change}}).load(tmp_path)
-    for at in FOUR:
-        u, v = at[0], 1 - at[1]
-        row, column = int((1 - u) * 2), int(v * 2)
-        assert seen(mesh, at) == PAINT[row, column].tolist()
 
 
 def test_a_texture_is_scaled_before_it_is_turned(tmp_path):
@@ -567,8 +554,3 @@ def test_packed_triangles_are_refused_by_name(tmp_path, name):
     refused(f"packed by {name}", document.load, tmp_path)
     document = Document(extensionsRequired=[name])
     refused(f"packed by {name}", document.load, tmp_path)
-
-
-def test_linear_light_of_all_displayed_values():
-    values = np.arange(256) / 255
-    np.testing.assert_array_equal(np.rint(255 * to_display(to_linear(values))), np.arange(256))

@@ -10,8 +10,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-import trimesh
-from helpers.meshes import MTL, gltf, write_quad
+from helpers.meshes import FACET, MTL, gltf, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -22,9 +21,6 @@ from gamba_warp.formats.meshes import load_mesh
 
 V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OFF = "OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 1 2 3\n"
-FACET = (
-    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
-)
 STL = "solid a\n" + FACET * 3 + "endsolid a\n"
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n"
 
@@ -77,19 +73,6 @@ def test_bad_meshes_are_one_line(tmp_path, name):
     start = time.process_time()
     assert reason in refused(None, load_mesh, path)
     assert time.process_time() - start < 5  # one of them took minutes
-
-
-def test_good_meshes_pass(tmp_path):
-    good = {
-        "a.obj": "# a\n" + V.replace("v 1", "v  1") + "f 1// 2// \\\n 3//\nf -4 -3 -2 \n",
-        "a.off": OFF.replace("4 2 0", "# six rows\n4 2 0 # no edges"),
-        "b.off": OFF.replace("OFF\n", "OFF "),
-        "a.stl": STL,
-        "a.ply": ascii_ply(CORNERS, ["3 0 1 2", "4 0 1 2 3"]),
-    }
-    for name, text in good.items():
-        (tmp_path / name).write_text(text)
-        assert len(load_mesh(tmp_path / name).faces) == (2 if name[2:] in ("obj", "off") else 3)
 
 
 def mixed(indices):
@@ -180,10 +163,8 @@ LIES = {
     ),
     "circle": ({"nodes": [{"mesh": 0, "children": [0]}]}, "nodes in a circle"),
     "no_mesh": ({"nodes": [{"mesh": 1}]}, "meshes[1] of 1"),
-    "draco": ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "packed by KHR_draco"),
     "lists": ({"accessors": {}}, "array"),
     "deep": (DEEP, "nested"),
-    "outside": ({"buffers": [{"byteLength": 36, "uri": "../secret.bin"}]}, "not found"),
     "short": (
         {"buffers": [{"byteLength": 36, "uri": "data:;base64,AAAA"}]},
         "buffer 0 take 36 bytes",
@@ -193,10 +174,7 @@ LIES = {
 
 @pytest.mark.parametrize("name", LIES)
 def test_invalid_gltf(tmp_path, name):
-    folder = tmp_path / "inner"
-    folder.mkdir()
-    (tmp_path / "secret.bin").write_bytes(np.eye(3, dtype="<f4").tobytes())
-    path = folder / "a.gltf"
+    path = tmp_path / "a.gltf"
     path.write_text(json.dumps(gltf()))
     assert len(load_mesh(path).faces) == 1
     changes, reason = LIES[name]
@@ -219,10 +197,7 @@ def _many(count, entry):
 
 
 _NONE = {"componentType": 5121, "bufferView": None}  # values without bytes are 0
-_SPREAD = {
-    "extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1}}},
-    "mesh": 0,
-}
+_SPREAD = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1}}}, "mesh": 0}
 _MORE = [ACCESSOR, ACCESSOR | {"bufferView": None, "count": 150_000}]
 # Documents of up to a megabyte that stand for much more.
 SMALL = {
@@ -255,10 +230,7 @@ SMALL = {
         "meshes": [{"primitives": [{"attributes": {"POSITION": 1}}] * 1_000}],
         "accessors": [ACCESSOR, ACCESSOR | {"bufferView": None, "count": 1_200}],
     },
-    "nodes": {
-        "nodes": [{"mesh": 0}] * 55_000,
-        "scenes": [{"nodes": list(range(55_000))}],
-    },
+    "nodes": {"nodes": [{"mesh": 0}] * 55_000, "scenes": [{"nodes": list(range(55_000))}]},
     "moved nodes": {
         "nodes": [{"mesh": 0, "translation": [1, 2, 3], "scale": [1, 1, 2]}] * 15_000,
         "scenes": [{"nodes": list(range(15_000))}],
@@ -295,23 +267,6 @@ def test_textures_over_the_limit_are_left_out(tmp_path, monkeypatch, limit):
     assert [x is None for x in found] == [False, False, True]
     (warning,) = sides.warnings
     assert warning.startswith("image 2: too many")
-
-
-def test_embedded_pictures_are_of_few_formats(tmp_path):
-    box = trimesh.creation.box()
-    pixels = io.BytesIO()
-    Image.new("RGB", (4, 4), (9, 9, 9)).save(pixels, "PNG")
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.open(io.BytesIO(pixels.getvalue()))
-    )
-    box.visual = trimesh.visual.TextureVisuals(np.zeros((len(box.vertices), 2)), material)
-    path = tmp_path / "a.glb"
-    box.export(path)
-    assert load_mesh(path).materials[0].texture is not None
-    content = path.read_bytes()
-    start = content.index(b"\x89PNG")
-    path.write_bytes(content[:start] + POSTSCRIPT[:60] + content[start + 60 :])
-    assert load_mesh(path).materials[0].texture is None
 
 
 def test_faces_of_one_or_two_corners_are_ignored(tmp_path):

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from helpers.meshes import MTL, QUAD, write_quad
+from helpers.meshes import FACET, MTL, QUAD, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -19,20 +19,7 @@ from gamba_warp.viewer.pack import read_viewed_mesh
 V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 FOUR = ["0 0 0", "1 0 0", "1 1 0", "0 1 0"]
 # A comb of three teeth, counter-clockwise; area 8.
-COMB = [
-    [0, 0],
-    [5, 0],
-    [5, 2],
-    [4, 2],
-    [4, 1],
-    [3, 1],
-    [3, 2],
-    [2, 2],
-    [2, 1],
-    [1, 1],
-    [1, 2],
-    [0, 2],
-]
+COMB = np.reshape([*map(int, "005052424131322221111202")], (-1, 2))
 # Turned, so that no axis is across it.
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
@@ -210,12 +197,8 @@ def test_materials_of_obj(tmp_path):
     mesh = loaded(tmp_path, "a.obj", "mtllib a b.mtl\n" + V + "usemtl c\nf 1 2 3\n")
     assert mesh.materials[0].color.tolist() == [1, 1, 1, 1] and not mesh.warnings
     mesh = loaded(tmp_path, "a.obj", text.replace("two.mtl", "none.mtl"))
-    assert "none.mtl: not found" in mesh.warnings and mesh.materials[0].color.tolist() == [
-        1,
-        0,
-        0,
-        1,
-    ]
+    assert "none.mtl: not found" in mesh.warnings
+    assert mesh.materials[0].color.tolist() == [1, 0, 0, 1]
 
 
 @pytest.mark.parametrize("options", ["d 0", "Tr 1", "d -halo 0", "d 0.001"])
@@ -274,9 +257,6 @@ def test_colours_of_the_faces_of_off(tmp_path):
     refused("names vertex 2.5 of 4", loaded, tmp_path, "a.off", text)
 
 
-FACET = (
-    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
-)
 SOLIDS = {
     "facet in the name": f"solid facetted endfacet vertex\n{FACET}endsolid facetted vertex\n",
     "upper case": f"solid a\n{FACET}endsolid a\n".upper(),

@@ -130,16 +130,6 @@ def test_texture_coordinates_of_three_numbers_in_a_gltf_are_none(tmp_path):
     ]
 
 
-def test_polygons_become_triangles(tmp_path):
-    hexagon = "\n".join(f"v {np.cos(a)} {np.sin(a)} 0" for a in np.arange(6) * np.pi / 3)
-    path = tmp_path / "hexagon.obj"
-    path.write_text(f"{hexagon}\nf 1 2 3 4 5 6\nf 1 2 3\n")
-    mesh = load_mesh(path)
-    corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    assert len(mesh.faces) == 5 and np.isfinite(area)
-
-
 def test_transparency_of_mtl(tmp_path):
     path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.5 1 0\nd 0.25\n")
     np.testing.assert_allclose(load_mesh(path).materials[0].color[3], 0.25)

@@ -95,18 +95,6 @@ def test_what_has_no_volume_has_no_density():
     refused("no visible Gaussian", opacity_volume, ball.select(flat), 24)
 
 
-@pytest.mark.parametrize("method", ["tsdf", "density"])
-def test_a_cube(method):
-    cube = trimesh.creation.box((0.7, 0.7, 0.7))
-    sigma = 0.014
-    surface = extract_surface(on(cube, 6000, sigma=sigma), SurfaceOptions(method=method, **QUICK))
-    size = np.ptp(np.quantile(surface.vertices, [0.02, 0.98], axis=0), axis=0)
-    assert np.abs(size - 0.7).max() < 4 * sigma + 1 / 64  # their widths on both sides, a voxel
-    distance = np.abs(np.abs(surface.vertices).max(1) - 0.35)  # exact beside edges
-    assert distance.mean() < 1.8 * sigma  # the bias: near edges, or the level
-    assert as_trimesh(surface).volume > 0.7**3
-
-
 def test_two_objects_stay_two():
     points = 0.2 * fibonacci_sphere(1500)
     pair = at(np.concatenate([points - [0.28, 0, 0], points + [0.28, 0, 0]]))
@@ -137,9 +125,6 @@ def test_colors_of_a_sphere_of_two():
             # a twentieth of the other side shines through, more in a gap
             error = np.abs(surface.colors[side] - color.numpy())
             assert error.mean() < 0.05 and error.max() < 0.2
-
-
-SEEN = SurfaceOptions(views=24, pixels=96, transmittance=0.9)
 
 
 def test_an_unseen_vertex_takes_the_nearest_color():
@@ -265,11 +250,6 @@ def test_unit_frame_passes_over_floaters():
     some = at(np.concatenate([points, [[9000.0, 3, 5]]]), sigma=0.1)
     center, side = unit_frame(some)
     assert np.abs(center.numpy() - [3, 4, 5]).max() < 0.3 and abs(side / 40 - 1) < 0.03
-
-
-@pytest.mark.parametrize("options", [{"voxels": 4}, {"voxels": 4096}, {"views": 1}, {"pixels": 3}])
-def test_options_out_of_range(options):
-    refused("--" + next(iter(options)), SurfaceOptions(**options).check)
 
 
 def test_a_grid_that_is_too_large():

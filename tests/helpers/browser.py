@@ -18,14 +18,9 @@ import pytest
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # A page must look the same on every machine: SwiftShader draws it, and nothing asks the network.
 FLAGS = (
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+    *("--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
 )
 
 
@@ -102,8 +97,7 @@ def browser_page(browser) -> Iterator[Callable[..., Opened]]:
         context.set_default_timeout(30_000)
         result = Opened(context.new_page())
         result.page.on(
-            "console",
-            lambda message: complains(message) and result.messages.append(message.text),
+            "console", lambda message: complains(message) and result.messages.append(message.text)
         )
         result.page.on("pageerror", lambda error: result.messages.append(str(error)))
         result.page.goto(place.resolve().as_uri() if isinstance(place, Path) else place)

@@ -136,6 +136,7 @@ def _watch(connection: socket.socket) -> None:
 def _become(streams, words, environment, folder, ignored) -> None:
     """Run Python's words ``-c CODE ..``, ``-m MODULE ..`` or ``SCRIPT ..``; does not return."""
     import runpy
+    import tempfile
     import threading
     import traceback
     import types
@@ -158,6 +159,7 @@ def _become(streams, words, environment, folder, ignored) -> None:
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
+    tempfile.tempdir = None  # TMPDIR is read anew
     if "OMP_NUM_THREADS" in environment:
         torch.set_num_threads(int(environment["OMP_NUM_THREADS"]))
     if words[0] == "-u":

@@ -67,3 +67,12 @@ def block_in_float64(**g):
     if "out_proj_weight" not in g:
         return y
     return y.mT @ g["out_proj_weight"].T + g["out_proj_bias"]
+
+
+def layer_in_float64(weights, tokens):
+    """Compute a Mamba layer from its weights by their names."""
+    w = {name.replace(".", "_"): value for name, value in weights.items()}
+    given = {k: w.get(k) for k in ("conv1d_weight", "conv1d_bias", "x_proj_weight", "D")}
+    given |= {"xz": (tokens @ w["in_proj_weight"].T).mT, "A": -w["A_log"].exp()}
+    given |= {"delta_proj_weight": w["dt_proj_weight"], "delta_bias": w["dt_proj_bias"]}
+    return block_in_float64(**given, out_proj_weight=w["out_proj_weight"], out_proj_bias=0)

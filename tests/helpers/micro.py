@@ -24,11 +24,7 @@ VIEWS = 6
 # One narrow block and 64 Gaussians.
 MODEL = (
     f"image_size={SIZE}",
-    "patch_size=4",
-    "width=16",
-    "depth=1",
-    "state_size=4",
-    "scale_init=0.06",
+    *"patch_size=4 width=16 depth=1 state_size=4 scale_init=0.06".split(),
 )
 
 

@@ -8,7 +8,9 @@ from gamba_warp import cli
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.gamba import Gamba, make_blocks
+from gamba_warp.model.parts.block import prefix_states, run_blocks
+from helpers import assert_rel_rms
 
 FIELDS = ("means", "scales", "opacities", "colors")
 SMALLEST = GambaConfig(
@@ -43,6 +45,56 @@ def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
     viewmats = orbit(torch.linspace(-30, 200, batch), 11.0)
     cameras = Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
     return torch.rand(batch, size, size, 3), cameras
+
+
+def cut_outs() -> tuple[torch.Tensor, Cameras]:
+    """Draw noise in boxes of 9, 1, 24 and no cells of transparent pictures."""
+    images, cameras = inputs(4)
+    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
+    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
+    return rgba, cameras
+
+
+def perturbed(blocks: torch.nn.Module) -> torch.nn.Module:
+    """Move every parameter, so that none is 0 or 1 by chance, or as in another block."""
+    with torch.no_grad():
+        for parameter in blocks.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    return blocks
+
+
+def moved_blocks(config: GambaConfig, camera: int, image: int) -> torch.nn.ModuleList:
+    """Make blocks without a parameter of its initial value, of the channels of a condition."""
+    return perturbed(make_blocks(config, camera, image))
+
+
+def assert_plain_form(plain, blocks, length: int, camera: int, image, tolerance: float) -> None:
+    """Assert that blocks give what a plain form does, and every gradient by its name.
+
+    ``camera`` is the channels of the camera's token, ``image`` the shape of the picture's.
+    """
+    width = blocks[0].norm.weight.numel()
+    tokens = torch.randn(2, length, width)
+    condition = [
+        torch.randn(2, *shape) if shape[-1] else None for shape in ((1, camera), tuple(image))
+    ]
+    given = dict(zip(("tokens", "camera", "image"), (tokens, *condition)))
+    leaves = {name: leaf.requires_grad_() for name, leaf in given.items() if leaf is not None}
+    named = leaves | dict(blocks.named_parameters())
+    cotangent = torch.randn(2, length, width)
+    want = plain(blocks, tokens, *condition)
+    got = run_blocks(blocks, tokens, prefix_states(blocks, *condition))
+    assert_rel_rms(got, want, tolerance, "tokens")
+    found = [
+        torch.autograd.grad(out, [*named.values()], cotangent.to(out.dtype), allow_unused=True)
+        for out in (want, got)
+    ]
+    for name, grad, other in zip(named, *found):
+        assert (grad is None) == (other is None), name
+        if name.endswith("kvq_proj.bias"):  # a key's bias changes nothing: its gradient is rounding
+            grad, other = grad[width:], other[width:]
+        if grad is not None:
+            assert_rel_rms(other, grad, 10 * tolerance, name)
 
 
 def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, cells) -> Gaussians:

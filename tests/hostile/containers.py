@@ -15,16 +15,7 @@ import torch
 from helpers.meshes import glb
 from hypothesis import strategies as st
 
-from .mutations import (
-    BOMB,
-    Draw,
-    any_plain,
-    chance,
-    change_json,
-    changed_tree,
-    choice,
-    dump,
-)
+from .mutations import BOMB, Draw, any_plain, chance, change_json, changed_tree, choice, dump
 from .seeds import npy
 
 

@@ -195,6 +195,4 @@ READERS = {
     "faulty": Reader(_faulty, checks.faulty, lambda: {"text": {"a.txt": b"valid text"}}, 0),
 }
 # Valid files that a reader rejects on purpose: EPS under another name, and stand-ins of weights.
-REFUSED = {
-    ("picture", "eps-as-png"),
-}
+REFUSED = {("picture", "eps-as-png")}

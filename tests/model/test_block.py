@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from helpers import assert_rel_rms
+from helpers.model import perturbed
 
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.parts.block import GambaBlock, Mamba, prefix_states
@@ -69,18 +70,10 @@ def _run(block: GambaBlock, tokens, camera, image) -> torch.Tensor:
     return block(tokens, *prefix_states([block], camera, image))[0]
 
 
-def _perturbed(block: GambaBlock) -> GambaBlock:
-    """Move every parameter from its initial value, so that none is 0 or 1 by chance."""
-    with torch.no_grad():
-        for parameter in block.parameters():
-            parameter += 0.1 * torch.randn_like(parameter)
-    return block
-
-
 @pytest.mark.parametrize("discretization", ["mamba", "zoh", "bilinear"])
 @pytest.mark.parametrize("norm", ["layer", "rms"])
 def test_block_equals_reference(norm, discretization):
-    block = _perturbed(GambaBlock(_config(norm=norm, discretization=discretization), 7, 11))
+    block = perturbed(GambaBlock(_config(norm=norm, discretization=discretization), 7, 11))
     tokens, camera, image = torch.randn(3, 9, 24), torch.randn(3, 1, 7), torch.randn(3, 4, 11)
     want = _block_reference(block, tokens, camera, image)
     # Float32 against float64.
@@ -89,7 +82,7 @@ def test_block_equals_reference(norm, discretization):
 
 @pytest.mark.parametrize("camera_channels, image_channels", [(7, 0), (0, 11), (0, 0)])
 def test_block_with_parts_of_the_condition(camera_channels, image_channels):
-    block = _perturbed(GambaBlock(_config(), camera_channels, image_channels))
+    block = perturbed(GambaBlock(_config(), camera_channels, image_channels))
     tokens = torch.randn(1, 6, 24)
     camera = torch.randn(1, 1, 7) if camera_channels else None
     image = torch.randn(1, 4, 11) if image_channels else None
@@ -99,7 +92,7 @@ def test_block_with_parts_of_the_condition(camera_channels, image_channels):
 
 
 def test_gradients_equal_those_of_the_reference_by_differences():
-    block = _perturbed(GambaBlock(_config(), 7, 11))
+    block = perturbed(GambaBlock(_config(), 7, 11))
     inputs = {
         "tokens": torch.randn(2, 5, 24, requires_grad=True),
         "camera": torch.randn(2, 1, 7, requires_grad=True),
@@ -127,7 +120,7 @@ def test_gradients_equal_those_of_the_reference_by_differences():
 
 
 def test_prefix_reaches_the_first_token_and_nothing_flows_back():
-    block = _perturbed(GambaBlock(_config(), 7, 11))
+    block = perturbed(GambaBlock(_config(), 7, 11))
     tokens, camera, image = torch.randn(1, 8, 24), torch.randn(1, 1, 7), torch.randn(1, 4, 11)
     base = _run(block, tokens, camera, image)
     assert not torch.allclose(base[:, 0], _run(block, tokens, camera + 1, image)[:, 0])
@@ -155,7 +148,7 @@ def test_start_values_are_those_of_mamba():
 
 
 def test_bfloat16_autocast_stays_near_float32():
-    block = _perturbed(GambaBlock(_config(), 7, 11))
+    block = perturbed(GambaBlock(_config(), 7, 11))
     tokens, camera, image = torch.randn(2, 19, 24), torch.randn(2, 1, 7), torch.randn(2, 4, 11)
     want = _run(block, tokens, camera, image)
     with torch.autocast("cpu", torch.bfloat16):

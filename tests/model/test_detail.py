@@ -217,9 +217,7 @@ def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
     torch.testing.assert_close(small[:, :2], (MIN_SIZE[2] * side).expand(200, 2), rtol=0.02, atol=0)
 
 
-def test_two_rounds_correct_colours_in_one_picture_and_opacities_in_two_smaller_ones(
-    monkeypatch,
-):
+def test_two_rounds_correct_colours_in_one_picture_and_opacities_in_two_smaller_ones(monkeypatch):
     model, sizes = fresh(), []
 
     def counted(gaussians, camera):

@@ -1,9 +1,12 @@
 """Conversion of a dataset's view to a model's posed input."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers.gaussians import some
 from helpers.micro import write_dataset
+from helpers.model import SMALLEST
 
 from gamba_warp.cameras import intrinsics, reference_viewmat
 from gamba_warp.data.dataset import open_dataset
@@ -12,22 +15,11 @@ from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
 from gamba_warp.eval.views.predictions import ModelPredictions, open_predictions
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.model.checkpoint import save_model
-from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import posed_input, reference_cameras, relative_cameras
 from gamba_warp.train.batches import load_sample
 
-CONFIG = GambaConfig(
-    image_size=16,
-    patch_size=4,
-    width=16,
-    depth=1,
-    encoder="none",
-    encoder_size=16,
-    distance=1.7,
-    fov=40.0,
-    background="black",
-)
+CONFIG = replace(SMALLEST, distance=1.7, fov=40.0, background="black")
 
 
 @pytest.fixture

@@ -73,18 +73,6 @@ def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
         assert together.opacities[index, alone.num :].eq(0).all()
 
 
-def test_what_fills_up_a_batch_gets_and_gives_no_gradient():
-    model, (rgba, cameras) = trained(rays()), cut_outs()
-    grads = []
-    for pictures, views in ((rgba[:1], one(cameras, 0)), (rgba, cameras)):
-        made = model(pictures, views)
-        loss = sum((value[0, : 9 * 3] ** 2).sum() for value in (made.means, made.colors))
-        grads.append(torch.autograd.grad(loss, list(model.parameters()), allow_unused=True))
-    for (name, _), alone, padded in zip(model.named_parameters(), *grads):
-        if alone is not None:
-            torch.testing.assert_close(padded, alone, rtol=1e-4, atol=1e-5, msg=name)
-
-
 @pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])
 def test_gradients_of_a_batch_are_those_of_its_pictures(encoder):
     """Of four pictures in one row of tokens, one of them empty."""
@@ -112,7 +100,6 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
     torch.manual_seed(6)
     model = Gamba(rays(ray_cells=cells, image_size=40))
     decoder = model.decoder
-    assert isinstance(decoder, RayDecoder)
     boxes = [
         (slice(21, 22), slice(17, 18)),
         (slice(0, 0), slice(0, 0)),
@@ -170,7 +157,6 @@ def test_gaussians_follow_the_formulas(rotation):
     numbers = [0.3, -0.2, 0.5, 0.1, 0.7, 0.2, -0.4, 0.6, 0.3, -0.1, 0.25]
     numbers += [0.1, 0.2, -0.3, 0.4] if rotation else []
     decoder = model.decoder
-    assert isinstance(decoder, RayDecoder)
     with torch.no_grad():
         decoder.head.weight.zero_()
         decoder.head.bias.copy_(torch.tensor(numbers).repeat(3))
@@ -204,7 +190,6 @@ def test_wild_sizes_and_almost_empty_cells_have_limits():
     model, (rgba, cameras) = Gamba(rays()), cut_outs([(slice(4, 6), slice(4, 6))])
     rgba[0, 4:6, 6:8] = torch.tensor([0.6, 0.6, 0.6, 5e-4])  # the cell beside, of the same patch
     decoder = model.decoder
-    assert isinstance(decoder, RayDecoder)
     with torch.no_grad():
         decoder.head.weight.zero_()
         decoder.head.bias.view(3, -1)[:, 5:8] = torch.tensor([50.0, -50.0, 0.0])
@@ -236,11 +221,7 @@ def test_at_the_start_the_picture_is_the_billboard():
     config = rays(image_size=48, ray_cells=4, width=8)
     with torch.no_grad():
         made = Gamba(config)(rgba[None], one(cameras, 0))
-    shown = render(
-        made,
-        Cameras(cameras.viewmats[None], cameras.Ks[None], 48, 48),
-        torch.ones(3),
-    )
+    shown = render(made, Cameras(cameras.viewmats[None], cameras.Ks[None], 48, 48), torch.ones(3))
     rgb = shown.rgb[0].clamp(0, 1)
     # The smallest Gaussian blurs the rim, which is a tenth of this small disc.
     assert psnr(rgb, flat).min() > 27 and ssim(rgb, flat).min() > 0.94

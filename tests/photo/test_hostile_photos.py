@@ -5,11 +5,11 @@ import os
 import numpy as np
 import pytest
 from helpers.images import disc_on_noise
+from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp import cli
 from gamba_warp import images as pictures
-from gamba_warp.errors import UserError
 from gamba_warp.images import load_rgba, picture_size, to_uint8
 from gamba_warp.photo.cutout import cut_out
 
@@ -91,8 +91,7 @@ def test_pictures_of_telephones(tmp_path):
     data = (tmp_path / "a.heic").read_bytes()
     for count in (11, 12, 40, len(data) // 2):
         (tmp_path / "c.heic").write_bytes(data[:count])
-        with pytest.raises(UserError, match=r"c\.heic: "):
-            load_rgba(tmp_path / "c.heic")
+        refused(r"c\.heic: ", load_rgba, tmp_path / "c.heic")
 
 
 def test_avif(tmp_path):
@@ -108,5 +107,4 @@ def test_a_heic_without_its_reader_says_what_it_needs(tmp_path, monkeypatch):
 
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(UserError, match=r"a\.heic: .*pip install '\.\[photo\]'"):
-        load_rgba(tmp_path / "a.heic")
+    refused(r"a\.heic: .*pip install '\.\[photo\]'", load_rgba, tmp_path / "a.heic")

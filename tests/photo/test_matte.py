@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from helpers.images import disc_on_noise
 from helpers.matting import matting_network
+from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp import cli
-from gamba_warp.errors import UserError
 from gamba_warp.images import save_image
 from gamba_warp.photo import matte
 from gamba_warp.photo.cutout import Ways, cut_out
@@ -76,18 +76,15 @@ def test_small_inputs_have_imagenets_colours(tmp_path):
 def test_files_that_are_no_matting_models(tmp_path, data, reason):
     path = tmp_path / "odd.onnx"
     path.write_bytes(data)
-    with pytest.raises(UserError) as caught:
-        Matte(path)(np.zeros((20, 20, 3), np.float32))
-    assert str(caught.value).startswith(f"--matte-model {path}: ") and reason in str(caught.value)
+    said = refused(None, lambda: Matte(path)(np.zeros((20, 20, 3), np.float32)))
+    assert said.startswith(f"--matte-model {path}: ") and reason in said
 
 
 def test_a_model_that_is_no_file(tmp_path):
     for path, reason in ((tmp_path / "none", "no such file"), (tmp_path, "not a plain file")):
-        with pytest.raises(UserError, match=reason):
-            Matte(path)
+        refused(reason, Matte, path)
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(UserError, match="not a plain file"):
-        Matte(tmp_path / "pipe")
+    refused("not a plain file", Matte, tmp_path / "pipe")
 
 
 def _die(task):
@@ -96,8 +93,7 @@ def _die(task):
 
 def test_a_crash_of_the_runtime_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(matte.models, "alpha_of", _die)
-    with pytest.raises(UserError, match=r"--matte-model .*its process died of signal 9"):
-        Matte(network(tmp_path))
+    refused(r"--matte-model .*its process died of signal 9", Matte, network(tmp_path))
 
 
 def test_the_command_says_the_way_and_writes_the_input(tmp_path, capsys):

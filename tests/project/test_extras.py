@@ -105,18 +105,28 @@ def test_each_library_is_in_the_extras_that_are_named():
     assert found["all"] >= set().union(*(found[e] for e in set(versions.EXTRA_OF.values())))
 
 
+def sources() -> list[Path]:
+    folders = ("gamba_warp", "kernels", "train", "eval")
+    return [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+
+
+def imports_of(nodes) -> set[str]:
+    """Names of the modules that these statements import."""
+    found = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            found.add(node.module or "")
+    return found
+
+
 def test_no_module_imports_an_extra_when_it_is_loaded():
     """Imports for types and inside functions do not count."""
-    for folder in ("gamba_warp", "kernels", "train", "eval"):
-        for path in (ROOT / folder).rglob("*.py"):
-            if path in ALL_OF_IT:
-                continue
-            for node in ast.parse(path.read_text(encoding="utf-8")).body:
-                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-                if isinstance(node, ast.ImportFrom) and node.level == 0:
-                    names = [node.module or ""]
-                for name in names:
-                    assert not {name, name.partition(".")[0]} & set(versions.EXTRA_OF), (path, name)
+    for path in sources():
+        nodes = [] if path in ALL_OF_IT else ast.parse(path.read_text(encoding="utf-8")).body
+        for name in imports_of(nodes):
+            assert not {name, name.partition(".")[0]} & set(versions.EXTRA_OF), (path, name)
 
 
 def test_training_loads_without_what_makes_objects(monkeypatch):
@@ -203,13 +213,9 @@ def test_what_only_an_option_needs(tmp_path):
 def imported() -> dict[str, Path]:
     """Libraries imported anywhere in the package, inside functions too, each with a file."""
     found = {}
-    for folder in ("gamba_warp", "kernels", "train", "eval"):
-        for path in (ROOT / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-                if isinstance(node, ast.ImportFrom) and node.level == 0:
-                    names = [node.module or ""]
-                found.update({name.split(".")[0]: path for name in names})
+    for path in sources():
+        names = imports_of(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        found.update({name.split(".")[0]: path for name in names})
     return {n: p for n, p in found.items() if n not in {*sys.stdlib_module_names, "gamba_warp"}}
 
 

@@ -24,41 +24,15 @@ from gamba_warp.images import load_rgba
 README = ROOT / "README.md"
 MAKEFILE = (ROOT / "Makefile").read_text()
 # Programs of others, and words of the shell, that stand in blocks.
-OTHERS = {
-    "git",
-    "cd",
-    "docker",
-    "source",
-    "pip",
-    "for",
-    "do",
-    "done",
-    "sbatch",
-    "export",
-    "apt-get",
-    "ulimit",
-}
+OTHERS = {*"git cd docker source pip for do done sbatch export apt-get ulimit".split()}
 SHELL = blocks("bash")
 PYTHON = blocks("python")
 # `gamba … ` in the middle of a sentence; a name in capitals or an ellipsis stands for something.
-TETRAHEDRON_PLY = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-element face 4
-property list uchar int vertex_indices
-end_header
-0 0 0
-1 0 0
-0 1 0
-0 0 1
-3 0 2 1
-3 0 1 3
-3 1 2 3
-3 0 3 2
-"""
+TETRAHEDRON_PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+    "property float z\nelement face 4\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
+)
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 INLINE = re.compile(r"`(gamba [a-z][^`]*)`")
 

@@ -4,8 +4,6 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = [
     path
@@ -22,29 +20,20 @@ def _is_overload(node) -> bool:
     return any(ast.unparse(d) == "overload" for d in node.decorator_list)
 
 
-def _functions(path: Path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.FunctionDef):
-            yield node
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_public_functions_have_docstrings(path):
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
-            if isinstance(node, ast.FunctionDef) and (_is_device(node) or _is_overload(node)):
-                continue
-            assert ast.get_docstring(node), f"{node.name} has no docstring"
+def test_public_functions_have_docstrings():
+    for path in SOURCES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+                if isinstance(node, ast.FunctionDef) and (_is_device(node) or _is_overload(node)):
+                    continue
+                assert ast.get_docstring(node), f"{path}: {node.name} has no docstring"
 
 
 def test_every_progress_bar_is_the_one_that_logs_do_without():
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
-                "tqdm",
-                "tqdm.tqdm",
-                "trange",
-            ):
+            bars = "tqdm", "tqdm.tqdm", "trange"
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in bars:
                 assert path == ROOT / "gamba_warp" / "batch.py", f"{path}, line {node.lineno}"
 
 

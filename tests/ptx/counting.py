@@ -28,7 +28,6 @@ from .parse import SPACES, Program
 CHANNELS, STATES = 1024, 16  # of the scan in the paper's model
 WIDTH = 4  # of the convolution
 GAUSSIANS, SIDE = 16384, 512
-SECTOR = 32
 # Counts beside instructions: their memory accesses.
 ASKED = ("bytes", "sectors", "first", "own", "passes", "conflicts", "together")
 _NAME = re.compile(r"(?:\w+__locals__)?_?(\w+?)(?:_[0-9a-f]{8})+_cuda_kernel_forward")

@@ -13,7 +13,7 @@ from .launch import interpreted
 _OPTIONS = {x: int(os.environ.get(f"GAMBA_PTX_{x.upper()}", "0")) for x in ("seed", "approximate")}
 _OPTIONS["contract"] = os.environ.get("GAMBA_PTX_CONTRACT", "")
 # These ask for what only the CPU's kernels have, as their order of lists.
-_OF_THE_CPU = ("test_many.py", "[cpu", "_cuda.py", "test_tile_lists", "test_counts_tell")
+_OF_THE_CPU = ("test_many.py", "[cpu", "_cuda.py", "test_counts_tell")
 _seen = {"tests": 0, "launches": 0, "instructions of warps": 0}
 
 

@@ -3,12 +3,9 @@
 import json
 
 import pytest
-import torch
 
-from . import counts, peer_code
-from .counting import Executed, count
+from . import counts
 from .machine import Missing, library
-from .peers import at_full_width
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +16,6 @@ def document():
 @pytest.fixture(scope="module")
 def kernels(document):
     return {(row["kernel"], row["case"], row["per"][:4]): row for row in document["kernels"]}
-
-
-def test_the_page_is_of_the_counts(document):
-    assert counts.PAGE.read_text() == counts.markdown(document)
 
 
 @pytest.mark.parametrize("case", [("conv", "bfloat16"), ("raster", "harmonics of degree 3")])
@@ -74,11 +67,6 @@ def test_bounds(kernels):
         assert 0.5 * most < found <= most, (kernel, kind)
 
 
-def test_what_is_not_executed_is_not_counted():
-    found = count(lambda: [], (), 1)
-    assert found == {"forward": {}}
-
-
 def test_ratios_to_others(document):
     """No kernel executes more instructions; a tenth above the ratios when this was written."""
     close = [(case, "forward") for case in ("projection", "tile lists", "1 x 2,048, bfloat16")]
@@ -87,55 +75,3 @@ def test_ratios_to_others(document):
         ratio = row["ours"]["instructions"] / row["theirs"]["instructions"]
         limit = 1.0 if (row["case"], row["direction"]) in close else most[row["op"]]
         assert 0 < ratio <= limit, row
-
-
-HEADER = """struct Base {
-    using index_t = uint64_t;
-    int batch, dim;  // sizes
-    bool even;
-    index_t x_batch_stride;
-    void *__restrict__ x_ptr;
-};
-struct More: public Base {
-    index_t y_l_stride;
-    void * y_ptr;
-};"""
-
-
-def test_parameters_of_a_kernel():
-    """Fields lie as a C++ compiler lays them; strides go by the names of axes."""
-    x = torch.zeros(3, 5)
-    kind = peer_code.structure(HEADER, "More")
-    made = kind.from_buffer_copy(
-        peer_code.filled(kind, {"x": (x, "batch l"), "y": (x.mT, "l batch")}, dim=7, even=True)
-    )
-    assert (made.batch, made.dim, made.even) == (0, 7, True)
-    assert (made.x_batch_stride, made.y_l_stride) == (5, 1)
-    assert made.x_ptr == made.y_ptr == x.data_ptr()
-    offsets = [
-        getattr(kind, name).offset for name in ("dim", "even", "x_ptr", "y_l_stride", "y_ptr")
-    ]
-    assert offsets == [4, 8, 24, 32, 40]
-
-
-def test_all_channels_from_two_runs():
-    """Count once for each sequence what channels share."""
-
-    def run(channels):
-        counts = {"first": 100 + 3 * channels, "float": 2 * channels}
-        return {"forward": [Executed("k", counts)]}
-
-    ((whole,),) = at_full_width(run, 4, 16).values()
-    assert whole.counts == {"first": 16 * (100 + 3 * 1024), "float": 16 * 2 * 1024}
-
-
-def test_without_an_index(monkeypatch, tmp_path):
-    """One line says that others' kernels cannot be had."""
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
-    try:
-        library()
-        with pytest.raises(Missing, match="pip: .*nvidia-cuda-nvcc|headers are needed"):
-            peer_code.Peers(tmp_path / "peers")
-    except Missing as reason:
-        pytest.skip(str(reason))

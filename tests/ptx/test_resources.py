@@ -97,10 +97,7 @@ def test_a_kernel_is_in_its_bounds(entries, key):
                 assert used.reloads <= 4, (arch, used)  # of the place of the marks
 
 
-ON_THE_HOST = {
-    "runtime/launch.py",
-    "ssim/lanes.py",
-}  # a CPU launches these; no path says so
+ON_THE_HOST = {"runtime/launch.py", "ssim/lanes.py"}  # a CPU launches these; no path says so
 
 
 def kernels_of_the_sources():

@@ -5,7 +5,7 @@ import json
 
 import pytest
 from helpers.published.gobjaverse import VIEWS, members, write_object, write_tar
-from helpers.refusals import refused
+from helpers.refusals import refused, refused_command
 
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
@@ -158,9 +158,8 @@ def test_bad_lists_are_one_line(published, tmp_path, capsys, words, reason):
     (published / "names.txt").write_text("../../etc/pass wd\n")
     (published / "cut.json.gz").write_bytes(gzip.compress(b"[" + b" " * 10**6 + b"]")[:-20])
     given = [word.format(published) for word in words]
-    assert data(tmp_path / "out", "--source", published / "set", *given) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and reason in error
+    words = [tmp_path / "out", "--source", published / "set", *given]
+    refused_command(capsys, "data objaverse", words, reason)
     assert not list(tmp_path.rglob("campos_512_v4"))
 
 

@@ -26,6 +26,7 @@ def test_a_second_run_has_the_options_of_the_first(data, tmp_path, capsys):
     for group, values in changed.items():
         first[group] |= values
     assert first == second and len(lines(two, "train")) == 3
+    assert "loss_rdist" not in lines(two, "train")[0]
     # Without --out the same run is resumed, here with another length.
     assert _train(f"--config={one / 'config.json'}", "--steps", 4) == 0
     assert [record["step"] for record in lines(one, "train")] == [1, 2, 3, 4]
@@ -57,10 +58,7 @@ def test_data_may_be_another(tmp_path):
         (b'{"data": "x", "preset": "tiny", "optim": 3}', "optim: Expected `object`"),
         (b'{"data": "--out=/", "preset": "tiny"}', "'--out=/' is not a valid value"),
         (b'{"data": "x", "preset": "tiny", "optim": {"lr": "fast"}}', "lr: Expected `float`, got"),
-        (
-            b'{"data": "x", "preset": "tiny", "optim": {"lr": {}}}',
-            "lr: Expected `float`",
-        ),
+        (b'{"data": "x", "preset": "tiny", "optim": {"lr": {}}}', "lr: Expected `float`"),
     ],
 )
 def test_bad_files_are_one_line(tmp_path, content, words):

@@ -17,12 +17,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.train.batches import load_sample
 from gamba_warp.train.data.samples import Change
-from gamba_warp.train.objective.losses import (
-    DEPTH_BETA,
-    SLOPE_STEPS,
-    SLOPE_WEIGHT,
-    depth_loss,
-)
+from gamba_warp.train.objective.losses import DEPTH_BETA, SLOPE_STEPS, SLOPE_WEIGHT, depth_loss
 
 SIDES = (1.0, 0.4, 0.6)
 RAYS = (*micro.MODEL, "decoder=rays", "ray_cells=2", "ray_layers=3", "ray_features=8")

@@ -24,7 +24,7 @@ from PIL import Image
 from safetensors.torch import load_file
 from torch.utils.checkpoint import checkpoint
 
-from gamba_warp import batch, cli
+from gamba_warp import batch
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
@@ -185,6 +185,8 @@ def test_finished_run_is_left_alone_and_can_be_lengthened(data, tmp_path):
 
 def test_a_run_learns_and_writes_everything(tmp_path):
     """One object for training and validation: better by far than at the start."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
     data = micro.write_dataset(tmp_path / "clouds", 1)
     shutil.copytree(data / "clouda", data / "cloudb")
     split = {"version": 2, "train": ["clouda"], "val": ["cloudb"], "test": []}
@@ -212,17 +214,8 @@ def test_a_run_learns_and_writes_everything(tmp_path):
     assert strip.shape == (2 * micro.SIZE, 5 * micro.SIZE, 3)
     assert lines(tmp_path, "start")[0]["config"]["model"]["width"] == 16
     assert json.loads((tmp_path / "latest.json").read_text())["step"] == 120
-    assert list((tmp_path / "tensorboard").iterdir())
-
-
-def test_tensorboard_gets_the_pictures(data, tmp_path):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    assert run(data, tmp_path, run={"val_every": 2}, length={"steps": 2}) == 0
     board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    (picture,) = board.Images("val/pictures")
-    # True views above the predicted ones: the input and four others of 16 pixels.
-    assert (picture.step, picture.height, picture.width) == (2, 32, 80)
+    assert board.Images("val/pictures")[-1].height == 2 * micro.SIZE
 
 
 def test_validation_is_on_held_out_objects(data, tmp_path, monkeypatch):
@@ -310,26 +303,14 @@ def test_never_resume_and_resume_from_a_path(data, tmp_path):
         run(data, tmp_path / "c", run={"resume": str(tmp_path / "nothing")})
 
 
-def test_init_takes_the_weights_only(data, tmp_path):
-    assert run(data, tmp_path / "a", length={"steps": 2}) == 0
-    start = {"init": tmp_path / "a" / "model.safetensors"}
-    still = {"optim": {"lr": 1e-30, "ema": 0.0}, "length": {"steps": 1}}
-    assert run(data, tmp_path / "b", run=start, **still) == 0
-    assert_same_files(*(tmp_path / part / "model.safetensors" for part in "ab"))
-
-
 def test_bad_data_and_bad_options(data, tmp_path):
+    (tmp_path / "file").write_text("")
+    refused("file", run, data, tmp_path / "file" / "run")
     refused("no such folder", run, tmp_path / "missing", tmp_path / "run")
-    refused("--lr -1.0: must be above 0", run, data, tmp_path / "run", optim={"lr": -1.0})
     with pytest.raises(UserError, match="nofield"):
         config = micro.options(data, tmp_path / "run")
         type(config)(**{**vars(config), "set": ("nofield=3",)}).model_config()
     assert not (tmp_path / "run").exists(), "bad input leaves nothing behind"
-
-
-def test_run_folder_that_cannot_be_written(data, tmp_path):
-    (tmp_path / "file").write_text("")
-    refused("file", run, data, tmp_path / "file" / "run")
 
 
 def test_broken_object_is_left_out_and_listed(tmp_path, capsys):
@@ -479,18 +460,3 @@ def test_the_average_is_in_eval_mode_and_shares_a_frozen_encoder(frozen):
     trained = {id(p) for p in model.parameters() if p.requires_grad}
     assert trained.isdisjoint(map(id, average.parameters()))
     assert not any(p.requires_grad for p in average.parameters())
-
-
-def test_command_line(data, tmp_path, capsys):
-    model = ["--preset", "tiny", "--set", *micro.MODEL]
-    quick = ["--steps", "2", "--size", "16", "--lpips", "off"]
-    views = ["--batch-size", "1", "--views-per-object", "1", "--no-radial-mask", "--device", "cpu"]
-    arguments = [str(data), *model, *quick, *views, "--out", str(tmp_path / "run")]
-    assert cli.run("train", arguments) == 0
-    assert "loss_rdist" not in (tmp_path / "run" / "log.jsonl").read_text()
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert config["views"]["views_per_object"] == 1 and config["model"]["depth"] == 1
-    capsys.readouterr()
-    assert cli.run("train", [str(tmp_path / "missing")]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "missing: no such folder" in error

@@ -21,10 +21,7 @@ DOORS = {
     "pickle.loads": {"gamba_warp/untrusted/children.py"},
     "json.load": set(),
     # files just written by the same process or its parent, and options
-    "json.loads": {
-        "gamba_warp/model/checkpoint.py",
-        "train/config.py",
-    },
+    "json.loads": {"gamba_warp/model/checkpoint.py", "train/config.py"},
     "msgspec.json.decode": {"gamba_warp/untrusted/documents.py", "eval/presets.py"},
 }
 

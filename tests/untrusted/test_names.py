@@ -6,21 +6,8 @@ from helpers.refusals import refused
 from gamba_warp.untrusted.names import MAX_NAME, inside, plain_name
 
 BAD = [
-    *(
-        "",
-        " ",
-        ".",
-        "..",
-        "../x",
-        "a/../b",
-        "a/..",
-        "/x",
-        "//x",
-        "C:/x",
-        "C:x",
-        "\\\\host\\x",
-        "a\\b",
-    ),
+    *("", " ", ".", "..", "../x", "a/../b", "a/..", "/x", "//x"),
+    *("C:/x", "C:x", "\\\\host\\x", "a\\b"),
     *("a\0b", "a\nb", "a\x7f", "a\u2028b", "\ud800", "a" * (MAX_NAME + 1), "a/" * 600),
     *(None, 3, ["a"], {"a": 1}, True),
 ]
@@ -33,16 +20,8 @@ def test_bad_names_are_one_line(tmp_path, name):
 
 
 def test_good_names(tmp_path):
-    for name in (
-        "a.png",
-        "./a.png",
-        "images/a.png",
-        "Café chair",
-        "a..b",
-        "-",
-        "~",
-        "a" * MAX_NAME,
-    ):
+    good = "a.png", "./a.png", "images/a.png", "Café chair", "a..b", "-", "~", "a" * MAX_NAME
+    for name in good:
         assert inside(tmp_path, name, "x") == tmp_path / name
     assert plain_name("chair-1.obj", "x") == "chair-1.obj"
     for name in ("a/b", "./a", "a/", ".hidden"):

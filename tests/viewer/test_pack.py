@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 import torch
-from helpers.gaussians import some
+from helpers.gaussians import rotations, some
+from helpers.refusals import refused
 
-from gamba_warp.errors import UserError
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.viewer.pack import (
@@ -26,16 +26,6 @@ UNMOVED = Frame(np.zeros(3), 1.0)
 ONE_FACE = np.array([[0, 1, 2]])
 
 
-def matrices(quats):
-    w, x, y, z = np.moveaxis(quats / np.linalg.norm(quats, axis=1, keepdims=True), 1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
 def test_records_hold_what_was_packed():
     gaussians = some(500)
     gaussians.quats[0] = torch.tensor([0.0, 0.6, 0.0, -0.8])  # a half turn: w is 0
@@ -48,9 +38,9 @@ def test_records_hold_what_was_packed():
     np.testing.assert_allclose(records["look"][:, 1:], gaussians.colors, rtol=half, atol=1e-7)
     p = records["turns"] / 32767
     k = 2 / (1 + (p * p).sum(1, keepdims=True))
-    turns = matrices(np.hstack([k - 1, k * p]))
+    turns = rotations(torch.from_numpy(np.hstack([k - 1, k * p])))
     # half a step of 1/32767 in each number, at most twice and four times as much in a rotation
-    assert np.abs(turns - matrices(gaussians.quats.double().numpy())).max() < 4 * 3 / 32767
+    assert (turns - rotations(gaussians.quats.double())).abs().max() < 4 * 3 / 32767
 
 
 @pytest.mark.parametrize("count", [3, 8, 15])
@@ -126,8 +116,7 @@ def test_cameras():
 def test_bad_gaussians(tmp_path, break_it, message):
     gaussians = some(9)
     break_it(gaussians)
-    with pytest.raises(UserError, match=message):
-        write_viewer(tmp_path / "a.html", "a.ply", gaussians)
+    refused(message, write_viewer, tmp_path / "a.html", "a.ply", gaussians)
     assert not list(tmp_path.iterdir())
 
 
@@ -135,8 +124,7 @@ def test_bad_gaussians(tmp_path, break_it, message):
     ("faces", "message"), [(np.zeros((0, 3), int), "no faces"), (ONE_FACE + 1, "names vertex 3")]
 )
 def test_bad_meshes(faces, message):
-    with pytest.raises(UserError, match=message):
-        pack_mesh(Surface(np.eye(3), faces), UNMOVED, "a")
+    refused(message, pack_mesh, Surface(np.eye(3), faces), UNMOVED, "a")
 
 
 @pytest.mark.parametrize("kind", ["glb", "ply", "obj"])

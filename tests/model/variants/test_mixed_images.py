@@ -3,19 +3,23 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.model import assert_each_alone, assert_recomputed_alike, inputs, micro
+from helpers.model import (
+    assert_each_alone,
+    assert_plain_form,
+    assert_recomputed_alike,
+    cut_outs,
+    inputs,
+    micro,
+    moved_blocks,
+)
 from helpers.refusals import refused
 
-from gamba_warp.model.gamba import Gamba, make_blocks
+from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.block import mixed_positions, prefix_states, run_blocks
 
 
 def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
-    blocks = make_blocks(micro(image_tokens="mixed", depth=3, **changes), camera, image)
-    with torch.no_grad():
-        for parameter in blocks.parameters():  # none is 0 or 1 by chance, or as in another block
-            parameter += 0.1 * torch.randn_like(parameter)
-    return blocks
+    return moved_blocks(micro(image_tokens="mixed", depth=3, **changes), camera, image)
 
 
 def plain(blocks, tokens, camera, image):
@@ -45,21 +49,8 @@ def plain(blocks, tokens, camera, image):
 )
 def test_equals_the_plain_form(camera, count, length):
     blocks = blocks_of(camera, 11 if count else 0, norm="rms" if camera else "layer")
-    leaves = {"tokens": torch.randn(2, length, 16)}
-    if camera:
-        leaves["camera"] = torch.randn(2, 1, camera)
-    if count:
-        leaves["image"] = torch.randn(2, count, 11)
-    condition = leaves.get("camera"), leaves.get("image")
-    named = {n: x.requires_grad_() for n, x in leaves.items()} | dict(blocks.named_parameters())
-    want = plain(blocks, leaves["tokens"], *condition)
-    got = run_blocks(blocks, leaves["tokens"], prefix_states(blocks, *condition))
     # Float32 sums in another order, through three blocks.
-    assert_rel_rms(got, want, 1e-6, "tokens")
-    cotangent = torch.randn(2, length, 16)
-    wanted, gotten = (torch.autograd.grad(out, [*named.values()], cotangent) for out in (want, got))
-    for name, grad, other in zip(named, wanted, gotten):
-        assert_rel_rms(other, grad, 1e-5, name)
+    assert_plain_form(plain, blocks, length, camera, (count, 11 if count else 0), 1e-6)
 
 
 def test_places_known_answer():
@@ -85,10 +76,7 @@ def test_a_batch_on_rays_is_each_picture_alone():
     changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
     model = Gamba(micro(image_tokens="mixed", **changes), "random")
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
-    images, cameras = inputs(4)
-    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
-    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
-    assert_each_alone(model, rgba, cameras, (9, 1, 24, 0))
+    assert_each_alone(model, *cut_outs(), (9, 1, 24, 0))
 
 
 def test_condition_recomputation_and_autocast():

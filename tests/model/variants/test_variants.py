@@ -5,7 +5,8 @@ import json
 
 import pytest
 import torch
-from helpers.model import inputs, micro
+from helpers.model import FIELDS, inputs, micro
+from safetensors import safe_open
 
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import PRESETS, GambaConfig
@@ -87,21 +88,37 @@ def test_older_files_mean_the_defaults():
     assert GambaConfig.from_json(json.dumps(old)) == PRESETS["tiny"]
 
 
-@pytest.mark.parametrize("changes", VARIANTS, ids=str)
-def test_files_hold_a_variant(tmp_path, changes):
-    model = Gamba(micro(**({"encoder": "none"} | changes))).eval()
+@pytest.mark.parametrize(
+    "changes, weights",
+    [
+        *(({"encoder": "none"} | changes, None) for changes in VARIANTS),
+        ({"encoder": "none", "predict_rotation": True}, None),
+        ({}, "random"),
+        ({"encoder_frozen": False}, "random"),
+        ({"prepend": False}, None),
+    ],
+    ids=str,
+)
+def test_files_hold_the_bits(tmp_path, changes, weights):
+    model, path = Gamba(micro(**changes), weights).eval(), tmp_path / "any.safetensors"
     with torch.no_grad():
         for parameter in model.parameters():
-            parameter += 0.01 * torch.randn_like(parameter)
-    save_model(tmp_path / "m.safetensors", model)
-    loaded = load_model(tmp_path / "m.safetensors")
-    assert loaded.config == model.config
+            if parameter.requires_grad:
+                parameter += 0.01 * torch.randn_like(parameter)
+    save_model(path, model, {"step": "12"})
+    frozen = model.encoder is not None and model.config.encoder_frozen
+    loaded = load_model(path, encoder_weights="random" if frozen else None)
+    assert loaded.config == model.config and not loaded.training
     size = model.config.image_size
     picture = torch.rand(size, size, 4).numpy()
     want, got = reconstruct(model, picture), reconstruct(loaded, picture)
-    for name in ("means", "scales", "opacities", "colors"):
+    for name in FIELDS:
         assert torch.equal(getattr(got, name), getattr(want, name)), name
         assert getattr(got, name).isfinite().all()
+    with safe_open(path, framework="pt") as file:
+        assert file.metadata()["step"] == "12"
+        stored = any(name.startswith("encoder.") for name in file.keys())
+    assert stored == (model.encoder is not None and not frozen)
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,12 @@
 
 import json
 import math
-import re
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import pytest
 import torch
 from helpers import rel_rms
+from helpers.refusals import refused_command
 
 from gamba_warp import cli
 from gamba_warp.commands import machine
@@ -175,20 +174,9 @@ def test_interrupt_keeps_what_was_measured(monkeypatch, tmp_path, capsys):
     assert rounds == {"a": 3, "b": 2, "c": 2}
 
 
-def test_interrupt_before_any_round(monkeypatch):
-    document = run(case(variant("a"), variant("b", raises(KeyboardInterrupt()))))
-    assert document["interrupted"] and document["records"] == []
-
-
 @pytest.mark.parametrize(
     "arguments, reason",
     [
-        (
-            ["nonsense"],
-            "unknown case 'nonsense'; there are scan, conv, raster, model, step and all",
-        ),
-        (["scan", "--quick", "--full"], "choose one"),
-        (["scan", "--threads", "0"], "--threads 0: must be at least 1"),
         (["scan", "--only", "two"], "--only two: no such case; there are one"),
         (["scan", "--out", "{}/file"], "cannot write into {}/file"),
         (["scan", "--out", "{}/file/deep"], "cannot write into {}/file/deep"),
@@ -197,16 +185,14 @@ def test_interrupt_before_any_round(monkeypatch):
 def test_bad_input_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, arguments, reason):
     (tmp_path / "file").write_text("x")
     stub(monkeypatch, case(variant("must not run", raises(AssertionError()))))
-    code = cli.run("bench", [a.format(tmp_path) for a in arguments])
-    captured = capsys.readouterr()
-    assert code == 2 and captured.err.count("\n") == 1 and "Traceback" not in captured.err
-    assert reason.format(tmp_path) in captured.err
+    words = [a.format(tmp_path) for a in arguments]
+    refused_command(capsys, "bench", words, reason.format(tmp_path))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_cuda_without_a_gpu(tmp_path, capsys):
-    assert cli.run("bench", ["scan", "--device", "cuda", "--out", str(tmp_path / "x")]) == 2
-    assert capsys.readouterr().err == "gamba: --device cuda: no CUDA device is available\n"
+    words = ["scan", "--device", "cuda", "--out", tmp_path / "x"]
+    refused_command(capsys, "bench", words, "gamba: --device cuda: no CUDA device is available")
     assert not (tmp_path / "x").exists()
 
 
@@ -229,32 +215,6 @@ def test_a_busy_machine_is_told():
     for record in document["records"]:
         record["cpu_ms"] = record["ms_p50"]
     assert "busy" not in markdown(document)
-
-
-def test_tables_leave_out_empty_columns():
-    made = (variant("a|b", work=lambda: {"pairs": 7, "saved_bytes": 1 << 20}), variant("b"))
-    document = run(case(*made), case(variant("c"), name="two"))
-    first, second = markdown(document).split("## scan: ")[1:]
-    assert "| work |" in first and "of ellipses 7, saved 1.0 MiB" in first
-    assert "Error: relative rms to a loop." in first
-    assert "| work |" not in second and "peer's time" not in first + second
-
-
-def test_the_chart_has_a_mark_for_each_variant():
-    made = [
-        variant("exact", error=0.0, default=True),
-        variant("<half>", error=1e-3, limit=1.0, direction=BOTH),
-        variant("theirs", error=1e-7, peer=True),
-    ]
-    document = run(case(*made), case(variant("x"), op="conv"))
-    root = ET.fromstring(chart(document))
-    spaces = {"s": "http://www.w3.org/2000/svg"}
-    titles = [e.text for e in root.iterfind(".//s:title", spaces)]
-    assert len(titles) == 4 and titles[0].startswith("one, exact: ")
-    numbers = re.findall(r' (?:x|y|cx|cy)="([^"]+)"', chart(document))
-    assert all(-1 <= float(n) <= 1000 for n in numbers)
-    assert len(root.findall("s:g", spaces)) == 3  # of operators and directions
-    ET.fromstring(chart(run(case(variant("broken", raises(ValueError("x")))))))
 
 
 def test_compare_of_tensors():

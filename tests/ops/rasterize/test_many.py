@@ -127,25 +127,6 @@ def test_repeatable_with_any_number_of_threads(monkeypatch):
             assert_same(want, call(scene))
 
 
-@pytest.mark.parametrize("num, views", [(1, 1), (17, 2), (0, 1), (5, 0)])
-def test_few_or_none(monkeypatch, num, views):
-    monkeypatch.setattr(bin_cpu, "MANY", 0)
-    scene = make(1, views, num)
-    got, meta = call(scene)
-    assert all(x.isfinite().all() for x in got.values())
-    assert len(meta.bins.order) == num * views
-    scene["means"][..., 2] += 100 if num else 0  # nothing is in sight
-    scene["far_plane"] = 10.0
-    assert rasterization(**scene)[2]["pairs"] == 0
-
-
-def test_too_many_pairs(monkeypatch):
-    monkeypatch.setattr(bin_cpu, "MANY", 0)
-    monkeypatch.setattr("gamba_warp.kernels.rasterize.ops.MAX_PAIRS", 100)
-    with pytest.raises(ValueError, match="pairs of tiles"):
-        rasterization(**make(1, 1, 90, 37, 53, size=0.3))
-
-
 @pytest.mark.parametrize(
     "num, rotated, antialiased, rounded, channels",
     [(1037, True, 0, 0, 3), (530, True, 1, 0, 1), (77, False, 0, 1, 5), (9, True, 0, 0, 18)],

@@ -20,12 +20,6 @@ def test_modes(mode):
     compare(make(), mode)
 
 
-@pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
-def test_antialiased(mode):
-    # small Gaussians, so that the factor matters
-    compare(make(1, 2, size=0.025, num=300, width=53), mode, antialiased=True)
-
-
 def test_antialiasing_leaves_a_two_hundredth_of_what_is_tiny():
     """The factor has a floor, where it has no gradient: sqrt(det Σ) would have an infinite one."""
     scene = make(1, 1, num=5, width=21, height=18)
@@ -43,28 +37,10 @@ def test_channels_and_batches(channels, views, batch):
     compare(make(batch, views, channels=channels, width=21, height=18))
 
 
-def test_large_gaussians_stop_early():
-    scene = make(num=150, size=0.3)
-    scene["opacities"] = 0.9 + 0.0999 * torch.rand(2, 150)
-    # alpha is clamped often, and 1e-4 is all that is left for the last ones
-    meta = compare(scene)
-    assert meta["pairs_walked"] < 0.7 * meta["pairs"]
-
-
 def test_colors_per_view():
     scene = make()
     scene["colors"] = torch.rand(2, 3, 60, 3)
     compare(scene)
-
-
-def test_wide_view_clamps_the_jacobian():
-    scene = make(num=200)
-    scene["means"] = scene["means"] * 4  # many beside the picture, and some behind
-    scene["Ks"][..., 0, 0] *= 0.3
-    scene["Ks"][..., 1, 1] *= 0.5
-    scene["scales"] = scene["scales"] * 3
-    meta = compare(scene)
-    assert meta["culled"]["near"] > 0
 
 
 @pytest.mark.parametrize(
@@ -94,13 +70,6 @@ def test_planes():
     compare(make(num=200, size=0.1), near_plane=1.5, far_plane=1.9)
 
 
-def test_needles():
-    """The conic as a sum of squares: no cancellation, where a c - b² would lose all digits."""
-    scene = make(num=40, size=0.01, width=96, height=80)
-    scene["scales"][..., 0] = 2.0
-    compare(scene, gradient=1e-3)  # a derivative of a needle's angle carries its length in pixels
-
-
 def test_without_rotation():
     scene = make()
     identity = dict(scene, quats=torch.tensor([1.0, 0, 0, 0]).expand(2, 60, 4).contiguous())
@@ -119,14 +88,7 @@ def test_zero_quaternion_is_no_rotation():
     assert (scene["quats"].grad[:, :7] == 0).all()
 
 
-def test_zero_scales_are_points():
-    scene = make(1, 2, num=200)
-    scene["scales"][:, ::2] = 0.0
-    compare(scene)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics(degree):
+def test_harmonics(degree=2):
     scene = make(num=50)
     coefficients = 0.4 * torch.randn(2, 50, 16, 3)
     scene["colors"] = coefficients

@@ -8,9 +8,8 @@ import warp as wp
 from helpers import assert_rel_rms
 from helpers.raster import absolute_gradients, crowded, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, ops, rasterization
+from gamba_warp.kernels.rasterize import Skip, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
-from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 from gamba_warp.kernels.rasterize.cuda import leaves as leaves_cuda
 from gamba_warp.kernels.rasterize.cuda.records import make_records
@@ -245,11 +244,6 @@ def test_no_sub_tile_is_missed(from_ptx, longest):
     assert 0.05 < needed.float().mean() < 0.8
     # no pixel centre need lie in an ellipse that touches a sub-tile, so some are kept in vain
     assert (got & ~needed).sum() < 0.2 * needed.sum()
-
-
-def test_devices_have_their_compositor():
-    assert ops._compositor(torch.device("cpu")) is composite_cpu
-    assert ops._compositor(torch.device("cuda")) is composite_cuda
 
 
 @pytest.mark.gpu

@@ -75,12 +75,3 @@ def test_counts_tell_what_each_leaves_out():
     assert on["gaussians_used"] < VIEWS * 6000
     for name in NAMES:  # what had an effect does not depend on what was looked at
         assert metas[name]["blocks_used"] == on["blocks_used"]
-
-
-@pytest.mark.parametrize("wanted", [("colors",), ("means", "scales"), ("opacities",)])
-def test_unasked_gradients(wanted):
-    want, _ = render()
-    for skip in (Skip(), Skip(unasked=False)):
-        got, _ = render(skip, wanted)
-        errors = close(got, {k: want[k] for k in got})
-        assert max(errors.values()) < 1e-6, errors

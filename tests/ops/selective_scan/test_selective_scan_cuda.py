@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from gpu import checks
 from helpers import assert_rel_rms
-from helpers.scan import STATE, leaves, make, oracle
+from helpers.scan import STATE, compare, leaves, make, oracle
 
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
@@ -75,30 +76,18 @@ def test_equal_terms_of_a_sum_do_not_round_to_one_side():
         assert_rel_rms(got[name], want[name], 6e-7, name)
 
 
-@pytest.mark.parametrize("length", [1, 4, 5, 63, 64, 65, 128])
-def test_lengths_around_a_chunk(length):
-    inputs = make(1, length, 5, 3)
-    v_out, v_last = cotangents(inputs)
-    assert_all(run(inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
-
-
-@pytest.mark.parametrize("states, length", [(1, 66), (17, 66), (40, 66), (256, 9)])
-def test_any_number_of_states(states, length):
-    inputs = make(1, length, 3, states)
-    v_out, v_last = cotangents(inputs)
-    assert_all(run(inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
+@pytest.mark.parametrize(
+    "states, length",
+    [*((3, n) for n in (1, 4, 5, 63, 64, 65, 128)), (1, 66), (17, 66), (40, 66), (256, 9)],
+)
+def test_lengths_around_a_chunk_and_numbers_of_states(states, length):
+    compare(make(1, length, 3, states), LIMIT, LIMIT)
 
 
 @pytest.mark.parametrize("dtype, limit", [(torch.bfloat16, 4e-3), (torch.float16, 5e-4)])
 def test_half_precision(dtype, limit):
     """Limits: one rounding of the dtype, 2^-9 and 2^-12."""
-    inputs = make(1, 20, 34, 3, dtype=dtype)
-    v_out, v_last = cotangents(inputs)
-    want = exact(inputs, "mamba", v_out, v_last)
-    got = run(inputs, "mamba", v_out, v_last)
-    for name, value in got.items():
-        assert value.dtype == (inputs[name] if name in inputs else v_last).dtype or name == "out"
-        assert_rel_rms(value, want[name], LIMIT if value.dtype == torch.float32 else limit, name)
+    compare(make(1, 20, 34, 3, dtype=dtype), limit, LIMIT)
 
 
 def test_without_options_and_with_strides():
@@ -116,13 +105,7 @@ def test_without_options_and_with_strides():
     )
 
 
-TUNINGS = [
-    Tuning(),
-    Tuning(segments=2, back_segments=3),
-    Tuning(segments=7, channels=1, states=16, back_channels=1, back_states=8),
-    Tuning(channels=4, states=4, back_segments=4, back_channels=4, back_states=4),
-    Tuning(channels=1, states=4, back_channels=2, back_states=8, block=64),
-]
+TUNINGS = [Tuning(), *checks.TUNINGS]
 
 
 def test_tunings_differ_by_rounding_only(tuned):
@@ -213,16 +196,3 @@ def test_on_a_gpu(tuned, shape, tuning, dtype, limit):
         assert torch.equal(value, second[name]), name
         # the exponential of the GPU errs by up to 2^-22 a step
         assert_rel_rms(value, want[name], 1e-5 if value.dtype == torch.float32 else limit, name)
-
-
-@pytest.mark.gpu
-def test_in_a_cuda_graph():
-    inputs = {k: v.cuda() for k, v in make(1, 577, 70, 16).items()}
-    want = selective_scan(**inputs, delta_softplus=True)
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        out = selective_scan(**inputs, delta_softplus=True)
-    out.fill_(torch.nan)
-    graph.replay()
-    assert torch.equal(out, want)

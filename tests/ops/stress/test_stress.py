@@ -277,21 +277,6 @@ def test_interrupted_keeps_what_was_found(tmp_path, monkeypatch, capsys):
     assert "interrupted" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "arguments, reason",
-    [
-        (["sort"], "unknown case 'sort'; there are scan, raster, model and all"),
-        (["--cases", "0"], "--cases 0: must be at least 1"),
-        (["--minutes", "0"], "--minutes 0.0: must be above 0"),
-        (["--threads", "0"], "--threads 0: must be at least 1"),
-    ],
-)
-def test_bad_options_are_told_in_one_line(capsys, arguments, reason):
-    assert exit_code(*arguments) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1 and reason in captured.err
-
-
 def test_constant_input_matrix_sums_its_gradient_in_float32():
     """Found by this command: tokens and repeated groups were summed in bfloat16 and float16."""
     torch.manual_seed(0)

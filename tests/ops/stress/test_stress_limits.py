@@ -80,11 +80,7 @@ def test_small_terms_of_a_sum_may_count_as_nothing():
 
 @pytest.mark.parametrize(
     "ratios, fails",
-    [
-        ((0.9,), False),
-        ((1.2, 0.5, 0.6, 1.1, 0.4), False),
-        ((1.2, 0.5, 1.1, 1.1, 0.4), True),
-    ],
+    [((0.9,), False), ((1.2, 0.5, 0.6, 1.1, 0.4), False), ((1.2, 0.5, 1.1, 1.1, 0.4), True)],
 )
 def test_most_trials_decide(ratios, fails):
     seen = []
