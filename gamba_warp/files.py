@@ -9,6 +9,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -236,6 +237,25 @@ def visible(folder: Path, pattern: str) -> Iterator[Path]:
     for inner, _, files in walk(folder):
         for name in fnmatch.filter(files, pattern):
             yield Path(inner, name)
+
+
+def plain_file(path: str | Path, links: bool = True) -> os.stat_result:
+    """Return the status of a plain file.
+
+    Args:
+        path: of the file.
+        links: follow symbolic links; else a link is refused.
+
+    Raises:
+        UserError: it is missing or another kind of file.
+    """
+    try:
+        found = os.stat(path, follow_symlinks=links)
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror or error}") from error
+    if not stat.S_ISREG(found.st_mode):
+        raise UserError(f"{path}: not a plain file")
+    return found
 
 
 def write_json(path: str | Path, value: object) -> None:

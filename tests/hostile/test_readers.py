@@ -6,6 +6,7 @@
 
 import functools
 import os
+import re
 import tempfile
 import time
 from collections import Counter
