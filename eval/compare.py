@@ -304,10 +304,11 @@ def _columns(joined: dict[str, Any]) -> tuple[dict[str, Column], dict[str, Colum
         for key in joined["common"]
         if key.startswith(_FSCORE)
     }
-    return tuple(
-        {key: column for key, column in columns.items() if joined["common"].get(key)}
-        for columns in (views | OF_SHAPES, grounds | fscores | _MORE_OF_SHAPES)
-    )
+
+    def evaluated(columns: dict[str, Column]) -> dict[str, Column]:
+        return {key: column for key, column in columns.items() if joined["common"].get(key)}
+
+    return evaluated(views | OF_SHAPES), evaluated(grounds | fscores | _MORE_OF_SHAPES)
 
 
 def markdown_page(joined: dict[str, Any]) -> str:

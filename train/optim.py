@@ -123,9 +123,10 @@ class Ema:
             share: scalar on their device, 1; or 0 to leave the average as it is.
         """
         averages, weights = map(list, zip(*self._pairs))
-        steps = torch._foreach_sub(weights, averages)
-        torch._foreach_mul_(steps, share * (1 - ema_decay(self.updates, self.decay)))
-        torch._foreach_add_(averages, steps)
+        torch_ops: Any = torch  # the names of its optimizers' own products
+        steps = torch_ops._foreach_sub(weights, averages)
+        torch_ops._foreach_mul_(steps, share * (1 - ema_decay(self.updates, self.decay)))
+        torch_ops._foreach_add_(averages, steps)
         self.updates += 1
 
 

@@ -119,7 +119,7 @@ class Mamba(nn.Module):
         x, z = self.in_proj(tokens).chunk(2, dim=-1)
         if conv_state is not None:
             conv_state = conv_state.to(x.dtype)
-        convolved = causal_conv1d(
+        convolved: Any = causal_conv1d(
             x,
             self.conv_weight,
             self.conv_bias,
@@ -132,7 +132,7 @@ class Mamba(nn.Module):
         low_rank, B, C = self.x_proj(x).split(self.split, dim=-1)
         # The bias is added inside the scan, in float32: δ of 1e-3 does not survive bfloat16.
         delta = F.linear(low_rank, self.dt_proj.weight)
-        scanned = selective_scan(
+        scanned: Any = selective_scan(
             x,
             delta,
             A,
@@ -148,7 +148,9 @@ class Mamba(nn.Module):
             cu_seqlens=packed,
         )
         y, scan_state = scanned if keep else (scanned, None)
-        return self.out_proj(y), State(conv_state, scan_state, A) if keep else None
+        if conv_state is None or scan_state is None:
+            return self.out_proj(y), None
+        return self.out_proj(y), State(conv_state, scan_state, A)
 
 
 class Block(nn.Module):

@@ -7,7 +7,7 @@ is asked for their numbers; a training makes them beside the data.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -81,7 +81,7 @@ class Foreground:
     def to(self, device: torch.device) -> Foreground:
         """Return the lists on a device."""
         moved = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
-        return Foreground(**vars(self) | moved)
+        return replace(self, **moved)
 
 
 def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Foreground:
