@@ -13,11 +13,8 @@ from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.cli import run
 from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.materials import to_linear
-from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.names import MESH_FORMATS
 from gamba_warp.formats.ply import load_ply, save_ply
-from gamba_warp.surfaces.extract import Surface
-from gamba_warp.surfaces.files import save_mesh
 
 QUICK = ["--voxels", "48", "--views", "16", "--pixels", "64"]
 
@@ -142,16 +139,6 @@ def test_inputs_are_there_and_stay(ball, tmp_path, capsys):
     before = ball.read_bytes()
     assert export(ball, "--out", tmp_path, "--mesh", "--splats", "ply") == 2
     assert ball.read_bytes() == before and "would be overwritten" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("kind", MESH_FORMATS)
-def test_mesh_files_are_read_back(tmp_path, kind):
-    ball = trimesh.creation.icosphere(2, 0.4)
-    colors = np.linspace(0, 1, 3 * len(ball.vertices)).reshape(-1, 3).astype(np.float32)
-    save_mesh(tmp_path / f"a.{kind}", Surface(ball.vertices, ball.faces, colors))
-    again = load_mesh(tmp_path / f"a.{kind}")
-    assert len(again.faces) == len(ball.faces)
-    assert abs(np.linalg.norm(again.vertices, axis=1) - 0.4).max() < 1e-6
 
 
 @pytest.mark.parametrize("command", ["export", "view", "render"])

@@ -345,6 +345,7 @@ def test_absurd_exif_does_not_hide_the_picture(tmp_path, recwarn):
     want = np.asarray(picture) / 255
     exifs = [b"Exif\0\0" + bytes(rng) for rng in ([], [255] * 20, range(200))]
     exifs += [b"Exif\0\0II*\0\x08\0\0\0" + b"\xff" * size for size in (1, 2, 9, 400)]
+    exifs.append(b"Exif\0\0MM\0\x2a\xff\xff\xff\xff")
     for exif in exifs:
         picture.save(tmp_path / "a.png", exif=exif)
         np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)

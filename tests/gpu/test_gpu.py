@@ -8,25 +8,28 @@ import torch
 from gpu import checks
 
 DEVICE = torch.device("cuda")
-pytestmark = pytest.mark.gpu
 
 
+@pytest.mark.gpu
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("shape", checks.SCANS)
 def test_scan(shape, dtype):
     checks.check_scan(shape, dtype, DEVICE)
 
 
+@pytest.mark.gpu
 @pytest.mark.parametrize("shape", checks.CONVS)
 def test_convolution(shape):
     checks.check_conv(shape, DEVICE)
 
 
+@pytest.mark.gpu
 @pytest.mark.parametrize(("count", "size", "views", "options"), checks.RASTERS)
 def test_rasterizer(count, size, views, options):
     checks.check_raster(count, size, views, options, DEVICE)
 
 
+@pytest.mark.gpu
 @pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
 def test_compile(backend):
     if backend == "inductor":
@@ -36,6 +39,7 @@ def test_compile(backend):
     checks.check_compiled(backend, DEVICE)
 
 
+@pytest.mark.gpu
 @pytest.mark.parametrize(
     "check",
     [

@@ -313,16 +313,6 @@ def test_bad_data_and_bad_options(data, tmp_path):
     assert not (tmp_path / "run").exists(), "bad input leaves nothing behind"
 
 
-def test_broken_object_is_left_out_and_listed(tmp_path, capsys):
-    root = micro.write_dataset(tmp_path / "clouds", objects=4)
-    (root / "clouda" / "002.png").write_bytes(b"not a picture")
-    (root / "cloudb" / "001.png").unlink()
-    assert run(root, tmp_path / "run", views={"views_per_object": 5}) == 1
-    assert "clouda" in capsys.readouterr().err
-    assert "cloudb is left out" in lines(tmp_path / "run", "warning")[0]["message"]
-    assert list(lines(tmp_path / "run", "end")[0]["failures"]) == ["clouda"]
-
-
 def test_minutes_alone_limit_the_run(data, tmp_path, monkeypatch):
     """With a clock that advances one second per reading, two minutes are about 120 readings."""
     ticks = itertools.count()
