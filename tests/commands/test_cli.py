@@ -63,7 +63,6 @@ def test_version(flag, capsys):
         (["data", "render"], "Missing from gamba data render: PATH --out PATH; gamba data render"),
         ("render a.ply --size".split(), "Missing value for argument '--size'. Expected 1 values;"),
         ("view a b".split(), "Unrecognized options: b; gamba view --help"),
-        ("eval-geometry . . --json --csv".split(), "--json and --csv"),
         ("eval-geometry a b --protocol absent.json".split(), "neither default, gamba, gso, sf3d,"),
         ("eval-geometry a b --protocol splatter-image".split(), "is of views (gamba eval-views)"),
         (["bench", "a"], "unknown case 'a'; there are scan, conv, raster, model, step and all"),
