@@ -71,7 +71,7 @@ def main(
     )
     found = [read_document(out / n / "report.json", dict[str, Any]) for n in ("eval", "shapes")]
     parts = {"figures": figures(*found)}
-    if page == "none":
+    if str(page) == "none":
         print("\n\n".join(parts.values()))
     else:
         write_text(page, with_parts(page.read_text(encoding="utf-8"), "make scanned", parts))
