@@ -157,11 +157,11 @@ class Trainer:
         self.step += 1
         self._unread_steps.append((self.step, update(self.optimizer, self.ema, made, self.wrapped)))
         logs = self.step % config.run.log_every == 0
-        loss, norm = self._count_skipped(late=1 if self.world.device.type == "cuda" else 0)
+        loss, norm = self._read_steps(late=1 if self.world.device.type == "cuda" else 0)
         if not logs:
             return {}
         if self._unread_steps:
-            loss, norm = self._count_skipped()
+            loss, norm = self._read_steps()
         seconds = time.perf_counter() - started
         views = made.batch.cameras.viewmats[..., 0, 0].numel() * self.accumulate * self.world.size
         figures = {"loss": loss, "grad_norm": norm, "lr": rate}
@@ -172,7 +172,7 @@ class Trainer:
         values = torch.stack([value.double() for value in found.values()]).tolist()
         return figures | self.world.mean(dict(zip(found, values)))
 
-    def _count_skipped(self, late: int = 0) -> tuple[float, float]:
+    def _read_steps(self, late: int = 0) -> tuple[float, float]:
         """Read the numbers of all steps but the last ``late``, and count those that were skipped.
 
         Returns:
@@ -353,7 +353,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint on the main process, once per step; the others wait."""
-        self._count_skipped()
+        self._read_steps()
 
         def write() -> None:
             if self._saved != self.step:

@@ -144,7 +144,7 @@ def _open(url: str, *_: object) -> Any:
 def _read(dataset: Any) -> Iterator[dict[str, Any] | Unreachable]:
     try:
         yield from dataset
-    except Exception as error:  # of the library, tarfile or a transfer; the last word is the tar
+    except Exception as error:  # of webdataset, tarfile or a transfer; the last argument is the tar
         words = ": ".join(word for word in reversed(error.args) if isinstance(word, str))
         reason = first_line(error if isinstance(error, OSError) else words or error)
         yield from repeat(Unreachable(f"the shards cannot be read: {reason}"))
