@@ -167,8 +167,7 @@ class GambaConfig:
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
             check_kind(f"config: {name} is", getattr(self, name), kind)
-        hints = get_type_hints(type(self), include_extras=True)
-        check_values(vars(self), hints, lambda name: f"config: {name} is")
+        check_values(vars(self), type(self), lambda name: f"config: {name} is")
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):
             raise UserError(f"config: encoder is {self.encoder[:100]!r}, not a network's name")
         self._check_relations()

@@ -109,24 +109,32 @@ def check_kind(label: str, value: object, kind: Any) -> None:
         raise UserError(f"{label} {shown}, it must be of type {kind.__name__}")
 
 
-def check_values(
-    values: Mapping[str, Any], hints: Mapping[str, Any], label: Callable[[str], str]
-) -> None:
+def check_values(values: Mapping[str, Any], owner: Callable, label: Callable[[str], str]) -> None:
     """Check values against the ranges declared by their types.
 
     Args:
         values: by name; a list or tuple is checked item by item, None is accepted.
-        hints: types by name, with their ``Annotated`` parts; types without ranges accept all.
+        owner: the dataclass or function that declares the types; those without ranges accept all.
         label: start of the message, from a value's name.
 
     Raises:
         UserError: as for ``check_range``.
     """
+    ranges = _ranges(owner)
     for name, value in values.items():
-        for limits in _limits(hints.get(name)):
+        for limits in ranges.get(name, ()):
             for item in value if isinstance(value, (list, tuple)) else [value]:
                 if isinstance(item, (int, float)) and not isinstance(item, bool):
                     check_range(label(name), item, limits)
+
+
+@functools.cache
+def _ranges(owner: Callable) -> dict[str, list[Meta]]:
+    """All ranges in the types of a dataclass's fields or a function's arguments, by name."""
+    return {
+        name: _limits(hint)
+        for name, hint in typing.get_type_hints(owner, include_extras=True).items()
+    }
 
 
 def _limits(hint: Any) -> list[Meta]:
@@ -146,8 +154,7 @@ def check_options(group: Any) -> None:
     Raises:
         UserError: as for ``check_range``; the message names the option.
     """
-    hints = typing.get_type_hints(type(group), include_extras=True)
-    check_values(vars(group), hints, option)
+    check_values(vars(group), type(group), option)
 
 
 def ranged(command: Function) -> Function:
@@ -158,9 +165,8 @@ def ranged(command: Function) -> Function:
 
     @functools.wraps(command)
     def checked(*args: Any, **kwargs: Any) -> Any:
-        hints = typing.get_type_hints(command, include_extras=True)
         values = inspect.signature(command).bind(*args, **kwargs).arguments
-        check_values(values, hints, option)
+        check_values(values, command, option)
         for value in values.values():
             if is_dataclass(value) and not isinstance(value, type):
                 check_options(value)
