@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -43,12 +42,10 @@ class HeldOut(NamedTuple):
     """Objects of one dataset that a run validates on.
 
     Attributes:
-        name: folder name of a further dataset; empty for DATA.
         dataset: the dataset.
         objects: indices into it.
     """
 
-    name: str
     dataset: ViewDataset
     objects: list[int]
 
@@ -60,14 +57,14 @@ class TrainingData:
     Attributes:
         train: dataset with the objects to train on.
         objects: indices into ``train``, possibly repeated; one pass over the list is an epoch.
-        held_out: validation objects by dataset; datasets without any are left out.
+        held_out: validation objects; None without any.
         notes: lines for the user.
         shards: the shards to train on; ``train`` is then empty, and ``objects`` are numbers.
     """
 
     train: ViewDataset
     objects: list[int]
-    held_out: list[HeldOut] = field(default_factory=list)
+    held_out: HeldOut | None = None
     notes: list[str] = field(default_factory=list)
     shards: Shards | None = None
 
@@ -114,14 +111,14 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
     notes += filter(None, [background_note(train)])
-    held_out = []
+    held_out = None
     try:
-        held_out.append(_held_out("", config.data, config.run.val_objects))
+        held_out = _held_out(open_dataset(config.data, "val"), config.run.val_objects)
     except UserError as error:
         notes.append(f"no validation: {error}")
-    held_out += _further_sets(config)
     used = {train.uids[i] for i in objects}
-    used |= {part.dataset.uids[i] for part in held_out for i in part.objects}
+    if held_out is not None:
+        used |= {held_out.dataset.uids[i] for i in held_out.objects}
     if names := scanned(used):
         shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         raise UserError(
@@ -131,7 +128,6 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
     if views.cache and gpu is not None:
         sizes = sorted({views.size, config.model_config().image_size})
         train.preload(sorted(set(objects)), sizes, gpu, views.threads("cuda"))
-    held_out = [part for part in held_out if part.objects]
     return TrainingData(train, objects, held_out, notes)
 
 
@@ -144,36 +140,20 @@ def _open_shards(config: TrainConfig, source: str) -> TrainingData:
     needs_folders = {"--extra": config.views.extra, "--cache": config.views.cache}
     for name in (name for name, given in needs_folders.items() if given):
         raise UserError(f"{name}: needs a folder of objects, and {config.data} has shards")
-    shards, notes, held_out = Shards(source, "train"), [], []
+    shards, notes, held_out = Shards(source, "train"), [], None
     try:
-        first = Shards(source, "val").first(config.run.val_objects)
-        held_out.append(HeldOut("", first, [*range(len(first))]))
+        held_out = _held_out(Shards(source, "val").first(config.run.val_objects))
     except UserError as error:
         notes.append(f"no validation: {error}")
-    held_out = [part for part in (*held_out, *_further_sets(config)) if part.objects]
     return TrainingData(dataset_of(), [*range(shards.count)], held_out, notes, shards)
 
 
-def _further_sets(config: TrainConfig) -> list[HeldOut]:
-    """Open the datasets of ``--val-extra``."""
-    found: list[HeldOut] = []
-    for folder in config.run.val_extra:
-        name = folder.resolve().name
-        if name in [part.name for part in found]:
-            raise UserError(f"--val-extra: two folders are called '{name}'; rename one of them")
-        try:
-            found.append(_held_out(name, folder, config.run.val_objects))
-        except UserError as error:
-            raise UserError(f"--val-extra: {error}") from error
-    return found
-
-
-def _held_out(name: str, folder: Path, count: int) -> HeldOut:
-    """Choose ``count`` evenly spaced readable objects of the val split."""
-    dataset = open_dataset(folder, "val")
+def _held_out(dataset: ViewDataset, count: int | None = None) -> HeldOut | None:
+    """Choose ``count`` evenly spaced readable objects, or all; None without any."""
     bad = dataset.check()
     good = [i for i, uid in enumerate(dataset.uids) if uid not in bad]
-    return HeldOut(name, dataset, evenly(good, count))
+    chosen = evenly(good, len(good) if count is None else count)
+    return HeldOut(dataset, chosen) if chosen else None
 
 
 class Prepared(NamedTuple):
@@ -405,7 +385,6 @@ def fixed_batches(
             novel = evenly(range(1, dataset.num_views(index)), VAL_VIEWS)
             batch = load_sample(dataset, index, [0, *novel], size, config, torch.ones(3))
         except EXPECTED as error:
-            uid = f"{part.name}/{dataset.uids[index]}" if part.name else dataset.uids[index]
-            failures[uid] = first_line(error)
+            failures[dataset.uids[index]] = first_line(error)
             continue
         yield batch

@@ -175,9 +175,7 @@ class RunConfig:
         encoder_weights: File of the image encoder's weights, or "random" to train one from scratch.
         log_every: Steps between two lines of the log.
         val_every: Steps between two validations (and sample pictures); 0 for none.
-        val_objects: Held-out objects of each dataset to validate on.
-        val_extra: More datasets, whose held-out objects are validated separately, under their
-            folder's name.
+        val_objects: Held-out objects to validate on.
         save_every: Steps between two checkpoints; one is always saved at the end, and the last two
             are kept.
         device: Device to train on; "auto" is the GPU if there is one.
@@ -196,7 +194,6 @@ class RunConfig:
     log_every: _Count = 10
     val_every: _Every = 500
     val_objects: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
-    val_extra: tuple[Path, ...] = ()
     save_every: _Count = 500
     device: DeviceChoice = "auto"
     threads: Threads | None = None
@@ -275,7 +272,7 @@ FOLLOWING = {"model"}  # of a config.json: it follows from the options
 # These may differ between the processes of one run; files are compared by content.
 _PER_MACHINE = {
     *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
-    *("run.init", "run.encoder_weights", "run.device", "run.threads", "run.val_extra"),
+    *("run.init", "run.encoder_weights", "run.device", "run.threads"),
 }
 # Groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {

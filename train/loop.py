@@ -19,7 +19,7 @@ from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.processes import stop_requests
 
-from .batches import Batches, HeldOut, TrainingData, fixed_batches
+from .batches import Batches, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
 from .data.shards import Unreachable
@@ -275,42 +275,25 @@ class Trainer:
         self._validated = self.step
 
         def validate_all() -> None:
-            if self.log is None or not self.data.held_out:
+            if self.log is None or self.data.held_out is None:
                 return
             objective = Objective(self._weights(validates=True), self.lpips)
-            scores, rows = [], []
-            for part in self.data.held_out:
-                figures, pictures = self._validate_on(part, objective)
-                if not pictures:
-                    about = f" on {part.name}" if part.name else ""
-                    reason = "none of its objects can be read"
-                    self.log.warn(self.step, f"no validation{about}: {reason}")
-                    continue
-                scores.append(figures.get("psnr_novel", figures["psnr_input"]))
-                rows += pictures
-            if len(scores) == len(self.data.held_out):  # else not comparable with earlier ones
-                self._keep_best(Score(self.step, sum(scores) / len(scores)))
-            if rows:
-                path = self.config.run.out / "samples" / f"step_{self.step:06d}.png"
-                self.log.sample(self.step, path, rows)
+            best, size = [*self.models.values()][-1], self.config.views.size
+            batches = fixed_batches(self.data.held_out, best.config, size, self._unread)
+            figures, rows = validate(best, batches, objective, self.world.device)
+            self._name_failures()
+            if not rows:
+                self.log.warn(self.step, "no validation: none of its objects can be read")
+                return
+            self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
+            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+            say(f"step {self.step}: validation {text}")
+            score = figures.get("psnr_novel", figures["psnr_input"])
+            self._keep_best(Score(self.step, score))
+            path = self.config.run.out / "samples" / f"step_{self.step:06d}.png"
+            self.log.sample(self.step, path, rows)
 
         self.world.on_main(validate_all)
-
-    def _validate_on(
-        self, part: HeldOut, objective: Objective
-    ) -> tuple[dict[str, float], list[Tensor]]:
-        """Validate on the objects of one dataset; log and return the figures."""
-        assert self.log is not None
-        best, size = [*self.models.values()][-1], self.config.views.size
-        batches = fixed_batches(part, best.config, size, self._unread)
-        figures, rows = validate(best, batches, objective, self.world.device)
-        self._name_failures()
-        if rows:
-            event, name = (f"val/{part.name}", f" on {part.name}") if part.name else ("val", "")
-            self.log.write(event, self.step, minutes=self.elapsed / 60, **figures)
-            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
-            say(f"step {self.step}: validation{name} {text}")
-        return figures, rows
 
     def _better(self, score: Score, name: str) -> bool:
         """True if a score is better than that of ``name``, or there is none; False for NaN."""
@@ -333,9 +316,6 @@ class Trainer:
             return
         self.scores["best"] = score
         self.log.write("best", self.step, minutes=self.elapsed / 60, psnr=score.psnr)
-        if len(self.data.held_out) > 1:
-            text = f"best so far, mean PSNR of the datasets {score.psnr:.4g}"
-            say(f"step {self.step}: {text} -> {path}")
 
     def _compare_ends(self) -> None:
         """Name the best validation; warn if the last is worse than the first."""

@@ -169,7 +169,7 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
     write_json(config.run.out / "config.json", values)
     facts = {
         "objects": len(set(data.objects)),
-        "held_out": sum(len(part.objects) for part in data.held_out),
+        "held_out": len(data.held_out.objects) if data.held_out else 0,
         "split_version": data.train.split_version,
         "parameters": sum(p.numel() for p in trainer.parameters),
         "steps": trainer.total,

@@ -74,11 +74,11 @@ def test_whatever_one_object_raises_stops_no_other(root, monkeypatch, error):
 
 def test_a_validation_passes_over_what_it_cannot_read(root):
     config, failures = micro.options(root, root), {}
-    part = HeldOut("other", open_data(config).train, [0, 1, 2])
+    part = HeldOut(open_data(config).train, [0, 1, 2])
     spoil(root, "b")
     found = fixed_batches(part, config.model_config(), micro.SIZE, failures)
     assert [batch.uids for batch in found] == [["clouda"], ["cloudc"]]
-    assert list(failures) == ["other/cloudb"]
+    assert list(failures) == ["cloudb"]
 
 
 def test_a_run_names_bad_objects_when_it_meets_them(root, tmp_path, capsys):

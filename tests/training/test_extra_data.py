@@ -26,7 +26,7 @@ def test_the_training_objects_of_all_sets_are_trained_on(roots, tmp_path):
     data = open_data(micro.options(first, tmp_path, views={"extra": (second,)}))
     assert data.train.uids == ["clouda", "cloudb", "cloudc", "second/clouda", "second/cloudb"]
     assert data.objects == [0, 1, 2, 3, 4]
-    assert [part.dataset.uids for part in data.held_out] == [["cloudd"]]  # of the first set alone
+    assert data.held_out.dataset.uids == ["cloudd"]  # of the first set alone
     alone = open_dataset(second).load("cloudb")
     assert data.train.load(4).images.equal(alone.images)
     assert data.train.load(4).uid == "second/cloudb"

@@ -27,9 +27,8 @@ SAID = "the data has Google Scanned Objects.*\\({}\\): leave them out"
     [
         (1, {}, ["Dino_4", "Elephant"]),
         (0, {"views": {"extra": True}}, ["things/Dino_4"]),
-        (0, {"run": {"val_extra": True}}, ["Elephant"]),
     ],
-    ids=["data", "extra", "val-extra"],
+    ids=["data", "extra"],
 )
 def test_their_names_are_refused_wherever_they_come_from(sets, tmp_path, place, groups, names):
     out = tmp_path / "run"

@@ -112,7 +112,7 @@ def test_shards_of_a_server_train_like_local_ones(packed, tmp_path, workers):
 
 def test_the_held_out_objects_of_shards_are_those_of_the_files(data, packed, tmp_path):
     parts = [open_data(micro.options(source, tmp_path)).held_out for source in (data, packed)]
-    ((one,), (other,)) = ([part.dataset.load(part.dataset.uids[0]) for part in p] for p in parts)
+    one, other = (part.dataset.load(part.dataset.uids[0]) for part in parts)
     assert one.uid == other.uid == "cloudi" and torch.equal(one.images, other.images)
     assert run(packed, tmp_path / "run", run={"val_every": 1}, length={"steps": 1}) == 0
     assert lines(tmp_path / "run", "val")
