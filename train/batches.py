@@ -356,7 +356,9 @@ class Batches:
         if len(good) < len(samples):
             return Prepared(None, failures)
         batch = join(good, self.model)
-        return Prepared(batch.pinned() if self.world.device.type == "cuda" else batch, failures)
+        if self.world.device.type == "cuda":
+            batch = batch.for_gpu(self.model)
+        return Prepared(batch, failures)
 
     def _record_failures(self, prepared: Prepared) -> Batch:
         """Record failures in the order of the run, and return the batch."""

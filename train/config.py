@@ -182,6 +182,8 @@ class RunConfig:
         threads: Number of CPU threads; all cores if not given.
         recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
             same result in less memory and more time.
+        graph: Repeat the launches of a step as a CUDA graph: the same result without the time that
+            the host takes for them. "auto" does so on a GPU, where a step can be captured.
         seed: Seed of the initial weights and of the order of the data.
     """
 
@@ -198,6 +200,7 @@ class RunConfig:
     device: DeviceChoice = "auto"
     threads: Threads | None = None
     recompute: bool = False
+    graph: Literal["auto", "off"] = "auto"
     seed: Seed = 0
 
 

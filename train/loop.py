@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,12 +22,22 @@ from gamba_warp.processes import stop_requests
 from .batches import Batches, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
+from .data.samples import Batch
 from .data.shards import Unreachable
 from .ddp import World
+from .graphs import MOST, StepGraphs
 from .log import RunLog, run_bar, say
 from .objective.losses import Progress, term_weights
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
-from .step import Objective, collapse_reason, compute_gradients, health, update, validate
+from .step import (
+    Gradients,
+    Objective,
+    collapse_reason,
+    compute_gradients,
+    health,
+    update,
+    validate,
+)
 
 CLIP = 1.0  # largest norm of the gradient (paper, §4.1)
 MAX_SKIPPED = 20  # a run ends after so many steps in a row that are not finite
@@ -72,6 +82,7 @@ class Trainer:
         self.wrapped = world.wrap(model)
         self.precision = world.precision(config.optim.precision, model.config.width)
         self.accumulate = config.views.accumulate
+        self.graphs = self._open_graphs()
         self.step = self.skipped = self.skipped_in_row = 0
         # Step, and the tensor of ``update``, of the steps whose numbers are not read yet.
         self._unread_steps: deque[tuple[int, Tensor]] = deque()
@@ -92,6 +103,19 @@ class Trainer:
             novel=lambda number: self.novel_views(number // self.accumulate),
             last=None if total is None else total * self.accumulate,
         )
+
+    def _open_graphs(self) -> StepGraphs | None:
+        """Prepare CUDA graphs of the steps; None on a CPU and where a step is no single one."""
+        if self.world.device.type != "cuda":
+            return None
+        if self.accumulate > 1 or self.world.size > 1:
+            if self.world.main and self.config.run.graph == "auto":
+                why = "--accumulate" if self.accumulate > 1 else "several processes"
+                say(f"no CUDA graphs with {why}")
+            return None
+        for group in self.optimizer.param_groups:
+            group["capturable"] = True
+        return StepGraphs(self.world.device, say, MOST if self.config.run.graph == "auto" else 0)
 
     def _schedule(self, length: LengthConfig) -> Schedule:
         total = length.steps
@@ -143,19 +167,21 @@ class Trainer:
         started = time.perf_counter()
         config, batches, first = self.config, self._batches, self.step * self.accumulate
         rate = config.optim.lr * self.schedule.share(self.step, self.elapsed)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        batches.waited = 0.0
-        made = compute_gradients(
-            self.wrapped,
-            self.optimizer,
-            map(batches.take, range(first, first + self.accumulate)),
-            Objective(self._weights(), self.lpips, config.loss.lpips_crop, self.precision),
-            clip=CLIP,
-            count=self.accumulate,
-        )
+        share = self.ema.next_share() if self.ema else 1.0
+        weights, batches.waited = self._weights(), 0.0
+        if self.graphs is None:
+            taken = map(batches.take, range(first, first + self.accumulate))
+            made, numbers = self._optimize(taken, weights, rate, share)
+        else:
+            number, key = self.graphs.number, tuple(sorted(n for n, w in weights.items() if w))
+            given = {n: w if n == "novel" else number(n, w) for n, w in weights.items() if w}
+            rest = number("learning rate", rate), number("share of the average", share)
+            made, numbers = self.graphs.run(
+                batches.take(first), key, lambda batch: self._optimize([batch], given, *rest)
+            )
+            numbers = numbers.clone()  # the next step of a graph overwrites them
         self.step += 1
-        self._unread_steps.append((self.step, update(self.optimizer, self.ema, made, self.wrapped)))
+        self._unread_steps.append((self.step, numbers))
         logs = self.step % config.run.log_every == 0
         loss, norm = self._read_steps(late=1 if self.world.device.type == "cuda" else 0)
         if not logs:
@@ -167,10 +193,30 @@ class Trainer:
         figures = {"loss": loss, "grad_norm": norm, "lr": rate}
         figures |= {"seconds": seconds, "wait_share": batches.waited / seconds}
         figures["views_per_second"] = views / seconds
-        terms = {f"loss_{name}": term.mean() for name, term in made.result.terms.items()}
+        terms = {f"loss_{name}": term.detach().mean() for name, term in made.result.terms.items()}
         found = terms | health(made.result, made.batch)
         values = torch.stack([value.double() for value in found.values()]).tolist()
         return figures | self.world.mean(dict(zip(found, values)))
+
+    def _optimize(
+        self,
+        batches: Iterable[Batch],
+        weights: dict[str, Any],
+        rate: float | Tensor,
+        share: float | Tensor,
+    ) -> tuple[Gradients, Tensor]:
+        """Compute the gradients of a step and update the weights, as ``update``."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        made = compute_gradients(
+            self.wrapped,
+            self.optimizer,
+            batches,
+            Objective(weights, self.lpips, self.config.loss.lpips_crop, self.precision),
+            clip=CLIP,
+            count=self.accumulate,
+        )
+        return made, update(self.optimizer, self.ema, share, made, self.wrapped)
 
     def _read_steps(self, late: int = 0) -> tuple[float, float]:
         """Read the numbers of all steps but the last ``late``, and count those that were skipped.

@@ -115,19 +115,24 @@ class Ema:
         for average, _ in self._pairs:
             average.requires_grad_(False)
 
+    def next_share(self) -> float:
+        """Count an update, and return the share of the way that it takes, 1 - the decay."""
+        share = 1 - ema_decay(self.updates, self.decay)
+        self.updates += 1
+        return share
+
     @torch.no_grad()
     def update(self, share: Tensor) -> None:
         """Move the average towards the model's current weights.
 
         Args:
-            share: scalar on their device, 1; or 0 to leave the average as it is.
+            share: scalar on their device, the share of the way.
         """
         averages, weights = map(list, zip(*self._pairs))
         torch_ops: Any = torch  # the names of its optimizers' own products
         steps = torch_ops._foreach_sub(weights, averages)
-        torch_ops._foreach_mul_(steps, share * (1 - ema_decay(self.updates, self.decay)))
+        torch_ops._foreach_mul_(steps, share)
         torch_ops._foreach_add_(averages, steps)
-        self.updates += 1
 
 
 def novel_views(progress: float) -> int:

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.distributed as dist
@@ -38,14 +38,15 @@ class Objective(NamedTuple):
     Attributes:
         weights: result of ``term_weights``; missing names have weight 0, except ``novel``, the
             weight of each novel view relative to the input view in all terms with one value per
-            view, which defaults to 1.
+            view, which defaults to 1. A weight other than ``novel`` may be a scalar tensor on the
+            device, whose value is not looked at.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
         lpips_crop: as for ``LossInputs``.
         precision: dtype of the products in the network, and of those in LPIPS that tolerate it;
             everything else is float32.
     """
 
-    weights: Mapping[str, float]
+    weights: Mapping[str, Any]
     lpips: Callable[[Tensor, Tensor], Tensor] | None = None
     lpips_crop: int = 0
     precision: torch.dtype = torch.float32
@@ -172,7 +173,11 @@ def compute_gradients(
 
 
 def update(
-    optimizer: torch.optim.Optimizer, ema: Ema | None, made: Gradients, model: Callable
+    optimizer: torch.optim.Optimizer,
+    ema: Ema | None,
+    share: float | Tensor,
+    made: Gradients,
+    model: Callable,
 ) -> Tensor:
     """Update the weights, unless loss or gradient is not finite on any process.
 
@@ -181,6 +186,7 @@ def update(
     Args:
         optimizer: fused AdamW.
         ema: the average of the weights, which is updated, too; or None.
+        share: ``ema.next_share()``, or a scalar tensor of it on the device.
         made: the gradients, which the parameters have.
         model: as for ``compute_gradients``.
 
@@ -194,7 +200,7 @@ def update(
     vars(optimizer)["found_inf"] = bad  # as torch.amp.GradScaler sets it
     optimizer.step()
     if ema is not None:
-        ema.update(1 - bad)
+        ema.update((1 - bad) * share)
     return torch.cat([numbers, bad[None]])
 
 

@@ -14,6 +14,7 @@ from gamba_warp.model.posing import reference_cameras
 
 from .config import OptimConfig
 from .data.samples import Batch, with_foreground
+from .graphs import StepGraphs
 from .loop import CLIP
 from .optim import Ema, build_optimizer
 from .step import Objective, compute_gradients, update
@@ -29,13 +30,18 @@ def cases(settings: Settings) -> list[Case]:
 class Step:
     """A model with its optimizer and a batch of random pictures, as in a training run."""
 
-    def __init__(self, preset: Preset, objects: int, device: torch.device) -> None:
+    def __init__(
+        self, preset: Preset, objects: int, device: torch.device, graph: bool = False
+    ) -> None:
+        """Make model and batch; with ``graph`` the third and later runs repeat a CUDA graph."""
         torch.manual_seed(0)
         config = PRESETS[preset]
         self.model = Gamba(config).to(device)
         self.optimizer = build_optimizer(self.model)
         for group in self.optimizer.param_groups:
             group["lr"] = 1e-6  # the weights hardly move, so every round does the same work
+            group["capturable"] = graph
+        self.graphs = StepGraphs(device, print) if graph else None
         self.ema = Ema(self.model, OptimConfig.ema)
         self.objective = Objective({"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "rdist": 0.0})
         views = orbit(90.0 * torch.arange(_VIEWS), 20.0, 1.8).expand(objects, -1, -1, -1)
@@ -53,14 +59,21 @@ class Step:
             Cameras(views, Ks, _SIZE, _SIZE),
             torch.ones(objects, 1, 3),
         )
-        self.batch = with_foreground(self.batch, config).to(device)
+        self.batch = with_foreground(self.batch, config)
+        if device.type == "cuda":
+            self.batch = self.batch.for_gpu(config).to(device)
 
     def run(self) -> Tensor:
         """Make the whole step and return loss and norm of the gradient (timed)."""
-        made = compute_gradients(
-            self.model, self.optimizer, [self.batch], self.objective, clip=CLIP
-        )
-        return update(self.optimizer, self.ema, made, self.model)
+        share = self.ema.next_share()
+        if self.graphs is None:
+            return self._step(self.batch, share)
+        given = self.graphs.number("share", share)
+        return self.graphs.run(self.batch, None, lambda batch: self._step(batch, given))
+
+    def _step(self, batch: Batch, share: float | Tensor) -> Tensor:
+        made = compute_gradients(self.model, self.optimizer, [batch], self.objective, clip=CLIP)
+        return update(self.optimizer, self.ema, share, made, self.model)
 
     def check(self) -> None:
         """Check that the gradient is finite and not 0, without an oracle."""
@@ -72,13 +85,15 @@ class Step:
 def steps(settings: Settings) -> list[Variant]:
     """One optimizer step on objects in four views of 128²: network, rendering, MSE + mask +
     0.2 (1 - SSIM), gradients, clipping, AdamW and the running average; fresh weights, discs of
-    random colours, no LPIPS. The only check is that the gradient is finite.
+    random colours, no LPIPS; on a GPU repeated as a CUDA graph. The only check is that the
+    gradient is finite.
     """
     made: list[Variant] = []
     presets: tuple[Preset, ...] = "tiny", "rays"
     for preset in presets:
-        for objects in (1,) if settings.level == "quick" else (1, 4):
-            step = Step(preset, objects, settings.device)
+        counts, graph = ((8, 64), True) if settings.device.type == "cuda" else ((1, 4), False)
+        for objects in counts[:1] if settings.level == "quick" else counts:
+            step = Step(preset, objects, settings.device, graph)
             name = f"{preset}, {objects} object{'s' * (objects > 1)}"
             made.append(
                 Variant(

@@ -1,8 +1,8 @@
 """The differentiable Gaussian rasterizer."""
 
-from .cuda.capacity import lists_outgrown
+from .cuda.capacity import forget_graphs, lists_outgrown
 from .function import rasterization
 from .quantile import depth_quantile
 from .skip import Skip
 
-__all__ = ["Skip", "depth_quantile", "lists_outgrown", "rasterization"]
+__all__ = ["Skip", "depth_quantile", "forget_graphs", "lists_outgrown", "rasterization"]

@@ -180,6 +180,20 @@ def check_step(device: torch.device) -> None:
     waits_for_nothing(Step("rays", 2, device).run)
 
 
+def check_step_graph(device: torch.device) -> None:
+    """Check a step that is repeated by a CUDA graph bit by bit against steps one by one."""
+    from gamba_warp.train.timing import Step
+
+    plain, repeated = (Step("rays", 3, device, graph) for graph in (False, True))
+    for _ in range(5):
+        assert_same((plain.run(),), (repeated.run().clone(),))
+    assert repeated.graphs is not None and repeated.graphs.count == 1
+    pairs = zip(plain.model.parameters(), repeated.model.parameters(), strict=True)
+    averages = zip(plain.ema.model.parameters(), repeated.ema.model.parameters(), strict=True)
+    for ours, theirs in (*pairs, *averages):
+        assert_same((ours,), (theirs,))
+
+
 def waits_for_nothing(run: Callable[[], Any]) -> None:
     """Run a function twice, the second time with every synchronisation an error."""
     run()

@@ -54,7 +54,8 @@ def test_streams_and_graphs(check):
 
 
 @pytest.mark.gpu
-def test_a_training_step_waits_for_nothing():
+@pytest.mark.parametrize("check", [checks.check_step, checks.check_step_graph])
+def test_a_training_step(check):
     for name in ("msgspec", "tyro"):
         pytest.importorskip(name)
-    checks.check_step(DEVICE)
+    check(DEVICE)

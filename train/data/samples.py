@@ -108,12 +108,24 @@ class Batch:
             return self
         return _combined([self], lambda values: values[0].to(device, non_blocking=True))
 
-    def pinned(self) -> Batch:
-        """Return the batch with its CPU tensors in page-locked memory.
+    def for_gpu(self, config: GambaConfig) -> Batch:
+        """Return the batch with its CPU tensors in page-locked memory, and padded lists.
 
         Only such memory is copied to a GPU asynchronously.
+
+        Args:
+            config: of the model.
         """
-        return _combined([self], lambda v: v[0].pin_memory() if v[0].device.type == "cpu" else v[0])
+        own = self.foreground and self.foreground.padded(config.ray_cells**2)
+        whole = replace(self, foreground=own)
+        return _combined(
+            [whole], lambda v: v[0].pin_memory() if v[0].device.type == "cpu" else v[0]
+        )
+
+
+def copied(batch: Batch) -> Batch:
+    """Return a copy of a batch, with tensors of its own."""
+    return _combined([batch], lambda values: values[0].clone())
 
 
 def join(samples: list[Batch], config: GambaConfig) -> Batch:

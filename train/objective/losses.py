@@ -338,11 +338,12 @@ def term_weights(loss: LossConfig, at: Progress) -> dict[str, float]:
     return weights | {"novel": loss.novel_weight}
 
 
-def loss_terms(inputs: LossInputs, weights: Mapping[str, float]) -> dict[str, Tensor]:
-    """Compute the terms with a nonzero weight, and those that are always computed."""
+def loss_terms(inputs: LossInputs, weights: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Compute the terms with a nonzero weight or a tensor's, and those always computed."""
     found = {}
     for name, term in TERMS.items():
-        if term.always or weights.get(name):
+        weight = weights.get(name)
+        if term.always or isinstance(weight, Tensor) or weight:
             with record_function(term.label):
                 value = term.value(inputs)
             if value is not None:
@@ -350,7 +351,7 @@ def loss_terms(inputs: LossInputs, weights: Mapping[str, float]) -> dict[str, Te
     return found
 
 
-def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
+def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, Any]) -> Tensor:
     """Sum the weighted terms, averaged over all views and objects, to a scalar.
 
     Raises:

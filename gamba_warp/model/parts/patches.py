@@ -7,6 +7,7 @@ is asked for their numbers; a training makes them beside the data.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,11 @@ from torch.nn import functional as F
 
 from ...kernels.runtime.packed import Packed
 from ..config import GambaConfig, Orders
+
+# Of ``Foreground.padded``: significant bits of its numbers of patches, and of rows of a picture;
+# share of a patch's cells that have an object, in the mean over 1,120 pictures of training data.
+_FINE, _COARSE = 5, 2
+_FILLED = 0.72
 
 
 def scan_orders(height: int, width: int, orders: Orders = "backward", count: int = 4) -> Tensor:
@@ -52,8 +58,10 @@ class Foreground:
         cell: ``[3, T]``: picture, row and column of each cell.
         number: ``[T]``, index of each cell among all cells of all patches, patch by patch.
         slot: ``[T]``, row of each cell among B times ``most`` rows.
+        most: rows of a picture, at least its number of cells.
         counts: number of cells of each picture.
         boxes: for each picture the first row and column of its patches, and those behind the last.
+        void: ``[T, 1]`` float32, 0, or -inf for cells that are none; None without such cells.
     """
 
     patch: Tensor
@@ -65,13 +73,10 @@ class Foreground:
     cell: Tensor
     number: Tensor
     slot: Tensor
+    most: int
     counts: list[int]
     boxes: list[tuple[int, int, int, int]]
-
-    @property
-    def most(self) -> int:
-        """The largest number of cells of a picture."""
-        return max(self.counts, default=0)
+    void: Tensor | None = None
 
     @property
     def packed(self) -> Packed | None:
@@ -82,6 +87,48 @@ class Foreground:
         """Return the lists on a device."""
         moved = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **moved)
+
+    def padded(self, cells: int) -> Foreground:
+        """Return lists of one of few lengths, so that a CUDA graph of one batch fits many.
+
+        Added tokens follow those of the last picture, so no other token depends on them. Added
+        patches and cells repeat the first of picture 0; these cells are transparent, and share a
+        row behind the cells of picture 0.
+
+        Args:
+            cells: number of cells of a patch.
+        """
+        orders, patches, cells_now = len(self.positions.T), len(self.patch.T), len(self.cell.T)
+        each = _FILLED * cells
+        more = _rounded_up(max(patches, cells_now / each, 1), _FINE) - patches
+        total = patches + more
+        empty = max(math.ceil(total * each), cells_now) - cells_now
+        most = _rounded_up(self.most + 1, _COARSE)
+        new = torch.arange(orders * patches, orders * total)
+        end = torch.tensor([orders * total])
+        rows = self.rows.clone()
+        rows[-1:, 2] = orders * total
+        slot = self.slot + self.cell[0] * (most - self.most)
+        return replace(
+            self,
+            patch=F.pad(self.patch, (0, more)),
+            tokens=F.pad(self.tokens, (0, len(new))),
+            patch_of=torch.cat([self.patch_of, new // orders]),
+            positions=torch.cat([self.positions, new.view(more, orders)]),
+            cu_seqlens=torch.cat([self.cu_seqlens[:-1], end]),
+            rows=rows,
+            cell=F.pad(self.cell, (0, empty)),
+            number=F.pad(self.number, (0, empty)),
+            slot=F.pad(slot, (0, empty), value=most - 1),
+            void=F.pad(torch.zeros(cells_now, 1), (0, 0, 0, empty), value=-math.inf),
+            most=most,
+        )
+
+
+def _rounded_up(number: float, bits: int) -> int:
+    """Return the next number of so many significant bits."""
+    step = 1 << max(0, math.ceil(number).bit_length() - bits)
+    return math.ceil(number / step) * step
 
 
 def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Foreground:
@@ -126,6 +173,7 @@ def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Fore
         cell=cell.contiguous(),
         number=among * count**2 + cell[1] % count * count + cell[2] % count,
         slot=torch.arange(cell.shape[1]) + first[cell[0]],
+        most=max(counts.tolist(), default=0),
         counts=counts.tolist(),
         boxes=[_box(grid) for grid in near.view(-1, side, side)],
     )

@@ -115,6 +115,8 @@ class RayDecoder(nn.Module):
         with torch.autocast(tokens.device.type, enabled=False):
             side = self.config.patch_size // self.config.ray_cells
             colors, alpha = cell_colors(rgba.float(), side, foreground.cell)
+            if foreground.void is not None:
+                alpha = alpha + foreground.void
         hidden = self.up(tokens.flatten(1)).unflatten(1, (self.upsampling.shape[1], -1))
         if self.config.ray_coarse:
             hidden = self.upsampling.to(hidden.dtype) @ hidden
@@ -131,9 +133,9 @@ class RayDecoder(nn.Module):
         """Apply ``stem`` to ``pixels``, at the cells: ``[T, C]``.
 
         A CPU only computes each picture's rows and columns with cells; a GPU is faster with all
-        pictures at once.
+        pictures at once, and padded cells are of any picture.
         """
-        if pixels.device.type != "cpu":
+        if pixels.device.type != "cpu" or foreground.void is not None:
             picture, row, column = foreground.cell
             return self.stem(pixels).permute(0, 2, 3, 1)[picture, row, column]
         count, found = self.config.ray_cells, []

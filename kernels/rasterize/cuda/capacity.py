@@ -151,6 +151,13 @@ def lists_outgrown() -> bool:
     return any(s.in_graph is not None and c.latest(s.slot) > s.in_graph for c, s in shapes)
 
 
+def forget_graphs() -> None:
+    """Forget the capacities of all CUDA graphs, which are about to be captured again."""
+    for counts in _counts.values():
+        for capacity in counts.shapes.values():
+            capacity.in_graph = None
+
+
 def clear() -> None:
     """Drop all shapes, for tests; CUDA graphs keep writing to their slots."""
     for counts in _counts.values():

@@ -1,0 +1,91 @@
+"""Steps repeated by graphs: the same bits as steps one by one, on a recording of operators."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import micro
+
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.train.batches import open_data
+from gamba_warp.train.loop import Trainer
+
+from .recording import RecordedGraphs
+
+RAYS = (*micro.MODEL, "decoder=rays", "ray_cells=2", "ray_layers=3", "ray_features=8")
+LOSSES = {
+    "rays": {"mask_l1_weight": 0.5, "translucency_weight": 0.1, "radial_mask": False},
+    "bins": {"radial_mask": True},  # whose weight falls from step to step
+}
+STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return micro.write_dataset(tmp_path_factory.mktemp("data"), 4)
+
+
+def squares(got, want):
+    return (got - want).square().mean((-3, -2, -1))
+
+
+def trained(data, out, kind, most):
+    """Train with at most so many graphs; return the trainer and its losses."""
+    model, lpips = (RAYS, squares) if kind == "rays" else (micro.MODEL, None)
+    loss = LOSSES[kind] | ({"lpips_crop": 16} if lpips else {})
+    optim = {"ema": 0.9, "lr": 1e-2, "warmup_steps": 1}
+    length = {"steps": STEPS}
+    config = micro.options(data, out, model, loss=loss, optim=optim, length=length)
+    torch.manual_seed(1)
+    trainer = Trainer(config, Gamba(config.model_config()), open_data(config), micro.ALONE, lpips)
+    take = trainer._batches.take
+
+    def padded(number):
+        batch = take(number)
+        own = batch.foreground and batch.foreground.padded(4)
+        return replace(batch, foreground=own)
+
+    trainer._batches.take = padded
+    optimizer, ema = trainer.optimizer, trainer.ema.model
+    trainer.graphs = RecordedGraphs(
+        lambda: [
+            *trainer.parameters,
+            *ema.parameters(),
+            *(x for entry in optimizer.state.values() for x in entry.values()),
+        ],
+        most,
+    )
+    trainer.model.train()
+    figures = [trainer.train_step() for _ in range(STEPS)]
+    trainer._batches.close()
+    return trainer, figures
+
+
+@pytest.mark.parametrize("kind", ["rays", "bins"])
+def test_repeated_steps_have_the_same_bits(data, tmp_path, kind):
+    one, wanted = trained(data, tmp_path / "one", kind, 0)
+    other, got = trained(data, tmp_path / "other", kind, 64)
+    assert one.graphs.replays == 0 and other.graphs.replays >= STEPS // 2
+    assert not other.graphs.said
+    for a, b in zip(wanted, got, strict=True):
+        for name in a.keys() - {"seconds", "wait_share", "views_per_second"}:
+            assert a[name] == b[name], name
+    for name, model in one.models.items():
+        theirs = other.models[name].state_dict()
+        for key, value in model.state_dict().items():
+            assert torch.equal(value, theirs[key]), (name, key)
+
+
+def test_a_step_that_cannot_be_captured_runs_as_before(data, tmp_path, monkeypatch):
+    def refuse(self, run):
+        raise RuntimeError("operation not permitted\nwhen stream is capturing")
+
+    one, _ = trained(data, tmp_path / "one", "bins", 0)
+    monkeypatch.setattr(RecordedGraphs, "_record", refuse)
+    other, _ = trained(data, tmp_path / "other", "bins", 64)
+    assert other.graphs.replays == 0
+    assert other.graphs.said == [
+        "no CUDA graph of a step: operation not permitted; steps run one by one"
+    ]
+    for name, value in one.model.state_dict().items():
+        assert torch.equal(value, other.model.state_dict()[name]), name

@@ -1,0 +1,150 @@
+"""CUDA graphs of the training step, one for each shape of a batch.
+
+A graph repeats the launches of its capture. Whatever changes from step to step is therefore in
+tensors of fixed addresses: the batch, which is copied there, and the numbers of ``number``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import is_dataclass
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from gamba_warp.errors import first_line
+from gamba_warp.kernels.rasterize import forget_graphs, lists_outgrown
+
+from .data.samples import Batch, copied
+
+MOST = 64  # graphs that are kept; each holds the results of a step
+Result = TypeVar("Result")
+
+
+class _Recorded(NamedTuple):
+    """Graph of a step, the batch that it reads, and the results that it overwrites."""
+
+    graph: torch.cuda.CUDAGraph
+    batch: Batch
+    result: Any
+
+
+class StepGraphs:
+    """Graphs of a run on one GPU.
+
+    The first step of a shape runs by itself: it finds the rasterizer's capacity, and libraries set
+    themselves up. The second one is captured. All run on one stream, which is not torch's default.
+    """
+
+    def __init__(self, device: torch.device, say: Callable[[str], None], most: int = MOST) -> None:
+        """Make no graph yet.
+
+        Args:
+            device: a GPU.
+            say: gets one line if a step cannot be captured.
+            most: graphs that are kept; 0 for none.
+        """
+        self._device, self._say, self._most = device, say, most
+        self._stream: Any = None
+        self._pool: Any = None
+        self._numbers: dict[str, Tensor] = {}
+        self._known: set[Hashable] = set()  # shapes of earlier steps
+        self._graphs: dict[Hashable, _Recorded] = {}
+
+    @property
+    def count(self) -> int:
+        """Number of graphs."""
+        return len(self._graphs)
+
+    def number(self, name: str, value: float) -> Tensor:
+        """Return a float32 scalar on the device, the same tensor each time, with a new value."""
+        if name not in self._numbers:
+            self._numbers[name] = torch.zeros((), device=self._device)
+        return self._numbers[name].fill_(value)
+
+    def run(self, batch: Batch, key: Hashable, step: Callable[[Batch], Result]) -> Result:
+        """Run a step, or repeat the graph of an equal one.
+
+        Args:
+            batch: on the device.
+            key: whatever else decides which launches a step makes.
+            step: makes a step with a batch; it must not wait for the device.
+
+        Returns:
+            The result of ``step``. The next step of its shape overwrites its tensors.
+        """
+        with self._on_stream():
+            return self._run(batch, key, step)
+
+    def _run(self, batch: Batch, key: Hashable, step: Callable[[Batch], Result]) -> Result:
+        if self._graphs and lists_outgrown():
+            self._graphs.clear()
+            forget_graphs()
+        shape = key, *_shape(batch)
+        found = self._graphs.get(shape)
+        if found is None and shape in self._known and len(self._graphs) < self._most:
+            found = self._capture(shape, batch, step)
+        if found is None:
+            self._known.add(shape)
+            return step(batch)
+        for own, given in zip(_tensors(found.batch), _tensors(batch), strict=True):
+            own.copy_(given)
+        found.graph.replay()
+        return found.result
+
+    def _capture(
+        self, shape: Hashable, batch: Batch, step: Callable[[Batch], Any]
+    ) -> _Recorded | None:
+        """Capture a step, which does not run it; None if that fails."""
+        own = copied(batch)
+        try:
+            graph, result = self._record(lambda: step(own))
+        except Exception as error:  # of torch, a library or the driver; steps work without graphs
+            self._say(f"no CUDA graph of a step: {first_line(error)}; steps run one by one")
+            self._most = 0
+            self._graphs.clear()
+            return None
+        found = self._graphs[shape] = _Recorded(graph, own, result)
+        return found
+
+    @contextmanager
+    def _on_stream(self) -> Iterator[None]:
+        if self._stream is None:
+            self._stream = torch.cuda.Stream(self._device)
+        current = torch.cuda.current_stream(self._device)
+        self._stream.wait_stream(current)
+        with torch.cuda.stream(self._stream):
+            yield
+        current.wait_stream(self._stream)
+
+    def _record(self, run: Callable[[], Result]) -> tuple[torch.cuda.CUDAGraph, Result]:
+        if self._pool is None:  # graphs that never run together may share their memory
+            self._pool = torch.cuda.graph_pool_handle()
+        graph = torch.cuda.CUDAGraph()
+        # The threads that load data allocate memory meanwhile, which "global" would forbid.
+        mode = "thread_local"
+        with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode=mode):
+            result = run()
+        return graph, result
+
+
+def _shape(value: Any) -> Iterator[Hashable]:
+    """Yield what a step bakes into its launches: shapes and numbers of a dataclass."""
+    for field in vars(value).values():
+        if isinstance(field, Tensor):
+            yield field.shape, field.dtype
+        elif is_dataclass(field):
+            yield from _shape(field)
+        elif not isinstance(field, list):  # names, and what only a CPU uses
+            yield field
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    """Yield the tensors of a dataclass and of those in it, in the order of their fields."""
+    for field in vars(value).values():
+        if isinstance(field, Tensor):
+            yield field
+        elif is_dataclass(field):
+            yield from _tensors(field)
