@@ -79,22 +79,20 @@ class TrainingData:
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
-def open_data(config: TrainConfig, device: torch.device | None = None) -> TrainingData:
+def open_data(config: TrainConfig) -> TrainingData:
     """Open the datasets of a run.
 
     Args:
         config: options of the run.
-        device: the training device; on a GPU it keeps the pictures of ``--cache``.
 
     Raises:
-        UserError: a folder does not exist, no object can be read, the pictures do not fit on the
-            device, or the data has Google Scanned Objects.
+        UserError: a folder does not exist, no object can be read, or the data has Google Scanned
+            Objects.
     """
     if (source := shards_at(config.data)) is not None:
         return _open_shards(config, source)
     views = config.views
-    gpu = device if device is not None and device.type == "cuda" else None
-    train = open_dataset(config.data, "train", cache=views.cache and gpu is None)
+    train = open_dataset(config.data, "train", cache=views.cache)
     taken = [range(len(train))]  # objects of DATA, then of each of --extra
     known = {config.data.resolve(): taken[0]}
     for folder in views.extra:
@@ -125,9 +123,6 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
             f"the data has Google Scanned Objects, which are for evaluation ({shown}): leave them "
             "out"
         )
-    if views.cache and gpu is not None:
-        sizes = sorted({views.size, config.model_config().image_size})
-        train.preload(sorted(set(objects)), sizes, gpu, views.threads("cuda"))
     return TrainingData(train, objects, held_out, notes)
 
 

@@ -67,8 +67,8 @@ class DataConfig:
         recolor: Share of the samples whose colour channels are permuted and change gamma.
         made: Share of the samples that show made objects (gamba data made), which other processes
             make and render during the training; the others are of the datasets.
-        cache: Keep decoded pictures in memory; on a GPU, decode all at the start and keep them in
-            the GPU's, with 8 bits a channel. Depth pictures are read when they are used.
+        cache: Keep decoded pictures in memory, with 8 bits a channel. Depth pictures are read when
+            they are used.
         workers: Threads that decode pictures ahead of the training; also the largest number of
             batches kept ready. By default 1, beside a GPU one per core but 8 at most. The number
             does not change the result.

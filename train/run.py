@@ -63,7 +63,7 @@ def train(config: TrainConfig, world: World) -> int:
             return find_checkpoint(run.out, run.resume, notes.append)
 
         with world.together():
-            data = open_data(config, world.device)
+            data = open_data(config)
             lpips, warning = open_lpips(config, world.device.type)
         world.agree(lambda: _facts(config, data, world, lpips is not None))
         checkpoint = world.on_main(claim)  # the others use its result

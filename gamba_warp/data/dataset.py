@@ -11,7 +11,6 @@ import hashlib
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -306,7 +305,6 @@ class ViewDataset:
         # By path and size: the picture, and the (width, height) of the file.
         self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
         self._pictures = {} if cache else None
-        self._preloaded: dict[tuple[str, int], tuple[Tensor, np.ndarray]] = {}
 
     def __len__(self) -> int:
         return len(self.uids)
@@ -385,44 +383,6 @@ class ViewDataset:
                 bad[uid] = str(error)
         return bad
 
-    def preload(
-        self, objects: Sequence[int], sizes: Sequence[int], device: torch.device, workers: int = 1
-    ) -> None:
-        """Decode pictures and keep them on a device, with 8 bits a channel, with a progress bar.
-
-        ``load`` then returns pictures on that device, and cameras and depths on the CPU. The values
-        are bit-identical to those decoded on the CPU.
-
-        Args:
-            objects: indices of the objects. Unreadable ones are skipped and raise when loaded.
-            sizes: heights, pixels.
-            device: device for the pictures.
-            workers: number of decoding threads.
-
-        Raises:
-            UserError: the pictures do not fit into the GPU's memory.
-        """
-        if device.type == "cuda":
-            views = sum(self.num_views(index) for index in objects)
-            needed = sum(4 * views * size**2 for size in sizes)
-            free, _ = torch.cuda.mem_get_info(device)
-            if needed > free:
-                raise UserError(
-                    f"--cache: {views} views take {needed / 2**30:.1f} GB, of which the GPU "
-                    f"has {free / 2**30:.1f} free"
-                )
-
-        def decode(key: tuple[str, int]) -> None:
-            with suppress(*EXPECTED):
-                pixels, Ks = self.pictures(key[0], None, key[1])
-                self._preloaded[key] = torch.from_numpy(pixels).to(device), Ks
-
-        keys = [(self.uids[index], size) for index in objects for size in sizes]
-        with ThreadPoolExecutor(workers) as pool:
-            done = pool.map(decode, keys)
-            for _ in progress_bar(done, total=len(keys), desc="decoding", unit="object"):
-                pass
-
     def load(
         self,
         index: int | str,
@@ -446,15 +406,8 @@ class ViewDataset:
         """
         uid = self._uid(index)
         files, wanted = self.files(uid), self._wanted(uid, views, size)
-        if size is not None and (uid, size) in self._preloaded:
-            pixels, Ks = self._preloaded[uid, size]
-            chosen, Ks = pixels[torch.tensor(wanted, device=pixels.device)], Ks[wanted]
-            # Divide by a tensor: for a Python number a GPU multiplies with the inverse, which
-            # differs in the last bit.
-            images = chosen.float() / torch.tensor(255.0, device=chosen.device)
-        else:
-            pixels, Ks = self.pictures(uid, wanted, size)
-            images = torch.from_numpy(np.divide(pixels, np.float32(255), dtype=np.float32))
+        pixels, Ks = self.pictures(uid, wanted, size)
+        images = torch.from_numpy(np.divide(pixels, np.float32(255), dtype=np.float32))
         height, width = images.shape[1:3]
         unit = np.float32(files.depth_unit)
         near, far = (

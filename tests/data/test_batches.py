@@ -11,7 +11,6 @@ from helpers import micro
 from helpers.micro import ALONE
 from helpers.refusals import refused
 
-from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
 from gamba_warp.train.batches import Batches, open_data
@@ -165,30 +164,3 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
     made.take(0)
     made.close()
     assert not asked, "the CPU's way is left alone"
-
-
-def test_kept_pictures_need_no_file_any_more(tmp_path):
-    root = micro.write_dataset(tmp_path / "clouds", objects=4)
-    (root / "clouda" / "002.png").write_bytes(b"no picture")
-    before = open_dataset(root, "train")
-    want = before.load("cloudb", [3, 1], 12)
-    kept = open_dataset(root, "train")
-    kept.preload(range(len(kept)), (12, micro.SIZE), torch.device("cpu"))
-    for path in root.rglob("*.png"):
-        path.unlink()
-    got = kept.load("cloudb", [3, 1], 12)
-    assert torch.equal(got.images, want.images) and got.images.dtype == torch.float32
-    assert torch.equal(got.cameras.Ks, want.cameras.Ks)
-    assert kept.load(1, size=micro.SIZE).images.shape == (6, 16, 16, 4)
-    for views, size, reason in (([6], 12, "view 6"), ([], 12, "no views"), (None, 9, "no such")):
-        refused(reason, kept.load, "cloudb", views, size)
-    refused("clouda/.*png", kept.load, "clouda", [0], 12)
-
-
-def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
-    config = micro.options(data, data, views={"cache": True})
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 2000))
-    monkeypatch.setattr(
-        torch, "tensor", lambda *a, device=None, real=torch.tensor, **k: real(*a, **k)
-    )
-    refused(r"^--cache: 30 views take 0.0 GB", open_data, config, GPU)

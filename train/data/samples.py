@@ -40,8 +40,9 @@ class Change:
             views = mirrored(views)
         if self.channels == (0, 1, 2) and self.gamma == 1.0:
             return views  # the most frequent case
-        color = views.images[..., list(self.channels)] ** self.gamma
-        return replace(views, images=torch.cat([color, views.images[..., 3:]], -1))
+        images = views.images[..., [*self.channels, 3]]
+        images[..., :3].pow_(self.gamma)
+        return replace(views, images=images)
 
 
 def draw_change(rng: np.random.Generator, mirror: float, recolor: float) -> Change:
