@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.profiler import profile
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.kernels.bench.measure import Case, Settings, Variant
@@ -20,6 +21,13 @@ from .optim import Ema, build_optimizer
 from .step import Objective, compute_gradients, update
 
 _VIEWS, _SIZE = 4, 128  # of an object, the input view included
+# Parts of a step, by the beginning of the names of their operators in a profile.
+_PARTS = {
+    "scan": ("gamba_warp::selective_scan",),
+    "convolution": ("gamba_warp::causal_conv1d",),
+    "rasterizer": ("gamba_warp::rasterize",),
+    "products": ("aten::mm", "aten::addmm", "aten::bmm", "aten::convolution"),
+}
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -75,6 +83,24 @@ class Step:
         made = compute_gradients(self.model, self.optimizer, [batch], self.objective, clip=CLIP)
         return update(self.optimizer, self.ema, share, made, self.model)
 
+    def work(self) -> dict[str, float]:
+        """Count the samples of a step, and the share of each of ``_PARTS`` in one without a graph.
+
+        Shares are of the time of the GPU's kernels, or of a CPU's operators.
+        """
+        on_gpu = self.batch.inputs.is_cuda
+        kind = "device_time_total" if on_gpu else "cpu_time_total"
+        # Without a driver kineto prints that there is none.
+        with profile(use_device="cuda" if on_gpu else None, use_kineto=on_gpu) as found:
+            self._step(self.batch, 0.0)
+        events = found.key_averages()
+        whole = sum(getattr(event, f"self_{kind}") for event in events) or 1
+        shares = {
+            f"share of {part}": sum(getattr(e, kind) for e in events if e.key.startswith(names))
+            for part, names in _PARTS.items()
+        }
+        return {"samples": len(self.batch.uids)} | {k: v / whole for k, v in shares.items()}
+
     def check(self) -> None:
         """Check that the gradient is finite and not 0, without an oracle."""
         _, norm, skipped = self.run().tolist()
@@ -103,7 +129,7 @@ def steps(settings: Settings) -> list[Variant]:
                     direction=BOTH,
                     rounds=5,
                     parameters={"B": objects, "views": _VIEWS, "side": _SIZE},
-                    work=lambda count=objects: {"samples": count},
+                    work=step.work,
                 )
             )
     return made

@@ -20,6 +20,10 @@ _WORK = {
     "state_history_bytes": "history",
     "saved_bytes": "saved",
     "samples": "",
+    "share of scan": "scan",
+    "share of convolution": "convolution",
+    "share of rasterizer": "rasterizer",
+    "share of products": "products",
 }
 _BUSY = 1.1  # wall time over CPU time from which a machine is busy
 _EXPLANATION = (
@@ -51,7 +55,7 @@ def _work_text(r: dict) -> str:
             value = r["work"].get(name)
             if value is None:
                 continue
-            if name == "skipped":
+            if name == "skipped" or name.startswith("share"):
                 text = f"{value:.0%}"
             elif name == "samples":
                 text = f"{1e3 * value / r['ms_p50']:.3g} samples/s"
