@@ -1,6 +1,5 @@
 """From a picture to files, without the page."""
 
-import html.parser
 import re
 import zipfile
 from dataclasses import replace
@@ -223,19 +222,6 @@ def test_a_mesh(made, tmp_path, monkeypatch):
         names = {f"My-thing-v2{work.KINDS[kind][1]}" for kind in work.IN_ZIP}
         assert {*archive.namelist()} == names and archive.testzip() is None
     assert [p for p in tmp_path.iterdir() if p.is_dir()] == [] and len(asked) == 2
-
-
-def test_the_viewer_is_a_whole_document(made):
-    class Counter(html.parser.HTMLParser):
-        found: list[str] = []
-
-        def handle_starttag(self, tag, attrs):
-            self.found.append(tag)
-            assert not {"src", "href"} & {name for name, _ in attrs}, "it loads nothing"
-
-    counter = Counter()
-    counter.feed(work.viewer(made))
-    assert counter.found.count("html") == 1 and "canvas" in counter.found
 
 
 def test_examples_are_pictures():

@@ -43,18 +43,6 @@ def test_records_hold_what_was_packed():
     assert (turns - rotations(gaussians.quats.double())).abs().max() < 4 * 3 / 32767
 
 
-@pytest.mark.parametrize("count", [3, 8, 15])
-def test_harmonics_fill_whole_texels(count):
-    gaussians = some(7)
-    gaussians.harmonics = torch.randn(7, count, 3)
-    data = np.frombuffer(pack_gaussians(gaussians, UNMOVED)[1], "<f2").reshape(7, -1)
-    assert data.shape[1] % 8 == 0 and data.shape[1] - 3 * count < 8
-    np.testing.assert_allclose(
-        data[:, : 3 * count], gaussians.harmonics.reshape(7, -1), rtol=2**-11, atol=1e-7
-    )
-    assert not data[:, 3 * count :].any()
-
-
 def test_the_largest_come_first_and_the_invisible_not_at_all():
     gaussians = some(50)
     gaussians.opacities[:20] = 0.003  # below 1/255
@@ -82,27 +70,27 @@ def test_the_page_is_small_and_loads_nothing(tmp_path):
     assert not re.search(r"<(link|img|iframe)|src\s*=\s*[\"']", page)
 
 
+def about(page):
+    """The object's data in a page."""
+    (text,) = re.findall(r'id="object">(.*?)</script>', page)
+    return json.loads(text)
+
+
 def test_text_is_escaped_and_slots_in_it_stay():
     nasty = '</script><b onload="x">&{{gaussians}}'
     page = viewer_page(nasty, some(3), note=nasty)
     assert "<b onload" not in page and page.count("</script>") == 5
-    (text,) = re.findall(r'id="object">(.*?)</script>', page)
-    about = json.loads(text)
-    assert about["title"] == about["note"] == nasty and about["input"] is None
+    found = about(page)
+    assert found["title"] == found["note"] == nasty and found["input"] is None
 
 
 def test_cameras():
-    (text,) = re.findall(
-        r'id="object">(.*?)</script>', viewer_page("a", some(9), camera=(2.0, 40.0, 30.0))
-    )
-    about = json.loads(text)
-    assert about["input"] == about["home"] and about["frame"]["size"] == 1
-    assert about["home"]["distance"] == 2 and about["home"]["fov"] == 40
-    assert about["home"]["elevation"] == pytest.approx(np.pi / 6)
-    (text,) = re.findall(
-        r'id="object">(.*?)</script>', viewer_page("a", some(9), view=(2.5, 30.0, 0.0))
-    )
-    assert json.loads(text)["home"]["distance"] == 2.5
+    found = about(viewer_page("a", some(9), camera=(2.0, 40.0, 30.0)))
+    assert found["input"] == found["home"] and found["frame"]["size"] == 1
+    assert found["home"]["distance"] == 2 and found["home"]["fov"] == 40
+    assert found["home"]["elevation"] == pytest.approx(np.pi / 6)
+    other = about(viewer_page("a", some(9), view=(2.5, 30.0, 0.0)))
+    assert other["home"]["distance"] == 2.5
 
 
 @pytest.mark.parametrize(
