@@ -34,11 +34,8 @@ OTHERS = (
 def test_torch_warp_and_pytest_are_enough(tmp_path):
     """A real run on a CPU with all other packages hidden: the tests of a GPU are skipped."""
     (tmp_path / "sitecustomize.py").write_text(HIDE.format(names=OTHERS))
-    environment = os.environ | {
-        "PYTHONPATH": str(tmp_path),
-        "OMP_NUM_THREADS": "1",
-        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
-    }
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     out = tmp_path / "out"
     words = ["-m", "gamba_warp.gpu_check", "--device", "cpu", "--out", out]
     done = subprocess.run(

@@ -188,9 +188,8 @@ def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     limit = plain.opacities.median().item()
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--min-opacity", limit) == 0
     few = load_ply(tmp_path / "thing.ply").num
-    assert (
-        0 < few < 64 and f"thing: {few} Gaussians, {64 - few} left out" in capsys.readouterr().out
-    )
+    said = f"thing: {few} Gaussians, {64 - few} left out"
+    assert 0 < few < 64 and said in capsys.readouterr().out
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--frame", "opencv") == 0
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--no-recenter") == 0

@@ -264,16 +264,6 @@ def test_bad_objects_name_the_file(tmp_path, spoil, message):
     refused(message, open_dataset(tmp_path).load, 0)
 
 
-def test_check_lists_every_bad_object(tmp_path):
-    for name in "abc":
-        write_transforms(tmp_path / name)
-    (tmp_path / "a" / "transforms.json").write_text("nonsense")
-    (tmp_path / "b" / "images" / "001.png").unlink()
-    bad = open_dataset(tmp_path).check()
-    assert set(bad) == {"a", "b"}
-    assert "001.png: no such file" in bad["b"]
-
-
 def test_bad_requests(tmp_path):
     refused("no such folder", open_dataset, tmp_path / "nowhere")
     refused("no objects found", open_dataset, tmp_path)

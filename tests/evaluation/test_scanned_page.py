@@ -47,15 +47,10 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
 
     def run(command, words):
         ran.append([command, *words])
-        folder = (
-            tmp_path
-            / "out"
-            / {"eval-views": "eval", "eval-geometry": "shapes"}.get(command, "views")
-        )
+        name = {"eval-views": "eval", "eval-geometry": "shapes"}.get(command, "views")
+        folder, report = tmp_path / "out" / name, VIEWS if command == "eval-views" else SHAPES
         folder.mkdir(parents=True)
-        (folder / "report.json").write_text(
-            json.dumps(VIEWS if command == "eval-views" else SHAPES)
-        )
+        (folder / "report.json").write_text(json.dumps(report))
         if command == "eval-views":
             Image.new("RGB", (9, 14), "red").save(folder / "contact_sheet.png")
         return int(command == "eval-views")

@@ -178,11 +178,7 @@ def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):
         (["reconstruct", "thing.png", "--mesh", "obj"], "trimesh", "mesh"),
         (["reconstruct", "thing.png", "--turntable", "mp4"], "imageio_ffmpeg", "video"),
         (["export", "thing.ply", "--splats", "spz"], "trimesh", "mesh"),  # a mesh by default
-        (
-            ["export", "thing.ply", "--mesh", "none", "--turntable", "mp4"],
-            "imageio_ffmpeg",
-            "video",
-        ),
+        ("export thing.ply --mesh none --turntable mp4".split(), "imageio_ffmpeg", "video"),
         (["render", "thing.ply", "--kind", "mp4"], "imageio_ffmpeg", "video"),
     ],
 )
