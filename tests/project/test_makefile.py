@@ -1,10 +1,10 @@
 """The Makefile installs for users what users need, and the rest for developers."""
 
 import os
-import subprocess
 from pathlib import Path
 
 import pytest
+from helpers.children import ran
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -12,8 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def commands(folder: Path, *words: str) -> str:
     """Everything that ``make WORDS`` would run where nothing is installed yet."""
     command = ["make", "--dry-run", f"VENV={folder / 'none'}", *words]
-    plain = {**os.environ, "MAKEFLAGS": ""}
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=plain)
+    done = ran(*command, cwd=ROOT, env={**os.environ, "MAKEFLAGS": ""})
     assert done.returncode == 0, done.stderr
     return done.stdout
 
