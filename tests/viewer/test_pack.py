@@ -29,13 +29,20 @@ ONE_FACE = np.array([[0, 1, 2]])
 def test_records_hold_what_was_packed():
     gaussians = some(500)
     gaussians.quats[0] = torch.tensor([0.0, 0.6, 0.0, -0.8])  # a half turn: w is 0
-    records = np.frombuffer(pack_gaussians(gaussians, UNMOVED)[0], RECORD)
+    gaussians.harmonics = torch.randn(500, 3, 3)
+    packed = pack_gaussians(gaussians, UNMOVED)
+    records, texels = np.frombuffer(packed[0], RECORD), np.frombuffer(packed[1], "<f2")
     assert RECORD.itemsize == 32
     np.testing.assert_array_equal(records["means"], gaussians.means)
     half = 2.0**-11  # of a value: float16 has 11 bits
     np.testing.assert_allclose(records["scales"], gaussians.scales, rtol=half, atol=1e-7)
     np.testing.assert_allclose(records["look"][:, 0], gaussians.opacities, rtol=half)
     np.testing.assert_allclose(records["look"][:, 1:], gaussians.colors, rtol=half, atol=1e-7)
+    texels = texels.reshape(500, 16)  # whole texels of 8 numbers
+    np.testing.assert_allclose(
+        texels[:, :9], gaussians.harmonics.reshape(500, -1), rtol=half, atol=1e-7
+    )
+    assert not texels[:, 9:].any()
     p = records["turns"] / 32767
     k = 2 / (1 + (p * p).sum(1, keepdims=True))
     turns = rotations(torch.from_numpy(np.hstack([k - 1, k * p])))
