@@ -239,6 +239,18 @@ def test_the_cut_out_can_be_mended_and_given_again(tmp_path, network, busy):
     np.testing.assert_allclose(mended.source_rgb[:, :20], source, atol=0.51 / 255)
 
 
+def test_no_fringe_of_the_background_is_left():
+    alpha = disc_on_noise((80, 80))[1]
+    soft = np.clip(alpha * 1.0, 0, 1)
+    red, green = np.array([0.9, 0.1, 0.1]), np.array([0.0, 0.9, 0.2])
+    rgb = (soft[..., None] * red + (1 - soft[..., None]) * green).astype(np.float32)
+    clean = cutout._blended(rgb, soft)
+    rim = (soft > 0.1) & (soft < 0.9)
+    assert rim.sum() > 30 and np.abs(rgb[rim] - red).max() > 0.5
+    assert np.abs(clean[rim][:, :3] - red).max() < 0.12  # what blurs cannot tell apart
+    np.testing.assert_array_equal(clean[soft == 1][:, :3], rgb[soft == 1])
+
+
 @pytest.mark.parametrize(
     "box, fault",
     [
