@@ -28,8 +28,8 @@ MAKEFILE = (ROOT / "Makefile").read_text()
 OTHERS = {*"git cd docker source pip for do done sbatch export apt-get ulimit".split()}
 SHELL = blocks("bash")
 PYTHON = blocks("python")
-# `gamba … ` in the middle of a sentence; a name in capitals or an ellipsis stands for something.
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+# `gamba … ` in the middle of a sentence; a name in capitals or an ellipsis stands for something.
 INLINE = re.compile(r"`(gamba [a-z][^`]*)`")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers.children import ran
-from website.links import targets
+from website.links import rewritten, targets
 
 from gamba_warp.versions import __version__
 
@@ -91,6 +91,13 @@ def test_the_command_that_make_docs_prints_serves_the_site_with_its_search(site,
             assert any(found() for _ in range(60))
         finally:
             server.kill()
+
+
+def test_links_keep_their_anchors_and_blocks_of_code_are_left():
+    text = "[a](../eval/README.md#b) [c](#d) [e](https://f.org/g.md)\n"
+    block = f"```text\n{text}```\n"
+    new = "[a](repository/eval.md#b) [c](#d) [e](https://f.org/g.md)\n"
+    assert rewritten(text + block, "docs/gpu.md", "gpu.md") == new + block
 
 
 def test_the_readme_is_short_and_its_links_lead_somewhere():
