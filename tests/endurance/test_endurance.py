@@ -7,6 +7,8 @@ full disk is simulated by a limit on the size of a file (``RLIMIT_FSIZE``).
 import os
 import random
 import shutil
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -145,6 +147,14 @@ def test_files_cut_short_are_not_whole(tmp_path):
         assert is_whole(name, data), name
         assert not is_whole(name, data[:-1]), name
         assert not is_whole(name, b""), name
+
+
+def test_children_are_killed_and_find_a_full_disk(tmp_path):
+    end = run_child(time.sleep, 60, kill_after=0.1)
+    assert end.killed and end.code == -9 and end.seconds < 5
+    end = run_child(Path.write_bytes, tmp_path / "a", bytes(9999), file_limit=5)
+    assert end.code == 1 and "File too large" in end.said
+    assert (tmp_path / "a").stat().st_size == 5
 
 
 def test_a_made_up_released_file_is_imported(tmp_path):

@@ -130,6 +130,15 @@ def test_a_hang_is_seen(base):
     assert run_case(faulty_case("hangs"), base, seconds=0.5).outcome == "hang"
 
 
+def test_a_failure_is_found_and_made_small(base, tmp_path):
+    """The reader fails if the third byte is not ASCII."""
+    with pytest.raises(AssertionError, match="exception, KeyError at"):
+        fuzz("faulty", base, 0, 400, tmp_path, Counter())
+    small = read_case(tmp_path / "faulty.json")
+    assert len(small.mutations) <= 2
+    assert len(small.files["a.txt"].data) <= len("valid text")
+
+
 @pytest.mark.parametrize("kind", ["pipe", "folder", "link", "missing"])
 def test_what_is_no_file_is_refused(base, kind):
     """In place of each file of every reader: a pipe and /dev/zero never end."""
