@@ -22,6 +22,7 @@ def told(path, tmp_path):
         ({"set": {"width": 0}}, "row b: --set: config: width is 0"),
         ({"set": {"patch_size": 5}}, "row b: --set: config: image_size"),
         ({"options": {"clap": 4}}, "row b: not the options of a run (unknown run.clap)"),
+        ({"options": {"plugins": ["a.py"]}}, "unknown run.plugins"),
         ({"options": {"lr": -1}}, "row b: lr: Expected `float` > 0"),
         ({"options": {"lr": "fast"}}, "row b: lr: Expected `float`, got `str`"),
         ({"options": {"radial_mask": 3}}, "row b: radial_mask: Expected `bool`, got `int`"),
@@ -48,6 +49,7 @@ def test_errors_name_the_row(b, reason, tmp_path):
         ("a", {"base": {"options": {"steps": 1, "minutes": 1}}}, "expected steps or minutes"),
         ("a", {"base": {"options": {"epochs": 1}}}, "expected steps or minutes"),
         ("a", {"base": {"preset": "huge"}}, "row a: preset: Invalid enum value 'huge'"),
+        ("a", {"plugin": ["a.py"]}, "unknown field `plugin`"),
         ([], {}, "$.rows"),
     ],
 )

@@ -4,7 +4,6 @@ import io
 import os
 import re
 import signal
-import subprocess
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.app import FORM, MEGABYTES, Program, command, form, serving
 from helpers.browser import complains
+from helpers.children import ran
 from PIL import Image
 
 from gamba_warp.formats.gaussians.files import read_gaussians
@@ -194,13 +194,8 @@ def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):
         (["--port", port], "", f"gamba: --port {port}: Address already in use\n"),
         (["--port", 0, "--matte-model", tmp_path / "none.onnx"], "loading the model\n", None),
     ):
-        done = subprocess.run(
-            command(*options),
-            capture_output=True,
-            text=True,
-            timeout=60,
-            env={**os.environ, "TMPDIR": str(served.temporary)},
-        )
+        environment = {**os.environ, "TMPDIR": str(served.temporary)}
+        done = ran(*command(*options), timeout=60, env=environment)
         assert done.returncode == 2 and done.stdout == f"loading torch\n{said}"
         assert done.stderr.count("\n") == 1 and done.stderr.startswith("gamba: "), done.stderr
         assert reason in (None, done.stderr)

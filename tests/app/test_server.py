@@ -19,6 +19,13 @@ from gamba_warp.app.visitor_files import VisitorFiles
 from gamba_warp.errors import UserError
 
 
+def headers_of(token, length, host="localhost"):
+    """Headers of an upload."""
+    said = {"host": host, "content-type": FORM["Content-Type"], "content-length": str(length)}
+    said["cookie"] = token and f"gamba-visitor={token}"
+    return [(name.encode(), value.encode()) for name, value in said.items() if value is not None]
+
+
 def answered(host, kind="http", path="/", method="GET", files=None, body=b"", token=None, more=()):
     """Return the guard's messages for a request, and the scopes that it passes on."""
     sent, inside = [], []
@@ -35,10 +42,7 @@ def answered(host, kind="http", path="/", method="GET", files=None, body=b"", to
     async def send(message):
         sent.append(message)
 
-    headers = [] if host is None else [(b"host", host.encode())]
-    headers += [(b"content-type", FORM["Content-Type"].encode()), *more]
-    headers += [(b"content-length", str(len(body)).encode())]
-    headers += [(b"cookie", f"gamba-visitor={token}".encode())] if token else []
+    headers = [*more, *headers_of(token, len(body), host)]
     place, _, asked = path.partition("?")
     scope = {"type": kind, "headers": headers, "path": place, "method": method}
     scope["query_string"] = asked.encode()
@@ -209,11 +213,8 @@ def dawdled(files, uploads, seconds=0.3):
         async def send(message):
             sent[k].append(message.get("status"))
 
-        headers = [(b"host", b"localhost"), (b"content-length", b"1048576")]
-        headers += [(b"cookie", f"gamba-visitor={token * 32}".encode())]
-        headers += [(b"content-type", FORM["Content-Type"].encode())]
         scope = {"type": "http", "method": "POST", "path": "/gradio_api/upload"}
-        await layer({**scope, "headers": headers}, receive, send)
+        await layer({**scope, "headers": headers_of(token * 32, 1 << 20)}, receive, send)
 
     async def come():
         tasks = [asyncio.create_task(ask(k, *upload)) for k, upload in enumerate(uploads)]
@@ -266,10 +267,7 @@ def test_a_body_that_does_not_come_is_refused(monkeypatch, name):
     async def send(message):
         sent.append(message)
 
-    headers = [(b"host", b"localhost"), (b"content-length", b"9999")]
-    headers += [(b"cookie", f"gamba-visitor={'a' * 32}".encode())]
-    headers += [(b"content-type", FORM["Content-Type"].encode())]
-    scope = {"type": "http", "method": "POST", "path": path, "headers": headers}
+    scope = {"type": "http", "method": "POST", "path": path, "headers": headers_of("a" * 32, 9999)}
     layer = guard.Guard(None, VisitorFiles(Path("unused")), {}, 1 << 20)
     asyncio.run(asyncio.wait_for(layer(scope, receive, send), 10))
     assert sent[0]["status"] == 408 and b"took too long" in sent[1]["body"]

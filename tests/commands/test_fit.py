@@ -213,12 +213,16 @@ def test_one_failure_does_not_stop_the_rest(dataset, tmp_path, capsys):
     assert "failed: ball: " in capsys.readouterr().err
 
 
-def test_pictures_without_background(dataset, tmp_path, capsys):
+def test_transparency_and_two_views_are_needed(dataset, tmp_path, capsys):
     for path in (dataset / "blob").glob("*.png"):
         save_image(path, load_rgba(path)[..., :3])
-    arguments = [str(dataset / "blob"), "--out", str(tmp_path / "out"), *OPTIONS]
-    assert run("fit", arguments) == 1
-    assert "no transparent pixel" in capsys.readouterr().err
+    write_object(tmp_path / "single", cloud(0), views=1)
+    for folder, reason in (
+        (dataset / "blob", "no transparent pixel"),
+        (tmp_path / "single", "at least 2"),
+    ):
+        assert run("fit", [str(folder), "--out", str(tmp_path / "out"), *OPTIONS]) == 1
+        assert reason in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -238,12 +242,6 @@ def test_bad_input_in_one_line(dataset, tmp_path, capsys, arguments, message):
     if "--out" not in arguments:
         arguments += ["--out", str(tmp_path / "out")]
     refused_command(capsys, "fit", arguments, message)
-
-
-def test_two_views_are_needed(tmp_path, capsys):
-    write_object(tmp_path / "single", cloud(0), views=1)
-    assert run("fit", [str(tmp_path / "single"), "--out", str(tmp_path / "out")]) == 1
-    assert "at least 2" in capsys.readouterr().err
 
 
 def test_interrupt_keeps_what_is_finished(dataset, tmp_path, monkeypatch):

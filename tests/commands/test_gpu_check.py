@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.children import ran
 
 from gamba_warp import gpu_check
 from gamba_warp.gpu_check import main, run_part
@@ -34,16 +34,11 @@ OTHERS = (
 def test_torch_warp_and_pytest_are_enough(tmp_path):
     """A real run on a CPU with all other packages hidden: the tests of a GPU are skipped."""
     (tmp_path / "sitecustomize.py").write_text(HIDE.format(names=OTHERS))
-    environment = os.environ | {
-        "PYTHONPATH": str(tmp_path),
-        "OMP_NUM_THREADS": "1",
-        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
-    }
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     out = tmp_path / "out"
     words = ["-m", "gamba_warp.gpu_check", "--device", "cpu", "--out", out]
-    done = subprocess.run(
-        [sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True
-    )
+    done = ran(sys.executable, *words, cwd=ROOT, env=environment)
     assert done.returncode == 0, done.stderr + done.stdout
     assert f"tests: passed ({out / 'tests.txt'})" in done.stdout
     assert f"bench: passed ({out / 'bench.txt'})" in done.stdout

@@ -1,5 +1,5 @@
 import re
-from types import SimpleNamespace
+from dataclasses import replace
 from urllib.parse import unquote
 
 import imageio_ffmpeg
@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers.gaussians import some
 from helpers.images import bad_files, cut_out
-from helpers.model import quick, run_reconstruct
+from helpers.model import SMALLEST, quick, run_reconstruct
 from helpers.refusals import refused_command
 from helpers.views import cloud_of
 from PIL import Image
@@ -22,6 +22,7 @@ from gamba_warp.images import find_pictures, save_image
 from gamba_warp.model import checkpoint as checkpoints
 from gamba_warp.model import predict
 from gamba_warp.model.checkpoint import load_model
+from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.predict import reconstruct
 from gamba_warp.pages.turntable import save_turntable, turntable_frames
 from gamba_warp.photo import cutout
@@ -33,39 +34,19 @@ def picture(tmp_path):
     return cut_out(tmp_path / "thing.png")
 
 
-class Recorder(torch.nn.Module):
-    """Stand-in of a model that records its inputs."""
-
-    def __init__(self, background):
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(1))
-        color = 1.0 if background == "white" else 0.0
-        self.config = SimpleNamespace(
-            image_size=24,
-            distance=2.0,
-            fov=40,
-            background_color=color,
-            input_channels=3,
-            width=1,
-            decoder="bins",
-        )
-
-    def forward(self, images, cameras):
-        self.images, self.cameras = images, cameras
-        return some(9).map(lambda value: value[None])
-
-
 @pytest.mark.parametrize("background", ["white", "black"])
 def test_the_model_sees_the_object_from_the_reference_camera(picture, background):
-    model, rgba = Recorder(background), cutout.cut_out(picture).rgba
+    model, seen = Gamba(replace(SMALLEST, distance=2.0, fov=40, background=background)), []
+    model.register_forward_pre_hook(lambda _, given: seen.append(given))
+    rgba = cutout.cut_out(picture).rgba
     gaussians = reconstruct(model, rgba)
-    assert gaussians.num == 9 and gaussians.means.shape == (9, 3)
-    want = composite(rgba, 24, 1.0 if background == "white" else 0.0)
-    torch.testing.assert_close(model.images, want[None])
-    cameras = model.cameras
+    assert gaussians.means.shape == (gaussians.num, 3)
+    ((images, cameras),) = seen
+    want = composite(rgba, 16, 1.0 if background == "white" else 0.0)
+    torch.testing.assert_close(images, want[None])
     torch.testing.assert_close(cameras.viewmats, reference_viewmat(2.0)[None])
-    torch.testing.assert_close(cameras.Ks, intrinsics(24, 24, 40)[None])
-    assert (cameras.width, cameras.height) == (24, 24)
+    torch.testing.assert_close(cameras.Ks, intrinsics(16, 16, 40)[None])
+    assert (cameras.width, cameras.height) == (16, 16)
 
 
 def test_turntable_begins_at_the_reference_view_and_turns():
@@ -207,9 +188,8 @@ def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     limit = plain.opacities.median().item()
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--min-opacity", limit) == 0
     few = load_ply(tmp_path / "thing.ply").num
-    assert (
-        0 < few < 64 and f"thing: {few} Gaussians, {64 - few} left out" in capsys.readouterr().out
-    )
+    said = f"thing: {few} Gaussians, {64 - few} left out"
+    assert 0 < few < 64 and said in capsys.readouterr().out
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--frame", "opencv") == 0
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--no-recenter") == 0

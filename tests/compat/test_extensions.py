@@ -208,9 +208,8 @@ print(fwd.__module__, "mamba_ssm" in sys.modules, *sys.argv[1:])
 """
 
 
-@pytest.mark.parametrize("take", [",".join(EXTENSIONS)])
-def test_a_program_gets_them_by_name(tmp_path, take):
+def test_a_program_gets_them_by_name(tmp_path):
     (tmp_path / "client.py").write_text(CLIENT)
-    command = [python(), "-m", "gamba_warp.compat", *(["--take", take] if take else [])]
+    command = [python(), "-m", "gamba_warp.compat", "--take", ",".join(EXTENSIONS)]
     done = subprocess.run([*command, tmp_path / "client.py", "3"], capture_output=True, text=True)
-    assert done.stdout == f"gamba_warp.compat.extensions {take is None} 3\n", done.stderr
+    assert done.stdout == "gamba_warp.compat.extensions False 3\n", done.stderr

@@ -14,7 +14,6 @@ from PIL import Image
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.train.data import furniture
-from gamba_warp.train.data.furniture import read_properties
 from gamba_warp.train.sources.commands import data_furniture_command
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -28,7 +27,7 @@ icon#1=/b/cafe.png
 model#1=/b/cafe/chair.obj
 creator#1=Jay
 id#2=B
-name#2=Caf\u00e9 chair 02
+name#2=Café chair 02
 icon#2=/b/other.png
 model#2=/b/other/chair.obj
 creator#2=Kay
@@ -66,13 +65,6 @@ def write_deb(path, files):
             file.write(f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(data):<10}`\n".encode())
             file.write(data + b"\n" * (len(data) % 2))
     return path
-
-
-def test_properties():
-    values = read_properties(PROPERTIES.encode("latin-1"))
-    assert values["name#1"] == "Café chair 01"
-    assert values["modelRotation#2"].split() == "1 0 0 0 0 -1 0 1 0".split()
-    assert not any("comment" in key for key in values)
 
 
 def test_package_to_views(tmp_path):

@@ -156,6 +156,8 @@ def test_gobjaverse_and_openlrm(tmp_path):
         assert "intrinsics.npy" in reason(tmp_path / f"o{number}" / "x")
     openlrm(tmp_path / "p" / "x", pose=[[1e200] * 4] * 3)
     assert "000.npy" in reason(tmp_path / "p" / "x")
+    (tmp_path / "p" / "x" / "pose" / "000.npy").unlink()
+    assert "000.npy: cannot be read" in reason(tmp_path / "p" / "x")
 
 
 def test_files_that_are_folders_and_folders_that_are_files(tmp_path):
@@ -182,6 +184,8 @@ def test_files_that_are_folders_and_folders_that_are_files(tmp_path):
     [
         ("[]", "split.json"),
         ("{", "not valid JSON"),
+        ('{"version": 7}', "split.json: version 7"),
+        ('{"version": 1, "train": ["x"], "test": ["x"]}', "in both train and test"),
         ('{"version": "1"}', "version"),
         ('{"version": 1, "train": "x"}', "train"),
         ('{"version": 1, "train": [["x"]]}', "train"),
@@ -196,8 +200,11 @@ def test_bad_splits(tmp_path, content, message):
 
 def test_a_split_may_name_more_than_is_there(tmp_path):
     transforms(tmp_path / "x")
-    (tmp_path / "split.json").write_text('{"version": 1, "train": ["x", "gone"], "val": [3]}')
-    assert open_dataset(tmp_path, "train").uids == ["x"]
+    for version in (1, 2):  # both are read and reported
+        split = {"version": version, "train": ["x", "gone"], "val": [3]}
+        (tmp_path / "split.json").write_text(json.dumps(split))
+        found = open_dataset(tmp_path, "train")
+        assert found.uids == ["x"] and found.split_version == version
     assert split_of("\udcff\ud800") in ("train", "val", "test")
 
 

@@ -27,10 +27,6 @@ def data(tmp_path):
     return root
 
 
-def lines_of(root):
-    return (root / MANIFEST).read_bytes().splitlines(keepends=True)
-
-
 def test_a_manifest_gives_the_dataset_without_reading_an_object(data, monkeypatch):
     uids = ["clouda", "cloudc", "cloudd", "more/cloudb"]
     fresh = {uid: datasets.content_digest(datasets._read_folder(data, "transforms", uid))
@@ -95,47 +91,38 @@ def test_other_files_change_nothing(data):
     assert len(open_dataset(data)) == 4
 
 
-def damaged(data, change):
-    lines = lines_of(data)
-    entry = json.loads(lines[1])
-    if change == "cut":
-        return lines[:-1]
-    if change == "half a line":
-        return [*lines[:-1], lines[-1][:20]]
-    if change == "more":
-        return [*lines, lines[-1]]
-    if change == "twice":
-        return [*lines[:-1], lines[1]]
-    if change == "version":
-        return [lines[0].replace(b'"version":1', b'"version":9'), *lines[1:]]
-    if change == "layout":
-        return [lines[0].replace(b'"transforms"', b'"other"'), *lines[1:]]
-    entry[0] = {"leaves": "../set/clouda", "dot": ".x/y", "absolute": "/etc"}.get(change, entry[0])
-    if change == "mark leaves":
-        entry[3][0][0] = "../../etc/passwd"
-    if change == "digest":
-        entry[1] = "no"
-    return [lines[0], json.dumps(entry).encode() + b"\n", *lines[2:]]
+def changed(value, *path):
+    """Return a function that changes the second line of a manifest, its first object."""
+
+    def change(lines):
+        entry = place = json.loads(lines[1])
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = value
+        return [lines[0], json.dumps(entry).encode() + b"\n", *lines[2:]]
+
+    return change
 
 
 @pytest.mark.parametrize(
     "change, words",
     [
-        ("cut", "cut short at line 5"),
-        ("half a line", "cut short at line 5"),
-        ("more", "has more than 4 objects"),
-        ("twice", "the object clouda occurs twice"),
-        ("version", "not a manifest of version 1"),
-        ("layout", "not a manifest of version 1"),
-        ("leaves", "line 2: the name .* leaves its folder"),
-        ("dot", "line 2: the name '.x/y' has a part with a leading dot"),
-        ("absolute", "line 2: the name .* is not relative"),
-        ("mark leaves", "line 2: the name .* leaves its folder"),
-        ("digest", "line 2: "),
+        (lambda lines: lines[:-1], "cut short at line 5"),
+        (lambda lines: [*lines[:-1], lines[-1][:20]], "cut short at line 5"),
+        (lambda lines: [*lines, lines[-1]], "has more than 4 objects"),
+        (lambda lines: [*lines[:-1], lines[1]], "the object clouda occurs twice"),
+        (lambda lines: [lines[0].replace(b'"version":1', b'"version":9')], "manifest of version 1"),
+        (lambda lines: [lines[0].replace(b'"transforms"', b'"other"')], "manifest of version 1"),
+        (changed("../set/clouda", 0), "line 2: the name .* leaves its folder"),
+        (changed(".x/y", 0), "line 2: the name '.x/y' has a part with a leading dot"),
+        (changed("/etc", 0), "line 2: the name .* is not relative"),
+        (changed("../../etc/passwd", 3, 0, 0), "line 2: the name .* leaves its folder"),
+        (changed("no", 1), "line 2: "),
     ],
 )
 def test_a_damaged_manifest_is_one_line(data, change, words):
-    (data / MANIFEST).write_bytes(b"".join(damaged(data, change)))
+    lines = (data / MANIFEST).read_bytes().splitlines(keepends=True)
+    (data / MANIFEST).write_bytes(b"".join(change(lines)))
     refused(words, open_dataset, data)
 
 

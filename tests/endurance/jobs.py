@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 import trimesh
 from helpers.released import make_released
+from helpers.views import cloud_of
 
 from gamba_warp.files import remove_folder, write_json
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
 
 from .child import gamba, run_child
@@ -125,25 +124,13 @@ def make_world(folder: Path, commands: list[str]) -> None:
         save_image(folder / "pictures" / f"{name}.png", rgba)
     points = rng.normal(size=(200, 3))
     points *= 0.4 / np.linalg.norm(points, axis=1, keepdims=True)
-    save_ply(folder / "gaussians" / "ball.ply", ball(points))
+    save_ply(folder / "gaussians" / "ball.ply", cloud_of(points, 0.08, 0.95, rng.random((200, 3))))
     if "ablate" in commands:
         write_json(folder / "plan.json", PLAN)
     if "data furniture" in commands:
         make_library(folder / "libraries", folder / "pictures" / "a.png")
     if "import-released" in commands:
         make_released(folder / "released")
-
-
-def ball(points: np.ndarray) -> Gaussians:
-    """Opaque Gaussians at points ``[N, 3]``."""
-    size, generator = len(points), torch.Generator().manual_seed(0)
-    return Gaussians(
-        torch.from_numpy(points).float(),
-        None,
-        torch.full((size, 3), 0.08),
-        torch.full((size,), 0.95),
-        torch.rand(size, 3, generator=generator),
-    )
 
 
 # An ablation of one row of a few steps.

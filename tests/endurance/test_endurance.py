@@ -8,6 +8,7 @@ import os
 import random
 import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from helpers.released import SIZES, make_released
 from safetensors.torch import save_file
 
 from gamba_warp.cli import run
-from gamba_warp.files import PART, output_folder, sha256, sha256_of_all
+from gamba_warp.files import sha256, sha256_of_all
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import read_config
@@ -148,37 +149,11 @@ def test_files_cut_short_are_not_whole(tmp_path):
         assert not is_whole(name, b""), name
 
 
-def test_leftovers_are_told_from_results(tmp_path):
-    part = tmp_path / "sub" / f"{PART}abcd1234"
-    part.mkdir(parents=True)
-    (part / "a.ply").touch()
-    (tmp_path / ".lock").touch()
-    (tmp_path / "sub" / "a.ply").touch()
-    assert list(contents(tmp_path)) == ["sub/a.ply"] and leftovers(tmp_path) == [part]
-    output_folder(tmp_path / "sub")
-    assert part.exists()
-    age(tmp_path)
-    output_folder(tmp_path / "sub")
-    assert not part.exists()
-
-
-def say_and_exit():
-    os.write(1, b"hello")
-    raise SystemExit(3)
-
-
-def write_too_much(path):
-    path.write_bytes(bytes(9999))
-
-
-def test_children_end_as_they_are_told(tmp_path):
-    end = run_child(say_and_exit)
-    assert (end.code, end.said) == (3, "hello")
-    assert run_child(os.abort).code == -6
+def test_children_are_killed_and_find_a_full_disk(tmp_path):
     end = run_child(time.sleep, 60, kill_after=0.1)
     assert end.killed and end.code == -9 and end.seconds < 5
-    full = run_child(write_too_much, tmp_path / "a", file_limit=5)
-    assert full.code == 1 and "File too large" in full.said
+    end = run_child(Path.write_bytes, tmp_path / "a", bytes(9999), file_limit=5)
+    assert end.code == 1 and "File too large" in end.said
     assert (tmp_path / "a").stat().st_size == 5
 
 

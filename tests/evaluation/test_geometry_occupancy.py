@@ -166,15 +166,6 @@ def test_rules_agree_on_a_closed_ball():
     assert values == dict.fromkeys(RULES, 1.0)
 
 
-def test_holes_and_flips_are_what_they_say():
-    ball = SHAPES["ball"]
-    assert len(with_hole(ball, 0.0, 0).faces) == len(ball.faces)
-    assert abs(len(with_hole(ball, 0.2, 0).faces) / len(ball.faces) - 0.8) < 0.01
-    flips = with_flips(ball, 0.3, 0)
-    assert abs(np.mean(flips.faces != ball.faces) / (2 / 3) - 0.3) < 0.03
-    assert len(clean_mesh(doubled(ball))[0].faces) == len(ball.faces)
-
-
 def test_open_sheets_hold_nothing(monkeypatch):
     """Flat sheets, alone and beside closed parts; facing sheets are another case."""
     corners = np.array([[-0.4, -0.4, 0.0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]])

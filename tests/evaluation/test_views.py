@@ -10,7 +10,6 @@ from helpers.refusals import refused
 from helpers.views import around, cloud_of, evaluated, straight, write_split, write_views
 
 from gamba_warp.cameras import Cameras, relative_to_reference
-from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.shapes.pairs import out_of_reference
 from gamba_warp.eval.views import evaluate as module
@@ -252,14 +251,6 @@ def test_saved_gaussians_evaluate_to_the_same(data, painted):
     code, again = evaluate(data, pred="out/gaussians")
     assert code == 0 and len(list((data / "out" / "gaussians").rglob("*.ply"))) == len(POINTS)
     assert again["mean"]["psnr"] == report["mean"]["psnr"] > 30
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_cuda_without_a_device_is_refused(data, capsys):
-    options = ["--checkpoint", str(data / "pred"), "--data", str(data / "data")]
-    options += ["--out", str(data / "out"), "--device", "cuda"]
-    assert run("eval-views", options) == 2
-    assert "no CUDA device" in capsys.readouterr().err and not (data / "out").exists()
 
 
 def test_bad_files_stop_no_other_object(data, painted, monkeypatch):

@@ -214,13 +214,13 @@ def test_light_and_moved_textures_of_mtl(tmp_path):
     mesh = load_mesh(write_quad(tmp_path, mtl=mtl, texture=None))
     np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear([1, 0.5, 0]))
     assert not mesh.warnings
-    mesh = load_mesh(write_quad(tmp_path, mtl=MTL + "Ke 1 1 1\n"))
-    assert mesh.warnings == ["light of a surface beside its base colour is not drawn"]
-    mesh = load_mesh(write_quad(tmp_path, mtl=MTL.replace("paint.png", "-s 2 2 1 paint.png")))
-    assert mesh.warnings == ["-s 2 2 1 paint.png: the option -s is not read"]
-    painted = QUAD.replace("v -1 0 0", "v -1 0 0 1 0 0")
-    mesh = load_mesh(write_quad(tmp_path, obj=painted))
-    assert mesh.warnings == ["colours beside a texture are not drawn"]
+    moved = MTL.replace("paint.png", "-s 2 2 1 paint.png")
+    for files, warning in (
+        ({"mtl": MTL + "Ke 1 1 1\n"}, "light of a surface beside its base colour is not drawn"),
+        ({"mtl": moved}, "-s 2 2 1 paint.png: the option -s is not read"),
+        ({"obj": QUAD.replace("-1 0 0", "-1 0 0 1 0 0")}, "colours beside a texture are not drawn"),
+    ):
+        assert load_mesh(write_quad(tmp_path, **files)).warnings == [warning]
 
 
 @pytest.mark.parametrize("head", ["OFF4 1 0", "OFF 4 1 0", "OFF\n4 1 0", "\ufeffOFF\r\n\r\n4 1"])

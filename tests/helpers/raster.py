@@ -76,10 +76,8 @@ def near_a_cut(scene, options):
     return (low != high)[..., 0]
 
 
-def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
-    """Pictures and gradients under a random cotangent, against the oracle in float64; the meta."""
-    flip = near_a_cut(scene, {**options, "antialiased": antialiased})
-    assert flip.float().mean() < 0.05
+def rendered(scene, mode="RGB", antialiased=False, **options):
+    """Leaves, renders and alphas of the rasterizer, the same of the oracle in float64; the meta."""
     got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
     kind = "antialiased" if antialiased else "classic"
     renders, alphas, meta = rasterization(**got, render_mode=mode, rasterize_mode=kind, **options)
@@ -88,7 +86,16 @@ def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
         depth = depth / alpha.clamp_min(1e-10)
     parts = {"RGB": [color], "D": [depth], "ED": [depth]}.get(mode, [color, depth])
     expected = torch.cat(parts, -1)
-    assert alpha.mean() > 0.1 and renders.std() > 0.01, "the picture is empty"
+    assert alpha.mean() > 0.1 and expected.std() > 0.01, "the picture is empty"
+    return (got, renders, alphas), (want, expected, alpha), meta
+
+
+def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
+    """Pictures and gradients under a random cotangent, against the oracle in float64; the meta."""
+    flip = near_a_cut(scene, {**options, "antialiased": antialiased})
+    assert flip.float().mean() < 0.05
+    (got, renders, alphas), theirs, meta = rendered(scene, mode, antialiased, **options)
+    want, expected, alpha = theirs
     keep = ~flip[..., None]
     assert ((renders - expected) * keep).abs().max() <= PICTURE * max(1.0, expected.max().item())
     assert ((alphas - alpha) * keep).abs().max() <= PICTURE

@@ -14,7 +14,6 @@ from gamba_warp.errors import MOST_LETTERS
 from .second_reader import points_in, vertices_stated
 
 _PIXELS = 64 << 20
-_UNPACKED = 256 << 20  # largest unpacked size of the small archives of the seeds, bytes
 _PARAMETERS = 1 << 30
 _CODE = re.compile(r"<script>alert|onerror='alert")
 _FOLDER = re.compile(r"[a-z0-9][a-z0-9_-]*")

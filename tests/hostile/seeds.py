@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import trimesh
 from helpers import micro
-from helpers.gaussians import khr_glb
+from helpers.gaussians import khr_glb, some
 from helpers.images import ADOBE_RGB, colour_profile
 from helpers.matting import matting_network
 from helpers.released import theirs
@@ -26,7 +26,6 @@ from plyfile import PlyData, PlyElement
 from gamba_warp.ablation.plan import PLANS
 from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.names import splat_suffix
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.encoders import ImageEncoder
@@ -48,7 +47,6 @@ _OWN = [  # fields of a Gaussian of a .ply beside its colours
     *((name, "<f4") for name in ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2")),
     *((f"rot_{i}", "<f4") for i in range(4)),
 ]
-_DATE = (2020, 1, 1, 0, 0, 0)
 
 
 def as_json(value: Any) -> bytes:
@@ -126,20 +124,14 @@ def masked_pictures() -> Kinds:
 
 def gaussians(count: int = 12, kind: Any = "ply", degree: int = 0) -> bytes:
     """A file of Gaussians of one of the formats, with harmonics of a degree."""
-    rng, K = torch.Generator().manual_seed(1), (degree + 1) ** 2 - 1
-    some = Gaussians(
-        means=torch.rand(count, 3, generator=rng) - 0.5,
-        quats=torch.randn(count, 4, generator=rng),
-        scales=torch.rand(count, 3, generator=rng) * 0.1 + 0.01,
-        opacities=torch.rand(count, generator=rng) * 0.9 + 0.05,
-        colors=torch.rand(count, 3, generator=rng),
-        harmonics=torch.rand(count, K, 3, generator=rng) - 0.5 if K else None,
-    )
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        made = some(count, degree=degree)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("object" + splat_suffix(kind))
         if kind == "glb":
-            return khr_glb(some)
-        write_gaussians(path, some, kind)
+            return khr_glb(made)
+        write_gaussians(path, made, kind)
         return path.read_bytes()
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.model import inputs, micro
+from helpers.model import assert_each_alone, inputs, micro
 from helpers.refusals import refused
 from torch.nn.functional import max_pool2d
 
@@ -60,17 +60,12 @@ def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
     """Also if the batch's row of tokens is cut inside pictures."""
     monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", segment)
     model, (rgba, cameras) = trained(rays()), cut_outs([*BOXES, (slice(0, 0), slice(0, 0))])
+    cells = 9, 1, 24, 0
     with torch.set_grad_enabled(segment > 7):
-        together = model(rgba, cameras)
+        together = assert_each_alone(model, rgba, cameras, cells)
     assert together.num == 24 * 3  # the largest has 24 of the 36 cells
-    for index in range(len(rgba)):
-        alone = model(rgba[index : index + 1], one(cameras, index))
-        assert alone.num == (9, 1, 24, 0)[index] * 3
-        for name in FIELDS:
-            got, want = getattr(together, name)[index], getattr(alone, name)[0]
-            # The same sums in products of other shapes: a few roundings.
-            torch.testing.assert_close(got[: alone.num], want, rtol=1e-5, atol=1e-6, msg=name)
-        assert together.opacities[index, alone.num :].eq(0).all()
+    for opacities, count in zip(together.opacities, cells):
+        assert opacities[3 * count :].eq(0).all()
 
 
 @pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])

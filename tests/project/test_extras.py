@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.children import ran
 from helpers.forked import python
 from helpers.gaussians import some
 from helpers.images import cut_out, disc_on_noise
@@ -53,8 +54,7 @@ cli.main(sys.argv[1:])
 
 
 def in_the_core(*arguments):
-    command = [python(), "-c", WITHOUT, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+    return ran(python(), "-c", WITHOUT, *arguments)
 
 
 def declared():
@@ -131,7 +131,7 @@ def test_no_module_imports_an_extra_when_it_is_loaded():
 
 def test_training_loads_without_what_makes_objects(monkeypatch):
     code = WITHOUT.rpartition("cli.main")[0] + "import gamba_warp.train.batches"
-    done = subprocess.run([python(), "-c", code], capture_output=True, text=True)
+    done = ran(python(), "-c", code)
     assert done.returncode == 0, done.stderr
     from gamba_warp.train.data.pool import Pool, PoolOptions
 
@@ -178,11 +178,7 @@ def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):
         (["reconstruct", "thing.png", "--mesh", "obj"], "trimesh", "mesh"),
         (["reconstruct", "thing.png", "--turntable", "mp4"], "imageio_ffmpeg", "video"),
         (["export", "thing.ply", "--splats", "spz"], "trimesh", "mesh"),  # a mesh by default
-        (
-            ["export", "thing.ply", "--mesh", "none", "--turntable", "mp4"],
-            "imageio_ffmpeg",
-            "video",
-        ),
+        ("export thing.ply --mesh none --turntable mp4".split(), "imageio_ffmpeg", "video"),
         (["render", "thing.ply", "--kind", "mp4"], "imageio_ffmpeg", "video"),
     ],
 )

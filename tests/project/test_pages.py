@@ -13,6 +13,7 @@ from importlib.util import find_spec
 
 import pytest
 import torch
+import trimesh
 from helpers.gaussians import some
 from helpers.images import cut_out
 from website.blocks import PAGES, ROOT, Block, blocks, commands
@@ -28,13 +29,8 @@ OTHERS = {*"git cd docker source pip for do done sbatch export apt-get ulimit".s
 OTHERS.add("docs/lab/gpu_train.sh")
 SHELL = blocks("bash")
 PYTHON = blocks("python")
-# `gamba … ` in the middle of a sentence; a name in capitals or an ellipsis stands for something.
-TETRAHEDRON_PLY = (
-    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
-    "property float z\nelement face 4\nproperty list uchar int vertex_indices\nend_header\n"
-    "0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
-)
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+# `gamba … ` in the middle of a sentence; a name in capitals or an ellipsis stands for something.
 INLINE = re.compile(r"`(gamba [a-z][^`]*)`")
 
 
@@ -162,7 +158,7 @@ def prepare(block: Block, folder) -> None:
             save_ply(folder / name, some(60))
     if "truth.obj" in block.text:
         (folder / "truth.obj").write_text(TETRAHEDRON)
-        (folder / "prediction.ply").write_text(TETRAHEDRON_PLY)
+        trimesh.load(folder / "truth.obj").export(folder / "prediction.ply")
 
 
 def assert_alike(found: str, wanted: str) -> None:

@@ -10,6 +10,7 @@ from importlib.metadata import PathDistribution, distribution
 from pathlib import Path
 
 import pytest
+from helpers.children import ran
 from helpers.forked import python
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -81,14 +82,7 @@ def test_an_installed_wheel_reconstructs_its_own_picture(fresh, tmp_path):
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
 
     def run(*words):
-        return subprocess.run(
-            [str(folder / "bin" / words[0]), *map(str, words[1:])],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            env=environment,
-            timeout=300,
-        )
+        return ran(folder / "bin" / words[0], *words[1:], cwd=tmp_path, env=environment)
 
     names = ("trimesh", "kornia", "open3d", "timm", "scipy", "skimage", "pytest")
     look = f"from importlib.util import find_spec; print([n for n in {names} if find_spec(n)])"
@@ -113,14 +107,9 @@ def test_an_installed_wheel_reconstructs_its_own_picture(fresh, tmp_path):
 @pytest.mark.slow
 def test_the_demo_of_an_installed_wheel_asks_for_a_checkout(fresh, tmp_path):
     _, site = fresh  # and all extras, which are where this test runs
-    demo = subprocess.run(
-        [python(), "-c", "from gamba_warp import cli; cli.main(['demo'])"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(site)},
-        timeout=300,
-    )
+    code, environment = "from gamba_warp import cli; cli.main(['demo'])", dict(os.environ)
+    environment["PYTHONPATH"] = str(site)
+    demo = ran(python(), "-c", code, cwd=tmp_path, env=environment)
     assert demo.returncode == 2 and demo.stderr.count("\n") == 1
     assert f"{site}/gamba_warp/starter/data: no such folder; make" in demo.stderr
 

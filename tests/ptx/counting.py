@@ -11,13 +11,18 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gamba_warp.kernels.cases.raster import orbit_cameras, shell
 from gamba_warp.kernels.cases.scan import make_inputs
+from gamba_warp.kernels.causal_conv1d import causal_conv1d
+from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 
 from .dry_run import MULTIPROCESSORS
@@ -25,8 +30,7 @@ from .launch import Interpreter, interpreted
 from .machine import Count, opcodes, units
 from .parse import SPACES, Program
 
-CHANNELS, STATES = 1024, 16  # of the scan in the paper's model
-WIDTH = 4  # of the convolution
+CHANNELS, STATES, WIDTH = 1024, 16, 4  # of the paper's model: of the scan, and the convolution's
 GAUSSIANS, SIDE = 16384, 512
 # Counts beside instructions: their memory accesses.
 ASKED = ("bytes", "sectors", "first", "own", "passes", "conflicts", "together")
@@ -54,10 +58,8 @@ Counts = dict[str, dict[str, Executed]]  # by direction and entry
 
 def executed(machine: Interpreter) -> dict[str, Executed]:
     """Return the counts of an interpreter, by entry."""
-    return {
-        entry: _sum(program, times, machine.counts[entry])
-        for entry, (program, times) in machine.executed.items()
-    }
+    ran = machine.executed.items()
+    return {k: _sum(program, times, machine.counts[k]) for k, (program, times) in ran}
 
 
 def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
@@ -86,12 +88,13 @@ def _sum(program: Program, times: list[int], asked: np.ndarray) -> Executed:
 
 
 def count(
-    run: Callable[[], Sequence[Tensor]], wanted: Iterable[Tensor], multiprocessors: int
+    run: Callable[[], Tensor | Sequence[Tensor]], wanted: Iterable[Tensor], multiprocessors: int
 ) -> Counts:
     """Count the instructions of a call on an imagined device: "forward", and "gradient"."""
     options = {"counting": True, "contract": ".*"}
     with interpreted(multiprocessors, **options) as machine:
-        outputs = [x for x in run() if x.requires_grad]
+        made = run()
+        outputs = [x for x in ([made] if torch.is_tensor(made) else made) if x.requires_grad]
     found = {"forward": executed(machine)}
     if outputs:
         cotangents = [torch.randn_like(x) for x in outputs]
@@ -119,8 +122,28 @@ def scan_inputs(length: int, channels: int, dtype: torch.dtype) -> dict[str, Ten
     return {name: x.requires_grad_() for name, x in inputs.items()}
 
 
+def count_scan(inputs: dict[str, Tensor], tuning: scan_cuda.Tuning, **options) -> Counts:
+    """Count a scan with softplus and gate."""
+    run = partial(selective_scan, **inputs, delta_softplus=True, **options)
+    with patch.object(scan_cuda, "FORCED", tuning):
+        return count(run, inputs.values(), MULTIPROCESSORS)
+
+
 def conv_inputs(length: int, channels: int, dtype: torch.dtype) -> list[Tensor]:
     """Return the convolution's inputs of one sequence, which require gradients."""
     torch.manual_seed(0)
     x, weight = torch.randn(1, length, channels).to(dtype), torch.randn(channels, WIDTH)
     return [value.requires_grad_() for value in (x, weight, torch.randn(channels))]
+
+
+def count_conv(length: int, channels: int, dtype: torch.dtype) -> Counts:
+    """Count a convolution of one sequence, with bias and SiLU."""
+    inputs = conv_inputs(length, channels, dtype)
+    return count(partial(causal_conv1d, *inputs, activation="silu"), inputs, MULTIPROCESSORS)
+
+
+def scene() -> tuple[dict[str, Tensor], dict]:
+    """Return the Gaussians of a view of the benchmark's shell, and the view."""
+    viewmats, Ks = orbit_cameras(1, SIDE)
+    leaves = {name: x.requires_grad_() for name, x in shell(GAUSSIANS).items()}
+    return leaves, dict(viewmats=viewmats, Ks=Ks, width=SIDE, height=SIDE)

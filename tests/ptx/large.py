@@ -22,26 +22,15 @@ HALF = 4e-3  # of numbers of 8 bits
 CPU = torch.device("cpu")
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("shape", checks.SCANS)
-def test_scan(shape, dtype):
-    checks.check_scan(shape, dtype, CPU)
+@pytest.mark.parametrize("check", checks.EACH, ids=lambda x: f"{x.func.__name__} {x.args}")
+def test_an_operator(check):
+    check(device=CPU)
 
 
 @pytest.mark.parametrize("tuning", checks.TUNINGS)
 def test_tunings(monkeypatch, tuning):
     monkeypatch.setattr(scan_cuda, "FORCED", tuning)
     checks.check_scan(checks.SCANS[3], torch.float32, CPU)
-
-
-@pytest.mark.parametrize("shape", checks.CONVS)
-def test_convolution(shape):
-    checks.check_conv(shape, CPU)
-
-
-@pytest.mark.parametrize(("count", "size", "views", "options"), checks.RASTERS)
-def test_rasterizer(count, size, views, options):
-    checks.check_raster(count, size, views, options, CPU)
 
 
 def on_both(function, inputs, cotangents):

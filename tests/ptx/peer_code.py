@@ -17,12 +17,14 @@ import sys
 import sysconfig
 import tarfile
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from .contract import contracted
+from .counting import Executed, executed
 from .launch import ARCHITECTURE, Interpreter
 from .machine import Missing
 from .parse import Program, read
@@ -32,28 +34,21 @@ _COMPILER = ("nvidia-cuda-nvcc", "nvidia-nvvm", "nvidia-cuda-crt")
 # pip asks a source package for its metadata, which needs no compiler where these are set.
 _NO_BUILD = {"MAMBA_SKIP_CUDA_BUILD": "TRUE", "CAUSAL_CONV1D_SKIP_CUDA_BUILD": "TRUE"}
 _NO_BUILD |= {"BUILD_NO_CUDA": "1"}
-_HALVES = [
-    f"-U__CUDA_NO_{kind}_{what}__"
-    for kind in ("HALF", "BFLOAT16", "BFLOAT162")
-    for what in ("OPERATORS", "CONVERSIONS")
-]
 # Their setup.py say C++17, with which torch's headers do not compile.
 _FLAGS = ["-O3", "-std=c++20", "--use_fast_math", "--expt-relaxed-constexpr"]
-FLAGS = {
-    "mamba-ssm": [*_HALVES, "--expt-extended-lambda"],
-    "causal-conv1d": [*_HALVES, "--expt-extended-lambda"],
-    "gsplat": ["-diag-suppress", "20012,186"],
-}
+_KINDS = product(("HALF", "BFLOAT16", "BFLOAT162"), ("OPERATORS", "CONVERSIONS"))
+_HALVES = [f"-U__CUDA_NO_{kind}_{what}__" for kind, what in _KINDS] + ["--expt-extended-lambda"]
+FLAGS = dict.fromkeys(("mamba-ssm", "causal-conv1d"), _HALVES)
+FLAGS["gsplat"] = ["-diag-suppress", "20012,186"]
 INCLUDES = {
     "mamba-ssm": ["csrc/selective_scan"],
     "causal-conv1d": ["csrc"],
     "gsplat": [f"gsplat/cuda/{name}" for name in ("include", "csrc", "csrc/third_party/glm")],
 }
 # An entry that does nothing; its name says the bytes of shared memory that the host asks for.
-_SHARED = """
-template <int bytes> __global__ void shared_bytes() {{}}
-template __global__ void shared_bytes<{}>();
-"""
+_SHARED = "\ntemplate <int bytes> __global__ void shared_bytes() {{}}\n"
+_SHARED += "template __global__ void shared_bytes<{}>();\n"
+_OTHER = "(?!_Z12shared_bytes)"
 
 
 class Peers:
@@ -73,9 +68,8 @@ class Peers:
         if cuda is None or torch.version.cuda is None:
             raise Missing("torch without CUDA: its headers are needed")
         self.nvcc = folder / "nvcc" / "nvidia" / cuda.parents[1].name / "bin" / "nvcc"
-        torch_include = site / "torch" / "include"
-        self.headers = [cuda.parent, cuda.parent / "cccl", torch_include]
-        self.headers.append(torch_include / "torch" / "csrc" / "api" / "include")
+        api = "torch/include/torch/csrc/api/include"
+        self.headers = [cuda.parent, cuda.parent / "cccl", site / "torch/include", site / api]
         if not self.nvcc.exists():
             wanted = [f"{name}=={torch.version.cuda}.*" for name in _COMPILER]
             _pip("install", "--no-deps", "--target", folder / "nvcc", *wanted)
@@ -90,9 +84,7 @@ class Peers:
         """Return the folder of a package's sources."""
         return self.folder / f"{package.replace('-', '_')}-{PACKAGES[package]}"
 
-    def compile(
-        self, package: str, text: str, shared: str = "0", entry: str = "(?!_Z12shared_bytes)"
-    ) -> tuple[Program, int]:
+    def compile(self, package: str, text: str, shared: str = "0", entry: str = _OTHER):
         """Compile a text that has one of a package's kernels.
 
         Args:
@@ -149,21 +141,21 @@ def structure(text: str, name: str) -> type[ctypes.Structure]:
     return type(name, (structure(text, base) if base else ctypes.Structure,), {"_fields_": fields})
 
 
-def filled(
-    kind: type[ctypes.Structure], tensors: dict[str, tuple[Tensor, str]], **numbers
-) -> bytes:
-    """Return the bytes of a structure.
+def filled(text: str, name: str, tensors: dict[str, Tensor], axes: dict[str, str], **numbers):
+    """Return the bytes of a structure of a C++ header.
 
     Args:
-        kind: from ``structure``.
-        tensors: by name a tensor, whose address is ``<name>_ptr``, and names of its axes, whose
-            strides are ``<name>_<axis>_stride`` where the structure has them.
+        text: the header.
+        name: of the structure.
+        tensors: by name; the address of one is ``<name>_ptr``.
+        axes: names of its axes, whose strides are ``<name>_<axis>_stride`` where the structure has
+            them.
         numbers: its other fields; those not named are 0.
     """
-    made = kind(**numbers)
-    for name, (x, axes) in tensors.items():
+    made = structure(text, name)(**numbers)
+    for name, x in tensors.items():
         setattr(made, f"{name}_ptr", x.data_ptr())
-        for axis, stride in zip(axes.split(), x.stride()):
+        for axis, stride in zip(axes[name].split(), x.stride()):
             if hasattr(made, f"{name}_{axis}_stride"):
                 setattr(made, f"{name}_{axis}_stride", stride)
     return bytes(made)
@@ -182,20 +174,15 @@ def packed(program: Program, values: Sequence[Tensor | float | int | None]) -> l
     return [one(value, size) for value, size in zip(values, sizes, strict=True)]
 
 
-def launch(
-    machine: Interpreter,
-    compiled: tuple[Program, int],
-    params: list[bytes],
-    tensors: Sequence[Tensor],
-    threads: tuple[int, ...],
-    blocks: tuple[int, ...],
-) -> None:
-    """Execute a kernel.
+def execute(compiled: tuple[Program, int], params: list[bytes], tensors, *sizes) -> list[Executed]:
+    """Execute and count a kernel; ``sizes``: threads of a block and blocks, three of each.
 
     Raises:
         ValueError: the interpreter reports something, which it names.
     """
     program, shared = compiled
-    machine.execute(program, params, tensors, (threads, blocks, shared))
+    machine = Interpreter(counting=True)
+    machine.execute(program, params, tensors, (*sizes, shared))
     if machine.findings:
         raise ValueError(machine.findings[0])
+    return [*executed(machine).values()]

@@ -126,12 +126,6 @@ def test_bad_models_are_one_line_and_leave_nothing(tmp_path, capsys, change, rea
     assert [p.name for p in (tmp_path / "out" / "meshes").iterdir()] == ["catalogue.json"]
 
 
-def test_what_a_report_says_of_the_evaluation():
-    said = gso.protocol_of([FIRST, "a chair"])
-    assert (said["objects"], said["evaluated"], said["others"]) == (60, 1, ["a chair"])
-    assert len(said["missing"]) == 59 and FIRST not in said["missing"]
-
-
 def test_all_names_hold_the_evaluation_and_are_told_by_the_last_part():
     assert len(gso.all_names()) == 1033 and {*gso.NAMES} < gso.all_names()
     uids = ["things/Dino_4", "Dino_4", "dino_4", "my_Dino_4", "Dino_4/x", "chair"]

@@ -55,6 +55,9 @@ def test_data_may_be_another(tmp_path):
         (b"{}", "missing required field `data`"),
         (b'{"data": "x", "preset": "tiny", "speed": 1}', "unknown speed"),
         (b'{"data": "x", "preset": "tiny", "optim": {"speed": 1}}', "unknown optim.speed"),
+        # no file names code
+        (b'{"data": "x", "preset": "tiny", "plugin": ["a.py"]}', "unknown plugin"),
+        (b'{"data": "x", "preset": "tiny", "run": {"plugins": ["a.py"]}}', "unknown run.plugins"),
         (b'{"data": "x", "preset": "tiny", "optim": 3}', "optim: Expected `object`"),
         (b'{"data": "--out=/", "preset": "tiny"}', "'--out=/' is not a valid value"),
         (b'{"data": "x", "preset": "tiny", "optim": {"lr": "fast"}}', "lr: Expected `float`, got"),

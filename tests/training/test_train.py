@@ -191,15 +191,9 @@ def test_a_run_learns_and_writes_everything(tmp_path):
     shutil.copytree(data / "clouda", data / "cloudb")
     split = {"version": 2, "train": ["clouda"], "val": ["cloudb"], "test": []}
     (data / "split.json").write_text(json.dumps(split))
-    code = run(
-        data,
-        tmp_path,
-        length={"steps": 120},
-        views={"batch_size": 4, "views_per_object": 3},
-        run={"val_every": 60},
-        optim={"lr": 5e-3, "ema": 0.9},
-    )
-    assert code == 0
+    options = {"views": {"batch_size": 4, "views_per_object": 3}, "run": {"val_every": 60}}
+    options |= {"length": {"steps": 120}, "optim": {"lr": 5e-3, "ema": 0.9}}
+    assert run(data, tmp_path, **options) == 0
     records = lines(tmp_path, "val")
     assert [record["step"] for record in records] == [60, 120]
     assert records[-1]["psnr_novel"] > 20 and records[-1]["psnr_input"] > 20

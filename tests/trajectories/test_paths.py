@@ -125,26 +125,14 @@ def test_three_forms_of_the_same_cameras(tmp_path):
     poses = torch.linalg.inv(viewmats)
     focal = 18 / math.tan(math.radians(25))
     opengl = poses @ FLIP
-    forms = {
-        "nerfstudio": {
-            "camera_type": "perspective",
-            "render_width": width,
-            "render_height": height,
-            "seconds": 2,
-            "fps": 24,
-            "keyframes": [],
-            "camera_path": [
-                {"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 1.5}
-                for pose in opengl
-            ],
-        },
-        "transforms": {
-            "w": width,
-            "h": height,
-            "fl_x": focal,
-            "frames": [{"transform_matrix": pose.tolist()} for pose in opengl],
-        },
-    }
+    nerfstudio = {"camera_type": "perspective", "render_width": width, "render_height": height}
+    nerfstudio |= {"seconds": 2, "fps": 24, "keyframes": []}
+    nerfstudio["camera_path"] = [
+        {"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 1.5} for pose in opengl
+    ]
+    transforms = {"w": width, "h": height, "fl_x": focal}
+    transforms["frames"] = [{"transform_matrix": pose.tolist()} for pose in opengl]
+    forms = {"nerfstudio": nerfstudio, "transforms": transforms}
     points = torch.randn(7, 3)
     ours = Cameras(viewmats, intrinsics(width, height, fov).double().repeat(3, 1, 1), width, height)
     want, want_depths = seen_at(ours, points)

@@ -29,30 +29,25 @@ ONE_FACE = np.array([[0, 1, 2]])
 def test_records_hold_what_was_packed():
     gaussians = some(500)
     gaussians.quats[0] = torch.tensor([0.0, 0.6, 0.0, -0.8])  # a half turn: w is 0
-    records = np.frombuffer(pack_gaussians(gaussians, UNMOVED)[0], RECORD)
+    gaussians.harmonics = torch.randn(500, 3, 3)
+    packed = pack_gaussians(gaussians, UNMOVED)
+    records, texels = np.frombuffer(packed[0], RECORD), np.frombuffer(packed[1], "<f2")
     assert RECORD.itemsize == 32
     np.testing.assert_array_equal(records["means"], gaussians.means)
     half = 2.0**-11  # of a value: float16 has 11 bits
     np.testing.assert_allclose(records["scales"], gaussians.scales, rtol=half, atol=1e-7)
     np.testing.assert_allclose(records["look"][:, 0], gaussians.opacities, rtol=half)
     np.testing.assert_allclose(records["look"][:, 1:], gaussians.colors, rtol=half, atol=1e-7)
+    texels = texels.reshape(500, 16)  # whole texels of 8 numbers
+    np.testing.assert_allclose(
+        texels[:, :9], gaussians.harmonics.reshape(500, -1), rtol=half, atol=1e-7
+    )
+    assert not texels[:, 9:].any()
     p = records["turns"] / 32767
     k = 2 / (1 + (p * p).sum(1, keepdims=True))
     turns = rotations(torch.from_numpy(np.hstack([k - 1, k * p])))
     # half a step of 1/32767 in each number, at most twice and four times as much in a rotation
     assert (turns - rotations(gaussians.quats.double())).abs().max() < 4 * 3 / 32767
-
-
-@pytest.mark.parametrize("count", [3, 8, 15])
-def test_harmonics_fill_whole_texels(count):
-    gaussians = some(7)
-    gaussians.harmonics = torch.randn(7, count, 3)
-    data = np.frombuffer(pack_gaussians(gaussians, UNMOVED)[1], "<f2").reshape(7, -1)
-    assert data.shape[1] % 8 == 0 and data.shape[1] - 3 * count < 8
-    np.testing.assert_allclose(
-        data[:, : 3 * count], gaussians.harmonics.reshape(7, -1), rtol=2**-11, atol=1e-7
-    )
-    assert not data[:, 3 * count :].any()
 
 
 def test_the_largest_come_first_and_the_invisible_not_at_all():
@@ -82,27 +77,27 @@ def test_the_page_is_small_and_loads_nothing(tmp_path):
     assert not re.search(r"<(link|img|iframe)|src\s*=\s*[\"']", page)
 
 
+def about(page):
+    """The object's data in a page."""
+    (text,) = re.findall(r'id="object">(.*?)</script>', page)
+    return json.loads(text)
+
+
 def test_text_is_escaped_and_slots_in_it_stay():
     nasty = '</script><b onload="x">&{{gaussians}}'
     page = viewer_page(nasty, some(3), note=nasty)
     assert "<b onload" not in page and page.count("</script>") == 5
-    (text,) = re.findall(r'id="object">(.*?)</script>', page)
-    about = json.loads(text)
-    assert about["title"] == about["note"] == nasty and about["input"] is None
+    found = about(page)
+    assert found["title"] == found["note"] == nasty and found["input"] is None
 
 
 def test_cameras():
-    (text,) = re.findall(
-        r'id="object">(.*?)</script>', viewer_page("a", some(9), camera=(2.0, 40.0, 30.0))
-    )
-    about = json.loads(text)
-    assert about["input"] == about["home"] and about["frame"]["size"] == 1
-    assert about["home"]["distance"] == 2 and about["home"]["fov"] == 40
-    assert about["home"]["elevation"] == pytest.approx(np.pi / 6)
-    (text,) = re.findall(
-        r'id="object">(.*?)</script>', viewer_page("a", some(9), view=(2.5, 30.0, 0.0))
-    )
-    assert json.loads(text)["home"]["distance"] == 2.5
+    found = about(viewer_page("a", some(9), camera=(2.0, 40.0, 30.0)))
+    assert found["input"] == found["home"] and found["frame"]["size"] == 1
+    assert found["home"]["distance"] == 2 and found["home"]["fov"] == 40
+    assert found["home"]["elevation"] == pytest.approx(np.pi / 6)
+    other = about(viewer_page("a", some(9), view=(2.5, 30.0, 0.0)))
+    assert other["home"]["distance"] == 2.5
 
 
 @pytest.mark.parametrize(

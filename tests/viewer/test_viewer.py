@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.gaussians import some
+from helpers.views import cloud_of
 from PIL import Image
 
 from gamba_warp import render
@@ -156,13 +157,7 @@ def test_hands(viewer):
 
 def ball(x, y, z, colour):
     """One round, nearly opaque Gaussian."""
-    return Gaussians(
-        means=torch.tensor([[x, y, z]]),
-        quats=None,
-        scales=torch.full((1, 3), 0.03),
-        opacities=torch.tensor([0.95]),
-        colors=torch.tensor([colour]),
-    )
+    return cloud_of([[x, y, z]], 0.03, 0.95, colour)
 
 
 def double_click(opened, x, y):
@@ -279,11 +274,8 @@ def test_it_turns_until_it_is_touched(viewer):
     page.mouse.click(100, 70)
     held = page.evaluate("[gambaViewer.turning, gambaViewer.camera.azimuth]")
     opened.promised("gambaViewer.rest()")
-    assert (
-        held[1] < 0
-        and held == [False, page.evaluate("gambaViewer.camera.azimuth")]
-        and not opened.messages
-    )
+    assert held[1] < 0 and held == [False, page.evaluate("gambaViewer.camera.azimuth")]
+    assert not opened.messages
 
 
 def test_an_object_of_any_size_anywhere(viewer):
@@ -419,13 +411,7 @@ def test_a_slow_machine_gets_coarser_pictures_and_a_fast_one_sharper(viewer):
 
 def test_a_million_do_not_stop_the_page(browser_page, tmp_path):
     n = 1_000_000
-    gaussians = Gaussians(
-        means=torch.rand(n, 3) - 0.5,
-        quats=None,
-        scales=torch.full((n, 3), 0.001),
-        opacities=torch.full((n,), 0.5),
-        colors=torch.rand(n, 3),
-    )
+    gaussians = cloud_of(torch.rand(n, 3) - 0.5, 0.001, 0.5, torch.rand(n, 3))
     write_viewer(tmp_path / "million.html", "Many", gaussians, camera=CAMERA)
     opened = browser_page(tmp_path / "million.html", 160, 120)
     opened.until("gambaViewer.ready")

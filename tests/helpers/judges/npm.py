@@ -10,6 +10,7 @@ import pytest
 from platformdirs import user_cache_path
 
 from gamba_warp.files import atomic_folder
+from helpers.children import ran
 
 SECONDS = 240  # to install; to run one takes a second
 
@@ -43,13 +44,8 @@ def npm_package(name: str, version: str) -> Path:
         with atomic_folder(target, replace=True) as folder:
             command = [program, npm, "install", "--ignore-scripts", "--silent", "--no-fund"]
             try:
-                done = subprocess.run(
-                    [*command, "--prefix", folder, f"{name}@{version}"],
-                    capture_output=True,
-                    text=True,
-                    timeout=SECONDS,
-                    env=environment,
-                )
+                words = [*command, "--prefix", folder, f"{name}@{version}"]
+                done = ran(*words, timeout=SECONDS, env=environment)
                 reason = done.stderr.strip()[-200:] if done.returncode else ""
             except (OSError, subprocess.TimeoutExpired) as error:
                 reason = str(error)[:200]
@@ -60,8 +56,6 @@ def npm_package(name: str, version: str) -> Path:
 
 def run_node(*arguments, cwd: Path) -> str:
     """Run a program and return its output; raise an AssertionError with it on failure."""
-    done = subprocess.run(
-        [node()[0], *map(str, arguments)], capture_output=True, text=True, timeout=SECONDS, cwd=cwd
-    )
+    done = ran(node()[0], *arguments, timeout=SECONDS, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from helpers.children import ran
+
 IMPORTS = """
 import os, sys
 import warp
@@ -50,12 +52,7 @@ print("done")
 
 def python(program: str, **environment: str) -> subprocess.CompletedProcess:
     """Run code in a new process."""
-    return subprocess.run(
-        [sys.executable, "-c", program],
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-    )
+    return ran(sys.executable, "-c", program, env=os.environ | environment)
 
 
 def test_imports_leave_warp_as_it_is():

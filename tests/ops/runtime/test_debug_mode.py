@@ -1,9 +1,10 @@
 """Warp's debug mode, in which ``make debug`` runs the operators' tests."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
+
+from helpers.children import ran
 
 PROGRAM = """
 import ops.debug_mode, torch
@@ -19,12 +20,7 @@ for room in (7, 6):
 
 def test_a_write_past_the_end_of_an_array_ends_the_process():
     tests = Path(__file__).parents[2]
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        env={**os.environ, "PYTHONPATH": str(tests)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    environment = {**os.environ, "PYTHONPATH": str(tests)}
+    done = ran(sys.executable, "-c", PROGRAM, env=environment)
     assert done.stdout.endswith("room for 7\n"), done.stdout + done.stderr
     assert done.returncode < 0 and "i < arr.shape[0]" in done.stderr
