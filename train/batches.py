@@ -157,10 +157,12 @@ class Prepared(NamedTuple):
     Attributes:
         batch: the batch, or None if too many objects in a row cannot be read.
         failures: uids of unreadable objects with the reasons, in order.
+        copied: event of a GPU at which the batch is there; None on a CPU.
     """
 
     batch: Batch | None
     failures: list[tuple[str, str]]
+    copied: torch.cuda.Event | None = None
 
 
 class Batches:
@@ -200,6 +202,7 @@ class Batches:
         self._made: Pool | None = None  # started with the first batch
         self._stream: Iterator[dict[str, Any] | Unreachable] | None = None  # begins with a batch
         self._reading = Lock()
+        self._copies: torch.cuda.Stream | None = None
         self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # epoch and its permutation
         self.workers = config.views.threads(world.device.type)
         self._pool = ThreadPoolExecutor(self.workers, thread_name_prefix="batches")
@@ -222,7 +225,12 @@ class Batches:
                     self._pool.submit(self.prepare, n, novel) for n in self._numbers(following)
                 ]
                 self._waiting[following] = self._pool.submit(self._join_samples, parts)
-        batch = self._record_failures(self._waiting.pop(number).result()).to(self.world.device)
+        prepared = self._waiting.pop(number).result()
+        batch = self._record_failures(prepared)
+        if prepared.copied is not None:
+            stream = torch.cuda.current_stream(self.world.device)
+            stream.wait_event(prepared.copied)
+            batch.used_on(stream)
         self.waited += time.perf_counter() - began
         return batch
 
@@ -351,9 +359,13 @@ class Batches:
         if len(good) < len(samples):
             return Prepared(None, failures)
         batch = join(good, self.model)
-        if self.world.device.type == "cuda":
-            batch = batch.for_gpu(self.model)
-        return Prepared(batch, failures)
+        if self.world.device.type != "cuda":
+            return Prepared(batch, failures)
+        if self._copies is None:
+            self._copies = torch.cuda.Stream(self.world.device)
+        with torch.cuda.stream(self._copies):  # beside the steps
+            batch = batch.for_gpu(self.model).to(self.world.device)
+            return Prepared(batch, failures, self._copies.record_event())
 
     def _record_failures(self, prepared: Prepared) -> Batch:
         """Record failures in the order of the run, and return the batch."""

@@ -3,7 +3,7 @@
 import threading
 import time
 from concurrent.futures import CancelledError
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
 import pytest
 import torch
@@ -139,6 +139,20 @@ def test_closing_waits_for_one_sample_of_each_thread(data):
     assert len(done) <= 4
 
 
+class Stream:
+    """A stream that writes down its events."""
+
+    def __init__(self, name):
+        self.name, self.said = name, []
+
+    def record_event(self):
+        self.said.append("recorded")
+        return self
+
+    def wait_event(self, event):
+        self.said.append(f"waits for {event.name}")
+
+
 def test_a_gpu_gets_pinned_batches(data, monkeypatch):
     """Without a GPU: the calls on the tensors, for a fake device."""
     asked = []
@@ -153,12 +167,19 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
         return tensor
 
     monkeypatch.setattr(torch.Tensor, "to", fake)
+    copies, steps, kept = Stream("copies"), Stream("steps"), []
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: copies)
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: steps)
+    monkeypatch.setattr(torch.Tensor, "record_stream", lambda t, s: kept.append((t.shape, s)))
     made = batches_of(data, world=World(0, 1, GPU), novel=lambda _: 1, last=1)
     batch = made.take(0)
     made.close()
     tensors = (batch.inputs, batch.targets, batch.background, batch.cameras.Ks)
     assert all(tensor.shape in asked for tensor in tensors)
     assert len(asked) == len(moved) == 7 and all(moved)
+    assert copies.said == ["recorded"] and steps.said == ["waits for copies"]
+    assert len(kept) == 7 and {stream for _, stream in kept} == {steps}
     asked.clear()
     made = batches_of(data, last=1)
     made.take(0)

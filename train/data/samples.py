@@ -109,6 +109,10 @@ class Batch:
             return self
         return _combined([self], lambda values: values[0].to(device, non_blocking=True))
 
+    def used_on(self, stream: torch.cuda.Stream) -> None:
+        """Keep the memory of the batch, once it is freed, until ``stream`` has done its work."""
+        _combined([self], lambda values: values[0].record_stream(stream))
+
     def for_gpu(self, config: GambaConfig) -> Batch:
         """Return the batch with its CPU tensors in page-locked memory, and padded lists.
 
@@ -144,7 +148,7 @@ def with_foreground(batch: Batch, config: GambaConfig) -> Batch:
     return replace(batch, foreground=find_foreground(batch.inputs[..., 3].cpu(), config))
 
 
-def _combined(parts: list[Any], make: Callable[[list[Tensor]], Tensor]) -> Any:
+def _combined(parts: list[Any], make: Callable[[list[Tensor]], Any]) -> Any:
     """Combine parts of one type: tensors by ``make``, lists by concatenation."""
     first = parts[0]
     if isinstance(first, Tensor):
