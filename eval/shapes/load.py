@@ -270,8 +270,7 @@ def load_shape(path: Path) -> Shape:
 def _has_faces(path: Path) -> bool:
     """Return True if the header of a ``.ply`` declares faces."""
     with open_shape(path) as (file, _):
-        elements = read_ply_header(path, file).elements
-    return any(element.name == "face" and element.count for element in elements)
+        return read_ply_header(path, file).has_faces
 
 
 def _load_points(path: Path) -> Points:

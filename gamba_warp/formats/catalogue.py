@@ -40,6 +40,7 @@ class Mesh:
         group: name shared by objects that belong on one side of a split.
         attribution: author and licence.
         rotation: ``[3, 3]``, turns the file's points upright first, or None.
+        root: the folder in which it was found, whose files it may use; None: its own.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class Mesh:
     group: str
     attribution: dict[str, str]
     rotation: list[list[float]] | None = None
+    root: Path | None = None
 
 
 def find_meshes(folder: Path) -> list[Mesh]:
@@ -76,7 +78,8 @@ def find_meshes(folder: Path) -> list[Mesh]:
         if uid in meshes:
             raise UserError(f"{path} and {meshes[uid].path} would both be '{uid}'")
         name, group = entry.name or parts[-1], entry.group or uid
-        meshes[uid] = Mesh(path, uid, name, group, entry.attribution or {}, entry.rotation)
+        about = entry.attribution or {}, entry.rotation, folder
+        meshes[uid] = Mesh(path, uid, name, group, *about)
     if not meshes:
         raise UserError(f"{folder}: no mesh files ({', '.join(SUFFIXES)})")
     return [meshes[uid] for uid in sorted(meshes)]

@@ -26,7 +26,7 @@ from .gltf_file import (
 )
 from .headers import open_shape
 from .materials import Material, SideFiles, plain, to_display
-from .parts import Part, to_rgba8
+from .parts import Part, strip_faces, to_rgba8
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _OTHERS = {0: "points", 1: "lines", 2: "a line loop", 3: "a line strip"}
@@ -187,6 +187,8 @@ class _Reader:
         for name in ("normalTexture", "occlusionTexture", "metallicRoughnessTexture"):
             if name in look.values or name in base.values:
                 self.warn(f"{name} is not drawn")
+        if "KHR_materials_unlit" in more.values:
+            self.warn("an unlit surface is drawn shaded")
         if _GLOSS in more.values:
             color, texture, info = self.glossy(more.entry(_GLOSS))
         else:
@@ -198,6 +200,7 @@ class _Reader:
                 self.warn("light of a surface beside its base colour is not drawn")
             else:
                 strength = more.entry("KHR_materials_emissive_strength")
+                self.warn("light of a surface is drawn as its colour, shaded")
                 color[:3] = light * strength.get("emissiveStrength", float, 1.0)
                 info = look.entry("emissiveTexture")
                 texture = self.texture(info)
@@ -311,13 +314,13 @@ def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
         if len(indices) % 3:
             raise UserError(f"{path}: {len(indices)} corners, which are no whole triangles")
         return indices.reshape(-1, 3)
-    if mode not in (_STRIP, _FAN):
+    if mode == _STRIP:
+        return strip_faces(indices)
+    if mode != _FAN:
         raise UserError(f"{path}: a primitive of mode {mode}")
     at = np.arange(max(len(indices) - 2, 0))
-    odd = at % 2
-    corners = (at, at + 1 + odd, at + 2 - odd) if mode == _STRIP else (0 * at, at + 1, at + 2)
-    faces = indices[np.stack(corners, 1)]
-    return faces[(faces != np.roll(faces, 1, 1)).all(1)]  # strips are joined by faces without area
+    faces = indices[np.stack([0 * at, at + 1, at + 2], 1)]
+    return faces[(faces != np.roll(faces, 1, 1)).all(1)]
 
 
 def _placed(part: Part, poses: np.ndarray) -> Part:

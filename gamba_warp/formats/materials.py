@@ -7,6 +7,7 @@ replaced and named; they never stop the mesh.
 from __future__ import annotations
 
 import io
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from ..images import open_picture, to_rgba
+from ..images import FORMATS, open_picture, to_rgba
 from ..untrusted.documents import read_bytes
 from ..untrusted.names import inside
 
@@ -74,6 +75,7 @@ class SideFiles:
     left: int = MAX_SIDE_FILES  # bytes that side files may still have
     texels: int = MAX_SIDE_FILES  # bytes that textures may still take
     pixels: int = FREE_PIXELS  # bytes to which pictures may still be decoded
+    root: Path | None = None  # the folder in which files are read; None: the mesh's own
 
     def omit(self, what: str) -> None:
         """Warn of unread content that changes the shape."""
@@ -82,9 +84,13 @@ class SideFiles:
 
     def read(self, *names: str) -> bytes:
         """Read the first of these files that exists. Raises UserError."""
-        file = _find_file(self.path.parent, *names)
+        root = self.root or self.path.parent
+        file = _find_file(self.path.parent, root, *names)
         if file is None:
-            raise UserError(f"{_shown(names[0])}: not found")
+            there = os.path.normpath(self.path.parent / names[0].replace("\\", "/"))
+            outside = ".." in names[0] and root not in Path(there).parents
+            what = f"outside of {root}, not read" if outside else "not found"
+            raise UserError(f"{_shown(names[0])}: {what}")
         data = read_bytes(file, min(MAX_SIDE_FILE, max(self.left, 0)))
         self.left -= len(data)
         return data
@@ -117,7 +123,9 @@ class SideFiles:
         """
         self.pixels += PIXELS_PER_BYTE * len(data)
         try:
-            with open_picture(io.BytesIO(data), name) as image:
+            # TARGA files have no mark of their own.
+            formats = ("TGA",) if name.lower().endswith(".tga") else FORMATS
+            with open_picture(io.BytesIO(data), name, formats=formats) as image:
                 if not self.claim(4 * image.width * image.height, name):
                     return None
                 pixels = to_rgba(image, name, profiled=profiled, warn=self.warnings.append)
@@ -141,22 +149,27 @@ def _shown(name: str) -> str:
     return " ".join(name[:100].split())
 
 
-def _find_file(folder: Path, *names: str) -> Path | None:
-    """Return the file of the first name found in a folder or below it; None without one."""
+def _find_file(folder: Path, root: Path, *names: str) -> Path | None:
+    """Return the file of the first name found from a folder on, in a root; None without one."""
     for name in names:
         bare = _OPTIONS.sub("", name[:2000].strip())
-        for candidate in (name, bare, Path(bare.replace("\\", "/")).name):
+        last = Path(bare.replace("\\", "/")).name
+        for candidate in (name, bare, last, bare.partition(" #")[0]):
             relative = candidate.strip().strip('"').replace("\\", "/").lstrip("/")
             try:
-                place = folder
-                for part in inside(folder, relative, "a mesh").relative_to(folder).parts:
+                base = folder
+                if ".." in relative:  # a sister of the mesh's folder
+                    there = Path(os.path.normpath(folder / relative))
+                    base, relative = root, there.relative_to(root).as_posix()
+                place = base
+                for part in inside(base, relative, "a mesh").relative_to(base).parts:
                     exact = place / part
                     if not exact.exists() and place.is_dir():
                         same = [p for p in place.iterdir() if p.name.lower() == part.lower()]
                         exact = same[0] if same else exact
                     place = exact
                 if place.is_file():
-                    return inside(folder, place.relative_to(folder).as_posix(), "a mesh")
-            except (UserError, OSError):  # over-long, absolute, out of the folder
+                    return inside(base, place.relative_to(base).as_posix(), "a mesh")
+            except (UserError, OSError, ValueError):  # over-long, absolute, out of the folder
                 continue
     return None

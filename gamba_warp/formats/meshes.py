@@ -98,15 +98,17 @@ def default_up(path: str | Path) -> str:
     return "y" if Path(path).suffix.lower() in Y_UP else "z"
 
 
-def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
+def load_mesh(path: str | Path, normals: bool = True, root: Path | None = None) -> TexturedMesh:
     """Read a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
-    texture without UV coordinates by its mean colour; ``warnings`` names each.
+    texture without UV coordinates by its mean colour, and the alpha of a mesh that would be
+    invisible by 1; ``warnings`` names each.
 
     Args:
         path: the file.
         normals: compute normals, which takes much of the time; else they are 0.
+        root: the folder above the file in which it may name other files; by default its own.
 
     Raises:
         UserError: missing, malformed, no faces, vertices not finite, or no extent.
@@ -116,7 +118,7 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
         raise UserError(f"{path}: not a mesh file ({', '.join(SUFFIXES)})")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
-    sides = SideFiles(path)
+    sides = SideFiles(path, root=root)
     parts, materials, ids, count = [], [], {}, 0
     try:
         for part in _READERS[path.suffix.lower()](path, sides):
@@ -136,6 +138,15 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
         raise UserError(f"{path}: not enough memory for it") from error
     if not parts:
         raise UserError(f"{path}: no faces")
+    if not any(_is_visible(part["colors"], materials[part["material_ids"][0]]) for part in parts):
+        sides.warnings.append("all its surfaces are transparent by their alpha: drawn opaque")
+        for part in parts:
+            part["colors"][..., 3] = 255
+        for material in materials:
+            material.color[3] = 1
+            if material.texture is not None:
+                rgb = material.texture[..., :3]
+                material.texture = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
     offsets = np.cumsum([0] + [len(part["vertices"]) for part in parts])
     for part, offset in zip(parts, offsets):
         part["faces"] = part["faces"] + offset
@@ -150,6 +161,12 @@ def load_mesh(path: str | Path, normals: bool = True) -> TexturedMesh:
         raise UserError(f"{path}: all vertices are one point")
     warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
     return TexturedMesh(**joined, materials=materials, warnings=warnings, omitted=omitted)
+
+
+def _is_visible(colors: np.ndarray, material: Material) -> bool:
+    """Return True if a part may have a pixel of an alpha of 1/255."""
+    texture = 255 if material.texture is None else int(material.texture[..., 3].max(initial=0))
+    return float(material.color[3]) * texture * int(colors[..., 3].max(initial=0)) >= 255
 
 
 def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Material]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,11 +13,12 @@ from PIL import Image
 from ..errors import UserError
 from .headers import open_shape
 from .materials import GREY, Material, SideFiles, plain, to_linear
-from .parts import Part, cut_polygons, to_rgba8
+from .parts import Part, color_range, cut_polygons, to_rgba8
 
 MAX_MATERIALS = 20_000  # of a file: each is a part
 MAX_LIBRARIES = 100  # MTL files of a file
 _DIGITS = 15  # of an index
+_NO_NUMBER = re.compile(rb"-?1\.#(IND|INF|QNAN|SNAN)\d*")  # as Microsoft's libraries print them
 # Statements that change neither shape nor colours.
 _IGNORED = {"g", "o", "s", "mg", "lod", "bevel", "shadow_obj", "trace_obj"}
 
@@ -29,7 +31,10 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
     """
     with open_shape(path) as (file, _):
         text = file.read().removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ")
+    if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise UserError(f"{path}: text in UTF-16, an .obj file is in UTF-8")
     text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ")
+    text = _NO_NUMBER.sub(b"nan", text)
     statements = _Statements(path, text)
     for word in sorted(statements.unread)[:9]:
         sides.omit(f"the statement {word} is not read")
@@ -63,7 +68,8 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
             continue
         at, uvs, normals = np.moveaxis(corners[places[order[first:last]]], -1, 0)
         used, faces = np.unique(at, return_inverse=True)
-        material = _material(library[name], name, sides) if name in library else None
+        own = next((x for x in (name, _bare(name)) if x in library), None)
+        material = None if own is None else _material(library[own], own, sides)
         part = Part(points[used], faces.reshape(-1, 3), material)
         if (normals >= 0).all():
             part.normals = vertex_normals[normals]
@@ -133,7 +139,8 @@ class _Statements:
             if len(numbers) >= 6:
                 self.colored.append(len(self.points) // 3)
                 self.colors.extend(numbers[3:6])
-            self.points.extend(numbers[:3])
+            w = numbers[3] if len(numbers) == 4 else 1.0  # homogeneous coordinates
+            self.points.extend([x / w for x in numbers[:3]] if w else numbers[:3])
 
     def _corner(self, word: bytes, known: dict[bytes, list[int]]) -> list[int]:
         """Return the three indices of a corner. Raises ValueError, IndexError if one is invalid."""
@@ -155,6 +162,11 @@ class _Statements:
         return numbers
 
 
+def _bare(name: str) -> str:
+    """Return a name without a comment behind it; names of some programs have a # themselves."""
+    return name.partition(" #")[0].strip()
+
+
 def _library(lines: list[str], sides: SideFiles) -> dict[str, dict[str, str]]:
     """Return the statements of each material of the MTL files, by their keywords in lower case."""
     found: dict[str, dict[str, str]] = {}
@@ -164,7 +176,9 @@ def _library(lines: list[str], sides: SideFiles) -> dict[str, dict[str, str]]:
             for row in text.decode("utf-8-sig", "replace").splitlines():
                 word, *rest = row.split(maxsplit=1) or [""]
                 if word.lower() == "newmtl":
-                    options = found[" ".join(rest).strip()] = {}
+                    options, name = {}, " ".join(rest).strip()
+                    found[name] = options
+                    found.setdefault(_bare(name), options)
                 elif rest:
                     options[word.lower()] = rest[0].strip()
     return found
@@ -172,9 +186,9 @@ def _library(lines: list[str], sides: SideFiles) -> dict[str, dict[str, str]]:
 
 def _library_texts(line: str, sides: SideFiles) -> list[bytes]:
     """Read the file of a line, whose name may have blanks, or else the files of its words."""
-    words = line.split()[:MAX_LIBRARIES]
+    words = _bare(line).split()[:MAX_LIBRARIES]
     texts, reasons = [], []
-    for name in (line, *(words if len(words) > 1 else ())):
+    for name in dict.fromkeys((line, _bare(line), *words)):
         try:
             texts.append(sides.read(name))
         except UserError as error:
@@ -188,9 +202,13 @@ def _library_texts(line: str, sides: SideFiles) -> list[bytes]:
 def _material(options: dict[str, str], name: str, sides: SideFiles) -> Material:
     """Return a material of an MTL file: a texture replaces the colour, light replaces black."""
     color, light = _color(options, "kd"), _color(options, "ke")
-    picture = options.get("map_kd")
+    if color is not None and color_range(color) > 1:
+        sides.warnings.append(f"the colour of {name[:60]} goes to 255")
+        color = color / 255
+    picture = options.get("map_kd", options.get("map_ka"))
     if light is not None and light.any():
         if color is not None and not color.any() and picture is None:
+            sides.warnings.append("light of a surface is drawn as its colour, shaded")
             color, picture = light, options.get("map_ke")
         else:
             sides.warnings.append("light of a surface beside its base colour is not drawn")

@@ -125,6 +125,18 @@ def _ears(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.asarray(triangulate([flat]), np.int64)
 
 
+def strip_faces(indices: np.ndarray) -> np.ndarray:
+    """Return the triangles ``[F, 3]`` of strips of vertices, with one orientation.
+
+    An index of -1 ends a strip. Triangles without area, which join strips, are left out.
+    """
+    at = np.arange(max(len(indices) - 2, 0))
+    first = np.where(indices < 0, np.arange(1, len(indices) + 1), 0)
+    odd = (at - np.maximum.accumulate(first)[: len(at)]) % 2
+    faces = indices[np.stack([at, at + 1 + odd, at + 2 - odd], 1)]
+    return faces[(faces != np.roll(faces, 1, 1)).all(1) & (faces >= 0).all(1)]
+
+
 def merged(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct rows of ``[V, C]``, sorted, and each row's index ``[V]`` among them."""
     rows = np.asarray(vertices, np.float64) + 0.0  # -0.0 becomes 0.0

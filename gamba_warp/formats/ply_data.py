@@ -61,6 +61,11 @@ class PlyHeader(NamedTuple):
     elements: list[PlyElement]  # in the order of their data
     start: int  # position of the first byte of the data
 
+    @property
+    def has_faces(self) -> bool:
+        """True for a mesh, of polygons or of strips."""
+        return any(x.name in ("face", "tristrips") and x.count for x in self.elements)
+
 
 class PlyList(NamedTuple):
     """A property whose values are lists."""

@@ -10,12 +10,13 @@ import numpy as np
 
 from ..errors import UserError
 from .materials import Material, SideFiles
-from .parts import Part, cut_polygons, to_rgba8
+from .parts import Part, cut_polygons, strip_faces, to_rgba8
 from .ply_data import Columns, PlyList, read_ply
 
 _CORNERS = ("vertex_indices", "vertex_index")
 # Names of the channels of a colour, and of texture coordinates.
-_CHANNELS = ("{}", "diffuse_{}")
+_RGBA = ("red", "green", "blue", "alpha")
+_CHANNELS = (_RGBA, tuple(f"diffuse_{name}" for name in _RGBA), ("r", "g", "b", "a"))
 _UVS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _TEXTURE = re.compile(r"TextureFile\s+(.*)", re.I)
 
@@ -29,13 +30,19 @@ def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
     data = read_ply(path)
     vertices, faces = data.elements.get("vertex", {}), data.elements.get("face", {})
     points = data.numbers("vertex", ("x", "y", "z"))
-    lists = [faces[name] for name in _CORNERS if isinstance(faces.get(name), PlyList)]
+    strips = {} if faces else data.elements.get("tristrips", {})
+    found = [(faces or strips).get(name) for name in _CORNERS]
+    lists = [x for x in found if isinstance(x, PlyList)]
     if points is None or not lists:
         raise UserError(f"{path}: its vertices have no x, y and z, or its faces no indices")
     for name in data.elements:
-        if name not in ("vertex", "face"):
+        if name not in ("vertex", "tristrips" if strips else "face"):
             sides.omit(f"the element {name[:60]} is not read")
     given, lengths = lists[0]
+    if strips:
+        given = np.insert(given.astype(np.int64), np.cumsum(lengths), -1)
+        given = strip_faces(given).reshape(-1)
+        lengths = np.full(len(given) // 3, 3)
     places = cut_polygons(sides, points, given, lengths)
     corners = given.astype(np.int64)[places]
     owner = np.repeat(np.arange(len(lengths)), lengths)[places]
@@ -67,8 +74,8 @@ def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
 
 def _colors(columns: Columns) -> np.ndarray | None:
     """Return ``[N, 4]`` uint8 RGBA of an element; None without colours."""
-    for name in _CHANNELS:
-        rgba = [columns.get(name.format(key)) for key in ("red", "green", "blue", "alpha")]
+    for names in _CHANNELS:
+        rgba = [columns.get(name) for name in names]
         rgba = rgba[: 3 if rgba[3] is None else 4]
         if all(isinstance(channel, np.ndarray) for channel in rgba):
             return to_rgba8(np.stack(rgba, 1))  # pyright: ignore[reportArgumentType, reportCallIssue]

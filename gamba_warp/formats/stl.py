@@ -32,12 +32,14 @@ def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
     count = struct.unpack_from("<I", data, 80)[0] if size >= _HEAD else -1
     start = data[: 1 << 12].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
     if size != _HEAD + 50 * count and start.startswith(b"solid") and b"\0" not in start:
-        corners = _text_corners(path, data)
+        corners = _text_corners(path, data, sides)
     else:
         if size < _HEAD:
             raise UserError(f"{path}: {size} bytes are too few for an .stl file")
         compare_sizes(path, f"{count} faces", 50 * count, size - _HEAD, exact=False)
         behind = size - _HEAD - 50 * count
+        if behind and not count:
+            raise UserError(f"{path}: its header states no faces, but {behind} bytes follow")
         if behind:
             sides.omit(f"{behind} bytes behind the faces are left out")
         faces = np.frombuffer(data, _FACE, count, _HEAD)
@@ -47,7 +49,7 @@ def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
     yield Part(corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3))
 
 
-def _text_corners(path: Path, data: bytes) -> np.ndarray:
+def _text_corners(path: Path, data: bytes, sides: SideFiles) -> np.ndarray:
     """Return ``[3 F, 3]``; keywords begin a line, in either case, as a name may be any words."""
     text = data.replace(b"\r", b"\n").lower()
     begun, ends, last = (
@@ -55,7 +57,9 @@ def _text_corners(path: Path, data: bytes) -> np.ndarray:
         for word in (b"facet", b"endfacet", b"endsolid")
     )
     rows = re.findall(rb"(?m)^[ \t]*vertex[ \t]+(.*)$", text)
-    if not begun == ends == len(rows) / 3 or not last:
+    if not last and rows:
+        sides.omit("there is no endsolid: the end of the file may be missing")
+    if not begun == ends == len(rows) / 3:
         says = f"{begun} facets, {ends} of them with an end, and {len(rows)} vertices"
         raise UserError(f"{path}: truncated or false, {says}")
     return read_table((row.decode("ascii", "replace") for row in rows), str(path), (3,))

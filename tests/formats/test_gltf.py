@@ -176,7 +176,8 @@ def test_surfaces_that_only_emit_light(tmp_path):
     document = Document().paint(emissiveTexture={"index": 0}, emissiveFactor=[1, 1, 1])
     document.tree["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [0, 0, 0, 1]}
     mesh = document.load(tmp_path)
-    assert [seen(mesh, at) for at in FOUR] == [RED, GREEN, BLUE, WHITE] and not mesh.warnings
+    assert [seen(mesh, at) for at in FOUR] == [RED, GREEN, BLUE, WHITE]
+    assert mesh.warnings == ["light of a surface is drawn as its colour, shaded"]
     assert mesh.materials[0].color.tolist() == [1, 1, 1, 1]
     strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 0.5}}
     document.tree["materials"][0] |= {"extensions": strength, "emissiveFactor": [1, 0.5, 0]}
@@ -191,7 +192,7 @@ def test_surfaces_that_only_emit_light(tmp_path):
     [
         *(("OPAQUE", 0.4, {}, 1), ("OPAQUE", 0.6, {}, 1)),
         *(("BLEND", 0.4, {}, 0.4), ("BLEND", 0.6, {}, 0.6)),
-        *(("MASK", 0.4, {}, 0), ("MASK", 0.6, {}, 1), ("MASK", 0.5, {}, 1)),
+        *(("MASK", 0.6, {}, 1), ("MASK", 0.5, {}, 1)),
         ("MASK", 0.25, {"alphaCutoff": 0.25}, 1),
     ],
 )
@@ -206,6 +207,52 @@ def test_alpha(tmp_path, mode, alpha, cutoff, want, painted):
     (material,) = document.load(tmp_path).materials
     texel = material.texture[0, 0, 3] / 255 if painted else 1
     np.testing.assert_allclose(material.color[3] * texel, want)
+
+
+@pytest.mark.parametrize(
+    "look, painted",
+    [
+        ({"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}}, False),
+        ({"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0]}}, True),
+        ({"alphaMode": "MASK", "alphaCutoff": 2.0}, True),
+        ({"alphaMode": "BLEND"}, False),  # its vertices have no alpha
+    ],
+)
+def test_a_mesh_that_would_be_invisible_is_opaque(tmp_path, look, painted):
+    document = Document(materials=[look])
+    document.primitive["material"] = 0
+    if painted:
+        material = document.paint().tree["materials"][0]
+        texture = material["pbrMetallicRoughness"]
+        document.tree["materials"] = [
+            look | {"pbrMetallicRoughness": texture | look.get("pbrMetallicRoughness", {})}
+        ]
+    document.attributes["COLOR_0"] = document.array(np.array([[1, 1, 1, painted]] * 4, "<f4"))
+    mesh = document.load(tmp_path)
+    assert mesh.warnings[-1] == "all its surfaces are transparent by their alpha: drawn opaque"
+    (material,) = mesh.materials
+    assert material.color[3] == 1 and mesh.colors[..., 3].min() == 255
+    assert (material.texture is not None) == painted
+    assert not painted or material.texture[..., 3].min() == 255
+
+
+def test_a_part_that_is_invisible_beside_others_stays_so(tmp_path):
+    document = Document(
+        materials=[
+            {"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0]}},
+            {},
+        ]
+    )
+    document.primitive["material"] = 0
+    document.tree["meshes"][0]["primitives"].append(document.primitive | {"material": 1})
+    mesh = document.load(tmp_path)
+    assert [material.color[3] for material in mesh.materials] == [0, 1] and not mesh.warnings
+
+
+def test_an_unlit_surface_is_named(tmp_path):
+    document = Document(materials=[{"extensions": {"KHR_materials_unlit": {}}}])
+    document.primitive["material"] = 0
+    assert document.load(tmp_path).warnings == ["an unlit surface is drawn shaded"]
 
 
 def test_diffuse_and_specular(tmp_path):
@@ -429,7 +476,7 @@ def test_names_of_other_files_may_be_encoded(tmp_path):
     for name in ("..%2Fout.bin", "%2e%2e/out.bin", "%2e%2e%5cout.bin", str(tmp_path / "out.bin")):
         document.tree["buffers"][0]["uri"] = name
         path.write_text(json.dumps(document.tree))
-        refused("not found", load_mesh, path)
+        refused("not found|outside of .*inner, not read", load_mesh, path)
     data = "data:application/octet-stream;base64," + base64.b64encode(document.binary).decode()
     document.tree["buffers"][0]["uri"] = data
     path.write_text(json.dumps(document.tree))

@@ -10,7 +10,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from helpers.meshes import FACET, MTL, gltf, write_quad
+from helpers.meshes import FACET, MTL, QUAD, gltf, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -54,7 +54,9 @@ BAD = {
     "short_face.off": (OFF[:-3] + "\n", "row 6 is not whole"),
     "long_face.off": (OFF.replace("3 0 1 2", "999999999 0 1 2"), "row 5 is not whole"),
     "negative.off": (OFF.replace("4 2 0", "4 -2 0"), "broken header"),
-    "truncated.stl": (STL[: STL.rindex("facet normal")], "truncated"),
+    "truncated.stl": (STL[: STL.rindex("vertex")], "truncated"),
+    "uncounted.stl": (bytes(84) + b"\1" * 50, "states no faces, but 50 bytes follow"),
+    "utf16.obj": (QUAD.encode("utf-16"), "text in UTF-16"),
     "without_a_vertex.stl": (STL.replace("vertex 1 0 0\n", "", 1), "8 vertices"),
     "word.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 x"]), "could not convert"),
     "short_row.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1"]), "a row of 3 numbers, not 4"),
@@ -69,7 +71,7 @@ BAD = {
 def test_bad_meshes_are_one_line(tmp_path, name):
     text, reason = BAD[name]
     path = tmp_path / name
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     start = time.process_time()
     assert reason in refused(None, load_mesh, path)
     assert time.process_time() - start < 5  # one of them took minutes
@@ -108,7 +110,20 @@ def test_textures_lie_in_the_folder(tmp_path, name):
     name = name.format(folder=tmp_path / "secret.png")
     mesh = load_mesh(write_quad(inner, mtl=MTL.replace("paint.png", name), texture=None))
     assert mesh.materials[0].texture is None
-    assert any("not found" in line for line in mesh.warnings), mesh.warnings
+    reasons = "not found", f"outside of {inner}, not read"
+    assert any(line.endswith(reasons) for line in mesh.warnings), mesh.warnings
+
+
+@pytest.mark.parametrize("name", ["../images/paint.png", "..\\images\\PAINT.png"])
+def test_textures_of_a_sister_folder_are_read_below_the_given_one(tmp_path, name):
+    """The layout of ShapeNet v2."""
+    inner = tmp_path / "models"
+    inner.mkdir()
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (4, 4), (1, 2, 3)).save(tmp_path / "images" / "paint.png")
+    path = write_quad(inner, mtl=MTL.replace("paint.png", name), texture=None)
+    assert load_mesh(path, root=tmp_path).materials[0].texture is not None
+    assert load_mesh(path).materials[0].texture is None
 
 
 def test_what_is_no_picture_is_not_opened(tmp_path, monkeypatch):

@@ -213,7 +213,7 @@ def test_light_and_moved_textures_of_mtl(tmp_path):
     mtl = "newmtl paint\nKd 0 0 0\nKe 1 0.5 0\n"
     mesh = load_mesh(write_quad(tmp_path, mtl=mtl, texture=None))
     np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear([1, 0.5, 0]))
-    assert not mesh.warnings
+    assert mesh.warnings == ["light of a surface is drawn as its colour, shaded"]
     moved = MTL.replace("paint.png", "-s 2 2 1 paint.png")
     for files, warning in (
         ({"mtl": MTL + "Ke 1 1 1\n"}, "light of a surface beside its base colour is not drawn"),
@@ -221,6 +221,58 @@ def test_light_and_moved_textures_of_mtl(tmp_path):
         ({"obj": QUAD.replace("-1 0 0", "-1 0 0 1 0 0")}, "colours beside a texture are not drawn"),
     ):
         assert load_mesh(write_quad(tmp_path, **files)).warnings == [warning]
+
+
+def test_strips_of_ply(tmp_path):
+    """Every second triangle is turned; -1 ends a strip."""
+    lines = ["ply", "format ascii 1.0", "element vertex 5"]
+    lines += [f"property float {axis}" for axis in "xyz"] + ["element tristrips 2"]
+    lines += ["property list int int vertex_indices", "end_header"]
+    lines += ["0 0 0", "1 0 0", "0 1 0", "1 1 0", "2 0 0", "8 0 1 2 3 -1 1 4 3", "3 4 3 1"]
+    mesh = loaded(tmp_path, "a.ply", "\n".join([*lines, ""]))
+    assert mesh.faces.tolist() == [[0, 1, 2], [1, 3, 2], [1, 4, 3], [4, 3, 1]]
+
+
+def test_short_names_of_colours_of_ply(tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 3"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"property uchar {name}" for name in "rgb"] + ["element face 1"]
+    lines += ["property list int int vertex_indices", "end_header"]
+    lines += [f"{x} {y} 0 255 128 0" for x, y in ((0, 0), (1, 0), (0, 1))] + ["3 0 1 2", ""]
+    mesh = loaded(tmp_path, "a.ply", "\n".join(lines))
+    assert mesh.colors[0, 0].tolist() == [255, 128, 0, 255]
+
+
+def test_numbers_of_obj_as_some_programs_write_them(tmp_path):
+    """Homogeneous vertices, and NaN as Microsoft's libraries print it."""
+    rows = ["v 0 0 0 2", "v 2 0 0 2", "v 0 -2 0 -2", "vt 1.#QNAN 0", "vn -1.#IND00 0 0"]
+    mesh = loaded(tmp_path, "a.obj", "\n".join([*rows, "f 1/1/1 2/1/1 3/1/1"]))
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert np.isfinite(mesh.uvs).all() and np.isfinite(mesh.normals).all()
+    rows[0] = "v -1.#IND 0 0"
+    refused("not finite", loaded, tmp_path, "a.obj", "\n".join([*rows, "f 1 2 3"]))
+
+
+def test_comments_and_other_colours_of_mtl(tmp_path):
+    """Comments behind names, colours up to 255, a texture of the ambient light alone, TARGA."""
+    mtl = "newmtl paint # the wood\nKd 255 0 51 # red\n"
+    obj = QUAD.replace("usemtl paint", "usemtl paint # here").replace("quad.mtl", "quad.mtl # colours")
+    assert obj.count(" # ") == 2
+    mesh = load_mesh(write_quad(tmp_path, obj=obj, mtl=mtl, texture=None))
+    np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear([1, 0, 0.2]))
+    assert mesh.warnings == ["the colour of paint goes to 255"]
+    for mtl in (MTL.replace("map_Kd", "map_Ka"), MTL.replace("paint.png", "paint.tga")):
+        path = write_quad(tmp_path, mtl=mtl)
+        Image.open(tmp_path / "paint.png").save(tmp_path / "paint.tga")
+        assert load_mesh(path).materials[0].texture is not None
+
+
+def test_a_text_stl_without_its_last_line(tmp_path):
+    rows = ["solid", "facet normal 0 0 1", "outer loop", "vertex 0 0 0", "vertex 1 0 0"]
+    rows += ["vertex 0 1 0", "endloop", "endfacet"]
+    mesh = loaded(tmp_path, "a.stl", "\n".join("  " + row for row in rows))
+    assert len(mesh.faces) == 1
+    assert mesh.omitted == ["there is no endsolid: the end of the file may be missing"]
 
 
 @pytest.mark.parametrize("head", ["OFF4 1 0", "OFF 4 1 0", "OFF\n4 1 0", "\ufeffOFF\r\n\r\n4 1"])

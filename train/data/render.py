@@ -116,12 +116,14 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
         Warnings about missing parts of the mesh's files that were replaced.
 
     Raises:
-        UserError: the mesh cannot be read, or the folder cannot be written.
+        UserError: the mesh cannot be read, no picture shows it, or the folder cannot be written.
     """
     up = default_up(mesh.path) if settings.up == "auto" else settings.up
     plain_name(mesh.uid, str(mesh.path))
-    model = load_mesh(mesh.path)
+    model = load_mesh(mesh.path, root=mesh.root)
     views = draw_views(model, mesh.uid, replace(settings, up=up), mesh.rotation)
+    if not views.images[..., 3].any():
+        raise UserError(f"{mesh.path}: every picture of it is empty")
     suffix, options = "webp", {"lossless": True, "method": 2, "quality": 50}
     if settings.format == "png":
         suffix, options = "png", {}

@@ -41,8 +41,7 @@ def splat_kind(path: str | Path) -> SplatFormat | Literal["glb"] | None:
         if start.startswith(b"ply"):
             header = read_ply_header(path, file)
             names = {item.name for element in header.elements for item in element.properties}
-            has_faces = any(x.name == "face" and x.count for x in header.elements)
-            if has_faces or not _GAUSSIAN_PROPERTIES & names:
+            if header.has_faces or not _GAUSSIAN_PROPERTIES & names:
                 return None
             return "compressed-ply" if is_compressed(header) else "ply"
         if start == b"glTF":
