@@ -12,11 +12,12 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+import warnings
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
-from .errors import UserError
+from .errors import FileWarning, UserError
 
 PACKAGE = Path(__file__).resolve().parent
 # The folder of a checkout: of this package, of tests/ and of starter/.
@@ -237,6 +238,22 @@ def visible(folder: Path, pattern: str) -> Iterator[Path]:
     for inner, _, files in walk(folder):
         for name in fnmatch.filter(files, pattern):
             yield Path(inner, name)
+
+
+_BESIDE = {".bin", ".csv", ".json", ".md", ".mtl", ".tga", ".txt", ".png", ".jpg", ".jpeg", ".webp"}
+
+
+def warn_of_others(folder: Path, files: Iterable[Path], known: Container[str]) -> None:
+    """Warn of the files of a folder that are not read because of their suffixes.
+
+    Files that often lie beside others, such as textures, count as known.
+    """
+    suffixes = [path.suffix.lower() for path in files if not path.name.startswith(".")]
+    others = [suffix for suffix in suffixes if suffix not in known and suffix not in _BESIDE]
+    if others:
+        kinds = ", ".join(sorted({suffix or "no suffix" for suffix in others})[:9])
+        count = f"{len(others)} file{'s' * (len(others) > 1)} of other kinds"
+        warnings.warn(f"{folder}: {count} passed over ({kinds})", FileWarning, stacklevel=2)
 
 
 def plain_file(path: str | Path, links: bool = True) -> os.stat_result:

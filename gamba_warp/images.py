@@ -158,25 +158,31 @@ def load_rgba(
 
 
 def load_rgba8(path: str | Path, content: bytes | None = None) -> np.ndarray:
-    """Read like ``load_rgba``, but ``[H, W, 4]`` uint8, a quarter of the memory.
+    """Read a picture of a posed set like ``load_rgba``, but ``[H, W, 4]`` uint8, as it is stored.
+
+    EXIF rotation is not applied: the cameras of COLMAP and others are for the stored pixels.
 
     Args:
         path: the file, or the name of ``content``.
         content: bytes of a file; None reads it.
     """
     with _still(path, content) as image:
-        return to_rgba(image, path, np.uint8, turned=True)
+        return to_rgba(image, path, np.uint8)
 
 
-def picture_size(path: str | Path) -> tuple[int, int]:
-    """Return width and height of a still picture after EXIF rotation, without decoding it.
+def picture_size(path: str | Path, turned: bool = True) -> tuple[int, int]:
+    """Return width and height of a still picture, without decoding it.
+
+    Args:
+        path: the file.
+        turned: apply EXIF rotation.
 
     Raises:
         UserError: as ``load_rgba``, but for damaged pixels.
     """
     with _still(path) as image:
         width, height = image.size
-        return (height, width) if _orientation(image) >= 5 else (width, height)
+        return (height, width) if turned and _orientation(image) >= 5 else (width, height)
 
 
 @contextmanager

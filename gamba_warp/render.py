@@ -52,6 +52,8 @@ def render(
         options["sh_degree"] = gaussians.degree
         constant = (colors - 0.5) / SH_C0
         colors = torch.cat([constant[..., None, :], gaussians.harmonics], -2)
+    elif not colors.requires_grad:  # of files; networks and fits give none below 0
+        colors = colors.clamp_min(0)
     with record_function("rasterizer"):
         pictures, alpha, meta = rasterization(
             means=gaussians.means,

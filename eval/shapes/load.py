@@ -6,7 +6,7 @@ move the shape into the unit frame, and clean and flag its mesh. ``compare`` is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,7 @@ class LoadedShape:
         motion: from the file's coordinates into the unit frame.
         axes: of the file: a key of ``TO_Z_UP``, ``UNKNOWN``, or for a truth ``DATASET``.
         warning: reason why the dataset's placement of a truth is not used; or empty.
+        notes: further warnings.
     """
 
     source: Shape
@@ -68,6 +69,7 @@ class LoadedShape:
     motion: Similarity
     axes: str
     warning: str = ""
+    notes: list[str] = field(default_factory=list)
 
     @property
     def kind(self) -> str:
@@ -78,7 +80,7 @@ class LoadedShape:
     def warnings(self) -> list[str]:
         """Warnings of the file for a report, one line each."""
         omitted = self.source.omitted if isinstance(self.source, Mesh) else ()
-        return [*([self.warning] if self.warning else []), *omitted]
+        return [*([self.warning] if self.warning else []), *omitted, *self.notes]
 
     def is_closed(self) -> bool | None:
         """Return True if the mesh is closed (``Mesh.is_closed``); None for points."""
@@ -281,6 +283,14 @@ def _load_points(path: Path) -> Points:
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     usable = np.isfinite(lengths).all() and lengths.all()
     return Points(positions, normals / lengths if usable else None)
+
+
+def scale_note(shape: Mesh | Points, protocol: GeometryProtocol) -> str:
+    """Return a warning of a prediction of another size than the truth, whose side is 1; or none."""
+    side = float(np.ptp(_positions(shape), axis=0).max())
+    if {"box", "scale", "icp"} & {*protocol.align} or 0.1 <= side <= 10:
+        return ""
+    return f"its side is {side:.3g} times the truth's: other units? --align scale fits them"
 
 
 def to_surface(

@@ -22,7 +22,7 @@ from gamba_warp.batch import progress_bar
 from gamba_warp.data import gso
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
-from gamba_warp.files import output_folder, sha256, visible, write_text
+from gamba_warp.files import output_folder, sha256, visible, warn_of_others, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes, object_names
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_lines
@@ -279,8 +279,9 @@ def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Pa
 
     A further file of the same name is another object if it was rendered as one (``find_meshes``).
     """
-    files = (path for path in visible(folder, "*") if path.suffix.lower() in SUFFIXES)
-    paths = sorted(path for path in files if path.is_file())
+    files = [path for path in visible(folder, "*") if path.is_file()]
+    warn_of_others(folder, files, SUFFIXES)
+    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     names = object_names([path.relative_to(folder).with_suffix("") for path in paths])
     found: dict[str, list[Path]] = {}
     for name, path in zip(names, paths):
@@ -326,7 +327,7 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
-    from .load import FRAME_AXES, load_prediction, load_truth
+    from .load import FRAME_AXES, load_prediction, load_truth, scale_note
     from .metrics import chamfer_by_turn, compare
 
     stages = Stopwatch(3)
@@ -335,6 +336,8 @@ def evaluate_pair(
         into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
         predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     with stages("compare"):
+        if note := scale_note(predicted.shape, protocol):
+            predicted.notes.append(note)
         metrics = compare(predicted.shape, truth.shape, protocol)
         check_finite(metrics)
         turned = check_finite(chamfer_by_turn(predicted, truth, protocol))

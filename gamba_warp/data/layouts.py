@@ -375,8 +375,9 @@ def _pictures(path: Path | str, frames: list[dict], find: Find) -> dict[str, lis
         if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise UserError(f"{source}: no file_path")
         for key, paths in files.items():
-            if frame.get(key):
-                paths.append(find(frame[key], source))
+            if name := frame.get(key):  # programs on Windows write backslashes
+                name = name.replace("\\", "/") if isinstance(name, str) else name
+                paths.append(find(name, source))
         files["file_path"][-1] = _with_suffix(files["file_path"][-1])
     for key, paths in files.items():
         repeated = next((p for p, n in Counter(paths).items() if n > 1), None)
@@ -463,7 +464,7 @@ def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFil
 
 def _size_of(picture: Path | DecodedPicture) -> tuple[int, int]:
     if isinstance(picture, Path):
-        return picture_size(picture)
+        return picture_size(picture, turned=False)
     height, width = picture.read().shape[:2]
     return width, height
 
@@ -493,7 +494,7 @@ class _View(Struct):
 
 
 def _aspect(picture: Path) -> float:
-    width, height = picture_size(picture)
+    width, height = picture_size(picture, turned=False)
     return width / height
 
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from ..errors import UserError
-from ..files import visible
+from ..files import visible, warn_of_others
 from ..untrusted.documents import read_document
 from ..untrusted.names import MAX_NAME, parts_of, plain_name
 from .meshes import SUFFIXES
@@ -66,8 +66,9 @@ def find_meshes(folder: Path) -> list[Mesh]:
         raise UserError(f"{folder}: no such folder")
     known = _read_catalogue(folder / CATALOGUE)
     meshes: dict[str, Mesh] = {}
-    files = (path for path in visible(folder, "*") if path.suffix.lower() in SUFFIXES)
-    paths = sorted(path for path in files if path.is_file())
+    files = [path for path in visible(folder, "*") if path.is_file()]
+    warn_of_others(folder, files, SUFFIXES)
+    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     named = _name_parts([path.relative_to(folder).with_suffix("") for path in paths])
     for path, parts in zip(paths, named):
         model = path.relative_to(folder).as_posix()

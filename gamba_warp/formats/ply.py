@@ -31,6 +31,7 @@ from .parts import color_range
 from .ply_data import PlyData, read_ply
 
 TURNED = "frame opengl"  # comment of files with y up, which earlier versions could write
+_FLAT = 1e-6  # third standard deviation of a flat Gaussian
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
 MAX_FILE = 4 << 30  # bytes; 17 million Gaussians with all their harmonics
 _GROUPS = {
@@ -90,8 +91,8 @@ def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
 
     It may be binary, text, or compressed (``formats.gaussians.compressed``). Normals, other
     properties and other elements are ignored. Without ``f_dc_*``, ``red green blue`` are the
-    colours, as nerfstudio's ``ns-export`` writes them. Without harmonics colours are clipped to
-    [0, 1]. A scale of -inf is size 0; an opacity of inf is 1, of -inf 0. ``left_out`` as for
+    colours, as nerfstudio's ``ns-export`` writes them. Two scales, of flat Gaussians (2DGS), get a
+    third of 1e-6. A scale of -inf is size 0; an opacity of inf is 1, of -inf 0. ``left_out`` as for
     ``checked_gaussians``.
 
     Returns:
@@ -115,6 +116,8 @@ def _activated(path: Path, data: PlyData) -> dict[str, np.ndarray]:
     plain = vertices.keys().isdisjoint(_GROUPS["colors"]) and vertices.keys() >= {*_RGB}
     groups = _GROUPS | {"colors": _RGB} if plain else {**_GROUPS}
     groups["harmonics"] = rest_names(sum(_REST.fullmatch(name) is not None for name in vertices))
+    if "scale_1" in vertices and "scale_2" not in vertices:
+        vertices["scale_2"] = np.full_like(vertices["scale_1"], np.log(_FLAT), np.float32)
     arrays = {}
     with np.errstate(over="ignore"):
         for name, properties in groups.items():

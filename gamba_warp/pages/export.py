@@ -15,6 +15,7 @@ from PIL import Image
 from ..batch import STAGES, say, warn
 from ..data.preprocess import composite
 from ..errors import UserError
+from ..files import warn_of_others
 from ..formats.gaussians.files import (
     comments_of,
     read_gaussians,
@@ -201,7 +202,9 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
             else:
                 failures.append((path, "no such file"))
             continue
-        inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() in SPLAT_SUFFIXES)
+        inside = sorted(p for p in path.glob("[!.]*") if p.is_file())
+        warn_of_others(path, inside, (*SPLAT_SUFFIXES, ".html", ".gif", ".mp4"))
+        inside = [p for p in inside if p.suffix.lower() in SPLAT_SUFFIXES]
         inside = [p for p in inside if p.suffix.lower() != ".glb" or holds_gaussians(p)]
         files.update(dict.fromkeys(inside))
         if not inside:

@@ -278,3 +278,23 @@ def test_bad_requests(tmp_path):
     refused("size 0", data.load, 0, size=0)
     refused("split 'tset'", open_dataset, tmp_path, "tset")
     refused("layout 'x'", open_dataset, tmp_path, layout="x")
+
+
+@pytest.mark.parametrize("stated", [{"w": 40, "h": 30, "fl_x": 43.75, "cx": 20, "cy": 15}, {}])
+def test_pictures_of_posed_sets_are_not_turned_by_exif(tmp_path, stated):
+    """As COLMAP takes them; by an angle alone the focal length is that of the stored width."""
+    folder = tmp_path / "obj"
+    (folder / "images").mkdir(parents=True)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture = Image.fromarray(np.arange(3600, dtype=np.uint8).reshape(30, 40, 3))
+    picture.save(folder / "images" / "0.png", exif=exif)
+    pose = np.eye(4)
+    pose[2, 3] = 2
+    about = stated or {"camera_angle_x": 2 * math.atan(20 / 43.75)}
+    frames = [{"file_path": "images\\0.png", "transform_matrix": pose.tolist()}]
+    (folder / "transforms.json").write_text(json.dumps({**about, "frames": frames}))
+    views = open_dataset(tmp_path).load("obj")
+    assert views.images.shape == (1, 30, 40, 4)
+    np.testing.assert_array_equal((255 * views.images[0, ..., :3]).round(), np.asarray(picture))
+    assert views.cameras.Ks[0, 0].tolist() == pytest.approx([43.75, 0, 20])

@@ -197,7 +197,7 @@ def test_bad_files_are_named_and_the_others_done(tmp_path, side, capfd):
 
 def test_gaussians_that_lack_an_attribute(tmp_path, capfd):
     """And Gaussians in place of a truth."""
-    gone = (b"f_dc_1", b"opacity", b"scale_2", b"rot_0")
+    gone = (b"f_dc_1", b"opacity", b"scale_1", b"rot_0")
     pred, gt = pairs_of(tmp_path, [*map(bytes.decode, gone), "whole"])
     save_ply(gt / "whole.ply", some(5, rotated=False))
     for name in gone:

@@ -256,7 +256,9 @@ def test_numbers_of_obj_as_some_programs_write_them(tmp_path):
 def test_comments_and_other_colours_of_mtl(tmp_path):
     """Comments behind names, colours up to 255, a texture of the ambient light alone, TARGA."""
     mtl = "newmtl paint # the wood\nKd 255 0 51 # red\n"
-    obj = QUAD.replace("usemtl paint", "usemtl paint # here").replace("quad.mtl", "quad.mtl # colours")
+    obj = QUAD.replace("usemtl paint", "usemtl paint # here").replace(
+        "quad.mtl", "quad.mtl # colours"
+    )
     assert obj.count(" # ") == 2
     mesh = load_mesh(write_quad(tmp_path, obj=obj, mtl=mtl, texture=None))
     np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear([1, 0, 0.2]))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ...conventions import Axes
-from ...errors import UserError
+from ...errors import FileWarning, UserError
 from ...gaussians import Gaussians
 
 MAX_REACH = 1e18  # of means and scales: the squares of larger numbers overflow float32
@@ -69,7 +70,8 @@ def checked_gaussians(
 ) -> Gaussians:
     """Validate the activated values of a file, and return them as one object.
 
-    Without harmonics colours are clipped to [0, 1]; with them a base colour may lie outside.
+    Colours may lie outside of [0, 1]; a rendering cuts them at 0. A line warns where numbers of
+    float32 are too coarse for the object.
 
     Args:
         path: named in errors.
@@ -116,9 +118,24 @@ def checked_gaussians(
         values = {name: value[keep] for name, value in values.items()}
     values["quats"] = _unit(values["quats"])
     values["opacities"] = values["opacities"].clamp(0, 1)
-    if "harmonics" not in values:
-        values["colors"] = values["colors"].clamp(0, 1)
+    warn_of_steps(path, values["means"])
     return Gaussians(**values)
+
+
+def warn_of_steps(path: str | Path, means: torch.Tensor, step: float = 0.0) -> None:
+    """Warn where positions are in steps of over 1/1000 of the object.
+
+    Args:
+        path: named in the warning.
+        means: ``[N, 3]`` float32, N > 0.
+        step: of the file's format; that of float32 counts if it is larger.
+    """
+    reach, extent = means.abs().max(), (means.amax(0) - means.amin(0)).max().item()
+    step = max(step, float(np.spacing(np.float32(reach))))
+    if len(means) > 1 and step > extent / 1000:
+        line = f"{path}: positions reach {reach:.3g} and have steps of {step:.3g}"
+        advice = f"the object has a side of {extent:.3g}; move it to the origin before it is stored"
+        warnings.warn(f"{line}, {advice}", FileWarning, stacklevel=2)
 
 
 def rest_names(count: int) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from .splat import load_splat, save_splat
 from .spz import load_spz, save_spz
 from .spz_container import GZIP, MAGIC
 
+_CONVERTED = (".sog", ".ksplat", ".rad")  # Gaussians in formats of single programs
 # One is enough, so that a file without the others is not taken for a point cloud.
 _GAUSSIAN_PROPERTIES = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
 
@@ -63,8 +64,8 @@ def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gauss
             (a row of NaN, a rotation of length zero); None: a file with such Gaussians is refused.
 
     Returns:
-        Float32 Gaussians on the CPU in OpenCV's axes (y down), ``quats`` normalised; without
-        harmonics colours are in [0, 1].
+        Float32 Gaussians on the CPU in OpenCV's axes (y down), ``quats`` normalised; colours may
+        lie outside of [0, 1].
 
     Raises:
         UserError: the file is missing, of another kind, truncated or longer than it states, or its
@@ -77,6 +78,9 @@ def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gauss
     by_name = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz, ".glb": load_glb}
     readers = [reader for magic, reader in magics.items() if start.startswith(magic)]
     reader = readers[0] if readers else by_name.get(path.suffix.lower())  # which names the error
+    if path.suffix.lower() in _CONVERTED:
+        tool = "SuperSplat (superspl.at/editor) and splat-transform convert it to .ply"
+        raise UserError(f"{path}: the format {path.suffix.lower()} is not read; {tool}")
     if reader is None:
         raise UserError(f"{path}: not Gaussians ({', '.join(SPLAT_SUFFIXES)})")
     return reader(path, left_out)

@@ -13,6 +13,7 @@ import gzip
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ...errors import UserError
 from ...files import atomic_path
@@ -26,6 +27,7 @@ from .arrays import (
     flip_axes,
     from_smallest_three,
     smallest_three,
+    warn_of_steps,
 )
 from .spz_container import COUNTS, HEADER, MAGIC, unpacked
 
@@ -52,6 +54,7 @@ def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
     bits = next((b for b in range(_FRACTION, -1, -1) if round(reach * 2**b) < 1 << 23), None)
     if bits is None:
         raise UserError(f"{path}: not written, means reach {reach:.3g}, an .spz holds {1 << 23}")
+    warn_of_steps(path, torch.from_numpy(arrays["means"]), 2.0**-bits)
     fixed = np.rint(arrays["means"].astype(np.float64) * 2**bits).astype("<i4")
     logs = np.log(arrays["scales"].clip(MIN_SCALE).astype(np.float64))
     coefficients = (arrays["colors"] - 0.5) / SH_C0
@@ -111,6 +114,8 @@ def load_spz(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     arrays["colors"] = colors
     arrays["harmonics"] = (take("u1", K, 3).astype(np.float64) - 128) / 128
+    if found.version > 1:
+        warn_of_steps(path, torch.from_numpy(means).float(), 2.0**-found.bits)
     return flip_axes(checked_gaussians(path, arrays, left_out))
 
 

@@ -1,4 +1,5 @@
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -6,9 +7,13 @@ import torch
 from helpers.gaussians import some
 from helpers.refusals import refused
 
+from gamba_warp.cameras import Cameras, intrinsics
+from gamba_warp.errors import FileWarning
 from gamba_warp.formats.gaussians.files import comments_of, splat_kind
+from gamba_warp.formats.gaussians.spz import save_spz
 from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
-from gamba_warp.gaussians import SH_C0
+from gamba_warp.gaussians import SH_C0, Gaussians
+from gamba_warp.render import render
 from gamba_warp.versions import import_open3d
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
@@ -104,9 +109,46 @@ def test_files_of_other_programs_are_read(tmp_path):
     lines += ["element extra 1", "property list uchar int things"]
     loaded = load_ply(write(tmp_path / "a.ply", lines, values.tobytes() + b"\0"))
     assert loaded.means.tolist() == [[1, 2, 3]] and loaded.means.dtype == torch.float32
-    assert loaded.opacities.tolist() == [0.5] and loaded.colors.tolist() == [[0.5, 1, 0]]
+    assert loaded.opacities.tolist() == [0.5]
+    assert loaded.colors[0].tolist() == pytest.approx([0.5, 0.5 + 5 * SH_C0, 0.5 - 5 * SH_C0])
     assert loaded.quats.tolist() == [[0, 0, 1, 0]]
     torch.testing.assert_close(loaded.scales, torch.full((1, 3), 0.5))
+
+
+def test_colours_out_of_range_are_kept_and_cut_below_0_alone(tmp_path):
+    """A picture of half an opacity has half the light of a colour over 1."""
+    colors = torch.tensor([[1.5, 0.5, -0.4]])
+    one = Gaussians(torch.zeros(1, 3), None, torch.ones(1, 3), torch.full((1,), 0.5), colors)
+    save_ply(tmp_path / "a.ply", one)
+    loaded = load_ply(tmp_path / "a.ply")
+    torch.testing.assert_close(loaded.colors, colors)
+    camera = Cameras(torch.eye(4)[None], intrinsics(5, 5)[None], 5, 5)
+    camera.viewmats[0, 2, 3] = 2
+    pixel = render(loaded, camera).rgb[0, 2, 2]
+    torch.testing.assert_close(pixel, torch.tensor([0.75, 0.25, 0.0]), rtol=0, atol=1e-3)
+
+
+def test_flat_gaussians_have_a_third_scale(tmp_path):
+    """2DGS has two scales."""
+    names = [name for name in PROPERTIES if name != "scale_2"]
+    values = np.ones((1, len(names)), "<f4")
+    loaded = load_ply(write(tmp_path / "a.ply", header(1, properties=names), values.tobytes()))
+    assert loaded.scales[0].tolist() == pytest.approx([math.e, math.e, 1e-6])
+
+
+@pytest.mark.parametrize("far, warned", [(0.0, False), (1e3, False), (3e5, True)])
+def test_steps_that_are_coarse_for_the_object_are_named(tmp_path, far, warned):
+    made = some()
+    made.means += far
+    save_ply(tmp_path / "a.ply", made)
+    for read in (lambda: load_ply(tmp_path / "a.ply"), lambda: save_spz(tmp_path / "a.spz", made)):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            read()
+        # 24 bits of an .spz leave steps of 1/8192 beside 1,000, and 1/16 beside 300,000
+        lines = [str(line.message) for line in told if line.category is FileWarning]
+        assert bool(lines) == warned, lines
+        assert all("have steps of" in line for line in lines)
 
 
 def test_infinite_logarithms_and_logits_have_a_meaning(tmp_path):
