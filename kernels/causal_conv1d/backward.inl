@@ -3,7 +3,19 @@
 // Equation 2 for a chunk of tokens. dx of token t needs the gradients g of t to t + 3: the loop
 // runs three tokens behind.
 #include "window.h"
-const auto douts = rows_(dout_in, b, 0, d, width), dxs = rows_(dx_out, b, 0, d, width);
+const auto dout_rows = rows_(dout_in, b, 0, d, width);
+#if TURNED
+// Turned as they are read and written. Whole tiles are read before and behind for three tokens.
+F x_lanes[PIECE + 32], dout_lanes[PIECE + 16], dx_lanes[PIECE];
+const int first = t0 == begin ? t0 : t0 - 16, last = end + 16 < stop ? end + 16 : stop;
+const auto xs = gather_(rows, first, last, x_lanes, sizeof(F));
+const auto douts = gather_(dout_rows, t0, last, dout_lanes, sizeof(F));
+const Lanes dxs = {(float*)dx_lanes, sizeof(F), t0, 16};
+#else
+const auto &xs = rows, &douts = dout_rows;
+const auto dxs = rows_(dx_out, b, 0, d, width);
+#endif
+start(xs);
 const auto dstates = rows_(dstate_out, own, 0, d, width);
 F g0 = F{}, g1 = F{}, g2 = F{}, sums[5] = {}, run[5] = {};
 auto complete = [&] {
@@ -45,11 +57,15 @@ for (; t < end + 3; ++t) {
     F x3 = x2, g3 = F{};
     if (t < stop) {
         x3 = read_(xs, t), g3 = read_(douts, t);
-        next_(xs, t), next_(douts, t);
+        next_(rows, t), next_(dout_rows, t);
     }
     step(t, x3, g3, t < stop, t < end);
 }
 complete();
+#if TURNED
+auto dx_of = [&](int t) { return dx_lanes[t - t0]; };
+if (dx_out.shape[1] > 0) scatter_(rows_(dx_out, b, 0, d, width), t0, end, dx_of, false);
+#endif
 F* const dweight = (F*)dweight_out.data + (size_t)task * 5 * taps + k;
 if (dweight_out.shape[1] > 0)
     for (int i = 0; i < 5; ++i) dweight[i * taps] = sums[i];

@@ -155,6 +155,8 @@ def causal_conv1d_fn(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Convolve with the arguments and layout of causal-conv1d's ``causal_conv1d_fn``.
 
+    A CPU reads x as it lies, with adjacent tokens or channels, and the output lies as x.
+
     Args:
         x: ``[B, D, L]`` float32, bfloat16 or float16.
         weight: ``[D, W]``, W from 2 to 4.

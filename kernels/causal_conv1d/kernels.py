@@ -15,8 +15,10 @@ from ..runtime.native import PRELUDE, WARP_DTYPES, W, lanes, native, native_kern
 from ..runtime.scalars import BITS, EXP2, RECIPROCAL
 
 TAPS = 4
-# Tokens of a forward task; on a CPU few, because each row may lie in another page.
+# Tokens of a forward task; on a CPU few, because each row may lie in another page, but many where x
+# is turned.
 STRIP = {"cpu": 16, "cuda": 128}
+TURNED_STRIP = 512
 # Tokens of a backward task, each with its own sum for the gradient of the weight.
 CHUNK = {"cpu": 64, "cuda": 128}
 # Tokens that a CPU adds one after the other: equal terms would round to the same side 64 times.
@@ -24,9 +26,10 @@ CHUNK = {"cpu": 64, "cuda": 128}
 RUN = 16
 AHEAD = 8  # tokens whose loads a CUDA thread has under way
 VALUES = {"cpu": (lanes, W), "cuda": (wp.vec4, 4)}  # type of a value, and its channels
+_INDICES = {False: "task, k", True: "k, task"}  # of a launch: adjacent memory follows last
 
 
-def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
+def _text(file: str, device_type: str, io: torch.dtype, piece: int, turned: bool) -> str:
     on_cpu = device_type == "cpu"
     head = PRELUDE if on_cpu else EXP2 + RECIPROCAL
     return head + native(
@@ -34,6 +37,7 @@ def _text(file: str, device_type: str, io: torch.dtype, piece: int) -> str:
         ELEMENT=BITS[io]["ELEMENT"],
         WIDTH=VALUES[device_type][1],
         PIECE=piece,
+        TURNED=turned,
         RUN=RUN if on_cpu else 0,
         AHEAD=AHEAD,
     )
@@ -53,20 +57,27 @@ def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:
 
 
 @functools.cache
-def forward_kernel(device_type: str, io: torch.dtype) -> Any:
-    """The kernel for tensors of dtype ``io`` on a device of that type (README, equation 1)."""
-    text = _text("forward.inl", device_type, io, STRIP[device_type])
+def forward_kernel(device_type: str, io: torch.dtype, turned: bool) -> Any:
+    """The kernel for tensors of dtype ``io`` on a device of that type (README, equation 1).
+
+    If x is ``turned`` (``runtime.views.is_turned``), the launch's first dimension is channels.
+    """
+    piece = TURNED_STRIP if turned else STRIP[device_type]
+    text = _text("forward.inl", device_type, io, piece, turned)
     inputs = {**_window(device_type, io), "stream": int}
     outputs = {"y_out": wp.array3d(dtype=WARP_DTYPES[io])}
-    return native_kernel("conv_forward", text, inputs, outputs, indices="task, k")
+    return native_kernel("conv_forward", text, inputs, outputs, _INDICES[turned])
 
 
 @functools.cache
-def backward_kernel(device_type: str, io: torch.dtype) -> Any:
-    """The kernel of the gradients (README, equation 2); those of the weight are one sum a chunk."""
-    text = _text("backward.inl", device_type, io, CHUNK[device_type])
+def backward_kernel(device_type: str, io: torch.dtype, turned: bool) -> Any:
+    """The kernel of the gradients (README, equation 2); those of the weight are one sum a chunk.
+
+    It is ``turned`` where x or the gradient of the output is.
+    """
+    text = _text("backward.inl", device_type, io, CHUNK[device_type], turned)
     rows = wp.array3d(dtype=WARP_DTYPES[io])
     inputs = {**_window(device_type, io), "dout_in": rows}
     sums = wp.array3d(dtype=VALUES[device_type][0])
     outputs = {"dx_out": rows, "dstate_out": rows, "dweight_out": sums}
-    return native_kernel("conv_backward", text, inputs, outputs, indices="task, k")
+    return native_kernel("conv_backward", text, inputs, outputs, _INDICES[turned])

@@ -4,20 +4,20 @@ import torch
 from torch import Tensor
 
 from ..runtime.launch import launch
-from ..runtime.memory import empty
+from ..runtime.memory import empty_like
 from ..runtime.native import streams
 from ..runtime.operator import operator
 from ..runtime.packed import count_slots, pieces
 from ..runtime.stand_in import kind_of
-from ..runtime.views import lane_contiguous, view
-from .kernels import CHUNK, STRIP, TAPS, VALUES, backward_kernel, forward_kernel
+from ..runtime.views import dense, is_turned, laid_as, lane_contiguous, view
+from .kernels import CHUNK, STRIP, TAPS, TURNED_STRIP, VALUES, backward_kernel, forward_kernel
 
 _ARGUMENTS = "Tensor x, Tensor weight, Tensor? bias, Tensor? state, Tensor? packed, bool silu"
 _FEW = 1 << 15  # elements that one thread has done before it could wake another
 
 
-def _empty(like: Tensor, shape: tuple[int, ...]) -> Tensor:
-    return empty(shape, like.dtype) if like.device.type == "cpu" else like.new_empty(shape)
+def _like(x: Tensor) -> Tensor:
+    return empty_like(x) if x.device.type == "cpu" else x.new_empty(x.shape)
 
 
 def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
@@ -68,20 +68,21 @@ def conv(x, weight, bias, state, packed, silu):
     ``packed`` are the sequences (``runtime.packed``), or None.
     """
     kind = kind_of(x.device)
-    strips, where = _pieces(x, packed, STRIP[kind])
-    x = lane_contiguous(x)
+    x = dense(x)
+    turned = is_turned(x)
+    strips, where = _pieces(x, packed, TURNED_STRIP if turned else STRIP[kind])
     blocks, w, v, rows = _operands(x, weight, bias, state)
-    out = _empty(x, tuple(x.shape))
-    kernel = forward_kernel(kind, x.dtype)
-    stream = int(kind == "cpu" and streams([out]))
+    out = _like(x)
+    kernel = forward_kernel(kind, x.dtype, turned)
+    stream = int(kind == "cpu" and streams([out]) and not (turned and packed is not None))
     inputs = [int(silu), where, x, w, v, rows, stream]
-    _launch(x, kernel, (strips, blocks), inputs, [out])
+    _launch(x, kernel, (blocks, strips) if turned else (strips, blocks), inputs, [out])
     return out
 
 
 @conv.register_fake
 def _(x, weight, bias, state, packed, silu):
-    return torch.empty_like(x, memory_format=torch.contiguous_format)
+    return laid_as(x, x.new_empty)
 
 
 @torch.library.custom_op(
@@ -94,10 +95,11 @@ def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     batch, length, channels = x.shape
     kind = kind_of(x.device)
     chunks, where = _pieces(x, packed, CHUNK[kind])
-    x = lane_contiguous(x)
+    x, dout = dense(x), dense(dout)
+    turned = is_turned(x) or is_turned(dout)
     value, width = VALUES[kind]
     blocks, w, v, rows = _operands(x, weight, bias, state)
-    dx = _empty(x, (batch, length if need_x else 0, channels))
+    dx = _like(x) if need_x else x.new_empty(batch, 0, channels)
     dstate = x.new_zeros(len(rows), TAPS - 1 if need_state else 0, channels)
     make = torch.empty if packed is None else torch.zeros  # a piece may have no token
     shape = chunks, 5 if need_weight or need_bias else 0, blocks * width
@@ -105,9 +107,9 @@ def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     shaped = dweight.view(*dweight.shape[:2], blocks, width) if width > 1 else dweight
     _launch(
         x,
-        backward_kernel(kind, x.dtype),
-        (chunks, blocks),
-        [int(silu), where, x, w, v, rows, lane_contiguous(dout)],
+        backward_kernel(kind, x.dtype, turned),
+        (blocks, chunks) if turned else (chunks, blocks),
+        [int(silu), where, x, w, v, rows, dout],
         [dx, dstate, view(shaped, value)],
     )
     grads = [dx] if need_x else []
@@ -123,11 +125,12 @@ def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
 
 @_conv_backward.register_fake
 def _(dout, x, weight, bias, state, packed, silu, needs):
-    return [
+    made = [
         torch.empty_like(a, memory_format=torch.contiguous_format)
         for a, needed in zip((x, weight, bias, state), needs)
         if needed
     ]
+    return [laid_as(x, x.new_empty), *made[1:]] if needs[0] else made
 
 
 def _setup_context(ctx, inputs, output):

@@ -1,7 +1,7 @@
-// needs: kernels.py: WIDTH, x_in, PIECE, pieces_in, task, k, state_in, weight_in, bias_in;
+// needs: kernels.py: WIDTH, TURNED, x_in, PIECE, pieces_in, task, k, state_in, weight_in, bias_in;
 //     scalars.py: reciprocal_, exp2_, ELEMENT; lanes.h: rows_, read_, write_, put_, fma_, sigmoid_
 // gives: F, each_, fma_, sigmoid_, one, rows_, b, t0, d, width, read_, write_, put_, next_, pieces,
-//     begin, stop, own, end, xs, before, w, taps, w0, w1, w2, w3, bias, x0, x1, x2
+//     begin, stop, own, end, rows, before, w, taps, w0, w1, w2, w3, bias, x0, x1, x2, start
 // The beginning of both kernels. A value F is WIDTH channels, from the head of kernels.py: sixteen
 // lanes on a CPU, a few numbers on CUDA.
 #if defined(__CUDA_ARCH__)
@@ -84,8 +84,6 @@ auto put_ = [&](const auto& rows, int t, F f, bool) { write_(rows, t, f); };
 auto next_ = [](const auto&, int) {};
 #else
 const F one = F{} + 1.0f;
-// Each row is in another page, so no processor prefetches the next lanes for the next task.
-auto next_ = [](const auto& rows, int t) { __builtin_prefetch(rows.row(t) + WIDTH); };
 #endif
 const int pieces = (x_in.shape[1] + PIECE - 1) / PIECE;
 int b = 0, begin = 0, stop = x_in.shape[1], t0 = 0, own = 0;  // ``own``: the sequence
@@ -94,16 +92,28 @@ if (pieces_in.shape[0] > 0) {
     b = piece[0], begin = piece[1], stop = piece[2], t0 = piece[3], own = piece[4];
     if (own < 0) return;
 } else b = own = task / pieces, t0 = task % pieces * PIECE;
+#if !defined(__CUDA_ARCH__)
+// Each row is in another page, so no processor prefetches what the next task reads: the next lanes,
+// or of turned rows the next tokens, whose lines these tokens share.
+auto next_ = [&](const auto& rows, int t) {
+    const int own = t - t0, lines = PIECE * sizeof(*rows.first) / 64;
+    __builtin_prefetch(!TURNED
+            ? (char*)(rows.row(t) + WIDTH)
+            : (char*)rows.row(t0 + PIECE) + own / lines * rows.across + own % lines * 64 + 63);
+};
+#endif
 const int end = t0 + PIECE < stop ? t0 + PIECE : stop;
 const int d = k * WIDTH, width = x_in.shape[2] - d < WIDTH ? x_in.shape[2] - d : WIDTH;
-const auto xs = rows_(x_in, b, 0, d, width), before = rows_(state_in, own, 0, d, width);
+const auto rows = rows_(x_in, b, 0, d, width), before = rows_(state_in, own, 0, d, width);
 const F* const w = (const F*)weight_in.data + k;
 const size_t taps = weight_in.shape[1];
 const F w0 = w[0], w1 = w[taps], w2 = w[2 * taps], w3 = w[3 * taps];
 const F bias = ((const F*)bias_in.data)[k];
 F x0 = F{}, x1 = F{}, x2 = F{};  // the three tokens before
-for (int t = t0 - 3; t < t0; ++t) {
-    x0 = x1, x1 = x2;
-    if (t >= begin) x2 = read_(xs, t);
-    else if (state_in.shape[1] > 0) x2 = read_(before, t - begin + 3);
-}
+auto start = [&](const auto& xs) {
+    for (int t = t0 - 3; t < t0; ++t) {
+        x0 = x1, x1 = x2;
+        if (t >= begin) x2 = read_(xs, t);
+        else if (state_in.shape[1] > 0) x2 = read_(before, t - begin + 3);
+    }
+};

@@ -1,7 +1,8 @@
 // needs: native.py: TABLE, DEGREE
 // gives: F, I, splat, fma_, max_abs_, in_range_, LOG2E, shifter, POWER_2, POWER_3, POWER_4,
 //     POWER_5, POWER_6, horner_, exp2_clamped_, exp2_, decay_, exp2_parts_, exp2_fm1_,
-//     softplus_of_, softplus_, sigmoid_, rows_, H, S, Line, narrow_, read_, write_, put_
+//     softplus_of_, softplus_, sigmoid_, rows_, H, S, Line, narrow_, read_, write_, put_, turn_,
+//     tiles_, Lanes, gather_, scatter_
 // Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_fm1_; TABLE:
 // true to take a table instead where the processor has AVX-512.
 typedef float F __attribute__((vector_size(64), aligned(4)));
@@ -126,8 +127,8 @@ auto sigmoid_ = [&](F v) -> F {
 };
 #undef TABLED
 
-// Rows of a tensor [B, L, D] as lanes. A row is dense in D; tokens and batch elements may be
-// strided.
+// Rows of a tensor [B, L, D] as lanes. Its channels are dense, or its tokens are, and it is turned.
+// The other dimensions may be strided.
 
 // The rows from batch element b, token t0 and channel d on: lanes past the width are read as 0 and
 // not written.
@@ -135,12 +136,16 @@ auto rows_ = [](auto& array, int b, int t0, int d, int width) __attribute__((alw
     auto* at = array.data;
     struct Rows {
         decltype(at) first;
-        size_t step;  // bytes
+        size_t step, across;  // bytes between tokens, and between channels
         int width;
         decltype(at) row(int t) const { return (decltype(at))((char*)first + t * step); }
+        bool turned() const { return across != sizeof(*first) && step == sizeof(*first); }
+        // rows of which each is a channel; their lanes are the tokens from t to before ``end``
+        Rows channels(int t, int end) const { return {row(t), across, step, end - t}; }
     };
-    at = (decltype(at))((char*)at + (size_t)b * array.strides[0] + (size_t)t0 * array.strides[1]);
-    return Rows{at + d, (size_t)array.strides[1], width};
+    const size_t step = (size_t)array.strides[1], across = (size_t)array.strides[2];
+    at = (decltype(at))((char*)at + (size_t)b * array.strides[0] + (size_t)t0 * step + d * across);
+    return Rows{at, step, across, width};
 };
 
 typedef _Float16 H __attribute__((vector_size(32), aligned(2)));
@@ -199,4 +204,81 @@ auto write_ = [&](const auto& rows, int t, F v) __attribute__((always_inline)) {
 auto put_ = [&](const auto& rows, int t, F v, bool stream) __attribute__((always_inline)) {
     if (stream) __builtin_nontemporal_store((Line)v, (Line*)rows.row(t));
     else write_(rows, t, v);
+};
+
+// Sixteen values of sixteen lanes are turned: lane j of value i becomes lane i of value j. A round
+// exchanges a bit of i and one of j, of which the last two count within 128 bits, the first two
+// count these; so no instruction moves numbers across these 128 bits one by one, which is slow.
+auto turn_ = [](F* v) __attribute__((always_inline)) {
+    auto place = [](int i) { return i % 4 * 4 + i / 4 % 2 * 2 + i / 8; };
+    F w[16];
+#pragma unroll
+    for (int i = 0; i < 16; ++i) w[place(i)] = v[i];
+#pragma unroll
+    for (int round = 0; round < 4; ++round) {
+        F x[16];
+#pragma unroll
+        for (int i = 0; i < 8; ++i) {
+            const F a = w[i], b = w[i + 8];
+            if (round < 2) {
+                x[2 * i] = __builtin_shufflevector(
+                    a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+                x[2 * i + 1] = __builtin_shufflevector(
+                    a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+            } else {
+                x[2 * i] = __builtin_shufflevector(
+                    a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
+                x[2 * i + 1] = __builtin_shufflevector(
+                    a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+            }
+        }
+#pragma unroll
+        for (int i = 0; i < 16; ++i) w[i] = x[i];
+    }
+#pragma unroll
+    for (int i = 0; i < 16; ++i) v[i] = w[place(i)];
+};
+// Calls tile(t, width, end) for the tokens from begin to before ``end`` of turned rows, by sixteen
+// or fewer at the end; tiles without missing lanes are compiled by themselves.
+auto tiles_ = [](const auto& rows, int begin, int end, auto tile) __attribute__((always_inline)) {
+    for (int t = begin; t < end; t += 16)
+        if (rows.width >= 16 && t + 16 <= end) tile(t, 16, t + 16);
+        else tile(t, rows.width, t + 16 < end ? t + 16 : end);
+};
+// Tokens in memory, from ``begin`` on, each as lanes: ``step`` bytes lie between them.
+struct Lanes {
+    float* first;
+    size_t step;
+    int begin, width;
+    float* row(int t) const { return (float*)((char*)first + (t - begin) * step); }
+};
+// Brings tokens to ``to``.
+auto gather_ = [&](const auto& rows, int begin, int end, F* to, size_t step)
+                   __attribute__((always_inline)) -> Lanes {
+    const Lanes lanes = {(float*)to, step, begin, 16};
+    if (!rows.turned())
+        for (int t = begin; t < end; ++t) write_(lanes, t, read_(rows, t));
+    else
+        tiles_(rows, begin, end, [&](int t, int width, int stop) __attribute__((always_inline)) {
+            const auto channels = rows.channels(t, stop);
+            F v[16] = {};
+            for (int i = 0; i < width; ++i) v[i] = read_(channels, i);
+            turn_(v);
+            for (int i = 0; i < channels.width; ++i) write_(lanes, t + i, v[i]);
+        });
+    return lanes;
+};
+// Writes ``value(t)`` of tokens t.
+auto scatter_ = [&](const auto& rows, int begin, int end, auto value,
+                    bool stream) __attribute__((always_inline)) {
+    if (!rows.turned())
+        for (int t = begin; t < end; ++t) put_(rows, t, value(t), stream);
+    else
+        tiles_(rows, begin, end, [&](int t, int width, int stop) __attribute__((always_inline)) {
+            const auto channels = rows.channels(t, stop);
+            F v[16] = {};
+            for (int i = 0; i < channels.width; ++i) v[i] = value(t + i);
+            turn_(v);
+            for (int i = 0; i < width; ++i) put_(channels, i, v[i], stream);
+        });
 };

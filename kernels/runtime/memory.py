@@ -26,6 +26,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from .views import laid_as
+
 LARGE = 4 << 20  # bytes from which a tensor is taken from the pool
 _PAGE = 2 << 20  # a huge page
 _SHARE = 8  # the pool keeps this part of the memory at most
@@ -150,6 +152,11 @@ def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
         return torch.empty(*shape, dtype=dtype)
     # Not a view: autograd lets nobody change a view in place that was made inside an operator.
     return torch.empty(0, dtype=dtype).set_(pool.take(size).untyped_storage()).resize_(shape)
+
+
+def empty_like(x: Tensor) -> Tensor:
+    """The same for a result of the shape, dtype and layout of x (``views.laid_as``)."""
+    return laid_as(x, lambda shape: empty(shape, x.dtype))
 
 
 def release() -> None:

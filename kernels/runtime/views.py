@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, TypeVar, cast, get_type_hints, overload
 
 import warp as wp
 from torch import Tensor
 
-from .stand_in import is_dry
+from .stand_in import is_dry, kind_of
 
 _Class = TypeVar("_Class")
 _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
@@ -165,6 +166,27 @@ def as_struct(record: Any) -> Packed:
 def lane_contiguous(tensor: Tensor) -> Tensor:
     """The tensor itself if its last dimension is dense (rows may be strided), else a dense copy."""
     return tensor if tensor.stride(-1) == 1 or tensor.shape[-1] == 1 else tensor.contiguous()
+
+
+def is_turned(x: Tensor) -> bool:
+    """True if a CPU's kernels read ``[B, L, D]`` along its tokens: these are dense, channels not.
+
+    It is a view of mamba-ssm's ``[B, D, L]``. CUDA's kernels have none.
+    """
+    return x.stride(2) != 1 and x.stride(1) == 1 and x.shape[2] != 1 and kind_of(x.device) == "cpu"
+
+
+def dense(x: Tensor) -> Tensor:
+    """The tensor itself if it is turned or its channels are dense, else a dense copy."""
+    return x if is_turned(x) else lane_contiguous(x)
+
+
+def laid_as(x: Tensor, make: Callable[[tuple[int, ...]], Tensor]) -> Tensor:
+    """Result of the shape ``[B, L, D]`` of x, turned if x is; ``make`` gives dense memory."""
+    if not is_turned(x):
+        return make(tuple(x.shape))
+    batch, length, channels = x.shape
+    return make((batch, channels, length)).transpose(1, 2)
 
 
 @overload

@@ -284,6 +284,8 @@ def selective_scan_fn(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Run the scan with the arguments and layout of mamba-ssm's ``selective_scan_fn``.
 
+    A CPU reads tensors as they lie, with adjacent tokens or channels, in any mixture, also slices.
+
     Args:
         u: ``[B, D, L]`` float32, bfloat16 or float16; likewise delta and z.
         delta: as u.
@@ -297,7 +299,7 @@ def selective_scan_fn(
         return_last_state: also return ``[B, D, N]`` float32 (its gradient flows here).
 
     Returns:
-        ``[B, D, L]`` in u's dtype, with channels adjacent in memory.
+        ``[B, D, L]`` in u's dtype; on a CPU in u's layout, on CUDA with adjacent channels.
 
     Raises:
         TypeError: as ``selective_scan``; also for complex A, B or C.

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ..runtime.operator import operator
 from ..runtime.stand_in import kind_of
+from ..runtime.views import laid_as
 from .cpu import launch as cpu
 from .problem import Inputs, Options, Scan
 
@@ -41,7 +42,7 @@ def scan(*arguments) -> tuple[Tensor, Tensor, Tensor]:
 def _(*arguments):
     x = Scan.of(*arguments)
     u, A, C = x.inputs.u, x.inputs.A, x.inputs.C
-    out = torch.empty_like(u, memory_format=torch.contiguous_format)
+    out = laid_as(u, u.new_empty)
     last = A.new_empty(x.sequences, *A.shape)
     saved = A.new_empty(_implementation(u).saved_shape(x))
     return out if C is not None else out.new_empty(u.shape[0], 0, u.shape[2]), last, saved
@@ -62,12 +63,16 @@ def _scan_backward(dout, dlast, saved, needs, *arguments) -> list[Tensor]:
 def _(dout, dlast, saved, needs, *arguments):
     x = Scan.of(*arguments)
     A = x.inputs.A
-    like = x.inputs._replace(initial_state=A.new_empty(x.sequences, *A.shape))
-    return [
-        torch.empty_like(tensor, memory_format=torch.contiguous_format)
-        for tensor, needed in zip(like, needs)
-        if needed and tensor is not None
-    ]
+    likes = x.inputs._replace(initial_state=A.new_empty(x.sequences, *A.shape))
+
+    def fake(name: str, like: Tensor) -> Tensor:
+        if name in ("u", "delta", "z"):
+            return laid_as(like, like.new_empty)
+        dense = torch.preserve_format if name in ("B", "C") else torch.contiguous_format
+        return torch.empty_like(like, memory_format=dense)
+
+    each = zip(Inputs._fields, likes, needs)
+    return [fake(name, x) for name, x, needed in each if needed and x is not None]
 
 
 def _setup_context(ctx, inputs, output):

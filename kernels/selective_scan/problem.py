@@ -74,17 +74,22 @@ class Scan(NamedTuple):
         return len(self.inputs.u if self.options.packed is None else self.options.packed)
 
 
-def in_dtypes(gradients: Inputs, inputs: Inputs, needs: Inputs) -> Inputs:
-    """Return the needed gradients, dense and in the dtypes of their inputs.
+def like_inputs(gradients: Inputs, inputs: Inputs, needs: Inputs) -> Inputs:
+    """Return the needed gradients in the dtypes of their inputs, those of B and C in their layout.
 
-    That of ``initial_state``, which a backward pass does not have, is float32 as ``A``.
+    Those of u, delta and z have it, the others are dense. That of ``initial_state``, which a
+    backward pass does not have, is float32 as ``A``.
     """
-    dtypes = inputs._replace(initial_state=inputs.A)
+
+    def like_input(name: str, x: Tensor, like: Tensor) -> Tensor:
+        if name not in ("B", "C") or (x.dtype, x.stride()) == (like.dtype, like.stride()):
+            return x.to(like.dtype)
+        return torch.empty_like(like).copy_(x)
+
+    likes = inputs._replace(initial_state=inputs.A)
+    each = zip(Inputs._fields, gradients, likes, needs)
     return Inputs(
-        *(
-            x.to(like.dtype, memory_format=torch.contiguous_format) if needed else None
-            for x, like, needed in zip(gradients, dtypes, needs)
-        )
+        *(like_input(name, x, like) if needed else None for name, x, like, needed in each)
     )
 
 

@@ -1,4 +1,5 @@
-// needs: lanes.h: F, fma_, splat, put_; kernels.py: work_out, sums_out, sizes, dlast_in, TOKENS,
+// needs: lanes.h: F, fma_, splat, put_, scatter_; kernels.py: work_out, sums_out, sizes, rows_in,
+//     task, channel_in, u_in, delta_in, z_in, dout_in, dlast_in, TOKENS, AT_ONCE, TURNED,
 //     starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB, NEED_DC, NEED_DZ,
 //     NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out; problem.py: WEIGHTED
 // gives: the body of scan_backward
@@ -6,24 +7,35 @@
 // backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums begin anew in the first of the
 // BLOCKS lane groups that share them. Gradients that are not in ``needs`` are not computed.
 #include "task.h"
-F *const work = row_(work_out, piece_(work_out)), *const sums = row_(sums_out, piece_(sums_out));
-auto work_of = [&](const Position& p) { return work + p.j * 3 * sizes.states; };
+#include "strip.h"
+#include "prepare.h"
+const int states = sizes.states, stream = sizes.stream;
+F *const work = piece_(work_out, sizes, task), *const sums = piece_(sums_out, sizes, task);
+auto work_of = [&](const Position& p) { return work + p.j * 3 * states; };
 auto enter = [&](const Position& p) {
-    load_(dlast_in, p, work_of(p)), fill_(work_of(p) + 2 * sizes.states, 0.0f);
+    load_(dlast_in, p, states, work_of(p)), fill_(work_of(p) + 2 * states, states, 0.0f);
 };
 auto walk = [&](const Position p) __attribute__((always_inline)) {
-#include "prepare.h"
+    alignas(64) PerToken per_token[TOKENS];
+    alignas(64) Saved saved[TOKENS * AT_ONCE];
+    alignas(64) Token token[TOKENS];
+    const Group group = group_(channel_in, p);
+    const int count = p.count;
+    Fetches fetches;
+    const F max_rate =
+        prepare_(sizes, p, group, u_in, delta_in, z_in, dout_in, token, per_token, fetches);
     F *const dh_of = work_of(p), *const da_of = dh_of + 2 * states;
     const int chunk = p.chunk + (p.t0 - p.begin) / TOKENS;
     const F* const start = row_(starts_in, chunk, p.k);
-    write_soon_(du_out), write_soon_(ddelta_out), write_soon_(dz_out);
+    write_soon_(fetches, du_out, p, stream), write_soon_(fetches, ddelta_out, p, stream);
+    write_soon_(fetches, dz_out, p, stream);
     const bool first = p.j % BLOCKS == 0;
     auto reverse = [&](auto kind, auto range, const auto& at,
                        int needs) __attribute__((always_inline)) {
         using State = decltype(kind);
         constexpr int K = sizeof(at.a) / sizeof(F);
         const int n = at.n;
-        const Column b = column_(b_in, n), c = column_(c_in, n);
+        const Column b = column_(b_in, p, n), c = column_(c_in, p, n);
         F *const db = sums + n * TOKENS, *const dc = sums + (states + n) * TOKENS;
         if (first)
             for (int t = 0; t < K * TOKENS; ++t) {
@@ -34,7 +46,7 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
         F das[K];
 #pragma unroll
         for (int k = 0; k < K; ++k) hs[k] = State(start[n + k], F{}, at.slow[k]);
-        Fetch fetch = fetch_();
+        Fetch fetch = fetches.next();
         for (int t = 0; t < count; ++t) {
             fetch.next();
             const float *const bt = b.row(t), *const ct = c.row(t);
@@ -62,7 +74,7 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
             dhs[k] = State(dh_of[n + k], dh_of[states + n + k], at.slow[k]);
             das[k] = F{};
         }
-        fetch = fetch_();
+        fetch = fetches.next();
         for (int t = count - 1; t >= 0; --t) {
             fetch.next();
             const float *const bt = b.row(t), *const ct = c.row(t);
@@ -103,33 +115,47 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
         }
     };
     const int needs = sizes.needs, all = NEED_DZ | NEED_DC | NEED_DB | NEED_DH;
-    visit_(needs == all, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
+    auto walk = [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
         if constexpr (sizeof(at.a) / sizeof(F) == 1) reverse(kind, range, at, needs);
         else reverse(kind, range, at, all);
-    });
+    };
+    visit_(group, max_rate, needs == all, walk);
+    fetches.rest(count);
 
     // Equations 9 and 11, dz, and the chunk's sums for dD and ddelta_bias. They are added by runs
     // of eight tokens, because equal terms would round to the same side at every token.
-    const auto du = here_(du_out, p.width);
-    const auto ddelta = here_(ddelta_out, p.width);
-    const auto dz = here_(dz_out, p.width);
+    auto du = [&](int t) {
+        return fma_(token[t].rate * (1.0f / SCALE), token[t].s, group.skip * token[t].dy);
+    };
+    auto ddelta = [&](int t) { return token[t].p; };
+    auto dz = [&](int t) { return token[t].y * per_token[t].gate; };
+    const auto dus = here_(du_out, p, p.width), dzs = here_(dz_out, p, p.width);
+    const auto ddeltas = here_(ddelta_out, p, p.width);
     const bool need_u = du_out.shape[1] > 0, need_delta = ddelta_out.shape[1] > 0;
     const bool need_z = dz_out.shape[1] > 0;
+    auto write = [&](auto put) __attribute__((always_inline)) {
+        if (need_u) put(dus, du);
+        if (need_delta) put(ddeltas, ddelta);
+        if (need_z) put(dzs, dz);
+    };
     F dskip = F{}, dbias = F{}, skips = F{}, biases = F{};
     for (int t = 0; t < count; ++t) {
-        const Token& own = token[t];
+        Token& own = token[t];
         const F u = per_token[t].u;
         skips = fma_(own.dy, u, skips);
-        const F d = fma_(u, own.s, own.p) * per_token[t].slope;
-        biases += d;
+        own.p = fma_(u, own.s, own.p) * per_token[t].slope;
+        biases += own.p;
         if ((t & 7) == 7 || t == count - 1) {
             dskip += skips, dbias += biases;
             skips = biases = F{};
         }
-        if (need_u) put_(du, t, fma_(own.rate * (1.0f / SCALE), own.s, skip * own.dy), stream);
-        if (need_delta) put_(ddelta, t, d, stream);
-        if (need_z) put_(dz, t, own.y * per_token[t].gate, stream);
+        if constexpr (!TURNED)
+            write([&](const auto& rows, auto value)
+                      __attribute__((always_inline)) { put_(rows, t, value(t), stream); });
     }
+    if constexpr (TURNED)
+        write([&](const auto& rows, auto value)
+                  __attribute__((always_inline)) { scatter_(rows, 0, count, value, stream); });
     *row_(dchannel_out, chunk, 0, p.k) = dskip;
     *row_(dchannel_out, chunk, 1, p.k) = dbias;
     // Adds the lanes of sums [states, TOKENS, 2], eight rows at a time, into [states, length].
@@ -143,7 +169,7 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
             + __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
     };
     auto sum_lanes_ = [&](const E* rows, float* total) {
-        for (int n = 0; n < sizes.states; ++n)
+        for (int n = 0; n < states; ++n)
             for (int t = 0; t < p.count; t += 8) {
                 const E* const r = rows + 2 * (n * TOKENS + t);
                 E v[8];
@@ -165,6 +191,6 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
             sum_lanes_((const E*)(sums + states * TOKENS), dc_out.data + part * size);
     }
 };
-each_(true, enter, walk, [&](const Position& p) {
-    store_(dfirst_out, p, work_of(p)), store_(da_out, p, work_of(p) + 2 * sizes.states);
+each_(sizes, position_(sizes, rows_in, task, true), true, enter, walk, [&](const Position& p) {
+    store_(dfirst_out, p, work_of(p)), store_(da_out, p, work_of(p) + 2 * states);
 });

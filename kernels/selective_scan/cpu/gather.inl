@@ -1,28 +1,37 @@
-// needs: lanes.h: F; kernels.py: work_out, sizes, c_in, dh_out, product_out
+// needs: lanes.h: F; kernels.py: work_out, sizes, rows_in, task, channel_in, TOKENS, u_in,
+//     delta_in, z_in, c_in, dout_in, dh_out, product_out
 // gives: the body of scan_gradient_states
 // The gradient of the outputs by the state before the first token, and the product of the decays.
 #include "task.h"
-F* const work = row_(work_out, piece_(work_out));
-auto work_of = [&](const Position& p) { return work + p.j * 4 * sizes.states; };
+#include "strip.h"
+#include "prepare.h"
+const int states = sizes.states;
+F* const work = piece_(work_out, sizes, task);
+auto work_of = [&](const Position& p) { return work + p.j * 4 * states; };
 auto enter = [&](const Position& p) {
-    pairs_(work_of(p), 0.0f), pairs_(work_of(p) + 2 * sizes.states, 1.0f);
+    pairs_(work_of(p), states, 0.0f), pairs_(work_of(p) + 2 * states, states, 1.0f);
 };
 auto walk = [&](const Position p) __attribute__((always_inline)) {
-#include "prepare.h"
+    alignas(64) Token token[TOKENS];
+    alignas(64) PerToken per_token[TOKENS];
+    const Group group = group_(channel_in, p);
+    Fetches fetches;
+    const F max_rate =
+        prepare_(sizes, p, group, u_in, delta_in, z_in, dout_in, token, per_token, fetches);
     F *const dh_of = work_of(p), *const product_of = dh_of + 2 * states;
-    visit_(true, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
+    auto gather = [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
         using State = decltype(kind);
         constexpr int K = sizeof(at.a) / sizeof(F);
         const int n = at.n;
-        const Column c = column_(c_in, n);
+        const Column c = column_(c_in, p, n);
         State dhs[K], products[K];
 #pragma unroll
         for (int k = 0; k < K; ++k) {
             dhs[k] = State(dh_of[n + k], dh_of[states + n + k], at.slow[k]);
             products[k] = State(product_of[n + k], product_of[states + n + k], at.slow[k]);
         }
-        Fetch fetch = fetch_();
-        for (int t = 0; t < count; ++t) {
+        Fetch fetch = fetches.next();
+        for (int t = 0; t < p.count; ++t) {
             fetch.next();
             const float* const ct = c.row(t);
 #pragma unroll
@@ -38,8 +47,10 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
             dhs[k].store(dh_of[n + k], dh_of[states + n + k]);
             products[k].store(product_of[n + k], product_of[states + n + k]);
         }
-    });
+    };
+    visit_(group, max_rate, true, gather);
+    fetches.rest(p.count);
 };
-each_(false, enter, walk, [&](const Position& p) {
-    store_(dh_out, p, work_of(p)), store_(product_out, p, work_of(p) + 2 * sizes.states);
+each_(sizes, position_(sizes, rows_in, task, false), false, enter, walk, [&](const Position& p) {
+    store_(dh_out, p, work_of(p)), store_(product_out, p, work_of(p) + 2 * states);
 });

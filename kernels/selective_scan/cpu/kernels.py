@@ -17,7 +17,9 @@ from ...runtime.native import WARP_DTYPES, lanes, native, native_kernel, prelude
 from ...runtime.views import struct
 from ..problem import DISCRETIZATIONS, macros
 
-SPAN = 32  # lane groups of a task at most: rows are read in long parts that fit a core's cache
+# Lane groups of a task at most: rows are read in long parts that fit a core's cache. Turned ones
+# are read along the tokens, and a task has the fewest that it can.
+SPAN = 32
 BLOCKS = 4  # lane groups whose dB and dC are one partial sum, whatever the number of threads
 FEW = 8  # states up to which the memory, and not the arithmetic, sets the time
 
@@ -60,12 +62,16 @@ class Tuning(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """Key of a compiled kernel: the dtypes of u and delta, the rule, and the tuning."""
+    """Key of a compiled kernel: the dtypes of u and delta, the rule, and the tuning.
+
+    ``turned``: u, delta, z, or the gradient of the output is (``runtime.views.is_turned``).
+    """
 
     io: torch.dtype
     delta_io: torch.dtype
     discretization: str
     tuning: Tuning
+    turned: bool
 
     def text(self, file: str, gradient: bool, output: bool = True) -> str:
         """A leaf's C++."""
@@ -77,7 +83,7 @@ class Kind(NamedTuple):
         text = native(
             _HERE / file, **macros(self.discretization, True), **limits, **NEEDS, SCALE=rule.scale,
             GRADIENT=gradient, OUTPUT=output, TOKENS=tokens, CHUNK=tuning.chunk, AT_ONCE=at_once,
-            BLOCKS=BLOCKS,
+            BLOCKS=BLOCKS, TURNED=self.turned,
         )  # fmt: skip
         return prelude(tuning.degree, tuning.table) + text
 

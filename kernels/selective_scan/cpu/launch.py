@@ -7,11 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...runtime.launch import parallel_launch
-from ...runtime.memory import empty
+from ...runtime.memory import empty, empty_like
 from ...runtime.native import W, lanes, streams
 from ...runtime.packed import count_slots, slots
-from ...runtime.views import filled, lane_contiguous, view
-from ..problem import DISCRETIZATIONS, Inputs, Scan, in_dtypes, sum_parts
+from ...runtime.views import dense, filled, is_turned, view
+from ..problem import DISCRETIZATIONS, Inputs, Scan, like_inputs, sum_parts
 from . import kernels
 from .kernels import BLOCKS, FEW, NEEDS, SPAN, Kind, Sizes, Tuning
 
@@ -37,12 +37,13 @@ class Layout:
     fewer segments than others have empty ones behind.
     """
 
-    def __init__(self, x: Scan, chunk: int, split: bool = True):
+    def __init__(self, x: Scan, chunk: int, span: int = SPAN, split: bool = True):
         """Cut a scan.
 
         Args:
             x: inputs and options of the scan.
             chunk: tokens; a state is saved at the start of each chunk.
+            span: blocks of a task at most; segments do not depend on it, nor do bits.
             split: True to allow several segments.
         """
         self.batch, self.length, self.channels = x.inputs.u.shape
@@ -53,13 +54,13 @@ class Layout:
         self.blocks = self.groups * self.group_blocks
         threads = torch.get_num_threads()
 
-        def spans(sequences: int) -> tuple[int, int]:  # blocks of one, and how many there are
+        def spans(sequences: int, most: int) -> tuple[int, int]:  # blocks of one, how many of them
             per_thread = max(1, min(self.group_blocks, -(-sequences * self.blocks // threads)))
-            span = min(SPAN, -(-per_thread // BLOCKS) * BLOCKS)
+            span = min(most, -(-per_thread // BLOCKS) * BLOCKS)
             return span, sequences * self.groups * -(-self.group_blocks // span)
 
-        _, alone = spans(self.batch if packed is None else 1)
-        self.span, count = spans(self.sequences)
+        _, alone = spans(self.batch if packed is None else 1, SPAN)
+        self.span, count = spans(self.sequences, span)
         most = -(-threads // alone) if split and 0 < alone < threads else 1
 
         def segment(length: int) -> int:  # its tokens
@@ -130,26 +131,29 @@ def _rows(states: Tensor | None):
 class _Operands:
     """Operands that the launches of one call share."""
 
-    def __init__(self, scan: Scan, split: bool = True):
+    def __init__(self, scan: Scan, dout: Tensor | None = None, split: bool = True):
         x, options = scan
         states = x.A.shape[1]
         tuning = TUNING._replace(walked=TUNING.walked or (2 if states <= FEW else 4))
-        self.layout = y = Layout(scan, tuning.chunk, split)
-        self.kind = Kind(x.u.dtype, x.delta.dtype, options.discretization, tuning)
+        u, delta, z = dense(x.u), dense(x.delta), dense(x.u if x.z is None else x.z)
+        turned = any(v is not None and is_turned(v) for v in (u, delta, z, dout))
+        span = SPAN if not turned else 1 if dout is None else BLOCKS
+        self.layout = y = Layout(scan, tuning.chunk, span, split)
+        self.kind = Kind(x.u.dtype, x.delta.dtype, options.discretization, tuning, turned)
         self.options = int(options.softplus), int(x.z is not None)
-        u, delta = lane_contiguous(x.u), lane_contiguous(x.delta)
         zero = x.A.new_zeros(y.channels, 1)
         skip, bias = (zero if v is None else v.float()[:, None] for v in (x.D, x.delta_bias))
         channel = torch.cat([x.A, x.A.abs().amax(1, keepdim=True), skip, bias], 1)
-        z = u if x.z is None else lane_contiguous(x.z)
         self.inputs = [y.rows, u, delta, z, view(y.pack(channel), lanes)]
         self.b = _entries(x.B)
         self.c = self.b if x.C is None else _entries(x.C)
+        # whole lines of turned results begin at a multiple of W tokens
+        self.whole = y.group_width % W == 0 and not (turned and options.packed is not None)
 
     def run(self, kernel, inputs: list, outputs: list, needs=0, results=()) -> None:
         """Launches a kernel of ``kernels.py``; ``results`` may go past the caches."""
         y = self.layout
-        stream = int(y.group_width % W == 0 and streams(results))
+        stream = int(self.whole and streams(results))
         sizes = filled(
             Sizes,
             *(y.length, y.segment, y.segments, y.sequences, y.states, y.groups, y.group_width),
@@ -193,7 +197,7 @@ def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
     read = x.C is not None
     s = _Operands(scan, split=read or not options.save)
     y, starts = s.layout, empty(saved_shape(scan), torch.float32)
-    out = empty(x.u.shape if read else (y.batch, 0, y.channels), x.u.dtype)
+    out = empty_like(x.u) if read else empty((y.batch, 0, y.channels), x.u.dtype)
     first, last = x.initial_state, s.states()
     if y.segments > 1:
         product = s.states()
@@ -223,18 +227,18 @@ def backward(
         needs: True where a gradient is needed; the others are None.
     """
     x, options = scan
-    s = _Operands(scan)
+    none = x.u.new_zeros(1, 1, x.u.shape[2]).expand_as(x.u)
+    dout = dense(none if dout is None else dout)
+    s = _Operands(scan, dout)
     y, chunk = s.layout, s.kind.tuning.chunk
     through = any(needs._replace(C=False, D=False, z=False))  # gradients of the states
     wanted = {"NEED_DZ": needs.z, "NEED_DC": needs.C, "NEED_DB": needs.B, "NEED_DH": through}
     flags = sum(NEEDS[name] for name, need in wanted.items() if need)
-    none = x.u.new_zeros(1, 1, y.channels).expand_as(x.u)
-    dout = lane_contiguous(none if dout is None else dout)
     if x.C is None:
         s.c = s.b.new_zeros(1, 1, 1, y.states).expand_as(s.b)
 
     def like(x: Tensor, needed: bool) -> Tensor:
-        return empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), x.dtype)
+        return empty_like(x) if needed else empty((x.shape[0], 0, x.shape[2]), x.dtype)
 
     def parts(needed: bool) -> Tensor:
         return empty((y.parts, y.states * y.length if needed else 0), torch.float32)
@@ -245,7 +249,8 @@ def backward(
         s.run(kernel, [s.c, dout], [s.work(4 * y.span), _rows(local), _rows(product)])
         dlast = _carry(dlast, local.flip(0), product.flip(0)).flip(0)
     dh, da = s.states(), s.states()
-    du, ddelta, dz = like(x.u, needs.u), like(x.delta, needs.delta), like(x.u, needs.z)
+    du, ddelta = like(x.u, needs.u), like(x.delta, needs.delta)
+    dz = like(x.u if x.z is None else x.z, needs.z)
     db, dc = parts(needs.B), parts(needs.C)
     make = torch.empty if options.packed is None else torch.zeros  # some have no chunk
     dchannel = make(y.chunks, 2, y.blocks, W, dtype=torch.float32)
@@ -271,4 +276,4 @@ def backward(
         delta_bias=y.unpack(dchannel[:, 1].sum(0)) if needs.delta_bias else None,
         initial_state=dh[0],
     )
-    return in_dtypes(gradients, x, needs)
+    return like_inputs(gradients, x, needs)

@@ -1,11 +1,9 @@
-// needs: kernels.py: GRADIENT, TOKENS, AT_ONCE, sizes, channel_in, SLOWEST, MODERATE; lanes.h: F,
-//     rows_, I, splat; problem.py: WEIGHTED; task.h: row_; forward.inl: p
-// gives: Token, PerToken, Saved, per_token, saved, token, max_rate, in_range, count, states,
-//     use_softplus, stream, channel, max_a, skip, bias, here_, Fetch, next, fetches, asked,
-//     fetched, more, read_soon_, write_soon_, fetch_, Plain, Slow, worth_slow_, slow_lanes_,
-//     Column, column_, Several, One, visit_
-// A strip of a lane group: the values of its tokens, TOKENS of them or fewer at the end, its states
-// and the loop over them.
+// needs: kernels.py: GRADIENT, TOKENS, AT_ONCE, TURNED, SLOWEST, MODERATE; lanes.h: F, I, rows_,
+//     gather_, in_range_, splat; problem.py: WEIGHTED; task.h: Position, row_
+// gives: Token, PerToken, Saved, Group, group_, here_, lanes_, Fetch, Fetches, lines_, read_soon_,
+//     write_soon_, Plain, Slow, worth_slow_, slow_lanes_, Column, column_, Several, One, visit_
+// A strip: TOKENS tokens of a lane group, or fewer at the end. Its memory, its rows, and the loop
+// over the states.
 // The values of a token lie together, because arrays of 4 KiB would evict one another from the
 // cache; those that the states do not need lie apart. A rate is δ times SCALE.
 #if GRADIENT
@@ -22,23 +20,33 @@ struct Saved {
     F g;
 #endif
 };
-alignas(64) PerToken per_token[TOKENS];
-alignas(64) Saved saved[TOKENS * AT_ONCE];
 #else
 struct Token {
     F rate, du, y, gate;
 };
 #endif
-alignas(64) Token token[TOKENS];
-F max_rate = F{};  // the largest |rate| of each lane
-bool in_range;     // true if all |rate A| are <= 125
+// A lane group: N rates A, the largest |A|, D and the bias.
+struct Group {
+    const F* a;
+    int states;
+    F max_a, skip, bias;
+};
+auto group_ = [&](const auto& channels, const Position& p) -> Group {
+    const int states = channels.shape[1] - 3;
+    const F* const a = row_(channels, p.k);
+    return {a, states, a[states], a[states + 1], a[states + 2]};
+};
 
-const int count = p.count, states = sizes.states;
-const bool use_softplus = sizes.use_softplus, stream = sizes.stream;
-// Of the lane group: N rates A, then the largest |A|, D and the bias.
-const F* const channel = row_(channel_in, p.k);
-const F max_a = channel[states], skip = channel[states + 1], bias = channel[states + 2];
-auto here_ = [&](auto& array, int width) { return rows_(array, p.b, p.t0, p.d, width); };
+// The rows of a strip as they lie.
+auto here_ = [&](auto& array, const Position& p, int width)
+                 __attribute__((always_inline)) { return rows_(array, p.b, p.t0, p.d, width); };
+// The same to be read, a token's lanes together: turned ones are first brought to a field of the
+// tokens, unless they are not ``used``.
+auto lanes_ = [&](auto& array, const Position& p, int width, F& field, bool used = true) {
+    const auto rows = here_(array, p, width);
+    if constexpr (TURNED) return gather_(rows, 0, used ? p.count : 0, &field, sizeof(Token));
+    else return rows;
+};
 
 // A row's cache lines lie together, but a lane group reads one line of each row. So the rows of the
 // next strip are prefetched in their order, each lane group its share, while the states are walked:
@@ -54,26 +62,48 @@ struct Fetch {
         line = last ? 0 : line;
     }
 };
-Fetch fetches[8];
-int asked = 0, fetched = 0;
-const int next = GRADIENT ? -TOKENS : TOKENS;
-const bool more = p.t0 + next >= 0 && p.t0 + next < sizes.length;
-auto read_soon_ = [&](auto& array) {
-    const auto rows = here_(array, 16);
-    const int row = p.j * count / p.blocks, line = p.j * count % p.blocks;
+struct Fetches {
+    Fetch all[8];
+    int asked = 0, fetched = 0;
+    Fetch next() {  // or one that repeats a line
+        if (fetched < asked) return all[fetched++];
+        return {(const char*)this, 0, 0, 0, 1};
+    }
+    void rest(int count) {
+        while (fetched < asked) {
+            Fetch fetch = next();
+            for (int t = 0; t < count; ++t) fetch.next();
+        }
+    }
+};
+// Of turned rows a channel's lines lie together; each is met at its end, since the strip may begin
+// within one, which the strip before has fetched.
+auto lines_ = [](const auto& rows, int64_t ahead) -> Fetch {
+    const int lines = TOKENS * sizeof(*rows.first) / 64;
+    const int64_t jump = (int64_t)rows.across - (lines - 1) * 64;
+    return {(const char*)rows.first + ahead + 63, 64, jump, 0, lines};
+};
+auto read_soon_ = [&](Fetches& fetches, auto& array, const Position& p) {
+    const int next = GRADIENT ? -TOKENS : TOKENS;
+    const bool more = p.t0 + next >= 0 && p.t0 + next < array.shape[1];
+    const auto rows = here_(array, p, 16);
     const int64_t step = rows.step, bytes = 16 * sizeof(*rows.first);
-    fetches[asked++] = {
-        (const char*)rows.first + (more ? (next + row) * step : 0) + (line - p.j) * bytes, bytes,
-        (more ? step : 0) - (p.blocks - 1) * bytes, line, p.blocks};
+    Fetch& fetch = fetches.all[fetches.asked++];
+    if (TURNED && rows.turned()) {
+        fetch = lines_(rows, more ? next * step : 0);
+        return;
+    }
+    const int row = p.j * p.count / p.blocks, line = p.j * p.count % p.blocks;
+    fetch = {(const char*)rows.first + (more ? (next + row) * step : 0) + (line - p.j) * bytes,
+        bytes, (more ? step : 0) - (p.blocks - 1) * bytes, line, p.blocks};
 };
-auto write_soon_ = [&](auto& array) {
+auto write_soon_ = [&](Fetches& fetches, auto& array, const Position& p, bool stream) {
     if (array.shape[1] == 0 || stream) return;
-    const auto rows = here_(array, 16);
-    fetches[asked++] = {(const char*)rows.first, (int64_t)rows.step, (int64_t)rows.step, 0, 1};
-};
-auto fetch_ = [&]() -> Fetch {  // the next prefetch, or one that repeats a line
-    if (fetched < asked) return fetches[fetched++];
-    return {(const char*)token, 0, 0, 0, 1};
+    const auto rows = here_(array, p, 16);
+    const int64_t step = rows.step;
+    fetches.all[fetches.asked++] = TURNED && rows.turned()
+        ? lines_(rows, 0)
+        : Fetch{(const char*)rows.first, step, step, 0, 1};
 };
 
 #include "../discretize.h"
@@ -131,7 +161,7 @@ struct Column {
     const size_t step;
     const float* row(int t) const { return (const float*)(at + t * step); }
 };
-auto column_ = [&](auto& array, int n) -> Column {
+auto column_ = [](const auto& array, const Position& p, int n) -> Column {
     return {(const char*)array.data + (size_t)p.b * array.strides[0]
             + (size_t)p.t0 * array.strides[1] + (size_t)p.group * array.strides[2] + (size_t)n * 4,
         (size_t)array.strides[1]};
@@ -151,19 +181,21 @@ struct One {
 // Walks all states: ``several`` at once, so that values that do not depend on them are read and
 // written once, unless an exponential needs a clamp. The order of all sums is that of one state
 // after the other, to the last bit. ``walk`` gets the kind of state, the range of x, and the
-// states.
-auto visit_ = [&](bool several, auto walk) __attribute__((always_inline)) {
+// states; ``max_rate`` is the largest |rate| of each lane.
+auto visit_ = [&](const Group& group, F max_rate, bool several,
+                  auto walk) __attribute__((always_inline)) {
+    const bool in_range = in_range_(max_rate * group.max_a);
     auto visit = [&](auto at) __attribute__((always_inline)) {
         constexpr int K = sizeof(at.a) / sizeof(F);
         if constexpr (K == 1)
             if (!in_range) {
-                at.a[0] = channel[at.n];
+                at.a[0] = group.a[at.n];
                 return walk(Plain(), AnyRange(), at);
             }
         F least = splat(125.0f);
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            at.a[k] = channel[at.n + k];
+            at.a[k] = group.a[at.n + k];
             least = __builtin_elementwise_min(least, __builtin_elementwise_abs(max_rate * at.a[k]));
         }
         const bool look = worth_slow_(least);  // false for most strips
@@ -172,13 +204,9 @@ auto visit_ = [&](bool several, auto walk) __attribute__((always_inline)) {
         if (look && __builtin_reduce_or(any)) walk(Slow(), InRange(), at);
         else walk(Plain(), InRange(), at);
     };
-    for (int n = 0; n < states;)
-        if (several && in_range && n + AT_ONCE <= states) {
+    for (int n = 0; n < group.states;)
+        if (several && in_range && n + AT_ONCE <= group.states) {
             visit(Several{n});
             n += AT_ONCE;
         } else visit(One{n++});
-    while (fetched < asked) {
-        Fetch fetch = fetch_();
-        for (int t = 0; t < count; ++t) fetch.next();
-    }
 };

@@ -1,5 +1,5 @@
-// needs: kernels.py: sizes, BLOCKS, task, rows_in, CHUNK, TOKENS; lanes.h: F, splat
-// gives: Position, position_of, row_, states_, fill_, pairs_, load_, store_, piece_, each_
+// needs: kernels.py: BLOCKS, CHUNK, TOKENS; lanes.h: F, splat
+// gives: Position, position_, row_, states_, fill_, pairs_, load_, store_, piece_, each_
 // A task: a segment of the tokens of one sequence, and lane groups of one channel group. Tasks that
 // follow one another have the same lane groups and adjacent tokens, also in the backward order: the
 // rows that one prefetches beyond its tokens are those of the next.
@@ -14,7 +14,8 @@ struct Position {
     int j, k;      // lane group of the task, and of all
     int d, width;  // channels
 };
-auto position_of = [&](bool backwards) -> Position {
+// ``ranges``: of packed rows, for each segment its b, begin, end and chunk; or none
+auto position_ = [](const auto& sizes, const auto& ranges, int task, bool backwards) -> Position {
     const int spans = (sizes.group_blocks + sizes.span - 1) / sizes.span;
     const int parts = (sizes.group_blocks + BLOCKS - 1) / BLOCKS;
     const int rows = sizes.segments * sizes.batch, share = task / rows;
@@ -22,8 +23,8 @@ auto position_of = [&](bool backwards) -> Position {
     Position p = {};
     p.first = share % spans * sizes.span, p.group = share / spans;
     p.row = row;
-    if (rows_in.shape[0] > 0) {
-        const int* const own = (const int*)rows_in.data + (size_t)row * 4;
+    if (ranges.shape[0] > 0) {
+        const int* const own = (const int*)ranges.data + (size_t)row * 4;
         p.b = own[0], p.begin = own[1], p.end = own[2], p.chunk = own[3];
     } else {
         p.b = row % sizes.batch, p.begin = row / sizes.batch * sizes.segment;
@@ -46,41 +47,40 @@ auto row_ = [](auto& array, auto... indices) -> F* {
 // States, gradients of states and products of decays lie in the caller's order, [rows, D, N]; an
 // array without rows is zeros, or not needed. While a task walks its tokens they are lanes in the
 // workspace of the launch's piece: pairs, N values, then the rounding error of each (strip.h).
-auto states_ = [&](const auto& array, const Position& p) -> float* {
-    const size_t channels = (size_t)sizes.groups * sizes.group_width;
-    return (float*)array.data + (p.row * channels + p.d) * sizes.states;
+auto states_ = [](const auto& array, const Position& p) -> float* {
+    return (float*)array.data + ((size_t)p.row * array.shape[1] + p.d) * array.shape[2];
 };
-auto fill_ = [&](F* values, float value) {
-    for (int n = 0; n < sizes.states; ++n) values[n] = splat(value);
+auto fill_ = [&](F* values, int states, float value) {
+    for (int n = 0; n < states; ++n) values[n] = splat(value);
 };
-auto pairs_ = [&](F* pairs, float value) {
-    fill_(pairs, value), fill_(pairs + sizes.states, 0.0f);
+auto pairs_ = [&](F* pairs, int states, float value) {
+    fill_(pairs, states, value), fill_(pairs + states, states, 0.0f);
 };
-auto load_ = [&](const auto& array, const Position& p, F* pairs) {
-    pairs_(pairs, 0.0f);
+auto load_ = [&](const auto& array, const Position& p, int states, F* pairs) {
+    pairs_(pairs, states, 0.0f);
     if (array.shape[0] == 0) return;
     const float* const from = states_(array, p);
-    for (int n = 0; n < sizes.states; ++n)
-        for (int i = 0; i < p.width; ++i) ((float*)(pairs + n))[i] = from[i * sizes.states + n];
+    for (int n = 0; n < states; ++n)
+        for (int i = 0; i < p.width; ++i) ((float*)(pairs + n))[i] = from[i * states + n];
 };
 auto store_ = [&](auto& array, const Position& p, const F* values) {
     if (array.shape[0] == 0) return;
     float* const to = states_(array, p);
+    const int states = array.shape[2];
     for (int i = 0; i < p.width; ++i)
-        for (int n = 0; n < sizes.states; ++n)
-            to[i * sizes.states + n] = ((const float*)(values + n))[i];
+        for (int n = 0; n < states; ++n) to[i * states + n] = ((const float*)(values + n))[i];
 };
 // The row of a workspace that has one for each piece of the launch.
-auto piece_ = [&](const auto& array) -> int {
+auto piece_ = [&](auto& array, const auto& sizes, int task) -> F* {
     const long long tasks = (long long)sizes.segments * sizes.batch * sizes.groups
         * ((sizes.group_blocks + sizes.span - 1) / sizes.span);
-    return (int)(((task + 1ll) * array.shape[0] - 1) / tasks);
+    return row_(array, (int)(((task + 1ll) * array.shape[0] - 1) / tasks));
 };
 // Calls ``walk`` with the lane groups of every TOKENS tokens, in the tokens' order or backwards;
 // before it ``enter``, and after it ``leave`` with each lane group.
-auto each_ = [&](bool backwards, auto enter, auto walk, auto leave) __attribute__((always_inline)) {
+auto each_ = [](const auto& sizes, Position p, bool backwards, auto enter, auto walk,
+                 auto leave) __attribute__((always_inline)) {
 #include "../../runtime/denormals.h"
-    Position p = position_of(backwards);
     auto groups = [&](auto act) __attribute__((always_inline)) {
         for (p.j = 0; p.j < p.blocks; ++p.j) {
             const int own = p.first + p.j, left = sizes.group_width - own * 16;

@@ -21,7 +21,7 @@ from ...runtime.packed import count_slots
 from ...runtime.scalars import LOG2E, exp2
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
-from ..problem import DISCRETIZATIONS, Inputs, Scan, in_dtypes
+from ..problem import DISCRETIZATIONS, Inputs, Scan, like_inputs
 from .backward import backward_kernel
 from .blocks import MARK, RUN, Sizes, block_shape
 from .forward import forward_kernel
@@ -355,4 +355,4 @@ def backward(
         delta_bias=dbias.sum((0, 1)) if needs.delta_bias else None,
         initial_state=dfirst,
     )
-    return in_dtypes(gradients, x, needs)
+    return like_inputs(gradients, x, needs)
