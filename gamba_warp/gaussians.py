@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,6 +28,8 @@ class Gaussians:
         harmonics: ``[.., N, K, 3]``, K of 3, 8 or 15: coefficients of the spherical harmonics of
             degrees 1 to 1, 2 or 3 in the order and signs of 3DGS, for the view-dependent part
             added to ``colors`` (Kerbl et al. 2023); None: the colour is view-independent.
+        antialiased: True for Gaussians that were fitted with antialiasing (Mip-Splatting, gsplat's
+            mode "antialiased"); ``render`` draws them so.
     """
 
     means: Tensor
@@ -37,6 +38,7 @@ class Gaussians:
     opacities: Tensor
     colors: Tensor
     harmonics: Tensor | None = None
+    antialiased: bool = False
 
     def __post_init__(self) -> None:
         lead = tuple(self.opacities.shape)
@@ -61,10 +63,13 @@ class Gaussians:
         return self.opacities.shape[-1]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """Return a container with ``function`` applied to every tensor that is not None."""
+        """Return a container with ``function`` applied to every tensor."""
+        return replace(self, **{name: function(value) for name, value in self.tensors().items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the attributes that are tensors, by name."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        made: dict[str, Any] = {k: v if v is None else function(v) for k, v in values.items()}
-        return Gaussians(**made)
+        return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 
     def __getitem__(self, index) -> Gaussians:
         """Index the leading batch dimensions, the same way in every tensor."""
@@ -108,12 +113,11 @@ class Gaussians:
         if quats is None:
             quats = torch.zeros_like(self.means[..., :1]).expand(*self.means.shape[:-1], 4).clone()
             quats[..., 0] = 1.0
-        return Gaussians(
+        return replace(
+            self,
             means=scale * self.means @ rotation.mT + translation,
             quats=quat_multiply(rotation_quat.to(quats), quats),
             scales=scale * self.scales,
-            opacities=self.opacities,
-            colors=self.colors,
             harmonics=None if self.harmonics is None else turn_harmonics(self.harmonics, rotation),
         )
 

@@ -54,6 +54,8 @@ def render(
         colors = torch.cat([constant[..., None, :], gaussians.harmonics], -2)
     elif not colors.requires_grad:  # of files; networks and fits give none below 0
         colors = colors.clamp_min(0)
+    if gaussians.antialiased:
+        options.setdefault("rasterize_mode", "antialiased")
     with record_function("rasterizer"):
         pictures, alpha, meta = rasterization(
             means=gaussians.means,

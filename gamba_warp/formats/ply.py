@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from .gaussians.compressed import is_compressed, unpacked
 from .parts import color_range
 from .ply_data import PlyData, read_ply
 
+MIP = "SplatRenderMode: mip"  # comment of Gaussians that were fitted with antialiasing
 TURNED = "frame opengl"  # comment of files with y up, which earlier versions could write
 _FLAT = 1e-6  # third standard deviation of a flat Gaussian
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
@@ -75,7 +77,12 @@ def save_ply(path: str | Path, gaussians: Gaussians, *, comments: Iterable[str] 
     lines += [f"property float {name}" for names in columns for name in names]
     body = np.hstack(list(columns.values())).astype("<f4").tobytes()
     with atomic_path(path) as temporary:
-        temporary.write_bytes(header_bytes(comments, lines) + body)
+        temporary.write_bytes(header_bytes(marked(gaussians, comments), lines) + body)
+
+
+def marked(gaussians: Gaussians, comments: Iterable[str]) -> list[str]:
+    """Return the comments of a ``.ply``, with that of antialiasing if it applies."""
+    return [*([MIP] if gaussians.antialiased else []), *comments]
 
 
 def header_bytes(comments: Iterable[str], elements: Iterable[str]) -> bytes:
@@ -106,6 +113,7 @@ def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     data = read_ply(path, MAX_FILE)
     arrays = (unpacked if is_compressed(data.header) else _activated)(path, data)
     gaussians = checked_gaussians(path, arrays, left_out)
+    gaussians = replace(gaussians, antialiased=MIP in data.header.comments)
     return flip_axes(gaussians) if TURNED in data.header.comments else gaussians
 
 

@@ -231,7 +231,7 @@ def _run(model: Gamba, o: dict, inputs: dict, cameras: Cameras) -> dict[str, Ten
             camera = model.camera_token(cameras) if model.camera_token else None
             condition = prefix_states(model.blocks, camera, inputs["image_tokens"])
         gaussians = model(inputs["images"], cameras, condition)
-    return {k: x for k, x in vars(gaussians).items() if x is not None}
+    return gaussians.tensors()
 
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:

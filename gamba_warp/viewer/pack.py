@@ -80,9 +80,8 @@ def visible(gaussians: Gaussians, name: str) -> Gaussians:
         )
     gaussians = gaussians.detach().to("cpu", torch.float32)
     bad = torch.zeros(gaussians.num, dtype=torch.bool)
-    for value in vars(gaussians).values():
-        if value is not None:
-            bad |= ~value.reshape(gaussians.num, -1).isfinite().all(1)
+    for value in gaussians.tensors().values():
+        bad |= ~value.reshape(gaussians.num, -1).isfinite().all(1)
     if bad.any():
         count = int(bad.sum())
         raise UserError(f"{name}: {count} of {gaussians.num} Gaussians are not finite")

@@ -116,6 +116,7 @@ def viewer_parts(
         "total": gaussians.num,
         "count": seen.num,
         "degree": seen.degree,
+        "antialiased": seen.antialiased,
         "vertices": vertices,
         "faces": faces,
         "home": home,

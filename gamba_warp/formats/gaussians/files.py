@@ -11,7 +11,7 @@ from ...files import atomic_path
 from ...gaussians import Gaussians
 from ..headers import open_shape
 from ..names import SPLAT_FORMATS, SPLAT_SUFFIXES, SplatFormat
-from ..ply import MAX_FILE, TURNED, header_bytes, load_ply, save_ply
+from ..ply import MAX_FILE, TURNED, header_bytes, load_ply, marked, save_ply
 from ..ply_data import read_ply_header
 from .arrays import export_arrays
 from .compressed import WORDS, is_compressed, packed
@@ -150,6 +150,6 @@ def write_gaussians(
     if kind == "compressed-ply":
         lines, body, clipped = packed(export_arrays(path, gaussians))
         with atomic_path(path) as temporary:
-            temporary.write_bytes(header_bytes(comments, lines) + body)
+            temporary.write_bytes(header_bytes(marked(gaussians, comments), lines) + body)
         return f"{path}: the format clips harmonics to ±4." if clipped else None
     return (save_splat if kind == "splat" else save_spz)(path, gaussians)

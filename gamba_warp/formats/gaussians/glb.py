@@ -138,7 +138,7 @@ def _moved(
     moved = gaussians.transformed(
         torch.from_numpy(turn).float(), torch.from_numpy(matrix[:3, 3].copy()).float(), scale
     )
-    arrays = {name: value.numpy() for name, value in vars(moved).items() if value is not None}
+    arrays = {name: value.numpy() for name, value in moved.tensors().items()}
     return checked_gaussians(path, arrays, left_out)
 
 
@@ -150,5 +150,5 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
     for part in parts if most else ():
         own = torch.zeros(part.num, 0, 3) if part.harmonics is None else part.harmonics
         part.harmonics = F.pad(own, (0, 0, 0, most - own.shape[1]))
-    names = [name for name, value in vars(parts[0]).items() if value is not None]
+    names = parts[0].tensors()
     return Gaussians(**{name: torch.cat([getattr(p, name) for p in parts]) for name in names})

@@ -27,7 +27,7 @@ def save_splat(path: str | Path, gaussians: Gaussians) -> str | None:
     """Write one object as ``.splat`` in OpenCV's axes, atomically.
 
     Returns:
-        A sentence about lost harmonics, or None.
+        A sentence about what is lost, or None.
 
     Raises:
         UserError: a value is not finite, there is no Gaussian, or the file cannot be written.
@@ -41,9 +41,9 @@ def save_splat(path: str | Path, gaussians: Gaussians) -> str | None:
     records["quats"] = np.clip(np.rint(arrays["quats"] * 128 + 128), 0, 255)
     with atomic_path(path) as temporary:
         temporary.write_bytes(records[np.argsort(-weight, kind="stable")].tobytes())
-    if gaussians.harmonics is None:
-        return None
-    return f"{path}: the harmonics are lost, a .splat has one colour for all directions."
+    lost = ["harmonics"] * (gaussians.harmonics is not None)
+    lost += ["antialiasing"] * gaussians.antialiased
+    return f"{path}: a .splat has no place for {' and '.join(lost)}." if lost else None
 
 
 def load_splat(path: str | Path, left_out: list[str] | None = None) -> Gaussians:

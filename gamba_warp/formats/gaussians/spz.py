@@ -10,6 +10,7 @@ maintained reader takes, is written. Axes are OpenGL's.
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from .arrays import (
     smallest_three,
     warn_of_steps,
 )
-from .spz_container import COUNTS, HEADER, MAGIC, unpacked
+from .spz_container import ANTIALIASED, COUNTS, HEADER, MAGIC, unpacked
 
 _VERSION = 3
 _FRACTION = 16  # most bits behind the point: steps of 1.5e-5
@@ -58,8 +59,9 @@ def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
     fixed = np.rint(arrays["means"].astype(np.float64) * 2**bits).astype("<i4")
     logs = np.log(arrays["scales"].clip(MIN_SCALE).astype(np.float64))
     coefficients = (arrays["colors"] - 0.5) / SH_C0
+    flags = ANTIALIASED if gaussians.antialiased else 0
     parts = [
-        HEADER.pack(MAGIC, _VERSION, count, DEGREES[harmonics.shape[1]], bits, 0, 0),
+        HEADER.pack(MAGIC, _VERSION, count, DEGREES[harmonics.shape[1]], bits, flags, 0),
         fixed[:, :, None].view(np.uint8)[..., :3].tobytes(),
         _bytes(arrays["opacities"] * 255.0),
         _bytes((coefficients * _COLOR + 0.5) * 255.0),
@@ -116,7 +118,8 @@ def load_spz(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     arrays["harmonics"] = (take("u1", K, 3).astype(np.float64) - 128) / 128
     if found.version > 1:
         warn_of_steps(path, torch.from_numpy(means).float(), 2.0**-found.bits)
-    return flip_axes(checked_gaussians(path, arrays, left_out))
+    gaussians = checked_gaussians(path, arrays, left_out)
+    return flip_axes(replace(gaussians, antialiased=found.antialiased))
 
 
 def _bytes(values: np.ndarray) -> bytes:

@@ -27,7 +27,7 @@ _PLAIN = struct.Struct("<I12x")  # of version 4: where the table of contents is
 _ENTRY = struct.Struct("<QQ")  # of that table: bytes packed, bytes unpacked
 _MAX_RATIO = 1040  # deflate packs at most 1032 to 1; of ZSTD the reference takes 1024 to 1
 _MAX_BITS = 30  # behind the point
-_MORE = 2  # flag: extensions follow
+ANTIALIASED, _MORE = 1, 2  # flags: fitted with antialiasing; extensions follow
 _MAX_EXTENSIONS = 1 << 20  # bytes of them that are read
 _RECORD = struct.Struct("<II")  # of an extension: kind, and bytes that follow
 _SYSTEM, _RUB = 0xADBE0003, 4  # the extension that names the axes; 4 is OpenGL's, 0 names none
@@ -44,6 +44,7 @@ class Unpacked:
     count: int
     degree: int
     bits: int
+    antialiased: bool
 
 
 def unpacked(path: Path, content: bytes) -> Unpacked:
@@ -61,7 +62,7 @@ def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]
 
     The ``packed`` bytes of the file cannot hold more than ``_MAX_RATIO`` times as many.
     """
-    _, version, count, degree, bits, _, _ = HEADER.unpack(header)
+    _, version, count, degree, bits, flags, _ = HEADER.unpack(header)
     if degree not in COUNTS:
         raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are read")
     if bits > _MAX_BITS or count > MAX_POINTS:
@@ -70,7 +71,9 @@ def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]
     each = [position, 1, 3, 3, rotation, 3 * COUNTS[degree]]
     says = f"{count} Gaussians"
     compare_sizes(path, says, count * sum(each), _MAX_RATIO * packed, exact=False)
-    return [count * size for size in each if size], Unpacked(b"", version, count, degree, bits)
+    return [count * size for size in each if size], Unpacked(
+        b"", version, count, degree, bits, bool(flags & ANTIALIASED)
+    )
 
 
 def _from_gzip(path: Path, content: bytes) -> Unpacked:

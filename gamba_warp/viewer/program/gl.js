@@ -27,8 +27,8 @@ function glProgram(gl, vertex, fragment, attributes = []) {
 }
 
 class Renderer {
-  constructor(gl, count, degree) {
-    Object.assign(this, { gl, count, degree, ordered: 0, width: 0, height: 0 });
+  constructor(gl, count, degree, antialiased) {
+    Object.assign(this, { gl, count, degree, antialiased, ordered: 0, width: 0, height: 0 });
     this.splats = glProgram(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.points = glProgram(gl, POINT_VERTEX, POINT_FRAGMENT);
     this.surface = glProgram(gl, MESH_VERTEX, MESH_FRAGMENT, ["vertex", "normal", "paint"]);
@@ -173,6 +173,7 @@ class Renderer {
     set("order", "1i", 2);
     set("first", "1ui", from);
     set("last", "1ui", to);
+    set("antialiased", "1i", this.antialiased ? 1 : 0);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);

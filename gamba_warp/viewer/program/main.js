@@ -61,7 +61,7 @@ class Viewer {
     if (!Renderer.fits(this.gl, about.count, about.degree))
       return say("It has more Gaussians than this graphics card takes.", "Too many");
     this.renderer?.free();
-    this.renderer = new Renderer(this.gl, about.count, about.degree);
+    this.renderer = new Renderer(this.gl, about.count, about.degree, about.antialiased);
     this.camera = new OrbitCamera(about.home, about.home.fov);
     this.coarse = this.quick = 0; // index into SIZES; quick frames in a row
     this.some = about.count; // Gaussians drawn in motion

@@ -32,11 +32,12 @@ function plyTable(buffer) {
   const start = end.index + end[0].length;
   if (start + count * size > buffer.byteLength) throw new Error("The file is cut short.");
   if (start + count * size < buffer.byteLength) throw new Error(`It has more than its ${count} Gaussians. ${OTHER}`);
-  return { count: Number(count), columns, size, view: new DataView(buffer, start) };
+  const antialiased = lines.includes("comment SplatRenderMode: mip");
+  return { count: Number(count), columns, size, antialiased, view: new DataView(buffer, start) };
 }
 
 function readPly(buffer) {
-  const { count, columns, size, view } = plyTable(buffer);
+  const { count, columns, size, antialiased, view } = plyTable(buffer);
   const read = (names, change = (x) => x) => {
     const values = new Float32Array(count * names.length);
     names.forEach((name, k) => {
@@ -51,7 +52,7 @@ function readPly(buffer) {
   if (![0, 3, 8, 15].includes(rest)) throw new Error(OTHER);
   const byColor = several("f_rest", 3 * rest); // all of red, then of green, then of blue
   return {
-    count, means: read(["x", "y", "z"]), scales: read(several("scale", 3), Math.exp), quats: read(several("rot", 4)),
+    count, antialiased, means: read(["x", "y", "z"]), scales: read(several("scale", 3), Math.exp), quats: read(several("rot", 4)),
     opacities: read(["opacity"], (x) => 1 / (1 + Math.exp(-x))), colors: read(several("f_dc", 3), (x) => x * SH_C0 + 0.5),
     harmonics: read(byColor.map((_, i) => byColor[(i % 3) * rest + Math.floor(i / 3)])), degree: Math.sqrt(rest + 1) - 1,
   };
@@ -111,7 +112,7 @@ function packedFile(name, buffer) {
   const kind = /\.(ply|splat)$/i.exec(name)?.[1].toLowerCase();
   if (!kind) throw new Error(OTHER);
   const file = { ply: readPly, splat: readSplat }[kind](buffer);
-  const seen = visibleOf(file), frame = frameOf(file, seen), { degree } = file;
+  const seen = visibleOf(file), frame = frameOf(file, seen), { degree, antialiased = false } = file;
   const records = new ArrayBuffer(32 * seen.length), clip = (x) => Math.max(-LARGEST, Math.min(LARGEST, x));
   const floats = new Float32Array(records), halves = new Float16Array(records), shorts = new Int16Array(records);
   const numbers = file.harmonics.length / file.count, width = Math.ceil(numbers / 8) * 8;
@@ -121,14 +122,14 @@ function packedFile(name, buffer) {
     for (let k = 0; k < 3; k++) {
       const color = file.colors[3 * i + k];
       floats[8 * row + k] = (file.means[3 * i + k] - frame.center[k]) / frame.size;
-      halves[16 * row + 7 + k] = degree ? clip(color) : Math.max(0, Math.min(1, color));
+      halves[16 * row + 7 + k] = clip(color);
       halves[16 * row + 10 + k] = clip(file.scales[3 * i + k] / frame.size);
       shorts[16 * row + 13 + k] = Math.round((32767 * q[k + 1]) / norm / (1 + q[0] / norm));
     }
     halves[16 * row + 6] = file.opacities[i];
     for (let k = 0; k < numbers; k++) harmonics[width * row + k] = clip(file.harmonics[numbers * i + k]);
   });
-  const about = { title: name, note: "", total: file.count, count: seen.length, degree, vertices: 0, faces: 0, home: HOME, input: null, frame };
+  const about = { title: name, note: "", total: file.count, count: seen.length, degree, antialiased, vertices: 0, faces: 0, home: HOME, input: null, frame };
   return [about, { gaussians: records, harmonics: harmonics.buffer, mesh: "" }];
 }
 

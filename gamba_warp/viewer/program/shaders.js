@@ -57,7 +57,7 @@ vec3 seen_from(uint index, vec3 d) {
     - 0.5900435899266435 * x * (xx - 3.0 * yy) * coefficients(14);
 }
 vec3 colour_of(uint index, vec3 mean, vec3 rgb) {
-  return degree == 0 ? rgb : max(vec3(0.0), rgb + seen_from(index, normalize(mean - eye)));
+  return max(vec3(0.0), degree == 0 ? rgb : rgb + seen_from(index, normalize(mean - eye)));
 }
 `;
 
@@ -65,6 +65,7 @@ vec3 colour_of(uint index, vec3 mean, vec3 rgb) {
 const SPLAT_VERTEX = `${SHADER_GAUSSIAN}
 uniform usampler2D order;
 uniform uint first, last;
+uniform bool antialiased;
 out vec2 at;
 out vec4 colour;
 void main() {
@@ -88,6 +89,10 @@ void main() {
   u = (u + 2.0 * cross(q, cross(q, u) - w * u)) * scales;
   v = (v + 2.0 * cross(q, cross(q, v) - w * v)) * scales;
   float xx = dot(u, u) + 0.3, xy = dot(u, v), yy = dot(v, v) + 0.3;
+  if (antialiased) { // the light that the wider ellipse would add
+    opacity_rgb.x *= sqrt(max(0.0, ((xx - 0.3) * (yy - 0.3) - xy * xy) / (xx * yy - xy * xy)));
+    if (opacity_rgb.x < 1.0 / 255.0) return;
+  }
   float mid = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy));
   vec2 axis = abs(xy) > 1e-6 * mid ? normalize(vec2(xy, 0.5 * (yy - xx) + spread))
     : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));

@@ -1,5 +1,7 @@
 """Round trips of every format of Gaussians, with a line about its losses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from helpers.gaussians import khr_glb, some
 from helpers.judges.splats import check, differences
 from helpers.refusals import refused
 
+from gamba_warp.cameras import Cameras, intrinsics
 from gamba_warp.errors import UserError
 from gamba_warp.formats.gaussians.files import (
     comments_of,
@@ -17,6 +20,7 @@ from gamba_warp.formats.gaussians.files import (
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
 from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.render import render
 
 HOLD_HARMONICS = [kind for kind in SPLAT_FORMATS if kind != "splat"]
 
@@ -34,7 +38,7 @@ def test_what_is_written_is_read(tmp_path, kind, degree):
     assert splat_kind(path) == kind
     loaded = read_gaussians(path)
     if kind == "splat" and degree:
-        assert loaded.degree == 0 and "harmonics are lost" in lost and str(path) in lost
+        assert loaded.degree == 0 and "no place for harmonics" in lost and str(path) in lost
         gaussians.colors.clamp_(0, 1)
     else:
         assert lost is None and loaded.degree == degree
@@ -208,3 +212,20 @@ def test_version_1_and_2_of_spz(tmp_path):
         assert got.means.tolist() == [[1.5, 2, -0.25], [0, -1, -2]]  # turned to ours
         torch.testing.assert_close(got.opacities, torch.tensor([1.0, 0.2]))
         torch.testing.assert_close(got.scales[0].log(), torch.tensor([0.0, -1.0, -2.0]))
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_antialiasing_is_kept_and_drawn(tmp_path, kind):
+    """By bit 0 of the flags of .spz, and a comment of .ply; .splat says that it has no place."""
+    gaussians = replace(some(), antialiased=True)
+    path, said = written(tmp_path, gaussians, kind)
+    loaded = read_gaussians(path)
+    assert loaded.antialiased == (kind != "splat")
+    assert kind != "splat" or said == f"{path}: a .splat has no place for antialiasing."
+    assert loaded.select(loaded.opacities > 0.5).antialiased == loaded.antialiased
+    camera = Cameras(torch.eye(4)[None], intrinsics(16, 16)[None], 16, 16)
+    camera.viewmats[0, 2, 3] = 9
+    shown = render(loaded, camera).alpha
+    mode = "antialiased" if loaded.antialiased else "classic"
+    plain = render(replace(loaded, antialiased=False), camera, rasterize_mode=mode).alpha
+    assert torch.equal(shown, plain) and shown.any()
