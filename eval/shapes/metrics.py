@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.ndimage import binary_erosion
 
 from gamba_warp.cameras import intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
@@ -128,8 +129,9 @@ def shape_iou(
     """Compute the Volume IoU by the protocol's rule and grid.
 
     Returns:
-        ``iou`` (None without volume), ``iou_voxel`` (the side of a voxel) and, if ``iou`` is None,
-        ``iou_reason``.
+        ``iou`` (None without volume), ``iou_error`` (the largest error that the voxels may cause:
+        half the share of those at a surface of either shape), ``iou_voxel`` (the side of a voxel)
+        and, if ``iou`` is None, ``iou_reason``.
     """
     if protocol.occupancy == "none":
         return {"iou": None, "iou_reason": "the protocol takes none"}
@@ -142,12 +144,15 @@ def shape_iou(
     else:
         grid = grid_around(predicted, truth, resolution=protocol.iou_voxels)
     fill = RULES[protocol.occupancy].fill
-    iou = volume_iou(fill(predicted, grid), fill(truth, grid))
+    filled = fill(predicted, grid), fill(truth, grid)
+    iou = volume_iou(*filled)
     if iou is None and grid.step > 1 / protocol.iou_voxels:
         iou = 0.0  # Far apart, or of very different size: they share less than a voxel.
     if iou is None:
         return {"iou": None, "iou_reason": "neither shape fills a voxel", "iou_voxel": grid.step}
-    return {"iou": iou, "iou_voxel": grid.step}
+    edges = sum(np.count_nonzero(x & ~binary_erosion(x)) for x in filled)
+    error = min(1.0, edges / max(1, np.count_nonzero(filled[0] | filled[1])) / 2)
+    return {"iou": iou, "iou_error": error, "iou_voxel": grid.step}
 
 
 def chamfer_by_turn(
