@@ -32,8 +32,8 @@ class ShapesOptions:
     Attributes:
         pred: Gaussians (.ply), a mesh or a point cloud; or a folder of them.
         gt: A mesh or a point cloud; or a folder, paired with PRED by name.
-        out: Folder for report.json, objects.csv and table.md. An interrupted evaluation resumes
-            there.
+        out: Folder for report.json, objects.csv, table.md and sheet.png. An interrupted evaluation
+            resumes there.
         limit: Number of objects, evenly spaced in the order of names; all by default.
         objects: Text file of the objects of --protocol gso in place of its own list, one name a
             line; the report states that.
@@ -69,6 +69,7 @@ class ShapesOptions:
         workers: Pairs evaluated at the same time, each in its own process.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.
+        sheet: Draw the worst and the best pairs, six of each, beside their truths.
     """
 
     pred: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PRED")] = None
@@ -95,3 +96,4 @@ class ShapesOptions:
     sensitivity: bool = False
     workers: Annotated[int, Meta(ge=1, le=256)] = 1
     strict: bool = False
+    sheet: bool = True

@@ -41,6 +41,7 @@ from ..report import (
 from .options import ShapesOptions
 from .protocol import GeometryProtocol
 from .shape import SUFFIXES, Similarity
+from .sheet import save_sheet
 from .table import page, summaries
 
 if TYPE_CHECKING:
@@ -156,6 +157,10 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     if folder is not None:
         save_report(report, folder)
         write_text(folder / "table.md", page(report))
+        if options.sheet and any(record["status"] == OK for record in objects):
+            with stdout_to_stderr():
+                again = partial(evaluate_pairs, protocol=protocol, dataset=dataset)
+                save_sheet(folder / "sheet.png", objects, pairs, again)
         cache.end()
     return report
 

@@ -1,0 +1,112 @@
+"""Sheet of predictions beside their truths, in two views: the worst and the best of a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from gamba_warp.cameras import intrinsics, orbit
+from gamba_warp.files import atomic_path
+
+from ..report import OK
+from .protocol import GeometryProtocol
+from .shape import Mesh, Points, Similarity
+
+EACH = 6  # worst and best pairs of a sheet
+SIDE, FOV = 176, 40.0  # pixels; degrees
+AZIMUTHS, ELEVATION, DISTANCE = (-35.0, 145.0), 20.0, 2.4  # degrees; sides of the truth
+_LABEL, _GAP = 20, 6  # pixels
+# From the reference camera's world (y down, z forward) to the truth's, which is z-up.
+_TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+def picture_of(shape: Mesh | Points) -> np.ndarray:
+    """Draw a shape in its truth's unit frame from two sides, ``[SIDE, 2 SIDE]`` uint8 grey.
+
+    Faces are shaded by their angle to the camera, points by their depth.
+    """
+    import torch
+
+    viewmats = orbit(torch.tensor(AZIMUTHS), ELEVATION, DISTANCE).double().numpy() @ _TURN
+    K = intrinsics(SIDE, SIDE, FOV).double().numpy()
+    draw = _draw_mesh if isinstance(shape, Mesh) else _draw_points
+    return np.hstack([draw(shape, viewmat, K) for viewmat in viewmats])
+
+
+def _draw_mesh(mesh: Any, viewmat: np.ndarray, K: np.ndarray) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
+    pixels = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    directions = pixels @ np.linalg.inv(K).T @ viewmat[:3, :3]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.broadcast_to(-viewmat[:3, :3].T @ viewmat[:3, 3], directions.shape)
+    found = mesh.scene().cast_rays(np.hstack([origins, directions]).astype(np.float32))
+    facing = np.abs((found["primitive_normals"].numpy() * directions).sum(1))
+    shade = np.where(np.isfinite(found["t_hit"].numpy()), 40 + 170 * facing, 255)
+    return shade.reshape(SIDE, SIDE).astype(np.uint8)
+
+
+def _draw_points(points: Any, viewmat: np.ndarray, K: np.ndarray) -> np.ndarray:
+    camera = points.positions @ viewmat[:3, :3].T + viewmat[:3, 3]
+    camera = camera[camera[:, 2] > 0.1]
+    camera = camera[np.argsort(-camera[:, 2])]  # the nearest last
+    column, row, _ = np.floor(camera @ K.T / camera[:, 2:]).astype(int).T
+    seen = (column >= 0) & (column < SIDE) & (row >= 0) & (row < SIDE)
+    shade = np.full((SIDE, SIDE), 255, np.uint8)
+    shade[row[seen], column[seen]] = np.clip(camera[seen, 2] - DISTANCE + 0.7, 0, 1) * 140 + 40
+    return shade
+
+
+def _draw_pair(
+    pair: Any, protocol: GeometryProtocol, motion: Similarity | None = None
+) -> dict[str, Any]:
+    """Return a record with the pictures of a pair, as it was compared; runs in a child."""
+    from .load import FRAME_AXES, load_prediction, load_truth
+    from .metrics import align_shape
+
+    truth = load_truth(pair.gt, protocol, pair.rotation, pair.placement)
+    into, axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
+    predicted = load_prediction(pair.pred, into, axes, protocol)
+    shapes = align_shape(predicted.shape, truth.shape, protocol)[0], truth.shape
+    return {"name": pair.name, "status": OK, "pictures": np.hstack([*map(picture_of, shapes)])}
+
+
+def save_sheet(
+    path: Path,
+    objects: list[dict[str, Any]],
+    pairs: list[Any],
+    evaluate_pairs: Any,
+) -> None:
+    """Write the sheet: the worst pairs by Chamfer distance, then the best.
+
+    Args:
+        path: the file, a PNG.
+        objects: records of the report.
+        pairs: of the evaluation.
+        evaluate_pairs: makes records of some pairs with ``evaluate``, as ``pairs.evaluate_pairs``.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    done = sorted((x for x in objects if x["status"] == OK), key=lambda x: -x["chamfer"])
+    chosen = done[:EACH] + done[EACH:][-EACH:]
+    by_name = {pair.name: pair for pair in pairs}
+    wanted = [by_name[record["name"]] for record in chosen]
+    drawn = evaluate_pairs(wanted, evaluate=_draw_pair)
+    pictures = {record["name"]: record.get("pictures") for record in drawn}
+    high = SIDE + _LABEL + _GAP
+    sheet = Image.new("L", (4 * SIDE, _LABEL + high * len(chosen)), 255)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
+    draw.text((4, 3), "prediction", 0, font)
+    draw.text((2 * SIDE + 4, 3), "truth", 0, font)
+    for number, record in enumerate(chosen):
+        top = _LABEL + number * high
+        iou = "" if record["iou"] is None else f", Volume IoU {record['iou']:.3f}"
+        text = f"{record['name'][:60]}: Chamfer {record['chamfer']:.4f}{iou}"
+        draw.text((4, top + 3), text.encode(errors="replace").decode(), 60, font)
+        if (picture := pictures[record["name"]]) is not None:
+            sheet.paste(Image.fromarray(picture), (0, top + _LABEL))
+    with atomic_path(path) as temporary:
+        sheet.save(temporary, format="PNG")
