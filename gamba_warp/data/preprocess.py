@@ -27,14 +27,23 @@ SAM_FILES = (
     "https://github.com/ChaoningZhang/MobileSAM"
 )
 
-_TRANSPARENT = 0.5  # a picture with any alpha below this has a cut-out object
+_TRANSPARENT = 0.5  # alpha below which a pixel is none of a cut-out object
+# Transparent shares of a picture's border or of the whole from which it is a cut-out: the rounded
+# corners of a screenshot are less.
+_CUT_BORDER, _CUT_SHARE = 0.15, 0.05
 PRESENT = 0.05  # least alpha of a pixel within the object's bounds
 _MIN_OBJECT = 16  # least size of an object, pixels
 
 
-def has_alpha(rgba: np.ndarray) -> bool:
-    """True if the object of a picture ``[H, W, 4]`` is cut out: some of it is transparent."""
-    return bool(rgba[..., 3].min() < _TRANSPARENT)
+def has_alpha(rgba: np.ndarray, any_share: bool = False) -> bool:
+    """True if the object of a picture ``[H, W, 4]`` is cut out.
+
+    A real share of its border or of the whole is transparent; or, with ``any_share``, a pixel.
+    """
+    clear = rgba[..., 3] < _TRANSPARENT
+    border = np.concatenate([clear[0], clear[-1], clear[:, 0], clear[:, -1]])
+    shares = border.mean() >= _CUT_BORDER or clear.mean() >= _CUT_SHARE
+    return bool(clear.any() and (any_share or shares))
 
 
 def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:

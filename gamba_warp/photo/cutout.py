@@ -214,10 +214,12 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     elif ways.cutout == "none":
         rgba[..., 3] = 1
         method = "none"
-    elif ways.cutout in ("auto", "alpha") and has_alpha(rgba):
+    elif ways.cutout in ("auto", "alpha") and has_alpha(rgba, ways.cutout == "alpha"):
         method = "alpha"
     elif ways.cutout == "alpha":
         raise UserError(f"{path}: has no transparency, which --cutout alpha uses")
+    elif has_alpha(rgba, any_share=True):
+        ways.say(f"{path}: its few transparent pixels are no cut-out (--cutout alpha takes them)")
     rgba = shrink(rgba, WORKING_SIZE)
     source, fringe = rgba[..., :3].copy(), None
     if method == "alpha":

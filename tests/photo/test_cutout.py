@@ -397,3 +397,29 @@ def test_without_the_extra_colours_alone_cut(monkeypatch, busy):
     assert found.method == "grabcut" and len(said) == 1 and "pip install '.[photo]'" in said[0]
     with pytest.raises(ModuleNotFoundError, match="onnxruntime"):
         Ways(matte_model="model.onnx").checked()
+
+
+@pytest.mark.parametrize("kind", ["rounded corners", "faint corner pixels"])
+def test_a_few_transparent_pixels_are_no_cut_out(tmp_path, kind):
+    """A screenshot with rounded corners; a photograph with twelve faint pixels in its corners."""
+    y, x = np.mgrid[:120, :160]
+    inside = (x - 80) ** 2 + (y - 60) ** 2 < 30**2
+    rgba = np.full((120, 160, 4), 255, np.uint8)
+    rgba[inside, :3] = (200, 30, 40)
+    if kind == "rounded corners":
+        for top, left in ((0, 0), (0, 152), (112, 0), (112, 152)):
+            corner = (
+                np.mgrid[:8, :8] - np.array([[[7 - 7 * (top > 0)]], [[7 - 7 * (left > 0)]]])
+            ) ** 2
+            rgba[top : top + 8, left : left + 8, 3][corner.sum(0) > 49] = 0
+    else:
+        rgba[:2, :3, 3] = rgba[-2:, -3:, 3] = 0
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    said = []
+    found = cut_out(tmp_path / "a.png", Ways(fetch=False, say=said.append))
+    assert found.method != "alpha"
+    kept = found.mask > 0.5
+    assert (kept & inside).sum() > 0.95 * (kept | inside).sum()
+    assert any("no cut-out" in line for line in said)
+    alone = cut_out(tmp_path / "a.png", Ways(cutout="alpha"))
+    assert alone.method == "alpha"
