@@ -46,9 +46,11 @@ def view_command(
     import tempfile
     import webbrowser
 
+    import numpy as np
+
     from ..pages.export import read_with_warning
     from ..trajectories.paths import Viewpoint
-    from ..viewer.pack import read_viewed_mesh
+    from ..viewer.pack import own_frame, read_viewed_mesh, visible
     from ..viewer.page import write_viewer
 
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
@@ -59,6 +61,11 @@ def view_command(
     if mesh is not None:
         surface = read_viewed_mesh(mesh, mesh_frame)
         warn(mesh, surface.warnings)
+        size = own_frame(visible(gaussians, file.name), file.name).size
+        scale = size / float(np.ptp(surface.vertices, axis=0).max())
+        if not 0.5 < scale < 2:  # of --size-mm
+            surface = surface._replace(vertices=surface.vertices * scale)
+            warn(mesh, [f"its sides are scaled by {scale:.4g} to those of the Gaussians"])
     if out is not None:
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"

@@ -77,13 +77,12 @@ def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    # Vertices at seams of the texture are duplicated.
-    corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
-    found, faces = merged(corners)
-    vertices, uvs = surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:]
-    faces = faces.reshape(-1, 3)
     image = Image.fromarray(to_uint8(texture.image))
-    if path.suffix.lower() == ".glb":
+    if path.suffix.lower() == ".glb":  # with vertices of their own at seams of the texture
+        corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
+        found, faces = merged(corners)
+        vertices, uvs = surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:]
+        faces = faces.reshape(-1, 3)
         material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
         visual = cast(Any, TextureVisuals(uv=uvs, material=material))
         mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
@@ -93,10 +92,12 @@ def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
         image.save(temporary)
     lines = ["newmtl surface", "Kd 1 1 1", "Ks 0 0 0", f"map_Kd {path.stem}.png", ""]
     _write(path.with_suffix(".mtl"), "\n".join(lines))
+    uvs, at = merged(texture.uvs.reshape(-1, 2))
+    corners = np.column_stack([surface.faces.reshape(-1), at]).reshape(-1, 6) + 1
     lines = [f"mtllib {path.stem}.mtl", "usemtl surface"]
-    lines += [f"v {x:.8g} {y:.8g} {z:.8g}" for x, y, z in vertices]
+    lines += [f"v {x:.8g} {y:.8g} {z:.8g}" for x, y, z in surface.vertices]
     lines += [f"vt {u:.7f} {v:.7f}" for u, v in uvs]
-    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in faces + 1]
+    lines += ["f {}/{} {}/{} {}/{}".format(*row) for row in corners]
     _write(path, "\n".join([*lines, ""]))
 
 

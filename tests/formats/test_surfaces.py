@@ -12,13 +12,22 @@ from helpers.views import cloud_of
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.errors import UserError
+from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.rasterize import depth_quantile
 from gamba_warp.render import render
 from gamba_warp.surfaces.density import MOST_POINTS, opacity_volume
-from gamba_warp.surfaces.extract import cleaned_mesh, extract_surface, unit_frame, vertex_colors
+from gamba_warp.surfaces.extract import (
+    Surface,
+    cleaned_mesh,
+    extract_surface,
+    unit_frame,
+    vertex_colors,
+)
+from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.surfaces.solid import distances, solid_of
+from gamba_warp.surfaces.texture import Texture
 from gamba_warp.surfaces.tsdf import CLEAR, Views, fuse, look_around, sphere_cameras
 from gamba_warp.versions import import_open3d
 
@@ -302,3 +311,19 @@ def test_a_few_pixels_that_the_fusion_passes_over_are_no_surface_in_one_line(see
         depth[:, row, column] = 1.5
     with pytest.raises(UserError, match="^the fused depth has no surface$"):
         fuse(Views(cameras, depth, torch.zeros(3, 32, 32, 3)), 64, 5.0, 1.0)
+
+
+def test_a_textured_obj_stays_closed(tmp_path):
+    """Corners at seams of the texture share their vertex, as another program reads it."""
+    import pymeshlab
+
+    box = trimesh.creation.box()
+    uvs = np.random.default_rng(4).random((len(box.faces), 3, 2))
+    picture = Texture(uvs, np.full((8, 8, 3), 0.5, np.float32))
+    save_mesh(tmp_path / "a.obj", Surface(np.array(box.vertices), box.faces, texture=picture))
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(tmp_path / "a.obj"))
+    found = meshes.get_topological_measures()
+    assert found["boundary_edges"] == 0 and found["vertices_number"] == 8
+    mesh = load_mesh(tmp_path / "a.obj")
+    np.testing.assert_allclose(mesh.uvs, uvs, atol=1e-6)

@@ -95,6 +95,9 @@ def test_view_shows_a_mesh_too(ball, tmp_path, capsys):
     assert '"faces": 1' in page.read_text()
     warned = f"warning: {tmp_path / 'mesh.glb'}: a part has no material: grey"
     assert warned in capsys.readouterr().err.splitlines()
+    save_mesh(tmp_path / "small.glb", Surface(np.eye(3) / 100, np.array([[0, 1, 2]])))
+    assert run([*command[:3], str(tmp_path / "small.glb"), *command[4:], "--no-open-browser"]) == 0
+    assert "small.glb: " in (err := capsys.readouterr().err) and "scaled by" in err
     (tmp_path / "bad.glb").write_bytes(b"no mesh")
     page.unlink()
     assert run([*command[:3], str(tmp_path / "bad.glb"), "--out", str(page)]) == 2
