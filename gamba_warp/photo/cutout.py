@@ -7,6 +7,7 @@ along the object's edge lose those of its background (``edges.py``).
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -20,11 +21,13 @@ from ..batch import counted
 from ..conventions import GREY, Cutout, over_background
 from ..data.preprocess import (
     BORDER_RATIO,
+    PRESENT,
     WORKING_SIZE,
     SamSegmenter,
     has_alpha,
     read_mask,
     recenter,
+    resize_rgba,
     shrink,
     without_specks,
 )
@@ -67,6 +70,10 @@ _LIKE_GROUND = "it is coloured like the background: parts may be lost, or enclos
 _BESIDE = 360  # longer side of each picture of ``CutOut.beside``
 _HAZE = 0.1  # lower alpha is set to 0
 _OPAQUE = 0.5  # a warning is given if alpha is lower everywhere
+# An object of a smaller longer side in the reduced picture is cut from the whole one.
+_CLOSE = WORKING_SIZE // 2  # pixels
+_SAME = 0.8  # least IoU of both cut-outs; else the first one's mask is enlarged
+_FEW_PIXELS = 128  # longer side of an object, below which a result is blurred
 
 
 @dataclass
@@ -220,7 +227,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         raise UserError(f"{path}: has no transparency, which --cutout alpha uses")
     elif has_alpha(rgba, any_share=True):
         ways.say(f"{path}: its few transparent pixels are no cut-out (--cutout alpha takes them)")
-    rgba = shrink(rgba, WORKING_SIZE)
+    whole, rgba = rgba, shrink(rgba, WORKING_SIZE)
     source, fringe = rgba[..., :3].copy(), None
     if method == "alpha":
         rgba, fringe = without_matte(rgba)
@@ -228,8 +235,9 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         rgba[..., :3] = without_background(source, rgba[..., 3])
     found = _cut_by_methods(path, source, ways) if method is None else _Found(method, rgba)
     method, rgba = found.method, found.rgba
+    close = _at_own_pixels(path, whole, found, ways) if ways.recenter else rgba
     try:
-        centred = recenter(rgba, BORDER_RATIO if ways.recenter else None)
+        centred = recenter(close, BORDER_RATIO if ways.recenter else None)
     except ValueError as error:
         raise UserError(f"{ways.mask or path}: {error}") from error
     model = ways.matte() if method == "matte" else None
@@ -240,6 +248,8 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         why=found.why,
         fringe=f", without the {fringe} mixed into its edge" if fringe else "",
     )
+    if ways.recenter and (pixels := round((1 - BORDER_RATIO) * len(centred))) < _FEW_PIXELS:
+        how += f" Its longer side has {pixels} pixels, so the result is blurred."
     if (most := rgba[..., 3].max()) < _OPAQUE:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
     warning, own = "", method in ("mask", "alpha", "none")
@@ -256,6 +266,56 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     editable = np.dstack([colors, rgba[..., 3]])
     areas = np.zeros(rgba.shape[:2], bool) if found.areas is None else found.areas > 0
     return CutOut(centred, method, how, source, rgba[..., 3], editable, warning, areas)
+
+
+def _at_own_pixels(path: str | Path, whole: np.ndarray, found: _Found, ways: Ways) -> np.ndarray:
+    """Return an object that is small in the reduced picture as it is in the whole one.
+
+    Args:
+        path: named in errors.
+        whole: ``[H, W, 4]``, the picture with its alpha or the mask's.
+        found: its cut-out in the reduced picture.
+        ways: options.
+
+    Returns:
+        ``[h, w, 4]``, the object and what is around it; or the reduced picture's.
+    """
+    rgba, scale = found.rgba, len(whole) / len(found.rgba)
+    rows, columns = (np.flatnonzero((rgba[..., 3] > PRESENT).any(axis)) for axis in (1, 0))
+    if scale < 1.1 or not len(rows):
+        return rgba
+    sides = [int(each[-1] - each[0]) + 1 for each in (rows, columns)]
+    if max(sides) > _CLOSE:
+        return rgba
+    spare = max(8, max(sides) // 4)
+    box = [
+        (max(0, each[0] - spare), min(n, each[-1] + 1 + spare))
+        for each, n in zip((rows, columns), rgba.shape)
+    ]
+    small = rgba[tuple(slice(*ends) for ends in box)]
+    part = whole[tuple(slice(round(a * scale), round(b * scale)) for a, b in box)]
+    part = shrink(part, WORKING_SIZE)
+    if found.method == "alpha":
+        return without_matte(part)[0]
+    if found.method == "mask":
+        return np.dstack([without_background(part[..., :3], part[..., 3]), part[..., 3]])
+    alpha = resize_rgba(small, *part.shape[:2])[..., 3]
+    if found.method == "none":
+        return part
+    same = copy.copy(ways)  # with its opened networks
+    same.cutout = "matte" if found.method == "sam" else found.method
+    try:
+        again = _cut_by_methods(path, part[..., :3], same).rgba
+    except UserError:  # it is all of the part
+        again = rgba[:0]
+    if again.shape == part.shape:
+        both, either = (
+            ((again[..., 3] > 0.5) & (alpha > 0.5)),
+            ((again[..., 3] > 0.5) | (alpha > 0.5)),
+        )
+        if both.sum() >= _SAME * either.sum():
+            return again
+    return _blended(part[..., :3], alpha)
 
 
 def _methods(ways: Ways) -> list[Method]:

@@ -81,9 +81,9 @@ def test_a_picture_keeps_no_fringe_of_its_background(tmp_path):
     clean = disc((0.7, 0.0, 0.1))
     save_image(tmp_path / "icon.png", mixed(clean, 1.0))
     icon = cut_out(tmp_path / "icon.png", Ways(recenter=False))
-    assert icon.how.endswith("is the cut-out, without the white mixed into its edge.")
+    assert "is the cut-out, without the white mixed into its edge." in icon.how
     save_image(tmp_path / "clean.png", clean)
-    assert cut_out(tmp_path / "clean.png").how.endswith("is the cut-out.")
+    assert "is the cut-out." in cut_out(tmp_path / "clean.png").how
     save_image(tmp_path / "photo.png", mixed(clean, 0.9)[..., :3])
     save_image(tmp_path / "mask.png", clean[..., 3])
     photo = cut_out(tmp_path / "photo.png", Ways(mask=tmp_path / "mask.png", recenter=False))
