@@ -7,6 +7,7 @@ from functools import partial
 import torch
 
 from ..cases.conv import conv_problem
+from ..causal_conv1d import causal_conv1d_fn
 from . import peers
 from .measure import Case, Settings, Variant, pair
 
@@ -20,12 +21,17 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def operator(settings: Settings) -> list[Variant]:
-    """Convolution and SiLU beside torch's grouped convolution in its own layout."""
+    """Convolution and SiLU beside torch's grouped convolution, in both layouts."""
     problem = partial(conv_problem, settings.device, _SIZES.get(settings.level, _FULL))
     made = pair(problem(), "default", default=True)
-    made += pair(problem(peers.torch_conv, True), "torch conv1d", peer=True, rounds=10)
+    made += pair(problem(partial(causal_conv1d_fn, activation="silu"), True), "[B, D, L]")
+    others = {"torch conv1d": (peers.torch_conv, {"rounds": 10})}
     if settings.peers and settings.device.type == "cuda":
-        made += pair(problem(peers.causal_conv1d, True), "causal-conv1d", peer=True)
+        others["causal-conv1d"] = peers.causal_conv1d, {}
+    for name, (function, options) in others.items():
+        made += pair(problem(function, True), name, peer=True, **options)
+        last = problem(peers.channels_last(function, ("x",)))
+        made += pair(last, f"{name}, channels last", peer=True, **options)
     return made
 
 

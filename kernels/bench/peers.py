@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -90,6 +91,18 @@ def mamba_ssm_scan(**inputs: Tensor) -> Tensor:
     """
     module = load("mamba_ssm.ops.selective_scan_interface", "mamba-ssm")
     return module.selective_scan_fn(**inputs, delta_softplus=True)
+
+
+def channels_last(function: Callable[..., Tensor], names: Sequence[str]) -> Callable[..., Tensor]:
+    """Return the function with its result and the inputs of these names exchanged, without copies.
+
+    So one of ``[B, D, L]`` takes and gives ``[B, L, D]``.
+    """
+
+    def call(**inputs: Tensor) -> Tensor:
+        return function(**inputs | {name: inputs[name].mT for name in names}).mT
+
+    return call
 
 
 def torch_conv(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 
 from ..cases.problem import BOTH, DIRECTIONS, Operator
 from ..cases.scan import make_inputs, scan_problem
+from ..selective_scan import selective_scan_fn
 from . import peers
 from .measure import Case, Settings, Variant, pair, saved_bytes, variant
 
@@ -41,8 +42,18 @@ def make_problem(settings: Settings, channels_seen: int = 32, **changes: int) ->
 
 
 def operator(settings: Settings) -> list[Variant]:
-    """The whole operator: softplus, bias, skip and gate."""
-    return pair(make_problem(settings), "default", default=True)
+    """The whole operator: softplus, bias, skip and gate; in both layouts."""
+    problem = make_problem(settings)
+    return pair(problem, "default", default=True) + pair(_turned(problem), "[B, D, L]")
+
+
+_TURNED = ("u", "delta", "B", "C", "z")
+
+
+def _turned(problem: Operator) -> Operator:
+    """Return the same operator in mamba-ssm's layout."""
+    function = partial(selective_scan_fn, delta_softplus=True)
+    return replace(problem, function=function, turned=(*_TURNED, "out"))
 
 
 def _peer(problem: Operator, function: Callable, channels_first: bool = True) -> Operator:
@@ -51,7 +62,7 @@ def _peer(problem: Operator, function: Callable, channels_first: bool = True) ->
         problem,
         function=function,
         limits=dict.fromkeys(problem.limits, 1e-4),
-        turned=("u", "delta", "B", "C", "z", "out") if channels_first else (),
+        turned=(*_TURNED, "out") if channels_first else (),
         compared=False,
     )
 
@@ -99,17 +110,21 @@ def count_memory(problem: Operator, direction: str) -> dict[str, int]:
 
 def layers(settings: Settings) -> list[Variant]:
     """Scans of layers, by tokens and channels: 512 channels of this project's preset rays, 1,536 of
-    mamba-130m, 5,120 of mamba-2.8b; beside the formula as a torch loop (Mamba's reference does it
-    so), and beside peers where they are installed, on the same inputs.
+    mamba-130m, 5,120 of mamba-2.8b; in both layouts. Beside them the formula as a torch loop
+    (Mamba's reference does it so), and peers where they are installed, on the same inputs.
     """
     quick, made = settings.level == "quick", []
     for length in (256,) if quick else (512, 2048, 8192):
         for width in (64,) if quick else (512, 1536, 5120):
             problem = scan_problem(make_inputs(1, length, width), settings.device, 512)
             name = f"{length} x {width}"
-            made += pair(problem, name) + pair(problem, f"{name}, bfloat16", options=_HALF)
+            made += pair(problem, name) + pair(_turned(problem), f"{name}, [B, D, L]")
+            made += pair(problem, f"{name}, bfloat16", options=_HALF)
             if settings.peers and settings.device.type == "cuda":
-                made += pair(_peer(problem, peers.mamba_ssm_scan), f"mamba-ssm, {name}", peer=True)
+                theirs, label = peers.mamba_ssm_scan, f"mamba-ssm, {name}"
+                made += pair(_peer(problem, theirs), label, peer=True)
+                last = _peer(problem, peers.channels_last(theirs, _TURNED), channels_first=False)
+                made += pair(last, f"{label}, channels last", peer=True)
             if length * width <= 2048 * 1536:  # others' code in torch takes seconds
                 loop, slow = _peer(problem, peers.scan_loop), {"peer": True, "rounds": 3}
                 made.append(variant(loop, f"torch loop, {name}", **slow))

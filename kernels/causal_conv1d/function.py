@@ -176,19 +176,19 @@ def causal_conv1d_fn(
     """
     if seq_idx is not None and (initial_states is not None or return_final_states):
         raise ValueError("seq_idx is given beside states, which causal_conv1d with cu_seqlens has")
-    out, final = causal_conv1d(
+    made = causal_conv1d(
         tokens_first(x, "x"),
         weight,
         bias,
         activation=activation,
         initial_state=tokens_first(initial_states, "initial_states"),
-        return_final_state=True,
+        return_final_state=return_final_states or final_states_out is not None,
         seq_idx=seq_idx,
     )
-    out, final = out.transpose(1, 2), final.transpose(1, 2)
+    out, *final = (y.transpose(1, 2) for y in (made if isinstance(made, tuple) else (made,)))
     if seq_idx is not None:
         out = out.masked_fill((seq_idx < 0)[:, None], 0)
     if final_states_out is not None:
         with torch.no_grad():
-            final_states_out.copy_(final)
-    return (out, final) if return_final_states else out
+            final_states_out.copy_(*final)
+    return (out, *final) if return_final_states else out

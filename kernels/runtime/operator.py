@@ -28,7 +28,7 @@ def has_tangent(*values: Any) -> bool:
     return any(forward_ad.unpack_dual(x).tangent is not None for x in _tensors(values))
 
 
-def _needs_dispatcher(values: Sequence[Any]) -> bool:
+def _needs_dispatcher(tensors: Sequence[Tensor]) -> bool:
     """True under a compiler, mode, transform, tracer or profiler, or for other kinds of tensors."""
     return (
         torch.compiler.is_compiling()
@@ -36,7 +36,7 @@ def _needs_dispatcher(values: Sequence[Any]) -> bool:
         or torch._C._len_torch_dispatch_stack() > 0
         or torch._C._are_functorch_transforms_active()
         or torch._C._get_tracing_state() is not None
-        or any(type(x) not in _PLAIN or x.is_meta for x in _tensors(values))
+        or any(type(x) not in _PLAIN or x.is_meta for x in tensors)
     )
 
 
@@ -83,14 +83,15 @@ def operator(
         function = Direct.apply
 
     def call(*args: Any) -> Any:
-        if has_tangent(*args):
+        tensors = [*_tensors(args)]
+        if has_tangent(*tensors):
             raise NotImplementedError(
                 f"{name}: forward-mode derivatives (torch.func.jvp, jacfwd, dual numbers) are not "
                 "supported; only backward() is"
             )
-        if _needs_dispatcher(args):
+        if _needs_dispatcher(tensors):
             return op(*args)
-        if torch.is_grad_enabled() and any(x.requires_grad for x in _tensors(args)):
+        if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
             return op(*args) if function is None else function(*args)
         return body(*args)
 

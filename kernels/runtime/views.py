@@ -173,7 +173,8 @@ def is_turned(x: Tensor) -> bool:
 
     It is a view of mamba-ssm's ``[B, D, L]``. CUDA's kernels have none.
     """
-    return x.stride(2) != 1 and x.stride(1) == 1 and x.shape[2] != 1 and kind_of(x.device) == "cpu"
+    _, tokens, channels = x.stride()
+    return tokens == 1 and channels != 1 and x.shape[2] != 1 and kind_of(x.device) == "cpu"
 
 
 def dense(x: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 // needs: lanes.h: F, fma_, splat, put_, scatter_; kernels.py: work_out, sums_out, sizes, rows_in,
-//     task, channel_in, u_in, delta_in, z_in, dout_in, dlast_in, TOKENS, AT_ONCE, TURNED,
-//     starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB, NEED_DC, NEED_DZ,
+//     task, a_in, skip_in, bias_in, u_in, delta_in, z_in, dout_in, dlast_in, TOKENS, AT_ONCE,
+//     TURNED, starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB, NEED_DC, NEED_DZ,
 //     NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out; problem.py: WEIGHTED
 // gives: the body of scan_backward
 // Equation 1 again, keeping decay and state of every token, and the sums of equation 8; then
@@ -11,15 +11,18 @@
 #include "prepare.h"
 const int states = sizes.states, stream = sizes.stream;
 F *const work = piece_(work_out, sizes, task), *const sums = piece_(sums_out, sizes, task);
-auto work_of = [&](const Position& p) { return work + p.j * 3 * states; };
+// of a lane group: states, then what Group has
+const int own = 3 * states, room = own + states + 3;
+auto work_of = [&](const Position& p) { return work + p.j * room; };
 auto enter = [&](const Position& p) {
+    load_group_(a_in, skip_in, bias_in, p, work_of(p) + own);
     load_(dlast_in, p, states, work_of(p)), fill_(work_of(p) + 2 * states, states, 0.0f);
 };
 auto walk = [&](const Position p) __attribute__((always_inline)) {
     alignas(64) PerToken per_token[TOKENS];
     alignas(64) Saved saved[TOKENS * AT_ONCE];
     alignas(64) Token token[TOKENS];
-    const Group group = group_(channel_in, p);
+    const Group group(work_of(p) + own, states);
     const int count = p.count;
     Fetches fetches;
     const F max_rate =
@@ -140,11 +143,11 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
     };
     F dskip = F{}, dbias = F{}, skips = F{}, biases = F{};
     for (int t = 0; t < count; ++t) {
-        Token& own = token[t];
+        Token& now = token[t];
         const F u = per_token[t].u;
-        skips = fma_(own.dy, u, skips);
-        own.p = fma_(u, own.s, own.p) * per_token[t].slope;
-        biases += own.p;
+        skips = fma_(now.dy, u, skips);
+        now.p = fma_(u, now.s, now.p) * per_token[t].slope;
+        biases += now.p;
         if ((t & 7) == 7 || t == count - 1) {
             dskip += skips, dbias += biases;
             skips = biases = F{};

@@ -1,6 +1,6 @@
 // needs: lanes.h: F, read_, splat, softplus_, sigmoid_, max_abs_, fma_, scatter_;
-//     kernels.py: work_out, OUTPUT, sizes, rows_in, task, channel_in, TOKENS, first_in, starts_out,
-//     CHUNK, delta_in, u_in, z_in, y_out, SCALE, b_in, c_in, last_out, product_out
+//     kernels.py: work_out, OUTPUT, sizes, rows_in, task, a_in, skip_in, bias_in, TOKENS, first_in,
+//     starts_out, CHUNK, delta_in, u_in, z_in, y_out, SCALE, b_in, c_in, last_out, product_out
 // gives: the body of scan_forward
 // A strip of a lane group: equation 1 over its tokens, with equation 5 and the gate, or without
 // OUTPUT with the product of the decays.
@@ -8,14 +8,17 @@
 #include "strip.h"
 const int states = sizes.states;
 F* const work = piece_(work_out, sizes, task);
-auto work_of = [&](const Position& p) { return work + p.j * (OUTPUT ? 2 : 4) * states; };
+// of a lane group: states, then what Group has
+const int own = (OUTPUT ? 2 : 4) * states, room = own + states + 3;
+auto work_of = [&](const Position& p) { return work + p.j * room; };
 auto enter = [&](const Position& p) {
+    load_group_(a_in, skip_in, bias_in, p, work_of(p) + own);
     load_(first_in, p, states, work_of(p));
     if (!OUTPUT) pairs_(work_of(p) + 2 * states, states, 1.0f);
 };
 auto walk = [&](const Position p) __attribute__((always_inline)) {
     alignas(64) Token token[TOKENS];
-    const Group group = group_(channel_in, p);
+    const Group group(work_of(p) + own, states);
     const int count = p.count;
     F *const h_of = work_of(p), *const product_of = h_of + 2 * states;
     if (starts_out.shape[0] > 0 && (p.t0 - p.begin) % CHUNK == 0) {

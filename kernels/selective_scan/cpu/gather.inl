@@ -1,5 +1,5 @@
-// needs: lanes.h: F; kernels.py: work_out, sizes, rows_in, task, channel_in, TOKENS, u_in,
-//     delta_in, z_in, c_in, dout_in, dh_out, product_out
+// needs: lanes.h: F; kernels.py: work_out, sizes, rows_in, task, a_in, skip_in, bias_in, TOKENS,
+//     u_in, delta_in, z_in, c_in, dout_in, dh_out, product_out
 // gives: the body of scan_gradient_states
 // The gradient of the outputs by the state before the first token, and the product of the decays.
 #include "task.h"
@@ -7,14 +7,17 @@
 #include "prepare.h"
 const int states = sizes.states;
 F* const work = piece_(work_out, sizes, task);
-auto work_of = [&](const Position& p) { return work + p.j * 4 * states; };
+// of a lane group: states, then what Group has
+const int own = 4 * states, room = own + states + 3;
+auto work_of = [&](const Position& p) { return work + p.j * room; };
 auto enter = [&](const Position& p) {
+    load_group_(a_in, skip_in, bias_in, p, work_of(p) + own);
     pairs_(work_of(p), states, 0.0f), pairs_(work_of(p) + 2 * states, states, 1.0f);
 };
 auto walk = [&](const Position p) __attribute__((always_inline)) {
     alignas(64) Token token[TOKENS];
     alignas(64) PerToken per_token[TOKENS];
-    const Group group = group_(channel_in, p);
+    const Group group(work_of(p) + own, states);
     Fetches fetches;
     const F max_rate =
         prepare_(sizes, p, group, u_in, delta_in, z_in, dout_in, token, per_token, fetches);

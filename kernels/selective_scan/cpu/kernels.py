@@ -111,7 +111,6 @@ class Sizes:
 def forward_kernel(kind: Kind, output: bool) -> Any:
     """Brings the states before each segment, ``first_in``, to those after it, ``last_out``.
 
-    ``channel_in`` has for each lane group the N rates of A, then the greatest |A|, D and the bias;
     ``task.h`` has the layout of states. With ``output`` it computes y; else the products of the
     decays, and z, C and D are not used.
     """
@@ -166,12 +165,13 @@ def _channels(kind: Kind) -> dict[str, Any]:
     """Return the text that all three begin with."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     deltas = wp.array3d(dtype=WARP_DTYPES[kind.delta_io])
-    channels = wp.array2d(dtype=lanes)
     return {
         "sizes": Sizes,
         "rows_in": wp.array2d(dtype=wp.int32),  # of packed rows: b, begin, end, chunk; or none
         "u_in": rows,
         "delta_in": deltas,
         "z_in": rows,
-        "channel_in": channels,
+        "a_in": wp.array2d(dtype=wp.float32),
+        "skip_in": wp.array(dtype=wp.float32),
+        "bias_in": wp.array(dtype=wp.float32),
     }

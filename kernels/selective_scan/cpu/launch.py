@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+from typing import NamedTuple
+
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ...runtime.launch import parallel_launch
@@ -19,12 +21,26 @@ TUNING = Tuning()
 SEGMENT = 4  # chunks of a segment at least
 
 
-def _chunks(x: Scan, chunk: int) -> int:
-    """Number of chunks of so many tokens in all sequences; an upper bound where they are packed."""
-    (batch, length, _), packed = x.inputs.u.shape, x.options.packed
-    if packed is None:
-        return batch * -(-length // chunk)
-    return count_slots(packed, batch, length, chunk)
+class Extent(NamedTuple):
+    """Sizes of a scan, and the threads that may share it."""
+
+    batch: int
+    length: int
+    channels: int
+    states: int
+    groups: int
+    threads: int
+
+    @classmethod
+    def of(cls, x: Inputs) -> Extent:
+        """Return those of a scan's inputs, with torch's threads."""
+        return cls(*x.u.shape, x.A.shape[1], x.B.shape[2], torch.get_num_threads())
+
+    def chunks(self, packed: Tensor | None, chunk: int) -> int:
+        """Chunks of so many tokens in all sequences; an upper bound where they are packed."""
+        if packed is None:
+            return self.batch * -(-self.length // chunk)
+        return count_slots(packed, self.batch, self.length, chunk)
 
 
 class Layout:
@@ -37,22 +53,28 @@ class Layout:
     fewer segments than others have empty ones behind.
     """
 
-    def __init__(self, x: Scan, chunk: int, span: int = SPAN, split: bool = True):
+    def __init__(
+        self,
+        extent: Extent,
+        packed: Tensor | None,
+        chunk: int,
+        span: int = SPAN,
+        split: bool = True,
+    ):
         """Cut a scan.
 
         Args:
-            x: inputs and options of the scan.
+            extent: of the scan.
+            packed: the sequences of packed rows, or None.
             chunk: tokens; a state is saved at the start of each chunk.
             span: blocks of a task at most; segments do not depend on it, nor do bits.
             split: True to allow several segments.
         """
-        self.batch, self.length, self.channels = x.inputs.u.shape
-        self.states, self.groups = x.inputs.A.shape[1], x.inputs.B.shape[2]
-        self.sequences, packed = x.sequences, x.options.packed
+        self.batch, self.length, self.channels, self.states, self.groups, threads = extent
+        self.sequences = self.batch if packed is None else len(packed)
         self.group_width = self.channels // self.groups
         self.group_blocks = -(-self.group_width // W)
         self.blocks = self.groups * self.group_blocks
-        threads = torch.get_num_threads()
 
         def spans(sequences: int, most: int) -> tuple[int, int]:  # blocks of one, how many of them
             per_thread = max(1, min(self.group_blocks, -(-sequences * self.blocks // threads)))
@@ -67,11 +89,11 @@ class Layout:
             cuts = max(1, min(most, length // (SEGMENT * chunk)))
             return max(1, -(-length // (cuts * chunk))) * chunk
 
-        self.chunks = _chunks(x, chunk)
+        self.chunks = extent.chunks(packed, chunk)
         if packed is None:
             self.segment = segment(self.length)
             self.segments = max(1, -(-self.length // self.segment))
-            self.rows, self.last = torch.empty(0, 4, dtype=torch.int32), -1
+            self.rows, self.last = None, -1
         else:
             self.segment = self.length
             b, begin, end = packed.unbind(1)
@@ -88,12 +110,6 @@ class Layout:
                 self.last = counts.long() - 1, torch.arange(len(counts))
         self.tasks = self.segments * count
         self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
-
-    def pack(self, x: Tensor) -> Tensor:
-        """Brings ``[D, K]`` to float32 ``[blocks, K, W]``."""
-        x = x.float().view(self.groups, self.group_width, x.shape[1])
-        x = F.pad(x, (0, 0, 0, self.group_blocks * W - self.group_width))
-        return x.view(self.blocks, W, x.shape[2]).mT.contiguous()
 
     def unpack(self, x: Tensor) -> Tensor:
         """Brings ``[blocks, W]`` to ``[D]``."""
@@ -124,8 +140,11 @@ def _entries(x: Tensor) -> Tensor:
 def _rows(states: Tensor | None):
     """States ``[.., D, N]`` as the kernels take them; None has no rows."""
     if states is None:
-        return torch.empty(0, 1, 1, dtype=torch.float32)
+        return None
     return states.contiguous().view(-1, *states.shape[-2:])
+
+
+_unpacked = functools.lru_cache(1024)(Layout)  # shared: not to be changed
 
 
 class _Operands:
@@ -135,16 +154,17 @@ class _Operands:
         x, options = scan
         states = x.A.shape[1]
         tuning = TUNING._replace(walked=TUNING.walked or (2 if states <= FEW else 4))
-        u, delta, z = dense(x.u), dense(x.delta), dense(x.u if x.z is None else x.z)
-        turned = any(v is not None and is_turned(v) for v in (u, delta, z, dout))
+        u, delta = dense(x.u), dense(x.delta)
+        z = u if x.z is None else dense(x.z)
+        turned = is_turned(u) or is_turned(delta) or is_turned(z)
+        turned = turned or (dout is not None and is_turned(dout))
         span = SPAN if not turned else 1 if dout is None else BLOCKS
-        self.layout = y = Layout(scan, tuning.chunk, span, split)
+        make = _unpacked if options.packed is None else Layout
+        self.layout = y = make(Extent.of(x), options.packed, tuning.chunk, span, split)
         self.kind = Kind(x.u.dtype, x.delta.dtype, options.discretization, tuning, turned)
         self.options = int(options.softplus), int(x.z is not None)
-        zero = x.A.new_zeros(y.channels, 1)
-        skip, bias = (zero if v is None else v.float()[:, None] for v in (x.D, x.delta_bias))
-        channel = torch.cat([x.A, x.A.abs().amax(1, keepdim=True), skip, bias], 1)
-        self.inputs = [y.rows, u, delta, z, view(y.pack(channel), lanes)]
+        skip, bias = (None if v is None else v.float().contiguous() for v in (x.D, x.delta_bias))
+        self.inputs = [y.rows, u, delta, z, x.A.contiguous(), skip, bias]
         self.b = _entries(x.B)
         self.c = self.b if x.C is None else _entries(x.C)
         # whole lines of turned results begin at a multiple of W tokens
@@ -161,11 +181,15 @@ class _Operands:
         )
         parallel_launch(kernel, y.tasks, [sizes, *self.inputs, *inputs], outputs)
 
+    def memory(self, values: int):
+        """Memory of so many lanes for each piece of a launch."""
+        pieces = max(1, min(torch.get_num_threads(), self.layout.tasks))
+        return view(torch.empty(pieces, values, W, dtype=torch.float32), lanes)
+
     def work(self, rows: int):
-        """Memory of lanes for each piece of a launch, ``rows`` for each state."""
+        """Memory of a task's lane groups: ``rows`` of the states, A, and three values."""
         y = self.layout
-        pieces = max(1, min(torch.get_num_threads(), y.tasks))
-        return view(torch.empty(pieces, rows * y.states, W, dtype=torch.float32), lanes)
+        return self.memory(y.span * ((rows + 1) * y.states + 3))
 
     def states(self) -> Tensor:
         y = self.layout
@@ -174,16 +198,17 @@ class _Operands:
     def advance(self, first: Tensor | None, last: Tensor, product: Tensor | None, starts: Tensor):
         """Walks without outputs: states after each segment, and the products of the decays."""
         kernel = kernels.forward_kernel(self.kind, output=False)
-        outputs = [_rows(last), _rows(product), view(starts, lanes), self.inputs[1]]
-        work = self.work(4 * self.layout.span)
+        outputs = [_rows(last), _rows(product), view(starts, lanes), None]
+        work = self.work(4)
         self.run(kernel, [self.b, self.b, _rows(first)], [work, *outputs])
 
 
 def saved_shape(x: Scan) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    channels, groups = x.inputs.u.shape[2], x.inputs.B.shape[2]
-    blocks = groups * -(-(channels // groups) // W)
-    return _chunks(x, TUNING.chunk) if x.options.save else 0, blocks, x.inputs.A.shape[1], W
+    extent = Extent.of(x.inputs)
+    blocks = extent.groups * -(-(extent.channels // extent.groups) // W)
+    chunks = extent.chunks(x.options.packed, TUNING.chunk) if x.options.save else 0
+    return chunks, blocks, extent.states, W
 
 
 def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
@@ -207,7 +232,7 @@ def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
             return out, torch.addcmul(last[y.last], product[y.last], first[y.last]), starts
     if read:
         kernel = kernels.forward_kernel(s.kind, output=True)
-        outputs = [s.work(2 * y.span), _rows(last), _rows(None), view(starts, lanes), out]
+        outputs = [s.work(2), _rows(last), _rows(None), view(starts, lanes), out]
         s.run(kernel, [s.b, s.c, _rows(first)], outputs, results=[out])
     else:
         s.advance(first, last, None, starts)
@@ -227,8 +252,7 @@ def backward(
         needs: True where a gradient is needed; the others are None.
     """
     x, options = scan
-    none = x.u.new_zeros(1, 1, x.u.shape[2]).expand_as(x.u)
-    dout = dense(none if dout is None else dout)
+    dout = dense(x.u.new_zeros(1, 1, x.u.shape[2]).expand_as(x.u) if dout is None else dout)
     s = _Operands(scan, dout)
     y, chunk = s.layout, s.kind.tuning.chunk
     through = any(needs._replace(C=False, D=False, z=False))  # gradients of the states
@@ -237,18 +261,19 @@ def backward(
     if x.C is None:
         s.c = s.b.new_zeros(1, 1, 1, y.states).expand_as(s.b)
 
-    def like(x: Tensor, needed: bool) -> Tensor:
-        return empty_like(x) if needed else empty((x.shape[0], 0, x.shape[2]), x.dtype)
+    def like(x: Tensor, needed: bool) -> Tensor | None:
+        return empty_like(x) if needed else None
 
-    def parts(needed: bool) -> Tensor:
-        return empty((y.parts, y.states * y.length if needed else 0), torch.float32)
+    def parts(needed: bool) -> Tensor | None:
+        return empty((y.parts, y.states * y.length), torch.float32) if needed else None
 
     if y.segments > 1 and through:  # the gradient of the state after each segment
         local, product = s.states(), s.states()
         kernel = kernels.gradient_states_kernel(s.kind)
-        s.run(kernel, [s.c, dout], [s.work(4 * y.span), _rows(local), _rows(product)])
+        s.run(kernel, [s.c, dout], [s.work(4), _rows(local), _rows(product)])
         dlast = _carry(dlast, local.flip(0), product.flip(0)).flip(0)
-    dh, da = s.states(), s.states()
+    dh = s.states() if needs.initial_state else None
+    da = s.states() if needs.A else None
     du, ddelta = like(x.u, needs.u), like(x.delta, needs.delta)
     dz = like(x.u if x.z is None else x.z, needs.z)
     db, dc = parts(needs.B), parts(needs.C)
@@ -258,22 +283,22 @@ def backward(
         kernels.backward_kernel(s.kind),
         [s.b, s.c, view(starts, lanes), dout, _rows(dlast if through else None)],
         [
-            s.work(3 * y.span), s.work(2 * chunk), _rows(dh if needs.initial_state else None),
-            du, ddelta, dz, _rows(da if needs.A else None), db, dc, view(dchannel, lanes),
+            s.work(3), s.memory(2 * y.states * chunk), _rows(dh),
+            du, ddelta, dz, _rows(da), db, dc, view(dchannel, lanes),
         ],
         flags,
-        [du, ddelta, dz],
+        [x for x in (du, ddelta, dz) if x is not None],
     )  # fmt: skip
     scale = DISCRETIZATIONS[options.discretization].scale
     gradients = Inputs(
         u=du,
         delta=ddelta,
-        A=da.sum((0, 1)) / scale if needs.A else None,
-        B=y.total(db) if needs.B else None,
-        C=y.total(dc) if needs.C else None,
+        A=None if da is None else da.sum((0, 1)) / scale,
+        B=None if db is None else y.total(db),
+        C=None if dc is None else y.total(dc),
         D=y.unpack(dchannel[:, 0].sum(0)) if needs.D else None,
         z=dz,
         delta_bias=y.unpack(dchannel[:, 1].sum(0)) if needs.delta_bias else None,
-        initial_state=dh[0],
+        initial_state=None if dh is None else dh[0],
     )
     return like_inputs(gradients, x, needs)

@@ -1,7 +1,8 @@
 // needs: kernels.py: GRADIENT, TOKENS, AT_ONCE, TURNED, SLOWEST, MODERATE; lanes.h: F, I, rows_,
-//     gather_, in_range_, splat; problem.py: WEIGHTED; task.h: Position, row_
-// gives: Token, PerToken, Saved, Group, group_, here_, lanes_, Fetch, Fetches, lines_, read_soon_,
-//     write_soon_, Plain, Slow, worth_slow_, slow_lanes_, Column, column_, Several, One, visit_
+//     gather_, in_range_, max_abs_, splat; problem.py: WEIGHTED; task.h: Position, fill_
+// gives: Token, PerToken, Saved, Group, load_group_, here_, lanes_, Fetch, Fetches, lines_,
+//     read_soon_, write_soon_, Plain, Slow, worth_slow_, slow_lanes_, Column, column_, Several,
+//     One, visit_
 // A strip: TOKENS tokens of a lane group, or fewer at the end. Its memory, its rows, and the loop
 // over the states.
 // The values of a token lie together, because arrays of 4 KiB would evict one another from the
@@ -25,16 +26,27 @@ struct Token {
     F rate, du, y, gate;
 };
 #endif
-// A lane group: N rates A, the largest |A|, D and the bias.
+// A lane group: N rates A, the largest |A|, D and the bias, which follow one another in memory.
 struct Group {
     const F* a;
     int states;
     F max_a, skip, bias;
+    Group(const F* a, int states)
+        : a(a), states(states), max_a(a[states]), skip(a[states + 1]), bias(a[states + 2]) {}
 };
-auto group_ = [&](const auto& channels, const Position& p) -> Group {
-    const int states = channels.shape[1] - 3;
-    const F* const a = row_(channels, p.k);
-    return {a, states, a[states], a[states + 1], a[states + 2]};
+// Brings them there; arrays without elements are zeros.
+auto load_group_ = [&](const auto& rates, const auto& skips, const auto& biases, const Position& p,
+                       F* a) {
+    const int states = rates.shape[1];
+    fill_(a, states + 3, 0.0f);
+    for (int i = 0; i < p.width; ++i)
+        for (int n = 0; n < states; ++n)
+            ((float*)(a + n))[i] = rates.data[(size_t)(p.d + i) * states + n];
+    for (int n = 0; n < states; ++n) a[states] = max_abs_(a[states], a[n]);
+    for (int i = 0; i < p.width; ++i) {
+        if (skips.shape[0] > 0) ((float*)(a + states + 1))[i] = skips.data[p.d + i];
+        if (biases.shape[0] > 0) ((float*)(a + states + 2))[i] = biases.data[p.d + i];
+    }
 };
 
 // The rows of a strip as they lie.
@@ -76,12 +88,12 @@ struct Fetches {
         }
     }
 };
-// Of turned rows a channel's lines lie together; each is met at its end, since the strip may begin
-// within one, which the strip before has fetched.
+// Of turned rows a channel's lines lie together. A strip may begin or end within one; the strip
+// before has fetched that, so they are met at their ends, or in the gradient at their begins.
 auto lines_ = [](const auto& rows, int64_t ahead) -> Fetch {
     const int lines = TOKENS * sizeof(*rows.first) / 64;
     const int64_t jump = (int64_t)rows.across - (lines - 1) * 64;
-    return {(const char*)rows.first + ahead + 63, 64, jump, 0, lines};
+    return {(const char*)rows.first + ahead + (GRADIENT ? 0 : 63), 64, jump, 0, lines};
 };
 auto read_soon_ = [&](Fetches& fetches, auto& array, const Position& p) {
     const int next = GRADIENT ? -TOKENS : TOKENS;

@@ -16,8 +16,8 @@ from helpers.scan import (
 )
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
-from gamba_warp.kernels.selective_scan.cpu.launch import Layout
-from gamba_warp.kernels.selective_scan.problem import Inputs, Options, Scan
+from gamba_warp.kernels.selective_scan.cpu.launch import Extent, Layout
+from gamba_warp.kernels.selective_scan.problem import Inputs
 
 
 def state_of(*shape):
@@ -76,8 +76,7 @@ def test_state_refuses_bad_input():
 def test_segments_match_oracle(threads, discretization):
     """Too few channels for the threads: the tokens are cut, and states carried over the cuts."""
     inputs = make(1, 1111, 21, 3)
-    options = Options(None, True, discretization, save=True)
-    layout = Layout(Scan(Inputs(**inputs), options), 64)
+    layout = Layout(Extent.of(Inputs(**inputs)), None, 64)
     assert layout.segments == {2: 2, 5: 4}[threads]
     compare(inputs, alone=True, discretization=discretization)
 
