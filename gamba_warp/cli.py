@@ -230,11 +230,17 @@ def _parsed(command: Callable, arguments: list[str], program: str) -> Callable[[
         rows = takewhile(lambda row: not _is_rule(row), rows)
         # Texts of help are indented twice.
         text = " ".join(row.strip() for row in rows if not row.startswith(" " * 8)).rstrip(".")
+        text = re.sub(r"\('.*?'\)", _choices, text)
         raise UserError(f"{text or 'invalid arguments'}; {program} --help") from error
     finally:
         if calls:
             sys.stderr.write(said.getvalue())
     return calls[0]
+
+
+def _choices(found: re.Match) -> str:
+    """Return tyro's list of choices in order, without the default of a missing option."""
+    return ", ".join(sorted({*re.findall("'(.*?)'", found[0])} - {"None"}))
 
 
 def _is_rule(row: str) -> bool:
