@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -69,7 +70,7 @@ def bench_command(
     Args:
         what: scan, conv, raster, model, step (of a training), or all.
         device: Device to measure; auto is the GPU if there is one.
-        quick: Small sizes and a few rounds, in seconds.
+        quick: Small sizes and a few rounds; all suites take about a minute.
         full: All sizes, many rounds, and the torch loop at full length.
         peers: Also measure mambapy, mamba-ssm, causal-conv1d and gsplat, if installed.
         out: Folder for the results.
@@ -80,7 +81,7 @@ def bench_command(
 
     from ..kernels.bench.measure import Settings, measure
     from ..kernels.bench.peers import versions
-    from ..kernels.bench.report import chart, markdown
+    from ..kernels.bench.report import busy_line, chart, markdown
 
     if quick and full:
         raise UserError("--quick and --full: choose one")
@@ -110,6 +111,8 @@ def bench_command(
         print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
     measured = sum(r["status"] == "ok" for r in document["records"])
     print(f"{measured} measured; wrote {folder / 'bench.json'}, bench.md and bench.svg")
+    if line := busy_line(document):
+        print(line, file=sys.stderr)
     if document["interrupted"]:
         print("interrupted; the results so far are kept")
         return 130

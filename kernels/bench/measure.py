@@ -160,7 +160,7 @@ def measure(
         "interrupted": False,
         "records": records,
     }
-    before = torch.get_num_threads()
+    before, load = torch.get_num_threads(), os.getloadavg()[0]
     torch.set_num_threads(settings.threads)
     try:
         for case in cases:
@@ -169,6 +169,7 @@ def measure(
         document["interrupted"] = True
     finally:
         torch.set_num_threads(before)
+        document["machine"]["load"] = [round(load, 2), round(os.getloadavg()[0], 2)]
     return document
 
 

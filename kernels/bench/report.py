@@ -25,7 +25,8 @@ _WORK = {
     "share of rasterizer": "rasterizer",
     "share of products": "products",
 }
-_BUSY = 1.1  # wall time over CPU time from which a machine is busy
+_UNSTEADY = 1.3  # the 80 % quantile over that of 20 %, from which a time is marked
+_BUSY = 1.2  # wall time over CPU time from which a machine is busy
 _EXPLANATION = (
     "Times are medians in milliseconds, with the 20 % and 80 % quantiles; variants of one table "
     "were timed in turn, so their ratios come from one run. CPU is the time of all threads of the "
@@ -74,6 +75,7 @@ def _row(r: dict) -> list[str]:
         reason = textwrap.shorten(r["status"], 90, placeholder=" …")
         return [name, r["direction"], r["dtype"], reason, "", "", "", error, "", ""]
     spread = f"{_number(r['ms_p20'])} to {_number(r['ms_p80'])}"
+    spread += " (unsteady)" * (r["ms_p80"] > _UNSTEADY * r["ms_p20"])
     times = [_number(r["ms_p50"]), spread, _number(r["cpu_ms"]), _number(r["jit_ms"])]
     peer = f"{_number(r['peer_ms'] / r['ms_p50'])} ({r['peer']})" if r["peer_ms"] else ""
     return [name, r["direction"], r["dtype"], *times, error or "none", peer, _work_text(r)]
@@ -86,19 +88,27 @@ def _table(records: Sequence[dict]) -> str:
     return tables.markdown(header, rows)
 
 
-def _busy(document: dict) -> str:
-    """Return a line if runs on the CPU waited for it; empty if not."""
+def busy_line(document: dict) -> str:
+    """Return a line if runs on the CPU waited for it; empty if not.
+
+    It has the load of the machine, the number of tasks that wanted a core, at both ends.
+    """
     timed = [r for r in document["records"] if r["ms_p50"] and r["device"] == "cpu"]
     late = sum(r["ms_p50"] > _BUSY * r["cpu_ms"] for r in timed)
-    text = "**The machine was busy**: {} of {} variants took over {:.0%} of their CPU time."
-    return text.format(late, len(timed), _BUSY) if late > len(timed) / 10 else ""
+    if late <= len(timed) / 10:
+        return ""
+    loads = " and ".join(f"{load:.1f}" for load in document["machine"]["load"])
+    return (
+        f"The machine was busy: {late} of {len(timed)} variants took over {_BUSY:.0%} of their CPU "
+        f"time; its load was {loads} at the begin and the end."
+    )
 
 
 def markdown(document: dict) -> str:
     """Return a page with a table for each case."""
     lines = ["# Benchmarks", "Written by `gamba bench`.", _EXPLANATION, machine_line(document)]
     lines += ["The run was interrupted; these are its measurements."] * document["interrupted"]
-    lines += filter(None, [_busy(document)])
+    lines += filter(None, [busy_line(document)])
     for (op, case), group in groupby(document["records"], lambda r: (r["op"], r["case"])):
         records = list(group)
         mine = (r["oracle"] for r in records if r["oracle"] and not r["is_peer"])

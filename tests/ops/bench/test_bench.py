@@ -211,7 +211,10 @@ def test_a_busy_machine_is_told():
     document = run(case(variant("idle", lambda: time.sleep(0.02)), variant("b"), variant("c")))
     record = document["records"][0]
     assert record["cpu_ms"] < 0.5 * record["ms_p50"]
-    assert "**The machine was busy**: " in markdown(document)
+    load = "{} and {}".format(*(f"{load:.1f}" for load in document["machine"]["load"]))
+    assert "The machine was busy: " in (page := markdown(document)) and f"load was {load}" in page
+    record |= {"ms_p20": 1.0, "ms_p80": 1.5}
+    assert markdown(document).count("(unsteady)") == page.count("(unsteady)") + 1
     for record in document["records"]:
         record["cpu_ms"] = record["ms_p50"]
     assert "busy" not in markdown(document)
