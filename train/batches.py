@@ -162,7 +162,7 @@ class Prepared(NamedTuple):
 
     batch: Batch | None
     failures: list[tuple[str, str]]
-    copied: torch.cuda.Event | None = None
+    copied: Any = None
 
 
 class Batches:

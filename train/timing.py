@@ -91,7 +91,8 @@ class Step:
         on_gpu = self.batch.inputs.is_cuda
         kind = "device_time_total" if on_gpu else "cpu_time_total"
         # Without a driver kineto prints that there is none.
-        with profile(use_device="cuda" if on_gpu else None, use_kineto=on_gpu) as found:
+        found = profile(use_device="cuda" if on_gpu else None, use_kineto=on_gpu)
+        with found:
             self._step(self.batch, 0.0)
         events = found.key_averages()
         whole = sum(getattr(event, f"self_{kind}") for event in events) or 1

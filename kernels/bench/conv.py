@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import torch
 
@@ -24,7 +25,8 @@ def operator(settings: Settings) -> list[Variant]:
     """Convolution and SiLU beside torch's grouped convolution, in both layouts."""
     problem = partial(conv_problem, settings.device, _SIZES.get(settings.level, _FULL))
     made = pair(problem(), "default", default=True)
-    made += pair(problem(partial(causal_conv1d_fn, activation="silu"), True), "[B, D, L]")
+    drop_in: Any = partial(causal_conv1d_fn, activation="silu")
+    made += pair(problem(drop_in, True), "[B, D, L]")
     others = {"torch conv1d": (peers.torch_conv, {"rounds": 10})}
     if settings.peers and settings.device.type == "cuda":
         others["causal-conv1d"] = peers.causal_conv1d, {}

@@ -185,10 +185,12 @@ def causal_conv1d_fn(
         return_final_state=return_final_states or final_states_out is not None,
         seq_idx=seq_idx,
     )
-    out, *final = (y.transpose(1, 2) for y in (made if isinstance(made, tuple) else (made,)))
+    both = made if isinstance(made, tuple) else (made, None)
+    out, final = (None if y is None else y.transpose(1, 2) for y in both)
+    assert out is not None
     if seq_idx is not None:
         out = out.masked_fill((seq_idx < 0)[:, None], 0)
-    if final_states_out is not None:
+    if final is not None and final_states_out is not None:
         with torch.no_grad():
-            final_states_out.copy_(*final)
-    return (out, *final) if return_final_states else out
+            final_states_out.copy_(final)
+    return (out, final) if final is not None and return_final_states else out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -119,7 +120,8 @@ def checked_gaussians(
     values["quats"] = _unit(values["quats"])
     values["opacities"] = values["opacities"].clamp(0, 1)
     warn_of_steps(path, values["means"])
-    return Gaussians(**values)
+    given: dict[str, Any] = {**values}
+    return Gaussians(**given)
 
 
 def warn_of_steps(path: str | Path, means: torch.Tensor, step: float = 0.0) -> None:

@@ -6,6 +6,7 @@ Colours are display values, as the extension's ``srgb_rec709_display`` says.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -150,5 +151,5 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
     for part in parts if most else ():
         own = torch.zeros(part.num, 0, 3) if part.harmonics is None else part.harmonics
         part.harmonics = F.pad(own, (0, 0, 0, most - own.shape[1]))
-    names = parts[0].tensors()
-    return Gaussians(**{name: torch.cat([getattr(p, name) for p in parts]) for name in names})
+    joined = {name: torch.cat([getattr(p, name) for p in parts]) for name in parts[0].tensors()}
+    return replace(parts[0], **joined)

@@ -34,7 +34,9 @@ class Extent(NamedTuple):
     @classmethod
     def of(cls, x: Inputs) -> Extent:
         """Return those of a scan's inputs, with torch's threads."""
-        return cls(*x.u.shape, x.A.shape[1], x.B.shape[2], torch.get_num_threads())
+        batch, length, channels = x.u.shape
+        sizes = batch, length, channels, x.A.shape[1], x.B.shape[2]
+        return cls(*sizes, torch.get_num_threads())
 
     def chunks(self, packed: Tensor | None, chunk: int) -> int:
         """Chunks of so many tokens in all sequences; an upper bound where they are packed."""
