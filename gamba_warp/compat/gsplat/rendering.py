@@ -149,6 +149,8 @@ def rasterization(
         backgrounds = None if backgrounds is None else backgrounds.expand(shape)
     one_device({"means": means, "colors": colors, "backgrounds": backgrounds})
 
+    if covars is not None:  # as in gsplat, the upper entries count
+        tensors["covars"] = covars[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     given = {name: flat(x, lead) for name, x in tensors.items()}
     if colors is None or not colored:
         blended = torch.ones_like(given["opacities"])[..., None]
