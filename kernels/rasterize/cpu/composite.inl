@@ -1,6 +1,6 @@
 // needs: composite.py: SUM_ROWS, absolute, lists, rows, task, RUN, splats, TILE, workers, picture,
-//     GRADIENT, ABSOLUTE, PASSES, walk, pixels, ZERO_UPSTREAM, UNUSED, SLACK, SLACK_ABS, EMPTY_TILES,
-//     BLOCK_TEST, STOPPED, v
+//     GRADIENT, ABSOLUTE, PASSES, walk, pixels, ZERO_UPSTREAM, UNUSED, SLACK, SLACK_ABS,
+//     EMPTY_TILES, BLOCK_TEST, STOPPED, v
 // gives: the bodies of composite, composite_vjp and sum_rows
 // Compositing on the CPU (README.md §3, §5), three kernels: the pictures, with GRADIENT the sums of
 // each intersection, with SUM_ROWS those of each Gaussian.

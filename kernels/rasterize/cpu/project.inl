@@ -212,8 +212,8 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         gather_(v_opacity, v_o);
         if (v_scene.covars.data) {  // README eq. 15
             const F a2 = mul_(a, a), v_xx = minus_(F{}, mul_(a2, v_conic[0]));
-            const F v_xy = minus_(F{},
-                add_(mul_(mul_(mul_(two, a2), k), v_conic[0]), mul_(e, v_conic[1])));
+            const F v_xy =
+                minus_(F{}, add_(mul_(mul_(mul_(two, a2), k), v_conic[0]), mul_(e, v_conic[1])));
             const F v_yy = minus_(F{},
                 add_(add_(mul_(mul_(mul_(a2, k), k), v_conic[0]), mul_(mul_(k, e), v_conic[1])),
                     mul_(mul_(e, e), v_conic[2])));
@@ -313,8 +313,8 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     read_(scene.opacities.data + g, 1, n, &opacity);
     to_camera_(camera, mean, t);
     I finite = finite_(sum_(mean)) & finite_(opacity) & finite_(sum_(t));
-    finite &= scene.covars.data ? finite_(sum_(covar)) & finite_(sum_(covar + 3))
-                                : finite_(sum_(scale));
+    finite &=
+        scene.covars.data ? finite_(sum_(covar)) & finite_(sum_(covar + 3)) : finite_(sum_(scale));
     F q[4] = {splat(1.0f), F{}, F{}, F{}};
     if (scene.quats.data) {
         read_(scene.quats.data + g, 4, n, q);

@@ -191,6 +191,9 @@ def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original)
     )
     for name, a, b in zip("means quats scales covars opacities".split(), of_lanes, of_threads):
         assert (a is None and b is None) or (torch.equal(a, b) and (a != 0).any()), name
+    alone = [True, *[False] * 5]
+    for run in (vjp_on_lanes, vjp_on_threads):
+        assert torch.equal(projection.project_backward(*kept[:-1], alone, run)[0], of_lanes[0])
 
 
 def sums_one_by_one(v_pairs, written, splats, bins, geometry, absolute):
