@@ -142,7 +142,7 @@ def test_importing_loads_nothing_else():
 
 
 def test_a_guard_around_the_import_of_another_module(tmp_path, monkeypatch):
-    """It takes its other way where one that is imported there lacks a name."""
+    """Takes its other way where one that is imported there lacks a name."""
     (tmp_path / "own_layers.py").write_text(
         "from gamba_warp.compat.mamba_ssm import Mamba2\n\nclass Mine:\n    pass\n"
     )
