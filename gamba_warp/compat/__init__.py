@@ -13,7 +13,13 @@ from types import ModuleType
 from typing import Any
 
 # Versions of the interfaces.
-VERSIONS = {"mamba_ssm": "2.3.2", "causal_conv1d": "1.7.0", "gsplat": "1.5.3"}
+VERSIONS = {
+    "mamba_ssm": "2.3.2",
+    "causal_conv1d": "1.7.0",
+    "gsplat": "1.5.3",
+    "diff_gaussian_rasterization": "0.0.0",
+    "simple_knn": "0.0.0",
+}
 # Modules replaced in an installed gsplat; the others need only torch.
 _OF_GSPLAT = (
     *("gsplat", "gsplat.cuda._wrapper", "gsplat.relocation", "gsplat.rendering"),
@@ -24,9 +30,9 @@ __all__ = ["take_names"]
 
 
 def take_names(*packages: str) -> None:
-    """Make ``import mamba_ssm``, ``causal_conv1d`` and ``gsplat`` load the modules of this folder.
+    """Make ``import mamba_ssm`` and so on load the modules of this folder.
 
-    The same holds for their extension modules. A fork of one of the packages runs over these alone.
+    They are those of ``VERSIONS``, and extension modules, over which alone a package's fork runs.
 
     Call it once, before the first of these imports; it holds for the whole process.
     ``importlib.metadata`` reports their versions. An installed gsplat keeps its parts without CUDA
@@ -53,7 +59,8 @@ def take_names(*packages: str) -> None:
             continue
         own = importlib.import_module(f"{_HERE}.{name}")
         theirs = importlib.util.find_spec(name) if name == "gsplat" else None
-        for _, path, _ in pkgutil.walk_packages(own.__path__, f"{own.__name__}."):
+        folders = getattr(own, "__path__", ())  # none of a single module
+        for _, path, _ in pkgutil.walk_packages(folders, f"{own.__name__}."):
             if not path.endswith("gsplat.strategy"):  # it is gsplat's own and loads gsplat
                 importlib.import_module(path)
         for path, module in list(sys.modules.items()):

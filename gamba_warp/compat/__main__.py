@@ -1,6 +1,7 @@
 """``python -m gamba_warp.compat SCRIPT …`` or ``-m MODULE …``: run a program on our kernels.
 
-``--take NAME,NAME`` before these takes only some of the names.
+``--take NAME,NAME`` before these takes only some of the names, ``--fork NAME`` chooses one of
+``diff_gaussian_rasterization.FORKS``.
 """
 
 import runpy
@@ -13,8 +14,14 @@ from . import take_names
 def main(arguments: list[str]) -> None:
     """Call ``take_names``, then run a program like ``python``."""
     names = []
-    if arguments[:1] == ["--take"] and len(arguments) > 1:
-        names, arguments = arguments[1].split(","), arguments[2:]
+    while arguments[:1] in (["--take"], ["--fork"]) and len(arguments) > 1:
+        if arguments[0] == "--take":
+            names = arguments[1].split(",")
+        else:
+            from .diff_gaussian_rasterization import use_fork
+
+            use_fork(arguments[1])
+        arguments = arguments[2:]
     if arguments[:1] == ["-m"] and len(arguments) > 1:
         sys.argv = arguments[1:]
         take_names(*names)
@@ -27,7 +34,8 @@ def main(arguments: list[str]) -> None:
         runpy.run_path(arguments[0], run_name="__main__")
     else:
         named = f": there is no file {arguments[0]!r}" if arguments else ""
-        sys.exit(f"python -m gamba_warp.compat [--take NAMES] SCRIPT … or -m MODULE …{named}")
+        options = "[--take NAMES] [--fork NAME]"
+        sys.exit(f"python -m gamba_warp.compat {options} SCRIPT … or -m MODULE …{named}")
 
 
 if __name__ == "__main__":

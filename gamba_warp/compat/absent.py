@@ -48,11 +48,22 @@ class _Module(ModuleType):
 
 
 def _caught(frame: FrameType | None) -> bool:
-    """Return whether the line of a frame is in a ``try`` that catches ImportError."""
+    """Return whether a frame's import is in a ``try`` that catches ImportError.
+
+    That may be around the import of the frame's module, or of one that imports it.
+    """
     while frame and frame.f_code.co_filename.startswith("<frozen importlib"):
         frame = frame.f_back
     if frame is None:
         return False
+    back, imported = frame.f_back, frame.f_code.co_name == "<module>"
+    if imported and back and back.f_code.co_filename.startswith("<frozen importlib"):
+        return _in_try(frame) or _caught(back)
+    return _in_try(frame)
+
+
+def _in_try(frame: FrameType) -> bool:
+    """Return whether the line of a frame is in a ``try`` that catches ImportError."""
     try:
         tree = ast.parse("".join(linecache.getlines(frame.f_code.co_filename, frame.f_globals)))
     except SyntaxError:  # the file has changed

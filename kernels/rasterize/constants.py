@@ -9,5 +9,6 @@ BLOCKS = (TILE // 4) ** 2  # of 4 x 4 pixels in a tile
 FRUSTUM_MARGIN = (
     0.3  # share of tan(fov / 2): how far outside the picture the Jacobian still follows
 )
+RADIUS_MAX = 2.0**24  # pixels; the original's radius is kept below, so that an int32 holds it
 CONIC_MAX = 1e19  # conics of larger entries, whose square leaves float32's range, are culled
 COMPENSATION_MIN = 0.005  # floor of the antialiasing factor, which keeps its gradient finite

@@ -119,7 +119,7 @@ def rasterization(
         antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
     ).numbers()  # fmt: skip
     # colours only cull here, so their gradient is no reason to compute that of the geometry
-    gaussians = x.means, x.quats, x.scales, x.opacities
+    gaussians = x.means, x.quats, x.scales, None, x.opacities
     projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, lens))
     channels = _channels(render_mode, colors, projected.depths)
     colors_per_view = int(channels.dim() > x.means.dim())

@@ -59,7 +59,8 @@ def _projector(device: torch.device) -> Callable[..., None]:
 def project(
     means: Tensor,
     quats: Tensor | None,
-    scales: Tensor,
+    scales: Tensor | None,
+    covars: Tensor | None,
     opacities: Tensor,
     colors: Tensor,
     viewmats: Tensor,
@@ -67,13 +68,13 @@ def project(
     lens: List[float],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``project_forward`` as an operator, with the numbers of ``LensOptions``."""
-    inputs = means, quats, scales, opacities, colors, viewmats, Ks
+    inputs = means, quats, scales, covars, opacities, colors, viewmats, Ks
     p = project_forward(inputs, make_lens(LensOptions(*lens)), _projector(means.device))
     return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
 @project.register_fake
-def _(means, quats, scales, opacities, colors, viewmats, Ks, lens):
+def _(means, quats, scales, covars, opacities, colors, viewmats, Ks, lens):
     shape = (*viewmats.shape[:-2], means.shape[-2])
     floats = tuple(means.new_empty(*shape, *size) for size in PROJECTED_SIZES)
     return *floats, means.new_empty(shape, dtype=torch.int32)
@@ -88,7 +89,7 @@ def _project_vjp(
     cotangents: List[Tensor],
     wanted: List[bool],
 ) -> List[Tensor]:
-    options, viewmats = LensOptions(*lens), wanted[4]
+    options, viewmats = LensOptions(*lens), wanted[5]
     on_lanes = kind_of(conics.device) == "cpu" and not (viewmats or options.antialiased)
     run = vjp_on_lanes if on_lanes else vjp_on_threads
     grads = project_backward(inputs, make_lens(options), conics, status, cotangents, wanted, run)
@@ -97,22 +98,21 @@ def _project_vjp(
 
 @_project_vjp.register_fake
 def _(inputs, lens, conics, status, cotangents, wanted):
-    return [torch.empty_like(x) for x, want in zip(inputs[:5], wanted) if want]
+    return [torch.empty_like(x) for x, want in zip(inputs[:6], wanted) if want]
 
 
 def _project_setup(ctx, inputs, output):
-    means, quats, scales, opacities, _, viewmats, Ks, ctx.lens = inputs
+    *gaussians, _, viewmats, Ks, ctx.lens = inputs
     projected = Projected(*output)
     ctx.mark_non_differentiable(projected.extents, projected.status)
     ctx.set_materialize_grads(False)
-    kept = projected.conics, projected.status
-    ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks, *kept)
+    ctx.save_for_backward(*gaussians, viewmats, Ks, projected.conics, projected.status)
 
 
 def _project_backward(ctx, *cotangents):
     *inputs, conics, status = ctx.saved_tensors
-    means, quats, scales, opacities, _, viewmats, _, _ = ctx.needs_input_grad
-    wanted = [means, quats, scales, opacities, viewmats]
+    *of_gaussians, _, viewmats, _, _ = ctx.needs_input_grad
+    wanted = [*of_gaussians, viewmats]
     given = [
         conics.new_zeros(*status.shape, *size) if v is None else v.contiguous()
         for v, size in zip(cotangents, PROJECTED_SIZES[:4])
@@ -278,7 +278,8 @@ def _composite_vjp(
     drawn = drawn._replace(colors=drawn.colors.flatten(0, -2))
     given = drawn, Bins(*bins), _picture(splats[0], size, limits), Walk(*walk)
     backward = _compositor(splats[0].device).composite_backward
-    grads = backward(*given, v_pixels, skipped, geometry, absolute if geometry else None)
+    passes, absolute = bool(Limits(*limits).passes), absolute if geometry else None
+    grads = backward(*given, v_pixels, skipped, geometry, absolute, passes)
     return [g for g in grads if g is not None]
 
 

@@ -34,6 +34,7 @@ class LensOptions(NamedTuple):
         skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
         rounded: not 0 to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
             does; a Gaussian that this keeps beside the picture has no pair.
+        original: not 0 for the conventions of the first 3D Gaussian splatting code (README.md §7).
     """
 
     width: float
@@ -46,6 +47,7 @@ class LensOptions(NamedTuple):
     antialiased: float
     skip_unused: float
     rounded: float = 0.0
+    original: float = 0.0
 
     def numbers(self) -> list[float]:
         """The attributes in their order; ``LensOptions(*numbers)`` is the way back."""
@@ -60,7 +62,8 @@ class Projected(NamedTuple):
         conics: ``[B, V, N, 3]``: a, k, e of README eq. 4.
         depths: ``[B, V, N]`` along the camera's axis, world units.
         view_opacities: ``[B, V, N]``, with the factor of antialiasing.
-        extents: ``[B, V, N, 2]`` half sides of the box around alpha >= alpha_min, pixels.
+        extents: ``[B, V, N, 2]`` half sides of the box around alpha >= alpha_min, pixels. With the
+            original's conventions both are its radius, also of a Gaussian that is transparent.
         status: ``[B, V, N]`` int32, an index of ``STATUS_NAMES``.
     """
 
@@ -89,6 +92,10 @@ class Lens:
     antialiased: int
     skip_unused: int
     rounded: int
+    original: int
+
+
+vec6 = wp.types.vector(6, wp.float32)
 
 
 @struct
@@ -98,6 +105,7 @@ class Scene:
     means: wp.array[wp.vec3]
     quats: wp.array[wp.vec4]
     scales: wp.array[wp.vec3]
+    covars: wp.array[vec6]  # in the place of quats and scales
     opacities: wp.array[wp.float32]
     viewmats: wp.array[wp.mat44]
     Ks: wp.array[wp.mat33]
@@ -119,9 +127,11 @@ def project_forward(inputs: Sequence[Any], lens: Lens, run: Callable[..., None])
     """Project objects of N Gaussians into V views each; float32, contiguous tensors.
 
     Args:
-        inputs: means ``[.., N, 3]``, quats ``[.., N, 4]`` or None, scales ``[.., N, 3]``,
-            opacities ``[.., N]``; colors ``[.., N, C]`` or ``[.., V, N, C]``, only to cull values
-            that are not finite; viewmats ``[.., V, 4, 4]`` and Ks ``[.., V, 3, 3]``.
+        inputs: means ``[.., N, 3]``, quats ``[.., N, 4]`` or None, scales ``[.., N, 3]`` and covars
+            None, or these two None and covars ``[.., N, 6]`` (xx, xy, xz, yy, yz, zz; positive
+            semidefinite), opacities ``[.., N]``; colors ``[.., N, C]`` or ``[.., V, N, C]``, only
+            to cull values that are not finite; viewmats ``[.., V, 4, 4]`` and Ks
+            ``[.., V, 3, 3]``.
         lens: from ``make_lens``.
         run: launches the device's kernel.
     """
@@ -148,7 +158,7 @@ def project_backward(
     wanted: Sequence[bool],
     run: Callable[..., None],
 ) -> list[Tensor | None]:
-    """Gradients of ``project_forward`` by means, quats, scales, opacities and viewmats.
+    """Gradients of ``project_forward`` by means, quats, scales, covars, opacities and viewmats.
 
     Args:
         inputs: as given forward, without the colors.
@@ -156,7 +166,7 @@ def project_backward(
         conics: as returned forward.
         status: as returned forward.
         cotangents: of means2d, conics, depths and view_opacities; contiguous.
-        wanted: True for the needed gradients of the five; the others are None.
+        wanted: True for the needed gradients of the six; the others are None.
         run: launches the device's kernel; the last argument is the gradient of viewmats, by
             Gaussians ``[B * V, N, 12]``, or None.
     """
@@ -172,7 +182,7 @@ def project_backward(
         else torch.zeros_like(x)
         for x, want in zip(gaussians, wanted)
     ]
-    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[4] else None
+    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[5] else None
     if status.numel():
         arguments = [
             *(views, num, lens, Packed(Scene, *gaussians, viewmats, Ks)),

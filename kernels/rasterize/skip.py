@@ -46,3 +46,4 @@ class Skip:
 TILE_TEST, BLOCK_TEST, STOPPED, EMPTY_TILES, ZERO_UPSTREAM, UNUSED, UNASKED = (
     1 << i for i in range(len(fields(Skip)))
 )
+SQUARES = UNASKED << 1  # not of ``Skip``: lists end at the original's squares (README.md §7)

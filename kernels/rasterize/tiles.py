@@ -170,11 +170,19 @@ class Size(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """The thresholds that a call of the compositor is given, as ``rasterization`` has them."""
+    """The thresholds that a call of the compositor is given, as ``rasterization`` has them.
+
+    Attributes:
+        alpha_min: as ``rasterization``.
+        alpha_max: as ``rasterization``.
+        t_min: as ``rasterization``.
+        passes: not 0 for a gradient that passes the clamp at ``alpha_max`` (README.md §7).
+    """
 
     alpha_min: float
     alpha_max: float
     t_min: float
+    passes: float = 0.0
 
 
 @struct
@@ -204,7 +212,7 @@ def make_picture(size: Size, limits: Limits, *, num: int) -> Picture:
     """
     tiling = Tiling(size.width, size.height)
     sizes = *tiling, tiling.tiles_x, tiling.tiles_y, size.views, num, size.colors_per_view
-    return filled(Picture, *sizes, *limits, size.skip)
+    return filled(Picture, *sizes, *limits[:3], size.skip)
 
 
 @wp.func

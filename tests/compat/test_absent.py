@@ -5,6 +5,7 @@ import importlib.util
 import runpy
 import subprocess
 import sys
+import types
 from typing import Optional
 
 import pytest
@@ -138,3 +139,46 @@ def test_importing_loads_nothing_else():
     code = "import gamba_warp.compat.gsplat.cuda._wrapper, sys; print('gsplat' in sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout == "False\n"
+
+
+def test_a_guard_around_the_import_of_another_module(tmp_path, monkeypatch):
+    """Takes its other way where one that is imported there lacks a name."""
+    (tmp_path / "own_layers.py").write_text(
+        "from gamba_warp.compat.mamba_ssm import Mamba2\n\nclass Mine:\n    pass\n"
+    )
+    (tmp_path / "own_models.py").write_text("from own_layers import Mine\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    space: dict = {}
+    path = tmp_path / "client.py"
+    path.write_text(
+        "try:\n    from own_models import Mine\nexcept ImportError:\n    Mine = None\n"
+        "import own_layers\n"
+    )
+    space = runpy.run_path(str(path))
+    assert space["Mine"] is None and space["own_layers"].Mine is not None
+
+
+@pytest.mark.parametrize("argument", [{"bimamba": True}, {"nslices": 64}, {"bimamba_type": "v3"}])
+def test_arguments_of_forks_name_the_way_out(argument):
+    (name,) = argument
+    line = f"^{name} is .*, which is not supported: a fork's own layer file runs .*drop-ins.md"
+    with pytest.raises((TypeError, ValueError), match=line):
+        mamba_ssm.Mamba(8, **argument)
+
+
+def test_names_of_later_gsplat():
+    from typing import get_args
+
+    assert gsplat.has_3dgs() and not gsplat.has_2dgs() and not gsplat.has_losses()
+    assert get_args(gsplat.RasterizeMode) == ("classic", "antialiased")
+    assert get_args(gsplat.CameraModel) == ("pinhole",) and "ED" in get_args(gsplat.RenderMode)
+
+
+def test_losses_are_an_installed_gsplats(monkeypatch):
+    made = types.ModuleType("gsplat.losses")
+    vars(made)["l1_loss"] = abs
+    monkeypatch.setitem(sys.modules, "gsplat", types.ModuleType("gsplat"))
+    monkeypatch.setitem(sys.modules, "gsplat.losses", made)
+    from gamba_warp.compat.gsplat import l1_loss
+
+    assert l1_loss is abs

@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from helpers import assert_rel_rms
 
 from gamba_warp.compat.causal_conv1d import (
+    causal_conv1d_fn,
     causal_conv1d_ref,
     causal_conv1d_update,
     causal_conv1d_update_ref,
@@ -133,3 +134,12 @@ def test_refuses(change, error, text):
     given = {"x": torch.ones(3, 5), "conv_state": torch.ones(3, 5, 4), "weight": torch.ones(5, 4)}
     with pytest.raises(error, match=f"^{text}"):
         causal_conv1d_update(**given | change)
+
+
+def test_the_form_of_version_1_0():
+    """The activation comes after the bias."""
+    x, weight, bias = torch.randn(2, 5, 9), torch.randn(5, 4), torch.randn(5)
+    want = causal_conv1d_fn(x, weight, bias, activation="silu")
+    assert torch.equal(causal_conv1d_fn(x, weight, bias, "silu"), want)
+    with pytest.raises(ValueError, match="activation"):
+        causal_conv1d_fn(x, weight, bias, "relu")

@@ -40,6 +40,18 @@ def test_relocation():
         assert torch.allclose(sizes[i], scales[i] * old / total, rtol=1e-6)
 
 
+def test_relocation_to_a_smallest_opacity():
+    """The scales follow from the opacity that is kept."""
+    opacities, scales = torch.tensor([0.1, 0.9]), torch.ones(2, 3)
+    binoms = torch.tensor([[math.comb(n, k) for k in range(9)] for n in range(9)]).float()
+    ratios = torch.tensor([8, 2])
+    new, sizes = compute_relocation(opacities, scales, ratios, binoms, min_opacity=0.05)
+    assert new[0] == pytest.approx(0.05) and new[1] == pytest.approx(1 - 0.1**0.5)
+    free = 1 - 0.95**8  # has the new opacity without a bound
+    want = compute_relocation(torch.tensor([free, 0.9]), scales, ratios, binoms)
+    assert torch.allclose(sizes[0], want[1][0] * 0.1 / free) and torch.equal(sizes[1], want[1][1])
+
+
 def fitted(strategy, state, rendering, steps=31, size=(29, 23), **more):
     """Fits a smooth picture; returns the numbers of Gaussians and the losses, step by step."""
     torch.manual_seed(2)

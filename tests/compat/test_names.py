@@ -84,7 +84,8 @@ def test_a_module_runs_as_with_python(monkeypatch):
 def test_what_cannot_be_run_is_one_line(tmp_path):
     done = run(tmp_path / "none.py")
     assert done.returncode == 1 and not done.stdout
-    assert done.stderr.startswith("python -m gamba_warp.compat [--take NAMES] SCRIPT …")
+    options = "[--take NAMES] [--fork NAME]"
+    assert done.stderr.startswith(f"python -m gamba_warp.compat {options} SCRIPT …")
     assert done.stderr.count("\n") == 1 and "none.py" in done.stderr
 
 
@@ -116,4 +117,4 @@ def test_names_of_older_versions():
     quarter = quat_to_rotmat(torch.tensor([[2.0, 0, 0, 2.0]]))  # about z
     assert torch.allclose(quarter, torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]]), atol=1e-6)
     packages = dict(gsplat=gsplat, mamba_ssm=mamba_ssm, causal_conv1d=causal_conv1d)
-    assert {name: package.__version__ for name, package in packages.items()} == VERSIONS
+    assert VERSIONS.items() >= {name: x.__version__ for name, x in packages.items()}.items()

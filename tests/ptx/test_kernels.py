@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import assert_rel_rms
+from helpers import assert_rel_rms, first_splatting
 from helpers import raster as rasters
 from helpers import scan as scans
 from helpers.kernels import conv_inputs
@@ -109,6 +109,11 @@ def test_rasterizer(channels, mode, parts):
         pictures(rasters.crowded(channels), mode)
 
     check(run, PARTS[parts])
+
+
+@pytest.mark.parametrize("name", ["colours", "covariances", "antialiased"])
+def test_original_rasterizer(name):
+    check(lambda: first_splatting.compare(name), PARTS[2])
 
 
 @pytest.mark.parametrize("channels", [3, 5])

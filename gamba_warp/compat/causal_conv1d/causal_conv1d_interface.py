@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...kernels.causal_conv1d import causal_conv1d_fn
+from ...kernels.causal_conv1d import causal_conv1d_fn as _causal_conv1d_fn
 from ...kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..shared import DTYPES, INDEX_DTYPES, check_tensor, of_rows, one_of
 
@@ -18,6 +20,14 @@ __all__ = [
 ]
 
 ACTIVATIONS = (None, "silu", "swish")
+
+
+@functools.wraps(_causal_conv1d_fn)
+def causal_conv1d_fn(x, weight, bias=None, seq_idx=None, *others, **named):
+    """Convolve as the kernels' function; an activation in the place of ``seq_idx`` is taken too."""
+    if isinstance(seq_idx, str) and not others:  # version 1.0 has the activation there
+        return _causal_conv1d_fn(x, weight, bias, activation=seq_idx)
+    return _causal_conv1d_fn(x, weight, bias, seq_idx, *others, **named)
 
 
 def causal_conv1d_update(

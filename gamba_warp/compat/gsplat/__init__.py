@@ -6,6 +6,7 @@ The strategies and exporters are gsplat's own, and load it when used.
 from __future__ import annotations
 
 import importlib
+from functools import partial
 from typing import Any
 
 from ..absent import complete
@@ -19,9 +20,12 @@ from .projection import (
     world_to_cam,
 )
 from .relocation import quat_scale_to_covar_preci, quat_to_rotmat
-from .rendering import RollingShutterType, rasterization
+from .rendering import CameraModel, RasterizeMode, RenderMode, RollingShutterType, rasterization
 
 __all__ = [
+    "CameraModel",
+    "RasterizeMode",
+    "RenderMode",
     "RollingShutterType",
     "SelectiveAdam",
     "adam",
@@ -39,7 +43,19 @@ __all__ = [
 ]
 
 _OF_STRATEGY = ("DefaultStrategy", "MCMCStrategy", "Strategy")
-_OF_GSPLAT = {"PngCompression": "gsplat.compression", "export_splats": "gsplat.exporter"}
+_LOSSES = (
+    "create_ssim_window depth_l1_loss gaussian_density_reg gaussian_scale_reg "
+    "gaussian_z_scale_reg l1_loss lidar_background_loss lidar_distance_loss "
+    "lidar_intensity_loss lidar_raydrop_loss mse_loss opacity_reg_loss out_of_bound_loss "
+    "scale_reg_loss ssim_loss torch_ssim_loss total_variation_loss "
+)
+_OF_GSPLAT = {
+    **{"PngCompression": "gsplat.compression", "export_splats": "gsplat.exporter"},
+    **dict.fromkeys(_LOSSES.split(), "gsplat.losses"),
+}
+# Which parts gsplat was built with.
+has_3dgs = has_adam = has_reloc = partial(bool, True)
+has_2dgs = has_3dgut = has_camera_wrappers = has_losses = partial(bool, False)
 # Names of gsplat 1.5.3; in the first entry those of later versions follow.
 ABSENT = complete(
     __name__,
@@ -49,23 +65,20 @@ ABSENT = complete(
         "": "accumulate accumulate_2dgs fully_fused_projection_2dgs "
         "fully_fused_projection_with_ut rasterization_2dgs rasterization_2dgs_inria_wrapper "
         "rasterization_inria_wrapper rasterize_to_indices_in_range "
-        "rasterize_to_indices_in_range_2dgs rasterize_to_pixels_2dgs rasterize_to_pixels_eval3d "
-        "CameraModel ExternalDistortionModelMeta ExternalDistortionModelParameters "
-        "FusedGaussianLosses LidarTiling RasterizeMode RenderMode RendererConfig "
+        "rasterize_to_indices_in_range_2dgs rasterize_to_pixels_2dgs "
+        "rasterize_to_pixels_eval3d ExternalDistortionModelMeta "
+        "ExternalDistortionModelParameters FusedGaussianLosses LidarTiling RendererConfig "
         "RendererConfig_MixedBatch RendererConfig_ParallelBatch "
         "RowOffsetStructuredSpinningLidarModelParameters "
         "RowOffsetStructuredSpinningLidarModelParametersExt SpinningDirection "
         "build_sparse_tile_layout color_correct_affine color_correct_quadratic "
-        "compute_lidar_angles_to_columns_map compute_lidar_tiling create_ssim_window depth_l1_loss "
-        "gaussian_density_reg gaussian_scale_reg gaussian_z_scale_reg has_2dgs has_3dgs has_3dgut "
-        "has_adam has_camera_wrappers has_losses has_reloc isect_tiles_lidar isect_tiles_sparse "
-        "l1_loss lidar_background_loss lidar_distance_loss lidar_intensity_loss "
-        "lidar_raydrop_loss mse_loss opacity_reg_loss out_of_bound_loss "
-        "rasterize_contributing_gaussian_ids rasterize_contributing_gaussian_ids_sparse "
-        "rasterize_num_contributing_gaussians rasterize_num_contributing_gaussians_sparse "
-        "rasterize_to_pixels_sparse rasterize_top_contributing_gaussian_ids "
-        "rasterize_top_contributing_gaussian_ids_sparse scale_reg_loss spherical_harmonics_l0 "
-        "spherical_harmonics_l1_plus ssim_loss torch_ssim_loss total_variation_loss",
+        "compute_lidar_angles_to_columns_map compute_lidar_tiling isect_tiles_lidar "
+        "isect_tiles_sparse rasterize_contributing_gaussian_ids "
+        "rasterize_contributing_gaussian_ids_sparse rasterize_num_contributing_gaussians "
+        "rasterize_num_contributing_gaussians_sparse rasterize_to_pixels_sparse "
+        "rasterize_top_contributing_gaussian_ids "
+        "rasterize_top_contributing_gaussian_ids_sparse spherical_harmonics_l0 "
+        "spherical_harmonics_l1_plus",
         "compression": "PngCompression",
         "compression.png_compression": "PngCompression",
         "compression.sort": "sort_splats",

@@ -180,26 +180,27 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -
 
     The rasterizer's factor of antialiasing is at least 0.005, while gsplat's goes down to 0. The
     few Gaussians below are projected again by their covariances, in float64, and culled by their
-    own factor.
+    own factor. Where covariances are given, that takes all: a thin one's factor needs their digits.
 
     Args:
         scene: by name ``means [B, N, 3]``, ``opacities [B, N]``, ``viewmats [B, C, 4, 4]``,
             ``Ks [B, C, 3, 3]``, and ``quats [B, N, 4]`` and ``scales [B, N, 3]``, or
-            ``covars [B, N, 3, 3]``.
+            ``covars [B, N, 6]``.
         colors: ``[B, N, D]`` or ``[B, C, N, D]``, only to cull what is not finite.
         lens: options.
     """
     means, opacities, viewmats, Ks = (scene[k] for k in ("means", "opacities", "viewmats", "Ks"))
-    if "covars" in scene:
+    quats, scales, covars = (scene.get(name) for name in ("quats", "scales", "covars"))
+    if covars is not None and lens.antialiased:
         finite = colors.isfinite().all(-1).view(len(colors), -1, means.shape[1])
         finite = finite & opacities.isfinite()[:, None]
         shown = torch.where(finite, opacities[:, None], 0.0)
-        return _project_covariances(means, scene["covars"], shown, viewmats, Ks, lens)
-    quats, scales = scene["quats"], scene["scales"]
-    given = means, quats, scales, opacities, colors.detach(), viewmats, Ks
+        whole: Any = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
+        return _project_covariances(means, whole, shown, viewmats, Ks, lens)
+    given = means, quats, scales, covars, opacities, colors.detach(), viewmats, Ks
     splats = Splats(*project(*given, lens.numbers())[:5])
     splats = splats._replace(extents=splats.extents.detach())
-    if not lens.antialiased:
+    if not lens.antialiased or quats is None or scales is None:
         return splats
     with torch.no_grad():
         faint = splats.opacities <= opacities[:, None] * (COMPENSATION_MIN * _NEARLY)
@@ -208,8 +209,8 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -
     if len(b) == 0:
         return splats
     wide = quats[b, g].double(), scales[b, g].double()
-    covars: Any = quat_scale_to_covar_preci(*wide, True, False)[0]
-    given = means[b, g], covars, opacities[b, g, None], viewmats[b, c], Ks[b, c]
+    whole = quat_scale_to_covar_preci(*wide, True, False)[0]
+    given = means[b, g], whole, opacities[b, g, None], viewmats[b, c], Ks[b, c]
     exact = _project_covariances(*(x[:, None] for x in given), lens=lens)
     return Splats(*(x.index_put(at, one[:, 0, 0]) for x, one in zip(splats, exact)))
 
@@ -323,8 +324,6 @@ def fully_fused_projection(
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
     lead = check_scene({**tensors, **({} if opacities is None else {"opacities": opacities})}, (6,))
     given = {name: flat(x, lead) for name, x in tensors.items()}
-    if covars is not None:  # to the whole matrix
-        given["covars"] = given["covars"][..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
     opacity = flat(means.detach()[..., 0] if opacities is None else opacities.detach(), lead)
 
     def projected(opacity: Tensor, antialiased: bool) -> Splats:

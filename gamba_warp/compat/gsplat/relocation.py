@@ -61,7 +61,11 @@ def quat_scale_to_covar_preci(
 
 
 def compute_relocation(
-    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor
+    opacities: Tensor,
+    scales: Tensor,
+    ratios: Tensor,
+    binoms: Tensor,
+    min_opacity: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """Compute opacity and size of n equal Gaussians at one place that look like a single one.
 
@@ -74,6 +78,7 @@ def compute_relocation(
         scales: ``[N, 3]``.
         ratios: ``[N]`` integers, n of each; clamped to 1 to n_max, in place as gsplat does.
         binoms: ``[n_max, n_max]``, ``binoms[i, k]`` = C(i, k).
+        min_opacity: new opacities, from which the scales follow, are at least this (gsplat 1.6).
 
     Returns:
         The new opacities, of their shape, and the new scales ``[N, 3]``.
@@ -90,7 +95,7 @@ def compute_relocation(
     ratios.clamp_(min=1, max=most)
     count = ratios.long()
     old = opacities.flatten().double()
-    new = -torch.expm1(torch.log1p(-old) / count)
+    new = -torch.expm1(torch.log1p(-old) / count).clamp_max(-min_opacity)
     power = torch.arange(1, most + 1, device=old.device)
     signs = torch.where(power % 2 == 1, 1.0, -1.0).double() / power.double().sqrt()
     weights = binoms.double().cumsum(0)[count - 1] * signs

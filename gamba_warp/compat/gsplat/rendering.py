@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -28,6 +28,11 @@ MUST_BE_DEFAULT = (
     "return_normals", "global_z_order", "rays", "lidar_coeffs", "external_distortion_coeffs",
     "ut_params", "extra_signals", "extra_signals_sh_degree", "renderer_config",
 )  # fmt: skip
+
+
+CameraModel = Literal["pinhole"]
+RasterizeMode = Literal["classic", "antialiased"]
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
 
 class RollingShutterType(Enum):
@@ -149,6 +154,8 @@ def rasterization(
         backgrounds = None if backgrounds is None else backgrounds.expand(shape)
     one_device({"means": means, "colors": colors, "backgrounds": backgrounds})
 
+    if covars is not None:  # as in gsplat, the upper entries count
+        tensors["covars"] = covars[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     given = {name: flat(x, lead) for name, x in tensors.items()}
     if colors is None or not colored:
         blended = torch.ones_like(given["opacities"])[..., None]

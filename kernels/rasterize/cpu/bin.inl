@@ -1,5 +1,5 @@
 // needs: bin.py: SORT, staged, splats, counter, lists, workspace, OFFSETS, work, parts, grid,
-//     SLACK, SLACK_ABS, TILE_TEST, COUNT, task, count
+//     SLACK, SLACK_ABS, TILE_TEST, SQUARES, COUNT, task, count
 // gives: the bodies of sort, count, offsets and scatter
 // The tile lists of the CPU (README.md §2), four kernels, of which a macro of its name chooses one:
 // COUNT the tiles of each Gaussian, OFFSETS of the lists, SCATTER the intersections, SORT a list.
@@ -118,9 +118,12 @@ const float wide = (float)(width - 1), high = (float)(height - 1);
 auto tile_ = [&](F x, float most) -> I {
     return ints_(min_(max_(x, F{}), splat(most))) >> grid.shift;
 };
-// first and last row with a pixel centre (at +0.5) in reach, with a pixel to spare
-auto top_ = [&](F y, F reach) -> I { return tile_(y - reach - 1.0f, high); };
-auto bottom_ = [&](F y, F reach) -> I { return tile_(y + reach + 1.0f, high); };
+// first and last row with a pixel centre (at +0.5) in reach, with a pixel to spare; or of README
+// eq. 16's square, whose half side is the reach
+const bool squares = grid.skip & SQUARES;
+const float above = squares ? 0.5f : 1.0f, below = squares ? -1.5f : 1.0f;
+auto top_ = [&](F y, F reach) -> I { return tile_(y - reach - above, high); };
+auto bottom_ = [&](F y, F reach) -> I { return tile_(y + reach + below, high); };
 // log(x) for x >= 1 to 2e-7 of itself or 1e-7: the limit has a slack of 1e-4
 auto log_ = [&](F x) -> F {
     const I bits = (I)x;
@@ -163,6 +166,10 @@ auto spans_ = [&](const Ellipse& E, I ty, I& first, I& last) {
     // a tile spans pixel centres 0.5 to 15.5; a gap between two tiles belongs to neither
     first = none ? I{} : tile_(x0 + 0.5f, wide);
     last = none ? I{} - 1 : tile_(x1 - 0.5f, wide);
+    if (!squares) return;
+    const I begin = tile_(E.x - E.extent - 0.5f, wide), end = tile_(E.x + E.extent - 1.5f, wide);
+    first = first > begin ? first : begin;
+    last = last < end ? last : end;
 };
 // `visit(row, first, last)` for each row of tiles that Gaussian i touches: lanes are its rows
 auto rows_ = [&](int i, auto visit) {

@@ -20,14 +20,14 @@ from ...runtime.memory import empty
 from ...runtime.native import native, native_kernel
 from ...runtime.views import Packed, as_struct, struct, struct_of
 from ..projection import Projected
-from ..skip import TILE_TEST
+from ..skip import SQUARES, TILE_TEST
 from ..tiles import SLACK, SLACK_ABS, Bins, Grid
 
 MANY = 1 << 15  # Gaussians of a view from which sorting each list is quicker
 _PARTS_PER_THREAD = 4  # more than 1, since Gaussians differ in size, and so do parts
 
 _HERE = Path(__file__).parent
-_DEFINES = {"SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "TILE_TEST": TILE_TEST}
+_DEFINES = {"SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "TILE_TEST": TILE_TEST, "SQUARES": SQUARES}
 
 
 @struct

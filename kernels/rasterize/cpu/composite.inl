@@ -1,6 +1,6 @@
 // needs: composite.py: SUM_ROWS, absolute, lists, rows, task, RUN, splats, TILE, workers, picture,
-//     GRADIENT, ABSOLUTE, walk, pixels, ZERO_UPSTREAM, UNUSED, SLACK, SLACK_ABS, EMPTY_TILES,
-//     BLOCK_TEST, STOPPED, v
+//     GRADIENT, ABSOLUTE, PASSES, walk, pixels, ZERO_UPSTREAM, UNUSED, SLACK, SLACK_ABS,
+//     EMPTY_TILES, BLOCK_TEST, STOPPED, v
 // gives: the bodies of composite, composite_vjp and sum_rows
 // Compositing on the CPU (README.md §3, §5), three kernels: the pictures, with GRADIENT the sums of
 // each intersection, with SUM_ROWS those of each Gaussian.
@@ -206,9 +206,9 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
         for (; bits; bits &= bits - 1) {
             const int b = __builtin_ctz(bits);
             const F U = u_of(s, b), V = v_of(s, b);
-            F alpha = alpha_of(s, U, V);
-            alpha = ((alpha >= picture.alpha_min) & (stops[b] > k))
-                ? min_(alpha, F{} + picture.alpha_max)
+            const F free = alpha_of(s, U, V);
+            const F alpha = ((free >= picture.alpha_min) & (stops[b] > k))
+                ? min_(free, F{} + picture.alpha_max)
                 : F{};
             const F T = Ts[b] / (1.0f - alpha);
             Ts[b] = T;
@@ -222,7 +222,9 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
             if (rows.geometry) {
                 const F diff = sum - Rs[b];
                 Rs[b] = fma_(alpha, diff, Rs[b]);
-                const F h = alpha < picture.alpha_max ? weight * diff : F{};
+                // past the clamp it is that of the alpha that is not clamped
+                const F over = PASSES ? T * free * diff : F{};
+                const F h = alpha < picture.alpha_max ? weight * diff : over;
                 const F u = h * U, w = h * V;
                 h0 += h;
                 hu += u;

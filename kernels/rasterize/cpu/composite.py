@@ -57,15 +57,22 @@ _composite = native_kernel(
     inputs=_SPLATS,
     outputs={**_WALK, "workers": Workers},
 )
-# without and with the sums of absolute values, which cost nothing where they are not asked for
-_composite_vjp, _composite_vjp_absolute = (
+# with the sums of absolute values, and with a gradient that passes the clamp of alpha, which cost
+# nothing where they are not asked for
+_composite_vjp, _composite_vjp_absolute, _composite_vjp_passing = (
     native_kernel(
-        name,
-        native(_HERE / "composite.inl", GRADIENT=True, **_DEFINES, ABSOLUTE=absolute),
+        f"composite_vjp{name}",
+        native(
+            _HERE / "composite.inl", GRADIENT=True, **_DEFINES, ABSOLUTE=absolute, PASSES=passes
+        ),
         inputs={**_SPLATS, **_WALK},
         outputs={"workers": Workers, "rows": Rows},
     )
-    for name, absolute in (("composite_vjp", False), ("composite_vjp_absolute", True))
+    for name, absolute, passes in (
+        ("", False, False),
+        ("_absolute", True, False),
+        ("_passing", False, True),
+    )
 )
 _sum_rows = native_kernel(
     "sum_rows",
@@ -126,6 +133,7 @@ def composite_backward(
     skipped: Tensor,
     geometry: bool,
     absolute: Tensor | None = None,
+    passes: bool = False,
 ) -> Drawn:
     """Gradients of ``composite_forward`` by (view, Gaussian), from a row of sums for each pair.
 
@@ -139,6 +147,7 @@ def composite_backward(
         geometry: True to compute more than the gradient of the colours.
         absolute: ``[.., N, 2]``, set to the pixels' absolute gradients of means2d, summed; or None.
             With it ``geometry`` is True.
+        passes: the gradient passes the clamp of alpha; not with ``absolute``.
     """
     channels = splats.colors.shape[1]
     moments = 6 if absolute is None else 8
@@ -153,7 +162,8 @@ def composite_backward(
         _workers(channels + BLOCKS * (channels + 1)),
         Packed(Rows, sums, written, skipped, int(geometry)),
     ]
-    kernel = _composite_vjp if absolute is None else _composite_vjp_absolute
+    kernel = _composite_vjp_passing if passes else _composite_vjp
+    kernel = kernel if absolute is None else _composite_vjp_absolute
     parallel_launch(kernel, torch.get_num_threads(), arguments)
     return reduce_rows(sums, written, splats, bins, geometry, absolute)
 

@@ -1,5 +1,5 @@
 // needs: project.py: num, RUN, task, scene, MARGIN, lens, GRADIENT, views, v_splats, splats,
-//     v_scene, colors, colors_per_view, COMPENSATION_MIN, CONIC_MAX;
+//     v_scene, colors, colors_per_view, COMPENSATION_MIN, CONIC_MAX, RADIUS_MAX, TILE;
 //     projection.py: VISIBLE, TRANSPARENT, FAR,
 //     NEAR, NOT_FINITE, OUTSIDE, SMALL
 // gives: the bodies of project and project_vjp
@@ -20,7 +20,7 @@ auto cross_ = [](F a, F b, F c, F d) -> F { return a * d - b * c; };
 // reads n rows of `size` numbers as lanes; loops of constant length become loads and shuffles
 auto read_ = [](const void* from, int size, int n, F* v) {
     const float* const p = (const float*)from;
-    float part[4][16] = {};
+    float part[6][16] = {};
     auto fill = [&](int count, int numbers) {
         for (int l = 0; l < count; ++l)
             for (int k = 0; k < numbers; ++k) part[k][l] = p[numbers * l + k];
@@ -32,7 +32,7 @@ auto read_ = [](const void* from, int size, int n, F* v) {
 };
 auto write_ = [](void* to, int size, int n, const F* v) {
     float* const p = (float*)to;
-    float part[4][16];
+    float part[6][16];
     for (int k = 0; k < size; ++k) *(F*)part[k] = v[k];
     auto spill = [&](int count, int numbers) {
         for (int l = 0; l < count; ++l)
@@ -43,8 +43,9 @@ auto write_ = [](void* to, int size, int n, const F* v) {
     else spill(n, size);
 };
 
-// the length of quaternions, in numbers that do not leave float32's range
+// the length of quaternions, in numbers that do not leave float32's range; 1 in the original
 auto length_ = [&](const F* q) -> F {
+    if (lens.original) return splat(1.0f);
     const F m = greater_(greater_(abs_(q[0]), abs_(q[1])), greater_(abs_(q[2]), abs_(q[3])));
     F sum = F{};
     for (int k = 0; k < 4; ++k) {
@@ -70,6 +71,20 @@ auto rotate_ = [&](F* q, F size, F (*R)[3]) {
     R[2][1] = mul_(two, plus(y, z, w, x));
     R[2][2] = add_(one, -mul_(two, plus(x, x, y, y)));
 };
+// README eq. 15: the triangle whose square is the covariance; kept within what rounding leaves
+auto root_of_ = [&](const F* c, F (*L)[3]) {
+    auto ratio_ = [](F part, F whole) -> F { return whole > 0.0f ? part / whole : F{}; };
+    auto within_ = [&](F x, F most) -> F { return less_(greater_(-most, x), most); };
+    auto left_ = [&](F x) -> F { return greater_(x, F{}); };
+    const F a = root_(left_(c[0])), along = root_(left_(c[3]));
+    const F b = within_(ratio_(c[1], a), along);
+    const F d = within_(ratio_(c[2], a), root_(left_(c[5])));
+    const F e = root_(left_(minus_(c[3], mul_(b, b)))), rest = left_(minus_(c[5], mul_(d, d)));
+    const F f = within_(ratio_(minus_(c[4], mul_(b, d)), e), root_(rest));
+    L[0][0] = a, L[0][1] = F{}, L[0][2] = F{};
+    L[1][0] = b, L[1][1] = e, L[1][2] = F{};
+    L[2][0] = d, L[2][1] = f, L[2][2] = root_(left_(minus_(rest, mul_(f, f))));
+};
 auto turned_ = [&](const F* row, const F (*R)[3], F* out) {
     for (int k = 0; k < 3; ++k)
         out[k] = fma_(row[2], R[2][k], fma_(row[1], R[1][k], mul_(row[0], R[0][k])));
@@ -85,9 +100,10 @@ auto camera_of = [&](size_t image) -> Camera {
     const float* const K = (const float*)(scene.Ks.data + image);
     const float half = MARGIN * 0.5f;
     const float across = half * lens.width / K[0], along = half * lens.height / K[4];
-    const float left = K[2] / K[0] + across, top = K[5] / K[4] + along;
-    return {V, K, -left, (lens.width - K[2]) / K[0] + across, -top,
-        (lens.height - K[5]) / K[4] + along};
+    const float x = lens.original ? 0.5f * lens.width : K[2];
+    const float y = lens.original ? 0.5f * lens.height : K[5];
+    const float left = x / K[0] + across, top = y / K[4] + along;
+    return {V, K, -left, (lens.width - x) / K[0] + across, -top, (lens.height - y) / K[4] + along};
 };
 auto to_camera_ = [&](const Camera& camera, const F* mean, F* t) {
     for (int r = 0; r < 3; ++r) {
@@ -115,20 +131,22 @@ auto jacobian_ = [&](const Camera& camera, const F* t, F* slopes, F (*rows)[3]) 
 #if GRADIENT
 // The gradient of a run of an object's Gaussians, over its views in their order, to the bits of the
 // kernel of ../cuda/project.py. Gradients of antialiasing and of viewmats are that kernel's alone.
-// gradient of j = -focal slope(x/z)/z to (x, z), p = x/z; a clamped slope is a constant
+// gradient of j = -focal slope(x/z)/z to (x, z), p = x/z; a clamped slope is a constant, and in the
+// original slope z is one
 auto slope_ = [&](F p, F z, float low, float high, float focal, F v, F& vx, F& vz) {
     const F s = less_(greater_(splat(low), p), splat(high));
     const F f = mul_(v, splat(focal)) / mul_(z, z);
     const I free = p == s;
     vx = free ? -f : F{};
-    vz = free ? mul_(mul_(splat(2.0f), f), s) : mul_(f, s);
+    vz = free | (I{} - lens.original) ? mul_(mul_(splat(2.0f), f), s) : mul_(f, s);
 };
 const int object = task / runs;
 for (int i0 = begin; i0 < end; i0 += 16) {
     const int n = end - i0 < 16 ? end - i0 : 16;
     const size_t g = (size_t)object * num + i0;
-    F v_mean[3] = {}, v_scale[3] = {}, v_opacity = F{}, v_R[3][3] = {};
+    F v_mean[3] = {}, v_scale[3] = {}, v_opacity = F{}, v_R[3][3] = {}, v_covar[6] = {};
     F mean[3], scale[3], q[4], R[3][3] = {}, size = F{};
+    const bool turns = scene.quats.data || scene.covars.data;
     I ever = I{};
     for (int view = 0; view < views; ++view) {
         const size_t image = (size_t)object * views + view, i = image * num + i0;
@@ -146,7 +164,12 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         if (!any_(seen)) continue;
         if (!any_(ever)) {
             read_(scene.means.data + g, 3, n, mean);
-            read_(scene.scales.data + g, 3, n, scale);
+            if (scene.covars.data) {  // its root in the place of the rotation, with scales of 1
+                F covar[6];
+                read_(scene.covars.data + g, 6, n, covar);
+                root_of_(covar, R);
+                for (int k = 0; k < 3; ++k) scale[k] = splat(1.0f);
+            } else read_(scene.scales.data + g, 3, n, scale);
             if (scene.quats.data) {
                 read_(scene.quats.data + g, 4, n, q);
                 size = length_(q);
@@ -160,7 +183,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         to_camera_(camera, mean, t);
         jacobian_(camera, t, slopes, P);
         for (int r = 0; r < 2; ++r)
-            if (scene.quats.data) turned_(P[r], R, N[r]);
+            if (turns) turned_(P[r], R, N[r]);
             else
                 for (int k = 0; k < 3; ++k) N[r][k] = P[r][k];
         for (int k = 0; k < 3; ++k) {
@@ -187,6 +210,23 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         }
         auto gather_ = [&](F& to, F value) { to = seen ? add_(to, value) : to; };
         gather_(v_opacity, v_o);
+        if (v_scene.covars.data) {  // README eq. 15
+            const F a2 = mul_(a, a), v_xx = minus_(F{}, mul_(a2, v_conic[0]));
+            const F v_xy =
+                minus_(F{}, add_(mul_(mul_(mul_(two, a2), k), v_conic[0]), mul_(e, v_conic[1])));
+            const F v_yy = minus_(F{},
+                add_(add_(mul_(mul_(mul_(a2, k), k), v_conic[0]), mul_(mul_(k, e), v_conic[1])),
+                    mul_(mul_(e, e), v_conic[2])));
+            int at = 0;
+            for (int r = 0; r < 3; ++r)
+                for (int j = r; j < 3; ++j) {
+                    const F across = mul_(mul_(splat(0.5f), v_xy),
+                        add_(mul_(P[0][r], P[1][j]), mul_(P[1][r], P[0][j])));
+                    const F entry = add_(add_(mul_(mul_(v_xx, P[0][r]), P[0][j]), across),
+                        mul_(mul_(v_yy, P[1][r]), P[1][j]));
+                    gather_(v_covar[at++], r == j ? entry : mul_(two, entry));
+                }
+        }
         for (int j = 0; j < 3; ++j)
             gather_(v_scale[j], add_(mul_(N[0][j], v_m[0][j]), mul_(N[1][j], v_m[1][j])));
         for (int r = 0; r < 2; ++r)
@@ -196,7 +236,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
                 gather_(v_R[r][j], fma_(P[1][r], v_N[1][j], mul_(P[0][r], v_N[0][j])));
         for (int r = 0; r < 2; ++r)
             for (int j = 0; j < 3; ++j)
-                v_P[r][j] = scene.quats.data
+                v_P[r][j] = turns
                     ? fma_(v_N[r][2], R[j][2], fma_(v_N[r][1], R[j][1], mul_(v_N[r][0], R[j][0])))
                     : v_N[r][j];
         auto v_J = [&](int r, int j) -> F {  // times the transpose of W
@@ -220,6 +260,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     }
     if (v_scene.means.data) write_(v_scene.means.data + g, 3, n, v_mean);
     if (v_scene.scales.data) write_(v_scene.scales.data + g, 3, n, v_scale);
+    if (v_scene.covars.data) write_(v_scene.covars.data + g, 6, n, v_covar);
     if (v_scene.opacities.data) write_(v_scene.opacities.data + g, 1, n, &v_opacity);
     if (!v_scene.quats.data) continue;
     F v_q[4] = {};
@@ -247,7 +288,8 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         }
         // the gradient of a shorter one leaves float32's range
         const I some = ever & (I)(size > 1e-30f);
-        for (int j = 0; j < 4; ++j) v_q[j] = some ? minus_(s[j], mul_(q[j], dot)) / size : F{};
+        const F turn = lens.original ? F{} : dot;
+        for (int j = 0; j < 4; ++j) v_q[j] = some ? minus_(s[j], mul_(q[j], turn)) / size : F{};
     }
     write_(v_scene.quats.data + g, 4, n, v_q);
 }
@@ -264,12 +306,15 @@ auto dot_ = [](const F* a, const F* b) -> F { return a[0] * b[0] + a[1] * b[1] +
 for (int i0 = begin; i0 < end; i0 += 16) {
     const int n = end - i0 < 16 ? end - i0 : 16;
     const size_t i = (size_t)image * num + i0, g = (size_t)object * num + i0;
-    F mean[3], scale[3], opacity, t[3];
+    F mean[3], scale[3], covar[6], opacity, t[3];
     read_(scene.means.data + g, 3, n, mean);
-    read_(scene.scales.data + g, 3, n, scale);
+    if (scene.covars.data) read_(scene.covars.data + g, 6, n, covar);
+    else read_(scene.scales.data + g, 3, n, scale);
     read_(scene.opacities.data + g, 1, n, &opacity);
     to_camera_(camera, mean, t);
-    I finite = finite_(sum_(mean)) & finite_(sum_(scale)) & finite_(opacity) & finite_(sum_(t));
+    I finite = finite_(sum_(mean)) & finite_(opacity) & finite_(sum_(t));
+    finite &=
+        scene.covars.data ? finite_(sum_(covar)) & finite_(sum_(covar + 3)) : finite_(sum_(scale));
     F q[4] = {splat(1.0f), F{}, F{}, F{}};
     if (scene.quats.data) {
         read_(scene.quats.data + g, 4, n, q);
@@ -291,8 +336,8 @@ for (int i0 = begin; i0 < end; i0 += 16) {
 
     // every cull is written so that NaN fails it, and comes before the first division by z
     const F z = t[2];
-    I status =
-        (z <= lens.far_plane) ? ((opacity >= lens.alpha_min) ? I{} : I{} + TRANSPARENT) : I{} + FAR;
+    const I shows = (I)(opacity >= lens.alpha_min) | (I{} - lens.original);
+    I status = (z <= lens.far_plane) ? (shows ? I{} : I{} + TRANSPARENT) : I{} + FAR;
     status = (z >= lens.near_plane) ? status : I{} + NEAR;
     status = finite ? status : I{} + NOT_FINITE;
     I seen = (I)(status == 0) & (I)(lane < n);
@@ -301,14 +346,17 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     if (any_(seen)) {
         F slopes[2], M[2][3];
         jacobian_(camera, t, slopes, M);
-        if (scene.quats.data) {
+        if (scene.quats.data || scene.covars.data) {
             F R[3][3], N[2][3];
-            rotate_(q, length_(q), R);
+            if (scene.covars.data) root_of_(covar, R);
+            else rotate_(q, length_(q), R);
             for (int r = 0; r < 2; ++r) turned_(M[r], R, N[r]);
             for (int k = 0; k < 3; ++k) M[0][k] = N[0][k], M[1][k] = N[1][k];
         }
         F *const m0 = M[0], *const m1 = M[1];
-        for (int k = 0; k < 3; ++k) m0[k] = mul_(m0[k], scale[k]), m1[k] = mul_(m1[k], scale[k]);
+        if (!scene.covars.data)
+            for (int k = 0; k < 3; ++k)
+                m0[k] = mul_(m0[k], scale[k]), m1[k] = mul_(m1[k], scale[k]);
         const F across[3] = {cross_(m0[1], m0[2], m1[1], m1[2]), cross_(m0[2], m0[0], m1[2], m1[0]),
             cross_(m0[0], m0[1], m1[0], m1[1])};
         const F det0 = dot_(across, across), d00 = dot_(m0, m0), d11 = dot_(m1, m1);
@@ -345,6 +393,22 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         I fate = inside ? I{} : I{} + OUTSIDE;
         fate = small ? I{} + SMALL : fate;
         fate = faint ? I{} + TRANSPARENT : fate;
+        if (lens.original) {
+            // README eq. 16: the radius, and whether its square of tiles is empty
+            const F half = mul_(splat(0.5f), minus_(sxx, syy));
+            const F spread = root_(greater_(add_(mul_(half, half), mul_(sxy, sxy)), splat(0.1f)));
+            const F most = add_(mul_(splat(0.5f), add_(sxx, syy)), spread);
+            const F whole = __builtin_elementwise_ceil(mul_(splat(3.0f), root_(most)));
+            const F radius = less_(whole, splat(RADIUS_MAX));
+            const float right = ((int)lens.width + TILE - 1) / TILE * TILE + 0.5f;
+            const float bottom = ((int)lens.height + TILE - 1) / TILE * TILE + 0.5f;
+            const I touches = (I)(x + radius >= 1.5f) & (I)(x - radius < right)
+                & (I)(y + radius >= 1.5f) & (I)(y - radius < bottom);
+            fate = (shown >= lens.alpha_min) ? I{} : I{} + TRANSPARENT;
+            fate = touches ? fate : I{} + OUTSIDE;
+            const I drawn = seen & sound & touches;
+            extent[0] = extent[1] = drawn ? radius : F{};
+        }
         fate = sound ? fate : I{} + NOT_FINITE;
         status = status == 0 ? fate : status;
         seen = (I)(status == 0) & (I)(lane < n);
@@ -354,8 +418,10 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         conic[0] = keep_(a, 1.0f);
         conic[1] = keep_(-sxy / syy, 0.0f);
         conic[2] = keep_(e, 1.0f);
-        extent[0] = keep_(extent[0], 0.0f);
-        extent[1] = keep_(extent[1], 0.0f);
+        if (!lens.original) {
+            extent[0] = keep_(extent[0], 0.0f);
+            extent[1] = keep_(extent[1], 0.0f);
+        }
         depth = keep_(z, 0.0f);
         shown = keep_(shown, 0.0f);
     }

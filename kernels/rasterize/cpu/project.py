@@ -11,7 +11,7 @@ import warp as wp
 from ...runtime.launch import parallel_launch
 from ...runtime.native import native, native_kernel
 from ...runtime.views import struct_of
-from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN
+from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN, RADIUS_MAX, TILE
 from ..projection import STATUS_NAMES, Lens, Projected, Scene
 
 _RUN = 512  # Gaussians of a task, a multiple of 16
@@ -21,7 +21,7 @@ _HERE = Path(__file__).parent
 _DEFINES = {
     **{name.upper(): number for number, name in enumerate(STATUS_NAMES)},
     **{"RUN": _RUN, "MARGIN": FRUSTUM_MARGIN, "COMPENSATION_MIN": COMPENSATION_MIN},
-    "CONIC_MAX": CONIC_MAX,
+    **{"CONIC_MAX": CONIC_MAX, "RADIUS_MAX": RADIUS_MAX, "TILE": TILE},
 }
 
 

@@ -70,11 +70,13 @@ class Sums(NamedTuple):
         channels: of colours, at most 4; 0 for the moments alone, of however many channels.
         geometry: moments of h (README eq. 11).
         absolute: rows have the two sums of absolute values (eq. 14) after the six moments.
+        passes: the gradient passes the clamp of alpha (README §7).
     """
 
     channels: int
     geometry: bool
     absolute: bool
+    passes: bool = False
 
     def moments(self) -> int:
         """Number of moments of a pair."""
@@ -180,7 +182,8 @@ def _walking(asked: Sums, parts: int, listed: bool):
     Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
     its pairs; pairs that a tile's own test excludes are removed from these.
     """
-    (channels, geometry, absolute), moments, size = asked, asked.moments(), asked.shared()
+    (channels, geometry, absolute, passes), moments = asked, asked.moments()
+    size = asked.shared()
     memory = shared_memory(parts * size)
     arena_type = memory.arena
     slots, leave, complete = _completing(asked, parts)
@@ -355,8 +358,10 @@ def _walking(asked: Sums, parts: int, listed: bool):
                                         v = L.load(v_pixels_in.renders, first, step + c)
                                         diff += L.load(gaussians.records, source, 8 + c) * v
                                 R[j] = R[j] + clamped * diff
-                                if alpha < picture.alpha_max:
+                                if wp.static(passes) or alpha < picture.alpha_max:
                                     h = weight * diff
+                                    if wp.static(passes):
+                                        h = T[j] * alpha * diff
                                     hu = h * u
                                     hy = h * dy
                                     sums[0] += h

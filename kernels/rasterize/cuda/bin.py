@@ -16,7 +16,7 @@ from torch import Tensor
 from ...runtime.launch import launch
 from ...runtime.views import as_struct, struct_of
 from ..projection import Projected
-from ..skip import TILE_TEST
+from ..skip import SQUARES, TILE_TEST
 from ..tiles import Bins, Grid
 from . import capacity
 from . import leaves as L
@@ -35,7 +35,7 @@ def _ellipse(grid: Grid, splats_in: struct_of(Projected), i: wp.int32) -> Ellips
     mean = L.load_vec2(splats_in.means2d, i)
     opacity = L.load_float(splats_in.view_opacities, i)
     ellipse = make_ellipse(mean, L.load_vec3(splats_in.conics, i), opacity, grid.alpha_min)
-    if (grid.skip & TILE_TEST) == 0:
+    if (grid.skip & (TILE_TEST | SQUARES)) != TILE_TEST:
         ellipse.box = L.load_vec2(splats_in.extents, i)
     return ellipse
 

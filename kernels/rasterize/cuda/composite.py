@@ -98,6 +98,7 @@ def composite_backward(
     skipped: Tensor,
     geometry: bool,
     absolute: Tensor | None = None,
+    passes: bool = False,
 ) -> Drawn:
     """As ``composite_backward`` of the CPU."""
     colors = splats.colors
@@ -119,8 +120,8 @@ def composite_backward(
         [rows],
         parts,
     )
-    flags = geometry and not apart, absolute is not None
+    flags = geometry and not apart, absolute is not None, passes
     _launch(lambda count: backward_kernels(Sums(count, *flags), parts), *given)
     if apart:
-        _launch(lambda _: backward_kernels(Sums(0, True, True), parts), *given, channels)
+        _launch(lambda _: backward_kernels(Sums(0, True, True, False), parts), *given, channels)
     return reduce_rows(rows, splats, bins, geometry, absolute)

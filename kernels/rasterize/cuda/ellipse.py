@@ -9,7 +9,7 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.views import struct
-from ..skip import TILE_TEST
+from ..skip import SQUARES, TILE_TEST
 from ..tiles import SLACK, SLACK_ABS, Grid
 from . import leaves as L
 
@@ -31,7 +31,7 @@ class Ellipse:
     over_a: wp.float32
     reach: wp.float32
     top: wp.float32
-    box: wp.vec2  # half sides, where tiles are tested against boxes
+    box: wp.vec2  # half sides, where tiles are tested against boxes or README eq. 16's squares
 
 
 @wp.func
@@ -77,13 +77,27 @@ def _box_columns(grid: Grid, x: wp.float32, extent: wp.float32) -> wp.vec2i:
 
 @wp.func
 @no_type_check
+def _in_square(
+    grid: Grid, tiles: wp.vec2i, x: wp.float32, radius: wp.float32, size: wp.int32
+) -> wp.vec2i:
+    # first and last tile, cut to README eq. 16's square; last is first - 1 at the least
+    if (grid.skip & SQUARES) == 0:
+        return tiles
+    first = wp.max(tiles[0], _to_tile(grid, x - radius - 0.5, size))
+    last = wp.min(tiles[1], _to_tile(grid, x + radius - 1.5, size))
+    return wp.vec2i(first, wp.max(last, first - 1))
+
+
+@wp.func
+@no_type_check
 def tile_rows(grid: Grid, ellipse: Ellipse) -> wp.vec2i:
     # first and last row that may have columns; first > last: none
     if (grid.skip & TILE_TEST) == 0:
         return _box_rows(grid, ellipse.mean[1], ellipse.box[1])
     y, reach = ellipse.mean[1], ellipse.reach
     top = _to_tile(grid, y - reach + _TO_CENTER, grid.height)
-    return wp.vec2i(top, _to_tile(grid, y + reach - _TO_CENTER, grid.height))
+    rows = wp.vec2i(top, _to_tile(grid, y + reach - _TO_CENTER, grid.height))
+    return _in_square(grid, rows, y, ellipse.box[1], grid.height)
 
 
 @wp.func
@@ -110,4 +124,5 @@ def tile_columns(grid: Grid, ellipse: Ellipse, ty: wp.int32) -> wp.vec2i:
         return wp.vec2i(0, -1)
     # a tile spans pixel centres 0.5 to 15.5; a gap between two tiles belongs to neither
     first = _to_tile(grid, x0 + 0.5, grid.width)
-    return wp.vec2i(first, _to_tile(grid, x1 - 0.5, grid.width))
+    columns = wp.vec2i(first, _to_tile(grid, x1 - 0.5, grid.width))
+    return _in_square(grid, columns, ellipse.mean[0], ellipse.box[0], grid.width)

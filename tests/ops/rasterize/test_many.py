@@ -10,9 +10,9 @@ from helpers.raster import NAMES, leaves, make
 from gamba_warp.kernels.rasterize import Skip, ops, projection, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
-from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
+from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes, vjp_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
-from gamba_warp.kernels.rasterize.cuda.project import project_on_threads
+from gamba_warp.kernels.rasterize.cuda.project import project_on_threads, vjp_on_threads
 from gamba_warp.kernels.rasterize.projection import LensOptions, Projected, make_lens
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
 from gamba_warp.kernels.rasterize.tiles import Drawn, Tiling, make_grid
@@ -148,12 +148,52 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=1.5)
     options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=antialiased, rounded=rounded)
     lens = make_lens(LensOptions(skip_unused=1, **options))
-    inputs = means, quats if rotated else None, scales, opacities, colors
+    inputs = means, quats if rotated else None, scales, None, opacities, colors
     got = projection.project_forward([*inputs, viewmats, Ks], lens, project_on_lanes)
     want = projection.project_forward([*inputs, viewmats, Ks], lens, project_on_threads)
     for name, value in want._asdict().items():
         assert torch.equal(getattr(got, name), value), name
     assert len(got.status.unique()) >= (5 if num > 500 else 3)
+
+
+@pytest.mark.parametrize("original", [0, 1])
+@pytest.mark.parametrize("shape", ["covars", "quats", "scales"])
+def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original):
+    """To the bit, forward and backward, also of covariances that rounding has made indefinite."""
+    num = 331
+    means, scales = torch.randn(2, num, 3), torch.exp(2 * torch.randn(2, num, 3) - 3.5)
+    quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
+    opacities[:, ::7] = 1e-3
+    root = torch.linalg.qr(torch.randn(2, num, 3, 3))[0] * scales[..., None, :]
+    covars = (root @ root.mT)[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    covars[:, :30, 3:] = covars[:, :30, :3]  # of no Gaussian
+    covars[:, 30:35], covars[0, 35, 2] = 0.0, torch.nan
+    given = {"covars": (None, None, covars), "quats": (quats, scales, None)}
+    gaussians = means, *given.get(shape, (None, scales, None)), opacities
+    viewmats = torch.eye(4).repeat(2, 3, 1, 1)
+    viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
+    viewmats[..., 2, 3] = 2.0
+    Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
+    options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=0.0)
+    options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=0, original=original)
+    lens = make_lens(LensOptions(skip_unused=1, **options))
+    inputs = [*gaussians, torch.rand(2, num, 3), viewmats, Ks]
+    got = projection.project_forward(inputs, lens, project_on_lanes)
+    want = projection.project_forward(inputs, lens, project_on_threads)
+    for name, value in want._asdict().items():
+        assert torch.equal(getattr(got, name), value), name
+    assert len(got.status.unique()) >= 5
+    v = [torch.randn_like(x) for x in got[:4]]
+    wanted = [x is not None for x in gaussians] + [False]
+    kept = [*gaussians, viewmats, Ks], lens, got.conics, got.status, v, wanted
+    of_lanes, of_threads = (
+        projection.project_backward(*kept, run) for run in (vjp_on_lanes, vjp_on_threads)
+    )
+    for name, a, b in zip("means quats scales covars opacities".split(), of_lanes, of_threads):
+        assert (a is None and b is None) or (torch.equal(a, b) and (a != 0).any()), name
+    alone = [True, *[False] * 5]
+    for run in (vjp_on_lanes, vjp_on_threads):
+        assert torch.equal(projection.project_backward(*kept[:-1], alone, run)[0], of_lanes[0])
 
 
 def sums_one_by_one(v_pairs, written, splats, bins, geometry, absolute):

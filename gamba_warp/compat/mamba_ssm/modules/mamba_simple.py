@@ -16,6 +16,11 @@ from ..ops.triton.selective_state_update import selective_state_update
 from ..utils.generation import InferenceParams
 from . import block
 
+_WAY_OUT = (
+    "which is not supported: a fork's own layer file runs over the functions here "
+    "(docs/drop-ins.md, 'Without any change')"
+)
+
 
 class Mamba(nn.Module):
     """Mamba layer; each output token depends on the input tokens up to it.
@@ -31,7 +36,7 @@ class Mamba(nn.Module):
         dt_init: str = "random", dt_scale: float = 1.0, dt_init_floor: float = 1e-4,
         conv_bias: bool = True, bias: bool = False, use_fast_path: bool = True,
         layer_idx: int | None = None, device=None, dtype: torch.dtype | None = None,
-        bimamba_type: str = "none",
+        bimamba_type: str = "none", **of_fork,
     ) -> None:  # fmt: skip
         """Build the layer.
 
@@ -53,17 +58,22 @@ class Mamba(nn.Module):
             device: of the weights.
             dtype: of the weights, except A_log and D, which are float32.
             bimamba_type: "none"; the forks' other layers run from their own files.
+            of_fork: none; those of forks are refused.
 
         Raises:
+            TypeError: an argument is one of a fork's layer, as ``bimamba`` and ``nslices`` are.
             ValueError: ``d_state``, ``d_conv``, ``dt_rank``, ``dt_init`` or ``bimamba_type`` is not
                 one of the above.
         """
         super().__init__()
+        if bimamba_type != "none":
+            raise ValueError(f"bimamba_type is {bimamba_type!r}, {_WAY_OUT}")
+        for name, value in of_fork.items():
+            raise TypeError(f"{name} is {value!r}, {_WAY_OUT}")
         if not 1 <= d_state <= 256:
             raise ValueError(f"d_state is {d_state}, allowed is 1 to 256")
         one_of("d_conv", d_conv, 2, 3, 4)  # supported by the convolution's kernel
         one_of("dt_init", dt_init, "random", "constant")
-        one_of("bimamba_type", bimamba_type, "none")
         if isinstance(dt_rank, str):
             one_of("dt_rank", dt_rank, "auto")
         self.d_model, self.d_state, self.d_conv, self.expand = d_model, d_state, d_conv, expand

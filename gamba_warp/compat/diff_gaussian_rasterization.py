@@ -1,0 +1,323 @@
+"""diff_gaussian_rasterization, the rasterizer of the first 3D Gaussian splatting code, on ours."""
+
+from __future__ import annotations
+
+import dis
+import sys
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gamba_warp.kernels.rasterize import Skip
+from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
+from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
+from gamba_warp.kernels.rasterize.ops import bin_op, composite, project
+from gamba_warp.kernels.rasterize.projection import LensOptions, Projected
+from gamba_warp.kernels.rasterize.skip import SQUARES
+from gamba_warp.kernels.rasterize.tiles import Limits, Size
+
+from .shared import DTYPES, check_tensor, one_device, one_of, side
+
+# What the forks return; ``use_fork`` chooses one.
+FORKS = {
+    "graphdeco": "colour, radii; with antialiasing in the settings also inverse depth",
+    "ingra14m": "colour, radii, depth",
+    "ashawkey": "colour, radii, depth, alpha",
+}
+NEAR = float(np.nextafter(np.float32(0.2), np.float32(1)))  # nearer ones are culled
+# A pixel goes on down to this transmittance, itself included.
+LIMITS = Limits(ALPHA_MIN, ALPHA_MAX, float(np.nextafter(np.float32(T_MIN), np.float32(0))), True)
+SKIP = Skip().bits() | SQUARES
+_MAX_SH_DEGREE = 3
+_UNPACK = dis.opmap["UNPACK_SEQUENCE"]
+_fork = "graphdeco"
+
+
+def use_fork(name: str) -> None:
+    """Choose what a rasterizer returns from now on, by the fork that a program was written for.
+
+    Args:
+        name: of ``FORKS``; "graphdeco", the original, is the default.
+
+    Raises:
+        ValueError: another name.
+    """
+    global _fork
+    one_of("fork", name, *FORKS)
+    _fork = name
+
+
+class _Settings(NamedTuple):
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool = False
+    debug: bool = False
+    antialiasing: bool | None = None
+
+
+class GaussianRasterizationSettings(_Settings):
+    """A camera, a background and options, checked where they are used.
+
+    Attributes:
+        image_height: pixels.
+        image_width: pixels.
+        tanfovx: tangent of half the horizontal field of view.
+        tanfovy: tangent of half the vertical one.
+        bg: ``[C]``, the background, which gets no gradient.
+        scale_modifier: factor of the scales.
+        viewmatrix: ``[4, 4]`` world to camera, transposed: of row vectors.
+        projmatrix: ``[4, 4]`` the same times a perspective projection, which has the slopes of
+            ``tanfovx`` and ``tanfovy``; its centre may be anywhere.
+        sh_degree: 0 to 3.
+        campos: ``[3]`` the camera's centre, from which harmonics are seen.
+        prefiltered: no effect.
+        debug: no effect.
+        antialiasing: None for the code before 2024; True scales opacities by the part of a
+            footprint's area that dilation has not added.
+    """
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> GaussianRasterizationSettings:
+        """Make settings.
+
+        Raises:
+            TypeError: there is another option, as Mip-Splatting, GOF, TRELLIS and 2DGS have it.
+        """
+        for name in kwargs:
+            if name not in _Settings._fields:
+                raise TypeError(f"{name} is an option of another rasterizer, which is not here")
+        return super().__new__(cls, *args, **kwargs)
+
+
+class _Results(tuple):
+    """Results that name ``use_fork`` where a program unpacks another number of them."""
+
+    def __iter__(self) -> Iterator[Any]:
+        frame = sys._getframe(1)
+        code, at = frame.f_code.co_code, frame.f_lasti
+        if at >= 0 and code[at] == _UNPACK and code[at + 1] != len(self):
+            raise ValueError(
+                f"{code[at + 1]} results are wanted, the fork {_fork!r} has {len(self)}: choose "
+                "another by gamba_warp.compat.diff_gaussian_rasterization.use_fork or --fork: "
+                + "; ".join(f"{name} ({what})" for name, what in FORKS.items())
+            )
+        return super().__iter__()
+
+
+class _InPicture(torch.autograd.Function):
+    """Centres in pixels, whose gradient also goes to ``means2D``, in units of half the picture."""
+
+    @staticmethod
+    def forward(ctx: Any, pixels: Tensor, means2D: Tensor, half: tuple[float, float]) -> Tensor:
+        """Return the centres."""
+        ctx.half, ctx.dtype = half, means2D.dtype
+        return pixels.view_as(pixels)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, Tensor, None]:
+        """Return the gradient, and itself scaled with a third entry of 0."""
+        (v,) = grads
+        scaled = torch.nn.functional.pad(v[0] * v.new_tensor(ctx.half), (0, 1))
+        return v, scaled.to(ctx.dtype), None
+
+
+class _Scaled(torch.autograd.Function):
+    """Scales times the modifier; as in the original, the gradient is that of the product."""
+
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor, modifier: float) -> Tensor:
+        """Return the product."""
+        return scales * modifier
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
+        """Return the gradient of the product."""
+        return grads[0], None
+
+
+class GaussianRasterizer(torch.nn.Module):
+    """A rasterizer of one view.
+
+    Args:
+        raster_settings: the camera and the options.
+    """
+
+    def __init__(self, raster_settings: GaussianRasterizationSettings):
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    @torch.no_grad()
+    def markVisible(self, positions: Tensor) -> Tensor:
+        """Return which of the positions ``[N, 3]`` are deeper than 0.2, ``[N]`` bool."""
+        check_tensor("positions", positions, ("N", 3))
+        view = self.raster_settings.viewmatrix
+        return positions @ view[:3, 2].to(positions) + view[3, 2].to(positions) >= NEAR
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """Render N Gaussians, differentiable in all arguments.
+
+        Args:
+            means3D: ``[N, 3]``; float32, bfloat16 or float16, as all.
+            means2D: ``[N, 3]``, whose values are not used; its gradient is that of the centres in
+                the picture, in units of half its sides.
+            opacities: ``[N, 1]`` or ``[N]`` in (0, 1).
+            shs: ``[N, K, 3]`` harmonics' coefficients, K >= (sh_degree + 1)²; or None.
+            colors_precomp: ``[N, C]`` in their place.
+            scales: ``[N, 3]`` standard deviations; or None.
+            rotations: ``[N, 4]`` wxyz of length 1, which is not made so here; or None.
+            cov3D_precomp: ``[N, 6]`` in their place: xx, xy, xz, yy, yz, zz of covariances.
+
+        Returns:
+            The colour ``[C, H, W]`` and the radii ``[N]`` int32, pixels, 0 where culled, and what
+            else the chosen fork has: Σ T α / z, Σ T α z or Σ T α, each ``[1, H, W]``.
+
+        Raises:
+            TypeError: an argument is not a tensor, or of another dtype.
+            ValueError: a shape, device or setting is not as above, or both or none of two
+                alternatives are given.
+        """
+        return rasterize_gaussians(
+            means3D, means2D, shs, colors_precomp, opacities, scales, rotations, cov3D_precomp,
+            self.raster_settings,
+        )  # fmt: skip
+
+
+def rasterize_gaussians(
+    means3D: Tensor,
+    means2D: Tensor,
+    sh: Tensor | None,
+    colors_precomp: Tensor | None,
+    opacities: Tensor,
+    scales: Tensor | None,
+    rotations: Tensor | None,
+    cov3Ds_precomp: Tensor | None,
+    raster_settings: GaussianRasterizationSettings,
+) -> tuple[Tensor, ...]:
+    """Render as ``GaussianRasterizer``; an empty tensor is the same as None."""
+    settings = raster_settings
+    optional: dict[str, Any] = dict(
+        shs=sh, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+        cov3D_precomp=cov3Ds_precomp,
+    )  # fmt: skip
+    given: dict[str, Any] = dict(means3D=means3D, means2D=means2D, opacities=opacities)
+    empty = isinstance(means3D, Tensor) and len(means3D) == 0
+    for name, x in optional.items():
+        if x is not None and (empty or not isinstance(x, Tensor) or x.numel()):
+            given[name] = x
+    _check(given, settings)
+    height, width = side(image_height=settings.image_height, image_width=settings.image_width)
+    viewmat, K = _camera(settings, width, height, means3D.device)
+
+    x = {name: value.float().contiguous() for name, value in given.items()}
+    if "shs" in x:
+        center = settings.campos.detach().float().view(1, 1, 3).to(means3D.device)
+        colors = colors_seen_from(settings.sh_degree, x["shs"][None], x["means3D"][None], center)
+        colors = colors[0]
+    else:
+        colors = x["colors_precomp"]
+    if "scales" in x and settings.scale_modifier != 1:
+        x["scales"] = _Scaled.apply(x["scales"], settings.scale_modifier)
+    lens = LensOptions(
+        width, height, NEAR, float("inf"), 0.0, EPS2D, ALPHA_MIN, bool(settings.antialiasing),
+        skip_unused=True, original=True,
+    ).numbers()  # fmt: skip
+    shapes = x.get("rotations"), x.get("scales"), x.get("cov3D_precomp")
+    gaussians = x["means3D"], *shapes, x["opacities"].flatten()
+    projected = Projected(*project(*gaussians, colors.detach(), viewmat, K, lens))
+    radii = projected.extents[0, :, 0].int()
+    centers: Any = _InPicture.apply(projected.means2d, given["means2D"], (width / 2, height / 2))
+
+    fork = _fork
+    depth, channels = projected.depths[..., None], colors
+    if fork != "graphdeco" or settings.antialiasing is not None:
+        if fork == "graphdeco":
+            depth = torch.where(depth > 0, depth, 1.0).reciprocal()
+        channels = torch.cat([colors.expand(1, *colors.shape[-2:]), depth], -1)
+    shown = projected.view_opacities
+    listed = torch.where(shown[..., None] > 0, projected.extents, 0.0)  # not the transparent ones
+    splats = projected.means2d, projected.conics, projected.depths, shown, listed
+    bins = bin_op(*(s.detach() for s in splats), width, height, ALPHA_MIN, SKIP, True)
+    size = Size(width, height, 1, int(channels.dim() == 3), SKIP)
+    drawn = centers, projected.conics, shown, channels
+    renders, alphas, *_ = composite(*drawn, list(bins), list(size), list(LIMITS), None, None)
+    layers = renders[0].permute(2, 0, 1)
+    alpha = alphas[0].permute(2, 0, 1)
+    bg = settings.bg.detach().to(layers)[:, None, None]
+    color = (layers[: len(bg)] + (1 - alpha) * bg).contiguous()
+    results = [color, radii, layers[len(bg) :].contiguous(), alpha.contiguous()]
+    return _Results(results[: 2 if channels is colors else 4 if fork == "ashawkey" else 3])
+
+
+def _check(given: dict[str, Any], settings: GaussianRasterizationSettings) -> None:
+    """Check the arguments by name, before any launch."""
+    names = {*given}
+    if len(names & {"shs", "colors_precomp"}) != 1:
+        raise ValueError("shs, colors_precomp: exactly one of them must be given")
+    if names & {"scales", "rotations", "cov3D_precomp"} not in (
+        {"scales", "rotations"}, {"cov3D_precomp"},
+    ):  # fmt: skip
+        raise ValueError("scales and rotations, or cov3D_precomp: one of them must be given")
+    one_of("sh_degree", settings.sh_degree, *range(_MAX_SH_DEGREE + 1))
+    check_tensor("means3D", given["means3D"], ("N", 3), dtypes=DTYPES)
+    num = len(given["means3D"])
+    shapes = {
+        "means2D": ((num, 3),), "opacities": ((num, 1), (num,)),
+        "shs": ((num, f"K >= {(settings.sh_degree + 1) ** 2}", 3),),
+        "colors_precomp": ((num, "C >= 1"),), "scales": ((num, 3),), "rotations": ((num, 4),),
+        "cov3D_precomp": ((num, 6),),
+    }  # fmt: skip
+    for name, allowed in shapes.items():
+        if name in given:
+            check_tensor(name, given[name], *allowed, dtypes=DTYPES)
+    channels = given["colors_precomp"].shape[1] if "colors_precomp" in given else 3
+    check_tensor("bg", settings.bg, (channels,))
+    check_tensor("campos", settings.campos, (3,))
+    check_tensor("viewmatrix", settings.viewmatrix, (4, 4))
+    check_tensor("projmatrix", settings.projmatrix, (4, 4))
+    one_device(given)
+
+
+def _camera(
+    settings: GaussianRasterizationSettings, width: int, height: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Return the viewmat ``[1, 4, 4]`` and the K ``[1, 3, 3]`` of settings."""
+    view, full = (
+        x.detach().double().cpu().numpy() for x in (settings.viewmatrix, settings.projmatrix)
+    )
+    half = np.array([float(settings.tanfovx), float(settings.tanfovy)])
+    if not (half > 0).all():
+        raise ValueError(f"tanfovx, tanfovy are {half[0]}, {half[1]}, allowed is > 0")
+    # Clip coordinates x/tan + center z, and the same for y; w is the depth z.
+    axis = view[:, 2]
+    straight = view[:, :2] / half
+    center = axis[:3] @ (full[:3, :2] - straight[:3]) / (axis[:3] @ axis[:3])
+    want = np.concatenate([straight + np.outer(axis, center), axis[:, None]], 1)
+    if not np.abs(full[:, [0, 1, 3]] - want).max() <= 2e-5 * np.abs(full).max():
+        raise ValueError(
+            "projmatrix is not viewmatrix times the perspective of tanfovx and tanfovy, transposed"
+        )
+    size = np.array([width, height])
+    focal, middle = size / (2 * half), size * (1 + center) / 2
+    K = [[focal[0], 0, middle[0]], [0, focal[1], middle[1]], [0, 0, 1]]
+    viewmat = settings.viewmatrix.detach().float().mT.contiguous().to(device)
+    return viewmat[None], torch.tensor([K], dtype=torch.float32, device=device)

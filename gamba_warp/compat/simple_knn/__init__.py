@@ -1,0 +1,1 @@
+"""simple_knn: distances to neighbours, for the first scales of Gaussians."""

@@ -1,0 +1,206 @@
+"""``diff_gaussian_rasterization`` and ``simple_knn``: values, forks, refusals, programs."""
+
+import inspect
+import math
+import subprocess
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers import first_splatting as first
+from helpers.first_splatting import CASES, compare, draw, draw_first, scene_of, settings_of
+from helpers.forked import python
+
+from gamba_warp.compat import diff_gaussian_rasterization as drop_in
+from gamba_warp.compat.diff_gaussian_rasterization import (
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    rasterize_gaussians,
+)
+from gamba_warp.compat.simple_knn._C import distCUDA2
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture
+def fork():
+    """Choose a fork for one test."""
+    yield drop_in.use_fork
+    drop_in.use_fork("graphdeco")
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pictures_and_gradients(name, seed):
+    torch.manual_seed(seed)
+    compare(name)
+
+
+@pytest.mark.parametrize("name", ["ingra14m", "ashawkey"])
+def test_results_of_forks(fork, name):
+    """Depth and alpha, with their gradients; of bfloat16 and of the other form of opacities too."""
+    fork(name)
+    settings, scene = settings_of(), scene_of()
+    leaves = {key: value.requires_grad_() for key, value in scene.items()}
+    color, radii, *layers = draw(leaves, settings)
+    want, expected = draw_first(scene, settings)
+    clear, kinds = ~want["close"], ("depth", "alpha")[: len(layers)]
+    assert len(layers) == (2 if name == "ashawkey" else 1)
+    v = [torch.randn(1, first.HEIGHT, first.WIDTH) * clear for _ in layers]
+    torch.autograd.backward(layers, v)
+    torch.autograd.backward([want[kind] for kind in kinds], [x.double() for x in v])
+    for kind, layer in zip(kinds, layers):
+        assert layer.shape == (1, first.HEIGHT, first.WIDTH)
+        assert_rel_rms(layer[:, clear], want[kind][:, clear], first.PICTURE, kind)
+    for key in set(leaves) - {"colors"}:
+        assert_rel_rms(leaves[key].grad, expected[key].grad, first.GRADIENT, key)
+    flat = {**scene, "opacities": scene["opacities"][:, 0]}
+    assert torch.equal(draw(flat, settings)[0], color)
+    half = {key: value.detach().bfloat16().requires_grad_() for key, value in scene.items()}
+    draw(half, settings)[0].sum().backward()
+    assert all(value.grad.dtype == torch.bfloat16 for value in half.values())
+
+
+def test_another_number_of_results_names_the_switch(fork):
+    settings, scene = settings_of(), scene_of(9)
+    line = "3 results are wanted, the fork 'graphdeco' has 2: .*--fork"
+    with pytest.raises(ValueError, match=line):
+        _, _, _ = draw(scene, settings)
+    with pytest.raises(ValueError, match="2 results are wanted, the fork 'graphdeco' has 3"):
+        _, _ = draw(scene, settings._replace(antialiasing=False))
+    fork("ashawkey")
+    _, _, _, _ = draw(scene, settings)
+    (_, *others), every = draw(scene, settings), list(draw(scene, settings))
+    assert len(others) == 3 and len(every) == 4 and draw(scene, settings)[1] is not None
+    with pytest.raises(ValueError, match="fork is 'lgm', allowed are 'graphdeco'"):
+        fork("lgm")
+
+
+def test_no_gaussians_and_gaussians_that_are_not_finite():
+    settings, scene = settings_of(), scene_of(40)
+    none = {key: value[:0].requires_grad_() for key, value in scene.items()}
+    color, radii = draw(none, settings)
+    assert torch.equal(color, settings.bg[:, None, None].expand_as(color)) and len(radii) == 0
+    color.sum().backward()
+    bad = {key: value.clone() for key, value in scene.items()}
+    bad["means3D"][0, 1], bad["colors"][1, 0], bad["scales"][2, 2] = torch.nan, torch.inf, torch.nan
+    got, radii = draw(bad, settings)
+    kept = {key: value[3:] for key, value in scene.items()}
+    assert torch.equal(got, draw(kept, settings)[0]) and not radii[:3].any()
+
+
+def test_values_of_means2D_are_not_used():
+    settings, scene = settings_of(), scene_of(40)
+    want = draw(scene, settings)[0]
+    scene["means2D"] = torch.full((40, 3), torch.nan)
+    assert torch.equal(draw(scene, settings)[0], want)
+
+
+def test_the_function_takes_empty_tensors():
+    """As programs call it that have their own module."""
+    settings, scene = settings_of(), scene_of(40)
+    x, empty = scene, torch.Tensor([])
+    given = x["means3D"], x["means2D"], empty, x["colors"], x["opacities"], x["scales"]
+    got = rasterize_gaussians(*given, x["rotations"], empty, settings)
+    assert torch.equal(got[0], draw(scene, settings)[0])
+
+
+def test_visible_positions():
+    settings = settings_of()
+    points = torch.randn(200, 3)
+    depths = points @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
+    visible = GaussianRasterizer(settings).markVisible(points)
+    assert torch.equal(visible, depths > 0.2) and 0 < visible.sum() < 200
+
+
+REFUSED = {
+    "means3D has shape": dict(means3D=torch.zeros(40, 2)),
+    "means2D has shape": dict(means2D=torch.zeros(39, 3)),
+    "opacities has shape": dict(opacities=torch.zeros(40, 2)),
+    "scales has shape": dict(scales=torch.zeros(40)),
+    "rotations has dtype": dict(rotations=torch.zeros(40, 4, dtype=torch.float64)),
+    "rotations is list": dict(rotations=[1.0]),
+    "colors_precomp has shape": dict(colors=torch.zeros(39, 3)),
+    "shs has shape": dict(colors=torch.zeros(40, 3, 3), settings=dict(degree=1)),
+    "scales and rotations, or cov3D_precomp": dict(cov3D_precomp=torch.zeros(40, 6)),
+    "scales and rotations, or": dict(scales=None),
+    "shs, colors_precomp: exactly one": dict(shs=torch.zeros(40, 1, 3)),
+    "sh_degree is 4": dict(settings=dict(sh_degree=4)),
+    "image_width is 0": dict(settings=dict(image_width=0)),
+    "bg has shape": dict(settings=dict(bg=torch.zeros(4))),
+    "campos is tuple": dict(settings=dict(campos=(0, 0, 0))),
+    "viewmatrix has shape": dict(settings=dict(viewmatrix=torch.eye(3))),
+    "projmatrix is not viewmatrix": dict(settings=dict(projmatrix=torch.eye(4))),
+    "projmatrix is not": dict(settings=dict(tanfovx=0.4)),
+    "tanfovx, tanfovy are": dict(settings=dict(tanfovy=0.0)),
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_bad_input_is_named(line):
+    changes = dict(REFUSED[line])
+    settings = settings_of(**changes.pop("settings", {}))
+    with pytest.raises((TypeError, ValueError), match=line) as caught:
+        draw({**scene_of(40), **changes}, settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_options_of_other_rasterizers_are_refused():
+    given = settings_of()._asdict()
+    for name in ("kernel_size", "subpixel_offset"):
+        with pytest.raises(TypeError, match=f"{name} is an option of another rasterizer"):
+            GaussianRasterizationSettings(**given, **{name: 0.1})
+    fields = inspect.signature(drop_in._Settings).parameters
+    assert list(fields)[:12] == list(given)[:12] and settings_of()._replace(debug=True).debug
+
+
+def test_distances_to_neighbours():
+    points = torch.randn(60, 3)
+    points[:4] = points[0]  # at one place
+    square = torch.cdist(points.double(), points.double()).square().fill_diagonal_(math.inf)
+    want = square.topk(3, largest=False).values.mean(1)
+    got = distCUDA2(points)
+    assert got.dtype == torch.float32 and got[0] == 0
+    assert_rel_rms(got, want, 1e-6, "distances")
+    assert distCUDA2(points[:3]).isinf().all() and distCUDA2(points[:0]).shape == (0,)
+    with pytest.raises(ValueError, match="points has shape"):
+        distCUDA2(torch.zeros(3))
+    with pytest.raises(ValueError, match="not finite"):
+        distCUDA2(torch.full((5, 3), torch.nan))
+
+
+PROGRAM = """
+import importlib.metadata
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+from simple_knn._C import distCUDA2
+try:
+    from diff_gaussian_rasterization import SparseGaussianAdam
+except ImportError:
+    print("without it")
+view, one = torch.eye(4), torch.ones(1, 3)
+view[3, 2] = 2.0
+flat = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 0]])
+settings = GaussianRasterizationSettings(
+    image_height=8, image_width=8, tanfovx=1.0, tanfovy=1.0, bg=torch.zeros(3), scale_modifier=1.0,
+    viewmatrix=view, projmatrix=view @ flat, sh_degree=0, campos=torch.zeros(3),
+    prefiltered=False, debug=False,
+)
+image, radii, depth, alpha = GaussianRasterizer(raster_settings=settings)(
+    means3D=0 * one, means2D=0 * one, shs=None, colors_precomp=one, opacities=one[:, :1],
+    scales=one, rotations=torch.tensor([[1.0, 0, 0, 0]]), cov3D_precomp=None,
+)
+print(image.shape, float(depth.max() / alpha.max()), importlib.metadata.version("simple-knn"))
+"""
+
+
+def test_a_program_takes_the_names_and_a_fork(tmp_path):
+    path = tmp_path / "client.py"
+    path.write_text(PROGRAM)
+    command = [python(), "-m", "gamba_warp.compat", "--fork", "ashawkey", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    lines = done.stdout.splitlines()
+    assert "without it" in lines and lines[-1] == "torch.Size([3, 8, 8]) 2.0 0.0.0"
+    done = subprocess.run([*command[:4], "lgm", str(path)], capture_output=True, text=True)
+    assert done.returncode == 1 and "fork is 'lgm'" in done.stderr
