@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -27,7 +28,7 @@ def causal_conv1d_fn(x, weight, bias=None, seq_idx=None, *others, **named):
     """Convolve as the kernels' function; an activation in the place of ``seq_idx`` is taken too."""
     if isinstance(seq_idx, str) and not others:  # version 1.0 has the activation there
         return _causal_conv1d_fn(x, weight, bias, activation=seq_idx)
-    return _causal_conv1d_fn(x, weight, bias, seq_idx, *others, **named)
+    return _causal_conv1d_fn(x, weight, bias, cast(Any, seq_idx), *others, **named)
 
 
 def causal_conv1d_update(
