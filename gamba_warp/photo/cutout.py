@@ -225,7 +225,8 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         method = "alpha"
     elif ways.cutout == "alpha":
         raise UserError(f"{path}: has no transparency, which --cutout alpha uses")
-    elif has_alpha(rgba, any_share=True):
+    few = method is None and ways.cutout == "auto" and has_alpha(rgba, any_share=True)
+    if few:
         ways.say(f"{path}: its few transparent pixels are no cut-out (--cutout alpha takes them)")
     whole, rgba = rgba, shrink(rgba, WORKING_SIZE)
     source, fringe = rgba[..., :3].copy(), None
@@ -233,7 +234,15 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         rgba, fringe = without_matte(rgba)
     elif method == "mask":
         rgba[..., :3] = without_background(source, rgba[..., 3])
-    found = _cut_by_methods(path, source, ways) if method is None else _Found(method, rgba)
+    found = None if method is None else _Found(method, rgba)
+    if found is None:
+        try:
+            found = _cut_by_methods(path, source, ways)
+        except UserError:
+            if not few:
+                raise
+    if found is None or few and not found.rgba[..., 3].any():
+        found = _Found("alpha", rgba)  # the object may well fill the picture
     method, rgba = found.method, found.rgba
     close = _at_own_pixels(path, whole, found, ways) if ways.recenter else rgba
     try:
