@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.ndimage import binary_erosion
 
 from gamba_warp.cameras import intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
@@ -150,6 +149,8 @@ def shape_iou(
         iou = 0.0  # Far apart, or of very different size: they share less than a voxel.
     if iou is None:
         return {"iou": None, "iou_reason": "neither shape fills a voxel", "iou_voxel": grid.step}
+    from scipy.ndimage import binary_erosion
+
     edges = sum(np.count_nonzero(x & ~binary_erosion(x)) for x in filled)
     error = min(1.0, edges / max(1, np.count_nonzero(filled[0] | filled[1])) / 2)
     return {"iou": iou, "iou_error": error, "iou_voxel": grid.step}

@@ -279,8 +279,8 @@ def test_five_million_points_in_memory(tmp_path):
 @pytest.mark.parametrize("side, shift, want", [(0.8, 0.0, 0.512), (1.0, 0.1, 0.9 / 1.1)])
 def test_the_stated_error_of_the_voxels_holds(rule, side, shift, want):
     """Cubes whose faces lie between the points of the grid."""
-    chosen = replace(PRESETS["default"], occupancy=rule)
+    chosen = replace(PRESETS["default"], occupancy=rule, iou_voxels=32)
     got = shape_iou(cube((shift, 0, 0), side), cube(), chosen)
-    assert 0.005 < abs(got["iou"] - want) <= got["iou_error"] < 0.1
-    finer = shape_iou(cube((shift, 0, 0), side), cube(), replace(chosen, iou_voxels=128))
-    assert finer["iou_error"] == pytest.approx(got["iou_error"] / 2, rel=0.05)
+    assert 0.005 < abs(got["iou"] - want) <= got["iou_error"] < 0.2
+    finer = shape_iou(cube((shift, 0, 0), side), cube(), replace(chosen, iou_voxels=64))
+    assert finer["iou_error"] == pytest.approx(got["iou_error"] / 2, rel=0.1)

@@ -429,13 +429,13 @@ def test_a_few_transparent_pixels_are_no_cut_out(tmp_path, kind):
 @pytest.mark.parametrize("way", ["plain", "alpha", "mask", "matte"])
 def test_a_small_object_of_a_large_picture_keeps_its_pixels(tmp_path, network, way):
     """As sharp as in a part of the same picture."""
-    y, x = np.mgrid[:1500, :2000]
-    inside = ((x - 1200) / 90) ** 2 + ((y - 700) / 60) ** 2 < 1
+    y, x = np.mgrid[:960, :1280]
+    inside = ((x - 800) / 90) ** 2 + ((y - 500) / 60) ** 2 < 1
     stripes = np.where((x // 4 + y // 4) % 2, 250, 170).astype(np.uint8)
-    rgb = np.full((1500, 2000, 3), 235, np.uint8)
+    rgb = np.full((960, 1280, 3), 235, np.uint8)
     rgb[inside] = np.stack([stripes, stripes // 8, stripes // 9], -1)[inside]
     alpha = (255 * inside).astype(np.uint8)
-    part = slice(600, 800), slice(1050, 1350)
+    part = slice(400, 600), slice(650, 950)
     names = []
     for name, at in (("whole", (slice(None), slice(None))), ("part", part)):
         picture = np.dstack([rgb, alpha])[at] if way == "alpha" else rgb[at]
