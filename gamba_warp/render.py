@@ -52,7 +52,7 @@ def render(
         options["sh_degree"] = gaussians.degree
         constant = (colors - 0.5) / SH_C0
         colors = torch.cat([constant[..., None, :], gaussians.harmonics], -2)
-    elif not colors.requires_grad:  # of files; networks and fits give none below 0
+    elif not colors.requires_grad:  # only files have colours below 0
         colors = colors.clamp_min(0)
     if gaussians.antialiased:
         options.setdefault("rasterize_mode", "antialiased")

@@ -82,15 +82,16 @@ class StepGraphs:
         if self._graphs and lists_outgrown():
             self._graphs.clear()
             forget_graphs()
-        shape = key, *_shape(batch)
+        shape = key, *((x.shape, x.dtype) if isinstance(x, Tensor) else x for x in _fields(batch))
         found = self._graphs.get(shape)
         if found is None and shape in self._known and len(self._graphs) < self._most:
             found = self._capture(shape, batch, step)
         if found is None:
             self._known.add(shape)
             return step(batch)
-        for own, given in zip(_tensors(found.batch), _tensors(batch), strict=True):
-            own.copy_(given)
+        for own, given in zip(_fields(found.batch), _fields(batch), strict=True):
+            if isinstance(own, Tensor):
+                own.copy_(given)
         found.graph.replay()
         return found.result
 
@@ -130,21 +131,13 @@ class StepGraphs:
         return graph, result
 
 
-def _shape(value: Any) -> Iterator[Hashable]:
-    """Yield what a step bakes into its launches: shapes and numbers of a dataclass."""
-    for field in vars(value).values():
-        if isinstance(field, Tensor):
-            yield field.shape, field.dtype
-        elif is_dataclass(field):
-            yield from _shape(field)
-        elif not isinstance(field, list):  # names, and what only a CPU uses
-            yield field
+def _fields(value: Any) -> Iterator[Any]:
+    """Yield the fields of a dataclass and of those in it, in order, without lists.
 
-
-def _tensors(value: Any) -> Iterator[Tensor]:
-    """Yield the tensors of a dataclass and of those in it, in the order of their fields."""
+    Shapes of the tensors and all other values are baked into the launches of a step.
+    """
     for field in vars(value).values():
-        if isinstance(field, Tensor):
+        if is_dataclass(field):
+            yield from _fields(field)
+        elif not isinstance(field, list):  # names, and pictures that only a CPU uses
             yield field
-        elif is_dataclass(field):
-            yield from _tensors(field)

@@ -105,7 +105,7 @@ class Trainer:
         )
 
     def _open_graphs(self) -> StepGraphs | None:
-        """Prepare CUDA graphs of the steps; None on a CPU and where a step is no single one."""
+        """Prepare CUDA graphs of the steps; None on a CPU or if a step has several parts."""
         if self.world.device.type != "cuda":
             return None
         if self.accumulate > 1 or self.world.size > 1:

@@ -1,4 +1,4 @@
-"""diff_gaussian_rasterization, the rasterizer of the first 3D Gaussian splatting code, on ours."""
+"""diff_gaussian_rasterization of the original 3D Gaussian splatting code, over our kernels."""
 
 from __future__ import annotations
 
@@ -193,8 +193,8 @@ class GaussianRasterizer(torch.nn.Module):
 
         Raises:
             TypeError: an argument is not a tensor, or of another dtype.
-            ValueError: a shape, device or setting is not as above, or both or none of two
-                alternatives are given.
+            ValueError: a shape, device or setting is not as above, or not exactly one of two
+                alternatives is given.
         """
         return rasterize_gaussians(
             means3D, means2D, shs, colors_precomp, opacities, scales, rotations, cov3D_precomp,

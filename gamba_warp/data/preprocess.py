@@ -27,7 +27,7 @@ SAM_FILES = (
     "https://github.com/ChaoningZhang/MobileSAM"
 )
 
-_TRANSPARENT = 0.5  # alpha below which a pixel is none of a cut-out object
+_TRANSPARENT = 0.5  # a pixel of lower alpha is outside of a cut-out object
 # Transparent shares of a picture's border or of the whole from which it is a cut-out: the rounded
 # corners of a screenshot are less.
 _CUT_BORDER, _CUT_SHARE = 0.15, 0.05

@@ -123,7 +123,7 @@ class SideFiles:
         """
         self.pixels += PIXELS_PER_BYTE * len(data)
         try:
-            # TARGA files have no mark of their own.
+            # The content of TARGA files does not tell their kind.
             formats = ("TGA",) if name.lower().endswith(".tga") else FORMATS
             with open_picture(io.BytesIO(data), name, formats=formats) as image:
                 if not self.claim(4 * image.width * image.height, name):

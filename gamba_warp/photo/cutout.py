@@ -308,9 +308,9 @@ def _at_own_pixels(path: str | Path, whole: np.ndarray, found: _Found, ways: Way
         return without_matte(part)[0]
     if found.method == "mask":
         return np.dstack([without_background(part[..., :3], part[..., 3]), part[..., 3]])
-    alpha = resize_rgba(small, *part.shape[:2])[..., 3]
     if found.method == "none":
         return part
+    alpha = resize_rgba(small, *part.shape[:2])[..., 3]
     same = copy.copy(ways)  # with its opened networks
     same.cutout = "matte" if found.method == "sam" else found.method
     try:
@@ -318,11 +318,8 @@ def _at_own_pixels(path: str | Path, whole: np.ndarray, found: _Found, ways: Way
     except UserError:  # it is all of the part
         again = rgba[:0]
     if again.shape == part.shape:
-        both, either = (
-            ((again[..., 3] > 0.5) & (alpha > 0.5)),
-            ((again[..., 3] > 0.5) | (alpha > 0.5)),
-        )
-        if both.sum() >= _SAME * either.sum():
+        one, other = again[..., 3] > 0.5, alpha > 0.5
+        if (one & other).sum() >= _SAME * (one | other).sum():
             return again
     return _blended(part[..., :3], alpha)
 

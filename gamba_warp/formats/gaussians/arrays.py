@@ -67,12 +67,15 @@ def export_arrays(
 
 
 def checked_gaussians(
-    path: str | Path, arrays: dict[str, np.ndarray], left_out: list[str] | None = None
+    path: str | Path,
+    arrays: dict[str, np.ndarray],
+    left_out: list[str] | None = None,
+    step: float = 0.0,
 ) -> Gaussians:
     """Validate the activated values of a file, and return them as one object.
 
-    Colours may lie outside of [0, 1]; a rendering cuts them at 0. A line warns where numbers of
-    float32 are too coarse for the object.
+    Colours may lie outside of [0, 1]; a rendering cuts them at 0. A line warns where positions are
+    too coarse for the object.
 
     Args:
         path: named in errors.
@@ -81,6 +84,7 @@ def checked_gaussians(
         left_out: receives one line that counts the Gaussians left out because they cannot be
             drawn: a value that is not finite, means or scales over ``MAX_REACH``, a scale below 0,
             or a rotation of length zero. None: a file with such Gaussians is refused.
+        step: of the format's positions, if coarser than float32.
 
     Returns:
         Float32 Gaussians on the CPU, ``quats`` normalised.
@@ -119,7 +123,7 @@ def checked_gaussians(
         values = {name: value[keep] for name, value in values.items()}
     values["quats"] = _unit(values["quats"])
     values["opacities"] = values["opacities"].clamp(0, 1)
-    warn_of_steps(path, values["means"])
+    warn_of_steps(path, values["means"], step)
     given: dict[str, Any] = {**values}
     return Gaussians(**given)
 

@@ -116,9 +116,8 @@ def load_spz(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     arrays["colors"] = colors
     arrays["harmonics"] = (take("u1", K, 3).astype(np.float64) - 128) / 128
-    if found.version > 1:
-        warn_of_steps(path, torch.from_numpy(means).float(), 2.0**-found.bits)
-    gaussians = checked_gaussians(path, arrays, left_out)
+    step = 2.0**-found.bits if found.version > 1 else 0.0
+    gaussians = checked_gaussians(path, arrays, left_out, step)
     return flip_axes(replace(gaussians, antialiased=found.antialiased))
 
 

@@ -61,7 +61,7 @@ class Foreground:
         most: rows of a picture, at least its number of cells.
         counts: number of cells of each picture.
         boxes: for each picture the first row and column of its patches, and those behind the last.
-        void: ``[T, 1]`` float32, 0, or -inf for cells that are none; None without such cells.
+        void: ``[T, 1]`` float32, 0, or -inf for padding; None without padding.
     """
 
     patch: Tensor
