@@ -261,7 +261,7 @@ def load_shape(path: Path) -> Shape:
     elif suffix in CLOUD_SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
         shape = _load_points(path)
     else:
-        mesh = load_mesh(path, normals=False)
+        mesh = load_mesh(path)
         shape = Mesh(mesh.vertices, mesh.faces, tuple(mesh.omitted))
     reach = np.abs(_positions(shape)).max()
     if reach > HUGE:

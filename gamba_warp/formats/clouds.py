@@ -12,14 +12,20 @@ Open3D's readers keep a part of a malformed file, even memory that was never wri
 
 from __future__ import annotations
 
-from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from ..errors import UserError
-from .headers import MAX_VALUES, check_lines, compare_sizes, lines_of, open_shape, read_table
+from .headers import (
+    MAX_VALUES,
+    check_lines,
+    compare_sizes,
+    open_shape,
+    read_rows,
+    without_comments,
+)
 from .ply_data import read_ply
 
 SUFFIXES = (".xyz", ".pts", ".pcd", ".ply")
@@ -67,7 +73,7 @@ def read_cloud(path: Path) -> Cloud:
 
 def _read_xyz(path: Path) -> Cloud:
     with open_shape(path) as (file, _):
-        table = read_table(lines_of(file, str(path), comments="#"), str(path))
+        table = read_rows(without_comments(file.read()), str(path)).table(str(path))
     if len(table) and table.shape[1] < 3:
         raise UserError(f"{path}: {table.shape[1]} columns, expected x y z")
     return Cloud(np.ascontiguousarray(table[:, :3]))
@@ -75,15 +81,14 @@ def _read_xyz(path: Path) -> Cloud:
 
 def _read_pts(path: Path) -> Cloud:
     with open_shape(path) as (file, _):
-        lines = lines_of(file, str(path), comments="#")
-        first = next(lines, "")
-        if len(first.split()) != 1:
-            table = read_table(chain([first] if first else [], lines), str(path), _PTS_COLUMNS)
-        else:
-            count = _whole(path, "the number of points", first.strip())
-            table = read_table(lines, str(path), _PTS_COLUMNS)
-            check_lines(path, f"{count} points", count, len(table))
-    return Cloud(np.ascontiguousarray(table[:, :3]))
+        rows = read_rows(without_comments(file.read()), str(path))
+    if len(rows.sizes) and rows.sizes[0] == 1:
+        stated, rows = rows.values[0], rows.part(1, len(rows.sizes))
+        if not (stated >= 0 and stated == np.rint(stated)):
+            what = f"the number of points is {stated:g}, not a whole number"
+            raise UserError(f"{path}: broken header, {what}")
+        check_lines(path, f"{stated:.0f} points", int(min(stated, 1e18)), len(rows.sizes))
+    return Cloud(np.ascontiguousarray(rows.table(str(path), _PTS_COLUMNS)[:, :3]))
 
 
 def _read_ply(path: Path) -> Cloud:
@@ -102,7 +107,7 @@ def _read_pcd(path: Path) -> Cloud:
         columns = {}
         if data == "ascii":
             ends = np.cumsum([repeat for _, _, (repeat,) in fields])
-            table = read_table(lines_of(file, str(path)), str(path), (int(ends[-1]),))
+            table = read_rows(file.read(), str(path)).table(str(path), (int(ends[-1]),))
             check_lines(path, says, count, len(table))
             columns = {name: table[:, end - 1] for (name, *_), end in zip(fields, ends)}
         elif data == "binary":

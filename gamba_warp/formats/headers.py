@@ -1,14 +1,14 @@
-"""Checks shared by the readers of shapes: stated counts against the size, tables of numbers."""
+"""Code shared by the readers of shapes: stated counts against the size, numbers in a text."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+import warnings
+from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain, islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,8 @@ MAX_FILE = 1 << 30  # bytes of a shape
 SLACK = 2  # bytes after the end: a line end
 MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
-_BOM = b"\xef\xbb\xbf"
-# str.split treats four control characters as blanks; here they become other than ASCII.
-_STRICT = bytes(0xFF if 0x1C <= number <= 0x1F else number for number in range(256))
+BOM = b"\xef\xbb\xbf"
+_BLOCK = 1 << 24  # bytes of a text that are read at once
 
 
 @contextmanager
@@ -74,69 +73,165 @@ def check_lines(path: Path, says: str, wanted: int, there: int) -> None:
         raise UserError(f"{path}: truncated or false header, {says} but {there} lines follow")
 
 
-def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
-    """Yield the lines of a text file that are neither blank nor, with ``comments``, begin with it.
+class Lines:
+    """Lines of a text, blank ones too, found without a loop over them.
+
+    Attributes:
+        data: ``[B]`` uint8, the text with a line end behind it.
+        lengths: ``[N]`` int64, bytes of each line with its end.
+        ends: ``[N]`` int64, position of each line's end.
+        first: ``[N]`` int64, position of each line's first word; of blank lines any.
+        sizes: ``[N]`` int64, number of words.
+    """
+
+    def __init__(self, text: bytes) -> None:
+        self.data = np.frombuffer(text if text.endswith(b"\n") else text + b"\n", np.uint8)
+        blank = is_blank(self.data)
+        words = np.flatnonzero(~blank & np.concatenate([[True], blank[:-1]]))
+        ends = np.flatnonzero(self.data == ord("\n"))
+        before = np.searchsorted(words, ends)
+        self.lengths = np.diff(ends, prepend=-1)
+        self.sizes = np.diff(before, prepend=0)
+        self.ends = ends
+        self.first = np.append(words, 0)[before - self.sizes]
+
+    def begin_with(self, word: bytes) -> np.ndarray:
+        """Return ``[N]`` bool, True for the lines whose first word is this one, in this case."""
+        found = self.sizes > 0
+        for place, letter in enumerate(word):
+            found &= self.data.take(self.first + place, mode="clip") == letter
+        return found & is_blank(self.data.take(self.first + len(word), mode="clip"))
+
+    def behind(self, word: bytes, lines: np.ndarray) -> bytes:
+        """Return the text of the lines ``[N]`` bool, which begin with a word, without it."""
+        data = self.data.copy()
+        for place in range(len(word)):
+            data[self.first[lines] + place] = ord(" ")
+        return data[np.repeat(lines, self.lengths)].tobytes()
+
+
+def is_blank(letters: np.ndarray) -> np.ndarray:
+    """Return True for the six blanks of ASCII among ``[N]`` uint8, as C has them."""
+    return (letters == ord(" ")) | (letters - np.uint8(ord("\t")) < 5)
+
+
+def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
+    """Yield a text in parts of whole lines, so that what is made of a part takes little memory.
 
     Raises:
-        UserError: a line is longer than ``MAX_LINE``.
+        UserError: a line is longer than ``MAX_LINE``, and the text than a part.
     """
-    first = True
-    while line := file.readline(MAX_LINE):
-        if len(line) == MAX_LINE:
+    at = 0
+    while at < len(text):
+        last = at + _BLOCK + MAX_LINE
+        end = text.find(b"\n", at + _BLOCK, last) + 1
+        if not end and len(text) > last:
             raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
-        # Other characters than ASCII become one that no number has.
-        line = (line.removeprefix(_BOM) if first else line).translate(_STRICT)
-        text = line.decode("ascii", "replace")
-        first = False
-        if not text.isspace() and text and not (comments and text.lstrip().startswith(comments)):
-            yield text
+        yield text[at : end or len(text)]
+        at = end or len(text)
 
 
-def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ()) -> np.ndarray:
-    """Read lines of numbers as ``[N, C]`` float64; NaN and infinity are numbers here.
-
-    Args:
-        lines: one row each.
-        source: named in errors.
-        columns: allowed numbers of columns; empty: any.
-
-    Raises:
-        UserError: a word is not a number, the rows differ in their number of columns, or there are
-            more than ``MAX_VALUES`` numbers.
-    """
-    lines = iter(lines)
-    first = next(lines, None)
-    if first is None:
-        return np.zeros((0, columns[0] if columns else 0))
-    count = len(first.split())
-    if columns and count not in columns:
-        wanted = " or ".join(map(str, columns))
-        raise UserError(f"{source}: {count} columns in the first row, expected {wanted}")
-    most = MAX_VALUES // count
+def parse_numbers(text: bytes, count: int, kind: Any = np.float64) -> np.ndarray | None:
+    """Return the ``count`` words of a text as numbers ``[count]``; None if one is no number."""
+    if count == 0:
+        return np.zeros(0, kind)
     try:
-        table = np.loadtxt(islice(chain([first], lines), most + 1), comments=None, ndmin=2)
-    except ValueError as error:
-        # "...; use `usecols` to select a subset" is advice for programmers.
-        reason = re.split(r"[;\n]", str(error))[0].rstrip(".")
-        raise UserError(f"{source}: {reason[:200]}") from error
-    if len(table) > most:
-        raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
-    return table
+        with warnings.catch_warnings():  # numpy before 2.3 warns of a word, and returns the others
+            warnings.simplefilter("ignore", DeprecationWarning)
+            found = np.fromstring(text, kind, sep=" ")
+    except ValueError:
+        return None
+    return found if len(found) == count else None  # "1-2" is one word but two numbers
 
 
-def read_rows(lines: Iterable[str], source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read rows of different lengths: ``[M]`` float64 of all rows, ``[N]`` int64 their lengths.
+class Rows(NamedTuple):
+    """Rows of numbers."""
+
+    values: np.ndarray  # [M] float64, of all rows one after the other
+    sizes: np.ndarray  # [N] int64, how many each row has
+
+    def column(self, number: int) -> np.ndarray:
+        """Return ``[N]`` float64, a number of each row; of shorter rows any."""
+        if len(self.sizes) and (self.sizes == self.sizes[0]).all() and number < self.sizes[0]:
+            return self.values[number :: self.sizes[0]]
+        return np.append(self.values, 0.0).take(
+            np.cumsum(self.sizes) - self.sizes + number, mode="clip"
+        )
+
+    def part(self, first: int, count: int) -> Rows:
+        """Return ``count`` rows from the ``first`` on."""
+        start, sizes = self.sizes[:first].sum(), self.sizes[first : first + count]
+        return Rows(self.values[start : start + sizes.sum()], sizes)
+
+    def table(self, source: str, columns: tuple[int, ...] = ()) -> np.ndarray:
+        """Return rows of one length as ``[N, C]`` float64.
+
+        Args:
+            source: named in errors.
+            columns: allowed numbers of columns; empty: any.
+
+        Raises:
+            UserError: the rows differ in their length, or have another.
+        """
+        if not len(self.sizes):
+            return np.zeros((0, columns[0] if columns else 0))
+        count = int(self.sizes[0])
+        if columns and count not in columns:
+            wanted = " or ".join(map(str, columns))
+            raise UserError(f"{source}: {count} columns in the first row, expected {wanted}")
+        if (self.sizes != count).any():
+            row = (self.sizes != count).argmax()
+            change = f"changed from {count} to {self.sizes[row]} at row {row + 1}"
+            raise UserError(f"{source}: the number of columns {change}")
+        return self.values.reshape(-1, count)
+
+
+def parse_rows(text: bytes) -> Rows | None:
+    """Return the rows of a text, one a line, empty for a blank one; None if a word is no number."""
+    sizes = Lines(text).sizes if text else np.zeros(0, np.int64)
+    values = parse_numbers(text, int(sizes.sum()))
+    return None if values is None else Rows(values, sizes)
+
+
+def read_rows(text: bytes, source: str) -> Rows:
+    """Read the rows of a text that are not blank.
+
+    NaN and infinity are numbers here.
 
     Raises:
-        UserError: as for ``read_table``.
+        UserError: a word is not a number, a line is longer than ``MAX_LINE``, or there are more
+            than ``MAX_VALUES`` numbers.
     """
-    sizes = []
+    values, sizes, total = [np.zeros(0)], [np.zeros(0, np.int64)], 0
+    for block in blocks_of(text.removeprefix(BOM), source):
+        lines = Lines(block)
+        if lines.lengths.max() > MAX_LINE:
+            raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
+        total += int(lines.sizes.sum())
+        if total > MAX_VALUES:
+            raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
+        found = parse_numbers(block, int(lines.sizes.sum()))
+        if found is None:
+            raise _no_number(block, source, sum(map(len, sizes)))
+        values.append(found)
+        sizes.append(lines.sizes[lines.sizes > 0])
+    return Rows(np.concatenate(values), np.concatenate(sizes))
 
-    def words() -> Iterator[str]:
-        for line in lines:
-            row = line.split()
-            sizes.append(len(row))
-            yield from row
 
-    numbers = read_table(words(), source, (1,))[:, 0]
-    return numbers, np.array(sizes, np.int64)
+def _no_number(block: bytes, source: str, before: int) -> UserError:
+    """Return the error of the first word that is no number, ``before`` rows from the start."""
+    rows = (line.split() for line in block.split(b"\n") if not line.isspace() and line)
+    words = ((word, row) for row, line in enumerate(rows, before + 1) for word in line)
+    word, row = next((found for found in words if not is_number(found[0])), (b"", before))
+    shown = word[:60].decode("ascii", "replace")
+    return UserError(f"{source}: could not convert '{shown}' of row {row} to a number")
+
+
+def without_comments(text: bytes) -> bytes:
+    """Return a text without what follows a ``#`` in its line."""
+    return re.sub(rb"#[^\n]*", b"", text) if b"#" in text else text
+
+
+def is_number(word: bytes) -> bool:
+    """Return True if a word is a number for ``parse_numbers`` alone."""
+    return parse_numbers(word, 1) is not None

@@ -1,14 +1,15 @@
 """Mesh files as flat arrays: one list of triangles with their corners' normals, UVs and materials.
 
-The readers of the formats yield parts, which are joined without unused vertices; missing normals
-are computed. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up by convention and
-are turned by ``normalized`` (front +z becomes front -y, as in Blender).
+The readers of the formats yield parts, which are joined without unused vertices; normals are
+computed when they are asked for. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up
+by convention and are turned by ``normalized`` (front +z becomes front -y, as in Blender).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from .gltf import read_gltf
 from .materials import GREY, Material, SideFiles, to_linear
 from .obj import read_obj
 from .off import read_off
-from .parts import Part
+from .parts import Part, used_vertices
 from .ply_mesh import read_ply_mesh
 from .stl import read_stl
 
@@ -47,24 +48,43 @@ class TexturedMesh:
     Attributes:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64.
-        normals: ``[F, 3, 3]`` float32, unit, on the side of the face's own normal.
         uvs: ``[F, 3, 2]`` float32, v upwards; 0 if missing.
         colors: ``[F, 3, 4]`` uint8 display RGBA; white if missing.
         material_ids: ``[F]`` int64 into ``materials``.
         materials: at least one.
+        given_normals: ``[F, 3, 3]`` of the file, of any length and side, not checked; or None.
         warnings: missing content that was replaced, or unread content, one line each.
         omitted: the warnings that concern the shape.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    normals: np.ndarray
     uvs: np.ndarray
     colors: np.ndarray
     material_ids: np.ndarray
     materials: list[Material]
+    given_normals: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)
     omitted: list[str] = field(default_factory=list)
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """``[F, 3, 3]`` float32, unit, on the side of the face's own normal.
+
+        A corner's is the file's, or without any its vertex's, if it agrees with the face.
+        """
+        given = self.given_normals
+        if given is None:
+            given = _vertex_normals(self.vertices, self.faces)
+        corners = self.vertices[self.faces]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(flat, axis=1, keepdims=True)
+        flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])[:, None]
+        smooth = np.nan_to_num(given)
+        smooth /= np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-12)
+        agree = (smooth * flat).sum(2, keepdims=True)
+        smooth *= np.sign(agree)
+        return np.where(np.abs(agree) > CREASE, smooth, flat).astype(np.float32)
 
     def normalized(
         self, up: str = "z", rotation: ArrayLike | None = None
@@ -84,12 +104,10 @@ class TexturedMesh:
         points = self.vertices @ turn.T
         low, high = points.min(0), points.max(0)
         center, scale = (low + high) / 2, 1.0 / (high - low).max()
-        normals = self.normals @ np.linalg.inv(turn).astype(np.float32)
-        mesh = replace(
-            self,
-            vertices=(points - center) * scale,
-            normals=normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12),
-        )
+        normals = self.given_normals
+        if normals is not None:
+            normals = normals @ np.linalg.inv(turn).astype(np.float32)
+        mesh = replace(self, vertices=(points - center) * scale, given_normals=normals)
         return mesh, np.hstack([turn, -center[:, None]]), float(scale)
 
 
@@ -98,7 +116,7 @@ def default_up(path: str | Path) -> str:
     return "y" if Path(path).suffix.lower() in Y_UP else "z"
 
 
-def load_mesh(path: str | Path, normals: bool = True, root: Path | None = None) -> TexturedMesh:
+def load_mesh(path: str | Path, root: Path | None = None) -> TexturedMesh:
     """Read a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
@@ -107,7 +125,6 @@ def load_mesh(path: str | Path, normals: bool = True, root: Path | None = None) 
 
     Args:
         path: the file.
-        normals: compute normals, which takes much of the time; else they are 0.
         root: the folder above the file in which it may name other files; by default its own.
 
     Raises:
@@ -119,48 +136,98 @@ def load_mesh(path: str | Path, normals: bool = True, root: Path | None = None) 
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     sides = SideFiles(path, root=root)
-    parts, materials, ids, count = [], [], {}, 0
+    parts: list[Part] = []
+    count = 0
     try:
         for part in _READERS[path.suffix.lower()](path, sides):
-            count += len(part.faces) + len(part.vertices)  # a scene may hold one part many times
+            if not len(part.faces):
+                continue
+            parts.append(_complete(part, sides))
+            count += len(part.faces) + len(parts[-1].vertices)  # a scene may repeat one part
             if count > MAX_PARTS:
                 limit = f"over {MAX_PARTS} vertices and faces, the limit for a mesh"
                 raise UserError(f"{path}: {limit}")
-            if not len(part.faces):
-                continue
-            arrays, material = _flatten(part, sides, normals)
-            number = ids.setdefault(id(material), len(materials))
-            if number == len(materials):
-                materials.append(material)
-            arrays["material_ids"] = np.full(len(part.faces), number)
-            parts.append(arrays)
+        if not parts:
+            raise UserError(f"{path}: no faces")
+        return _joined(parts, sides)
     except MemoryError as error:
         raise UserError(f"{path}: not enough memory for it") from error
-    if not parts:
-        raise UserError(f"{path}: no faces")
-    if not any(_is_visible(part["colors"], materials[part["material_ids"][0]]) for part in parts):
+
+
+def _complete(part: Part, sides: SideFiles) -> Part:
+    """Return a part with a material and without unused vertices."""
+    faces, kept = used_vertices(part.faces, len(part.vertices))
+    vertices = part.vertices if kept is None else part.vertices[kept]
+    if not np.isfinite(vertices).all():
+        bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
+        raise UserError(f"{sides.path}: {bad} of {len(vertices)} vertices are not finite")
+    material = part.material
+    if material is None:
+        material = Material(np.ones(4, np.float32))
+        if part.colors is None:
+            material.color[:3] = to_linear(GREY)
+            sides.warnings.append("a part has no material: grey")
+    elif material.texture is not None and part.uvs is None:
+        sides.warnings.append("a textured part has no UV coordinates")
+        mean = material.texture.mean((0, 1), keepdims=True).astype(np.uint8)
+        material = replace(material, texture=mean)
+    return replace(part, vertices=vertices, faces=faces, material=material)
+
+
+def _joined(parts: list[Part], sides: SideFiles) -> TexturedMesh:
+    """Return complete parts as one mesh. Raises UserError if it has no usable extent."""
+    found = [part.material or Material(np.ones(4, np.float32)) for part in parts]
+    materials = list({id(material): material for material in found}.values())
+    numbers = {id(material): number for number, material in enumerate(materials)}
+    sizes = [len(part.faces) for part in parts]
+    vertices = _concatenated([part.vertices for part in parts]).astype(np.float64, copy=False)
+    low, high = np.array([(axis.min(), axis.max()) for axis in vertices.T]).T
+    reach, extent = np.abs([low, high]).max(), (high - low).max()
+    if reach > MAX_REACH:
+        raise UserError(f"{sides.path}: coordinates reach {reach:.3g}, over {MAX_REACH:g}")
+    if 0 < extent < 1 / MAX_REACH:
+        raise UserError(f"{sides.path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
+    if extent <= 0:
+        raise UserError(f"{sides.path}: all vertices are one point")
+    uvs, colors, normals = [], [], None
+    for part, size in zip(parts, sizes):
+        white = np.full((size, 3, 4), 255, np.uint8)
+        colors.append(white if part.colors is None else part.colors)
+        zeros = np.zeros((size, 3, 2), np.float32)
+        uvs.append(zeros if part.uvs is None else np.nan_to_num(part.uvs.astype(np.float32)))
+    if any(part.normals is not None for part in parts):
+        normals = _concatenated(
+            [
+                _vertex_normals(x.vertices, x.faces) if x.normals is None else x.normals
+                for x in parts
+            ]
+        )
+    if not any(_is_visible(*pair) for pair in zip(colors, found)):
         sides.warnings.append("all its surfaces are transparent by their alpha: drawn opaque")
-        for part in parts:
-            part["colors"][..., 3] = 255
+        for part_colors in colors:
+            part_colors[..., 3] = 255
         for material in materials:
             material.color[3] = 1
             if material.texture is not None:
                 rgb = material.texture[..., :3]
                 material.texture = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-    offsets = np.cumsum([0] + [len(part["vertices"]) for part in parts])
-    for part, offset in zip(parts, offsets):
-        part["faces"] = part["faces"] + offset
-    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    reach = np.abs(joined["vertices"]).max()
-    if reach > MAX_REACH:
-        raise UserError(f"{path}: coordinates reach {reach:.3g}, over {MAX_REACH:g}")
-    extent = np.ptp(joined["vertices"], axis=0).max()
-    if 0 < extent < 1 / MAX_REACH:
-        raise UserError(f"{path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
-    if extent <= 0:
-        raise UserError(f"{path}: all vertices are one point")
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
     warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
-    return TexturedMesh(**joined, materials=materials, warnings=warnings, omitted=omitted)
+    return TexturedMesh(
+        vertices=vertices,
+        faces=_concatenated([x.faces + at if at else x.faces for x, at in zip(parts, offsets)]),
+        uvs=_concatenated(uvs),
+        colors=_concatenated(colors),
+        material_ids=np.repeat([numbers[id(material)] for material in found], sizes),
+        materials=materials,
+        given_normals=normals,
+        warnings=warnings,
+        omitted=omitted,
+    )
+
+
+def _concatenated(arrays: list[np.ndarray]) -> np.ndarray:
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _is_visible(colors: np.ndarray, material: Material) -> bool:
@@ -169,52 +236,8 @@ def _is_visible(colors: np.ndarray, material: Material) -> bool:
     return float(material.color[3]) * texture * int(colors[..., 3].max(initial=0)) >= 255
 
 
-def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Material]:
-    """Return the arrays of one part, without unused vertices, and its material."""
-    used = np.zeros(len(part.vertices), bool)
-    used[part.faces] = True
-    faces, vertices = part.faces, part.vertices
-    if not used.all():
-        faces, vertices = (np.cumsum(used) - 1)[faces], vertices[used]
-    bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
-    if bad:
-        raise UserError(f"{sides.path}: {bad} of {len(vertices)} vertices are not finite")
-    material, uvs = part.material, part.uvs
-    if material is None:
-        material = Material(np.ones(4, np.float32))
-        if part.colors is None:
-            material.color[:3] = to_linear(GREY)
-            sides.warnings.append("a part has no material: grey")
-    elif material.texture is not None and uvs is None:
-        sides.warnings.append("a textured part has no UV coordinates")
-        mean = material.texture.mean((0, 1), keepdims=True).astype(np.uint8)
-        material = replace(material, texture=mean)
-    corners, colors = faces.shape, part.colors
-    arrays = {"vertices": vertices, "faces": faces}
-    arrays["normals"] = np.zeros((*corners, 3), np.float32)
-    if normals:
-        arrays["normals"] = _corner_normals(vertices, faces, part.normals)
-    uvs = np.zeros((*corners, 2)) if uvs is None else uvs
-    arrays["uvs"] = np.nan_to_num(uvs.astype(np.float32))
-    arrays["colors"] = np.full((*corners, 4), 255, np.uint8) if colors is None else colors
-    return arrays, material
+def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return ``[F, 3, 3]``, at each corner the mean of the normals of its vertex's faces."""
+    import trimesh
 
-
-def _corner_normals(
-    vertices: np.ndarray, faces: np.ndarray, given: np.ndarray | None
-) -> np.ndarray:
-    """Return normals ``[F, 3, 3]``: the corner's if it agrees with the face, else the face's."""
-    if given is None:
-        import trimesh
-
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        given = np.asarray(mesh.vertex_normals)[faces]
-    corners = vertices[faces]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(flat, axis=1, keepdims=True)
-    flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])[:, None]
-    smooth = np.nan_to_num(given, copy=False)
-    smooth /= np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-12)
-    agree = (smooth * flat).sum(2, keepdims=True)
-    smooth *= np.sign(agree)
-    return np.where(np.abs(agree) > CREASE, smooth, flat).astype(np.float32)
+    return trimesh.Trimesh(vertices, faces, process=False).vertex_normals[faces]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -14,12 +12,11 @@ from ..errors import UserError
 from .headers import (
     MAX_FILE,
     MAX_VALUES,
+    Rows,
     check_lines,
     compare_sizes,
-    lines_of,
     open_shape,
     read_rows,
-    read_table,
 )
 
 MAX_HEADER = 1 << 16  # bytes
@@ -149,9 +146,12 @@ def read_ply(path: Path, limit: int = MAX_FILE) -> PlyData:
         file.seek(header.start)
         says = ", ".join(f"{element.count} {element.name}" for element in header.elements)
         if header.format == "ascii":
-            lines = lines_of(file, str(path))
-            found = {element.name: _from_text(path, lines, element) for element in header.elements}
-            if next(lines, None) is not None:
+            rows, first, found = read_rows(file.read(), str(path)), 0, {}
+            for element in header.elements:
+                count = element.count if element.properties else 0
+                found[element.name] = _from_text(path, rows.part(first, count), element)
+                first += count
+            if first < len(rows.sizes):
                 raise UserError(f"{path}: false header, more lines follow than {says}")
             return PlyData(header, found)
         least = sum(element.least_bytes() for element in header.elements)
@@ -187,17 +187,15 @@ def spread(starts: np.ndarray, lengths: np.ndarray, step: int = 1) -> np.ndarray
     return np.repeat(starts, lengths) + within * step
 
 
-def _from_text(path: Path, lines: Iterator[str], element: PlyElement) -> Columns:
-    """Return the element's columns, from as many lines as it has rows."""
+def _from_text(path: Path, rows: Rows, element: PlyElement) -> Columns:
+    """Return the element's columns from its rows, or as many as there are."""
     items, source = element.properties, f"{path}: {element.name}"
     count = element.count if items else 0
-    rows, says = islice(lines, count), f"{count} {element.name},"
+    check_lines(path, f"{count} {element.name},", count, len(rows.sizes))
     if not any(item.length for item in items):
-        table = read_table(rows, source, (len(items),))
-        check_lines(path, says, count, len(table))
+        table = rows.table(source, (len(items),))
         return {item.name: _typed(path, table[:, i], item) for i, item in enumerate(items)}
-    numbers, sizes = read_rows(rows, source)
-    check_lines(path, says, count, len(sizes))
+    numbers, sizes = rows
     spans, ends = [], np.cumsum(sizes)
     at = ends - sizes
     for item in items:

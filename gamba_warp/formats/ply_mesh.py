@@ -45,12 +45,11 @@ def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
         lengths = np.full(len(given) // 3, 3)
     places = cut_polygons(sides, points, given, lengths)
     corners = given.astype(np.int64)[places]
-    owner = np.repeat(np.arange(len(lengths)), lengths)[places]
     normals, colors = data.numbers("vertex", ("nx", "ny", "nz")), _colors(vertices)
     if colors is not None:
         colors = colors[corners]
     elif (of_faces := _colors(faces)) is not None:
-        colors = of_faces[owner]
+        colors = of_faces[np.repeat(np.arange(len(lengths)), lengths)[places]]
     uvs, of_corners = None, faces.get("texcoord")
     names = next((pair for pair in _UVS if {*pair} <= vertices.keys()), None)
     if isinstance(of_corners, PlyList) and (of_corners.lengths == 2 * lengths).all():

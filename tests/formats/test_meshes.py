@@ -202,9 +202,6 @@ def test_smooth_normals_are_kept(tmp_path):
     mesh = load_mesh(tmp_path / "ball.ply")
     outward = mesh.vertices[mesh.faces]
     assert ((mesh.normals * outward).sum(-1) > 0.999).all()
-    bare = load_mesh(tmp_path / "ball.ply", normals=False)
-    assert not bare.normals.any() and bare.normals.shape == mesh.normals.shape
-    assert (bare.vertices[bare.faces] == outward).all()
 
 
 @pytest.mark.parametrize(

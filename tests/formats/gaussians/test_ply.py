@@ -235,7 +235,7 @@ BAD_FILES = {
     "no end": (b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n", "has no end"),
     "endless": (b"ply\n" + b"comment x\n" * 10000 + b"end_header\n", "has no end"),
     "no format": (["element vertex 2", "property float x"], "format is none"),
-    "ascii": (header(2, form="ascii"), "vertex"),
+    "ascii": (header(2, form="ascii"), "could not convert"),
     "odd format": (header(2, form="binary"), "format is binary"),
     "no vertices": (["format binary_little_endian 1.0"], "no property x, y, z; not Gaussians"),
     "faces alone": ([header(2)[0], "element face 2"], "no property x, y, z; not Gaussians"),
