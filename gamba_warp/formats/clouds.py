@@ -26,7 +26,7 @@ from .headers import (
     read_rows,
     without_comments,
 )
-from .ply_data import read_ply
+from .ply_data import PlyData, read_ply
 
 SUFFIXES = (".xyz", ".pts", ".pcd", ".ply")
 MAX_POINTS = MAX_VALUES // 3
@@ -57,9 +57,12 @@ def read_cloud(path: Path) -> Cloud:
     if reader is None:
         raise UserError(f"{path}: not one of {', '.join(SUFFIXES)}")
     try:
-        cloud = reader(path)
+        return _checked(path, reader(path))
     except MemoryError as error:
         raise UserError(f"{path}: not enough memory for it") from error
+
+
+def _checked(path: Path, cloud: Cloud) -> Cloud:
     count = len(cloud.positions)
     if count == 0:
         raise UserError(f"{path}: no points in it")
@@ -91,12 +94,12 @@ def _read_pts(path: Path) -> Cloud:
     return Cloud(np.ascontiguousarray(rows.table(str(path), _PTS_COLUMNS)[:, :3]))
 
 
-def _read_ply(path: Path) -> Cloud:
-    data = read_ply(path)
+def cloud_of(path: Path, data: PlyData) -> Cloud:
+    """Return the cloud of a ``.ply`` file's content. Raises UserError as ``read_cloud``."""
     positions = data.numbers("vertex", _AXES)
     if positions is None:
         raise UserError(f"{path}: its vertices have no x, y and z")
-    return Cloud(positions, data.numbers("vertex", ("nx", "ny", "nz")))
+    return _checked(path, Cloud(positions, data.numbers("vertex", ("nx", "ny", "nz"))))
 
 
 def _read_pcd(path: Path) -> Cloud:
@@ -223,7 +226,10 @@ def lzf_decompressed(data: bytes, size: int, source: str) -> bytearray:
     return out
 
 
-_READERS = {".xyz": _read_xyz, ".pts": _read_pts, ".pcd": _read_pcd, ".ply": _read_ply}
+_READERS = {
+    **{".xyz": _read_xyz, ".pts": _read_pts, ".pcd": _read_pcd},
+    ".ply": lambda path: cloud_of(path, read_ply(path)),
+}
 _PCD_COUNTS = ("WIDTH", "HEIGHT", "POINTS")
 _PCD_KINDS = {
     (letter, size): f"<{letter.lower()}{size}"

@@ -37,13 +37,18 @@ def open_shape(path: Path, limit: int = MAX_FILE) -> Iterator[tuple[BinaryIO, in
             size = os.fstat(file.fileno()).st_size
             if size == 0:
                 raise UserError(f"{path}: the file is empty, not a {path.suffix} file")
-            if size > limit:
-                raise UserError(f"{path}: over {limit >> 20} MB, the limit for a shape")
+            check_limit(path, size, limit)
             yield file, size
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise UserError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
     except MemoryError as error:
         raise UserError(f"{path}: not enough memory for it") from error
+
+
+def check_limit(path: Path, size: int, limit: int) -> None:
+    """Raise UserError if a file has more bytes than the limit."""
+    if size > limit:
+        raise UserError(f"{path}: over {limit >> 20} MB, the limit for a shape")
 
 
 def compare_sizes(path: Path, says: str, wanted: int, there: int, exact: bool = True) -> None:

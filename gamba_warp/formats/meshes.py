@@ -21,6 +21,7 @@ from .materials import GREY, Material, SideFiles, to_linear
 from .obj import read_obj
 from .off import read_off
 from .parts import Part, used_vertices
+from .ply_data import PlyData
 from .ply_mesh import read_ply_mesh
 from .stl import read_stl
 
@@ -116,7 +117,9 @@ def default_up(path: str | Path) -> str:
     return "y" if Path(path).suffix.lower() in Y_UP else "z"
 
 
-def load_mesh(path: str | Path, root: Path | None = None) -> TexturedMesh:
+def load_mesh(
+    path: str | Path, root: Path | None = None, ply: PlyData | None = None
+) -> TexturedMesh:
     """Read a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
@@ -126,6 +129,7 @@ def load_mesh(path: str | Path, root: Path | None = None) -> TexturedMesh:
     Args:
         path: the file.
         root: the folder above the file in which it may name other files; by default its own.
+        ply: content of a ``.ply`` file that was read already; or None.
 
     Raises:
         UserError: missing, malformed, no faces, vertices not finite, or no extent.
@@ -138,8 +142,9 @@ def load_mesh(path: str | Path, root: Path | None = None) -> TexturedMesh:
     sides = SideFiles(path, root=root)
     parts: list[Part] = []
     count = 0
+    reader = _READERS[path.suffix.lower()]
     try:
-        for part in _READERS[path.suffix.lower()](path, sides):
+        for part in reader(path, sides) if ply is None else read_ply_mesh(path, sides, ply):
             if not len(part.faces):
                 continue
             parts.append(_complete(part, sides))
