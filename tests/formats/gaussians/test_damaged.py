@@ -320,3 +320,15 @@ def test_an_evaluation_takes_gaussians_of_any_format_and_meshes_as_meshes(sound,
     suffix = path.suffix if path.suffix in (".ply", ".glb") else ".ply"
     trimesh.creation.box().export(tmp_path / f"box{suffix}")
     assert len(load_shape(tmp_path / f"box{suffix}").faces) == 12
+
+
+def test_an_evaluation_opens_a_ply_once(sound, tmp_path, monkeypatch):
+    from gamba_warp.eval.shapes.load import load_shape
+
+    opened, plain = [], open
+    trimesh.creation.box().export(tmp_path / "box.ply")
+    monkeypatch.setattr("builtins.open", lambda *a, **k: opened.append(a[0]) or plain(*a, **k))
+    for path in (sound("ply")[0], tmp_path / "box.ply"):
+        opened.clear()
+        load_shape(path)
+        assert opened == [path]
