@@ -19,6 +19,7 @@ import numpy as np
 
 from ..errors import UserError
 from .headers import (
+    MAX_COLUMNS,
     MAX_VALUES,
     check_lines,
     compare_sizes,
@@ -31,7 +32,6 @@ from .ply_data import PlyData, read_ply
 SUFFIXES = (".xyz", ".pts", ".pcd", ".ply")
 MAX_POINTS = MAX_VALUES // 3
 MAX_UNPACKED = 1 << 30  # bytes of a compressed .pcd
-_MAX_FIELDS = 1024  # of a .pcd; its descriptors of shape have up to 640
 _HEADER_LINES = 64
 _PTS_COLUMNS = (3, 4, 6, 7)
 _AXES, _PCD_NORMALS = ("x", "y", "z"), ("normal_x", "normal_y", "normal_z")
@@ -167,7 +167,7 @@ def _pcd_header(path: Path, file: BinaryIO) -> tuple[list[tuple[str, str, tuple[
     count = counts.get("POINTS", counts.get("WIDTH", 0) * counts.get("HEIGHT", 1))
     if "WIDTH" in counts and counts["WIDTH"] * counts.get("HEIGHT", 1) != count:
         raise UserError(f"{path}: false header, WIDTH times HEIGHT is not {count} POINTS")
-    if sum(repeats) > _MAX_FIELDS or min(repeats) < 1:
+    if sum(repeats) > MAX_COLUMNS or min(repeats) < 1:
         raise UserError(f"{path}: broken header, COUNT {' '.join(lines['COUNT'])[:60]}")
     fields = []
     for i, (name, letter, size, repeat) in enumerate(zip(names, kinds, sizes, repeats)):

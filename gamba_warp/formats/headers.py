@@ -16,7 +16,7 @@ from ..errors import UserError
 
 MAX_FILE = 1 << 30  # bytes of a shape
 SLACK = 2  # bytes after the end: a line end
-MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
+MAX_COLUMNS = 1024  # of a table; descriptors of shape have up to 640
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
 BOM = b"\xef\xbb\xbf"
 _BLOCK = 1 << 24  # bytes of a text that are read at once
@@ -124,14 +124,13 @@ def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
     """Yield a text in parts of whole lines, so that what is made of a part takes little memory.
 
     Raises:
-        UserError: a line is longer than ``MAX_LINE``, and the text than a part.
+        UserError: a line is longer than a part.
     """
     at = 0
     while at < len(text):
-        last = at + _BLOCK + MAX_LINE
-        end = text.find(b"\n", at + _BLOCK, last) + 1
-        if not end and len(text) > last:
-            raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
+        end = text.find(b"\n", at + _BLOCK, at + 2 * _BLOCK) + 1
+        if not end and len(text) > at + 2 * _BLOCK:
+            raise UserError(f"{source}: a line of more than {_BLOCK} letters")
         yield text[at : end or len(text)]
         at = end or len(text)
 
@@ -181,8 +180,8 @@ class Rows(NamedTuple):
         if not len(self.sizes):
             return np.zeros((0, columns[0] if columns else 0))
         count = int(self.sizes[0])
-        if columns and count not in columns:
-            wanted = " or ".join(map(str, columns))
+        if (columns and count not in columns) or count > MAX_COLUMNS:
+            wanted = " or ".join(map(str, columns)) or f"{MAX_COLUMNS} at most"
             raise UserError(f"{source}: {count} columns in the first row, expected {wanted}")
         if (self.sizes != count).any():
             row = (self.sizes != count).argmax()
@@ -204,23 +203,25 @@ def read_rows(text: bytes, source: str) -> Rows:
     NaN and infinity are numbers here.
 
     Raises:
-        UserError: a word is not a number, a line is longer than ``MAX_LINE``, or there are more
-            than ``MAX_VALUES`` numbers.
+        UserError: a word is not a number, there are more than ``MAX_VALUES`` numbers, or as for
+            ``blocks_of``.
     """
-    values, sizes, total = [np.zeros(0)], [np.zeros(0, np.int64)], 0
+    found = [Rows(np.zeros(0), np.zeros(0, np.int64))]
+    left = MAX_VALUES
     for block in blocks_of(text.removeprefix(BOM), source):
-        lines = Lines(block)
-        if lines.lengths.max() > MAX_LINE:
-            raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
-        total += int(lines.sizes.sum())
-        if total > MAX_VALUES:
+        rows = parse_rows(block)
+        if rows is None:
+            raise _no_number(block, source, sum(len(rows.sizes) for rows in found))
+        left -= len(rows.values)
+        if left < 0:
             raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
-        found = parse_numbers(block, int(lines.sizes.sum()))
-        if found is None:
-            raise _no_number(block, source, sum(map(len, sizes)))
-        values.append(found)
-        sizes.append(lines.sizes[lines.sizes > 0])
-    return Rows(np.concatenate(values), np.concatenate(sizes))
+        found.append(Rows(rows.values, rows.sizes[rows.sizes > 0]))
+    return joined_rows(found)
+
+
+def joined_rows(parts: list[Rows]) -> Rows:
+    """Return the rows of one part or more, one after the other."""
+    return Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
 def _no_number(block: bytes, source: str, before: int) -> UserError:

@@ -17,6 +17,7 @@ from .headers import (
     blocks_of,
     is_blank,
     is_number,
+    joined_rows,
     open_shape,
     parse_numbers,
     parse_rows,
@@ -54,8 +55,8 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
     del text
     for word in sorted(found.unread - _IGNORED)[:9]:
         sides.omit(f"the statement {word} is not read")
-    points, colors = _vertices(found.rows(b"v"))
-    uvs, normals = found.rows(b"vt"), found.rows(b"vn")
+    vertices, uvs, normals = map(joined_rows, found.rows.values())
+    points, colors = _vertices(vertices)
     # A texture may have one coordinate.
     vertex_uvs = np.stack([uvs.column(0), np.where(uvs.sizes > 1, uvs.column(1), 0.0)], 1)
     vertex_normals = np.stack([normals.column(axis) for axis in range(3)], 1)
@@ -111,7 +112,7 @@ class _Statements:
     """Statements of a file.
 
     Attributes:
-        found: numbers of the lines of ``v``, ``vt`` and ``vn``, by block.
+        rows: numbers of the lines of ``v``, ``vt`` and ``vn``, by block.
         corners: by block ``[C, 3]`` int64, of each corner the indices of v, vt and vn from 1, or 0.
         lengths: by block ``[F]``, number of corners of each face.
         faces: by block ``[F]``, line of each face.
@@ -121,9 +122,9 @@ class _Statements:
     """
 
     def __init__(self, path: Path, text: bytes) -> None:
-        self.found: dict[bytes, list[Rows]] = {word: [] for word in _LEAST}
-        self.corners, self.lengths = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
-        self.faces = [np.zeros(0, np.int64)]
+        none = np.zeros(0, np.int64)
+        self.rows = {word: [Rows(np.zeros(0), none)] for word in _LEAST}
+        self.corners, self.lengths, self.faces = [np.zeros((0, 3), np.int64)], [none], [none]
         self.names, self.libraries, self.unread = [""], list[str](), set[str]()
         self._numbers = {"": 0}  # of the names
         self._used = [(-1, 0)]  # lines of usemtl, and numbers of the materials
@@ -134,11 +135,6 @@ class _Statements:
             if not self._read(path, lines, line):
                 raise _invalid_line(path, block, line)
             line += len(lines.sizes)
-
-    def rows(self, word: bytes) -> Rows:
-        """Return the numbers of all lines of a word."""
-        parts = [*self.found[word], Rows(np.zeros(0), np.zeros(0, np.int64))]
-        return Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
     def materials_of(self, lines: np.ndarray) -> np.ndarray:
         """Return the numbers of the materials of faces at these lines."""
@@ -156,7 +152,7 @@ class _Statements:
             rows = parse_rows(without_comments(lines.behind(word, which)))
             if rows is None or (rows.sizes < least).any():
                 return False
-            self.found[word].append(rows)
+            self.rows[word].append(rows)
         which = lines.begin_with(b"f")
         found = _corners(without_comments(lines.behind(b"f", which)))
         if found is None:

@@ -180,7 +180,7 @@ f -1 -2 -3
 )
 
 
-@pytest.mark.parametrize("block", [1, 20, 1 << 24])
+@pytest.mark.parametrize("block", [30, 60, 1 << 24])
 def test_a_text_is_read_in_blocks_of_any_length(tmp_path, monkeypatch, block):
     """What counts back, and the material in use, go on from one to the next."""
     monkeypatch.setattr("gamba_warp.formats.headers._BLOCK", block)
