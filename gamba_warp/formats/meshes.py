@@ -140,7 +140,7 @@ def load_mesh(
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     sides = SideFiles(path, root=root)
-    parts: list[Part] = []
+    parts: list[_Whole] = []
     count = 0
     reader = _READERS[path.suffix.lower()]
     try:
@@ -159,33 +159,49 @@ def load_mesh(
         raise UserError(f"{path}: not enough memory for it") from error
 
 
-def _complete(part: Part, sides: SideFiles) -> Part:
-    """Return a part with a material and without unused vertices."""
+@dataclass
+class _Whole:
+    """A part with all that a ``TexturedMesh`` has, and without unused vertices."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    material: Material
+    normals: np.ndarray | None
+    uvs: np.ndarray
+    colors: np.ndarray
+
+
+def _complete(part: Part, sides: SideFiles) -> _Whole:
+    """Replace what a part has not. Raises UserError if a vertex is not finite."""
     faces, kept = used_vertices(part.faces, len(part.vertices))
     vertices = part.vertices if kept is None else part.vertices[kept]
     if not np.isfinite(vertices).all():
         bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
         raise UserError(f"{sides.path}: {bad} of {len(vertices)} vertices are not finite")
-    material = part.material
+    material, uvs, colors = part.material, part.uvs, part.colors
     if material is None:
         material = Material(np.ones(4, np.float32))
-        if part.colors is None:
+        if colors is None:
             material.color[:3] = to_linear(GREY)
             sides.warnings.append("a part has no material: grey")
-    elif material.texture is not None and part.uvs is None:
+    elif material.texture is not None and uvs is None:
         sides.warnings.append("a textured part has no UV coordinates")
         mean = material.texture.mean((0, 1), keepdims=True).astype(np.uint8)
         material = replace(material, texture=mean)
-    return replace(part, vertices=vertices, faces=faces, material=material)
+    zeros = np.zeros((*faces.shape, 2), np.float32)
+    uvs = zeros if uvs is None else np.nan_to_num(uvs.astype(np.float32))
+    colors = np.full((*faces.shape, 4), 255, np.uint8) if colors is None else colors
+    return _Whole(vertices, faces, material, part.normals, uvs, colors)
 
 
-def _joined(parts: list[Part], sides: SideFiles) -> TexturedMesh:
+def _joined(parts: list[_Whole], sides: SideFiles) -> TexturedMesh:
     """Return complete parts as one mesh. Raises UserError if it has no usable extent."""
-    found = [part.material or Material(np.ones(4, np.float32)) for part in parts]
-    materials = list({id(material): material for material in found}.values())
-    numbers = {id(material): number for number, material in enumerate(materials)}
-    sizes = [len(part.faces) for part in parts]
-    vertices = _concatenated([part.vertices for part in parts]).astype(np.float64, copy=False)
+
+    def all_of(name: str) -> np.ndarray:
+        arrays = [getattr(part, name) for part in parts]
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+    vertices, colors = all_of("vertices").astype(np.float64, copy=False), all_of("colors")
     low, high = np.array([(axis.min(), axis.max()) for axis in vertices.T]).T
     reach, extent = np.abs([low, high]).max(), (high - low).max()
     if reach > MAX_REACH:
@@ -194,51 +210,39 @@ def _joined(parts: list[Part], sides: SideFiles) -> TexturedMesh:
         raise UserError(f"{sides.path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
     if extent <= 0:
         raise UserError(f"{sides.path}: all vertices are one point")
-    uvs, colors, normals = [], [], None
-    for part, size in zip(parts, sizes):
-        white = np.full((size, 3, 4), 255, np.uint8)
-        colors.append(white if part.colors is None else part.colors)
-        zeros = np.zeros((size, 3, 2), np.float32)
-        uvs.append(zeros if part.uvs is None else np.nan_to_num(part.uvs.astype(np.float32)))
-    if any(part.normals is not None for part in parts):
-        normals = _concatenated(
-            [
-                _vertex_normals(x.vertices, x.faces) if x.normals is None else x.normals
-                for x in parts
-            ]
-        )
-    if not any(_is_visible(*pair) for pair in zip(colors, found)):
+    materials = list({id(part.material): part.material for part in parts}.values())
+    numbers = {id(material): number for number, material in enumerate(materials)}
+    if not any(map(_is_visible, parts)):
         sides.warnings.append("all its surfaces are transparent by their alpha: drawn opaque")
-        for part_colors in colors:
-            part_colors[..., 3] = 255
+        colors[..., 3] = 255
         for material in materials:
             material.color[3] = 1
             if material.texture is not None:
                 rgb = material.texture[..., :3]
                 material.texture = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
-    warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
+    normals = None
+    if any(part.normals is not None for part in parts):
+        for part in parts:
+            if part.normals is None:
+                part.normals = _vertex_normals(part.vertices, part.faces)
+        normals = all_of("normals")
+    at = 0
+    for part in parts:
+        part.faces = part.faces + at if at else part.faces
+        at += len(part.vertices)
+    sizes = [len(part.faces) for part in parts]
+    ids = np.repeat([numbers[id(part.material)] for part in parts], sizes)
+    told = (list(dict.fromkeys(lines)) for lines in (sides.warnings, sides.omitted))
     return TexturedMesh(
-        vertices=vertices,
-        faces=_concatenated([x.faces + at if at else x.faces for x, at in zip(parts, offsets)]),
-        uvs=_concatenated(uvs),
-        colors=_concatenated(colors),
-        material_ids=np.repeat([numbers[id(material)] for material in found], sizes),
-        materials=materials,
-        given_normals=normals,
-        warnings=warnings,
-        omitted=omitted,
+        vertices, all_of("faces"), all_of("uvs"), colors, ids, materials, normals, *told
     )
 
 
-def _concatenated(arrays: list[np.ndarray]) -> np.ndarray:
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
-
-
-def _is_visible(colors: np.ndarray, material: Material) -> bool:
+def _is_visible(part: _Whole) -> bool:
     """Return True if a part may have a pixel of an alpha of 1/255."""
-    texture = 255 if material.texture is None else int(material.texture[..., 3].max(initial=0))
-    return float(material.color[3]) * texture * int(colors[..., 3].max(initial=0)) >= 255
+    texture = part.material.texture
+    most = 255 if texture is None else int(texture[..., 3].max(initial=0))
+    return float(part.material.color[3]) * most * int(part.colors[..., 3].max(initial=0)) >= 255
 
 
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
