@@ -74,18 +74,21 @@ class TexturedMesh:
 
         A corner's is the file's, or without any its vertex's, if it agrees with the face.
         """
+        first, second, third = (self.vertices[corner] for corner in self.faces.T)
+        flat = np.cross(second - first, third - first)
+        length = np.linalg.norm(flat, axis=1, keepdims=True)
+        flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
         given = self.given_normals
         if given is None:
-            given = _vertex_normals(self.vertices, self.faces)
-        corners = self.vertices[self.faces]
-        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(flat, axis=1, keepdims=True)
-        flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])[:, None]
-        smooth = np.nan_to_num(given)
-        smooth /= np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-12)
-        agree = (smooth * flat).sum(2, keepdims=True)
+            smooth = _vertex_normals(self.vertices, self.faces)
+        else:
+            smooth = np.nan_to_num(given)
+            lengths = np.linalg.norm(smooth, axis=2, keepdims=True)
+            smooth = (smooth / np.maximum(lengths, 1e-12)).astype(np.float32)
+        flat = flat.astype(np.float32)
+        agree = np.einsum("fci,fi->fc", smooth, flat)[..., None]
         smooth *= np.sign(agree)
-        return np.where(np.abs(agree) > CREASE, smooth, flat).astype(np.float32)
+        return np.where(np.abs(agree) > CREASE, smooth, flat[:, None])
 
     def normalized(
         self, up: str = "z", rotation: ArrayLike | None = None
@@ -246,7 +249,8 @@ def _is_visible(part: _Whole) -> bool:
 
 
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return ``[F, 3, 3]``, at each corner the mean of the normals of its vertex's faces."""
+    """Return ``[F, 3, 3]`` float32, at each corner the mean of its vertex's faces' normals."""
     import trimesh
 
-    return trimesh.Trimesh(vertices, faces, process=False).vertex_normals[faces]
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return mesh.vertex_normals.astype(np.float32)[faces]
