@@ -25,7 +25,6 @@ from .headers import (
     compare_sizes,
     open_shape,
     read_rows,
-    without_comments,
 )
 from .ply_data import PlyData, read_ply
 
@@ -76,7 +75,7 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
 
 def _read_xyz(path: Path) -> Cloud:
     with open_shape(path) as (file, _):
-        table = read_rows(without_comments(file.read()), str(path)).table(str(path))
+        table = read_rows(file.read(), str(path), comments=True).table(str(path))
     if len(table) and table.shape[1] < 3:
         raise UserError(f"{path}: {table.shape[1]} columns, expected x y z")
     return Cloud(np.ascontiguousarray(table[:, :3]))
@@ -84,7 +83,7 @@ def _read_xyz(path: Path) -> Cloud:
 
 def _read_pts(path: Path) -> Cloud:
     with open_shape(path) as (file, _):
-        rows = read_rows(without_comments(file.read()), str(path))
+        rows = read_rows(file.read(), str(path), comments=True)
     if len(rows.sizes) and rows.sizes[0] == 1:
         stated, rows = rows.values[0], rows.part(1, len(rows.sizes))
         if not (stated >= 0 and stated == np.rint(stated)):

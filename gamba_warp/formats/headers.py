@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ SLACK = 2  # bytes after the end: a line end
 MAX_COLUMNS = 1024  # of a table; descriptors of shape have up to 640
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
 BOM = b"\xef\xbb\xbf"
-_BLOCK = 1 << 24  # bytes of a text that are read at once
+_BLOCK = 1 << 22  # bytes of a text that are read at once
 
 
 @contextmanager
@@ -84,7 +83,6 @@ class Lines:
     Attributes:
         data: ``[B]`` uint8, the text with a line end behind it.
         lengths: ``[N]`` int64, bytes of each line with its end.
-        ends: ``[N]`` int64, position of each line's end.
         first: ``[N]`` int64, position of each line's first word; of blank lines any.
         sizes: ``[N]`` int64, number of words.
     """
@@ -97,7 +95,6 @@ class Lines:
         before = np.searchsorted(words, ends)
         self.lengths = np.diff(ends, prepend=-1)
         self.sizes = np.diff(before, prepend=0)
-        self.ends = ends
         self.first = np.append(words, 0)[before - self.sizes]
 
     def begin_with(self, word: bytes) -> np.ndarray:
@@ -140,12 +137,11 @@ def parse_numbers(text: bytes, count: int, kind: Any = np.float64) -> np.ndarray
     if count == 0:
         return np.zeros(0, kind)
     try:
-        with warnings.catch_warnings():  # numpy before 2.3 warns of a word, and returns the others
-            warnings.simplefilter("ignore", DeprecationWarning)
-            found = np.fromstring(text, kind, sep=" ")
+        found = np.fromstring(text, kind, sep=" ")
     except ValueError:
         return None
-    return found if len(found) == count else None  # "1-2" is one word but two numbers
+    # "1-2" is one word but two numbers; older releases of numpy stop at a word that is none.
+    return found if len(found) == count else None
 
 
 class Rows(NamedTuple):
@@ -197,10 +193,13 @@ def parse_rows(text: bytes) -> Rows | None:
     return None if values is None else Rows(values, sizes)
 
 
-def read_rows(text: bytes, source: str) -> Rows:
-    """Read the rows of a text that are not blank.
+def read_rows(text: bytes, source: str, comments: bool = False) -> Rows:
+    """Read the rows of a text that are not blank; NaN and infinity are numbers here.
 
-    NaN and infinity are numbers here.
+    Args:
+        text: as in the file.
+        source: named in errors.
+        comments: leave out what follows a ``#`` in its line.
 
     Raises:
         UserError: a word is not a number, there are more than ``MAX_VALUES`` numbers, or as for
@@ -209,6 +208,7 @@ def read_rows(text: bytes, source: str) -> Rows:
     found = [Rows(np.zeros(0), np.zeros(0, np.int64))]
     left = MAX_VALUES
     for block in blocks_of(text.removeprefix(BOM), source):
+        block = without_comments(block) if comments else block
         rows = parse_rows(block)
         if rows is None:
             raise _no_number(block, source, sum(len(rows.sizes) for rows in found))
@@ -239,5 +239,9 @@ def without_comments(text: bytes) -> bytes:
 
 
 def is_number(word: bytes) -> bool:
-    """Return True if a word is a number for ``parse_numbers`` alone."""
-    return parse_numbers(word, 1) is not None
+    """Return True if a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return b"_" not in word

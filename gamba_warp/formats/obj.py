@@ -72,12 +72,12 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
     numbers, first = np.unique(group, return_index=True)
     if len(numbers) > MAX_MATERIALS:
         raise UserError(f"{path}: uses {len(numbers)} materials, over the limit of {MAX_MATERIALS}")
-    library = _library(found.libraries[:MAX_LIBRARIES], sides)
+    names, library = [*found.names], _library(found.libraries[:MAX_LIBRARIES], sides)
     order = np.argsort(group, kind="stable")
     ends = np.searchsorted(group, numbers, "right", sorter=order)
     for i in np.argsort(first):
         mine = places[order[ends[i - 1] if i else 0 : ends[i]]]
-        name = found.names[numbers[i]]
+        name = names[numbers[i]]
         own = next((x for x in (name, _bare(name)) if x in library), None)
         material = None if own is None else _material(library[own], own, sides)
         part = Part(points, corners[mine, 0], material)
@@ -116,7 +116,7 @@ class _Statements:
         corners: by block ``[C, 3]`` int64, of each corner the indices of v, vt and vn from 1, or 0.
         lengths: by block ``[F]``, number of corners of each face.
         faces: by block ``[F]``, line of each face.
-        names: of materials, the first of those faces that name none.
+        names: of the materials, to their numbers; 0 is that of faces that name none.
         libraries: names of MTL files.
         unread: first words of other statements.
     """
@@ -125,8 +125,8 @@ class _Statements:
         none = np.zeros(0, np.int64)
         self.rows = {word: [Rows(np.zeros(0), none)] for word in _LEAST}
         self.corners, self.lengths, self.faces = [np.zeros((0, 3), np.int64)], [none], [none]
-        self.names, self.libraries, self.unread = [""], list[str](), set[str]()
-        self._numbers = {"": 0}  # of the names
+        self.libraries, self.unread = list[str](), set[str]()
+        self.names = {"": 0}
         self._used = [(-1, 0)]  # lines of usemtl, and numbers of the materials
         self._totals = np.zeros(3, np.int64)  # of v, vt and vn in the blocks before
         line = 0
@@ -167,25 +167,20 @@ class _Statements:
         self.corners.append(corners)
         self.lengths.append(lengths)
         self.faces.append(start + np.flatnonzero(which))
-        for at in np.flatnonzero(others & ~which):
-            first = lines.first[at]
-            self._other(start + int(at), lines.data[first : lines.ends[at]].tobytes())
-        return True
-
-    def _other(self, number: int, line: bytes) -> None:
-        """Read a statement that is neither of vertices nor of faces."""
-        word = line.split(maxsplit=1)[0]
-        if word in (b"usemtl", b"mtllib"):
-            name = line[len(word) :].decode("utf-8", "replace").strip()
+        for word in (b"f", b"g", b"o", b"s"):  # groups are as frequent as faces in some files
+            others &= ~lines.begin_with(word)
+        texts = lines.behind(b"", others).split(b"\n")
+        for at, line in zip(np.flatnonzero(others).tolist(), texts):
+            word = line.split(maxsplit=1)[0]
+            if word in (b"mtllib", b"usemtl"):
+                name = line.strip()[len(word) :].decode("utf-8", "replace").strip()
             if word == b"mtllib":
                 self.libraries.append(name)
-                return
-            if name not in self._numbers:
-                self._numbers[name] = len(self.names)
-                self.names.append(name)
-            self._used.append((number, self._numbers[name]))
-        elif word.isalpha() and word.islower():
-            self.unread.add(word[:30].decode())
+            elif word == b"usemtl":
+                self._used.append((start + at, self.names.setdefault(name, len(self.names))))
+            elif word.isalpha() and word.islower():
+                self.unread.add(word[:30].decode())
+        return True
 
 
 def _corners(text: bytes) -> tuple[np.ndarray, np.ndarray] | None:

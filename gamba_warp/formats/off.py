@@ -5,17 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from ..errors import UserError
-from .headers import BOM, check_lines, open_shape, read_rows, without_comments
+from .headers import BOM, check_lines, open_shape, read_rows
 from .materials import SideFiles
 from .parts import Part, cut_polygons, to_rgba8
 from .ply_data import spread
 
 # Attributes of vertices: texture coordinates, colours, normals. Some files of ModelNet40 have the
 # counts behind the word, without a blank.
+_HEADER_LINES, _HEADER_LINE = 1000, 1 << 12  # lines of a header, and letters of one
 _HEADER = re.compile(r"(ST)?(C)?(N)?OFF(?![A-Z])\s*(.*)")
 
 
@@ -26,16 +28,13 @@ def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
         UserError: it holds less or more than its header states, or a word is not a number.
     """
     with open_shape(path) as (file, _):
-        text = without_comments(file.read().removeprefix(BOM)).lstrip()
-    head, _, rest = text.partition(b"\n")
-    found = _HEADER.fullmatch(head[:200].decode("ascii", "replace").strip())
-    if found is not None and not found[4]:
-        head, _, rest = rest.lstrip().partition(b"\n")
-    counts = (found[4] or head[:200].decode("ascii", "replace")).split() if found else []
+        found = _HEADER.fullmatch(_next_line(file))
+        counts = (found[4] or _next_line(file)).split() if found else []
+        text = file.read()
     if found is None or len(counts) < 2 or not all(w.isdecimal() for w in counts[:2]):
         raise UserError(f"{path}: broken header, not OFF and numbers of vertices and faces")
     count, faces = (int(word[:18]) for word in counts[:2])
-    rows = read_rows(rest, str(path))
+    rows = read_rows(text, str(path), comments=True)
     check_lines(path, f"{count} vertices and {faces} faces,", count + faces, len(rows.sizes))
     table = rows.part(0, count).table(f"{path}: vertices")
     if count and table.shape[1] < 3:
@@ -63,3 +62,12 @@ def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
     elif of_vertices.shape[1] or rest.any():
         sides.warnings.append("colours that are not RGB are left out")
     yield Part(points, corners[places], colors=colors)
+
+
+def _next_line(file: BinaryIO) -> str:
+    """Return the next line of the header that is not blank, without its comment."""
+    for _ in range(_HEADER_LINES):
+        line = file.readline(_HEADER_LINE).removeprefix(BOM).partition(b"#")[0].strip()
+        if line:
+            return line.decode("ascii", "replace")
+    return ""
