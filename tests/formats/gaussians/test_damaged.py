@@ -206,18 +206,6 @@ def test_each_reason_is_named_once_and_all_bad_is_refused(tmp_path):
         read_gaussians(path, [])
 
 
-@pytest.mark.parametrize("count", [1, 8, 10, 72])
-def test_an_odd_number_of_harmonics(tmp_path, count):
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
-    names += [f"f_rest_{i}" for i in range(count)]
-    lines = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
-    lines += [*(f"property float {name}" for name in names), "end_header", ""]
-    body = np.ones((2, len(names)), "<f4").tobytes()
-    (tmp_path / "a.ply").write_bytes("\n".join(lines).encode() + body)
-    refused(tmp_path / "a.ply", f"{count} properties f_rest_*")
-
-
 def taken_apart(data):
     size = struct.unpack_from("<I", data, 12)[0]
     return json.loads(data[20 : 20 + size]), data[28 + size :]

@@ -205,6 +205,10 @@ BAD_FILES = {
     "cloud": (header(2, properties=PROPERTIES[:3]), "no property f_dc_0, f_dc_1, f_dc_2"),
     "no opacity": (header(2, properties=PROPERTIES[:6] + PROPERTIES[7:]), "no property opacity"),
 }
+ODD = {f"{count} coefficients": count for count in (1, 8, 10, 72)}
+for case, count in ODD.items():
+    head = header(2, properties=[*PROPERTIES, *rest_names(count)])
+    BAD_FILES[case] = head, f"{count} properties f_rest_*"
 SIZES = {"cloud": 24, "no opacity": 104, "list": 28}  # bytes of the data, if not those of GOOD
 SIZES |= dict.fromkeys(["none", "no vertices", "faces alone", "no properties"], 0)
 
@@ -216,8 +220,8 @@ def test_bad_files_are_refused_with_the_reason(tmp_path, case):
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        size = SIZES.get(case, len(GOOD))
-        write(path, content, bytes(size) if case == "list" else GOOD[:size])
+        size = SIZES.get(case, len(GOOD) + 8 * ODD.get(case, 0))
+        write(path, content, bytes(size) if case == "list" else (9 * GOOD)[:size])
     said = refused(None, load_ply, path)
     assert str(path) in said and reason in said
 

@@ -18,7 +18,7 @@ from gamba_warp.formats.gaussians.files import (
     write_gaussians,
 )
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
-from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
+from gamba_warp.formats.ply import flip_axes
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.render import render
 
@@ -151,24 +151,6 @@ def test_refusals(tmp_path, kind):
 def test_an_unknown_format(tmp_path):
     with pytest.raises(ValueError, match="ksplat"):
         write_gaussians(tmp_path / "a", some(), "ksplat")
-
-
-def as_text(data):
-    header, _, body = data.partition(b"end_header\n")
-    rows = np.frombuffer(body, "<f4").reshape(-1, header.count(b"property float"))
-    lines = [" ".join(f"{value:.9g}" for value in row) for row in rows]
-    return header.replace(b"binary_little_endian", b"ascii") + (
-        "\n".join(["end_header", *lines, ""]).encode()
-    )
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_text_is_read(tmp_path, degree):
-    gaussians = some(degree=degree)
-    save_ply(tmp_path / "a.ply", gaussians, comments=["frame opengl"])
-    (tmp_path / "b.ply").write_bytes(as_text((tmp_path / "a.ply").read_bytes()))
-    check("ply", load_ply(tmp_path / "a.ply"), read_gaussians(tmp_path / "b.ply"))
-    assert splat_kind(tmp_path / "b.ply") == "ply"
 
 
 def test_the_content_decides_and_not_the_name(tmp_path):
