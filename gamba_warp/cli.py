@@ -62,7 +62,6 @@ COMMANDS = {
     "demo": Command("Reconstruct and evaluate the starter set.", "all", SHAPES, _MODEL),
     "reconstruct": Command("Pictures to 3D Gaussians.", "photo", (), _PICTURES),
     "train": Command("Train a model on posed views.", "train", _METRICS, _MODEL, _TRAIN),
-    "fit": Command("Posed views of an object to 3D Gaussians.", "fit", _METRICS, _MODEL),
     "data furniture": Command("Get 820 models.", "", (), (), _DATA),
     "data made": Command("Make models of random parts.", "mesh", MADE, (), _DATA),
     "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),

@@ -240,10 +240,6 @@ NONSENSE = {
         "set": "image_size=100000000 depth=1000000000 width=-8 fov=1e999 fov=NaN depth=[[",
     },
     "train DATA --lpips on": {"size": "8 15"},
-    "fit DATA": {
-        "seed": "-1", "size": "7 100000 -1", "gaussians": "1 1000000000 -5", "steps": "0 -1",
-        "minutes": "inf nan 0 -1", "limit": "0 -1", "held-out": "-1 1",
-    },
     "eval-views --checkpoint M --data DATA": {
         "views": "0 -1", "size": "15 100000", "limit": "0", "sheet": "-1 1000", "strips": "-1",
         "distance": "nan inf 0 -1", "reference": "-1",
