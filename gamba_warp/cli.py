@@ -67,7 +67,6 @@ COMMANDS = {
     "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),
     "data pack": Command("Posed views to shards.", "shards", ("webdataset",), (), _DATA),
     "data index": Command("Check a dataset once, for all later starts.", "", (), (), _DATA),
-    "data objaverse": Command("A copy of G-Objaverse.", "", (), (), _DATA),
     "data gso": Command("Google Scanned Objects, for evaluation.", "mesh", _RENDERS, (), _DATA),
     "eval-views": Command("PSNR, SSIM, LPIPS of views.", "eval", _METRICS, _MODEL, _VIEWS),
     "eval-geometry": Command("Chamfer, IoU, F-score.", "eval", SHAPES, (), _SHAPES),

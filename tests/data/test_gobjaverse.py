@@ -1,4 +1,4 @@
-"""G-Objaverse as published: its folders and tars, its lists, and its missing files."""
+"""G-Objaverse's layout as published, and its missing files."""
 
 import json
 import math
@@ -20,7 +20,7 @@ def project(point, views, number):
 
 
 def test_the_published_layout_is_read_where_it_is(tmp_path):
-    write_object(tmp_path / "0" / "10010", "readme")
+    write_object(tmp_path / "0" / "10010")
     data = open_dataset(tmp_path)
     assert (data.layout, data.uids, data.num_views(0)) == ("gobjaverse", ["0/10010"], VIEWS)
     views = data.load(0)
@@ -39,7 +39,7 @@ def test_the_published_layout_is_read_where_it_is(tmp_path):
 
 
 def test_each_side_has_its_own_angle(tmp_path):
-    write_object(tmp_path / "0" / "10010", "readme", 1)
+    write_object(tmp_path / "0" / "10010", 1)
     path = tmp_path / "0/10010/campos_512_v4/00000/00000.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"x_fov": 0.8, "y_fov": 0.6}))
     K = open_dataset(tmp_path).load(0).cameras.Ks[0]
@@ -49,7 +49,7 @@ def test_each_side_has_its_own_angle(tmp_path):
 
 def test_poses_are_brought_to_the_models_distance(tmp_path):
     """Paper §4.1: "the camera poses ... are normalized to a unit distance"; ours is 1.5."""
-    write_object(tmp_path / "0" / "10010", "readme")
+    write_object(tmp_path / "0" / "10010")
     views = open_dataset(tmp_path).load(0, [3, 0, 25])
     moved = relative_cameras(views.cameras, 1.5)
     want = torch.tensor([0.0, 0.0, 1.5])
@@ -62,7 +62,7 @@ def test_poses_are_brought_to_the_models_distance(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".json"])
 def test_views_that_lack_a_file_are_passed_over(tmp_path, suffix):
-    write_object(tmp_path / "0" / "10010", "readme")
+    write_object(tmp_path / "0" / "10010")
     views = tmp_path / "0" / "10010" / "campos_512_v4"
     (views / "00007" / f"00007{suffix}").unlink()
     (views / "00040").mkdir()  # an empty one, as left by an interrupted wget
@@ -77,7 +77,7 @@ def test_views_that_lack_a_file_are_passed_over(tmp_path, suffix):
 
 def test_the_cameras_file_is_as_published(tmp_path):
     """G-Objaverse's files have the keys of Blender scripts that render Objaverse."""
-    write_object(tmp_path / "0" / "10010", "readme")
+    write_object(tmp_path / "0" / "10010")
     text = (tmp_path / "0/10010/campos_512_v4/00000/00000.json").read_text()
     keys = {"bbox", "max_depth", "origin", "x", "x_fov", "y", "y_fov", "z"}
     assert set(json.loads(text)) == keys
