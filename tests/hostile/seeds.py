@@ -290,14 +290,10 @@ def cameras() -> Kinds:
     """Two cameras as a file of each format."""
     poses = [np.eye(4), np.eye(4)]
     poses[1][:3, 3] = 0.5, -1.5, 2.0
-    head = {"format": "gamba-cameras", "version": 1, "width": 8, "height": 6, "fps": 24, "fov": 50}
-    K = [[9.0, 0, 4], [0, 9.0, 3], [0, 0, 1]]
-    frames = [{"viewmat": poses[0].tolist(), "K": K}, {"viewmat": poses[1].tolist()}]
     path = [{"camera_to_world": p.ravel().tolist(), "fov": 50.0, "aspect": 1.3} for p in poses]
     nerfstudio = {"camera_type": "perspective", "render_height": 6, "render_width": 8}
     nerfstudio |= {"fps": 24, "seconds": 4, "keyframes": [], "camera_path": path}
-    forms = {"ours": head | {"frames": frames}, "nerfstudio": nerfstudio}
-    made = {name: {"cameras.json": as_json(value)} for name, value in forms.items()}
+    made = {"nerfstudio": {"cameras.json": as_json(nerfstudio)}}
     dataset = transforms("chair")["chair/transforms.json"]
     return made | {"transforms": {"transforms.json": dataset}}
 
