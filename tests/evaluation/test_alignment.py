@@ -58,6 +58,7 @@ def test_a_copy_comes_back_from_any_start(name):
         assert got["chamfer"] <= 1e-3 and set(got["fscore"].values()) == {1.0}
         found = got["alignment"]
         assert abs(found["scale"] * motion.scale - 1) < 1e-3
+        assert found["fitness"] > 0.99 and found["inlier_rmse"] < 0.03
         again = Similarity(*(np.array(found[k]) for k in ("rotation", "translation", "scale")))
         back = again.apply(motion.apply(SHAPES[name]))
         assert np.abs(back.vertices - moved.vertices).max() < 1e-9

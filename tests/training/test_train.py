@@ -335,22 +335,6 @@ def test_views_are_distinct_while_they_last():
     assert choose_views(1, 2, None, rng) == [0, 0, 0]
 
 
-def test_input_view_is_the_model_s_reference(data):
-    """The camera of any input view is the reference camera in the model's world."""
-    from gamba_warp.data.dataset import open_dataset
-    from gamba_warp.train.batches import load_sample
-
-    config = micro.options(data, data).model_config()
-    dataset = open_dataset(data, "train")
-    batch = load_sample(dataset, 0, [3, 1], 8, config, torch.ones(3))
-    want = torch.eye(4)
-    want[2, 3] = config.distance
-    torch.testing.assert_close(batch.input_cameras.viewmats[0], want, atol=1e-5, rtol=0)
-    torch.testing.assert_close(batch.cameras.viewmats[0, 0], want, atol=1e-5, rtol=0)
-    assert batch.targets.shape == (1, 2, 8, 8, 4) and batch.inputs.shape == (1, 16, 16, 3)
-    assert batch.inputs[0, 0, 0].min() > 0.99, "the input lies on white"
-
-
 def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
     monkeypatch.setattr(losses, "lpips_available", lambda: False)
     short = {"length": {"steps": 3}}
