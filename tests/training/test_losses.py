@@ -41,9 +41,16 @@ def test_mse_and_psnr():
 
 
 def test_loss_terms_and_weights():
-    rgb, target = torch.zeros(2, 3, 8, 8, 3), torch.full((2, 3, 8, 8, 3), 0.5)
-    alpha, target_alpha = torch.ones(2, 3, 8, 8, 1), torch.zeros(2, 3, 8, 8, 1)
-    inputs = LossInputs(rgb, alpha, target, target_alpha, lambda a, b: (b - a).mean((-3, -2, -1)))
+    """Terms are those that are asked for; the crops are what LPIPS sees."""
+    rgb, target = torch.zeros(2, 3, 16, 16, 3), torch.full((2, 3, 16, 16, 3), 0.5)
+    alpha, target_alpha = torch.ones(2, 3, 16, 16, 1), torch.zeros(2, 3, 16, 16, 1)
+    seen: list = []
+
+    def lpips(got, want):
+        seen.append(got.shape)
+        return (want - got).mean((-3, -2, -1))
+
+    inputs = LossInputs(rgb, alpha, target, target_alpha, lpips)
     terms = loss_terms(inputs, {"lpips": 0.5})
     shapes = {name: tuple(term.shape) for name, term in terms.items()}
     assert shapes == dict.fromkeys(("rgb", "mask", "lpips"), (2, 3))
@@ -52,6 +59,13 @@ def test_loss_terms_and_weights():
     assert set(loss_terms(inputs, {})) == {"rgb", "mask"}
     with pytest.raises(KeyError, match="lpips"):
         total_loss(terms, {"rgb": 1.0, "mask": 1.0})
+    assert set(loss_terms(inputs._replace(lpips=None), {"lpips": 1.0})) == {"rgb", "mask"}
+    cropped = LossInputs(rgb, alpha, rgb, alpha, lpips, lpips_crop=8)
+    terms = loss_terms(cropped, {"lpips": 1.0, "ssim": 1.0})
+    shapes = {name: tuple(term.shape) for name, term in terms.items()}
+    assert shapes == dict.fromkeys(("rgb", "mask", "ssim"), (2, 3)) | {"lpips": (2,)}
+    assert seen == [(2, 3, 16, 16, 3), (2, 8, 8, 3)]
+    assert all(term.abs().max() < 1e-6 for term in terms.values())
 
 
 def test_non_finite_pictures_are_not_hidden():
@@ -116,22 +130,3 @@ def test_translucency_beyond_the_true_one():
     terms = loss_terms(given, {"mask_l1": 1.0, "translucency": 1.0})
     torch.testing.assert_close(terms["translucency"], got)
     torch.testing.assert_close(terms["mask_l1"], torch.full((1, 3), 0.25))
-
-
-def test_loss_terms_have_the_terms_that_are_asked_for():
-    torch.manual_seed(0)
-    rgb, alpha = torch.rand(2, 3, 16, 16, 3), torch.rand(2, 3, 16, 16, 1)
-    shapes: list = []
-
-    def lpips(got, want):
-        shapes.append(got.shape)
-        return (got - want).square().mean((-3, -2, -1))
-
-    inputs = LossInputs(rgb, alpha, rgb, alpha, lpips, lpips_crop=8)
-    weights = {"lpips": 1.0, "ssim": 1.0}
-    terms = loss_terms(inputs, weights)
-    found = {name: tuple(term.shape) for name, term in terms.items()}
-    assert found == dict.fromkeys(("rgb", "mask", "ssim"), (2, 3)) | {"lpips": (2,)}
-    assert shapes == [(2, 8, 8, 3)]
-    assert all(term.abs().max() < 1e-6 for term in terms.values())
-    assert set(loss_terms(inputs._replace(lpips=None), {"lpips": 1.0})) == {"rgb", "mask"}
