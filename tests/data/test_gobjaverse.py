@@ -1,6 +1,5 @@
 """G-Objaverse as published: its folders and tars, its lists, and its missing files."""
 
-import json
 import math
 
 import pytest
@@ -35,15 +34,6 @@ def test_the_published_layout_is_read_where_it_is(tmp_path):
     centre = -views.cameras.viewmats[0, :3, :3].T @ views.cameras.viewmats[0, :3, 3]
     sine = (centre[2] / centre.norm()).item()
     assert math.degrees(math.asin(sine)) == pytest.approx(ELEVATION[0], abs=1e-4)
-
-
-def test_each_side_has_its_own_angle(tmp_path):
-    write_object(tmp_path / "0" / "10010", "readme", 1)
-    path = tmp_path / "0/10010/campos_512_v4/00000/00000.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"x_fov": 0.8, "y_fov": 0.6}))
-    K = open_dataset(tmp_path).load(0).cameras.Ks[0]
-    want = [16 / math.tan(0.4), 16 / math.tan(0.3)]
-    assert [K[0, 0].item(), K[1, 1].item()] == pytest.approx(want)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".json"])
