@@ -1,4 +1,3 @@
-import math
 import shutil
 from dataclasses import replace
 
@@ -7,30 +6,18 @@ import pytest
 import torch
 import trimesh
 from helpers.gaussians import rotations
+from helpers.meshes import cube
 from helpers.refusals import refused
 from helpers.views import cloud_of, evaluated
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
-from gamba_warp.eval.shapes.metrics import compare, syncdreamer_points
-from gamba_warp.eval.shapes.occupancy import VOTERS, grid_around, parity, solid, syncdreamer_grid
+from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, nearest, sample
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.density import opacity_volume
 from gamba_warp.surfaces.options import SurfaceOptions
-
-
-def as_mesh(source, move=(0.0, 0, 0)):
-    return Mesh(np.array(source.vertices) + move, np.array(source.faces))
-
-
-def cube(move=(0.0, 0, 0), side=1.0):
-    return as_mesh(trimesh.creation.box((side,) * 3), move)
-
-
-def ball(radius, move=(0.0, 0, 0)):
-    return as_mesh(trimesh.creation.icosphere(4, radius), move)
 
 
 def join(*meshes):
@@ -57,48 +44,6 @@ def test_a_shape_and_itself(name):
         assert got["iou"] == (None if PRESETS[name].occupancy == "none" else 1)
         # The search has turned and turned back, by rounding; without it there is no rounding.
         assert got["chamfer"] <= (2e-5 if align else 0) and set(got["fscore"].values()) == {1.0}
-
-
-def test_solid_fills_cavities_and_unites_parts():
-    hollow = join(cube(), cube(side=0.5))
-    grid = grid_around(hollow, resolution=16)
-    assert solid(hollow, grid).sum() == 16**3
-    overlapping = join(cube(), cube((0.5, 0, 0)))
-    grid = grid_around(overlapping, resolution=16)
-    assert solid(overlapping, grid).sum() == 1.5 * 16**3
-    assert parity(overlapping, grid).sum() == 16**3  # which is why parity alone will not do
-
-
-@pytest.mark.parametrize("tilt", [0.0, 0.3, 0.9, 1.57])
-def test_solid_of_a_sheet(tilt):
-    side, rise = math.cos(tilt), math.sin(tilt)
-    corners = [[-0.4, 0, 0], [0.4, 0, 0], [0.4, side, rise], [-0.4, side, rise]]
-    sheet = Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
-    assert not solid(sheet, grid_around(sheet, resolution=32)).any()
-    half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
-    assert (half[:, 2] > 0).all()  # so no direction is also among the opposites
-
-
-def test_syncdreamer_sees_from_above():
-    fine = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide().subdivide().subdivide().subdivide()
-    points = syncdreamer_points(as_mesh(fine)).positions
-    low, high = points.min(0), points.max(0)
-    # half a pixel is 0.0027 at the centre's distance; see visible_points
-    assert np.allclose(high, 0.5, atol=6e-3) and low[0] < -0.494 and low[1] < -0.494
-    assert np.mean(points[:, 2] > 0.494) > 0.15  # the top, one of five sides seen
-    inside = np.abs(points[:, :2]).max(1) < 0.49
-    assert points[inside, 2].min() > 0.49  # the bottom is not seen
-    spacing = len(points) / 5
-    assert 0.8e4 < spacing < 2.5e4  # a mean point a voxel of 0.01: about 1e4 a side
-
-
-def test_syncdreamer_lattice():
-    grid = syncdreamer_grid()
-    points = grid.points()
-    assert points.shape == (64, 64, 64, 3)
-    assert points[0, 0, 0].tolist() == [-1, -1, -1] and points[1, 0, 0, 0] == -1 + 1 / 32
-    volume = parity(ball(0.5), grid).sum() / 32**3
-    assert abs(volume - math.pi / 6) < 0.01
 
 
 @pytest.mark.parametrize("count, limit", [(1, 0.0051), (40, 0.05)])

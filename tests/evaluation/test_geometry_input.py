@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from helpers.children import faulty_pair
 from helpers.gaussians import some
-from helpers.meshes import glb, gltf
+from helpers.meshes import as_mesh, glb, gltf
 from helpers.refusals import refused
 
 from gamba_warp.cli import run
@@ -28,10 +28,6 @@ def box(side=1.0, move=(0.0, 0, 0)):
     mesh = trimesh.creation.box((side, side, side))
     mesh.apply_translation(move)
     return mesh
-
-
-def as_mesh(source):
-    return Mesh(np.array(source.vertices), np.array(source.faces))
 
 
 def evaluate(capfd, *arguments):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from helpers.meshes import as_mesh, cube
 
 from gamba_warp.eval.shapes import occupancy
 from gamba_warp.eval.shapes.flags import clean_mesh
@@ -31,8 +32,7 @@ def known_shapes() -> dict[str, Mesh]:
     """Closed meshes of fine triangles by name; the longest side is 1 or a little less."""
 
     def mesh(*sources) -> Mesh:
-        joined = trimesh.util.concatenate(list(sources))
-        return Mesh(np.array(joined.vertices), np.array(joined.faces))
+        return as_mesh(trimesh.util.concatenate(list(sources)))
 
     box = trimesh.creation.box()
     for _ in range(4):
@@ -85,11 +85,6 @@ SHAPES = known_shapes()
 # IoU of the rule "solid" with the closed original, by the share of the area that is cut out, at
 # least: the figures of eval/README.md less 0.02 for other places of the hole and coarser voxels
 LEAST = {0.01: 0.97, 0.05: 0.95, 0.1: 0.89, 0.2: 0.78, 0.5: 0.44}
-
-
-def cube(move=(0.0, 0, 0), side=1.0):
-    mesh = trimesh.creation.box((side,) * 3)
-    return Mesh(np.array(mesh.vertices) + move, np.array(mesh.faces))
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -159,6 +154,8 @@ def test_votes_that_are_decided_are_not_taken():
         votes = sum(mesh.scene().count_intersections(part).numpy() % 2 for part in rays)
         assert len(np.unique(votes)) > VOTERS // 2
         assert (majority(mesh, grid) == (2 * votes > VOTERS)).all()
+    half = np.array(directions())[: VOTERS // 2]
+    assert (half[:, 2] > 0).all()  # so no direction is also among the opposites
 
 
 def test_rules_agree_on_a_closed_ball():
@@ -217,8 +214,7 @@ def test_predictions_of_another_size_or_place_still_count(other, want, error):
 
 @pytest.mark.parametrize("radius", [0.25, 0.4, 0.49])
 def test_spheres(radius):
-    a, b = (trimesh.creation.icosphere(4, r) for r in (radius, 0.5))
-    meshes = [Mesh(np.array(m.vertices), np.array(m.faces)) for m in (a, b)]
+    meshes = [as_mesh(trimesh.creation.icosphere(4, r)) for r in (radius, 0.5)]
     got = compare(*meshes, replace(PRESETS["default"], num_points=30_000, iou_voxels=32))
     # nearest samples are not straight across: at most a noise floor longer, squared against it
     slack = got["noise_floor"] ** 2 / (0.5 - radius) + 5e-4
