@@ -261,8 +261,6 @@ def test_the_margin_lets_the_network_see_more_patches():
     model, (rgba, cameras) = trained(rays()), cut_outs([BOXES[1]])
     near, wide = model(rgba, cameras), model(rgba, cameras, background_margin=1)
     assert near.num == wide.num == 3 and (near.means - wide.means).abs().max() > 1e-3
-    with pytest.raises(ValueError, match="background_margin is -1"):
-        model(rgba, cameras, background_margin=-1)
 
 
 def test_configurations_of_older_files_mean_the_paper():

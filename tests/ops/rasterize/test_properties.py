@@ -70,12 +70,9 @@ def test_stops_before_falling_to_the_limit():
     assert alphas[0, 15, 16, 0] == pytest.approx(0.992)
 
 
-def test_at_the_near_plane_is_seen():
+def test_culls_and_the_near_plane_that_is_seen():
     _, alphas, meta = rasterization(**one(mean=(0.0, 0.0, 0.5)), near_plane=0.5)
     assert alphas.max() > 0.7 and meta["culled"]["near"] == 0
-
-
-def test_other_culls():
     assert rasterization(**one(), far_plane=1.9)[2]["culled"]["far"] == 1
     assert rasterization(**one(mean=(9.0, 0.0, 2.0)))[2]["culled"]["outside"] == 1
     assert rasterization(**one(), radius_clip=30.0)[2]["culled"]["small"] == 1
