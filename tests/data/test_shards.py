@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers import micro
 from helpers.disk import full_at
+from helpers.images import bytes_of
 from helpers.refusals import refused
 from hostile import seeds
 from PIL import Image
@@ -200,12 +201,6 @@ def in_document(change):
     return changed("json", changed_document)
 
 
-def bomb():
-    stream = io.BytesIO()
-    Image.new("1", (20000, 20000)).save(stream, "PNG")
-    return stream.getvalue()
-
-
 @pytest.mark.parametrize(
     "change, reason",
     [
@@ -217,7 +212,7 @@ def bomb():
             in_document(lambda top: top["frames"][0].update(transform_matrix=[[7] * 4] * 4)),
             "not a rotation",
         ),
-        (changed("000.png", bomb()), "megapixels"),
+        (changed("000.png", bytes_of(Image.new("1", (20000, 20000)))), "megapixels"),
         (changed("000.png", b"no picture"), "a.000.png: "),
         (lambda all: [m for m in all if m[0].name != "a.json"], "not valid JSON"),
     ],
