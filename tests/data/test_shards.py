@@ -58,8 +58,7 @@ def data(tmp_path):
     root = tmp_path / "data"
     for seed, (uid, depth) in enumerate(zip(UIDS, ("uint16", None, "float32"))):
         write_object(root / uid, seed, depth)
-    split = {"version": 1, "train": UIDS[:2], "val": [], "test": UIDS[2:]}
-    (root / "split.json").write_text(json.dumps(split))
+    micro.write_split(root, train=UIDS[:2], test=UIDS[2:])
     return root
 
 

@@ -3,7 +3,8 @@ import shutil
 
 import pytest
 import torch
-from helpers.views import around, cloud_of, eval_views, straight, write_split, write_views
+from helpers.micro import write_split
+from helpers.views import around, cloud_of, eval_views, straight, write_views
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
 from gamba_warp.cli import run

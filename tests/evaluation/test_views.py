@@ -4,9 +4,10 @@ import sys
 
 import pytest
 import torch
+from helpers.micro import write_split
 from helpers.model import SMALLEST
 from helpers.refusals import refused
-from helpers.views import around, cloud_of, evaluated, straight, write_split, write_views
+from helpers.views import around, cloud_of, evaluated, straight, write_views
 
 from gamba_warp.cameras import Cameras, relative_to_reference
 from gamba_warp.eval.views import evaluate as module

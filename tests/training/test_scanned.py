@@ -1,7 +1,5 @@
 """Training rejects Google Scanned Objects, which are for evaluation."""
 
-import json
-
 from helpers import micro
 from helpers.refusals import refused
 
@@ -11,8 +9,7 @@ def test_their_names_are_refused_wherever_they_come_from(tmp_path):
     first, things = (micro.write_dataset(tmp_path / name, 3) for name in ("first", "things"))
     for old, new in (("clouda", "Dino_4"), ("cloudc", "Elephant")):
         (things / old).rename(things / new)
-    split = {"version": 2, "train": ["Dino_4", "cloudb"], "val": ["Elephant"], "test": []}
-    (things / "split.json").write_text(json.dumps(split))
+    micro.write_split(things, train=["Dino_4", "cloudb"], val=["Elephant"])
     out = tmp_path / "run"
     for data, views, names in (
         (things, {}, "Dino_4, Elephant"),

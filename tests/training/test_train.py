@@ -172,8 +172,7 @@ def test_a_run_learns_and_writes_everything(tmp_path):
 
     data = micro.write_dataset(tmp_path / "clouds", 1)
     shutil.copytree(data / "clouda", data / "cloudb")
-    split = {"version": 2, "train": ["clouda"], "val": ["cloudb"], "test": []}
-    (data / "split.json").write_text(json.dumps(split))
+    micro.write_split(data, train=["clouda"], val=["cloudb"])
     options = {"views": {"batch_size": 4, "views_per_object": 3}, "run": {"val_every": 60}}
     options |= {"length": {"steps": 120}, "optim": {"lr": 5e-3, "ema": 0.9}}
     assert run(data, tmp_path, **options) == 0
