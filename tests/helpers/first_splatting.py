@@ -18,6 +18,7 @@ from gamba_warp.compat.diff_gaussian_rasterization import (
 )
 from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
 from helpers import assert_rel_rms
+from helpers.gaussians import rotations
 
 PICTURE, GRADIENT = 1e-6, 1e-5
 WIDTH, HEIGHT = 37, 53
@@ -26,14 +27,8 @@ NEAR, DILATION, ALPHA_MAX, ALPHA_MIN, STOP, TILE = 0.2, 0.3, 0.99, 1 / 255, 1e-4
 
 def covariances(scales: Tensor, modifier: float, quats: Tensor) -> Tensor:
     """``[N, 3, 3]``; quaternions are not made unit ones, and the modifier has no slope."""
-    w, x, y, z = quats.unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    rotations = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    root = rotations * (scales + (scales * (modifier - 1)).detach())[:, None]
+    sizes = scales + (scales * (modifier - 1)).detach()
+    root = rotations(quats, unit=False) * sizes[:, None]
     return root @ root.mT
 
 
