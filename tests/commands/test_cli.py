@@ -160,12 +160,6 @@ def run(*arguments, program=sys.executable, **options):
     return subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=120, **options)
 
 
-def test_exit_code_reaches_the_shell(tmp_path):
-    result = run("nonsense", stdout=subprocess.PIPE, cwd=tmp_path)
-    assert result.returncode == 2 and result.stdout == ""
-    assert result.stderr == "gamba: unknown command 'nonsense'; gamba --help lists them\n"
-
-
 def test_a_closed_pipe_is_no_traceback():
     reader, writer = os.pipe()
     os.close(reader)
@@ -336,7 +330,7 @@ def test_a_full_disk_under_the_output_is_one_line(tmp_path):
 def test_names_that_are_not_utf_8_can_be_printed(tmp_path):
     name = os.fsdecode(bytes(tmp_path) + b"/caf\xe9.ply")
     result = run("export", name, program=python(), stdout=subprocess.PIPE, cwd=tmp_path)
-    assert result.returncode == 2 and "Traceback" not in result.stderr
+    assert result.returncode == 2 and result.stdout == "" and "Traceback" not in result.stderr
     assert result.stderr.endswith("caf\\udce9.ply: no such file\n")
 
 

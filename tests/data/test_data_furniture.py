@@ -1,6 +1,5 @@
 """The furniture package: from its archives to rendered views, and bad sources."""
 
-import io
 import json
 import shutil
 import subprocess
@@ -8,6 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from helpers.images import bytes_of
 from helpers.meshes import render_views
 from helpers.refusals import refused
 from PIL import Image
@@ -38,14 +38,13 @@ modelRotation#2=1 0 0 0 \
 
 
 def write_library(path, properties=PROPERTIES, more=()):
-    icon = io.BytesIO()
-    Image.fromarray(np.zeros((8, 8, 4), np.uint8)).save(icon, "PNG")
+    icon = bytes_of(Image.fromarray(np.zeros((8, 8, 4), np.uint8)))
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("PluginFurnitureCatalog.properties", properties.encode("latin-1"))
         archive.writestr("PluginFurnitureCatalog_fr.properties", "name#1=Chaise")
         archive.writestr("LICENSE.TXT", "free")
         for name in ("cafe", "other"):
-            archive.writestr(f"b/{name}.png", icon.getvalue())
+            archive.writestr(f"b/{name}.png", icon)
             archive.writestr(f"b/{name}/chair.obj", TRIANGLE)
         for name in more:
             archive.writestr(name, "more")

@@ -49,13 +49,14 @@ def test_each_way_in_its_order(tmp_path, network, busy):
     path, alpha = busy
     rgb = load_rgba(path)[..., :3]
     transparent, plain, mask = (tmp_path / f"{n}.png" for n in ("alpha", "plain", "mask"))
-    save_image(transparent, np.dstack([rgb, alpha]))
-    save_image(plain, rgb * alpha[..., None] + 1 - alpha[..., None])
     half = alpha * (np.arange(SIZE[1]) < SIZE[1] // 2)
+    on_white = rgb * alpha[..., None] + 1 - alpha[..., None]
+    save_image(transparent, np.dstack([on_white, alpha - half]))
+    save_image(plain, on_white)
     save_image(mask, half)
     ways = Ways(matte_model=network)
     for file, how, want in (
-        (transparent, "alpha", alpha),
+        (transparent, "alpha", alpha - half),
         (path, "matte", alpha),
         (plain, "matte", alpha),  # a given network comes before colours
         (plain, "plain", alpha),

@@ -1,12 +1,13 @@
 """Objects in the published layouts of G-Objaverse, small."""
 
-import io
 import json
 import math
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from helpers.images import bytes_of
 
 # 25 views on an orbit, of which the last repeats the first, top and bottom, 13 on another orbit.
 VIEWS = 40
@@ -49,10 +50,9 @@ def files_of(number: int) -> dict[str, bytes]:
     values["bbox"] = [[-0.5, -0.31, -0.5], [0.5, 0.31, 0.5]]
     pixels = np.zeros((SIZE, SIZE, 4), np.uint8)
     pixels[8:24, 8:24] = (200, number, 50, 255)
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG")
+    picture = bytes_of(Image.fromarray(pixels))
     others = {suffix: b"not read" for suffix in OTHERS}
-    return {".json": json.dumps(values).encode(), ".png": stream.getvalue(), **others}
+    return {".json": json.dumps(values).encode(), ".png": picture, **others}
 
 
 def write_object(folder: Path, views: int = VIEWS) -> None:
