@@ -36,7 +36,7 @@ _USED = (
 EXTRA_OF = {
     "backports.zstd": "spz",
     "gradio": "app",
-    "gsplat": "fit",
+    "gsplat": "gsplat",
     "huggingface_hub": "hub",
     "hypothesis": "stress",
     "imageio_ffmpeg": "video",
@@ -63,7 +63,7 @@ HOLDS = {
     "train": {"kornia", "tensorboard", "timm"},
     "mesh": {*SHAPES, "xatlas"},
     "eval": {*SHAPES, "xatlas"},
-    "fit": {"gsplat", "kornia"},
+    "gsplat": {"gsplat"},
     "app": {
         *("gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch"),
         *SHAPES,

@@ -1,6 +1,6 @@
 """Fits Gaussians to a photograph with gsplat's strategies over our rasterizer.
 
-    pip install '.[fit]'         # in the checkout
+    pip install '.[gsplat]'      # in the checkout
     python docs/examples/fit_photograph.py --out astronaut.png
 
 The script only uses gsplat's interface: with ``gsplat`` instead of ``gamba_warp.compat.gsplat`` in

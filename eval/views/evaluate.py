@@ -13,11 +13,10 @@ from typing import Any
 from gamba_warp.batch import check_not_read, progress_bar
 from gamba_warp.conventions import GREY, WHITE
 from gamba_warp.data import gso
-from gamba_warp.data.dataset import ViewDataset, background_note, open_dataset
+from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_dataset
 from gamba_warp.devices import pick_device
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_text
-from gamba_warp.fitting.objects import choose_objects
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
@@ -126,7 +125,7 @@ def open_job(options: ViewsOptions) -> Job:
     """
     device = str(pick_device(options.device))
     dataset = open_dataset(options.data, options.split)
-    uids = choose_objects(dataset.uids, (), options.limit)
+    uids = dataset.uids if options.limit is None else evenly(dataset.uids, options.limit)
     evaluation = None
     if options.protocol == "gso":
         names = gso.names_of(options.objects)

@@ -47,8 +47,8 @@ def render_command(
         trajectory: turntable, spiral (two turns, up and down), or a file of cameras: gamba's
             (docs/cameras.md), transforms.json, or nerfstudio's camera path.
         out: Folder for the results; for a single input also a .gif, an .mp4, or a .png of one view.
-        kind: Kind of output; png is a folder of pictures with their cameras.json. By default that
-            of --out, else gif.
+        kind: Kind of output; png is a folder of pictures and a transforms.json. By default
+            that of --out, else gif.
         size: Width of the pictures, or width and height, pixels; by default the file's, else 512.
         frames: Number of pictures of a turntable (48) or spiral (96).
         fps: Pictures per second; by default the file's, else 3 seconds per turn.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from inspect import Parameter, Signature, signature
 from typing import Any
 
 import torch
@@ -121,6 +122,25 @@ def one_device(tensors: dict[str, Any]) -> None:
     if len(devices) > 1 or not {device.type for device in devices} <= {"cpu", "cuda"}:
         names = ", ".join(sorted(map(str, devices)))
         raise ValueError(f"{', '.join(tensors)} are on {names}: allowed is one, cpu or cuda")
+
+
+def with_order(function: Callable[..., Any], names: str, **fixed: Any) -> Callable[..., Any]:
+    """Return a function whose parameters have another order, by place and to ``inspect``.
+
+    Args:
+        function: it takes all parameters by name.
+        names: of the parameters in their order; others cannot be given.
+        fixed: values of other parameters.
+    """
+    own = signature(function).parameters
+    kind = Parameter.POSITIONAL_OR_KEYWORD
+    order = Signature([own[name].replace(kind=kind) for name in names.split()])
+
+    def call(*args: Any, **options: Any) -> Any:
+        return function(**order.bind(*args, **options).arguments, **fixed)
+
+    call.__doc__, call.__signature__ = function.__doc__, order  # pyright: ignore
+    return call
 
 
 @torch.no_grad()

@@ -174,19 +174,23 @@ def _matrix(value: object, source: str, what: str = "the pose") -> np.ndarray:
 
 
 def check_cameras(
-    poses: np.ndarray, Ks: np.ndarray, sizes: Sequence[tuple[int, int] | None], names: Sequence[str]
+    poses: np.ndarray,
+    Ks: np.ndarray,
+    sizes: Sequence[tuple[int, int] | None],
+    names: Sequence[str],
+    near: bool = True,
 ) -> None:
-    """Check that cameras are plausible for views of an object.
+    """Check that cameras are plausible.
 
     Args:
         poses: ``[V, 4, 4]`` float64, camera to world.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: V widths and heights, pixels, or None.
         names: names of the V views, for the message.
+        near: they look at an object about the origin, which bounds their distance.
 
     Raises:
-        UserError: a pose is not a rotation with a position near the object, or a K does not match
-            the size.
+        UserError: a pose is not a rotation with a position, or a K does not match the size.
     """
     size = np.array([size or (1, 1) for size in sizes])
     with np.errstate(all="ignore"):  # non-finite numbers are reported below
@@ -199,7 +203,7 @@ def check_cameras(
             "the pose is not finite, or over {most:g}": (np.abs(poses) <= _LARGEST).all((1, 2)),
             "the pose's 3x3 part is not a rotation": orthogonal & ~(np.linalg.det(rotations) < 0),
             "the camera is {distance:g} from the object's centre, expected {near:g} to {far:g}": (
-                (distances >= NEAREST) & (distances <= FARTHEST)
+                (distances >= NEAREST) & (distances <= FARTHEST) | (not near)
             ),
             "focal lengths must be positive": positive,
             "focal lengths of {focal[0]:g} and {focal[1]:g} sides of the picture, expected "
@@ -326,7 +330,7 @@ def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
         UserError: the file is invalid; one line says where.
     """
     top, frames = _frames(path, read_document(path, object))
-    return _cameras(path, top, frames, None)
+    return _cameras(path, top, frames, None, near=False)
 
 
 def _frames(path: Path | str, top: object) -> tuple[dict, list[dict]]:
@@ -344,7 +348,11 @@ def _frames(path: Path | str, top: object) -> tuple[dict, list[dict]]:
 
 
 def _cameras(
-    path: Path | str, top: dict, frames: list[dict], size: Callable[[], tuple[int, int]] | None
+    path: Path | str,
+    top: dict,
+    frames: list[dict],
+    size: Callable[[], tuple[int, int]] | None,
+    near: bool = True,
 ) -> tuple[np.ndarray, np.ndarray, Sizes]:
     poses, lenses, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
     shared = None  # most files have one lens for all frames
@@ -356,7 +364,7 @@ def _cameras(
             shared = shared or _intrinsics(top, source, size)
             lenses.append(shared)
     Ks, sizes = np.stack([K for K, _ in lenses]), [size for _, size in lenses]
-    check_cameras(np.stack(poses), Ks, sizes, names)
+    check_cameras(np.stack(poses), Ks, sizes, names, near)
     return np.stack(poses), Ks, sizes
 
 

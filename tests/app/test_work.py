@@ -13,7 +13,6 @@ from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.app import cutting, work
-from gamba_warp.app.cutting import examples
 from gamba_warp.cameras import orbit
 from gamba_warp.files import STARTER
 from gamba_warp.formats.gaussians.files import read_gaussians
@@ -218,9 +217,3 @@ def test_a_mesh(made, tmp_path, monkeypatch):
         names = {f"My-thing-v2{work.KINDS[kind][1]}" for kind in work.IN_ZIP}
         assert {*archive.namelist()} == names and archive.testzip() is None
     assert [p for p in tmp_path.iterdir() if p.is_dir()] == [] and len(asked) == 2
-
-
-def test_examples_are_pictures():
-    found = examples()
-    assert {"toaster", "fire hydrant"} <= {title for _, title in found}
-    assert all(path.is_file() for path, _ in found)

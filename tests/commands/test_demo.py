@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+from helpers.micro import write_split
 
 from gamba_warp.cli import run
 from gamba_warp.commands import demo as command
@@ -18,8 +19,7 @@ def starter(tmp_path):
     folder = tmp_path / "starter"
     for uid in OBJECTS.values():
         shutil.copytree(STARTER / "data" / uid, folder / "data" / uid)
-    split = {"version": 1, **{name: [uid] for name, uid in OBJECTS.items()}}
-    (folder / "data" / "split.json").write_text(json.dumps(split))
+    write_split(folder / "data", **{name: [uid] for name, uid in OBJECTS.items()})
     (folder / "meshes").mkdir()
     shutil.copy(STARTER / "meshes" / "scopia-toaster.ply", folder / "meshes")
     (folder / "icons").mkdir()

@@ -198,6 +198,13 @@ def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     got = load_ply(tmp_path / "thing.ply").means
     torch.testing.assert_close(got, want.detach(), atol=1e-5, rtol=0)  # the file's rounding
     assert not torch.allclose(got, plain.means, atol=1e-3)
+    save_image(tmp_path / "mask.png", np.eye(20, 30))
+    mask = ["--mask", tmp_path / "mask.png"]
+    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, *mask) == 0
+    masked = cutout.cut_out(picture, cutout.Ways(mask=mask[1])).rgba
+    want = reconstruct(load_model(checkpoint), masked).means
+    got = load_ply(tmp_path / "thing.ply").means
+    torch.testing.assert_close(got, want.detach(), atol=1e-5, rtol=0)
 
 
 def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):
@@ -326,17 +333,6 @@ def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeyp
     refused_command(capsys, "reconstruct", arguments, "tiny.safetensors", "--checkpoint FILE")
     (tmp_path / "tiny.safetensors").write_bytes(checkpoint.read_bytes())
     assert run_reconstruct(*arguments) == 0
-
-
-def test_a_mask_cuts_a_busy_picture(tmp_path, checkpoint):
-    noise = np.random.default_rng(0).random((20, 30, 3))
-    save_image(tmp_path / "noise.png", noise)
-    mask = np.zeros((20, 30))
-    mask[5:15, 5:25] = 1
-    save_image(tmp_path / "mask.png", mask)
-    ready = [tmp_path / "noise.png", *quick(checkpoint, tmp_path / "out")]
-    assert run_reconstruct(*ready) == 1
-    assert run_reconstruct(*ready, "--mask", tmp_path / "mask.png") == 0
 
 
 def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):

@@ -50,7 +50,6 @@ COMMANDS = {
     "data index": "data index set",
     "train": "train set --preset tiny --out out --steps 1 --lpips off --batch-size 1",
     "eval-views": "eval-views --checkpoint {model} --data set --split all --out out --no-lpips",
-    "fit": "fit set --out out --steps 1",
     "compare": "compare {odd}.yaml {odd}.glb",
     "configuration": "train set --config {odd}",
     "unknown command": "{odd}",

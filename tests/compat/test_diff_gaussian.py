@@ -202,5 +202,3 @@ def test_a_program_takes_the_names_and_a_fork(tmp_path):
     assert not done.returncode, done.stderr
     lines = done.stdout.splitlines()
     assert "without it" in lines and lines[-1] == "torch.Size([3, 8, 8]) 2.0 0.0.0"
-    done = subprocess.run([*command[:4], "lgm", str(path)], capture_output=True, text=True)
-    assert done.returncode == 1 and "fork is 'lgm'" in done.stderr

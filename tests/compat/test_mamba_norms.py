@@ -94,13 +94,13 @@ def test_dropout_is_that_of_its_masks():
     want = written_out(False, 1e-6, x * mask / 0.75, weight, None, residual, x1 * mask1 / 0.75)
     assert_rel_rms(total, want[-1], 1e-6, "sum")
     assert_rel_rms(outs[0], want[0], 1e-6, "out")
-    again = norms.layer_norm_ref(
-        x, weight, None, **given, prenorm=True, dropout_mask=mask, dropout_mask1=mask1
-    )
+    by_place = x, weight, None, residual, x1, weight1, None, 1e-6, 0.25, None, True
+    again = norms.layer_norm_ref(*by_place, mask, mask1)
     for got, value in zip(again, (*outs, total), strict=True):
         assert_rel_rms(got, value, 1e-6, "reference")
     layer = norms.RMSNorm(17, dropout_p=0.5)
     assert not torch.equal(layer(x), layer(x)) and torch.equal(layer.eval()(x), layer(x))
+    assert len(norms.rms_norm_fn(*by_place, False, True)) == 5
     none = norms.layer_norm_fn(x, weight, None, return_dropout_mask=True)
     assert len(none) == 3 and none[1] is none[2] is None
 

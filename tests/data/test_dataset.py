@@ -73,6 +73,8 @@ def test_transforms_layout(tmp_path):
     torch.testing.assert_close(got.cameras.Ks[1], torch.tensor(want))
     assert got.depths.shape == (2, 10, 14)
     assert got.depths[:, 3, 3].tolist() == pytest.approx([1.002, 1.0])
+    alone = open_dataset(tmp_path / "thing")
+    assert alone.uids == ["thing"] and torch.equal(alone.load(0, [2, 0]).images, got.images)
 
 
 def test_three_layouts_agree(tmp_path):
@@ -104,13 +106,6 @@ def test_three_layouts_agree(tmp_path):
         # float32 poses
         torch.testing.assert_close(got.cameras.viewmats, want.cameras.viewmats, atol=1e-5, rtol=0)
         torch.testing.assert_close(got.cameras.Ks, want.cameras.Ks, msg=layout)
-
-
-def test_one_object_folder_is_a_dataset(tmp_path):
-    write_transforms(tmp_path / "lamp")
-    data = open_dataset(tmp_path / "lamp")
-    assert data.uids == ["lamp"]
-    assert data.load(0).images.shape[0] == 3
 
 
 def test_linked_objects_are_found_once(tmp_path):
@@ -150,10 +145,12 @@ def test_gobjaverse_of_pictures_that_are_not_square(tmp_path):
     view = tmp_path / "campos_512_v4" / "00000"  # one object's folder
     write_picture(view / "00000.png", 16, 8)
     axes = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1], "origin": [0, 0, -2]}
-    for angles, focal in (({"x_fov": FOV}, FOCAL * 16), ({}, 8 * 1422.222 / 1024)):
+    both = {"x_fov": 0.8, "y_fov": 0.6}, (8 / math.tan(0.4), 4 / math.tan(0.3))
+    published = {}, (8 * 1422.222 / 1024,) * 2
+    for angles, focal in (({"x_fov": FOV}, (FOCAL * 16,) * 2), both, published):
         (view / "00000.json").write_text(json.dumps(axes | angles))
         K = open_dataset(tmp_path).load(0).cameras.Ks[0]
-        assert (K[0, 0], K[1, 1]) == pytest.approx((focal, focal))
+        assert (K[0, 0], K[1, 1]) == pytest.approx(focal)
 
 
 def test_masks_are_the_alpha(tmp_path):

@@ -87,15 +87,6 @@ def test_busy_backgrounds_are_not_plain():
     assert plain_matte(rgb) is None
 
 
-def test_alpha_wins_over_the_background(tmp_path):
-    alpha = np.zeros((30, 40))
-    alpha[10:18, 5:29] = 1
-    rgba = np.dstack([scene(disc((30, 40), (5, 20), 4), RED, (1, 1, 1)), alpha])
-    out = prepare(write(tmp_path / "a.png", rgba))
-    assert out.shape == (30, 30, 4)  # 24 / (1 - 0.2)
-    assert out[11:19, 3:27, 3].min() == 1 and out[..., 3].sum() == 8 * 24
-
-
 def test_a_mask_wins_over_all(tmp_path):
     rgb = write(tmp_path / "a.png", scene(disc(), RED, (1, 1, 1)))
     mask = np.zeros((60, 80))

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers import micro
 from helpers.disk import full_at
+from helpers.images import bytes_of
 from helpers.refusals import refused
 from hostile import seeds
 from PIL import Image
@@ -57,8 +58,7 @@ def data(tmp_path):
     root = tmp_path / "data"
     for seed, (uid, depth) in enumerate(zip(UIDS, ("uint16", None, "float32"))):
         write_object(root / uid, seed, depth)
-    split = {"version": 1, "train": UIDS[:2], "val": [], "test": UIDS[2:]}
-    (root / "split.json").write_text(json.dumps(split))
+    micro.write_split(root, train=UIDS[:2], test=UIDS[2:])
     return root
 
 
@@ -200,12 +200,6 @@ def in_document(change):
     return changed("json", changed_document)
 
 
-def bomb():
-    stream = io.BytesIO()
-    Image.new("1", (20000, 20000)).save(stream, "PNG")
-    return stream.getvalue()
-
-
 @pytest.mark.parametrize(
     "change, reason",
     [
@@ -217,7 +211,7 @@ def bomb():
             in_document(lambda top: top["frames"][0].update(transform_matrix=[[7] * 4] * 4)),
             "not a rotation",
         ),
-        (changed("000.png", bomb()), "megapixels"),
+        (changed("000.png", bytes_of(Image.new("1", (20000, 20000)))), "megapixels"),
         (changed("000.png", b"no picture"), "a.000.png: "),
         (lambda all: [m for m in all if m[0].name != "a.json"], "not valid JSON"),
     ],

@@ -16,7 +16,7 @@ LONGEST = 300.0  # seconds; a command that takes longer hangs
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
     [
-        *("timm", "trimesh", "gamba_warp.measure.models", "gamba_warp.fitting.objects"),
+        *("timm", "trimesh", "gamba_warp.measure.models"),
         *("gamba_warp.eval.shapes.pairs", "gamba_warp.eval.views.evaluate"),
         *("gamba_warp.model.predict", "gamba_warp.model.released"),
         *("gamba_warp.pages.export", "gamba_warp.train.run", "gamba_warp.train.data.render"),

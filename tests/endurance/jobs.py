@@ -59,7 +59,6 @@ JOBS = {
         "render {world}/gaussians --out {out} --kind png --size 32 --frames 3 --depth --device cpu",
         "--elevation 20",
     ),
-    "fit": Job("fit {world}/data --out {out} --steps 4 --gaussians 60 --device cpu", "--seed 1"),
     "data render": Job(
         "data render {world}/meshes --out {out} --views 2 --size 16 --workers 1",
         undo=without_one_object,

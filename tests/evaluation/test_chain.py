@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from helpers.views import eval_views, evaluated, write_split
+from helpers.micro import write_split
+from helpers.views import eval_views, evaluated
 
 from gamba_warp.cameras import relative_to_reference
 from gamba_warp.cli import run

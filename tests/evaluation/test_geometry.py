@@ -1,4 +1,3 @@
-import math
 import shutil
 from dataclasses import replace
 
@@ -6,30 +5,19 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.gaussians import rotations
+from helpers.meshes import cube
 from helpers.refusals import refused
 from helpers.views import cloud_of, evaluated
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
-from gamba_warp.eval.shapes.metrics import compare, syncdreamer_points
-from gamba_warp.eval.shapes.occupancy import VOTERS, grid_around, parity, solid, syncdreamer_grid
+from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, nearest, sample
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.density import opacity_volume
 from gamba_warp.surfaces.options import SurfaceOptions
-
-
-def as_mesh(source, move=(0.0, 0, 0)):
-    return Mesh(np.array(source.vertices) + move, np.array(source.faces))
-
-
-def cube(move=(0.0, 0, 0), side=1.0):
-    return as_mesh(trimesh.creation.box((side,) * 3), move)
-
-
-def ball(radius, move=(0.0, 0, 0)):
-    return as_mesh(trimesh.creation.icosphere(4, radius), move)
 
 
 def join(*meshes):
@@ -58,87 +46,27 @@ def test_a_shape_and_itself(name):
         assert got["chamfer"] <= (2e-5 if align else 0) and set(got["fscore"].values()) == {1.0}
 
 
-def test_solid_fills_cavities_and_unites_parts():
-    hollow = join(cube(), cube(side=0.5))
-    grid = grid_around(hollow, resolution=16)
-    assert solid(hollow, grid).sum() == 16**3
-    overlapping = join(cube(), cube((0.5, 0, 0)))
-    grid = grid_around(overlapping, resolution=16)
-    assert solid(overlapping, grid).sum() == 1.5 * 16**3
-    assert parity(overlapping, grid).sum() == 16**3  # which is why parity alone will not do
-
-
-@pytest.mark.parametrize("tilt", [0.0, 0.3, 0.9, 1.57])
-def test_solid_of_a_sheet(tilt):
-    side, rise = math.cos(tilt), math.sin(tilt)
-    corners = [[-0.4, 0, 0], [0.4, 0, 0], [0.4, side, rise], [-0.4, side, rise]]
-    sheet = Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
-    assert not solid(sheet, grid_around(sheet, resolution=32)).any()
-    half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
-    assert (half[:, 2] > 0).all()  # so no direction is also among the opposites
-
-
-def test_syncdreamer_sees_from_above():
-    fine = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide().subdivide().subdivide().subdivide()
-    points = syncdreamer_points(as_mesh(fine)).positions
-    low, high = points.min(0), points.max(0)
-    # half a pixel is 0.0027 at the centre's distance; see visible_points
-    assert np.allclose(high, 0.5, atol=6e-3) and low[0] < -0.494 and low[1] < -0.494
-    assert np.mean(points[:, 2] > 0.494) > 0.15  # the top, one of five sides seen
-    inside = np.abs(points[:, :2]).max(1) < 0.49
-    assert points[inside, 2].min() > 0.49  # the bottom is not seen
-    spacing = len(points) / 5
-    assert 0.8e4 < spacing < 2.5e4  # a mean point a voxel of 0.01: about 1e4 a side
-
-
-def test_syncdreamer_lattice():
-    grid = syncdreamer_grid()
-    points = grid.points()
-    assert points.shape == (64, 64, 64, 3)
-    assert points[0, 0, 0].tolist() == [-1, -1, -1] and points[1, 0, 0, 0] == -1 + 1 / 32
-    volume = parity(ball(0.5), grid).sum() / 32**3
-    assert abs(volume - math.pi / 6) < 0.01
-
-
-def test_density_of_one_gaussian():
-    turn = torch.tensor([[math.cos(0.4), 0, 0, math.sin(0.4)]])
-    one = Gaussians(
-        means=torch.tensor([[0.1, -0.2, 0.3]]),
-        quats=turn,
-        scales=torch.tensor([[0.2, 0.05, 0.1]]),
-        opacities=torch.tensor([0.7]),
-        colors=torch.zeros(1, 3),
-    )
-    volume, origin = opacity_volume(one, 32)
-    axes = [origin[k] + np.arange(volume.shape[k]) / 32 for k in range(3)]
-    at = np.stack(np.meshgrid(*axes, indexing="ij"), -1) - one.means.numpy()
-    rotation = trimesh.transformations.rotation_matrix(0.8, [0, 0, 1])[:3, :3]
-    squared = ((at @ rotation / one.scales.numpy()) ** 2).sum(-1)
-    want = 0.7 * np.exp(-squared / 2)
-    assert np.abs(volume - want).max() < 0.0051  # what is under 0.005 is cut
-
-
-def test_density_of_many_is_the_union():
-    """Boxes of every size are visited once."""
+@pytest.mark.parametrize("count, limit", [(1, 0.0051), (40, 0.05)])
+def test_density_is_the_union_of_the_gaussians(count, limit):
+    """Boxes of every size are visited once; what is under 0.005 is cut."""
     generator = torch.Generator().manual_seed(0)
-    count = 40
-    many = Gaussians(
+    made = Gaussians(
         means=torch.rand(count, 3, generator=generator) - 0.5,
-        quats=None,
+        quats=torch.randn(count, 4, generator=generator),
         scales=0.005 + 0.1 * torch.rand(count, 3, generator=generator) ** 2,
         opacities=0.05 + 0.9 * torch.rand(count, generator=generator),
         colors=torch.zeros(count, 3),
     )
-    volume, origin = opacity_volume(many, 16)
+    volume, origin = opacity_volume(made, 16)
     axes = [torch.from_numpy(origin[k] + np.arange(volume.shape[k]) / 16) for k in range(3)]
     at = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
     clear = torch.ones(at.shape[:3], dtype=torch.float64)
-    for k in range(count):
-        squared = ((at - many.means[k]) / many.scales[k]).square().sum(-1)
-        alpha = many.opacities[k] * torch.exp(-0.5 * squared)
+    for k, turn in enumerate(rotations(made.quats.double())):
+        squared = ((at - made.means[k]) @ turn / made.scales[k]).square().sum(-1)
+        alpha = made.opacities[k] * torch.exp(-0.5 * squared)
         clear *= 1 - torch.where(alpha < 0.005, 0.0, alpha)
     error = np.abs(volume - (1 - clear.numpy()))
-    assert error.max() < 0.05 and error.mean() < 2e-3  # tails under 0.005 differ
+    assert error.max() < limit and error.mean() < 2e-3
 
 
 def test_centers_are_drawn_by_opacity():

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.micro import write_split
 from helpers.refusals import refused
-from helpers.views import (
-    around,
-    cloud_of,
-    eval_views,
-    evaluated,
-    straight,
-    write_split,
-    write_views,
-)
+from helpers.views import around, cloud_of, eval_views, evaluated, straight, write_views
 
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset

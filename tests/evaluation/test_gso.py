@@ -25,8 +25,7 @@ def data(tmp_path_factory):
     for name in THERE:
         (root / "meshes" / name).mkdir(parents=True)
         trimesh.creation.box().export(root / "meshes" / name / "model.obj")
-    everything = {"version": 2, "test": [*THERE, "not of the list"]}
-    (root / "views" / "split.json").write_text(json.dumps(everything))
+    micro.write_split(root / "views", test=[*THERE, "not of the list"])
     entries = [{"model": f"{name}/model.obj", "uid": name} for name in THERE]
     (root / "meshes" / "catalogue.json").write_text(json.dumps({"objects": entries}))
     return root

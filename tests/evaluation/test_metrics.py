@@ -10,7 +10,7 @@ from helpers.views import around, eval_views, straight, write_views
 from gamba_warp.cli import run
 from gamba_warp.conventions import over_another, over_background
 from gamba_warp.eval.report import failure, intervals_of, make_report, mean_of, save_report
-from gamba_warp.eval.shapes.metrics import surface_metrics, volume_iou
+from gamba_warp.eval.shapes.metrics import surface_metrics
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Points
 from gamba_warp.eval.views.compare import Shown, Truth, compare, render_views
@@ -70,14 +70,6 @@ def test_surface_metrics_by_hand():
         assert abs(got[name] - value) < 1e-6, name  # float32 search
     assert got["fscore"] == {"0.02": 0.0, "0.05": pytest.approx(2 / 3)}  # precision 1/2, recall 1
     assert got["normal_consistency"] == pytest.approx(0.8)
-
-
-def test_volume_iou():
-    a = np.zeros((3, 3, 3), bool)
-    assert volume_iou(a, a) is None
-    b = a.copy()
-    a[:2], b[1:] = True, True
-    assert volume_iou(a, b) == 1 / 3 and volume_iou(a, a) == 1
 
 
 def test_means_pass_over_what_is_not_there():

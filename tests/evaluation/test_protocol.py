@@ -3,7 +3,6 @@
 import json
 import math
 import stat
-from dataclasses import replace
 
 import pytest
 from helpers.refusals import refused, refused_command
@@ -111,12 +110,6 @@ def test_any_field_can_be_changed_and_the_change_is_named(capsys):
 )
 def test_bad_fields_are_one_line(text, reason, capsys):
     refused_command(capsys, "eval-geometry", ["--explain", "--set", text], "gamba: --set ", reason)
-
-
-def test_changes_name_what_is_nested_too():
-    surface = replace(PRESETS["gso"].surface, voxels=100)
-    changed = replace(PRESETS["gso"], seed=3, surface=surface)
-    assert changed.changes() == ["seed", "surface.voxels"] and not PRESETS["gso"].changes()
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import trimesh
-from helpers.children import murderous_pair
+from helpers.children import faulty_pair
 from helpers.gaussians import some
 
 from gamba_warp.cli import run
@@ -118,9 +118,7 @@ def test_an_interrupted_evaluation_goes_on(folders):
     # what is no record: nested too deeply, of another kind, and a line that was cut off
     noted.write_text("[" * 10**5 + '\n{"key": "a", "record": 5}\n' + lines + '{"key": "cut of')
     pairs = [pair._replace(name="bad" if pair.name == "b" else pair.name) for pair in pairs]
-    again = evaluate_pairs(
-        pairs, SMALL, None, murderous_pair, cache=RecordCache(folders, SMALL, None)
-    )
+    again = evaluate_pairs(pairs, SMALL, None, faulty_pair, cache=RecordCache(folders, SMALL, None))
     assert again[0] == first[0] and again[1]["status"] == "failed"
     other = RecordCache(folders, replace(SMALL, seed=5), None)
     assert other.get(other.key(pairs[0])) is None

@@ -10,11 +10,11 @@ turned, so that no face lies in the lattice's planes, where mesh2sdf's rounding 
 import numpy as np
 import pytest
 import trimesh
+from helpers.meshes import as_mesh, cube
 
 from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.occupancy import Grid, parity
 from gamba_warp.eval.shapes.protocol import PRESETS
-from gamba_warp.eval.shapes.shape import Mesh
 
 THEIRS = {  # Chamfer distance and Volume IoU
     "ball": (0.0979962, 0.5103978),
@@ -78,20 +78,17 @@ def pair_of(name):
 
 @pytest.mark.parametrize("name", THEIRS)
 def test_the_numbers_are_those_of_the_public_script(name):
-    meshes = (Mesh(np.array(m.vertices), np.array(m.faces)) for m in pair_of(name))
-    got = compare(*meshes, PRESETS["syncdreamer"])
+    got = compare(*map(as_mesh, pair_of(name)), PRESETS["syncdreamer"])
     chamfer, iou = THEIRS[name]
     assert abs(got["chamfer"] - chamfer) <= 1e-5 and abs(got["iou"] - iou) <= 1e-5
 
 
 def test_rays_through_edges_and_corners_meet_one_face():
     """Every line of the grid runs through edges or corners of a box of two triangles a side."""
-    box = trimesh.creation.box((1.0, 1.0, 1.0))
-    mesh = Mesh(np.array(box.vertices), np.array(box.faces))
     grid = Grid(np.full(3, -0.75), 0.25, (7, 7, 7))
     want = np.zeros((7, 7, 7), bool)
     want[2:5, 2:5, 2:5] = True  # the places on its faces are outside
-    assert (parity(mesh, grid) == want).all()
+    assert (parity(cube(), grid) == want).all()
     aside = Grid(grid.origin + 0.01, 0.25, (7, 7, 7))
     want[1:5, 1:5, 1:5] = True
-    assert (parity(mesh, aside) == want).all()
+    assert (parity(cube(), aside) == want).all()

@@ -2,16 +2,14 @@ import math
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import torch
+from helpers.micro import write_split
 from helpers.model import SMALLEST
 from helpers.refusals import refused
-from helpers.views import around, cloud_of, evaluated, straight, write_split, write_views
+from helpers.views import around, cloud_of, evaluated, straight, write_views
 
 from gamba_warp.cameras import Cameras, relative_to_reference
-from gamba_warp.data.dataset import open_dataset
-from gamba_warp.eval.shapes.pairs import out_of_reference
 from gamba_warp.eval.views import evaluate as module
 from gamba_warp.eval.views.compare import Shown, choose_views
 from gamba_warp.formats.ply import save_ply
@@ -196,12 +194,6 @@ def test_what_cannot_start(data, case, options, said, capsys):
     assert evaluate(data, *options, pred=pred) == (2, None)
     error = capsys.readouterr().err
     assert error.startswith("gamba: ") and said in error
-
-
-def test_out_of_the_reference_world(data):
-    motion = out_of_reference(open_dataset(data / "data"), "c", 1, 1.5)
-    there = np.array([in_reference_world(POINTS["c"], 1)])
-    assert np.abs(motion.points(there) - POINTS["c"]).max() < 1e-6
 
 
 def test_module_entry():

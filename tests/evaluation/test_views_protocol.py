@@ -9,14 +9,11 @@ def options(**given):
     return ViewsOptions(checkpoint=Path("a"), data=Path("b"), **given).filled()
 
 
-def test_a_protocol_fills_in_what_is_not_given():
+def test_a_protocol_fills_in_what_is_not_given_and_names_what_is():
+    """Also where the given is the default without a protocol."""
     default, splatter = options(), options(protocol="splatter-image")
     assert (default.reference, default.size, default.changed()) == (0, None, [])
     assert (splatter.reference, splatter.size, splatter.changed()) == (64, 128, [])
-
-
-def test_what_is_given_changes_a_protocol_and_is_named():
-    """Also the default value without a protocol."""
     changed = options(protocol="splatter-image", reference=0, size=64)
     assert (changed.reference, changed.size) == (0, 64)
     assert changed.changed() == ["size", "reference"]

@@ -5,8 +5,9 @@ import re
 import numpy as np
 import pytest
 import torch
+from helpers.micro import write_split
 from helpers.model import micro, run_reconstruct
-from helpers.views import around, eval_views, write_split, write_views
+from helpers.views import around, eval_views, write_views
 
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba

@@ -11,22 +11,15 @@ def ran(*words, timeout=300, **options):
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, **options)
 
 
-def murderous_pair(pair, protocol, motion):
-    """Evaluate a pair; a name that begins with ``bad`` kills the process."""
-    from gamba_warp.eval.shapes.pairs import evaluate_pair
-
-    if pair.name.startswith("bad"):
-        signal.raise_signal(signal.SIGSEGV)
-    return evaluate_pair(pair, protocol, motion)
-
-
-def talking_pair(pair, protocol, motion):
-    """Evaluate a pair, and print; one named ``bad`` raises an unexpected error."""
+def faulty_pair(pair, protocol, motion):
+    """Evaluate a pair, and print; one named ``bad`` kills the process, ``odd`` raises an error."""
     from gamba_warp.eval.shapes.pairs import evaluate_pair
 
     os.write(1, b"a library talks\n")
-    if pair.name == "bad":
+    if pair.name == "odd":
         raise MemoryError("no room")
+    if pair.name == "bad":
+        signal.raise_signal(signal.SIGSEGV)
     return evaluate_pair(pair, protocol, motion)
 
 

@@ -16,49 +16,19 @@ from gamba_warp.compat.diff_gaussian_rasterization import (
     GaussianRasterizationSettings,
     GaussianRasterizer,
 )
+from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
 from helpers import assert_rel_rms
+from helpers.gaussians import rotations
 
 PICTURE, GRADIENT = 1e-6, 1e-5
 WIDTH, HEIGHT = 37, 53
 NEAR, DILATION, ALPHA_MAX, ALPHA_MIN, STOP, TILE = 0.2, 0.3, 0.99, 1 / 255, 1e-4, 16
-C0, C1 = 0.28209479177387814, 0.4886025119029199
-C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792)
-C2 = (*C2, 0.5462742152960396)
-C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154)
-C3 = (*C3, -0.4570457994644658, 1.445305721320277, -0.5900435899266435)
-
-
-def harmonics(degree: int, shs: Tensor, means: Tensor, center: Tensor) -> Tensor:
-    """Colours ``[N, 3]`` from coefficients ``[N, K, 3]``."""
-    x, y, z = torch.nn.functional.normalize(means - center, dim=-1).unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [torch.full_like(x, C0)]
-    if degree > 0:
-        basis += [-C1 * y, C1 * z, -C1 * x]
-    if degree > 1:
-        last = [2 * zz - xx - yy, x * z, xx - yy]
-        basis += [c * p for c, p in zip(C2, [x * y, y * z, *last])]
-    if degree > 2:
-        polynomials = [
-            *(y * (3 * xx - yy), x * y * z, y * (4 * zz - xx - yy)),
-            *(z * (2 * zz - 3 * xx - 3 * yy), x * (4 * zz - xx - yy)),
-            *(z * (xx - yy), x * (xx - 3 * yy)),
-        ]
-        basis += [c * p for c, p in zip(C3, polynomials)]
-    sums = (torch.stack(basis, -1)[..., None] * shs[:, : len(basis)]).sum(1)
-    return (sums + 0.5).clamp_min(0)
 
 
 def covariances(scales: Tensor, modifier: float, quats: Tensor) -> Tensor:
     """``[N, 3, 3]``; quaternions are not made unit ones, and the modifier has no slope."""
-    w, x, y, z = quats.unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    rotations = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    root = rotations * (scales + (scales * (modifier - 1)).detach())[:, None]
+    sizes = scales + (scales * (modifier - 1)).detach()
+    root = rotations(quats, unit=False) * sizes[:, None]
     return root @ root.mT
 
 
@@ -236,7 +206,8 @@ def draw_first(scene, settings):
     x = {name: value.detach().double().requires_grad_() for name, value in scene.items()}
     colors, campos = x["colors"], settings.campos.double()
     if colors.dim() == 3:
-        colors = harmonics(settings.sh_degree, colors, x["means3D"], campos)
+        given = colors[None], x["means3D"][None], campos[None, None]
+        colors = colors_by_formula(settings.sh_degree, *given)[0, 0]
     if "cov3D_precomp" in x:
         covars = whole(x["cov3D_precomp"])
     else:

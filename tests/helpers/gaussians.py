@@ -28,9 +28,9 @@ def some(n=37, rotated=True, degree=0):
     )
 
 
-def rotations(quats):
-    """``[..., 3, 3]`` of wxyz quaternions of any length."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+def rotations(quats, unit=True):
+    """``[..., 3, 3]`` of wxyz quaternions of any length, or as they are if not ``unit``."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True) if unit else quats).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -18,11 +18,16 @@ def colours(mode="RGB", size=(7, 5)):
     return image.convert(mode) if "A" in mode else image.convert("RGB").convert(mode)
 
 
+def bytes_of(picture, form="PNG", **options):
+    """Return the bytes of a picture in a format of PIL."""
+    content = io.BytesIO()
+    picture.save(content, form, **options)
+    return content.getvalue()
+
+
 def encoded(form):
     """Return the bytes of a 40 x 30 picture in a format of PIL."""
-    content = io.BytesIO()
-    colours(size=(40, 30)).save(content, form)
-    return content.getvalue()
+    return bytes_of(colours(size=(40, 30)), form)
 
 
 def png_of_size(width, height):

@@ -3,8 +3,17 @@
 import torch
 import torch.nn.functional as F
 
+# Of x = delta A: the decay of the state, and the factor of delta B u.
+TRANSITIONS = {
+    "mamba": lambda x: (x.exp(), 1.0),
+    "zoh": lambda x: (x.exp(), (x.exp() - 1) / x),
+    "bilinear": lambda x: ((1 + x / 2) / (1 - x / 2), 1 / (1 - x / 2)),
+}
 
-def scan_in_float64(u, delta, A, B, C, D=None, z=None, delta_bias=None, softplus=False):
+
+def scan_in_float64(
+    u, delta, A, B, C, D=None, z=None, delta_bias=None, softplus=False, discretization="mamba"
+):
     """The scan written out, channel by channel, for any shapes of B and C."""
 
     def at(matrix, t):  # [B or 1, D, N]
@@ -21,7 +30,8 @@ def scan_in_float64(u, delta, A, B, C, D=None, z=None, delta_bias=None, softplus
     h, rows = u.new_zeros(*u.shape[:2], A.shape[1]), []
     for t in range(u.shape[2]):
         step = delta[:, :, t, None]
-        h = (step * A).exp() * h + step * at(B, t) * u[:, :, t, None]
+        decay, gain = TRANSITIONS[discretization](step * A)
+        h = decay * h + gain * step * at(B, t) * u[:, :, t, None]
         rows.append((h * at(C, t)).sum(-1))
     y = torch.stack(rows, -1)
     if D is not None:
@@ -58,8 +68,8 @@ def block_in_float64(**g):
     for name, part in (("B", low[..., rank : rank + states]), ("C", low[..., -states:])):
         part = norm(part + g.get(f"{name}_proj_bias", 0), g.get(f"{name.lower()}_rms_weight")).mT
         matrices.append(g.get(name, part))
-    skip, shift = g["D"], g["delta_bias"]
-    y, _ = scan_in_float64(x, delta, g["A"], *matrices, skip, z, shift, True)
+    skip, shift, kind = g["D"], g["delta_bias"], g.get("discretization", "mamba")
+    y, _ = scan_in_float64(x, delta, g["A"], *matrices, skip, z, shift, True, kind)
     if "A_b" in g:  # the same from the end on; constant matrices have no tokens
         x, delta, z = (part.flip(-1) for part in (x, delta, z))
         matrices = [m.flip(-1) if m.dim() == 3 else m for m in matrices]
@@ -69,10 +79,11 @@ def block_in_float64(**g):
     return y.mT @ g["out_proj_weight"].T + g["out_proj_bias"]
 
 
-def layer_in_float64(weights, tokens):
+def layer_in_float64(weights, tokens, discretization="mamba"):
     """Compute a Mamba layer from its weights by their names."""
     w = {name.replace(".", "_"): value for name, value in weights.items()}
     given = {k: w.get(k) for k in ("conv1d_weight", "conv1d_bias", "x_proj_weight", "D")}
     given |= {"xz": (tokens @ w["in_proj_weight"].T).mT, "A": -w["A_log"].exp()}
     given |= {"delta_proj_weight": w["dt_proj_weight"], "delta_bias": w["dt_proj_bias"]}
+    given |= {"discretization": discretization}
     return block_in_float64(**given, out_proj_weight=w["out_proj_weight"], out_proj_bias=0)

@@ -5,8 +5,10 @@ import json
 import struct
 
 import numpy as np
+import trimesh
 from PIL import Image
 
+from gamba_warp.eval.shapes.shape import Mesh
 from gamba_warp.train.data.settings import Settings
 from gamba_warp.train.sources.commands import Share, data_render_command
 
@@ -24,6 +26,16 @@ f 1/1 2/2 3/3 4/4
 """
 MTL = "newmtl paint\nKd 0.1 0.1 0.1\nmap_Kd paint.png\n"
 QUARTERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
+
+
+def as_mesh(source, move=(0.0, 0, 0)) -> Mesh:
+    """Return a mesh of trimesh's as one to evaluate, moved."""
+    return Mesh(np.array(source.vertices) + move, np.array(source.faces))
+
+
+def cube(move=(0.0, 0, 0), side=1.0) -> Mesh:
+    """Return a cube about a place."""
+    return as_mesh(trimesh.creation.box((side,) * 3), move)
 
 
 def write_quad(folder, obj=QUAD, mtl=MTL, texture="paint.png"):

@@ -84,9 +84,14 @@ def write_dataset(root: Path, objects: int = 3) -> Path:
     uids = [f"cloud{chr(ord('a') + i)}" for i in range(objects)]
     for i, uid in enumerate(uids):
         write_object(root / uid, cloud(i))
-    split = {"version": 1, "train": uids[:-1], "val": uids[-1:], "test": []}
-    (root / "split.json").write_text(json.dumps(split))
+    write_split(root, train=uids[:-1], val=uids[-1:])
     return root
+
+
+def write_split(data: Path, **parts: list[str]) -> None:
+    """Writes ``split.json``; parts that are not given are empty."""
+    empty: dict = {"version": 1, "train": [], "val": [], "test": []}
+    (data / "split.json").write_text(json.dumps(empty | parts))
 
 
 def options(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dict) -> TrainConfig:

@@ -13,6 +13,9 @@ from gamba_warp.model.parts.block import prefix_states, run_blocks
 from helpers import assert_rel_rms
 
 FIELDS = ("means", "scales", "opacities", "colors")
+NOTHING = slice(0, 0), slice(0, 0)
+# Random noise has no flat cells; a disc on the left, one pixel, a square that touches two sides.
+BOXES = [(slice(5, 9), slice(1, 5)), (slice(7, 8), slice(10, 11)), (slice(0, 12), slice(4, 12))]
 SMALLEST = GambaConfig(
     image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
 )
@@ -40,11 +43,12 @@ def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
     return torch.rand(batch, size, size, 3), cameras
 
 
-def cut_outs() -> tuple[torch.Tensor, Cameras]:
-    """Draw noise in boxes of 9, 1, 24 and no cells of transparent pictures."""
-    images, cameras = inputs(4)
+def cut_outs(boxes=BOXES) -> tuple[torch.Tensor, Cameras]:
+    """Draw noise in some boxes of transparent pictures, and make a camera for each."""
+    images, cameras = inputs(len(boxes))
     rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
-    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
+    for picture, (rows, columns) in zip(rgba, boxes):
+        picture[rows, columns, 3] = 0.25 + 0.75 * torch.rand_like(picture[rows, columns, 3])
     return rgba, cameras
 
 

@@ -59,12 +59,6 @@ def write_views(folder: Path, rgba: Tensor, cameras: Cameras) -> None:
     (folder / "transforms.json").write_text(transforms(names, cameras))
 
 
-def write_split(data: Path, **parts: list[str]) -> None:
-    """Writes ``split.json``; parts that are not given are empty."""
-    empty: dict = {"version": 1, "train": [], "val": [], "test": []}
-    (data / "split.json").write_text(json.dumps(empty | parts))
-
-
 def evaluated(command: str, out: Path, *words: object) -> tuple[int, dict | None]:
     """Run ``eval-views`` or ``eval-geometry``; return the exit code and the report, if any."""
     code = run(command, [*map(str, words), "--out", str(out)])

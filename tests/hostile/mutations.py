@@ -8,6 +8,8 @@ import json
 import re
 import struct
 from collections.abc import Callable
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from hypothesis import strategies as st
@@ -67,13 +69,23 @@ def encode(text: str) -> bytes:
 
 
 def _span(draw: Draw, data: bytes) -> tuple[int, int]:
-    start = position(draw, len(data) - 1)
+    start = position(draw, len(data))
     return start, start + draw(st.integers(1, 8) | st.integers(1, 256))
 
 
-def truncate(draw: Draw, data: bytes) -> bytes:
-    """Cut the end off: anywhere, or just a few bytes."""
-    return data[: draw(st.integers(0, len(data) - 1) | st.integers(-8, -1))]
+def cut(draw: Draw, data: bytes) -> bytes:
+    """Remove a span, all that follows an offset, or a few bytes at the end."""
+    start, end = _span(draw, data)
+    return choice(draw, data[:start] + data[end:], data[:start], data[: start - end])
+
+
+def put(draw: Draw, data: bytes) -> bytes:
+    """Insert bytes or overwrite others: any, equal ones, a part of the file, or all of it."""
+    start, end = _span(draw, data)
+    blocks = data[start:end], b"\0" * (end - start), b"\xff" * (end - start), data
+    block = draw(st.sampled_from(blocks) | st.binary(min_size=1, max_size=100))
+    at = choice(draw, position(draw, len(data)), len(data))
+    return data[:at] + block + data[choice(draw, at, at + len(block)) :]
 
 
 def flip_bits(draw: Draw, data: bytes) -> bytes:
@@ -82,29 +94,6 @@ def flip_bits(draw: Draw, data: bytes) -> bytes:
     for _ in range(draw(st.integers(1, 8))):
         out[position(draw, len(out) - 1)] ^= 1 << draw(st.integers(0, 7))
     return bytes(out)
-
-
-def set_bytes(draw: Draw, data: bytes) -> bytes:
-    """Fill a span with 0, 255 or other bytes."""
-    start, end = _span(draw, data)
-    length = min(end, len(data)) - start
-    fill = draw(st.sampled_from((b"\0", b"\xff")) | st.binary(min_size=1, max_size=64))
-    return data[:start] + (fill * length)[:length] + data[end:]
-
-
-def insert_bytes(draw: Draw, data: bytes) -> bytes:
-    """Insert bytes, possibly at the end."""
-    at = choice(draw, position(draw, len(data)), len(data))
-    return data[:at] + draw(st.binary(min_size=1, max_size=100)) + data[at:]
-
-
-def move_block(draw: Draw, data: bytes) -> bytes:
-    """Remove a span, or move it to another offset, overwriting or inserting."""
-    start, end = _span(draw, data)
-    if chance(draw, 60):
-        block, at = data[start:end], position(draw, len(data))
-        return data[:at] + block + data[choice(draw, at, at + len(block)) :]
-    return data[:start] + data[end:]
 
 
 def extreme_word(draw: Draw, data: bytes) -> bytes:
@@ -124,14 +113,9 @@ def add_to_word(draw: Draw, data: bytes) -> bytes:
     return data[:at] + (value % 256**size).to_bytes(size, order) + data[at + size :]
 
 
-def append(draw: Draw, data: bytes) -> bytes:
-    """Repeat the file, or make it empty."""
-    return choice(draw, data * 2, b"")
-
-
 BYTES = (
-    *(truncate, truncate, flip_bits, flip_bits, set_bytes, insert_bytes, move_block, move_block),
-    *(extreme_word, extreme_word, extreme_word, add_to_word, append),
+    *(cut, cut, cut, flip_bits, flip_bits, put, put, put, put),
+    *(extreme_word, extreme_word, extreme_word, add_to_word),
 )
 
 
@@ -230,9 +214,7 @@ def changed_tree(draw: Draw, tree: Any) -> Any:
         if not paths or chance(draw, 1):
             return _hostile_value(draw, tree)
         *way, key = choice(draw, *paths)
-        holder = tree
-        for step in way:
-            holder = holder[step]
+        holder = reduce(getitem, way, tree)
         kind = choice(draw, "value", "value", "value", "value", "delete", "add")
         if kind == "value":
             holder[key] = _hostile_value(draw, holder[key])
@@ -259,10 +241,7 @@ def deep_json(draw: Draw, data: bytes) -> bytes:
         return inner[: choice(draw, len(inner), deep)]
     tree = json.loads(data)
     *way, key = choice(draw, *_paths(tree))
-    holder = tree
-    for step in way:
-        holder = holder[step]
-    holder[key] = "@deep@"
+    reduce(getitem, way, tree)[key] = "@deep@"
     return dump(tree).replace(b'"@deep@"', inner, 1)
 
 

@@ -17,7 +17,7 @@ import torch
 import trimesh
 from helpers import micro
 from helpers.gaussians import khr_glb, some
-from helpers.images import ADOBE_RGB, colour_profile
+from helpers.images import ADOBE_RGB, bytes_of, colour_profile
 from helpers.matting import matting_network
 from helpers.released import theirs
 from PIL import Image
@@ -54,13 +54,6 @@ def as_json(value: Any) -> bytes:
     return json.dumps(value).encode()
 
 
-def encoded(picture: Image.Image, form: str = "PNG", **options) -> bytes:
-    """The bytes of a picture in one of PIL's formats."""
-    content = io.BytesIO()
-    picture.save(content, form, **options)
-    return content.getvalue()
-
-
 def rgba(size: int = 24) -> np.ndarray:
     """``[size, size, 4]`` uint8: a coloured disc on a transparent ground."""
     y, x = np.mgrid[:size, :size]
@@ -71,7 +64,7 @@ def rgba(size: int = 24) -> np.ndarray:
 
 def png(size: int = _SIZE) -> bytes:
     """A small RGBA picture."""
-    return encoded(Image.fromarray(rgba(size)))
+    return bytes_of(Image.fromarray(rgba(size)))
 
 
 def pictures() -> Kinds:
@@ -82,28 +75,28 @@ def pictures() -> Kinds:
     plain, exif = on_white.convert("RGB"), Image.Exif()
     wide = rgba()[..., 0].astype(np.uint16) * 257
     exif[0x0112] = 6
-    palette = encoded(plain.quantize(16), transparency=0)
+    palette = bytes_of(plain.quantize(16), transparency=0)
     return {
-        "png-rgba": {"photo.png": encoded(cut)},
-        "png-16": {"photo.png": encoded(Image.fromarray(wide))},
-        "png-16-key": {"photo.png": encoded(Image.fromarray(wide), transparency=0)},
-        "png-profile": {"photo.png": encoded(cut, icc_profile=colour_profile(ADOBE_RGB))},
+        "png-rgba": {"photo.png": bytes_of(cut)},
+        "png-16": {"photo.png": bytes_of(Image.fromarray(wide))},
+        "png-16-key": {"photo.png": bytes_of(Image.fromarray(wide), transparency=0)},
+        "png-profile": {"photo.png": bytes_of(cut, icc_profile=colour_profile(ADOBE_RGB))},
         "png-palette": {"photo.png": palette},
-        "png-grey": {"photo.png": encoded(grey)},
-        "png-bit": {"photo.png": encoded(grey.convert("1"))},
-        "jpeg": {"photo.jpg": encoded(plain, "JPEG", exif=exif)},
-        "jpeg-progressive": {"photo.jpg": encoded(plain, "JPEG", progressive=True)},
-        "jpeg-cmyk": {"photo.jpg": encoded(plain.convert("CMYK"), "JPEG")},
+        "png-grey": {"photo.png": bytes_of(grey)},
+        "png-bit": {"photo.png": bytes_of(grey.convert("1"))},
+        "jpeg": {"photo.jpg": bytes_of(plain, "JPEG", exif=exif)},
+        "jpeg-progressive": {"photo.jpg": bytes_of(plain, "JPEG", progressive=True)},
+        "jpeg-cmyk": {"photo.jpg": bytes_of(plain.convert("CMYK"), "JPEG")},
         "jpeg-press": {
-            "photo.jpg": encoded(plain.convert("CMYK"), "JPEG", icc_profile=colour_profile("CMYK"))
+            "photo.jpg": bytes_of(plain.convert("CMYK"), "JPEG", icc_profile=colour_profile("CMYK"))
         },
-        "webp": {"photo.webp": encoded(cut, "WEBP", lossless=True)},
-        "webp-lossy": {"photo.webp": encoded(cut, "WEBP", quality=70)},
-        "gif": {"photo.gif": encoded(plain.quantize(16), "GIF")},
-        "tiff": {"photo.tif": encoded(cut, "TIFF")},
-        "tiff-deflate": {"photo.tiff": encoded(cut, "TIFF", compression="tiff_deflate")},
-        "tiff-float": {"photo.tif": encoded(Image.fromarray(wide / np.float32(65535)), "TIFF")},
-        "bmp": {"photo.bmp": encoded(plain, "BMP")},
+        "webp": {"photo.webp": bytes_of(cut, "WEBP", lossless=True)},
+        "webp-lossy": {"photo.webp": bytes_of(cut, "WEBP", quality=70)},
+        "gif": {"photo.gif": bytes_of(plain.quantize(16), "GIF")},
+        "tiff": {"photo.tif": bytes_of(cut, "TIFF")},
+        "tiff-deflate": {"photo.tiff": bytes_of(cut, "TIFF", compression="tiff_deflate")},
+        "tiff-float": {"photo.tif": bytes_of(Image.fromarray(wide / np.float32(65535)), "TIFF")},
+        "bmp": {"photo.bmp": bytes_of(plain, "BMP")},
         "eps-as-png": {"photo.png": EPS},
     }
 
@@ -112,12 +105,12 @@ def masked_pictures() -> Kinds:
     """Pictures with ``mask.png`` beside them; and one that needs no mask."""
     cut = rgba()
     plain = Image.fromarray(np.where(cut[..., 3:] > 0, cut[..., :3], 255).astype(np.uint8))
-    mask = encoded(Image.fromarray(cut[..., 3]))
+    mask = bytes_of(Image.fromarray(cut[..., 3]))
     busy = Image.fromarray(np.random.default_rng(0).integers(0, 256, (24, 24, 3), np.uint8))
     return {
-        "masked": {"photo.png": encoded(busy), "mask.png": mask},
-        "masked-jpeg": {"photo.jpg": encoded(busy, "JPEG"), "mask.png": mask},
-        "plain-ground": {"photo.png": encoded(plain)},
+        "masked": {"photo.png": bytes_of(busy), "mask.png": mask},
+        "masked-jpeg": {"photo.jpg": bytes_of(busy, "JPEG"), "mask.png": mask},
+        "plain-ground": {"photo.png": bytes_of(plain)},
         "cut-out": {"photo.png": png(24)},
     }
 
@@ -290,14 +283,10 @@ def cameras() -> Kinds:
     """Two cameras as a file of each format."""
     poses = [np.eye(4), np.eye(4)]
     poses[1][:3, 3] = 0.5, -1.5, 2.0
-    head = {"format": "gamba-cameras", "version": 1, "width": 8, "height": 6, "fps": 24, "fov": 50}
-    K = [[9.0, 0, 4], [0, 9.0, 3], [0, 0, 1]]
-    frames = [{"viewmat": poses[0].tolist(), "K": K}, {"viewmat": poses[1].tolist()}]
     path = [{"camera_to_world": p.ravel().tolist(), "fov": 50.0, "aspect": 1.3} for p in poses]
     nerfstudio = {"camera_type": "perspective", "render_height": 6, "render_width": 8}
     nerfstudio |= {"fps": 24, "seconds": 4, "keyframes": [], "camera_path": path}
-    forms = {"ours": head | {"frames": frames}, "nerfstudio": nerfstudio}
-    made = {name: {"cameras.json": as_json(value)} for name, value in forms.items()}
+    made = {"nerfstudio": {"cameras.json": as_json(nerfstudio)}}
     dataset = transforms("chair")["chair/transforms.json"]
     return made | {"transforms": {"transforms.json": dataset}}
 
@@ -318,7 +307,7 @@ def transforms(uid: str, depth: bool = False) -> Files:
         files[f"{uid}/{name}"] = png()
         if depth:
             frame["depth_file_path"] = f"depth_{name}"
-            files[f"{uid}/depth_{name}"] = encoded(Image.fromarray(steps))
+            files[f"{uid}/depth_{name}"] = bytes_of(Image.fromarray(steps))
         frames.append(frame)
     values = {"uid": uid, "name": "A chair", "group": uid, "attribution": {"creator": "Jay"}}
     values |= {"w": _SIZE, "h": _SIZE, "fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 4.0}
@@ -347,8 +336,8 @@ def datasets() -> Kinds:
     for frame in values["frames"]:
         frame["mask_path"] = f"mask_{frame['file_path']}"
         opaque = Image.fromarray(rgba(_SIZE)[..., :3])
-        masked[f"chair/{frame['file_path']}"] = encoded(opaque)
-        masked[f"chair/{frame['mask_path']}"] = encoded(Image.fromarray(rgba(_SIZE)[..., 3]))
+        masked[f"chair/{frame['file_path']}"] = bytes_of(opaque)
+        masked[f"chair/{frame['mask_path']}"] = bytes_of(Image.fromarray(rgba(_SIZE)[..., 3]))
     masked["chair/transforms.json"] = as_json(values)
     camera = {"x": [1.0, 0, 0], "y": [0, 0, -1.0], "z": [0, 1.0, 0], "origin": [0, -1.5, 0]}
     camera = as_json(camera | {"x_fov": 0.8, "y_fov": 0.8})

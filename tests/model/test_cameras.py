@@ -62,14 +62,9 @@ def test_opengl_bridge():
     centre = torch.cat([poses[..., :3, 3], torch.ones(5, 2, 1)], -1)[..., None].double()
     origin = torch.tensor([0.0, 0, 0, 1]).expand(5, 2, 4).double()
     assert_close((viewmats @ centre)[..., 0], origin)
-
-
-def test_blender_camera_known_answer():
-    """Identity in Blender's convention looks along -z with y up."""
-    viewmat = C.from_opengl(torch.eye(4))
-    ahead, above = torch.tensor([0.0, 0, -2, 1]), torch.tensor([0.0, 1, 0, 1])
-    assert (viewmat @ ahead).tolist() == [0, 0, 2, 1]
-    assert (viewmat @ above).tolist() == [0, -1, 0, 1]
+    # Blender's own: identity looks along -z with y up.
+    ahead_above = torch.tensor([[0.0, 0, -2, 1], [0, 1, 0, 1]])
+    assert (ahead_above @ C.from_opengl(torch.eye(4)).mT).tolist() == [[0, 0, 2, 1], [0, -1, 0, 1]]
 
 
 def test_orbit_begins_at_the_reference_camera():

@@ -54,10 +54,6 @@ def _want(vit, images, config):
     return tokens[:, 5:]
 
 
-def test_none():
-    assert build_encoder(_config(encoder="none"), None) is None
-
-
 @pytest.mark.parametrize("normalize", [True, False])
 @pytest.mark.parametrize("form", ["timm.safetensors", "timm.pth", "meta.pth", "nested.pth"])
 def test_local_files(tmp_path, form, normalize):

@@ -11,14 +11,6 @@ from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_shapes(batch):
-    gaussians = Gamba(micro(), "random")(*inputs(batch))
-    assert gaussians.means.shape == (batch, 36, 3)
-    assert gaussians.means.dtype == torch.float32 and gaussians.quats is None
-    assert all(torch.isfinite(v).all() for v in (gaussians.means, gaussians.scales))
-
-
 def test_pictures_of_a_batch_do_not_mix():
     model = Gamba(micro(), "random")
     images, cameras = inputs(3)

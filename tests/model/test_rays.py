@@ -1,11 +1,9 @@
 """Decoder ``rays``: computed tokens, positions of Gaussians, and initialization."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
-from helpers.model import assert_each_alone, inputs, micro
+from helpers.model import BOXES, NOTHING, assert_each_alone, cut_outs, micro
 from helpers.refusals import refused
 from torch.nn.functional import max_pool2d
 
@@ -21,8 +19,6 @@ from gamba_warp.model.predict import model_input, reconstruct
 from gamba_warp.render import render
 
 FIELDS = ("means", "scales", "opacities", "colors")
-# Random noise has no flat cells; a disc on the left, one pixel, a square that touches two sides.
-BOXES = [(slice(5, 9), slice(1, 5)), (slice(7, 8), slice(10, 11)), (slice(0, 12), slice(4, 12))]
 
 
 def rays(**changes) -> GambaConfig:
@@ -39,27 +35,11 @@ def trained(config: GambaConfig) -> Gamba:
     return model
 
 
-def cut_outs(boxes=BOXES) -> tuple[torch.Tensor, Cameras]:
-    """Noise in some boxes of transparent pictures, and a camera each."""
-    torch.manual_seed(5)
-    images, cameras = inputs(len(boxes))
-    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
-    for picture, (rows, columns) in zip(rgba, boxes):
-        picture[rows, columns, 3] = 0.25 + 0.75 * torch.rand_like(picture[rows, columns, 3])
-    return rgba, cameras
-
-
-def one(cameras: Cameras, index: int) -> Cameras:
-    return replace(
-        cameras, viewmats=cameras.viewmats[index : index + 1], Ks=cameras.Ks[index : index + 1]
-    )
-
-
 @pytest.mark.parametrize("segment", [4096, 7])
 def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
     """Also if the batch's row of tokens is cut inside pictures."""
     monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", segment)
-    model, (rgba, cameras) = trained(rays()), cut_outs([*BOXES, (slice(0, 0), slice(0, 0))])
+    model, (rgba, cameras) = trained(rays()), cut_outs([*BOXES, NOTHING])
     cells = 9, 1, 24, 0
     with torch.set_grad_enabled(segment > 7):
         together = assert_each_alone(model, rgba, cameras, cells)
@@ -72,7 +52,7 @@ def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
 def test_gradients_of_a_batch_are_those_of_its_pictures(encoder):
     """Of four pictures in one row of tokens, one of them empty."""
     model = trained(rays(encoder=encoder))
-    rgba, cameras = cut_outs([*BOXES, (slice(0, 0), slice(0, 0))])
+    rgba, cameras = cut_outs([*BOXES, NOTHING])
     weights = {name: p for name, p in model.named_parameters() if p.requires_grad}
 
     def gradients(rgba, cameras):
@@ -84,7 +64,7 @@ def test_gradients_of_a_batch_are_those_of_its_pictures(encoder):
         found = torch.autograd.grad(loss, list(weights.values()), allow_unused=True)
         return [torch.zeros(()) if g is None else g for g in found]
 
-    alone = [gradients(rgba[i : i + 1], one(cameras, i)) for i in range(4)]
+    alone = [gradients(rgba[i : i + 1], cameras[[i]]) for i in range(4)]
     for name, got, *wanted in zip(weights, gradients(rgba, cameras), *alone):
         torch.testing.assert_close(got, sum(wanted), rtol=1e-4, atol=1e-5, msg=name)
 
@@ -95,16 +75,11 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
     torch.manual_seed(6)
     model = Gamba(rays(ray_cells=cells, image_size=40))
     decoder = model.decoder
-    boxes = [
-        (slice(21, 22), slice(17, 18)),
-        (slice(0, 0), slice(0, 0)),
-        (slice(9, 40), slice(0, 40)),
-    ]
+    boxes = [(slice(21, 22), slice(17, 18)), NOTHING, (slice(9, 40), slice(0, 40))]
     rgba = torch.rand(3, 40, 40, 4)
     for picture, (rows, columns) in zip(rgba, boxes):
-        alpha = torch.zeros(40, 40)
-        alpha[rows, columns] = 1
-        picture[..., 3] = alpha
+        picture[..., 3] = 0
+        picture[rows, columns, 3] = 1
     pixels = torch.rand(3, model.config.pixel_channels, 40, 40)
     seen = find_foreground(rgba[..., 3], model.config)
     picture, row, column = seen.cell
@@ -215,7 +190,7 @@ def test_at_the_start_the_picture_is_the_billboard():
     flat, alpha = billboard(truth)
     config = rays(image_size=48, ray_cells=4, width=8)
     with torch.no_grad():
-        made = Gamba(config)(rgba[None], one(cameras, 0))
+        made = Gamba(config)(rgba[None], cameras[[0]])
     shown = render(made, Cameras(cameras.viewmats[None], cameras.Ks[None], 48, 48), torch.ones(3))
     rgb = shown.rgb[0].clamp(0, 1)
     # The smallest Gaussian blurs the rim, which is a tenth of this small disc.
@@ -246,7 +221,7 @@ def test_an_opaque_back_is_as_opaque_as_its_cell_whatever_the_head_says():
 def test_an_empty_picture_has_no_gaussians_and_may_stand_in_a_batch():
     model, (rgba, cameras) = Gamba(rays()), cut_outs()
     empty = torch.zeros_like(rgba[:1])
-    made = model(empty, one(cameras, 0))
+    made = model(empty, cameras[[0]])
     assert made.num == 0
     views = Cameras(cameras.viewmats[:1, None], cameras.Ks[:1, None], 12, 12)
     assert render(made, views, torch.ones(3)).rgb.eq(1).all()
@@ -286,8 +261,6 @@ def test_the_margin_lets_the_network_see_more_patches():
     model, (rgba, cameras) = trained(rays()), cut_outs([BOXES[1]])
     near, wide = model(rgba, cameras), model(rgba, cameras, background_margin=1)
     assert near.num == wide.num == 3 and (near.means - wide.means).abs().max() > 1e-3
-    with pytest.raises(ValueError, match="background_margin is -1"):
-        model(rgba, cameras, background_margin=-1)
 
 
 def test_configurations_of_older_files_mean_the_paper():
@@ -299,7 +272,7 @@ def test_configurations_of_older_files_mean_the_paper():
     refused("patch_size 4 is not a multiple of ray_cells 3", rays, ray_cells=3)
     refused("ray_cells 4 is not a multiple of ray_coarse 3", rays, ray_cells=4, ray_coarse=3)
     with pytest.raises(ValueError, match=r"images is \(1, 12, 12, 3\), expected"):
-        Gamba(rays())(torch.rand(1, 12, 12, 3), one(cut_outs()[1], 0))
+        Gamba(rays())(torch.rand(1, 12, 12, 3), cut_outs()[1][[0]])
 
 
 def test_reconstruct_gives_the_alpha_to_the_model():

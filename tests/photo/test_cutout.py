@@ -49,13 +49,14 @@ def test_each_way_in_its_order(tmp_path, network, busy):
     path, alpha = busy
     rgb = load_rgba(path)[..., :3]
     transparent, plain, mask = (tmp_path / f"{n}.png" for n in ("alpha", "plain", "mask"))
-    save_image(transparent, np.dstack([rgb, alpha]))
-    save_image(plain, rgb * alpha[..., None] + 1 - alpha[..., None])
     half = alpha * (np.arange(SIZE[1]) < SIZE[1] // 2)
+    on_white = rgb * alpha[..., None] + 1 - alpha[..., None]
+    save_image(transparent, np.dstack([on_white, alpha - half]))
+    save_image(plain, on_white)
     save_image(mask, half)
     ways = Ways(matte_model=network)
     for file, how, want in (
-        (transparent, "alpha", alpha),
+        (transparent, "alpha", alpha - half),
         (path, "matte", alpha),
         (plain, "matte", alpha),  # a given network comes before colours
         (plain, "plain", alpha),
@@ -137,7 +138,8 @@ def test_a_doubt_names_the_way_to_a_network_unless_it_is_refused(tmp_path, monke
     rgb[20:, 30:50] = 0.8, 0.2, 0.1  # down to the lower edge
     save_image(tmp_path / "post.png", rgb)
     ways = Ways(say=lambda line: None)
-    assert "--cutout matte (179 MB, fetched once)" in cut_out(tmp_path / "post.png", ways).warning
+    advice = "--cutout matte (isnet-general-use, 179 MB, Apache 2.0, fetched once)"
+    assert advice in cut_out(tmp_path / "post.png", ways).warning
     assert ways.matte() is None
     found = cut_out(tmp_path / "post.png", ways)
     assert (

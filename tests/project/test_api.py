@@ -12,14 +12,8 @@ from helpers.forked import python
 
 import gamba_warp
 from gamba_warp import kernels
-from gamba_warp.cameras import Cameras
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import load_rgba, save_image
-from gamba_warp.kernels.causal_conv1d.function import causal_conv1d
-from gamba_warp.kernels.rasterize.function import rasterization
-from gamba_warp.kernels.selective_scan.function import selective_scan
 from gamba_warp.model.checkpoint import load_model
-from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.predict import reconstruct
 from gamba_warp.render import render
 
@@ -44,14 +38,6 @@ def test_every_public_name_is_there_and_listed(package):
         assert name in dir(package)
     with pytest.raises(AttributeError, match="no_such_name"):
         package.no_such_name  # noqa: B018
-
-
-def test_the_names_are_the_functions_and_classes():
-    assert gamba_warp.Gamba is Gamba and gamba_warp.Cameras is Cameras
-    assert gamba_warp.Gaussians is Gaussians and gamba_warp.render is render
-    assert gamba_warp.load_model is load_model and gamba_warp.reconstruct is reconstruct
-    assert kernels.selective_scan is selective_scan and kernels.causal_conv1d is causal_conv1d
-    assert kernels.rasterization is rasterization
 
 
 def test_importing_the_packages_is_light():

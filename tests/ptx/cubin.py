@@ -16,7 +16,7 @@ _SECTION = np.dtype("<u4, <u4, V16, <u8, <u8, V24")  # name, kind, .., offset, s
 _SYMBOL = np.dtype("<u4, V20")  # name, ..
 _EMPTY = 8  # kind of a section that takes no room in the file
 _REGISTERS, _FRAME = 0x2F, 0x11  # attributes
-_LOAD_LOCAL, _STORE_LOCAL = 0x983, 0x387  # operations LDL and STL
+_LOAD_LOCAL = 0x983  # operation LDL
 _STACK_POINTER = 1  # register R1
 RESERVED = 1024  # bytes of shared memory that the system takes per block, from sm_80 on
 
@@ -29,19 +29,13 @@ class Resources(NamedTuple):
         frame: bytes of stack of a thread, in local memory: arrays that are indexed at run time,
             and spilled registers.
         shared: static shared memory of a block, bytes, without what the system reserves.
-        instructions: of the kernel, those of functions it calls not counted.
-        local_loads: instructions that load from local memory.
-        local_stores: instructions that store to it.
-        reloads: of ``local_loads`` those at a fixed place of the stack, which is how a spilled
+        reloads: instructions that load from a fixed place of the stack, which is how a spilled
             register is fetched; no kernel has more spills than these.
     """
 
     registers: int
     frame: int
     shared: int
-    instructions: int
-    local_loads: int
-    local_stores: int
     reloads: int
 
 
@@ -89,10 +83,7 @@ def _read(elf: bytes) -> dict[str, Resources]:
         if f".text.{name}" not in data or f".nv.info.{name}" not in data:
             continue
         code = np.frombuffer(data[f".text.{name}"], "<u8")[::2]
-        loads, stores = (code & 0xFFF == operation for operation in (_LOAD_LOCAL, _STORE_LOCAL))
-        reloads = loads & (code >> 24 & 0xFF == _STACK_POINTER)
+        reloads = (code & 0xFFF == _LOAD_LOCAL) & (code >> 24 & 0xFF == _STACK_POINTER)
         shared = max(0, sizes.get(f".nv.shared.{name}", 0) - hidden)
-        counts = (int(x.sum()) for x in (loads, stores, reloads))
-        frame = found[_FRAME].get(name, 0)
-        kernels[name] = Resources(registers, frame, shared, len(code), *counts)
+        kernels[name] = Resources(registers, found[_FRAME].get(name, 0), shared, int(reloads.sum()))
     return kernels

@@ -13,7 +13,7 @@ from helpers.model import SMALLEST, inputs
 from gamba_warp.cameras import Cameras
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
-from gamba_warp.kernels.rasterize import depth_quantile, rasterization
+from gamba_warp.kernels.rasterize import depth_quantile
 from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.kernels.rasterize.cuda.bin import bin_views
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
@@ -116,51 +116,10 @@ def test_original_rasterizer(name):
     check(lambda: first_splatting.compare(name), PARTS[2])
 
 
-@pytest.mark.parametrize("channels", [3, 5])
-def test_absolute_gradients(monkeypatch, channels):
-    """Also of more channels than a launch has."""
-    found = rasters.absolute_gradients(monkeypatch)
-    with standing_in(None):
-        rasters.compare(rasters.crowded(channels))
-    (want,) = found
-    check(lambda: rasters.compare(rasters.crowded(channels)), PARTS[2])
-    assert want.any()
-    for got in found[1:]:
-        assert_rel_rms(got, want, rasters.GRADIENT, "absolute")
-
-
 def test_sizes():
     def run():
         for width, height, num in ((16, 16, 33), (17, 15, 9), (3, 1, 60)):
             rasters.compare(rasters.make(2, 1, num, width, height, size=0.3))
-
-    check(run)
-
-
-@pytest.mark.parametrize("needs", [rasters.NAMES, ["colors"]])
-def test_without_room(needs):
-    """The lists have no room for what there is: pictures and gradients are made without lists."""
-    scene = rasters.crowded()
-
-    def run():
-        tensors = rasters.leaves(scene, torch.float32)
-        for name, x in tensors.items():
-            if isinstance(x, torch.Tensor):
-                x.requires_grad_(name in needs)
-        results = []
-        for _ in range(2):
-            renders, alphas, meta = rasterization(**tensors)
-            torch.manual_seed(1)
-            v = torch.randn_like(renders), torch.randn_like(alphas)
-            v = v[: 2 if alphas.requires_grad else 1]
-            wanted = [tensors[name] for name in needs]
-            grads = torch.autograd.grad((renders, alphas)[: len(v)], wanted, v)
-            results.append([renders, alphas, *grads, depth_quantile(meta)])
-            (room,) = capacity._counts[torch.device("cpu")].shapes.values()
-            capacity._counts[torch.device("cpu")].on_host.numpy()[room.slot] = 0
-            room.pairs = 0
-        assert meta.bins.count > meta.bins.pairs.numel()
-        assert all(map(torch.equal, *results)), "with room and without"
 
     check(run)
 

@@ -31,8 +31,7 @@ def boxes(tmp_path_factory):
     for name in ("a", "b"):
         trimesh.creation.box(extents=SIDES).export(root / "meshes" / f"{name}.ply")
     render_views(root / "meshes", root / "data", views=5, size=16, depth=True, workers=1)
-    split = {"version": 2, "train": ["a"], "val": ["b"], "test": []}
-    (root / "data" / "split.json").write_text(json.dumps(split))
+    micro.write_split(root / "data", train=["a"], val=["b"])
     return root / "data"
 
 

@@ -74,8 +74,7 @@ def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, share):
     data = replace(open_data(options), objects=[0])
     dataset = data.train
     poses = dataset.files(0).camera_to_world
-    # The clouds' cameras stand 60° apart; the one at the front is not the first.
-    assert front_views(poses) == [0, micro.VIEWS // 2] or len(front_views(poses)) >= 1
+    assert 0 < len(front_views(poses)) < micro.VIEWS
     source = Batches(data, options, micro.ALONE)
     views = dataset.load(0)
     seen = set()

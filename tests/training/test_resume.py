@@ -59,6 +59,8 @@ def test_another_length_goes_on_at_the_rate_of_the_checkpoint(data, done, tmp_pa
 def test_a_finished_run_says_that_its_rate_rises_again(data, done, tmp_path, capsys):
     shutil.copytree(done, tmp_path / "run")
     out = tmp_path / "run"
+    assert run(data, out, length={"steps": 8}, optim={"ema": 0.5}) == 0
+    assert same_weights(out / "model.safetensors", done / "model.safetensors")  # left alone
     assert run(data, out, length={"steps": 40}, optim={"ema": 0.5}) == 0
     assert "goes to 0.000923, the new length's own, in a tenth of" in capsys.readouterr().out
     rates = [line["lr"] for line in lines(out, "train")][8:]

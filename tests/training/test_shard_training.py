@@ -145,12 +145,10 @@ def test_a_damaged_object_is_skipped_and_a_damaged_tar_ends_the_run(data, tmp_pa
     assert list_checkpoints(tmp_path / "short"), "nothing is lost"
 
 
-@pytest.mark.parametrize(
-    "name, value", [("extra", lambda data: (data,)), ("cache", lambda data: True)]
-)
-def test_options_of_folders_are_refused(data, packed, tmp_path, name, value):
-    views = {name: value(data)}
-    refused(f"--{name}: needs a folder of objects", run, packed, tmp_path / "run", views=views)
+def test_options_of_folders_are_refused(data, packed, tmp_path):
+    for name, value in (("extra", (data,)), ("cache", True)):
+        line = f"--{name}: needs a folder of objects"
+        refused(line, run, packed, tmp_path / "run", views={name: value})
 
 
 def test_a_dead_server_is_one_line(tmp_path, capsys):

@@ -63,31 +63,23 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_the_bar_is_of_the_minutes_and_a_log_has_none(data, tmp_path, monkeypatch):
-    def drawn(stream, out, **length):
+def test_progress_is_a_bar_on_a_terminal_and_lines_in_a_log(data, tmp_path, monkeypatch):
+    def shown(stream, out, **length):
         monkeypatch.setattr(sys, "stderr", stream)
-        assert run(data, out, length=length) == 0
+        assert run(data, tmp_path / out, length=length) == 0
         return stream.getvalue()
 
-    assert "\r" not in drawn(io.StringIO(), tmp_path / "log", steps=2)
-    assert "2/2" in drawn(Terminal(), tmp_path / "steps", steps=2)
-    shown = drawn(Terminal(), tmp_path / "minutes", steps=None, minutes=0.02)
-    assert "of 0.02 min, step=1, loss=" in shown and re.search(r"\b(9\d|100)%\|", shown), shown
-
-
-def test_a_log_gets_lines_of_progress(data, tmp_path, monkeypatch):
-    def logged(out, **length):
-        monkeypatch.setattr(sys, "stderr", io.StringIO())
-        assert run(data, out, length=length) == 0
-        return sys.stderr.getvalue()
-
+    assert "2/2" in shown(Terminal(), "steps", steps=2)
+    minutes = {"steps": None, "minutes": 0.02}
+    bar = shown(Terminal(), "minutes", **minutes)
+    assert "of 0.02 min, step=1, loss=" in bar and re.search(r"\b(9\d|100)%\|", bar), bar
     monkeypatch.setattr(batch, "LINE_SECONDS", 3600.0)  # a busy machine may need ten seconds
-    assert logged(tmp_path / "quick", steps=3) == ""
+    assert shown(io.StringIO(), "quick", steps=3) == ""
     monkeypatch.setattr(batch, "LINE_SECONDS", 0.0)
-    text = logged(tmp_path / "steps", steps=3)
+    text = shown(io.StringIO(), "log", steps=3)
     assert "3/3 steps [00:0" in text and "loss=" in text and "psnr=" in text
     assert "\r" not in text and all(text.splitlines())
-    assert "of 0.02 min, step=1, loss=" in logged(tmp_path / "time", steps=None, minutes=0.02)
+    assert "of 0.02 min, step=1, loss=" in shown(io.StringIO(), "log of minutes", **minutes)
 
 
 def test_lines_of_progress_are_seconds_apart(monkeypatch):
@@ -174,23 +166,13 @@ def test_nothing_is_loaded_where_a_part_is_damaged(data, tmp_path, monkeypatch):
     assert not loaded
 
 
-def test_finished_run_is_left_alone_and_can_be_lengthened(data, tmp_path):
-    assert run(data, tmp_path, length={"steps": 2}) == 0
-    shutil.copy(tmp_path / "model.safetensors", tmp_path / "before.safetensors")
-    assert run(data, tmp_path, length={"steps": 2}) == 0
-    assert micro.same_weights(tmp_path / "before.safetensors", tmp_path / "model.safetensors")
-    assert run(data, tmp_path, length={"steps": 4}) == 0
-    assert lines(tmp_path, "end")[-1]["step"] == 4
-
-
 def test_a_run_learns_and_writes_everything(tmp_path):
     """One object for training and validation: better by far than at the start."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     data = micro.write_dataset(tmp_path / "clouds", 1)
     shutil.copytree(data / "clouda", data / "cloudb")
-    split = {"version": 2, "train": ["clouda"], "val": ["cloudb"], "test": []}
-    (data / "split.json").write_text(json.dumps(split))
+    micro.write_split(data, train=["clouda"], val=["cloudb"])
     options = {"views": {"batch_size": 4, "views_per_object": 3}, "run": {"val_every": 60}}
     options |= {"length": {"steps": 120}, "optim": {"lr": 5e-3, "ema": 0.9}}
     assert run(data, tmp_path, **options) == 0
@@ -279,22 +261,18 @@ def test_collapse_warns_once(data, tmp_path):
     assert ["collapse" in w["message"] for w in lines(tmp_path, "warning")] == [True]
 
 
-def test_other_options_and_another_model_are_refused(data, tmp_path):
-    assert run(data, tmp_path, length={"steps": 1}) == 0
-    refused("optim.lr", run, data, tmp_path, optim={"lr": 2e-3})
-    refused("loss.radial_mask", run, data, tmp_path, loss={"radial_mask": False})
-    refused("run.seed", run, data, tmp_path, run={"seed": 7})
-    deeper = (*micro.MODEL[:3], "depth=2")
-    refused(r"model\.depth \(1 there, 2 here\)", run, data, tmp_path, deeper)
-
-
-def test_never_resume_and_resume_from_a_path(data, tmp_path):
+def test_a_run_is_resumed_only_as_asked(data, tmp_path):
     assert run(data, tmp_path / "a", length={"steps": 2}) == 0
     refused("already holds a run", run, data, tmp_path / "a", run={"resume": "never"})
-    assert run(data, tmp_path / "b", run={"resume": str(tmp_path / "a")}) == 0
-    assert [record["step"] for record in lines(tmp_path / "b", "train")] == [3, 4, 5, 6]
     with pytest.raises(UserError, match="no checkpoint there"):
-        run(data, tmp_path / "c", run={"resume": str(tmp_path / "nothing")})
+        run(data, tmp_path / "b", run={"resume": str(tmp_path / "nothing")})
+    refused("optim.lr", run, data, tmp_path / "a", optim={"lr": 2e-3})
+    refused("loss.radial_mask", run, data, tmp_path / "a", loss={"radial_mask": False})
+    refused("run.seed", run, data, tmp_path / "a", run={"seed": 7})
+    deeper = (*micro.MODEL[:3], "depth=2")
+    refused(r"model\.depth \(1 there, 2 here\)", run, data, tmp_path / "a", deeper)
+    assert run(data, tmp_path / "c", run={"resume": str(tmp_path / "a")}) == 0
+    assert [record["step"] for record in lines(tmp_path / "c", "train")] == [3, 4, 5, 6]
 
 
 def test_bad_data_and_bad_options(data, tmp_path):
@@ -333,22 +311,6 @@ def test_views_are_distinct_while_they_last():
     assert choose_views(6, 3, 0, rng)[0] == 0
     assert len(choose_views(2, 4, None, rng)) == 5
     assert choose_views(1, 2, None, rng) == [0, 0, 0]
-
-
-def test_input_view_is_the_model_s_reference(data):
-    """The camera of any input view is the reference camera in the model's world."""
-    from gamba_warp.data.dataset import open_dataset
-    from gamba_warp.train.batches import load_sample
-
-    config = micro.options(data, data).model_config()
-    dataset = open_dataset(data, "train")
-    batch = load_sample(dataset, 0, [3, 1], 8, config, torch.ones(3))
-    want = torch.eye(4)
-    want[2, 3] = config.distance
-    torch.testing.assert_close(batch.input_cameras.viewmats[0], want, atol=1e-5, rtol=0)
-    torch.testing.assert_close(batch.cameras.viewmats[0, 0], want, atol=1e-5, rtol=0)
-    assert batch.targets.shape == (1, 2, 8, 8, 4) and batch.inputs.shape == (1, 16, 16, 3)
-    assert batch.inputs[0, 0, 0].min() > 0.99, "the input lies on white"
 
 
 def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):

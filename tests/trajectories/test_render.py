@@ -50,14 +50,14 @@ def test_a_turntable_of_pictures_with_its_cameras(thing, tmp_path, capsys):
     made = np.stack(pictures(folder))
     # rounding to 8 bits
     np.testing.assert_allclose(made / 255, seen.rgb.numpy(), atol=0.51 / 255)
-    # cameras.json has the same cameras in the file's frame, where depths are as long as there
-    stated = load_path(folder / "cameras.json")
+    # transforms.json has the same cameras in the file's frame, where depths are as long as there
+    stated = load_path(folder / "transforms.json")
     own = render(gaussians, stated.cameras.to(torch.float32), torch.ones(3), depth=True)
     # The place of a camera far from the origin has fewer digits.
     np.testing.assert_allclose(made / 255, own.rgb.numpy(), atol=0.02)
-    document = json.loads((folder / "cameras.json").read_text())
+    document = json.loads((folder / "transforms.json").read_text())
     for number, frame in enumerate(document["frames"]):
-        assert frame["picture"] == f"{number:04d}.png"
+        assert frame["file_path"] == f"{number:04d}.png"
         depth = np.asarray(Image.open(folder / frame["depth"])) * frame["depth_unit"]
         known = own.alpha[number, ..., 0].numpy() > 0.51
         want = own.depth[number, ..., 0].numpy()
@@ -69,15 +69,15 @@ def test_cameras_of_a_file_are_in_the_frame_of_the_gaussians(thing, tmp_path):
     viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[:, :3, 3] = -CENTER + torch.tensor([[0.0, 0, 9], [0.5, 0, 8]])
     cameras = Cameras(viewmats, intrinsics(31, 22, 45.0).repeat(2, 1, 1), 31, 22)
-    save_path(tmp_path / "cameras.json", cameras, fps=7)
-    options = ["--trajectory", tmp_path / "cameras.json", "--kind", "png"]
+    save_path(tmp_path / "transforms.json", cameras, fps=7)
+    options = ["--trajectory", tmp_path / "transforms.json", "--kind", "png"]
     assert shoot(path, "--out", tmp_path / "out", *options, "--background", "none") == 0
     made = np.stack(pictures(tmp_path / "out" / "thing")) / 255
     seen = render(gaussians, cameras)
     np.testing.assert_allclose(made[..., 3:], seen.alpha.numpy(), atol=0.01)
     np.testing.assert_allclose(made[..., :3] * made[..., 3:], seen.rgb.numpy(), atol=0.01)
     assert made[..., 3].max() > 0.5
-    again = load_path(tmp_path / "out" / "thing" / "cameras.json")
+    again = load_path(tmp_path / "out" / "thing" / "transforms.json")
     assert torch.allclose(again.cameras.viewmats, cameras.viewmats.double()) and again.fps == 7
 
 
@@ -153,7 +153,7 @@ def test_a_folder_of_other_files_is_not_replaced(thing, tmp_path, capsys):
     assert "holds other files (notes.txt)" in capsys.readouterr().err
     (folder / "notes.txt").unlink()
     assert shoot(path, *options) == 0
-    assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png", "cameras.json"]
+    assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png", "transforms.json"]
 
 
 @pytest.mark.parametrize("kind", ["gif", "mp4", "png"])

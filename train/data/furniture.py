@@ -17,10 +17,10 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from gamba_warp.batch import progress_bar
-from gamba_warp.errors import UserError
+from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import PART, atomic_folder, output_folder, write_json
 from gamba_warp.formats.catalogue import CATALOGUE, check_rotation
-from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
+from gamba_warp.untrusted.archives import open_zip
 from gamba_warp.untrusted.names import parts_of, plain_name
 
 from .groups import ObjectInfo, split_groups, textures_of
@@ -97,18 +97,14 @@ def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
         if INSTALLED.is_dir():
             return INSTALLED
         deb = _download(scratch)
-    # A .deb is an ar archive with a tar inside.
-    with tempfile.TemporaryFile(dir=scratch) as data:
-        name = read_ar(deb, "data.tar", data)
-        with open_tar(data, f"{deb}: {name}", scratch) as members:
-            for member in members:
-                if member.name.endswith(".sh3f"):
-                    file = scratch / plain_name(PurePosixPath(member.name).name, str(deb))
-                    if file.exists():
-                        raise UserError(f"{deb}: {file.name} occurs twice")
-                    with file.open("wb") as target:
-                        shutil.copyfileobj(member.file, target)
-    return scratch
+    if not deb.is_file():
+        raise UserError(f"{deb}: no such file")
+    if shutil.which("dpkg-deb") is None:
+        raise UserError(f"dpkg-deb is missing: unpack {deb}, and pass the folder as --tree")
+    result = subprocess.run(["dpkg-deb", "--extract", str(deb), str(scratch / "deb")], **_TEXT)
+    if result.returncode:
+        raise UserError(f"{deb}: cannot be unpacked ({first_line(Exception(result.stderr))})")
+    return _find_libraries(None, scratch / "deb", scratch)
 
 
 def _download(folder: Path) -> Path:

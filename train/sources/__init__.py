@@ -1,1 +1,1 @@
-"""Published datasets: G-Objaverse, Objaverse, GSO; and shards of views."""
+"""Published datasets: GSO; and shards of views."""

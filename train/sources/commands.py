@@ -18,11 +18,10 @@ from msgspec import Meta
 
 from gamba_warp.batch import counted
 from gamba_warp.errors import UserError
-from gamba_warp.files import output_folder, write_json
+from gamba_warp.files import output_folder
 from gamba_warp.untrusted.ranges import Seed, ranged, shard_numbers
 
 from ..data.settings import Settings
-from .objaverse_lists import Lists
 
 Item = TypeVar("Item")
 
@@ -32,7 +31,7 @@ _WITHOUT = {
     "val": "training does not validate",
     "test": "eval-views needs --split",
 }
-_MAX_SHOWN = 20  # failures of Objaverse that are printed; the record has all
+_MAX_SHOWN = 20  # damaged objects that are printed; the list has all
 
 
 @dataclass(frozen=True)
@@ -195,62 +194,6 @@ def data_pack_command(
     if note := background_note(open_dataset(data)):
         print(f"warning: {data}: {note}", file=sys.stderr)
     return _report(failures, "failed", {})
-
-
-@ranged
-def data_objaverse_command(
-    out: tyro.conf.Positional[Path],
-    source: Path,
-    lists: tyro.conf.OmitArgPrefixes[Lists],
-    share: tyro.conf.OmitArgPrefixes[Share],
-    min_views: Annotated[int, Meta(ge=1, le=10_000)] = 40,
-    copy: bool = False,
-) -> int:
-    """Make a dataset of a local copy of G-Objaverse.
-
-    Folders are linked; of tars only the files for training are unpacked. Existing objects are
-    skipped, so a stopped command can be continued. OUT/objaverse.json records the choice.
-    docs/data.md has the commands for the paper's training set.
-
-    Args:
-        out: folder to make or to continue.
-        source: folder of G-Objaverse (folders or tars).
-        lists: lists of objects.
-        share: selection of these objects.
-        min_views: complete views that an object must have; published are 40.
-        copy: copy the files of folders instead of linking them.
-    """
-    from .objaverse_views import find_rendered, take_views
-
-    first, count = share.numbers
-    objects = find_rendered(source)
-    if out.resolve() == source.resolve():
-        raise UserError(f"{out}: is --source itself; choose another folder")
-    chosen = lists.choose(objects)
-    names = share.of(chosen.names)
-    out = output_folder(out)
-    for what, number in chosen.counts.items():
-        print(f"{number:>9,} {what}")
-    taken, failures = take_views(objects, names, out, min_views, copy)
-    record = out / ("objaverse.json" if count == 1 else f"objaverse.{first}-{count}.json")
-    known = {name: chosen.uids[name] for name in names if name in chosen.uids}
-    about = {
-        "source": str(source),
-        "counts": chosen.counts,
-        "shard": share.shard,
-        "objects": len(names),
-    }
-    write_json(record, about | {"objaverse": known, "left_out": failures})
-    there = len(names) - taken - len(failures)
-    found = f"{there:,} existed, {len(failures):,} left out"
-    print(f"{counted(taken, 'object')} put into {out}, {found}")
-    for name, reason in list(failures.items())[:_MAX_SHOWN]:
-        print(f"left out: {name}: {reason}", file=sys.stderr)
-    if (rest := len(failures) - _MAX_SHOWN) > 0:
-        print(f"left out: {rest:,} more, see {record}", file=sys.stderr)
-    _report_empty_splits(out)
-    print(f"next: gamba train {out} ...")
-    return 1 if failures else 0
 
 
 def data_index_command(data: tyro.conf.Positional[Path]) -> int:

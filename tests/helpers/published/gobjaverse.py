@@ -1,13 +1,13 @@
 """Objects in the published layouts of G-Objaverse, small."""
 
-import io
 import json
 import math
-import tarfile
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from helpers.images import bytes_of
 
 # 25 views on an orbit, of which the last repeats the first, top and bottom, 13 on another orbit.
 VIEWS = 40
@@ -50,47 +50,15 @@ def files_of(number: int) -> dict[str, bytes]:
     values["bbox"] = [[-0.5, -0.31, -0.5], [0.5, 0.31, 0.5]]
     pixels = np.zeros((SIZE, SIZE, 4), np.uint8)
     pixels[8:24, 8:24] = (200, number, 50, 255)
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG")
+    picture = bytes_of(Image.fromarray(pixels))
     others = {suffix: b"not read" for suffix in OTHERS}
-    return {".json": json.dumps(values).encode(), ".png": stream.getvalue(), **others}
+    return {".json": json.dumps(values).encode(), ".png": picture, **others}
 
 
-def members(name: str, views: int = VIEWS) -> dict[str, bytes]:
-    """The files of an object's tar; ``name`` is its instance_id."""
-    return {
-        f"{name}/campos_512_v4/{number:05d}/{number:05d}{suffix}": data
-        for number in range(views)
-        for suffix, data in files_of(number).items()
-    }
-
-
-def write_object(folder: Path, layout: str, views: int = VIEWS) -> None:
-    """Write an object.
-
-    Args:
-        folder: ``ROOT/dictionary_id/instance_id``.
-        layout: "readme", that of the set's README and its tars; "script", that of its script for
-            single files; "tar".
-        views: number of views.
-    """
-    made = members(folder.name, views)
-    if layout == "tar":
-        write_tar(folder.with_suffix(".tar"), made)
-        return
-    for name, data in made.items():
-        path = folder.parent / name
-        if layout == "script":
-            path = folder / path.relative_to(folder / "campos_512_v4")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-
-
-def write_tar(path: Path, content: dict[str, bytes]) -> None:
-    """Write a plain tar of these files."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tarfile.open(path, "w") as tar:
-        for name, data in content.items():
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
+def write_object(folder: Path, views: int = VIEWS) -> None:
+    """Write an object; ``folder`` is ``ROOT/dictionary_id/instance_id``."""
+    for number in range(views):
+        view = folder / "campos_512_v4" / f"{number:05d}"
+        view.mkdir(parents=True)
+        for suffix, data in files_of(number).items():
+            (view / f"{number:05d}{suffix}").write_bytes(data)

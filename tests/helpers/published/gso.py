@@ -1,11 +1,12 @@
 """Models in the published layout of Google Scanned Objects, small."""
 
-import io
 import zipfile
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from helpers.images import bytes_of
 
 # Metadata of a model, with another name.
 PBTXT = """model {
@@ -64,9 +65,7 @@ def texture() -> bytes:
     """A picture, red on the left and blue on the right."""
     pixels = np.zeros((8, 8, 3), np.uint8)
     pixels[:, :4, 0] = pixels[:, 4:, 2] = 255
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG")
-    return stream.getvalue()
+    return bytes_of(Image.fromarray(pixels))
 
 
 def files() -> dict[str, bytes]:

@@ -4,7 +4,9 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.model import (
+    BOXES,
     FIELDS,
+    NOTHING,
     assert_each_alone,
     assert_plain_form,
     assert_recomputed_alike,
@@ -112,7 +114,7 @@ def test_a_batch_on_rays_is_each_picture_alone(gradients):
     changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
     model = Gamba(micro(mixer="attention", attention_heads=2, encoder="none", **changes))
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
-    rgba, cameras = cut_outs()
+    rgba, cameras = cut_outs([*BOXES, NOTHING])
     with torch.set_grad_enabled(gradients):
         together = assert_each_alone(model, rgba, cameras, (9, 1, 24, 0))
         if gradients:

@@ -4,6 +4,8 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.model import (
+    BOXES,
+    NOTHING,
     assert_each_alone,
     assert_plain_form,
     assert_recomputed_alike,
@@ -76,7 +78,7 @@ def test_a_batch_on_rays_is_each_picture_alone():
     changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
     model = Gamba(micro(image_tokens="mixed", **changes), "random")
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
-    assert_each_alone(model, *cut_outs(), (9, 1, 24, 0))
+    assert_each_alone(model, *cut_outs([*BOXES, NOTHING]), (9, 1, 24, 0))
 
 
 def test_condition_recomputation_and_autocast():

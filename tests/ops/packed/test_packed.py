@@ -5,6 +5,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from helpers import on_threads
 from helpers.kernels import conv_inputs
 from helpers.scan import gradients, leaves, make
 
@@ -133,12 +134,8 @@ def test_borders_that_nobody_looks_at_are_bounded(from_ptx):
 def test_scan_in_segments(channels, states, threads):
     """A packed sequence is cut for the threads in the same places as one alone."""
     lengths = [700, 3, 0, 300, 512, 256, 1, 1030]
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
+    with on_threads(threads):
         assert_as_alone(scan, scan_inputs(lengths, channels, states), lengths, 1e-5)
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("device", ["cpu", "ptx"])

@@ -191,9 +191,15 @@ def test_equal_depths(cuts):
     assert (rasterization(**back)[0] - got[1][..., :3]).abs().max() > 0.01, "order has no effect"
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", GAUSSIAN)
-def test_not_finite(name, value):
+@pytest.mark.parametrize(
+    "name, value, reason",
+    [
+        *((n, x, "not_finite") for n in GAUSSIAN for x in (math.nan, math.inf, -math.inf)),
+        *(("scales", 1e30, "not_finite"), ("means", 1e20, None)),
+        *(("opacities", -1.0, "transparent"), ("opacities", 1e-3, "transparent")),
+    ],
+)
+def test_bad_gaussians_are_left_out_and_counted(name, value, reason):
     """Every entry of an input, each in another Gaussian: the rest stays, to the bit."""
     scene = base(90)
     bad = mapped(scene, torch.Tensor.clone)
@@ -208,7 +214,7 @@ def test_not_finite(name, value):
     renders, alphas, grads, meta = survives(bad)
     want, _, want_grads, _ = survives(rest)
     assert torch.equal(renders, want) and alphas.mean() > 0.1
-    assert meta["culled"]["not_finite"] == 2 * size
+    assert reason is None or meta["culled"][reason] == 2 * size
     for key in NAMES:
         got = grads[key][:, keep] if key in GAUSSIAN else grads[key]
         assert key not in GAUSSIAN or (grads[key][:, place] == 0).all(), key

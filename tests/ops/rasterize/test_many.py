@@ -118,13 +118,31 @@ def test_pairs_are_numbered_by_gaussian(monkeypatch):
     assert bins.offsets[0] == 0 and bins.offsets[-1] == total
 
 
-def test_repeatable_with_any_number_of_threads(monkeypatch):
-    monkeypatch.setattr(bin_cpu, "MANY", 0)
-    scene = make(1, 2, 400, 90, 61)
-    want = call(scene)
-    for threads in (1, 3, 5):
+@pytest.mark.parametrize("many", [0, 1 << 30])
+def test_repeatable_with_any_number_of_threads(monkeypatch, many):
+    monkeypatch.setattr(bin_cpu, "MANY", many)
+    scene = make(2, 3, 400, 90, 61)
+    want = call(scene, render_mode="RGB+ED")
+    for threads in (1, 2, 2, 5):
         with on_threads(threads):
-            assert_same(want, call(scene))
+            assert_same(want, call(scene, render_mode="RGB+ED"))
+
+
+def projected(gaussians, colors, **changes):
+    """The inputs, lens and projection on lanes, which is that on threads to the bit."""
+    viewmats = torch.eye(4).repeat(2, 3, 1, 1)
+    viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
+    viewmats[..., 2, 3] = 2.0
+    Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
+    options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=0.0)
+    options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=0, skip_unused=1)
+    lens, inputs = make_lens(LensOptions(**options | changes)), [*gaussians, colors, viewmats, Ks]
+    got = projection.project_forward(inputs, lens, project_on_lanes)
+    want = projection.project_forward(inputs, lens, project_on_threads)
+    for name, value in want._asdict().items():
+        assert torch.equal(getattr(got, name), value), name
+    assert len(got.status.unique()) >= (5 if gaussians[0].shape[1] > 300 else 3)
+    return inputs, lens, got
 
 
 @pytest.mark.parametrize(
@@ -132,7 +150,6 @@ def test_repeatable_with_any_number_of_threads(monkeypatch):
     [(1037, True, 0, 0, 3), (530, True, 1, 0, 1), (77, False, 0, 1, 5), (9, True, 0, 0, 18)],
 )
 def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
-    """To the bit: the operations are the same, in the same order."""
     means, scales = torch.randn(2, num, 3), torch.exp(torch.randn(2, num, 3) - 3.5)
     quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
     colors = torch.rand(2, num, channels)
@@ -141,25 +158,14 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
         for x in (means, quats, scales, opacities, colors):
             bad = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e30, 1e-30, 0.0]).repeat(2)
             x.view(-1)[torch.randperm(x.numel())[: len(bad)]] = bad
-    viewmats = torch.eye(4).repeat(2, 3, 1, 1)
-    viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
-    viewmats[..., 2, 3] = 2.0
-    Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
-    options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=1.5)
-    options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=antialiased, rounded=rounded)
-    lens = make_lens(LensOptions(skip_unused=1, **options))
-    inputs = means, quats if rotated else None, scales, None, opacities, colors
-    got = projection.project_forward([*inputs, viewmats, Ks], lens, project_on_lanes)
-    want = projection.project_forward([*inputs, viewmats, Ks], lens, project_on_threads)
-    for name, value in want._asdict().items():
-        assert torch.equal(getattr(got, name), value), name
-    assert len(got.status.unique()) >= (5 if num > 500 else 3)
+    gaussians = means, quats if rotated else None, scales, None, opacities
+    projected(gaussians, colors, radius_clip=1.5, antialiased=antialiased, rounded=rounded)
 
 
 @pytest.mark.parametrize("original", [0, 1])
 @pytest.mark.parametrize("shape", ["covars", "quats", "scales"])
 def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original):
-    """To the bit, forward and backward, also of covariances that rounding has made indefinite."""
+    """Also backward, and of covariances that rounding has made indefinite."""
     num = 331
     means, scales = torch.randn(2, num, 3), torch.exp(2 * torch.randn(2, num, 3) - 3.5)
     quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
@@ -170,22 +176,10 @@ def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original)
     covars[:, 30:35], covars[0, 35, 2] = 0.0, torch.nan
     given = {"covars": (None, None, covars), "quats": (quats, scales, None)}
     gaussians = means, *given.get(shape, (None, scales, None)), opacities
-    viewmats = torch.eye(4).repeat(2, 3, 1, 1)
-    viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
-    viewmats[..., 2, 3] = 2.0
-    Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
-    options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=0.0)
-    options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=0, original=original)
-    lens = make_lens(LensOptions(skip_unused=1, **options))
-    inputs = [*gaussians, torch.rand(2, num, 3), viewmats, Ks]
-    got = projection.project_forward(inputs, lens, project_on_lanes)
-    want = projection.project_forward(inputs, lens, project_on_threads)
-    for name, value in want._asdict().items():
-        assert torch.equal(getattr(got, name), value), name
-    assert len(got.status.unique()) >= 5
+    inputs, lens, got = projected(gaussians, torch.rand(2, num, 3), original=original)
     v = [torch.randn_like(x) for x in got[:4]]
     wanted = [x is not None for x in gaussians] + [False]
-    kept = [*gaussians, viewmats, Ks], lens, got.conics, got.status, v, wanted
+    kept = [*gaussians, *inputs[-2:]], lens, got.conics, got.status, v, wanted
     of_lanes, of_threads = (
         projection.project_backward(*kept, run) for run in (vjp_on_lanes, vjp_on_threads)
     )

@@ -4,8 +4,11 @@ import pytest
 import torch
 from helpers import assert_same_on_threads
 
-from gamba_warp.kernels.ssim import dissimilarity, lanes
+from gamba_warp.kernels.ssim import dissimilarity, lanes, products
 from gamba_warp.kernels.ssim.reference import dissimilarity_reference
+
+# Of kernels and of products.
+every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 
 
 def pictures(shape, seed=0):
@@ -40,9 +43,11 @@ def test_value_and_gradient_are_those_of_the_definition(monkeypatch, shape, toge
     assert none is None and torch.equal(alone, value)
 
 
-@pytest.mark.parametrize("shape", [(1, 11, 11, 1), (3, 11, 43, 3), (2, 37, 75, 2)])
-def test_products_in_float64(shape):
-    """Pictures of up to three tiles of columns, in groups of all sizes."""
+@pytest.mark.parametrize("together", [1, 2 * 37 * 75 * 2, 1 << 20])
+@pytest.mark.parametrize("shape", [(1, 11, 11, 1), (3, 11, 43, 3), (5, 37, 75, 2)])
+def test_products_in_float64(monkeypatch, shape, together):
+    """Pictures of up to three tiles of columns, one at a time, two and all together."""
+    monkeypatch.setattr(products, "_TOGETHER", together)
     got, want = (x.double() for x in pictures(shape))
     value, slope = dissimilarity(got, want, True)
     wanted, gradient = truth(got, want)
@@ -63,17 +68,19 @@ def test_flat_pictures_keep_their_digits():
     assert (slope.double() - gradient).norm() < 1e-3 * gradient.norm()
 
 
+@every_dtype
 @pytest.mark.parametrize("place", [(0, 0), (24, 30), (0, 30), (12, 15)])
-def test_one_differing_pixel_is_found_anywhere(place):
+def test_one_differing_pixel_is_found_anywhere(place, dtype):
     torch.manual_seed(1)
-    want = torch.rand(2, 25, 31, 3)
+    want = torch.rand(2, 25, 31, 3, dtype=dtype)
     got = want.clone()
     got[1, place[0], place[1]] += 0.5
     value, slope = dissimilarity(got, want, True)
     wanted, gradient = truth(got, want)
-    torch.testing.assert_close(value.double(), wanted, rtol=0, atol=1e-6)
-    torch.testing.assert_close(slope.double(), gradient, rtol=1e-3, atol=1e-7)
-    assert value[0] == 0 and slope[0].eq(0).all()
+    exact, rtol, atol = (1e-6, 1e-3, 1e-7) if dtype == torch.float32 else (1e-12, 1e-9, 1e-12)
+    torch.testing.assert_close(value.double(), wanted, rtol=0, atol=exact)
+    torch.testing.assert_close(slope.double(), gradient, rtol=rtol, atol=atol)
+    assert value[0] == 0 and slope[0].eq(0).all() and slope[1].ne(0).any()
 
 
 def test_threads_and_runs_change_no_bit():
@@ -81,8 +88,9 @@ def test_threads_and_runs_change_no_bit():
     assert_same_on_threads(lambda: dissimilarity(got, want, True), 1, 2, 3, 1)
 
 
-def test_nan_stays_in_its_picture():
-    got, want = pictures((3, 20, 20, 3))
+@every_dtype
+def test_nan_stays_in_its_picture(dtype):
+    got, want = (x.to(dtype) for x in pictures((3, 20, 20, 3)))
     got[1, 5, 5] = torch.nan
     value, slope = dissimilarity(got, want, True)
     assert value[1].isnan() and value[[0, 2]].isfinite().all()

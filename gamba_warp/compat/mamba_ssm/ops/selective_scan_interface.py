@@ -116,15 +116,22 @@ def mamba_inner_fn_no_out_proj(
 def mamba_inner_fn(
     xz: Tensor, conv1d_weight: Tensor, conv1d_bias: Tensor | None, x_proj_weight: Tensor,
     delta_proj_weight: Tensor, out_proj_weight: Tensor, out_proj_bias: Tensor | None, A: Tensor,
-    *args: Any, **options: Any,
+    B: Tensor | None = None, C: Tensor | None = None, D: Tensor | None = None,
+    delta_bias: Tensor | None = None, B_proj_bias: Tensor | None = None,
+    C_proj_bias: Tensor | None = None, delta_softplus: bool = True, checkpoint_lvl: int = 1,
+    b_rms_weight: Tensor | None = None, c_rms_weight: Tensor | None = None,
+    dt_rms_weight: Tensor | None = None, b_c_dt_rms_eps: float = 1e-6, *, A_b: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """Run a Mamba block after its first projection: convolution, small projections, scan, output.
 
     The arguments are those of ``mamba_inner_fn_no_out_proj``, with a last projection
     ``out_proj_weight [M, D]`` and ``out_proj_bias [M]`` or None. Returns ``[B, L, M]``.
     """
-    given = xz, conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight, A
-    y = mamba_inner_fn_no_out_proj(*given, *args, **options)
+    weights = conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight
+    rest = B_proj_bias, C_proj_bias, delta_softplus, checkpoint_lvl
+    norms = b_rms_weight, c_rms_weight, dt_rms_weight, b_c_dt_rms_eps
+    given = xz, *weights, A, B, C, D, delta_bias, *rest, *norms
+    y = mamba_inner_fn_no_out_proj(*given, A_b=A_b)
     return F.linear(y.transpose(1, 2), out_proj_weight, out_proj_bias)
 
 

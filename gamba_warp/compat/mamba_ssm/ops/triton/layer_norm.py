@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ....shared import check_tensor
+from ....shared import check_tensor, with_order
 
 __all__ = ["RMSNorm", "layer_norm_fn", "layer_norm_ref", "rms_norm_fn", "rms_norm_ref"]
 
@@ -70,9 +69,14 @@ def layer_norm_fn(
     return outs[0] if len(outs) == 1 else tuple(outs)
 
 
-rms_norm_fn = partial(layer_norm_fn, is_rms_norm=True)
+_COMMON = "x weight bias residual x1 weight1 bias1 eps dropout_p rowscale prenorm "
+_REFERENCE = _COMMON + "dropout_mask dropout_mask1 upcast"
+rms_norm_fn = with_order(
+    layer_norm_fn, _COMMON + "residual_in_fp32 return_dropout_mask", is_rms_norm=True
+)
 # References in plain torch, as these are.
-layer_norm_ref, rms_norm_ref = layer_norm_fn, rms_norm_fn
+layer_norm_ref = with_order(layer_norm_fn, _REFERENCE)
+rms_norm_ref = with_order(layer_norm_fn, _REFERENCE, is_rms_norm=True)
 
 
 class RMSNorm(nn.Module):

@@ -1,1 +1,0 @@
-"""Fitting of Gaussians to one object by optimisation, without a model."""
