@@ -38,13 +38,13 @@ def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
     check_lines(path, f"{count} vertices and {faces} faces,", count + faces, len(rows.sizes))
     table = rows.part(0, count).table(f"{path}: vertices")
     if count and table.shape[1] < 3:
-        raise UserError(f"{path}: row 1 is not whole")
+        raise UserError(f"{path}: row 1 has too few numbers")
     numbers, sizes = rows.part(count, faces)
     starts = np.cumsum(sizes) - sizes
     lengths = numbers[starts]
     bad = ~((lengths >= 0) & (lengths < sizes) & (lengths == np.rint(lengths)))
     if bad.any():
-        raise UserError(f"{path}: row {count + bad.argmax() + 1} is not whole")
+        raise UserError(f"{path}: row {count + bad.argmax() + 1} has too few numbers")
     points, lengths = table[:, :3], lengths.astype(np.int64)
     corners = numbers[spread(starts + 1, lengths)]
     places = cut_polygons(sides, points, corners, lengths)

@@ -37,7 +37,7 @@ COUNTS = {degree: count for count, degree in DEGREES.items()}
 
 @dataclass
 class Unpacked:
-    """Numbers of an ``.spz``, all of one kind after the other, and the header's values."""
+    """Decoded arrays of an ``.spz``, attribute by attribute, and the header's values."""
 
     body: bytes | bytearray
     version: int
