@@ -150,13 +150,13 @@ class Rows(NamedTuple):
     values: np.ndarray  # [M] float64, of all rows one after the other
     sizes: np.ndarray  # [N] int64, how many each row has
 
-    def column(self, number: int) -> np.ndarray:
-        """Return ``[N]`` float64, a number of each row; of shorter rows any."""
-        if len(self.sizes) and (self.sizes == self.sizes[0]).all() and number < self.sizes[0]:
-            return self.values[number :: self.sizes[0]]
-        return np.append(self.values, 0.0).take(
-            np.cumsum(self.sizes) - self.sizes + number, mode="clip"
-        )
+    def columns(self, *numbers: int) -> np.ndarray:
+        """Return ``[N, C]`` float64, these numbers of each row; of shorter rows any."""
+        width = int(self.sizes[0]) if len(self.sizes) else 0
+        if max(numbers) < width and (self.sizes == width).all():
+            return self.values.reshape(-1, width)[:, numbers]
+        at = (np.cumsum(self.sizes) - self.sizes)[:, None] + np.array(numbers, np.int64)
+        return np.append(self.values, 0.0).take(at, mode="clip")
 
     def part(self, first: int, count: int) -> Rows:
         """Return ``count`` rows from the ``first`` on."""

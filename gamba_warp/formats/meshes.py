@@ -143,7 +143,7 @@ def load_mesh(
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     sides = SideFiles(path, root=root)
-    parts: list[_Whole] = []
+    parts: list[TexturedMesh] = []
     count = 0
     reader = _READERS[path.suffix.lower()]
     try:
@@ -162,20 +162,8 @@ def load_mesh(
         raise UserError(f"{path}: not enough memory for it") from error
 
 
-@dataclass
-class _Whole:
-    """A part with all that a ``TexturedMesh`` has, and without unused vertices."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    material: Material
-    normals: np.ndarray | None
-    uvs: np.ndarray
-    colors: np.ndarray
-
-
-def _complete(part: Part, sides: SideFiles) -> _Whole:
-    """Replace what a part has not. Raises UserError if a vertex is not finite."""
+def _complete(part: Part, sides: SideFiles) -> TexturedMesh:
+    """Return a part as a mesh. Raises UserError if a vertex is not finite."""
     faces, kept = used_vertices(part.faces, len(part.vertices))
     vertices = part.vertices if kept is None else part.vertices[kept]
     if not np.isfinite(vertices).all():
@@ -194,11 +182,12 @@ def _complete(part: Part, sides: SideFiles) -> _Whole:
     zeros = np.zeros((*faces.shape, 2), np.float32)
     uvs = zeros if uvs is None else np.nan_to_num(uvs.astype(np.float32))
     colors = np.full((*faces.shape, 4), 255, np.uint8) if colors is None else colors
-    return _Whole(vertices, faces, material, part.normals, uvs, colors)
+    ids = np.zeros(len(faces), np.int64)
+    return TexturedMesh(vertices, faces, uvs, colors, ids, [material], part.normals)
 
 
-def _joined(parts: list[_Whole], sides: SideFiles) -> TexturedMesh:
-    """Return complete parts as one mesh. Raises UserError if it has no usable extent."""
+def _joined(parts: list[TexturedMesh], sides: SideFiles) -> TexturedMesh:
+    """Return meshes of one material each as one. Raises UserError if it has no usable extent."""
 
     def all_of(name: str) -> np.ndarray:
         arrays = [getattr(part, name) for part in parts]
@@ -213,7 +202,7 @@ def _joined(parts: list[_Whole], sides: SideFiles) -> TexturedMesh:
         raise UserError(f"{sides.path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
     if extent <= 0:
         raise UserError(f"{sides.path}: all vertices are one point")
-    materials = list({id(part.material): part.material for part in parts}.values())
+    materials = list({id(part.materials[0]): part.materials[0] for part in parts}.values())
     numbers = {id(material): number for number, material in enumerate(materials)}
     if not any(map(_is_visible, parts)):
         sides.warnings.append("all its surfaces are transparent by their alpha: drawn opaque")
@@ -223,29 +212,26 @@ def _joined(parts: list[_Whole], sides: SideFiles) -> TexturedMesh:
             if material.texture is not None:
                 rgb = material.texture[..., :3]
                 material.texture = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-    normals = None
-    if any(part.normals is not None for part in parts):
+    at, normals = 0, None
+    if any(part.given_normals is not None for part in parts):
         for part in parts:
-            if part.normals is None:
-                part.normals = _vertex_normals(part.vertices, part.faces)
-        normals = all_of("normals")
-    at = 0
+            if part.given_normals is None:
+                part.given_normals = _vertex_normals(part.vertices, part.faces)
+        normals = all_of("given_normals")
     for part in parts:
+        part.material_ids += numbers[id(part.materials[0])]
         part.faces = part.faces + at if at else part.faces
         at += len(part.vertices)
-    sizes = [len(part.faces) for part in parts]
-    ids = np.repeat([numbers[id(part.material)] for part in parts], sizes)
-    told = (list(dict.fromkeys(lines)) for lines in (sides.warnings, sides.omitted))
-    return TexturedMesh(
-        vertices, all_of("faces"), all_of("uvs"), colors, ids, materials, normals, *told
-    )
+    warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
+    arrays = vertices, all_of("faces"), all_of("uvs"), colors, all_of("material_ids")
+    return TexturedMesh(*arrays, materials, normals, warnings, omitted)
 
 
-def _is_visible(part: _Whole) -> bool:
-    """Return True if a part may have a pixel of an alpha of 1/255."""
-    texture = part.material.texture
-    most = 255 if texture is None else int(texture[..., 3].max(initial=0))
-    return float(part.material.color[3]) * most * int(part.colors[..., 3].max(initial=0)) >= 255
+def _is_visible(part: TexturedMesh) -> bool:
+    """Return True if a mesh of one material may have a pixel of an alpha of 1/255."""
+    (material,) = part.materials
+    texture = 255 if material.texture is None else int(material.texture[..., 3].max(initial=0))
+    return float(material.color[3]) * texture * int(part.colors[..., 3].max(initial=0)) >= 255
 
 
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

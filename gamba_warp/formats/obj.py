@@ -58,8 +58,8 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
     vertices, uvs, normals = map(joined_rows, found.rows.values())
     points, colors = _vertices(vertices)
     # A texture may have one coordinate.
-    vertex_uvs = np.stack([uvs.column(0), np.where(uvs.sizes > 1, uvs.column(1), 0.0)], 1)
-    vertex_normals = np.stack([normals.column(axis) for axis in range(3)], 1)
+    vertex_uvs, vertex_normals = uvs.columns(0, 1), normals.columns(0, 1, 2)
+    vertex_uvs[uvs.sizes < 2, 1] = 0.0
     corners, lengths = np.concatenate(found.corners) - 1, np.concatenate(found.lengths)
     places = cut_polygons(sides, points, corners[:, 0], lengths)
     beyond = corners >= [len(points), len(vertex_uvs), len(vertex_normals)]
@@ -96,15 +96,14 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
 
 def _vertices(rows: Rows) -> tuple[np.ndarray, np.ndarray | None]:
     """Return positions ``[V, 3]``, and colours ``[V, 4]`` uint8 if one is not white."""
-    points = np.stack([rows.column(axis) for axis in range(3)], 1)
+    points = rows.columns(0, 1, 2)
     if (homogeneous := rows.sizes == 4).any():
-        w = np.where(homogeneous, rows.column(3), 1.0)
-        points /= np.where(w == 0, 1.0, w)[:, None]
+        w = np.where(homogeneous[:, None], rows.columns(3), 1.0)
+        points /= np.where(w == 0, 1.0, w)
     if not (colored := rows.sizes >= 6).any():
         return points, None
     colors = np.full((len(points), 4), 255, np.uint8)
-    rgb = np.stack([rows.column(channel) for channel in (3, 4, 5)], 1)
-    colors[colored] = to_rgba8(rgb[colored])
+    colors[colored] = to_rgba8(rows.columns(3, 4, 5)[colored])
     return points, colors if (colors < 255).any() else None
 
 

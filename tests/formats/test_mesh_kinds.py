@@ -182,7 +182,7 @@ f -1 -2 -3
 
 @pytest.mark.parametrize("block", [30, 60, 1 << 24])
 def test_a_text_is_read_in_blocks_of_any_length(tmp_path, monkeypatch, block):
-    """What counts back, and the material in use, go on from one to the next."""
+    """Indices that count back, and the material in use, go on from one to the next."""
     monkeypatch.setattr("gamba_warp.formats.headers._BLOCK", block)
     mesh = loaded(tmp_path, "a.obj", MIXED)
     corners = [[0, 0, 1], [0, 1, 0], [1, 0, 0]], [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
