@@ -44,7 +44,7 @@ def reason_of(error: BaseException) -> str:
     return " ".join(text.split()) or type(error).__name__
 
 
-def why_not_written(error: BaseException) -> str | None:
+def write_error(error: BaseException) -> str | None:
     """Return why a file could not be written, in one line; None for an unrelated error.
 
     safetensors has its own error type, also for a full disk.
@@ -90,7 +90,7 @@ def _unfinished(path: Path) -> Iterator[Path]:
         folder = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
         yield folder
     except Exception as error:
-        reason = why_not_written(error)
+        reason = write_error(error)
         if reason is None:
             raise
         raise UserError(f"cannot write {path}: {reason}") from error
@@ -348,7 +348,7 @@ def only_process(folder: Path, what: str) -> Iterator[None]:
         message = f"{folder}: another process {what} here (pid {number})"
         raise UserError(message) from error
     except (OSError, NotImplementedError) as error:
-        raise UserError(f"cannot lock {folder}: {why_not_written(error) or error}") from error
+        raise UserError(f"cannot lock {folder}: {write_error(error) or error}") from error
     try:
         with suppress(OSError):  # a full disk: the lock holds all the same
             path.write_text(f"{os.getpid()}\n", encoding="utf-8")

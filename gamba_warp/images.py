@@ -416,15 +416,15 @@ def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Im
         table = np.asarray(colours(Image.fromarray(levels[None])))[0, :, 1]
         if np.abs(table.astype(int) - levels).max() <= 1:
             return None
-        return _beside_alpha(lambda band: band.convert("L").point(table.tolist()))
+        return _keeping_alpha(lambda band: band.convert("L").point(table.tolist()))
     if mode == "RGB":
         grid = np.stack(np.meshgrid(*3 * [levels[::15]]), -1).reshape(18, -1, 3)
         if np.abs(np.asarray(colours(Image.fromarray(grid))).astype(int) - grid).max() <= 1:
             return None
-    return _beside_alpha(colours)
+    return _keeping_alpha(colours)
 
 
-def _beside_alpha(
+def _keeping_alpha(
     colours: Callable[[Image.Image], Image.Image],
 ) -> Callable[[Image.Image], Image.Image]:
     """Extend a conversion to pictures with alpha, which is copied."""

@@ -14,12 +14,13 @@ import numpy as np
 from gamba_warp.data.layouts import Placement
 from gamba_warp.errors import UserError
 from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
-from gamba_warp.formats.clouds import read_cloud
+from gamba_warp.formats.clouds import Cloud, cloud_of, read_cloud
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind
 from gamba_warp.formats.headers import open_shape
 from gamba_warp.formats.meshes import Y_TO_Z_UP, default_up, load_mesh
 from gamba_warp.formats.names import SPLAT_SUFFIXES
-from gamba_warp.formats.ply_data import read_ply_header
+from gamba_warp.formats.ply import gaussians_of
+from gamba_warp.formats.ply_data import MAX_SPLATS, PlyData, parse_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import extract_surface
 from gamba_warp.surfaces.options import SurfaceOptions
@@ -107,7 +108,7 @@ def load_truth(
         UserError: the file cannot be read, holds Gaussians, or has no extent; or ``rotation`` is
             not a rotation.
     """
-    shape = load_shape(path)
+    shape, axes = _read_shape(path)
     if isinstance(shape, Gaussians):
         raise UserError(f"{path}: Gaussians, the truth must be a mesh or a point cloud")
     try:
@@ -120,7 +121,7 @@ def load_truth(
             warning = f"--up {protocol.up} contradicts DATA, {_FOLLOWED}"
         elif placement is not None and asked is None:
             warning = _OTHER_FILES
-        axes = asked or axes_of(path, shape)
+        axes = asked or axes
         motion = unit_motion(shape, axes, rotation)
         found = _loaded(shape, motion.apply(shape), motion, axes, protocol)
         return replace(found, warning=warning)
@@ -136,21 +137,6 @@ def _same_up(
         turn = turn @ np.asarray(rotation, np.float64)
     up, other = placement.transform[2, :3], turn[2]
     return up @ other > (1 - ROUNDED) * np.linalg.norm(up) * np.linalg.norm(other)
-
-
-def axes_of(path: Path, shape: Shape) -> str:
-    """Return the axes of a shape's file by its format, or by the comment "axes NAME" of a ``.ply``.
-
-    ``UNKNOWN`` without either.
-    """
-    if isinstance(shape, Gaussians):
-        return "opencv"
-    if path.suffix.lower() == ".ply":
-        with open_shape(path) as (file, _):
-            known = {f"axes {axes}": axes for axes in TO_Z_UP}
-            found = [known[c] for c in read_ply_header(path, file).comments if c in known]
-        return found[0] if found else UNKNOWN
-    return "opengl" if default_up(path) == "y" else UNKNOWN
 
 
 def turn_between(axes: str, frame: str) -> np.ndarray:
@@ -174,9 +160,10 @@ def load_prediction(
     Raises:
         UserError: it cannot be read, has no surface, or lies far away.
     """
-    source, axes = load_shape(path), protocol.pred_axes
+    source, of_file = _read_shape(path)
+    axes = protocol.pred_axes
     if axes == "auto" and protocol.frame != "unit":
-        axes = axes_of(path, source)
+        axes = of_file
     if axes in ("auto", "frame"):
         axes = frame_axes
     motion = motion.after(turn_between(axes, frame_axes))
@@ -250,33 +237,50 @@ def load_shape(path: Path) -> Shape:
         UserError: missing, unreadable, empty, with a false header, or with values that are not
             finite or beyond ``HUGE``.
     """
-    suffix = path.suffix.lower()
+    return _read_shape(path)[0]
+
+
+def _read_shape(path: Path) -> tuple[Shape, str]:
+    """Return a shape as ``load_shape`` does, and its file's axes, a key of ``TO_Z_UP``.
+
+    The axes are those of the format, or of the comment "axes NAME" of a ``.ply``; ``UNKNOWN``
+    without either.
+    """
+    suffix, ply = path.suffix.lower(), None
     if suffix not in SUFFIXES:
         raise UserError(f"{path}: not one of {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
+    if suffix in SPLAT_SUFFIXES:
+        with open_shape(path, MAX_SPLATS) as (file, size):
+            if file.read(3) == b"ply":
+                file.seek(0)
+                ply = parse_ply(path, file, size)
     shape: Shape
-    if suffix in SPLAT_SUFFIXES and splat_kind(path) is not None:
-        shape = read_gaussians(path)
-    elif suffix in CLOUD_SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
-        shape = _load_points(path)
+    axes = "opengl" if default_up(path) == "y" else UNKNOWN
+    if ply is not None and ply.header.has_gaussians:
+        shape, axes = gaussians_of(path, ply), "opencv"
+    elif ply is not None and suffix == ".ply":
+        known = {f"axes {name}": name for name in TO_Z_UP}
+        axes = next((known[line] for line in ply.header.comments if line in known), UNKNOWN)
+        shape = _mesh(path, ply) if ply.header.has_faces else _points(cloud_of(path, ply))
+    elif suffix in SPLAT_SUFFIXES and splat_kind(path) is not None:
+        shape, axes = read_gaussians(path), "opencv"
     else:
-        mesh = load_mesh(path, normals=False)
-        shape = Mesh(mesh.vertices, mesh.faces, tuple(mesh.omitted))
+        shape = _points(read_cloud(path)) if suffix in CLOUD_SUFFIXES else _mesh(path)
     reach = np.abs(_positions(shape)).max()
     if reach > HUGE:
         raise UserError(f"{path}: coordinates reach {reach:.3g}, over {HUGE:g}")
-    return shape
+    return shape, axes
 
 
-def _has_faces(path: Path) -> bool:
-    """Return True if the header of a ``.ply`` declares faces."""
-    with open_shape(path) as (file, _):
-        return read_ply_header(path, file).has_faces
+def _mesh(path: Path, ply: PlyData | None = None) -> Mesh:
+    mesh = load_mesh(path, ply=ply)
+    return Mesh(mesh.vertices, mesh.faces, tuple(mesh.omitted))
 
 
-def _load_points(path: Path) -> Points:
-    positions, normals = read_cloud(path)
+def _points(cloud: Cloud) -> Points:
+    positions, normals = cloud
     if normals is None:
         return Points(positions)
     with np.errstate(over="ignore"):

@@ -153,7 +153,7 @@ def read_manifest(root: Path) -> Manifest:
 
     Raises:
         UserError: it is invalid, cut short, or older than its dataset; the message names the
-            command that makes it anew.
+            command that writes it again.
     """
     status = plain_file(root / MANIFEST)
     return _read(root, status.st_mtime_ns, status.st_size, status.st_ino)
@@ -161,7 +161,7 @@ def read_manifest(root: Path) -> Manifest:
 
 @lru_cache(maxsize=8)
 def _read(root: Path, *status: int) -> Manifest:
-    path, again = root / MANIFEST, f"gamba data index {root} makes it anew"
+    path, again = root / MANIFEST, f"gamba data index {root} writes it again"
 
     def older(name: str) -> UserError:
         return UserError(f"{path}: older than its dataset, {name or '.'} has changed; {again}")

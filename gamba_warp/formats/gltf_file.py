@@ -114,7 +114,7 @@ class GltfFile:
         return items[index]
 
     def content(self, uri: str) -> bytes:
-        """Return the bytes of a data URI, or of the file of another one."""
+        """Return the bytes of a URI: embedded data, or a file beside the document."""
         if not uri.startswith("data:"):
             found = self.side_file(uri)
             self.size += len(found)

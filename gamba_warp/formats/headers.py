@@ -1,14 +1,13 @@
-"""Checks shared by the readers of shapes: stated counts against the size, tables of numbers."""
+"""Code shared by the readers of shapes: stated counts against the size, numbers in a text."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain, islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -16,11 +15,10 @@ from ..errors import UserError
 
 MAX_FILE = 1 << 30  # bytes of a shape
 SLACK = 2  # bytes after the end: a line end
-MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
+MAX_COLUMNS = 1024  # of a table; descriptors of shape have up to 640
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
-_BOM = b"\xef\xbb\xbf"
-# str.split treats four control characters as blanks; here they become other than ASCII.
-_STRICT = bytes(0xFF if 0x1C <= number <= 0x1F else number for number in range(256))
+BOM = b"\xef\xbb\xbf"
+_BLOCK = 1 << 22  # bytes of a text that are read at once
 
 
 @contextmanager
@@ -38,13 +36,18 @@ def open_shape(path: Path, limit: int = MAX_FILE) -> Iterator[tuple[BinaryIO, in
             size = os.fstat(file.fileno()).st_size
             if size == 0:
                 raise UserError(f"{path}: the file is empty, not a {path.suffix} file")
-            if size > limit:
-                raise UserError(f"{path}: over {limit >> 20} MB, the limit for a shape")
+            check_limit(path, size, limit)
             yield file, size
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise UserError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
     except MemoryError as error:
         raise UserError(f"{path}: not enough memory for it") from error
+
+
+def check_limit(path: Path, size: int, limit: int) -> None:
+    """Raise UserError if a file has more bytes than the limit."""
+    if size > limit:
+        raise UserError(f"{path}: over {limit >> 20} MB, the limit for a shape")
 
 
 def compare_sizes(path: Path, says: str, wanted: int, there: int, exact: bool = True) -> None:
@@ -74,69 +77,171 @@ def check_lines(path: Path, says: str, wanted: int, there: int) -> None:
         raise UserError(f"{path}: truncated or false header, {says} but {there} lines follow")
 
 
-def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
-    """Yield the lines of a text file that are neither blank nor, with ``comments``, begin with it.
+class Lines:
+    """Lines of a text, blank ones too, found without a loop over them.
+
+    Attributes:
+        data: ``[B]`` uint8, the text with a line end behind it.
+        lengths: ``[N]`` int64, bytes of each line with its end.
+        first: ``[N]`` int64, position of each line's first word; of blank lines any.
+        sizes: ``[N]`` int64, number of words.
+    """
+
+    def __init__(self, text: bytes) -> None:
+        self.data = np.frombuffer(text if text.endswith(b"\n") else text + b"\n", np.uint8)
+        blank = is_blank(self.data)
+        words = np.flatnonzero(~blank & np.concatenate([[True], blank[:-1]]))
+        ends = np.flatnonzero(self.data == ord("\n"))
+        before = np.searchsorted(words, ends)
+        self.lengths = np.diff(ends, prepend=-1)
+        self.sizes = np.diff(before, prepend=0)
+        self.first = np.append(words, 0)[before - self.sizes]
+
+    def begin_with(self, word: bytes) -> np.ndarray:
+        """Return ``[N]`` bool, True for the lines whose first word is this one, in this case."""
+        found = self.sizes > 0
+        for place, letter in enumerate(word):
+            found &= self.data.take(self.first + place, mode="clip") == letter
+        return found & is_blank(self.data.take(self.first + len(word), mode="clip"))
+
+    def behind(self, word: bytes, lines: np.ndarray) -> bytes:
+        """Return the text of the lines ``[N]`` bool, which begin with a word, without it."""
+        data = self.data.copy()
+        for place in range(len(word)):
+            data[self.first[lines] + place] = ord(" ")
+        return data[np.repeat(lines, self.lengths)].tobytes()
+
+
+def is_blank(letters: np.ndarray) -> np.ndarray:
+    """Return True for the six blanks of ASCII among ``[N]`` uint8, as C has them."""
+    return (letters == ord(" ")) | (letters - np.uint8(ord("\t")) < 5)
+
+
+def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
+    """Yield a text in parts of whole lines, so that what is made of a part takes little memory.
 
     Raises:
-        UserError: a line is longer than ``MAX_LINE``.
+        UserError: a line is longer than a part.
     """
-    first = True
-    while line := file.readline(MAX_LINE):
-        if len(line) == MAX_LINE:
-            raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
-        # Other characters than ASCII become one that no number has.
-        line = (line.removeprefix(_BOM) if first else line).translate(_STRICT)
-        text = line.decode("ascii", "replace")
-        first = False
-        if not text.isspace() and text and not (comments and text.lstrip().startswith(comments)):
-            yield text
+    at = 0
+    while at < len(text):
+        end = text.find(b"\n", at + _BLOCK, at + 2 * _BLOCK) + 1
+        if not end and len(text) > at + 2 * _BLOCK:
+            raise UserError(f"{source}: a line of more than {_BLOCK} letters")
+        yield text[at : end or len(text)]
+        at = end or len(text)
 
 
-def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ()) -> np.ndarray:
-    """Read lines of numbers as ``[N, C]`` float64; NaN and infinity are numbers here.
+def parse_numbers(text: bytes, count: int, kind: Any = np.float64) -> np.ndarray | None:
+    """Return the ``count`` words of a text as numbers ``[count]``; None if one is no number."""
+    if count == 0:
+        return np.zeros(0, kind)
+    try:
+        found = np.fromstring(text, kind, sep=" ")
+    except ValueError:
+        return None
+    # "1-2" is one word but two numbers; older releases of numpy stop at a word that is none.
+    return found if len(found) == count else None
+
+
+class Rows(NamedTuple):
+    """Rows of numbers."""
+
+    values: np.ndarray  # [M] float64, of all rows one after the other
+    sizes: np.ndarray  # [N] int64, how many each row has
+
+    def columns(self, *numbers: int) -> np.ndarray:
+        """Return ``[N, C]`` float64, these numbers of each row; of shorter rows any."""
+        width = int(self.sizes[0]) if len(self.sizes) else 0
+        if max(numbers) < width and (self.sizes == width).all():
+            return self.values.reshape(-1, width)[:, numbers]
+        at = (np.cumsum(self.sizes) - self.sizes)[:, None] + np.array(numbers, np.int64)
+        return np.append(self.values, 0.0).take(at, mode="clip")
+
+    def part(self, first: int, count: int) -> Rows:
+        """Return ``count`` rows from the ``first`` on."""
+        start, sizes = self.sizes[:first].sum(), self.sizes[first : first + count]
+        return Rows(self.values[start : start + sizes.sum()], sizes)
+
+    def table(self, source: str, columns: tuple[int, ...] = ()) -> np.ndarray:
+        """Return rows of one length as ``[N, C]`` float64.
+
+        Args:
+            source: named in errors.
+            columns: allowed numbers of columns; empty: any.
+
+        Raises:
+            UserError: the rows differ in their length, or have another.
+        """
+        if not len(self.sizes):
+            return np.zeros((0, columns[0] if columns else 0))
+        count = int(self.sizes[0])
+        if (columns and count not in columns) or count > MAX_COLUMNS:
+            wanted = " or ".join(map(str, columns)) or f"{MAX_COLUMNS} at most"
+            raise UserError(f"{source}: {count} columns in the first row, expected {wanted}")
+        if (self.sizes != count).any():
+            row = (self.sizes != count).argmax()
+            change = f"changed from {count} to {self.sizes[row]} at row {row + 1}"
+            raise UserError(f"{source}: the number of columns {change}")
+        return self.values.reshape(-1, count)
+
+
+def parse_rows(text: bytes) -> Rows | None:
+    """Return the rows of a text, one a line, empty for a blank one; None if a word is no number."""
+    sizes = Lines(text).sizes if text else np.zeros(0, np.int64)
+    values = parse_numbers(text, int(sizes.sum()))
+    return None if values is None else Rows(values, sizes)
+
+
+def read_rows(text: bytes, source: str, comments: bool = False) -> Rows:
+    """Read the rows of a text that are not blank; NaN and infinity are numbers here.
 
     Args:
-        lines: one row each.
+        text: as in the file.
         source: named in errors.
-        columns: allowed numbers of columns; empty: any.
+        comments: leave out what follows a ``#`` in its line.
 
     Raises:
-        UserError: a word is not a number, the rows differ in their number of columns, or there are
-            more than ``MAX_VALUES`` numbers.
+        UserError: a word is not a number, there are more than ``MAX_VALUES`` numbers, or as for
+            ``blocks_of``.
     """
-    lines = iter(lines)
-    first = next(lines, None)
-    if first is None:
-        return np.zeros((0, columns[0] if columns else 0))
-    count = len(first.split())
-    if columns and count not in columns:
-        wanted = " or ".join(map(str, columns))
-        raise UserError(f"{source}: {count} columns in the first row, expected {wanted}")
-    most = MAX_VALUES // count
+    found = [Rows(np.zeros(0), np.zeros(0, np.int64))]
+    left = MAX_VALUES
+    for block in blocks_of(text.removeprefix(BOM), source):
+        block = without_comments(block) if comments else block
+        rows = parse_rows(block)
+        if rows is None:
+            raise _no_number(block, source, sum(len(rows.sizes) for rows in found))
+        left -= len(rows.values)
+        if left < 0:
+            raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
+        found.append(Rows(rows.values, rows.sizes[rows.sizes > 0]))
+    return joined_rows(found)
+
+
+def joined_rows(parts: list[Rows]) -> Rows:
+    """Return the rows of one part or more, one after the other."""
+    return Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def _no_number(block: bytes, source: str, before: int) -> UserError:
+    """Return the error of the first word that is no number, ``before`` rows from the start."""
+    rows = (line.split() for line in block.split(b"\n") if not line.isspace() and line)
+    words = ((word, row) for row, line in enumerate(rows, before + 1) for word in line)
+    word, row = next((found for found in words if not is_number(found[0])), (b"", before))
+    shown = word[:60].decode("ascii", "replace")
+    return UserError(f"{source}: could not convert '{shown}' of row {row} to a number")
+
+
+def without_comments(text: bytes) -> bytes:
+    """Return a text without what follows a ``#`` in its line."""
+    return re.sub(rb"#[^\n]*", b"", text) if b"#" in text else text
+
+
+def is_number(word: bytes) -> bool:
+    """Return True if a word is a number."""
     try:
-        table = np.loadtxt(islice(chain([first], lines), most + 1), comments=None, ndmin=2)
-    except ValueError as error:
-        # "...; use `usecols` to select a subset" is advice for programmers.
-        reason = re.split(r"[;\n]", str(error))[0].rstrip(".")
-        raise UserError(f"{source}: {reason[:200]}") from error
-    if len(table) > most:
-        raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
-    return table
-
-
-def read_rows(lines: Iterable[str], source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read rows of different lengths: ``[M]`` float64 of all rows, ``[N]`` int64 their lengths.
-
-    Raises:
-        UserError: as for ``read_table``.
-    """
-    sizes = []
-
-    def words() -> Iterator[str]:
-        for line in lines:
-            row = line.split()
-            sizes.append(len(row))
-            yield from row
-
-    numbers = read_table(words(), source, (1,))[:, 0]
-    return numbers, np.array(sizes, np.int64)
+        float(word)
+    except ValueError:
+        return False
+    return b"_" not in word

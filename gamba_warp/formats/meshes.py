@@ -1,14 +1,15 @@
 """Mesh files as flat arrays: one list of triangles with their corners' normals, UVs and materials.
 
-The readers of the formats yield parts, which are joined without unused vertices; missing normals
-are computed. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up by convention and
-are turned by ``normalized`` (front +z becomes front -y, as in Blender).
+The readers of the formats yield parts, which are joined without unused vertices; normals are
+computed when they are asked for. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up
+by convention and are turned by ``normalized`` (front +z becomes front -y, as in Blender).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ from .gltf import read_gltf
 from .materials import GREY, Material, SideFiles, to_linear
 from .obj import read_obj
 from .off import read_off
-from .parts import Part
+from .parts import Part, used_vertices
+from .ply_data import PlyData
 from .ply_mesh import read_ply_mesh
 from .stl import read_stl
 
@@ -47,24 +49,46 @@ class TexturedMesh:
     Attributes:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64.
-        normals: ``[F, 3, 3]`` float32, unit, on the side of the face's own normal.
         uvs: ``[F, 3, 2]`` float32, v upwards; 0 if missing.
         colors: ``[F, 3, 4]`` uint8 display RGBA; white if missing.
         material_ids: ``[F]`` int64 into ``materials``.
         materials: at least one.
+        given_normals: ``[F, 3, 3]`` of the file, of any length and side, not checked; or None.
         warnings: missing content that was replaced, or unread content, one line each.
         omitted: the warnings that concern the shape.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    normals: np.ndarray
     uvs: np.ndarray
     colors: np.ndarray
     material_ids: np.ndarray
     materials: list[Material]
+    given_normals: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)
     omitted: list[str] = field(default_factory=list)
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """``[F, 3, 3]`` float32, unit, on the side of the face's own normal.
+
+        A corner's is the file's, or without any its vertex's, if it agrees with the face.
+        """
+        first, second, third = (self.vertices[corner] for corner in self.faces.T)
+        flat = np.cross(second - first, third - first)
+        length = np.linalg.norm(flat, axis=1, keepdims=True)
+        flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
+        given = self.given_normals
+        if given is None:
+            smooth = _vertex_normals(self.vertices, self.faces)
+        else:
+            smooth = np.nan_to_num(given)
+            lengths = np.linalg.norm(smooth, axis=2, keepdims=True)
+            smooth = (smooth / np.maximum(lengths, 1e-12)).astype(np.float32)
+        flat = flat.astype(np.float32)
+        agree = np.einsum("fci,fi->fc", smooth, flat)[..., None]
+        smooth *= np.sign(agree)
+        return np.where(np.abs(agree) > CREASE, smooth, flat[:, None])
 
     def normalized(
         self, up: str = "z", rotation: ArrayLike | None = None
@@ -84,12 +108,10 @@ class TexturedMesh:
         points = self.vertices @ turn.T
         low, high = points.min(0), points.max(0)
         center, scale = (low + high) / 2, 1.0 / (high - low).max()
-        normals = self.normals @ np.linalg.inv(turn).astype(np.float32)
-        mesh = replace(
-            self,
-            vertices=(points - center) * scale,
-            normals=normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12),
-        )
+        normals = self.given_normals
+        if normals is not None:
+            normals = normals @ np.linalg.inv(turn).astype(np.float32)
+        mesh = replace(self, vertices=(points - center) * scale, given_normals=normals)
         return mesh, np.hstack([turn, -center[:, None]]), float(scale)
 
 
@@ -98,7 +120,9 @@ def default_up(path: str | Path) -> str:
     return "y" if Path(path).suffix.lower() in Y_UP else "z"
 
 
-def load_mesh(path: str | Path, normals: bool = True, root: Path | None = None) -> TexturedMesh:
+def load_mesh(
+    path: str | Path, root: Path | None = None, ply: PlyData | None = None
+) -> TexturedMesh:
     """Read a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
@@ -107,8 +131,8 @@ def load_mesh(path: str | Path, normals: bool = True, root: Path | None = None) 
 
     Args:
         path: the file.
-        normals: compute normals, which takes much of the time; else they are 0.
         root: the folder above the file in which it may name other files; by default its own.
+        ply: content of a ``.ply`` file that was read already; or None.
 
     Raises:
         UserError: missing, malformed, no faces, vertices not finite, or no extent.
@@ -119,102 +143,100 @@ def load_mesh(path: str | Path, normals: bool = True, root: Path | None = None) 
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     sides = SideFiles(path, root=root)
-    parts, materials, ids, count = [], [], {}, 0
+    parts: list[TexturedMesh] = []
+    count = 0
+    reader = _READERS[path.suffix.lower()]
     try:
-        for part in _READERS[path.suffix.lower()](path, sides):
-            count += len(part.faces) + len(part.vertices)  # a scene may hold one part many times
+        for part in reader(path, sides) if ply is None else read_ply_mesh(path, sides, ply):
+            if not len(part.faces):
+                continue
+            parts.append(_complete(part, sides))
+            count += len(part.faces) + len(parts[-1].vertices)  # a scene may repeat one part
             if count > MAX_PARTS:
                 limit = f"over {MAX_PARTS} vertices and faces, the limit for a mesh"
                 raise UserError(f"{path}: {limit}")
-            if not len(part.faces):
-                continue
-            arrays, material = _flatten(part, sides, normals)
-            number = ids.setdefault(id(material), len(materials))
-            if number == len(materials):
-                materials.append(material)
-            arrays["material_ids"] = np.full(len(part.faces), number)
-            parts.append(arrays)
+        if not parts:
+            raise UserError(f"{path}: no faces")
+        return _joined(parts, sides)
     except MemoryError as error:
         raise UserError(f"{path}: not enough memory for it") from error
-    if not parts:
-        raise UserError(f"{path}: no faces")
-    if not any(_is_visible(part["colors"], materials[part["material_ids"][0]]) for part in parts):
-        sides.warnings.append("all its surfaces are transparent by their alpha: drawn opaque")
-        for part in parts:
-            part["colors"][..., 3] = 255
-        for material in materials:
-            material.color[3] = 1
-            if material.texture is not None:
-                rgb = material.texture[..., :3]
-                material.texture = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-    offsets = np.cumsum([0] + [len(part["vertices"]) for part in parts])
-    for part, offset in zip(parts, offsets):
-        part["faces"] = part["faces"] + offset
-    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    reach = np.abs(joined["vertices"]).max()
-    if reach > MAX_REACH:
-        raise UserError(f"{path}: coordinates reach {reach:.3g}, over {MAX_REACH:g}")
-    extent = np.ptp(joined["vertices"], axis=0).max()
-    if 0 < extent < 1 / MAX_REACH:
-        raise UserError(f"{path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
-    if extent <= 0:
-        raise UserError(f"{path}: all vertices are one point")
-    warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
-    return TexturedMesh(**joined, materials=materials, warnings=warnings, omitted=omitted)
 
 
-def _is_visible(colors: np.ndarray, material: Material) -> bool:
-    """Return True if a part may have a pixel of an alpha of 1/255."""
-    texture = 255 if material.texture is None else int(material.texture[..., 3].max(initial=0))
-    return float(material.color[3]) * texture * int(colors[..., 3].max(initial=0)) >= 255
-
-
-def _flatten(part: Part, sides: SideFiles, normals: bool) -> tuple[dict, Material]:
-    """Return the arrays of one part, without unused vertices, and its material."""
-    used = np.zeros(len(part.vertices), bool)
-    used[part.faces] = True
-    faces, vertices = part.faces, part.vertices
-    if not used.all():
-        faces, vertices = (np.cumsum(used) - 1)[faces], vertices[used]
-    bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
-    if bad:
+def _complete(part: Part, sides: SideFiles) -> TexturedMesh:
+    """Return a part as a mesh. Raises UserError if a vertex is not finite."""
+    faces, kept = used_vertices(part.faces, len(part.vertices))
+    vertices = part.vertices if kept is None else part.vertices[kept]
+    if not np.isfinite(vertices).all():
+        bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
         raise UserError(f"{sides.path}: {bad} of {len(vertices)} vertices are not finite")
-    material, uvs = part.material, part.uvs
+    material, uvs, colors = part.material, part.uvs, part.colors
     if material is None:
         material = Material(np.ones(4, np.float32))
-        if part.colors is None:
+        if colors is None:
             material.color[:3] = to_linear(GREY)
             sides.warnings.append("a part has no material: grey")
     elif material.texture is not None and uvs is None:
         sides.warnings.append("a textured part has no UV coordinates")
         mean = material.texture.mean((0, 1), keepdims=True).astype(np.uint8)
         material = replace(material, texture=mean)
-    corners, colors = faces.shape, part.colors
-    arrays = {"vertices": vertices, "faces": faces}
-    arrays["normals"] = np.zeros((*corners, 3), np.float32)
-    if normals:
-        arrays["normals"] = _corner_normals(vertices, faces, part.normals)
-    uvs = np.zeros((*corners, 2)) if uvs is None else uvs
-    arrays["uvs"] = np.nan_to_num(uvs.astype(np.float32))
-    arrays["colors"] = np.full((*corners, 4), 255, np.uint8) if colors is None else colors
-    return arrays, material
+    zeros = np.zeros((*faces.shape, 2), np.float32)
+    uvs = zeros if uvs is None else np.nan_to_num(uvs.astype(np.float32))
+    colors = np.full((*faces.shape, 4), 255, np.uint8) if colors is None else colors
+    ids = np.zeros(len(faces), np.int64)
+    return TexturedMesh(vertices, faces, uvs, colors, ids, [material], part.normals)
 
 
-def _corner_normals(
-    vertices: np.ndarray, faces: np.ndarray, given: np.ndarray | None
-) -> np.ndarray:
-    """Return normals ``[F, 3, 3]``: the corner's if it agrees with the face, else the face's."""
-    if given is None:
-        import trimesh
+def _joined(parts: list[TexturedMesh], sides: SideFiles) -> TexturedMesh:
+    """Return meshes of one material each as one. Raises UserError if it has no usable extent."""
 
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        given = np.asarray(mesh.vertex_normals)[faces]
-    corners = vertices[faces]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(flat, axis=1, keepdims=True)
-    flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])[:, None]
-    smooth = np.nan_to_num(given, copy=False)
-    smooth /= np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-12)
-    agree = (smooth * flat).sum(2, keepdims=True)
-    smooth *= np.sign(agree)
-    return np.where(np.abs(agree) > CREASE, smooth, flat).astype(np.float32)
+    def all_of(name: str) -> np.ndarray:
+        arrays = [getattr(part, name) for part in parts]
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+    vertices, colors = all_of("vertices").astype(np.float64, copy=False), all_of("colors")
+    low, high = np.array([(axis.min(), axis.max()) for axis in vertices.T]).T
+    reach, extent = np.abs([low, high]).max(), (high - low).max()
+    if reach > MAX_REACH:
+        raise UserError(f"{sides.path}: coordinates reach {reach:.3g}, over {MAX_REACH:g}")
+    if 0 < extent < 1 / MAX_REACH:
+        raise UserError(f"{sides.path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
+    if extent <= 0:
+        raise UserError(f"{sides.path}: all vertices are one point")
+    materials = list({id(part.materials[0]): part.materials[0] for part in parts}.values())
+    numbers = {id(material): number for number, material in enumerate(materials)}
+    if not any(map(_is_visible, parts)):
+        sides.warnings.append("all its surfaces are transparent by their alpha: drawn opaque")
+        colors[..., 3] = 255
+        for material in materials:
+            material.color[3] = 1
+            if material.texture is not None:
+                rgb = material.texture[..., :3]
+                material.texture = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+    at, normals = 0, None
+    if any(part.given_normals is not None for part in parts):
+        for part in parts:
+            if part.given_normals is None:
+                part.given_normals = _vertex_normals(part.vertices, part.faces)
+        normals = all_of("given_normals")
+    for part in parts:
+        part.material_ids += numbers[id(part.materials[0])]
+        part.faces = part.faces + at if at else part.faces
+        at += len(part.vertices)
+    warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
+    arrays = vertices, all_of("faces"), all_of("uvs"), colors, all_of("material_ids")
+    return TexturedMesh(*arrays, materials, normals, warnings, omitted)
+
+
+def _is_visible(part: TexturedMesh) -> bool:
+    """Return True if a mesh of one material may have a pixel of an alpha of 1/255."""
+    (material,) = part.materials
+    texture = 255 if material.texture is None else int(material.texture[..., 3].max(initial=0))
+    return float(material.color[3]) * texture * int(part.colors[..., 3].max(initial=0)) >= 255
+
+
+def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return ``[F, 3, 3]`` float32, at each corner the mean of its vertex's faces' normals."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return mesh.vertex_normals.astype(np.float32)[faces]

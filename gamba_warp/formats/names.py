@@ -26,5 +26,5 @@ def mesh_formats(chosen: Sequence[MeshChoice]) -> tuple[MeshFormat, ...]:
         UserError: ``none`` beside a format.
     """
     if "none" in chosen and len({*chosen}) > 1:
-        raise UserError(f"--mesh {' '.join(chosen)}: none goes with no format")
+        raise UserError(f"--mesh {' '.join(chosen)}: none cannot be combined with other formats")
     return cast("tuple[MeshFormat, ...]", tuple(kind for kind in chosen if kind != "none"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +10,19 @@ import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from .headers import open_shape
+from .headers import (
+    BOM,
+    Lines,
+    Rows,
+    blocks_of,
+    is_blank,
+    is_number,
+    joined_rows,
+    open_shape,
+    parse_numbers,
+    parse_rows,
+    without_comments,
+)
 from .materials import GREY, Material, SideFiles, plain, to_linear
 from .parts import Part, color_range, cut_polygons, to_rgba8
 
@@ -19,6 +30,8 @@ MAX_MATERIALS = 20_000  # of a file: each is a part
 MAX_LIBRARIES = 100  # MTL files of a file
 _DIGITS = 15  # of an index
 _NO_NUMBER = re.compile(rb"-?1\.#(IND|INF|QNAN|SNAN)\d*")  # as Microsoft's libraries print them
+_CORNER = re.compile(rb"-?0*[1-9]\d{0,14}(/(-?\d{1,15})?){0,2}")
+_LEAST = {b"v": 3, b"vt": 1, b"vn": 3}  # numbers of a line at least, by its first word
 # Statements that change neither shape nor colours.
 _IGNORED = {"g", "o", "s", "mg", "lod", "bevel", "shadow_obj", "trace_obj"}
 
@@ -30,136 +43,190 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
         UserError: a line of vertices or faces is malformed, or a face names a missing vertex.
     """
     with open_shape(path) as (file, _):
-        text = file.read().removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ")
+        text = file.read().removeprefix(BOM).replace(b"\\\r\n", b" ")
     if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise UserError(f"{path}: text in UTF-16, an .obj file is in UTF-8")
     text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ")
-    text = _NO_NUMBER.sub(b"nan", text)
-    statements = _Statements(path, text)
-    for word in sorted(statements.unread)[:9]:
-        sides.omit(f"the statement {word} is not read")
+    if b"1.#" in text:
+        text = _NO_NUMBER.sub(b"nan", text)
     if b"#MRGB" in text:
         sides.warnings.append("the colours of ZBrush (#MRGB) are not read")
-    points = np.array(statements.points).reshape(-1, 3)
-    vertex_uvs = np.array(statements.uvs).reshape(-1, 2)
-    vertex_normals = np.array(statements.normals).reshape(-1, 3)
-    corners = np.array(statements.corners, np.int64).reshape(-1, 3) - 1
-    lengths = np.array(statements.lengths, np.int64)
+    found = _Statements(path, text)
+    del text
+    for word in sorted(found.unread - _IGNORED)[:9]:
+        sides.omit(f"the statement {word} is not read")
+    vertices, uvs, normals = map(joined_rows, found.rows.values())
+    points, colors = _vertices(vertices)
+    # A texture may have one coordinate.
+    vertex_uvs, vertex_normals = uvs.columns(0, 1), normals.columns(0, 1, 2)
+    vertex_uvs[uvs.sizes < 2, 1] = 0.0
+    corners, lengths = np.concatenate(found.corners) - 1, np.concatenate(found.lengths)
     places = cut_polygons(sides, points, corners[:, 0], lengths)
     beyond = corners >= [len(points), len(vertex_uvs), len(vertex_normals)]
     if beyond.any():
         sides.warnings.append("faces name texture coordinates or normals that are not there")
         corners[beyond] = -1
-    vertex_colors = None
-    if statements.colors:
-        vertex_colors = np.full((len(points), 4), 255, np.uint8)
-        vertex_colors[statements.colored] = to_rgba8(np.array(statements.colors).reshape(-1, 3))
-        vertex_colors = vertex_colors if (vertex_colors < 255).any() else None
-    names = {name: number for number, name in enumerate(dict.fromkeys(statements.materials))}
-    if len(names) > MAX_MATERIALS:
-        raise UserError(f"{path}: uses {len(names)} materials, over the limit of {MAX_MATERIALS}")
-    named = np.array([names[name] for name in statements.materials], np.int64)
-    group = np.repeat(named, lengths)[places[:, 0]]
+    group = found.materials_of(np.concatenate(found.faces))
+    if (lengths != 3).any():
+        group = np.repeat(group, np.maximum(lengths - 2, 0))
+    numbers, first = np.unique(group, return_index=True)
+    if len(numbers) > MAX_MATERIALS:
+        raise UserError(f"{path}: uses {len(numbers)} materials, over the limit of {MAX_MATERIALS}")
+    names, library = [*found.names], _library(found.libraries[:MAX_LIBRARIES], sides)
     order = np.argsort(group, kind="stable")
-    library = _library(statements.libraries[:MAX_LIBRARIES], sides)
-    for name, number in names.items():
-        first, last = np.searchsorted(group, [number, number + 1], sorter=order)
-        if first == last:
-            continue
-        at, uvs, normals = np.moveaxis(corners[places[order[first:last]]], -1, 0)
-        used, faces = np.unique(at, return_inverse=True)
+    ends = np.searchsorted(group, numbers, "right", sorter=order)
+    for i in np.argsort(first):
+        mine = places[order[ends[i - 1] if i else 0 : ends[i]]]
+        name = names[numbers[i]]
         own = next((x for x in (name, _bare(name)) if x in library), None)
         material = None if own is None else _material(library[own], own, sides)
-        part = Part(points[used], faces.reshape(-1, 3), material)
-        if (normals >= 0).all():
-            part.normals = vertex_normals[normals]
-        if (uvs >= 0).any():
-            part.uvs = np.where(uvs[..., None] >= 0, vertex_uvs[uvs], 0.0)
-        if vertex_colors is not None and material is not None and material.texture is not None:
+        part = Part(points, corners[mine, 0], material)
+        if len(vertex_normals) and (corners[mine, 2] >= 0).all():
+            part.normals = vertex_normals[corners[mine, 2]]
+        if len(vertex_uvs) and (at := corners[mine, 1]).max(initial=-1) >= 0:
+            part.uvs = np.where(at[..., None] >= 0, vertex_uvs[at], 0.0)
+        if colors is not None and material is not None and material.texture is not None:
             sides.warnings.append("colours beside a texture are not drawn")
-        elif vertex_colors is not None:  # they stand for the material's
-            part.colors = vertex_colors[at]
+        elif colors is not None:  # they stand for the material's
+            part.colors = colors[part.faces]
             if material is not None:
                 material.color[:3] = 1.0
         yield part
 
 
+def _vertices(rows: Rows) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return positions ``[V, 3]``, and colours ``[V, 4]`` uint8 if one is not white."""
+    points = rows.columns(0, 1, 2)
+    if (homogeneous := rows.sizes == 4).any():
+        w = np.where(homogeneous[:, None], rows.columns(3), 1.0)
+        points /= np.where(w == 0, 1.0, w)
+    if not (colored := rows.sizes >= 6).any():
+        return points, None
+    colors = np.full((len(points), 4), 255, np.uint8)
+    colors[colored] = to_rgba8(rows.columns(3, 4, 5)[colored])
+    return points, colors if (colors < 255).any() else None
+
+
 class _Statements:
-    """Statements of a file."""
+    """Statements of a file.
+
+    Attributes:
+        rows: numbers of the lines of ``v``, ``vt`` and ``vn``, by block.
+        corners: by block ``[C, 3]`` int64, of each corner the indices of v, vt and vn from 1, or 0.
+        lengths: by block ``[F]``, number of corners of each face.
+        faces: by block ``[F]``, line of each face.
+        names: of the materials, to their numbers; 0 is that of faces that name none.
+        libraries: names of MTL files.
+        unread: first words of other statements.
+    """
 
     def __init__(self, path: Path, text: bytes) -> None:
-        self.points, self.uvs, self.normals = array("d"), array("d"), array("d")
-        self.colored, self.colors = array("q"), array("d")  # vertices with colours
-        # Of each corner the indices of v, vt and vn from 1, or 0; of each face its corners.
-        self.corners, self.lengths = array("q"), array("q")
-        self.materials: list[str] = []  # of each face
-        self.libraries: list[str] = []
-        self.unread: set[str] = set()
-        known: dict[bytes, list[int]] = {}
-        material = ""
-        for number, line in enumerate(text.split(b"\n"), 1):
-            words = line.split()
-            word = words[0] if words else b"#"
-            try:
-                if word in (b"v", b"vt", b"vn", b"f"):
-                    if b"#" in line:
-                        words = line.partition(b"#")[0].split()
-                    if word == b"f":
-                        for corner in words[1:]:
-                            self.corners.extend(known.get(corner) or self._corner(corner, known))
-                        self.lengths.append(len(words) - 1)
-                        self.materials.append(material)
-                    else:
-                        self._numbers(word, [*map(float, words[1:])], b"_" in line)
-                elif word in (b"usemtl", b"mtllib"):
-                    name = line.strip()[7:].decode("utf-8", "replace").strip()
-                    if word == b"mtllib":
-                        self.libraries.append(name)
-                    else:
-                        material = name
-                elif word.isalpha() and word.islower():
-                    self.unread.add(word[:30].decode())
-            except ValueError as error:
-                shown = b" ".join(words)[:60].decode("ascii", "replace")
-                message = f"line {number}, '{shown}', is not a valid vertex or face"
-                raise UserError(f"{path}: {message}") from error
-            except IndexError as error:
-                raise UserError(f"{path}: a face names a vertex before the first") from error
-        self.unread -= _IGNORED
+        none = np.zeros(0, np.int64)
+        self.rows = {word: [Rows(np.zeros(0), none)] for word in _LEAST}
+        self.corners, self.lengths, self.faces = [np.zeros((0, 3), np.int64)], [none], [none]
+        self.libraries, self.unread = list[str](), set[str]()
+        self.names = {"": 0}
+        self._used = [(-1, 0)]  # lines of usemtl, and numbers of the materials
+        self._totals = np.zeros(3, np.int64)  # of v, vt and vn in the blocks before
+        line = 0
+        for block in blocks_of(text, str(path)):
+            lines = Lines(block)
+            if not self._read(path, lines, line):
+                raise _invalid_line(path, block, line)
+            line += len(lines.sizes)
 
-    def _numbers(self, word: bytes, numbers: list[float], wrong: bool) -> None:
-        """Add a line of numbers. Raises ValueError if they are too few."""
-        if wrong or len(numbers) < (1 if word == b"vt" else 3):
-            raise ValueError
-        if word == b"vt":
-            self.uvs.extend([*numbers, 0.0][:2])  # a texture may have one coordinate
-        elif word == b"vn":
-            self.normals.extend(numbers[:3])
+    def materials_of(self, lines: np.ndarray) -> np.ndarray:
+        """Return the numbers of the materials of faces at these lines."""
+        at, numbers = np.transpose(self._used)
+        return numbers[np.searchsorted(at, lines) - 1]
+
+    def _read(self, path: Path, lines: Lines, start: int) -> bool:
+        """Read a block whose first line has this number; return False if a line is invalid."""
+        others = (lines.sizes > 0) & (lines.data.take(lines.first, mode="clip") != ord("#"))
+        counts = np.zeros((len(lines.sizes), 3), np.int64)
+        for column, (word, least) in enumerate(_LEAST.items()):
+            which = lines.begin_with(word)
+            others &= ~which
+            counts[:, column] = which
+            rows = parse_rows(without_comments(lines.behind(word, which)))
+            if rows is None or (rows.sizes < least).any():
+                return False
+            self.rows[word].append(rows)
+        which = lines.begin_with(b"f")
+        found = _corners(without_comments(lines.behind(b"f", which)))
+        if found is None:
+            return False
+        corners, lengths = found
+        if (corners < 0).any():  # they count back from their own line
+            totals = (self._totals + np.cumsum(counts, axis=0))[which]
+            corners += np.where(corners < 0, np.repeat(totals, lengths, axis=0) + 1, 0)
+            if (corners < [1, 0, 0]).any():
+                raise UserError(f"{path}: a face names a vertex before the first")
+        self._totals += counts.sum(0)
+        self.corners.append(corners)
+        self.lengths.append(lengths)
+        self.faces.append(start + np.flatnonzero(which))
+        for word in (b"f", b"g", b"o", b"s"):  # groups are as frequent as faces in some files
+            others &= ~lines.begin_with(word)
+        texts = lines.behind(b"", others).split(b"\n")
+        for at, line in zip(np.flatnonzero(others).tolist(), texts):
+            word = line.split(maxsplit=1)[0]
+            if word in (b"mtllib", b"usemtl"):
+                name = line.strip()[len(word) :].decode("utf-8", "replace").strip()
+            if word == b"mtllib":
+                self.libraries.append(name)
+            elif word == b"usemtl":
+                self._used.append((start + at, self.names.setdefault(name, len(self.names))))
+            elif word.isalpha() and word.islower():
+                self.unread.add(word[:30].decode())
+        return True
+
+
+def _corners(text: bytes) -> tuple[np.ndarray, np.ndarray] | None:
+    """Read the corners of faces, a face a line: ``7``, ``7/8``, ``7//9`` or ``7/8/9``.
+
+    Returns:
+        ``[C, 3]`` int64, the indices as they are, 0 where there is none; and ``[F]`` int64, the
+        number of each face's corners. None if a corner is invalid.
+    """
+    lines = Lines(text)
+    letters, sizes = lines.data, lines.sizes if text else np.zeros(0, np.int64)
+    slash = letters == ord("/")
+    inside = (letters - np.uint8(ord("0")) < 10) | (letters == ord("-"))
+    if not (inside | slash | is_blank(letters)).all() or b"///" in text:
+        return None
+    before = np.concatenate([[False], inside[:-1]])
+    starts = np.flatnonzero(inside & ~before)
+    numbers = parse_numbers(text.replace(b"/", b" "), len(starts), np.int64)
+    if numbers is None or (np.abs(numbers) >= 10**_DIGITS).any():
+        return None
+    # Steps from one number to the next: a slash, two, or none before the first of a corner.
+    steps = slash[starts - 1].astype(np.int8) + (slash[starts - 1] & slash[starts - 2])
+    heads = np.flatnonzero(steps == 0)
+    if len(heads) != sizes.sum():  # a corner begins with a slash
+        return None
+    within = np.arange(len(starts)) - np.repeat(heads, np.diff(heads, append=len(starts)))
+    places = steps + np.where(within == 2, np.roll(steps, 1), 0)
+    if (within > 2).any() or (places > 2).any():
+        return None
+    corners = np.zeros((len(heads), 3), np.int64)
+    corners[np.cumsum(steps == 0) - 1, places] = numbers
+    return None if (corners[:, 0] == 0).any() else (corners, sizes)
+
+
+def _invalid_line(path: Path, block: bytes, before: int) -> UserError:
+    """Return the error of the first invalid line of a block, ``before`` lines from the start."""
+    for number, line in enumerate(block.split(b"\n"), before + 1):
+        words = line.partition(b"#")[0].split() or [b""]
+        if words[0] == b"f":
+            valid = all(_CORNER.fullmatch(word) for word in words[1:])
         else:
-            if len(numbers) >= 6:
-                self.colored.append(len(self.points) // 3)
-                self.colors.extend(numbers[3:6])
-            w = numbers[3] if len(numbers) == 4 else 1.0  # homogeneous coordinates
-            self.points.extend([x / w for x in numbers[:3]] if w else numbers[:3])
-
-    def _corner(self, word: bytes, known: dict[bytes, list[int]]) -> list[int]:
-        """Return the three indices of a corner. Raises ValueError, IndexError if one is invalid."""
-        parts = word.split(b"/")
-        digits = [part.removeprefix(b"-") for part in parts]
-        if len(parts) > 3 or not parts[0] or int(parts[0]) == 0:
-            raise ValueError
-        if not all((part.isdigit() and len(part) <= _DIGITS) or not part for part in digits):
-            raise ValueError
-        numbers = [int(part or 0) for part in parts] + [0] * (3 - len(parts))
-        if b"-" not in word:
-            known[word] = numbers
-            return numbers
-        # Negative ones count back from their own line.
-        totals = len(self.points) // 3, len(self.uvs) // 2, len(self.normals) // 3
-        numbers = [n + total + 1 if n < 0 else n for n, total in zip(numbers, totals)]
-        if min(n for n, part in zip(numbers, parts) if part) < 0 or numbers[0] < 1:
-            raise IndexError
-        return numbers
+            least = _LEAST.get(words[0], 0)
+            valid = words[0] not in _LEAST or len(words) > least and all(map(is_number, words[1:]))
+        if not valid:
+            shown = b" ".join(words)[:60].decode("ascii", "replace")
+            return UserError(f"{path}: line {number}, '{shown}', is not a valid vertex or face")
+    return UserError(f"{path}: it is not a valid .obj file")
 
 
 def _bare(name: str) -> str:

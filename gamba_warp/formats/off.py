@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from ..errors import UserError
-from .headers import MAX_VALUES, check_lines, lines_of, open_shape, read_rows, read_table
+from .headers import BOM, check_lines, open_shape, read_rows
 from .materials import SideFiles
 from .parts import Part, cut_polygons, to_rgba8
 from .ply_data import spread
 
 # Attributes of vertices: texture coordinates, colours, normals. Some files of ModelNet40 have the
 # counts behind the word, without a blank.
+_HEADER_LINES, _HEADER_LINE = 1000, 1 << 12  # lines of a header, and letters of one
 _HEADER = re.compile(r"(ST)?(C)?(N)?OFF(?![A-Z])\s*(.*)")
 
 
@@ -27,24 +28,23 @@ def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
         UserError: it holds less or more than its header states, or a word is not a number.
     """
     with open_shape(path) as (file, _):
-        lines = (line.split("#")[0] for line in lines_of(file, str(path), comments="#"))
-        found = _HEADER.fullmatch(next(lines, "").strip())
-        counts = (found[4] or next(lines, "")).split() if found else []
-        if found is None or len(counts) < 2 or not all(w.isdecimal() for w in counts[:2]):
-            raise UserError(f"{path}: broken header, not OFF and numbers of vertices and faces")
-        count, faces = (int(word[:18]) for word in counts[:2])
-        rows = list(islice(lines, MAX_VALUES))
-    check_lines(path, f"{count} vertices and {faces} faces,", count + faces, len(rows))
-    table = read_table(rows[:count], f"{path}: vertices")
+        found = _HEADER.fullmatch(_next_line(file))
+        counts = (found[4] or _next_line(file)).split() if found else []
+        text = file.read()
+    if found is None or len(counts) < 2 or not all(w.isdecimal() for w in counts[:2]):
+        raise UserError(f"{path}: broken header, not OFF and numbers of vertices and faces")
+    count, faces = (int(word[:18]) for word in counts[:2])
+    rows = read_rows(text, str(path), comments=True)
+    check_lines(path, f"{count} vertices and {faces} faces,", count + faces, len(rows.sizes))
+    table = rows.part(0, count).table(f"{path}: vertices")
     if count and table.shape[1] < 3:
-        raise UserError(f"{path}: row 1 is not whole: {rows[0][:40].strip()}")
-    numbers, sizes = read_rows(rows[count:], f"{path}: faces")
+        raise UserError(f"{path}: row 1 has too few numbers")
+    numbers, sizes = rows.part(count, faces)
     starts = np.cumsum(sizes) - sizes
     lengths = numbers[starts]
     bad = ~((lengths >= 0) & (lengths < sizes) & (lengths == np.rint(lengths)))
     if bad.any():
-        row = count + bad.argmax()
-        raise UserError(f"{path}: row {row + 1} is not whole: {rows[row][:40].strip()}")
+        raise UserError(f"{path}: row {count + bad.argmax() + 1} has too few numbers")
     points, lengths = table[:, :3], lengths.astype(np.int64)
     corners = numbers[spread(starts + 1, lengths)]
     places = cut_polygons(sides, points, corners, lengths)
@@ -62,3 +62,12 @@ def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
     elif of_vertices.shape[1] or rest.any():
         sides.warnings.append("colours that are not RGB are left out")
     yield Part(points, corners[places], colors=colors)
+
+
+def _next_line(file: BinaryIO) -> str:
+    """Return the next line of the header that is not blank, without its comment."""
+    for _ in range(_HEADER_LINES):
+        line = file.readline(_HEADER_LINE).removeprefix(BOM).partition(b"#")[0].strip()
+        if line:
+            return line.decode("ascii", "replace")
+    return ""

@@ -79,9 +79,12 @@ def cut_polygons(
     Raises:
         UserError: a corner is not the index of a point.
     """
-    bad = ~((corners >= 0) & (corners < len(points)) & (corners == np.rint(corners)))
-    if bad.any():
+    fits = len(corners) == 0 or (corners.min() >= 0 and corners.max() < len(points))
+    if not fits or (corners.dtype.kind == "f" and (corners != np.rint(corners)).any()):
+        bad = ~((corners >= 0) & (corners < len(points)) & (corners == np.rint(corners)))
         raise UserError(f"{sides.path}: a face names vertex {corners[bad][0]} of {len(points)}")
+    if (lengths == 3).all():
+        return np.arange(len(corners)).reshape(-1, 3)
     corners, first = corners.astype(np.int64), np.cumsum(lengths) - lengths
     first, lengths = first[lengths >= 3], lengths[lengths >= 3]
     counts = lengths - 2
@@ -123,6 +126,26 @@ def _ears(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
     right /= np.linalg.norm(right)
     flat = places @ np.stack([right, np.cross(normal, right)], 1)
     return np.asarray(triangulate([flat]), np.int64)
+
+
+def used_vertices(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return faces as indices into the vertices that they use.
+
+    Args:
+        faces: ``[F, 3]`` indices, 0 to ``count`` less 1.
+        count: number of vertices.
+
+    Returns:
+        ``[F, 3]`` int64; and ``[U]``, the used vertices in their order, or None for all of them.
+    """
+    if 8 * faces.size < count:  # a part of many that share their vertices
+        kept, at = np.unique(faces, return_inverse=True)
+        return at.reshape(-1, 3), kept
+    used = np.zeros(count, bool)
+    used[faces] = True
+    if used.all():
+        return faces, None
+    return (np.cumsum(used) - 1)[faces], np.flatnonzero(used)
 
 
 def strip_faces(indices: np.ndarray) -> np.ndarray:

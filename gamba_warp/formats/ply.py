@@ -27,7 +27,7 @@ from .gaussians.arrays import (
     harmonics_of,
     rest_names,
 )
-from .gaussians.compressed import is_compressed, unpacked
+from .gaussians.compressed import unpacked
 from .parts import color_range
 from .ply_data import PlyData, read_ply
 
@@ -35,7 +35,6 @@ MIP = "SplatRenderMode: mip"  # comment of Gaussians that were fitted with antia
 TURNED = "frame opengl"  # comment of files with y up, which earlier versions could write
 _FLAT = 1e-6  # third standard deviation of a flat Gaussian
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
-MAX_FILE = 4 << 30  # bytes; 17 million Gaussians with all their harmonics
 _GROUPS = {
     "means": ("x", "y", "z"),
     "colors": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -109,9 +108,12 @@ def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
         UserError: the file is missing, not a ``.ply``, truncated or longer than it states, an
             attribute is missing, or ``checked_gaussians`` refuses the Gaussians.
     """
-    path = Path(path)
-    data = read_ply(path, MAX_FILE)
-    arrays = (unpacked if is_compressed(data.header) else _activated)(path, data)
+    return gaussians_of(Path(path), read_ply(Path(path)), left_out)
+
+
+def gaussians_of(path: Path, data: PlyData, left_out: list[str] | None = None) -> Gaussians:
+    """Return the Gaussians of a file's content, as ``load_ply`` does."""
+    arrays = (unpacked if data.header.is_packed else _activated)(path, data)
     gaussians = checked_gaussians(path, arrays, left_out)
     gaussians = replace(gaussians, antialiased=MIP in data.header.comments)
     return flip_axes(gaussians) if TURNED in data.header.comments else gaussians

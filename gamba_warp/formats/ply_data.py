@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -14,15 +12,16 @@ from ..errors import UserError
 from .headers import (
     MAX_FILE,
     MAX_VALUES,
+    Rows,
+    check_limit,
     check_lines,
     compare_sizes,
-    lines_of,
     open_shape,
     read_rows,
-    read_table,
 )
 
 MAX_HEADER = 1 << 16  # bytes
+MAX_SPLATS = 4 << 30  # bytes of a file of Gaussians; 17 million with all their harmonics
 MAX_DIGITS = 18  # of a count, so that it fits 64 bits
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}  # format to numpy's byte order
 TYPES = {
@@ -30,6 +29,10 @@ TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+# Words of packed Gaussians. One of the names is enough, so that a file without the others is not
+# taken for a point cloud.
+WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_GAUSSIANS = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
 _END = re.compile(rb"[\r\n]end_header[ \t]*\r?\n")  # a line of its own; a comment may contain it
 
 
@@ -65,6 +68,18 @@ class PlyHeader(NamedTuple):
     def has_faces(self) -> bool:
         """True for a mesh, of polygons or of strips."""
         return any(x.name in ("face", "tristrips") and x.count for x in self.elements)
+
+    @property
+    def has_gaussians(self) -> bool:
+        """True for Gaussians, packed or not."""
+        names = {item.name for element in self.elements for item in element.properties}
+        return not self.has_faces and not names.isdisjoint(_GAUSSIANS)
+
+    @property
+    def is_packed(self) -> bool:
+        """True for Gaussians of a compressed ``.ply``."""
+        vertices = (x.properties for x in self.elements if x.name == "vertex")
+        return any(item.name in WORDS for properties in vertices for item in properties)
 
 
 class PlyList(NamedTuple):
@@ -136,27 +151,40 @@ def _property(path: Path, words: list[str]) -> PlyProperty:
     return PlyProperty(words[-1], kinds[-1], kinds[0] if is_list else "")
 
 
-def read_ply(path: Path, limit: int = MAX_FILE) -> PlyData:
-    """Read every element of a ``.ply`` file, text or binary, of at most ``limit`` bytes.
+def read_ply(path: Path) -> PlyData:
+    """Read every element of a ``.ply`` file, text or binary.
 
     Raises:
-        UserError: not a ``.ply`` file, it holds less or more than its header states, a word is not
-            a number, or a name is given twice.
+        UserError: as for ``parse_ply``, or the file cannot be read.
     """
-    with open_shape(path, limit) as (file, size):
-        header = read_ply_header(path, file)
-        _check_header(path, header)
-        file.seek(header.start)
-        says = ", ".join(f"{element.count} {element.name}" for element in header.elements)
-        if header.format == "ascii":
-            lines = lines_of(file, str(path))
-            found = {element.name: _from_text(path, lines, element) for element in header.elements}
-            if next(lines, None) is not None:
-                raise UserError(f"{path}: false header, more lines follow than {says}")
-            return PlyData(header, found)
-        least = sum(element.least_bytes() for element in header.elements)
-        compare_sizes(path, says, least, size - header.start, exact=False)
-        data, at = file.read(), 0
+    with open_shape(path, MAX_SPLATS) as (file, size):
+        return parse_ply(path, file, size)
+
+
+def parse_ply(path: Path, file: BinaryIO, size: int) -> PlyData:
+    """Read every element of an open ``.ply`` file of ``size`` bytes, from its start.
+
+    Raises:
+        UserError: not a ``.ply`` file, too large, it holds less or more than its header states, a
+            word is not a number, or a name is given twice.
+    """
+    header = read_ply_header(path, file)
+    _check_header(path, header)
+    check_limit(path, size, MAX_SPLATS if header.has_gaussians else MAX_FILE)
+    file.seek(header.start)
+    says = ", ".join(f"{element.count} {element.name}" for element in header.elements)
+    if header.format == "ascii":
+        rows, first, found = read_rows(file.read(), str(path)), 0, {}
+        for element in header.elements:
+            count = element.count if element.properties else 0
+            found[element.name] = _from_text(path, rows.part(first, count), element)
+            first += count
+        if first < len(rows.sizes):
+            raise UserError(f"{path}: false header, more lines follow than {says}")
+        return PlyData(header, found)
+    least = sum(element.least_bytes() for element in header.elements)
+    compare_sizes(path, says, least, size - header.start, exact=False)
+    data, at = file.read(), 0
     elements: dict[str, Columns] = {}
     for element in header.elements:
         elements[element.name], at = _from_bytes(path, data, at, element, ORDERS[header.format])
@@ -187,17 +215,15 @@ def spread(starts: np.ndarray, lengths: np.ndarray, step: int = 1) -> np.ndarray
     return np.repeat(starts, lengths) + within * step
 
 
-def _from_text(path: Path, lines: Iterator[str], element: PlyElement) -> Columns:
-    """Return the element's columns, from as many lines as it has rows."""
+def _from_text(path: Path, rows: Rows, element: PlyElement) -> Columns:
+    """Return the element's columns from its rows, or as many as there are."""
     items, source = element.properties, f"{path}: {element.name}"
     count = element.count if items else 0
-    rows, says = islice(lines, count), f"{count} {element.name},"
+    check_lines(path, f"{count} {element.name},", count, len(rows.sizes))
     if not any(item.length for item in items):
-        table = read_table(rows, source, (len(items),))
-        check_lines(path, says, count, len(table))
+        table = rows.table(source, (len(items),))
         return {item.name: _typed(path, table[:, i], item) for i, item in enumerate(items)}
-    numbers, sizes = read_rows(rows, source)
-    check_lines(path, says, count, len(sizes))
+    numbers, sizes = rows
     spans, ends = [], np.cumsum(sizes)
     at = ends - sizes
     for item in items:

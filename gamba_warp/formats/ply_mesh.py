@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import UserError
 from .materials import Material, SideFiles
 from .parts import Part, cut_polygons, strip_faces, to_rgba8
-from .ply_data import Columns, PlyList, read_ply
+from .ply_data import Columns, PlyData, PlyList, read_ply
 
 _CORNERS = ("vertex_indices", "vertex_index")
 # Names of the channels of a colour, and of texture coordinates.
@@ -21,13 +21,13 @@ _UVS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _TEXTURE = re.compile(r"TextureFile\s+(.*)", re.I)
 
 
-def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
-    """Yield the one part of a file.
+def read_ply_mesh(path: Path, sides: SideFiles, data: PlyData | None = None) -> Iterator[Part]:
+    """Yield the one part of a file; ``data`` is its content, if it was read already.
 
     Raises:
         UserError: as for ``read_ply``, or vertices without a position, or faces without corners.
     """
-    data = read_ply(path)
+    data = data or read_ply(path)
     vertices, faces = data.elements.get("vertex", {}), data.elements.get("face", {})
     points = data.numbers("vertex", ("x", "y", "z"))
     strips = {} if faces else data.elements.get("tristrips", {})
@@ -45,12 +45,11 @@ def read_ply_mesh(path: Path, sides: SideFiles) -> Iterator[Part]:
         lengths = np.full(len(given) // 3, 3)
     places = cut_polygons(sides, points, given, lengths)
     corners = given.astype(np.int64)[places]
-    owner = np.repeat(np.arange(len(lengths)), lengths)[places]
     normals, colors = data.numbers("vertex", ("nx", "ny", "nz")), _colors(vertices)
     if colors is not None:
         colors = colors[corners]
     elif (of_faces := _colors(faces)) is not None:
-        colors = of_faces[owner]
+        colors = of_faces[np.repeat(np.arange(len(lengths)), lengths)[places]]
     uvs, of_corners = None, faces.get("texcoord")
     names = next((pair for pair in _UVS if {*pair} <= vertices.keys()), None)
     if isinstance(of_corners, PlyList) and (of_corners.lengths == 2 * lengths).all():

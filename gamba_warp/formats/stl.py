@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
-from .headers import compare_sizes, open_shape, read_table
+from .headers import BOM, Lines, blocks_of, compare_sizes, open_shape, read_rows
 from .materials import SideFiles
 from .parts import Part
 
@@ -51,15 +50,20 @@ def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
 
 def _text_corners(path: Path, data: bytes, sides: SideFiles) -> np.ndarray:
     """Return ``[3 F, 3]``; keywords begin a line, in either case, as a name may be any words."""
-    text = data.replace(b"\r", b"\n").lower()
-    begun, ends, last = (
-        len(re.findall(rb"(?m)^[ \t]*" + word + rb"\b", text))
-        for word in (b"facet", b"endfacet", b"endsolid")
-    )
-    rows = re.findall(rb"(?m)^[ \t]*vertex[ \t]+(.*)$", text)
-    if not last and rows:
+    begun = ends = last = 0
+    rows = []
+    text = data.removeprefix(BOM).replace(b"\r", b"\n").lower()
+    for block in blocks_of(text, str(path)):
+        lines = Lines(block)
+        begun, ends, last = (
+            count + np.count_nonzero(lines.begin_with(word))
+            for count, word in ((begun, b"facet"), (ends, b"endfacet"), (last, b"endsolid"))
+        )
+        rows.append(lines.behind(b"vertex", lines.begin_with(b"vertex")))
+    points = read_rows(b"".join(rows), str(path)).table(str(path), (3,))
+    if not last and len(points):
         sides.omit("there is no endsolid: the end of the file may be missing")
-    if not begun == ends == len(rows) / 3:
-        says = f"{begun} facets, {ends} of them with an end, and {len(rows)} vertices"
+    if not begun == ends == len(points) / 3:
+        says = f"{begun} facets, {ends} of them with an end, and {len(points)} vertices"
         raise UserError(f"{path}: truncated or false, {says}")
-    return read_table((row.decode("ascii", "replace") for row in rows), str(path), (3,))
+    return points

@@ -156,7 +156,7 @@ def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
     Raises:
         UserError: as ``load_mesh``.
     """
-    mesh = load_mesh(path, normals=False)
+    mesh = load_mesh(path)
     vertices = mesh.vertices * ([1.0, -1.0, -1.0] if axes == "opengl" else 1.0)
     paint = (255 * _corner_colors(mesh) + 0.5).astype(np.int64)
     # A vertex with several colours is split.

@@ -13,7 +13,7 @@ from .tiles import Bins, Limits, Size, Tiling, Walk
 
 
 class Call(NamedTuple):
-    """Arguments of a call: enough to make the lists anew.
+    """Arguments of a call: enough to make the lists again.
 
     Attributes:
         splats: the projection, without gradients.
@@ -30,14 +30,14 @@ class Call(NamedTuple):
         return Tiling(self.size.width, self.size.height)
 
     def bins(self, exact: bool) -> Bins:
-        """The lists; if ``exact`` as long as there are pairs, whose number is read back."""
+        """The lists; ``exact`` sizes them to the pair count, which waits for the device."""
         s, size = self.splats, self.size
         splats = s.means2d, s.conics, s.depths, s.view_opacities, s.extents
         picture = size.width, size.height, self.limits.alpha_min, size.skip
         return Bins(*bin_op(*splats, *picture, exact))
 
     def listed(self) -> tuple[Bins, Walk]:
-        """The lists with all pairs, whose number is read back, and the walk of the compositor."""
+        """The lists with all pairs, and the compositor's walk; this waits for the device."""
         bins, s = self.bins(exact=True), self.splats
         size = self.size._replace(colors_per_view=1)
         drawn = s.means2d, s.conics, s.view_opacities, torch.ones_like(s.depths)[..., None]

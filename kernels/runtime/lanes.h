@@ -1,8 +1,8 @@
 // needs: native.py: TABLE, DEGREE
 // gives: F, I, splat, fma_, max_abs_, in_range_, LOG2E, shifter, POWER_2, POWER_3, POWER_4,
 //     POWER_5, POWER_6, horner_, exp2_clamped_, exp2_, decay_, exp2_parts_, exp2_fm1_,
-//     softplus_of_, softplus_, sigmoid_, rows_, H, S, Line, narrow_, read_, write_, put_, turn_,
-//     tiles_, Lanes, gather_, scatter_
+//     softplus_of_, softplus_, sigmoid_, rows_, H, S, Line, narrow_, read_, write_, put_,
+//     transpose_, tiles_, Lanes, gather_, scatter_
 // Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_fm1_; TABLE:
 // true to take a table instead where the processor has AVX-512.
 typedef float F __attribute__((vector_size(64), aligned(4)));
@@ -209,7 +209,7 @@ auto put_ = [&](const auto& rows, int t, F v, bool stream) __attribute__((always
 // Sixteen values of sixteen lanes are turned: lane j of value i becomes lane i of value j. A round
 // exchanges a bit of i and one of j, of which the last two count within 128 bits, the first two
 // count these; so no instruction moves numbers across these 128 bits one by one, which is slow.
-auto turn_ = [](F* v) __attribute__((always_inline)) {
+auto transpose_ = [](F* v) __attribute__((always_inline)) {
     auto place = [](int i) { return i % 4 * 4 + i / 4 % 2 * 2 + i / 8; };
     F w[16];
 #pragma unroll
@@ -263,7 +263,7 @@ auto gather_ = [&](const auto& rows, int begin, int end, F* to, size_t step)
             const auto channels = rows.channels(t, stop);
             F v[16] = {};
             for (int i = 0; i < width; ++i) v[i] = read_(channels, i);
-            turn_(v);
+            transpose_(v);
             for (int i = 0; i < channels.width; ++i) write_(lanes, t + i, v[i]);
         });
     return lanes;
@@ -278,7 +278,7 @@ auto scatter_ = [&](const auto& rows, int begin, int end, auto value,
             const auto channels = rows.channels(t, stop);
             F v[16] = {};
             for (int i = 0; i < channels.width; ++i) v[i] = value(t + i);
-            turn_(v);
+            transpose_(v);
             for (int i = 0; i < width; ++i) put_(channels, i, v[i], stream);
         });
 };

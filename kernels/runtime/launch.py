@@ -1,6 +1,6 @@
 """Launches of kernels, on torch's own threads on the CPU and on its current stream on CUDA.
 
-``wp.launch`` checks and packs its arguments anew each time, which takes as long as a short kernel
+``wp.launch`` checks and packs its arguments each time, which takes as long as a short kernel
 runs. A launch that is recorded once (``Entry``) shows the result; later launches of the
 kernel have the same kinds of arguments and fill the same structures.
 
@@ -27,7 +27,7 @@ import warp as wp
 from torch import Tensor
 
 from .stand_in import kind_of, stand_in
-from .views import unkept, view
+from .views import cache_error, view
 
 wp.set_module_options({"enable_backward": False})
 
@@ -152,13 +152,13 @@ def _find_team() -> None:
         _parallel = 0
 
 
-def _lose_team() -> None:
+def _disable_team() -> None:
     global _parallel
     _parallel = 0  # after a fork: the threads of the team stayed with the parent
 
 
 _find_team()
-os.register_at_fork(after_in_child=_lose_team)
+os.register_at_fork(after_in_child=_disable_team)
 
 
 def has_team() -> bool:
@@ -176,7 +176,7 @@ def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> Entry | None:
         try:
             command = wp.launch(kernel, dim, arguments, device="cpu", record_cmd=True)
         except OSError as error:
-            raise unkept(error) from error
+            raise cache_error(error) from error
         try:
             entry = Entry(kernel, command, dim, arguments)
             if not ctypes.cast(entry.call, ctypes.c_void_p).value:
@@ -190,7 +190,7 @@ def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> Entry | None:
                     RuntimeWarning,
                     stacklevel=2,
                 )
-            _lose_team()
+            _disable_team()
             return None
     return _entries[kernel]
 
@@ -299,7 +299,7 @@ def parallel_launch(
     try:
         kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
     except OSError as error:
-        raise unkept(error) from error
+        raise cache_error(error) from error
     todo = iter(list(zip(cuts[:-1], cuts[1:])))
 
     def work() -> None:
@@ -350,14 +350,14 @@ def cuda_launch(
     key = kernel, device, block_dim
     stream = _stream(device)
     if (entry := _entries.get(key)) is not None:
-        _launch_again(entry, dim, arguments, stream)
+        _replay_launch(entry, dim, arguments, stream)
         return
     try:
         command: Any = wp.launch(
             kernel, dim, arguments, block_dim=block_dim, stream=stream, record_cmd=True
         )
     except OSError as error:
-        raise unkept(error) from error
+        raise cache_error(error) from error
     command.launch(stream)
     try:
         _entries[key] = Entry(kernel, command, dim, arguments)
@@ -365,7 +365,7 @@ def cuda_launch(
         pass
 
 
-def _launch_again(entry: Entry, dim: tuple[int, ...], arguments: list, stream: wp.Stream) -> None:
+def _replay_launch(entry: Entry, dim: tuple[int, ...], arguments: list, stream: wp.Stream) -> None:
     """Launches a kernel that was launched before, in a fraction of the time of ``wp.launch``."""
     record, bounds = entry.pack(arguments), entry.extent(dim)
     first = ctypes.addressof(record)

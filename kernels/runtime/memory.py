@@ -2,7 +2,7 @@
 
 The first touch of a page costs many times its use: the system has to find it, to clear it, and in a
 virtual machine to ask the host for it. Memory of the size of a result goes back to the system when
-the result is freed, so every call would pay anew. Here it goes to a pool instead, as soon as no
+the result is freed, so every call would pay again. Here it goes to a pool instead, as soon as no
 tensor holds its storage any more, and the next result of about that size is taken from there.
 
 Only our operators' results come from here. For those of torch's operators a command can tell the C

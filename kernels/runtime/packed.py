@@ -121,7 +121,7 @@ def slots(rows: Tensor, length: int, tokens: int) -> Tensor:
 
 
 def count_slots(rows: Tensor, batch: int, length: int, tokens: int) -> int:
-    """The number of all slots, of which the last of a sequence may stay empty."""
+    """Total number of slots; a sequence's last slot may be unused."""
     return batch * length // tokens + len(rows)
 
 

@@ -65,7 +65,7 @@ def reciprocal(x: float) -> float: ...
 
 
 @wp.func_native('asm volatile("" : "+r"(x)); return x;')
-def anew(x: int) -> int:
+def opaque(x: int) -> int:
     """Return x, so that values computed from it before need not stay in registers."""
     ...
 

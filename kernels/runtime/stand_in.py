@@ -41,7 +41,7 @@ stand_in: Callable[[], StandIn | None] = _stand_in.get
 
 @contextmanager
 def standing_in(new: StandIn | None) -> Iterator[None]:
-    """Inside, in this thread, launches on CUDA are made by ``new``."""
+    """Route this thread's CUDA launches to ``new`` within the block."""
     token = _stand_in.set(new)
     try:
         yield

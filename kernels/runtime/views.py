@@ -49,7 +49,7 @@ _MOST_DESCRIPTORS = 4096
 _descriptors: dict[tuple, Any] = {}  # one for each dtype, shape and strides
 
 
-def unkept(error: OSError) -> OSError:
+def cache_error(error: OSError) -> OSError:
     """The error of Warp's folder of compiled kernels, which also says how to choose another."""
     advice = "WARP_CACHE_PATH names another folder for compiled kernels"
     return OSError(error.errno, f"{error.strerror}; {advice}", error.filename)
@@ -59,7 +59,7 @@ def _start() -> None:
     try:
         wp.init()
     except OSError as error:
-        raise unkept(error) from error
+        raise cache_error(error) from error
 
 
 def _describe(tensor: Tensor, dtype, name: str) -> Any:

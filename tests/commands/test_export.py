@@ -123,7 +123,7 @@ def test_a_folder_and_failures(ball, tmp_path, capsys):
     [
         (["--mesh"], "--mesh, --splats"),
         (["--mesh", "none"], "--mesh, --splats"),
-        (["--mesh", "none", "obj"], "--mesh none obj: none goes with no format"),
+        (["--mesh", "none", "obj"], "--mesh none obj: none cannot be combined with other formats"),
     ],
 )
 def test_what_cannot_start(ball, tmp_path, options, reason, capsys):

@@ -78,7 +78,7 @@ def test_an_old_manifest_is_refused_and_made_anew(data, change, capsys):
             if os.stat(data / uid).st_mtime_ns == time:
                 os.utime(data / uid, ns=(time + 1, time + 1))
     line = refused("older than its dataset, .* has changed", open_dataset, data)
-    assert f"gamba data index {data} makes it anew" in line
+    assert f"gamba data index {data} writes it again" in line
     bad = 0 if change == "a repair" else 2 if change == "a picture" else 1
     assert cli.run("data index", [str(data)]) == min(1, bad)
     assert f", {bad} left out, listed in {data / MANIFEST}" in capsys.readouterr().out

@@ -65,12 +65,6 @@ def one_accessor(**accessor):
     return glb(tree, bytes(36))
 
 
-def pcd(count, data, body):
-    lines = ["VERSION 0.7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1"]
-    lines += [f"WIDTH {count}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}"]
-    return "\n".join([*lines, f"DATA {data}", ""]).encode() + body
-
-
 TRIANGLE = np.eye(3, dtype="<f4").tobytes()
 FACE = struct.pack("<B3i", 3, 0, 1, 2)
 BOTH = [*vertices_of(3), *faces_of(1)]
@@ -102,11 +96,6 @@ LIES = {
     "chunk.glb": b"glTF\2\0\0\0" + b"\xff" * 8 + one_accessor(bufferView=0, count=3)[16:],
     "count.glb": one_accessor(bufferView=0, count=MANY),
     "zeros.glb": one_accessor(count=MANY),
-    "raw.pcd": pcd(MANY, "binary", TRIANGLE),
-    "text.pcd": pcd(MANY, "ascii", b"0 0 0\n"),
-    "packed.pcd": pcd(10**8, "binary_compressed", struct.pack("<II", 20, 12 * 10**8) + bytes(20)),
-    "broken.pcd": b"VERSION 0.7\nDATA binary\n",
-    "count.pts": f"{MANY}\n0 0 0\n1 1 1\n".encode(),
 }
 
 
@@ -140,9 +129,6 @@ def test_true_counts_pass(tmp_path):
         "c.ply": ply(vertices_of(3), TRIANGLE),
         "d.ply": ply(BOTH, b"1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n", "ascii"),
         "e.glb": one_accessor(bufferView=0, count=3),
-        "f.pcd": pcd(3, "binary", TRIANGLE),
-        "g.pcd": pcd(3, "ascii", b"1 0 0\n0 1 0\n0 0 1\n"),
-        "h.pts": b"3\n1 0 0\n0 1 0\n0 0 1\n",
     }
     for name, content in good.items():
         (tmp_path / name).write_bytes(content)

@@ -556,6 +556,10 @@ UNREAD = {
         lambda d: d.attributes.update(NORMAL=d.array(SQUARE[:3])),
         "NORMAL of 3 x 3 numbers is left out",
     ),
+    "long coordinates": (
+        lambda d: d.attributes.update(TEXCOORD_0=d.array(SQUARE)),
+        "TEXCOORD_0 of 4 x 3 numbers is left out",
+    ),
     **{
         name: (changed((*MATERIAL, "extensions"), {name: {}}), f"the extension {name} is not read")
         for name in ("KHR_materials_clearcoat", "KHR_materials_transmission", "MSFT_lod")

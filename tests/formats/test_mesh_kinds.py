@@ -164,6 +164,38 @@ def test_invalid_lines_of_obj(tmp_path, line):
     refused("line 5, ", loaded, tmp_path, "a.obj", V + line + "\nf 1 2 3\n")
 
 
+MIXED = (
+    V
+    + """vt 0 0
+vn 0 0 1
+usemtl a
+f -1/1/1 -2//1 -3
+v 1 1 0 1 0 0
+f 1/1 2/1 5/1 # all of a
+usemtl b
+f 1 2 5 4
+l 1 2
+f -1 -2 -3
+"""
+)
+
+
+@pytest.mark.parametrize("block", [30, 60, 1 << 24])
+def test_a_text_is_read_in_blocks_of_any_length(tmp_path, monkeypatch, block):
+    """Indices that count back, and the material in use, go on from one to the next."""
+    monkeypatch.setattr("gamba_warp.formats.headers._BLOCK", block)
+    mesh = loaded(tmp_path, "a.obj", MIXED)
+    corners = [[0, 0, 1], [0, 1, 0], [1, 0, 0]], [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
+    assert places(mesh)[:2].tolist() == [*corners] and len(mesh.faces) == 5
+    assert mesh.material_ids.tolist() == [0, 0, 1, 1, 1]
+    assert mesh.colors[1, 2].tolist() == [255, 0, 0, 255] == mesh.colors[4, 0].tolist()
+    assert mesh.omitted == ["the statement l is not read"]
+    refused("line 15, 'f 1 x'", loaded, tmp_path, "a.obj", MIXED + "f 1 x")
+    mesh = loaded(tmp_path, "a.ply", ply(FOUR, ["4 0 1 2 3", "3 0 1 2"]))
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2]]
+    assert len(loaded(tmp_path, "a.stl", f"solid a\n{FACET * 3}endsolid a\n").faces) == 3
+
+
 def test_statements_of_obj_that_are_not_read_are_named(tmp_path):
     mesh = loaded(tmp_path, "a.obj", V + "vp 1 2\ncurv 1 2\nl 1 2\nf 1 2 3\n")
     for word in ("curv", "l", "vp"):
@@ -231,16 +263,6 @@ def test_strips_of_ply(tmp_path):
     lines += ["0 0 0", "1 0 0", "0 1 0", "1 1 0", "2 0 0", "8 0 1 2 3 -1 1 4 3", "3 4 3 1"]
     mesh = loaded(tmp_path, "a.ply", "\n".join([*lines, ""]))
     assert mesh.faces.tolist() == [[0, 1, 2], [1, 3, 2], [1, 4, 3], [4, 3, 1]]
-
-
-def test_short_names_of_colours_of_ply(tmp_path):
-    lines = ["ply", "format ascii 1.0", "element vertex 3"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    lines += [f"property uchar {name}" for name in "rgb"] + ["element face 1"]
-    lines += ["property list int int vertex_indices", "end_header"]
-    lines += [f"{x} {y} 0 255 128 0" for x, y in ((0, 0), (1, 0), (0, 1))] + ["3 0 1 2", ""]
-    mesh = loaded(tmp_path, "a.ply", "\n".join(lines))
-    assert mesh.colors[0, 0].tolist() == [255, 128, 0, 255]
 
 
 def test_numbers_of_obj_as_some_programs_write_them(tmp_path):
@@ -345,7 +367,9 @@ def test_bytes_of_stl(tmp_path):
     assert "the colours of an .stl file are not read" in mesh.warnings
 
 
-@pytest.mark.parametrize("names", ["red green blue", "diffuse_red diffuse_green diffuse_blue"])
+@pytest.mark.parametrize(
+    "names", ["red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"]
+)
 @pytest.mark.parametrize("kind, scale", [("uchar", 1), ("ushort", 257), ("float", 1 / 255)])
 def test_colours_of_ply(tmp_path, names, kind, scale):
     colour = " ".join(f"{value * scale:.7g}" for value in (51, 128, 204))

@@ -1,4 +1,3 @@
-import json
 import re
 
 import numpy as np
@@ -6,7 +5,6 @@ import pytest
 import trimesh
 from helpers.images import ADOBE_RGB, colour_profile, colours
 from helpers.meshes import MTL, QUAD, write_quad
-from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.formats.materials import to_display, to_linear
@@ -111,25 +109,6 @@ def test_a_texture_coordinate_of_one_number_has_v_0(tmp_path, old):
     assert not flat.uvs[..., 1].any()
 
 
-def test_texture_coordinates_of_three_numbers_in_a_gltf_are_none(tmp_path):
-    box = trimesh.creation.box()
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2)))
-    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
-    for name, content in trimesh.exchange.gltf.export_gltf(trimesh.Scene([box])).items():
-        (tmp_path / name).write_bytes(content)
-    path = tmp_path / "model.gltf"
-    tree = json.loads(path.read_text())
-    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
-    attributes["TEXCOORD_0"] = attributes["POSITION"]
-    path.write_text(json.dumps(tree))
-    mesh = load_mesh(path)
-    assert mesh.uvs.shape == (12, 3, 2) and not mesh.uvs.any()
-    assert mesh.warnings == [
-        "TEXCOORD_0 of 8 x 3 numbers is left out",
-        "a textured part has no UV coordinates",
-    ]
-
-
 def test_transparency_of_mtl(tmp_path):
     path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.5 1 0\nd 0.25\n")
     np.testing.assert_allclose(load_mesh(path).materials[0].color[3], 0.25)
@@ -165,23 +144,6 @@ def test_colour_profiles_of_textures(tmp_path):
     assert "paint.png: its colour profile is not used" in load_mesh(path).warnings[0]
 
 
-def test_glb_scene(tmp_path):
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorFactor=[255, 0, 0, 128], alphaMode="BLEND"
-    )
-    box = trimesh.creation.box()
-    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
-    scene = trimesh.Scene()
-    move = trimesh.transformations.translation_matrix([3, 0, 0])
-    scene.add_geometry(box, transform=move)
-    scene.add_geometry(box)
-    scene.export(tmp_path / "two.glb")
-    mesh = load_mesh(tmp_path / "two.glb")
-    assert len(mesh.faces) == 24
-    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [4, 1, 1])
-    np.testing.assert_allclose(mesh.materials[0].color, [1, 0, 0, 128 / 255], atol=1e-6)
-
-
 def test_other_formats(tmp_path):
     box = trimesh.creation.box()
     for suffix in (".ply", ".stl", ".off"):
@@ -202,33 +164,6 @@ def test_smooth_normals_are_kept(tmp_path):
     mesh = load_mesh(tmp_path / "ball.ply")
     outward = mesh.vertices[mesh.faces]
     assert ((mesh.normals * outward).sum(-1) > 0.999).all()
-    bare = load_mesh(tmp_path / "ball.ply", normals=False)
-    assert not bare.normals.any() and bare.normals.shape == mesh.normals.shape
-    assert (bare.vertices[bare.faces] == outward).all()
-
-
-@pytest.mark.parametrize(
-    "name, content, message",
-    [
-        ("a.obj", b"", "the file is empty"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
-        ("a.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "1 of 3 vertices are not finite"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "names vertex 8 of 3"),
-        ("a.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "all vertices are one point"),
-        ("a.obj", b"\x00\x01 binary \xff", "a.obj"),
-        ("a.glb", b"glTF nonsense", "cannot be read as a mesh"),
-        ("a.stl", b"solid nothing\nendsolid", "a.stl"),
-        ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", "a.ply"),
-        ("a.txt", b"v 0 0 0", "not a mesh file"),
-    ],
-)
-def test_bad_files_name_the_file(tmp_path, name, content, message):
-    path = tmp_path / name
-    path.write_bytes(content)
-    said = refused(None, load_mesh, path)
-    assert message in said and name in said
-    path.unlink()
-    refused("no such file|not a mesh file", load_mesh, path)
 
 
 def test_display_curve_inverts():

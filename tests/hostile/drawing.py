@@ -21,7 +21,7 @@ UNFIT = (
     *(OSError, EOFError, zlib.error, zipfile.BadZipFile, tarfile.TarError, NotImplementedError),
 )
 _JSON_SUFFIXES = (".json", ".gltf")
-_TEXT_SUFFIXES = (".obj", ".mtl", ".ply", ".off", ".xyz", ".pts", ".pcd", ".stl", ".txt", ".gltf")
+_TEXT_SUFFIXES = (".obj", ".mtl", ".ply", ".off", ".xyz", ".stl", ".txt", ".gltf")
 
 
 def _kinds(name: str, whole: bool) -> list[tuple]:
@@ -82,7 +82,7 @@ def _other_kind(draw: Draw, case: Case, name: str) -> Case:
 def _renamed(draw: Draw, case: Case, name: str) -> Case:
     """Another name or suffix for a file; the reader gets the new name."""
     path = PurePosixPath(name)
-    suffixes = (".png", ".ply", ".obj", ".gltf", ".pcd", ".PLY", "", ".json", ".eps", ".npy")
+    suffixes = (".png", ".ply", ".obj", ".gltf", ".PLY", "", ".json", ".eps", ".npy")
     odd = [n for n in NAMES if 2 < len(n) < 100 and not re.search(r"[/\\\0]", n)]
     odd = [n for n in odd if n.isprintable()]
     names = [path.stem + choice(draw, *suffixes), choice(draw, *odd) + path.suffix]

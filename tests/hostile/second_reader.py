@@ -13,21 +13,14 @@ def points_in(data: bytes, suffix: str) -> np.ndarray | str | None:
 
     Args:
         data: the file.
-        suffix: ".xyz", ".pts", ".pcd" or ".ply".
+        suffix: ".xyz" or ".ply".
 
     Returns:
-        ``[N, 3]`` float64 of a text; the reason why it is not a cloud; or None if unknown, as for
-        compressed data.
+        ``[N, 3]`` float64 of a text; the reason why it is not a cloud; or None if unknown.
     """
-    if suffix == ".pcd":
-        return _pcd(data)
     if suffix == ".ply":
         return _ply(data)
     lines = [line for line in _lines(data) if not line.lstrip().startswith(_COMMENTS)]
-    if suffix == ".pts" and lines and len(lines[0].split()) == 1:
-        stated = lines.pop(0).split()[0]
-        if not stated.isdigit() or int(stated) != len(lines):
-            return f"it states {stated[:20]!r} and has {len(lines)} lines"
     return _table(lines, [0, 1, 2])
 
 
@@ -58,28 +51,6 @@ def _table(lines: list[bytes], columns: list[int]) -> np.ndarray | str:
             return f"the line {line[:30]!r} is not finite"
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 3)
-
-
-def _pcd(data: bytes) -> np.ndarray | str | None:
-    head, rest, found = {}, data, False
-    while rest and not found:
-        line, _, rest = rest.partition(b"\n")
-        words = line.split()
-        if words and not words[0].startswith(b"#"):
-            head[words[0]] = words[1:]
-            found = words[0] == b"DATA"
-    names, form = head.get(b"FIELDS", []), head.get(b"DATA", [b""])[:1]
-    stated = head.get(b"POINTS", [b""])[:1]
-    if not found or not stated or not stated[0].isdigit() or form != [b"ascii"]:
-        return None
-    counts = [int(word) for word in head.get(b"COUNT", [b"1"] * len(names)) if word.isdigit()]
-    if len(counts) != len(names) or any(names.count(axis) != 1 for axis in (b"x", b"y", b"z")):
-        return None
-    starts = dict(zip(names, np.cumsum([0, *counts]).tolist()))
-    lines = _lines(rest)
-    if len(lines) != int(stated[0]):
-        return f"it states {int(stated[0])} points and has {len(lines)} lines"
-    return _table(lines, [starts[axis] for axis in (b"x", b"y", b"z")])
 
 
 def _ply(data: bytes) -> np.ndarray | str | None:

@@ -33,7 +33,6 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.batches import open_data
 from gamba_warp.train.loop import Trainer
 from gamba_warp.train.sources.pack import write_pack
-from gamba_warp.versions import import_open3d
 
 Files = dict[str, bytes]
 Kinds = dict[str, Files]
@@ -241,32 +240,14 @@ def meshes() -> Kinds:
     }
 
 
-def pcd(points: np.ndarray, normals: bool = False, **form: bool) -> bytes:
-    """A ``.pcd`` of points ``[N, 3]``, written by Open3D."""
-    o3d = import_open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.normals = o3d.utility.Vector3dVector(points if normals else [])
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "cloud.pcd"
-        o3d.io.write_point_cloud(str(path), cloud, **form)
-        return path.read_bytes()
-
-
 def clouds() -> Kinds:
     """Point clouds, one file each."""
     points = np.random.default_rng(2).normal(size=(24, 3)).round(3)
     lines = [" ".join(f"{value:g}" for value in row) for row in points]
     text = "\n".join([*lines, ""]).encode()
-    coloured = "\n".join(["24", *(f"{line} 5 10 20 30" for line in lines), ""])
     normals = {f"n{name}": points[:, i].astype("<f4") for i, name in enumerate("xyz")}
     return {
         "xyz": {"cloud.xyz": text},
-        "pts": {"cloud.pts": b"24\n" + text},
-        "pts-coloured": {"cloud.pts": coloured.encode()},
-        "pcd-ascii": {"cloud.pcd": pcd(points, write_ascii=True)},
-        "pcd-binary": {"cloud.pcd": pcd(points)},
-        "pcd-compressed": {"cloud.pcd": pcd(points, compressed=True)},
-        "pcd-normals": {"cloud.pcd": pcd(points, normals=True)},
         "ply-cloud": {"cloud.ply": ply(points, normals)},
         "ply-cloud-binary": {"cloud.ply": ply(points, {}, form="binary_little_endian")},
     }

@@ -76,7 +76,7 @@ def draw_views(
         model: the object in the file's frame; ``settings.up`` is "y" or "z".
         uid: name of the object; with the settings' seed it seeds cameras and lights.
         settings: options of the pictures.
-        rotation: ``[3, 3]``, applied to the file's points first; None for none.
+        rotation: ``[3, 3]``, applied to the file's points first; None: not rotated.
     """
     digest = hashlib.sha256(f"{settings.seed} {uid}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))

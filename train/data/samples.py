@@ -182,7 +182,7 @@ def load_sample(
         size: side of the pictures to match, pixels.
         config: the model's configuration.
         background: RGB ``[3]``.
-        change: augmentation of the views; None for none.
+        change: augmentation of the views; None: not augmented.
         surfaces: also load them, if the object has depth pictures.
 
     Raises:

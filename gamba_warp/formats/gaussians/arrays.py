@@ -57,9 +57,9 @@ def export_arrays(
     if gaussians.harmonics is None:
         gaussians.harmonics = torch.zeros(gaussians.num, 0, 3)
     arrays = {name: getattr(gaussians, name).numpy() for name in (*_NAMES, "harmonics")}
-    bad = sum(~np.isfinite(value.reshape(gaussians.num, -1)).all(1) for value in arrays.values())
-    if np.any(bad):
-        count = np.count_nonzero(bad)
+    if not all(np.isfinite(value).all() for value in arrays.values()):
+        finite = [np.isfinite(x.reshape(gaussians.num, -1)).all(1) for x in arrays.values()]
+        count = np.count_nonzero(~np.all(finite, axis=0))
         raise UserError(f"{path}: not written, {count} of {gaussians.num} Gaussians are not finite")
     lengths = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
     arrays["quats"] = arrays["quats"] / lengths.clip(1e-12)

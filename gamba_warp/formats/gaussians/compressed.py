@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import UserError
-from ..ply_data import PlyData, PlyHeader
+from ..ply_data import WORDS, PlyData
 from .arrays import MIN_SCALE, from_smallest_three, harmonics_of, rest_names, smallest_three
 
 CHUNK = 256
@@ -26,14 +26,7 @@ BOUNDS = tuple(
     for end in ("min", "max")
     for name in names
 )
-WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _MAX_LOG = 20.0  # of a scale, as PlayCanvas has it
-
-
-def is_compressed(header: PlyHeader) -> bool:
-    """Return True if a header's vertices are packed."""
-    vertices = (element.properties for element in header.elements if element.name == "vertex")
-    return any(item.name in WORDS for properties in vertices for item in properties)
 
 
 def packed(arrays: dict[str, np.ndarray]) -> tuple[list[str], bytes, bool]:

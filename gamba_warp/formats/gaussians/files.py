@@ -11,18 +11,16 @@ from ...files import atomic_path
 from ...gaussians import Gaussians
 from ..headers import open_shape
 from ..names import SPLAT_FORMATS, SPLAT_SUFFIXES, SplatFormat
-from ..ply import MAX_FILE, TURNED, header_bytes, load_ply, marked, save_ply
-from ..ply_data import read_ply_header
+from ..ply import TURNED, header_bytes, load_ply, marked, save_ply
+from ..ply_data import MAX_SPLATS, read_ply_header
 from .arrays import export_arrays
-from .compressed import WORDS, is_compressed, packed
+from .compressed import packed
 from .glb import holds_gaussians, load_glb
 from .splat import load_splat, save_splat
 from .spz import load_spz, save_spz
 from .spz_container import GZIP, MAGIC
 
 _CONVERTED = (".sog", ".ksplat", ".rad")  # Gaussians in formats of single programs
-# One is enough, so that a file without the others is not taken for a point cloud.
-_GAUSSIAN_PROPERTIES = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
 
 
 def splat_kind(path: str | Path) -> SplatFormat | Literal["glb"] | None:
@@ -36,15 +34,14 @@ def splat_kind(path: str | Path) -> SplatFormat | Literal["glb"] | None:
             header.
     """
     path = Path(path)
-    with open_shape(path, MAX_FILE) as (file, size):
+    with open_shape(path, MAX_SPLATS) as (file, size):
         start = file.read(4)
         file.seek(0)
         if start.startswith(b"ply"):
             header = read_ply_header(path, file)
-            names = {item.name for element in header.elements for item in element.properties}
-            if header.has_faces or not _GAUSSIAN_PROPERTIES & names:
+            if not header.has_gaussians:
                 return None
-            return "compressed-ply" if is_compressed(header) else "ply"
+            return "compressed-ply" if header.is_packed else "ply"
         if start == b"glTF":
             return "glb" if holds_gaussians(path, file, size) else None
     if start.startswith(GZIP) or start == MAGIC:
@@ -72,7 +69,7 @@ def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gauss
             values are invalid.
     """
     path = Path(path)
-    with open_shape(path, MAX_FILE) as (file, _):
+    with open_shape(path, MAX_SPLATS) as (file, _):
         start = file.read(4)
     magics = {b"ply": load_ply, b"glTF": load_glb, GZIP: load_spz, MAGIC: load_spz}
     by_name = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz, ".glb": load_glb}
@@ -95,7 +92,7 @@ def comments_of(path: str | Path) -> list[str]:
         UserError: as for ``splat_kind``.
     """
     path = Path(path)
-    with open_shape(path, MAX_FILE) as (file, _):
+    with open_shape(path, MAX_SPLATS) as (file, _):
         if file.read(3) != b"ply":
             return []
         file.seek(0)

@@ -37,7 +37,7 @@ COUNTS = {degree: count for count, degree in DEGREES.items()}
 
 @dataclass
 class Unpacked:
-    """Numbers of an ``.spz``, all of one kind after the other, and the header's values."""
+    """Decoded arrays of an ``.spz``, attribute by attribute, and the header's values."""
 
     body: bytes | bytearray
     version: int
@@ -45,6 +45,7 @@ class Unpacked:
     degree: int
     bits: int
     antialiased: bool
+    widths: list[int]  # bytes of a Gaussian, of each kind
 
 
 def unpacked(path: Path, content: bytes) -> Unpacked:
@@ -68,11 +69,11 @@ def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]
     if bits > _MAX_BITS or count > MAX_POINTS:
         raise UserError(f"{path}: broken header, {count} Gaussians, {bits} bits")
     position, rotation = 6 if version == 1 else 9, 4 if version > 2 else 3
-    each = [position, 1, 3, 3, rotation, 3 * COUNTS[degree]]
+    each = [position, 1, 3, 3, rotation, *([3 * COUNTS[degree]] if degree else [])]
     says = f"{count} Gaussians"
     compare_sizes(path, says, count * sum(each), _MAX_RATIO * packed, exact=False)
-    return [count * size for size in each if size], Unpacked(
-        b"", version, count, degree, bits, bool(flags & ANTIALIASED)
+    return [count * size for size in each], Unpacked(
+        b"", version, count, degree, bits, bool(flags & ANTIALIASED), each
     )
 
 

@@ -27,7 +27,7 @@ from ..config import GambaConfig
 
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
 # Tokens that pass through all blocks at a time on a CPU without gradients. Temporaries of this size
-# are reused instead of being mapped anew each time.
+# are reused instead of being mapped each time.
 SEGMENT = 4096
 Blocks = Sequence["Block"] | nn.ModuleList
 

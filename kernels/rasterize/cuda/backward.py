@@ -58,16 +58,16 @@ HEAD = 8  # numbers of a chunk in ``heads``
 
 
 def row_sizes(channels: int, absolute: bool) -> tuple[int, int]:
-    """Numbers of a row in ``heads`` and in ``tails``."""
+    """Floats per row of ``heads`` and of ``tails``."""
     chunks = [min(CHUNK, channels - first) for first in range(0, channels, CHUNK)]
     return HEAD * len(chunks), sum(Sums(c, False, absolute).tail() for c in chunks)
 
 
 class Sums(NamedTuple):
-    """The sums of a kernel.
+    """The sums that a kernel writes for each pair.
 
     Attributes:
-        channels: of colours, at most 4; 0 for the moments alone, of however many channels.
+        channels: of colours, at most 4; 0: only the moments, of any number of channels.
         geometry: moments of h (README eq. 11).
         absolute: rows have the two sums of absolute values (eq. 14) after the six moments.
         passes: the gradient passes the clamp of alpha (README §7).
@@ -383,7 +383,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 if (bits >> STOP) != 0:
                     # pixels that stopped here take part from the next pair on
                     k = end - WARP + i
-                    at = wp.int64(L.anew(p.index)) * wp.int64(wp.static(pixels * WARP))
+                    at = wp.int64(L.opaque(p.index)) * wp.int64(wp.static(pixels * WARP))
                     at += wp.int64(p.lane)
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
@@ -403,7 +403,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 if wp.static(listed):
                     row = L.load_int(lists.rows, k)
                 record = p.lane * RECORD
-                channel = L.anew(gaussians.first)  # no registers hold what follows from it
+                channel = L.opaque(gaussians.first)  # no registers hold what follows from it
                 for n in range(wp.static(len(vectors))):
                     if p.part == wp.static(n % parts):
                         total = memory.get4(arena, record + wp.static(4 * vectors[n]))

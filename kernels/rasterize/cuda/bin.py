@@ -84,7 +84,7 @@ def _count(
             at += wp.int64(num)
             if kept:
                 L.store_word(spans_out, at, 0, _span(columns))
-            ty = L.anew(ty + 1)  # keeps the loop from being unrolled, which splits warps more
+            ty = L.opaque(ty + 1)  # keeps the loop from being unrolled, which splits warps more
     if j == 0:
         L.store_long(counts_out, 0, wp.int64(0))  # their running sum says where each begins
     L.store_long(counts_out, j + 1, wp.int64(count))

@@ -180,8 +180,8 @@ def _walking(channels: int, parts: int, listed: bool):
                 leave(walked_out.blocks, k0 + p.lane, p.part, mine)
             k0 += WARP
 
-        # found anew, so that no registers hold the lane's pixels during the walk
-        p = lane_pixels(picture, L.anew(p.index), p.lane)
+        # computed again, so that no registers hold the lane's pixels during the walk
+        p = lane_pixels(picture, L.opaque(p.index), p.lane)
         if p.lane == 0:
             if wp.static(listed):
                 wp.atomic_max(walked_out.walked, p.tile, end - lists.starts[p.tile])

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from ...runtime.scalars import anew as anew
 from ...runtime.scalars import exp2 as exp2
+from ...runtime.scalars import opaque as opaque
 from ...runtime.scalars import reciprocal as reciprocal
 
 wp.set_module_options({"enable_backward": False})

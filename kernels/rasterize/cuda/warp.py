@@ -184,7 +184,7 @@ def touching(parts: int):
         reach = L.root(limit * L.reciprocal(e))
         over_a = L.reciprocal(a)
         # the centre of the part's first pixel, which no registers hold during the walk
-        lane = L.anew(p.lane)
+        lane = L.opaque(p.lane)
         x = p.x[0] - float(lane & wp.static(WIDTH - 1)) - shape[0]
         y = p.y[0] - float(lane >> wp.static(WIDTH.bit_length() - 1)) - shape[1]
         bits = word()

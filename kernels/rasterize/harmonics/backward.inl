@@ -21,7 +21,7 @@ auto store_rows_ = [&](float* row, int live, const F* from) {
     for (int o = 0; o < FLOATS; o += 16) {
         F r[16];
         for (int i = 0; i < 16; ++i) r[i] = from[o + i];
-        turn_(r);
+        transpose_(r);
         for (int j = 0; j < live; ++j)
             if (o + 16 <= FLOATS) *(F*)(row + j * K_D + o) = r[j];
             else __builtin_memcpy(row + j * K_D + o, r + j, FLOATS % 16 * 4);

@@ -9,7 +9,7 @@ for (int first = begin; first < end; first += 16) {
 
     F T[PADDED];
     I lost = {};
-    for (int i = 0; i < 3; ++i) lost |= wild_(mean[i]);
+    for (int i = 0; i < 3; ++i) lost |= not_finite_(mean[i]);
     for (int view = 0; view < views; ++view) {
         const size_t image = (size_t)b * views + view, at = image * num + first;
         const size_t row = per_view ? at : (size_t)b * num + first;
@@ -25,7 +25,7 @@ for (int first = begin; first < end; first += 16) {
         }
         // a coefficient that is not finite leaves a sum that is not; the reverse need not hold
         I bad = lost;
-        for (int d = 0; d < D; ++d) bad |= wild_(sum[d]);
+        for (int d = 0; d < D; ++d) bad |= not_finite_(sum[d]);
         if (any_(bad))
             for (int j = 0; j < live; ++j) {
                 bool finite = !lost[j];

@@ -1,5 +1,5 @@
 // needs: cpu.py: DEGREE, D, arrays, SHORTEST, CLAMPED, CHUNK, task
-// gives: F, I, COUNT, FLOATS, PADDED, fma_, b, any_, wild_, turn_, num, views, per_view,
+// gives: F, I, COUNT, FLOATS, PADDED, fma_, b, any_, not_finite_, transpose_, num, views, per_view,
 //     coefficients, centers, K_D, stop, load_rows_, direction_, basis_, shown_, passes_, chunks,
 //     begin, end, means_
 // Sixteen Gaussians as the lanes of one SIMD value. Rows of coefficients are turned, 16 x 16 floats
@@ -11,7 +11,7 @@ const int COUNT = (DEGREE + 1) * (DEGREE + 1), FLOATS = COUNT * D, PADDED = (FLO
 auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
 auto any_ = [](I mask) -> bool { return __builtin_reduce_or(mask) != 0; };
 // not finite, by the exponent's bits
-auto wild_ = [](F x) -> I { return ((I)x & 0x7fffffff) >= 0x7f800000; };
+auto not_finite_ = [](F x) -> I { return ((I)x & 0x7fffffff) >= 0x7f800000; };
 // transposes 16 x 16 floats by exchanging ever smaller squares
 #define LOW(l, w) ((l) & (w) ? 16 + (l) - (w) : (l))
 #define HIGH(l, w) ((l) & (w) ? 16 + (l) : (l) + (w))
@@ -25,7 +25,7 @@ auto wild_ = [](F x) -> I { return ((I)x & 0x7fffffff) >= 0x7f800000; };
         r[i] = __builtin_shufflevector(a, b, LANES(LOW, w));                                       \
         r[i + (w)] = __builtin_shufflevector(a, b, LANES(HIGH, w));                                \
     }
-auto turn_ = [](F* r) {
+auto transpose_ = [](F* r) {
     EXCHANGE(8)
     EXCHANGE(4)
     EXCHANGE(2)
@@ -56,7 +56,7 @@ auto load_rows_ = [&](const float* row, int live, F* into) {
                 r[j] = *(const F*)part;
             }
         }
-        turn_(r);
+        transpose_(r);
         for (int i = 0; i < 16; ++i) into[o + i] = r[i];
     }
 };

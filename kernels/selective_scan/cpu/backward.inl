@@ -4,7 +4,7 @@
 //     NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out; problem.py: WEIGHTED
 // gives: the body of scan_backward
 // Equation 1 again, keeping decay and state of every token, and the sums of equation 8; then
-// backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums begin anew in the first of the
+// backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums restart in the first of the
 // BLOCKS lane groups that share them. Gradients that are not in ``needs`` are not computed.
 #include "task.h"
 #include "strip.h"

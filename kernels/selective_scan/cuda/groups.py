@@ -63,7 +63,7 @@ class Groups:
 
 @functools.cache
 def group_io(g: Groups, io: torch.dtype):
-    """Access to a thread's elements of ``[B, L, D]``, whose place is found once, as 64 bits.
+    """Access to a thread's elements of ``[B, L, D]``; the 64-bit base address is computed once.
 
     ``fetch`` loads bits, as ``blocks.channel_io`` does, from the thread's token ``t`` on. In place
     of tokens after ``last`` it loads that one. ``store`` does nothing unless ``inside``.

@@ -9,14 +9,12 @@ from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, intrinsics
 from gamba_warp.errors import FileWarning
+from gamba_warp.formats.gaussians.arrays import rest_names
 from gamba_warp.formats.gaussians.files import comments_of, splat_kind
 from gamba_warp.formats.gaussians.spz import save_spz
-from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
+from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.gaussians import SH_C0, Gaussians
 from gamba_warp.render import render
-from gamba_warp.versions import import_open3d
-
-NAMES = ("means", "quats", "scales", "opacities", "colors")
 
 
 def write(path, header, body=b""):
@@ -38,36 +36,19 @@ def header(count, kind="float", properties=PROPERTIES, form="binary_little_endia
     ]
 
 
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("rotated", [True, False])
-def test_what_is_saved_is_loaded(tmp_path, turned, rotated):
-    """Older versions could turn y up and state it in a comment."""
-    gaussians = some(rotated=rotated)
-    comments = ["one\ntwo", "é", *(["frame opengl"] if turned else [])]
-    written = flip_axes(gaussians) if turned else gaussians
-    save_ply(tmp_path / "a.ply", written, comments=comments)
-    loaded = load_ply(tmp_path / "a.ply")
-    quats = torch.eye(4)[:1].expand(37, 4) if gaussians.quats is None else gaussians.quats
-    quats = quats / quats.norm(dim=1, keepdim=True)
-    sign = (loaded.quats * quats).sum(1, keepdim=True).sign()  # q and -q are one rotation
-    # float32 through a logarithm or a logit
-    torch.testing.assert_close(loaded.quats * sign, quats, atol=1e-6, rtol=0)
-    for name in ("means", "scales", "opacities", "colors"):
-        want = getattr(gaussians, name)
-        torch.testing.assert_close(getattr(loaded, name), want, atol=2e-7, rtol=2e-6, msg=name)
-
-
 def test_the_file_is_the_standard_layout_in_another_reader(tmp_path):
     from plyfile import PlyData
 
-    gaussians = some()
+    gaussians = some(degree=2)
     save_ply(tmp_path / "a.ply", gaussians, comments=["hello"])
     data = PlyData.read(tmp_path / "a.ply")
     assert data.byte_order == "<" and not data.text and "hello" in data.comments
     vertex = data["vertex"]
-    want = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 "
-    want += "rot_0 rot_1 rot_2 rot_3"
-    assert [p.name for p in vertex.properties] == want.split()
+    want = ["x", "y", "z", "nx", "ny", "nz", *PROPERTIES[3:6], *rest_names(24), *PROPERTIES[6:]]
+    assert [p.name for p in vertex.properties] == want
+    for channel, k in np.ndindex(3, 8):  # all of red, then all of green, then all of blue
+        rest = gaussians.harmonics[:, k, channel]
+        np.testing.assert_array_equal(vertex[f"f_rest_{8 * channel + k}"], rest)
     assert {p.val_dtype for p in vertex.properties} == {"f4"}
     np.testing.assert_array_equal(vertex["y"], gaussians.means[:, 1])
     opacity = 1 / (1 + np.exp(-vertex["opacity"]))
@@ -78,27 +59,6 @@ def test_the_file_is_the_standard_layout_in_another_reader(tmp_path):
     )
     w = gaussians.quats[:, 0] / gaussians.quats.norm(dim=1)
     np.testing.assert_allclose(vertex["rot_0"], w, atol=1e-6)
-
-
-def test_open3d_sees_the_same_gaussians(tmp_path):
-    """Its reader knows the layout: it gives scales activated, opacities as logits."""
-    open3d = import_open3d()
-    gaussians = some()
-    save_ply(tmp_path / "a.ply", gaussians)
-    cloud = open3d.t.io.read_point_cloud(str(tmp_path / "a.ply"))
-    np.testing.assert_array_equal(cloud.point.positions.numpy(), gaussians.means)
-    np.testing.assert_allclose(cloud.point.scale.numpy(), gaussians.scales, rtol=1e-5)
-    quats = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
-    np.testing.assert_allclose(cloud.point.rot.numpy(), quats, atol=1e-6)
-    logits = cloud.point.opacity.numpy()[:, 0]
-    np.testing.assert_allclose(1 / (1 + np.exp(-logits)), gaussians.opacities, rtol=1e-5)
-
-
-def test_opengl_axes_turn_y_up():
-    gaussians = some()
-    flipped = flip_axes(gaussians)
-    torch.testing.assert_close(flipped.means, gaussians.means * torch.tensor([1.0, -1, -1]))
-    torch.testing.assert_close(flip_axes(flipped).means, gaussians.means)
 
 
 def test_files_of_other_programs_are_read(tmp_path):
@@ -213,21 +173,6 @@ def test_extremes_stay_finite(tmp_path):
     assert (loaded.scales > 0).all()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_what_is_not_finite_is_not_written(tmp_path, name):
-    gaussians = some()
-    getattr(gaussians, name)[4] = float("nan")
-    refused(r"a\.ply: not written, 1 of 37 Gaussians", save_ply, tmp_path / "a.ply", gaussians)
-    assert not list(tmp_path.iterdir())
-
-
-def test_refusals_when_saving(tmp_path):
-    refused(r"a\.ply: not written, there is no Gaussian", save_ply, tmp_path / "a.ply", some(0))
-    with pytest.raises(ValueError, match=r"leading shape \(1,\)"):
-        save_ply(tmp_path / "a.ply", some().map(lambda value: value[None]))
-    refused(r"/dev/null/a\.ply: Not a directory", save_ply, "/dev/null/a.ply", some())
-
-
 GOOD = np.ones((2, 14), "<f4").tobytes()
 BAD_FILES = {
     "empty": (b"", "not a .ply"),
@@ -235,7 +180,7 @@ BAD_FILES = {
     "no end": (b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n", "has no end"),
     "endless": (b"ply\n" + b"comment x\n" * 10000 + b"end_header\n", "has no end"),
     "no format": (["element vertex 2", "property float x"], "format is none"),
-    "ascii": (header(2, form="ascii"), "vertex"),
+    "ascii": (header(2, form="ascii"), "could not convert"),
     "odd format": (header(2, form="binary"), "format is binary"),
     "no vertices": (["format binary_little_endian 1.0"], "no property x, y, z; not Gaussians"),
     "faces alone": ([header(2)[0], "element face 2"], "no property x, y, z; not Gaussians"),
@@ -260,6 +205,10 @@ BAD_FILES = {
     "cloud": (header(2, properties=PROPERTIES[:3]), "no property f_dc_0, f_dc_1, f_dc_2"),
     "no opacity": (header(2, properties=PROPERTIES[:6] + PROPERTIES[7:]), "no property opacity"),
 }
+ODD = {f"{count} coefficients": count for count in (1, 8, 10, 72)}
+for case, count in ODD.items():
+    head = header(2, properties=[*PROPERTIES, *rest_names(count)])
+    BAD_FILES[case] = head, f"{count} properties f_rest_*"
 SIZES = {"cloud": 24, "no opacity": 104, "list": 28}  # bytes of the data, if not those of GOOD
 SIZES |= dict.fromkeys(["none", "no vertices", "faces alone", "no properties"], 0)
 
@@ -271,37 +220,31 @@ def test_bad_files_are_refused_with_the_reason(tmp_path, case):
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        size = SIZES.get(case, len(GOOD))
-        write(path, content, bytes(size) if case == "list" else GOOD[:size])
+        size = SIZES.get(case, len(GOOD) + 8 * ODD.get(case, 0))
+        write(path, content, bytes(size) if case == "list" else (9 * GOOD)[:size])
     said = refused(None, load_ply, path)
     assert str(path) in said and reason in said
 
 
 @pytest.mark.parametrize(
-    "column, value, reason",
-    [(1, np.nan, "means"), (6, np.nan, "opacities"), (8, 200, "scales"), (3, -np.inf, "colors")],
+    "columns, value, reason",
+    [
+        *((1, np.nan, "means that are not finite"), (6, np.nan, "opacities that are not finite")),
+        *((8, 200, "scales that are not finite"), (3, -np.inf, "colors that are not finite")),
+        *((0, 1e30, r"means over 1e\+18"), (7, 60, "scales over")),
+        (slice(10, None), 0, "rotations of length zero"),
+    ],
 )
-def test_values_that_are_not_finite_are_refused(tmp_path, column, value, reason):
+def test_values_that_cannot_be_drawn_are_refused(tmp_path, columns, value, reason):
     values = np.ones((3, 14), "<f4")
-    values[1, column] = value
+    values[1, columns] = value
     path = write(tmp_path / "a.ply", header(3), values.tobytes())
-    refused(f"1 of 3 Gaussians have {reason} that are not finite", load_ply, path)
+    refused(f"1 of 3 Gaussians have {reason}", load_ply, path)
 
 
-def test_rotations_of_length_zero_are_refused(tmp_path):
-    values = np.ones((3, 14), "<f4")
-    values[2, 10:] = 0
-    path = write(tmp_path / "a.ply", header(3), values.tobytes())
-    refused("1 of 3 Gaussians have rotations of length zero", load_ply, path)
-
-
-def test_values_whose_squares_overflow(tmp_path):
-    """Rotations of any length are valid; positions and sizes have a limit."""
+def test_rotations_may_have_any_length(tmp_path):
+    """Also such whose squares leave float32's range."""
     rows = np.ones((3, 14), "<f4")
     rows[1, 10:], rows[2, 10:] = 1e30, 1e-30
     loaded = load_ply(write(tmp_path / "a.ply", header(3), rows.tobytes()))
     torch.testing.assert_close(loaded.quats, torch.full((3, 4), 0.5))
-    for column, value, reason in ((0, 1e30, r"means over 1e\+18"), (7, 60, "scales over")):
-        bad = rows.copy()
-        bad[1, column] = value
-        refused(reason, load_ply, write(tmp_path / "a.ply", header(3), bad.tobytes()))

@@ -171,7 +171,7 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
     return TexturedMesh(
         vertices=vertices,
         faces=faces,
-        normals=normals,
+        given_normals=normals,
         uvs=uvs,
         colors=np.full((len(faces), 3, 4), 255, np.uint8),
         material_ids=ids,
