@@ -130,7 +130,7 @@ def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Compute occupancy ``[X, Y, Z]`` bool. See ``RULES``.
 
     The generalised winding number (Jacobson et al. 2013) is the mean of a ray's signed crossings
-    over all directions; here over those of ``majority``.
+    over all directions; here over the directions of ``majority``.
     """
     scene, points, normals = mesh.scene(), grid.points().reshape(-1, 3), mesh.normals()
     total = np.zeros(len(points))
