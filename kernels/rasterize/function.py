@@ -118,7 +118,7 @@ def rasterization(
         radius_clip=radius_clip, eps2d=eps2d, alpha_min=alpha_min,
         antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
     ).numbers()  # fmt: skip
-    # colours only cull here, so their gradient is no reason to compute that of the geometry
+    # colours only cull here, so their gradient does not require the geometry's
     gaussians = x.means, x.quats, x.scales, None, x.opacities
     projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, lens))
     channels = _channels(render_mode, colors, projected.depths)

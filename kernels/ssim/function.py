@@ -34,12 +34,12 @@ def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tenso
     for name, x in (("got", got), ("want", want)):
         if not x.is_floating_point() or x.dtype != got.dtype or x.device != got.device:
             raise TypeError(
-                f"{name} is {x.dtype} on {x.device}, must be of a floating dtype, that of got, and "
-                "on the device of got"
+                f"{name} is {x.dtype} on {x.device}, must have the floating dtype "
+                "and the device of got"
             )
         if x.ndim != 4 or x.shape != got.shape or min(x.shape[1:3]) < WINDOW:
             raise ValueError(
-                f"{name} has shape {tuple(x.shape)}, must be that of got, [P, H, W, C] with H and "
+                f"{name} has shape {tuple(x.shape)}, must be got's, [P, H, W, C] with H and "
                 f"W >= {WINDOW}"
             )
     on_lanes = got.device.type == "cpu" and got.dtype == torch.float32
