@@ -46,7 +46,7 @@ class Within:
         self._plain: dict[tuple[str, ...], set[str]] = {}
 
     def path(self, name: object, source: str) -> Path:
-        """Return the path of a name. Arguments, result and errors are those of ``inside``."""
+        """Return the path of a name. Arguments, result and errors as in ``inside``."""
         parts = parts_of(name, source)
         above = parts[:-1]
         if above not in self._plain:
@@ -73,7 +73,7 @@ def plain_name(name: object, source: str) -> str:
     """
     parts = parts_of(name, source)
     if len(parts) != 1 or parts[0] != name:
-        raise UserError(f"{source}: the name {name!r} is not that of one file")
+        raise UserError(f"{source}: the name {name!r} is not a plain file name")
     if parts[0].startswith("."):
         raise UserError(f"{source}: the name {name!r} begins with a dot")
     return parts[0]

@@ -86,7 +86,7 @@ def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
 
 
 def _chunks(count: int) -> Iterator[slice]:
-    """Yield parts of ``count`` rows, so that what is made of a part takes little memory."""
+    """Yield parts of ``count`` rows, which bounds the memory of intermediate results."""
     return (slice(at, at + _CHUNK) for at in range(0, count, _CHUNK))
 
 
@@ -143,7 +143,7 @@ def _activated(found: Unpacked, columns: list[np.ndarray]) -> dict[str, np.ndarr
 
 
 def _packed_means(means: np.ndarray, bits: int) -> bytes:
-    """Return 24-bit fixed point numbers with so many bits behind the point."""
+    """Return 24-bit fixed point numbers with ``bits`` fractional bits."""
     fixed = np.rint(means.astype(np.float64) * 2**bits).astype("<i4")
     return fixed[:, :, None].view(np.uint8)[..., :3].tobytes()
 
