@@ -79,7 +79,7 @@ def depth_quantile(
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
 ) -> Tensor:
-    """Depth of the first Gaussian behind which each pixel's transmittance is no larger than asked.
+    """Depth of the first Gaussian behind which each pixel's transmittance is at most the given one.
 
     ``z_i`` of the least i with ``Π_{j<=i} (1 - α_j) <= transmittance``: 0.5 is the median depth of
     2DGS (Huang et al. 2024). Without gradient.

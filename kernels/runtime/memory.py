@@ -107,7 +107,7 @@ class Pool:
                 continue
             with contextlib.suppress(ValueError):  # another thread has taken it
                 place = self._free.index(block)
-                self._free.remove(block)  # nobody may take it while its pages are given away
+                self._free.remove(block)  # not available while its pages are given away
                 with contextlib.suppress(OSError, AttributeError):  # an old kernel keeps it
                     block.madvise(mmap.MADV_FREE)
                 block.lent = True
@@ -150,7 +150,7 @@ def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     size = math.prod(shape) * dtype.itemsize
     if pool is None or pool.most == 0 or size < LARGE:
         return torch.empty(*shape, dtype=dtype)
-    # Not a view: autograd lets nobody change a view in place that was made inside an operator.
+    # Not a view: autograd forbids in-place changes of a view made inside an operator.
     return torch.empty(0, dtype=dtype).set_(pool.take(size).untyped_storage()).resize_(shape)
 
 

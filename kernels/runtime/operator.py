@@ -57,7 +57,7 @@ def operator(
         op: a ``torch.library.custom_op`` with its fake results.
         name: of the public function, for messages.
         setup_context: as ``op.register_autograd`` takes it, like ``backward``.
-        backward: None: the operator is no part of a graph, or its gradient has no gradient.
+        backward: None: the operator is not part of a graph, or its gradient has no gradient.
 
     Returns:
         A function of the same positional arguments. It raises ``NotImplementedError`` for a

@@ -77,7 +77,7 @@ class Scan(NamedTuple):
 def like_inputs(gradients: Inputs, inputs: Inputs, needs: Inputs) -> Inputs:
     """Return the needed gradients in the dtypes of their inputs, B's and C's in their layout.
 
-    Those of u, delta and z have it, the others are dense. That of ``initial_state``, which a
+    Only those for u, delta and z have that layout; others are dense. ``initial_state``'s, which a
     backward pass does not have, is float32 as ``A``.
     """
 

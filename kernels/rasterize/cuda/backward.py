@@ -45,7 +45,7 @@ class Rows:
 
     A row has for each chunk of channels the six moments, the two sums of absolute values if they
     are asked for, and the colours: the first eight of these numbers, a sector of memory, in
-    ``heads``, the others in ``tails``. A row of a pair that is not ``written`` holds nothing.
+    ``heads``, the others in ``tails``. A row of a pair that is not ``written`` is undefined.
     """
 
     heads: wp.array2d[wp.float32]
