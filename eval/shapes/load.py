@@ -99,7 +99,7 @@ def load_truth(
     Args:
         path: file.
         protocol: with the upward axis of the file and the refused flags.
-        rotation: ``[3, 3]``, applied first, for files whose object lies on its side; or None.
+        rotation: ``[3, 3]``, applied first, for files whose object is on its side; or None.
         placement: of the dataset's source mesh, or None. It replaces the protocol's axis and the
             rotation if the file has that mesh's bounding box and the protocol asks for no other
             upward axis.

@@ -40,7 +40,7 @@ class Grid:
 def grid_around(*meshes: Mesh, resolution: int) -> Grid:
     """Return the voxel centres around several meshes, with one empty voxel on each side.
 
-    Voxel faces lie on multiples of their side, so the grid is the same for all meshes within a cube
+    Voxel faces are at multiples of their side, so the grid is the same for all meshes within a cube
     of side 2; for larger ones the voxels grow.
 
     Args:
