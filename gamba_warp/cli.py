@@ -191,7 +191,7 @@ def _common(arguments: list[str]) -> tuple[list[str], bool, bool]:
     return left, bool(found["-q"]), bool(found["-v"])
 
 
-# A missing option has the default None, which is no value that anybody can give.
+# A missing option has the default None, which users cannot give.
 _CONFIG = (tyro.conf.DisallowNone, tyro.conf.HelptextFromCommentsOff)
 
 

@@ -94,7 +94,7 @@ def quiet_warp() -> None:
         return
     try:
         saved = os.dup(2)
-    except OSError:  # stderr is closed, so nobody would see the line
+    except OSError:  # stderr is closed, so the line would be lost
         return
     with tempfile.TemporaryFile() as held:
         os.dup2(held.fileno(), 2)

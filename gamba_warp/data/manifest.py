@@ -87,7 +87,7 @@ class Manifest(NamedTuple):
 
 
 def list_of(folder: str) -> str:
-    """Return a digest of the names in a folder that decide which objects lie under it.
+    """Return a digest of the names in a folder that decide which objects it contains.
 
     Raises:
         OSError: it cannot be read.

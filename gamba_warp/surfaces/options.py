@@ -37,7 +37,7 @@ class SurfaceOptions:
         pixels: side of a depth map.
         truncation: of the TSDF, in voxels.
         transmittance: depth is where a ray's transmittance has fallen to this. Fitted and predicted
-            Gaussians are half transparent, so the median (0.5) lies behind the surface.
+            Gaussians are half transparent, so the median (0.5) is behind the surface.
         min_alpha: pixels with less have no depth.
         clear_alpha: pixels with less are empty.
         max_slope: pixels of a steeper surface, depth over width, have no depth.

@@ -37,7 +37,7 @@ def inside(folder: str | Path, name: object, source: str) -> Path:
 class Within:
     """``inside`` for many names of one folder: each of its subfolders is listed once.
 
-    A listed name that is no link needs no further system call; others are followed by ``inside``.
+    A listed name that is not a link needs no further system call; ``inside`` follows others.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -56,7 +56,7 @@ class Within:
         return inside(self._folder, name, source)
 
     def _list(self, above: tuple[str, ...], source: str) -> set[str]:
-        """Names in a subfolder that are no links; none if it is missing or leaves the folder."""
+        """Names in a subfolder except links; empty if it is missing or leaves the folder."""
         try:
             folder = inside(self._folder, "/".join(above), source) if above else self._folder
             with os.scandir(folder) as found:

@@ -74,7 +74,7 @@ def checked_gaussians(
 ) -> Gaussians:
     """Validate the activated values of a file, and return them as one object.
 
-    Colours may lie outside of [0, 1]; a rendering cuts them at 0. A line warns where positions are
+    Colours may be outside of [0, 1]; a rendering clamps them at 0. A line warns where positions are
     too coarse for the object.
 
     Args:

@@ -137,7 +137,7 @@ def _between(
     )
     with np.errstate(all="ignore"):  # untrusted bounds; the result is checked
         values = low.astype(np.float64) * (1 - steps) + high.astype(np.float64) * steps
-    # Nothing lies between bounds if one is infinite.
+    # No value is between bounds if one is infinite.
     return np.where(np.isfinite(low) & np.isfinite(high), values, np.nan)
 
 

@@ -137,7 +137,7 @@ def _activated(found: Unpacked, columns: list[np.ndarray]) -> dict[str, np.ndarr
         "opacities": opacities[:, 0] / 255,
         "colors": (colors / 255 - 0.5) / _COLOR * SH_C0 + 0.5,
     }
-    for rest in harmonics:  # of degree 0 there are none
+    for rest in harmonics:  # empty at degree 0
         arrays["harmonics"] = (rest.reshape(len(rest), -1, 3).astype(np.float64) - 128) / 128
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
