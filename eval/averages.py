@@ -116,7 +116,7 @@ def summary_of(values: Sequence[float | None]) -> dict[str, Any]:
 
 
 def minus(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Subtract the numbers of ``b`` from those of ``a``, nested ones too.
+    """Subtract the numbers of ``b`` from the ones of ``a``, nested ones too.
 
     Only keys with numbers in both are kept; the difference is None if one of the two is None.
     """

@@ -28,7 +28,7 @@ VIEWS, SHAPES = "eval-views", "eval-geometry"
 _MAX_LETTERS = 60  # of a method's name
 _MAX_NAMED = 5  # objects of a method named in a line
 
-# Metrics of shapes: those of the paper's table, then the others.
+# Metrics of shapes: the paper's table first, then the others.
 OF_SHAPES = {"chamfer": Column("Chamfer ↓", 4), "iou": Column("Volume IoU ↑", 4)}
 _FSCORE = "fscore."  # before a threshold
 _MORE_OF_SHAPES = {
@@ -120,14 +120,14 @@ def read_reports(arguments: tuple[str, ...]) -> dict[str, dict[str, Report]]:
             or two reports differ in protocol or truth; the message names the difference.
     """
     if len(arguments) > MAX_REPORTS:
-        raise UserError(f"{len(arguments)} reports, at most {MAX_REPORTS} are compared")
+        raise UserError(f"{len(arguments)} reports, at most {MAX_REPORTS} can be compared")
     methods: dict[str, dict[str, Report]] = {}
     for argument in arguments:
         name, text = _split(argument)
         report = read_report(Path(text))
         others = [of[report.kind] for of in methods.values() if report.kind in of]
         if report.kind in methods.setdefault(name, {}):
-            raise UserError(f"{argument}: {name} has a report of {report.kind} already")
+            raise UserError(f"{argument}: {name} already has a report of {report.kind}")
         for other in others:
             _check_pair(other, report)
         methods[name][report.kind] = report
@@ -137,9 +137,9 @@ def read_reports(arguments: tuple[str, ...]) -> dict[str, dict[str, Report]]:
 def _split(argument: str) -> tuple[str, str]:
     name, equals, text = argument.partition("=")
     if not (name and equals and text):
-        raise UserError(f"{argument}: give NAME=a report.json or its folder")
+        raise UserError(f"{argument}: expected NAME=PATH of a report.json or its folder")
     if len(name) > _MAX_LETTERS or not name.isprintable() or "|" in name:
-        raise UserError(f"{argument}: a name has at most {_MAX_LETTERS} letters and no '|'")
+        raise UserError(f"{argument}: a name has at most {_MAX_LETTERS} characters and no '|'")
     return name, text
 
 
@@ -156,12 +156,12 @@ def read_report(path: Path) -> Report:
     content = parse_document(read_bytes(path), _Document, str(path))
     kind = next((kind for name, kind in _KIND_BY_FIELD.items() if name in content.protocol), None)
     if kind is None:
-        raise UserError(f"{path}: no report of gamba eval-views or gamba eval-geometry")
+        raise UserError(f"{path}: not a report of gamba eval-views or gamba eval-geometry")
     report = Report(path, kind, content.protocol)
     for number, item in enumerate(content.objects):
         name = item.get("name")
         if not isinstance(name, str) or name in report.records or name in report.failed:
-            raise UserError(f"{path}: objects[{number}] has no name, or that of another one")
+            raise UserError(f"{path}: objects[{number}] has no name, or a duplicate one")
         if item.get("status") != OK:
             report.failed[name] = str(item.get("reason", "failed"))
             continue
@@ -189,14 +189,14 @@ def _check_pair(first: Report, report: Report) -> None:
             free = not all(any(v.kind == "gaussians" for v in r.records.values()) for r in pair)
         if not free:
             raise UserError(
-                f"{report.path}: not of the protocol of {first.path}: "
+                f"{report.path}: its protocol differs from {first.path}: "
                 f"{key} is {_shown(a)}, not {_shown(b)}"
             )
     for uid in sorted(report.records.keys() & first.records.keys()):
         one, two = ([getattr(r.records[uid], key, None) for key in _TRUTH] for r in pair)
         if one != two:
             raise UserError(
-                f"{report.path}: {uid} was compared with another truth than in {first.path}"
+                f"{report.path}: {uid} was compared with a different truth than in {first.path}"
             )
 
 
@@ -227,7 +227,7 @@ def join(methods: dict[str, dict[str, Report]], against: str | None) -> dict[str
     names = list(methods)
     base = names[0] if against is None else against
     if base not in names:
-        raise UserError(f"--against {base}: the methods are {', '.join(names)}")
+        raise UserError(f"--against {base}: expected one of {', '.join(names)}")
     # By figure, method and object; a method without any value of a figure is left out.
     values: dict[str, dict[str, dict[str, float]]] = {}
     common: dict[str, list[str]] = {}

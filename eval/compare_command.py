@@ -37,7 +37,7 @@ def compare_command(
         json: Print compare.json in place of the table.
     """
     if not reports:
-        raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
+        raise UserError("give NAME=REPORT pairs, each a report.json of eval-views or eval-geometry")
     from gamba_warp.files import output_folder, write_json, write_text
 
     from .compare import join, markdown_page, read_reports

@@ -201,7 +201,7 @@ def count_line(report: dict[str, Any], folder: Path | None, beside: int = 0) -> 
     Args:
         report: the result of ``make_report``.
         folder: where it was written, or None.
-        beside: the number of failures of baselines.
+        beside: number of failures of baselines, counted separately.
     """
     others = f", {beside} of baselines failed" if beside else ""
     file = f"; {folder / 'report.json'}" if folder else ""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from .versions import __version__
 
 _root = Path(__file__).resolve().parent.parent
-if (_root / "setup.cfg").is_file():  # a checkout: sub-packages sit beside this folder
+if (_root / "setup.cfg").is_file():  # a checkout: sub-packages are next to this folder
     __path__.append(str(_root))
 
 from .kernels.lazy import load_when_used  # noqa: E402 (in a checkout it is found only now)

@@ -1,4 +1,4 @@
-"""Processing of many inputs: a failure is recorded, and the rest go on."""
+"""Processing of many inputs: a failure is recorded, and the rest continues."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def warn(path: Path, lines: Iterable[str]) -> None:
 
 
 class Stages:
-    """Stages of a command, timed and shown beside the bar of ``for_each``.
+    """Stages of a command, timed and shown next to the bar of ``for_each``.
 
     Attributes:
         quiet: no bar is drawn.

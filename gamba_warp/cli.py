@@ -33,7 +33,7 @@ class Command(NamedTuple):
     Attributes:
         about: its purpose, a line.
         extra: the extra that brings its libraries; empty for the core.
-        needs: libraries that it always needs; those of single options are checked on use.
+        needs: libraries that it always needs; options check their own on use.
         uses: it launches "kernels" (``quiet_warp``), runs the "network" (``keep_memory``,
             ``use_fastest_products``), or leaves "cores" to others while it waits (``share_cores``),
             unlike training and measurements, which keep torch's busy-waiting.
@@ -170,7 +170,7 @@ def _common(arguments: list[str]) -> tuple[list[str], bool, bool]:
         The other arguments, and whether ``--quiet`` and ``--verbose`` were given.
 
     Raises:
-        UserError: an option is repeated, of which tyro would silently keep the last.
+        UserError: an option is repeated; tyro would silently keep the last one.
     """
     found: dict[str, list[str]] = {"-q": [], "-v": []}
     left, seen = [], set()
@@ -185,13 +185,13 @@ def _common(arguments: list[str]) -> tuple[list[str], bool, bool]:
         if word.startswith("--"):
             name = word.partition("=")[0].replace("_", "-")
             if (key := name.replace("--no-", "--", 1)) in seen:
-                raise UserError(f"give {name} once")
+                raise UserError(f"{name} may be given only once")
             seen.add(key)
         left.append(word)
     return left, bool(found["-q"]), bool(found["-v"])
 
 
-# A missing option has the default None, which is no value that anybody can give.
+# A missing option has the default None, which users cannot give.
 _CONFIG = (tyro.conf.DisallowNone, tyro.conf.HelptextFromCommentsOff)
 
 
@@ -292,7 +292,7 @@ _default_format = warnings.formatwarning
 
 
 def _format_warning(message: Any, category: type[Warning], *where: Any, **others: Any) -> str:
-    """Format a warning; that of a file is one line without a place in the code."""
+    """Format a warning; a ``FileWarning`` is one line without a source location."""
     if issubclass(category, FileWarning):
         return f"gamba: warning: {message}\n"
     return _default_format(message, category, *where, **others)

@@ -94,7 +94,7 @@ def quiet_warp() -> None:
         return
     try:
         saved = os.dup(2)
-    except OSError:  # stderr is closed, so nobody would see the line
+    except OSError:  # stderr is closed, so the line would be lost
         return
     with tempfile.TemporaryFile() as held:
         os.dup2(held.fileno(), 2)
@@ -150,7 +150,7 @@ def _bfloat16_speedup(name: str, width: int, threads: int) -> float:
 
 @contextmanager
 def float32_weights() -> Iterator[None]:
-    """Create networks in float32 inside, whatever torch's default dtype is.
+    """Create networks in float32 within the block, whatever torch's default dtype is.
 
     The operators take no float64, and random weights differ in it. The default dtype is
     process-wide, so other threads see float32 meanwhile.
@@ -171,7 +171,7 @@ def use_fastest_products() -> None:
     - AMD with AVX-512 and without AMX: oneDNN. By default torch calls MKL, which does not use
       AVX-512 there and takes twice as long on a Zen 5. torch selects oneDNN by the setting
       "medium", which also permits factors rounded to bfloat16; without AMX oneDNN does not round
-      them. A product is compared with float64; if its error is larger than that of float32,
+      them. A product is compared with float64; if its error is larger than float32's,
       nothing is changed.
     - Other CPUs: unchanged. MKL is made for Intel's.
     - Machines with a GPU: unchanged, since the setting would round factors there (TF32).

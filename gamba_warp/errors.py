@@ -27,7 +27,7 @@ def first_line(error: BaseException | str) -> str:
 
 
 def one_line(text: str, most: int = MOST_LETTERS) -> str:
-    """Return the text as one printable line of at most ``most`` letters (over 20)."""
+    """Return the text as one printable line of at most ``most`` characters (over 20)."""
     line = " ".join(part.strip() for part in text.strip().splitlines())
     if len(line) > 2 * most:  # before the escapes, which may take long
         line = f"{line[:most]}{line[-most:]}"
@@ -61,7 +61,7 @@ class PrintableStream:
         self.terminal = terminal
 
     def write(self, text: str) -> int:
-        """Write the escaped text; return the number of letters of the text."""
+        """Write the escaped text; return the number of characters of the text."""
         self.terminal.write(printable(text))
         return len(text)
 

@@ -31,7 +31,7 @@ PART = ".gamba-part-"
 _PART_NAME = re.compile(re.escape(PART) + "[a-z0-9_]{8}")
 _DAY = 24 * 3600.0  # seconds; no command writes one file for so long
 _READ = 1 << 20  # bytes read at once; a file may be larger than the memory
-# Endings of names of files: those that every Python knows, without the system's, and ours.
+# File suffixes that every Python knows, without the system's, and ours.
 _FILE_NAMES = mimetypes.MimeTypes()
 _FILE_SUFFIXES = {*".ply .splat .spz .glb .gltf .obj .stl .off .safetensors .npz".split()}
 # Codes of a failed write that blame the disk, even if the error names no file.
@@ -59,7 +59,7 @@ def write_error(error: BaseException) -> str | None:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a path of the same name in a new folder beside; on success the file moves to ``path``.
+    """Yield a temporary path of the same name; on success the file moves to ``path``.
 
     The name keeps its suffix, by which many writers choose the format. The folder also holds the
     temporary file that safetensors makes, and marks the leftovers of a killed process. The file is
@@ -84,7 +84,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _unfinished(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside ``path``; errors of the disk name ``path``."""
+    """Yield a temporary folder next to ``path``; errors of the disk name ``path``."""
     folder = None
     try:
         folder = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
@@ -107,7 +107,7 @@ def _umask() -> int:
 
 @contextmanager
 def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
-    """Yield a temporary folder beside ``path``; it is renamed on success, else removed.
+    """Yield a temporary folder next to ``path``; it is renamed on success, else removed.
 
     Args:
         path: the final folder.
@@ -246,14 +246,14 @@ _BESIDE = {".bin", ".csv", ".json", ".md", ".mtl", ".tga", ".txt", ".png", ".jpg
 def warn_of_others(folder: Path, files: Iterable[Path], known: Container[str]) -> None:
     """Warn of the files of a folder that are not read because of their suffixes.
 
-    Files that often lie beside others, such as textures, count as known.
+    Files that often accompany others, such as textures, count as known.
     """
     suffixes = [path.suffix.lower() for path in files if not path.name.startswith(".")]
     others = [suffix for suffix in suffixes if suffix not in known and suffix not in _BESIDE]
     if others:
         kinds = ", ".join(sorted({suffix or "no suffix" for suffix in others})[:9])
         count = f"{len(others)} file{'s' * (len(others) > 1)} of other kinds"
-        warnings.warn(f"{folder}: {count} passed over ({kinds})", FileWarning, stacklevel=2)
+        warnings.warn(f"{folder}: {count} skipped ({kinds})", FileWarning, stacklevel=2)
 
 
 def plain_file(path: str | Path, links: bool = True) -> os.stat_result:
@@ -291,14 +291,14 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def check_folder_name(path: Path) -> None:
-    """Refuse a new folder whose name ends like that of a file, such as ``model.glb``.
+    """Refuse a new folder with the name of a file, such as ``model.glb``.
 
     Raises:
         UserError: the name has such an ending, and there is no folder of that name.
     """
     kind, coding = _FILE_NAMES.guess_type(path.name)
     if (kind or coding or path.suffix.lower() in _FILE_SUFFIXES) and not path.exists():
-        raise UserError(f"{path}: a file's name, but the results need a folder; give one")
+        raise UserError(f"{path}: looks like a file, but the results need a folder; give one")
 
 
 def output_folder(path: str | Path) -> Path:

@@ -24,7 +24,7 @@ class Gaussians:
         quats: ``[.., N, 4]`` wxyz, any length > 0, or None for no rotation (cheaper).
         scales: ``[.., N, 3]`` standard deviations, > 0, object units.
         opacities: ``[.., N]`` in (0, 1).
-        colors: ``[.., N, 3]`` RGB, of networks in [0, 1]; those of files may lie outside.
+        colors: ``[.., N, 3]`` RGB, of networks in [0, 1]; from files they may be outside.
         harmonics: ``[.., N, K, 3]``, K of 3, 8 or 15: coefficients of the spherical harmonics of
             degrees 1 to 1, 2 or 3 in the order and signs of 3DGS, for the view-dependent part
             added to ``colors`` (Kerbl et al. 2023); None: the colour is view-independent.

@@ -158,7 +158,7 @@ def load_rgba(
 
 
 def load_rgba8(path: str | Path, content: bytes | None = None) -> np.ndarray:
-    """Read a picture of a posed set like ``load_rgba``, but ``[H, W, 4]`` uint8, as it is stored.
+    """Read a picture of a posed set like ``load_rgba``, but ``[H, W, 4]`` uint8, as stored.
 
     EXIF rotation is not applied: the cameras of COLMAP and others are for the stored pixels.
 
@@ -373,7 +373,7 @@ def _conversion(
         for chunk, (key, srgb) in _CHUNKS.items() if "srgb" not in image.info else ():
             values = np.ravel(image.info.get(key, srgb))
             if len(values) != len(srgb) or np.abs(values - srgb).max() > 0.01:
-                warn(f"{name}: its {chunk} chunk is not read; colours are taken for sRGB")
+                warn(f"{name}: its {chunk} chunk is ignored; colours are taken as sRGB")
         return None
     profile = image.info["icc_profile"]
     try:
@@ -384,7 +384,7 @@ def _conversion(
         return _from_profile(profile, mode)
     except Exception as error:  # littleCMS is missing, or raises errors of many types
         reason = first_line(error)
-        warn(f"{name}: its colour profile is not used ({reason}); colours are taken for sRGB")
+        warn(f"{name}: its colour profile is not used ({reason}); colours are taken as sRGB")
         return None
 
 
@@ -399,7 +399,7 @@ def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Im
     source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
     space = cast(Any, source.profile).xcolor_space.strip()  # missing in Pillow's stub
     if space not in {"L": ("GRAY", "RGB"), "RGB": ("RGB",), "CMYK": ("CMYK",)}[mode]:
-        raise ValueError(f"it is of {space}, the picture of {mode}")
+        raise ValueError(f"it is for {space}, but the picture is {mode}")
     source_mode = "L" if space == "GRAY" else space
     # For speed littleCMS interpolates grey between a few steps; the table below has all 256.
     flags = ImageCms.Flags.NOOPTIMIZE if mode == "L" else ImageCms.Flags.NONE
@@ -468,7 +468,7 @@ def find_pictures(
     """Resolve files and folders to picture files.
 
     Args:
-        images: files, which are kept as they are, and folders, whose files with a picture's suffix
+        images: files, which are kept unchanged, and folders, whose files with a picture's suffix
             follow in sorted order.
         recursive: also take those in their sub-folders; links to folders are not followed.
 

@@ -31,7 +31,7 @@ _USED = (
     "gsplat",
     "tyro",
 )
-# The extra that brings a library, by import name. A command with an extra of its own names that
+# The extra that brings a library, by import name. A command with its own extra names that
 # instead if it holds the library too.
 EXTRA_OF = {
     "backports.zstd": "spz",
@@ -108,7 +108,7 @@ def advice(library: str, command: str, extra: str = "") -> str | None:
     Args:
         library: the failed import; also a submodule, such as ``scipy.spatial``.
         command: the command that needs it.
-        extra: that of the command, if it has one.
+        extra: the command's extra, if it has one.
     """
     name = library if library in EXTRA_OF else library.partition(".")[0]
     if name not in EXTRA_OF:
@@ -125,7 +125,7 @@ def require(*libraries: str) -> None:
         libraries: import names, such as ``trimesh``.
 
     Raises:
-        ModuleNotFoundError: one is missing; the console script tells how to get it (``advice``).
+        ModuleNotFoundError: one is missing; the console script prints how to get it (``advice``).
     """
     for name in libraries:
         if find_spec(name) is None:
@@ -144,7 +144,7 @@ def to_install(extra: str) -> str:
 def import_open3d() -> ModuleType:
     """Return the ``open3d`` module, which is imported nowhere else.
 
-    Its Linux wheel wants ``libusb-1.0.so.0`` from the system; ``libusb-package`` carries the
+    Its Linux wheel needs ``libusb-1.0.so.0`` from the system; ``libusb-package`` carries the
     library, and loading it first satisfies the linker without root.
     """
     import ctypes

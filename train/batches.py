@@ -363,7 +363,7 @@ class Batches:
             return Prepared(batch, failures)
         if self._copies is None:
             self._copies = torch.cuda.Stream(self.world.device)
-        with torch.cuda.stream(self._copies):  # beside the steps
+        with torch.cuda.stream(self._copies):  # in parallel with the steps
             batch = batch.for_gpu(self.model).to(self.world.device)
             return Prepared(batch, failures, self._copies.record_event())
 

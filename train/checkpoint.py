@@ -43,7 +43,7 @@ _Count = Annotated[int, msgspec.Meta(ge=0, le=10**12)]
 
 
 class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    """Fields of ``state.pt``: everything beside the weights that a resumed run needs."""
+    """Fields of ``state.pt``: everything that a resumed run needs besides the weights."""
 
     version: int
     config: dict[str, Any]
@@ -138,7 +138,7 @@ def find_checkpoint(
     if not (path / "state.pt").is_file():
         found = list_checkpoints(path)
         if not found:
-            raise UserError(f"--resume {path}: no checkpoint there")
+            raise UserError(f"--resume {path}: no checkpoint found")
         path = found[-1]
     reason = damage(path)
     if reason:
@@ -156,10 +156,10 @@ def _newest_whole(found: list[Path], warn: Callable[[str], None]) -> Path:
         reason = damage(checkpoint)
         if not reason:
             for text in reasons:
-                warn(f"{text}; going on from {checkpoint}")
+                warn(f"{text}; resuming from {checkpoint}")
             return checkpoint
         reasons.append(reason)
-    raise UserError(f"{reasons[0]}; no checkpoint of this run is whole")
+    raise UserError(f"{reasons[0]}; no checkpoint of this run is intact")
 
 
 def damage(checkpoint: Path) -> str | None:
@@ -193,7 +193,7 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     path = checkpoint / "state.pt"
     state = read_torch(path, "damaged, take an older checkpoint")
     if not isinstance(state, dict):
-        raise UserError(f"{path}: damaged, it does not hold the state of a run")
+        raise UserError(f"{path}: damaged, it does not contain the state of a run")
     return state
 
 
@@ -234,7 +234,7 @@ def read_run(
     stored, source = read_state(checkpoint), str(checkpoint / "state.pt")
     version = stored.get("version")
     if type(version) is not int or version != STATE_VERSION:  # a tensor's comparison may raise
-        raise UserError(f"{checkpoint}: state of version {str(version)[:40]!r}")
+        raise UserError(f"{checkpoint}: unsupported state version {str(version)[:40]!r}")
     state = check_state(stored, source)
     there, here = state.config, config.to_dict()
     try:
@@ -294,7 +294,7 @@ def initial_differences(path: Path, config: TrainConfig, objects: str) -> list[s
     """Compare this run with the one that made a model file, if it is known.
 
     Args:
-        path: the model file; a checkpoint's state or a run's ``config.json`` may lie beside it.
+        path: the model file; a checkpoint's state or a run's ``config.json`` may be in its folder.
         config: options of this run.
         objects: ``TrainingData.fingerprint`` of this run.
 
@@ -324,7 +324,7 @@ def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:
     stored, wanted = asdict(config), asdict(model.config)
     differing = [name for name in wanted if stored[name] != wanted[name]]
     if differing:
-        raise UserError(f"{path}: is a model with another {', '.join(differing)}")
+        raise UserError(f"{path}: is a model with a different {', '.join(differing)}")
     try:
         return read_weights(path, model)
     except ValueError as error:

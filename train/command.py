@@ -68,7 +68,7 @@ def expand(arguments: list[str]) -> list[str]:
     if helped:
         print(table_of(name) + "\n")
         return rest
-    # DATA may come first, last beside a recipe, and after the one value of --config.
+    # DATA may come first, last with a recipe, and after the one value of --config.
     first = rest[:1] if rest and not rest[0].startswith("-") else []
     if chosen == "--recipe":
         taken = recipe_words(name, rest, os.environ)

@@ -58,7 +58,7 @@ class DataConfig:
             to 6.
         background: Colour behind the rendered and the true pictures; "random" draws one for each
             object and step. The input picture always has the model's own background.
-        extra: More datasets, whose training objects are added to those of DATA. The objects of one
+        extra: More datasets; their training objects are added to DATA's. The objects of one
             that is named twice come twice in an epoch.
         front_share: Share of the samples whose input is a view from the front: the object's first,
             or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation. The other
@@ -70,7 +70,7 @@ class DataConfig:
         cache: Keep decoded pictures in memory, with 8 bits a channel. Depth pictures are read when
             they are used.
         workers: Threads that decode pictures ahead of the training; also the largest number of
-            batches kept ready. By default 1, beside a GPU one per core but 8 at most. The number
+            batches kept ready. By default 1, or with a GPU one per core, at most 8. The number
             does not change the result.
     """
 
@@ -88,7 +88,7 @@ class DataConfig:
     workers: Annotated[int, Meta(ge=1, le=1024)] | None = None
 
     def threads(self, device: str) -> int:
-        """Return the number of workers beside a device of a type, "cpu" or "cuda"."""
+        """Return the number of workers for a device type, "cpu" or "cuda"."""
         return self.workers or (min(8, cores()) if device == "cuda" else 1)
 
 
@@ -111,8 +111,8 @@ class LossConfig:
         depth_weight: Weight of the depth loss: the first layer of "rays" is pulled to the first
             surface of the input view, the last layer to the last surface. The data needs depth
             pictures (gamba data render --depth); not in the paper.
-        mask_l1_weight: Weight of the absolute error of alpha, beside its squared error: where a
-            position is unknown, its least value is at 0 or 1 and not between. Not in the paper.
+        mask_l1_weight: Weight of the absolute error of alpha, added to its squared error: where a
+            position is unknown, its minimum is at 0 or 1 and not between. Not in the paper.
         translucency_weight: Weight of 4 alpha (1 - alpha) of rendered alpha beyond that of the true
             one, in views more than 20 degrees from the input. Not in the paper.
         radial_mask: The radial mask constraint on the projected centres (paper Table 2).
@@ -164,7 +164,7 @@ class RunConfig:
             override them, and so does DATA if it comes first; without --out that run itself is
             resumed.
         recipe: Set of options: "paper" is the paper's training, with 256 objects a step over all
-            processes; "tiny" or "rays" is that of the shipped model, at its size. Further options
+            processes; "tiny" or "rays" is the shipped model's, at its size. Further options
             override it; with --help it shows the recipe's options and their sources.
         resume: "auto" resumes from the newest checkpoint of the run folder; else "never", or the
             path of a checkpoint. The number of processes may be another one, if --batch-size and
@@ -182,8 +182,8 @@ class RunConfig:
         threads: Number of CPU threads; all cores if not given.
         recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
             same result in less memory and more time.
-        graph: Repeat the launches of a step as a CUDA graph: the same result without the time that
-            the host takes for them. "auto" does so on a GPU, where a step can be captured.
+        graph: Replay the launches of a step as a CUDA graph: the same result without the launch
+            overhead of the host. "auto" does so on a GPU, where a step can be captured.
         seed: Seed of the initial weights and of the order of the data.
     """
 

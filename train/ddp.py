@@ -170,7 +170,7 @@ class World:
                 parts.append(f"{subject}: {', '.join(shown[:_MAX_SHOWN] + more)}")
         like = f", like {len(others) - 1} more," if len(others) > 1 else ""
         raise UserError(
-            f"process {others[0]} on {name}{like} is not set up as process 0 on {host}: "
+            f"process {others[0]} on {name}{like} is not set up like process 0 on {host}: "
             f"{'; '.join(parts)}"
         )
 

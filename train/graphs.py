@@ -34,7 +34,7 @@ class _Recorded(NamedTuple):
 class StepGraphs:
     """Graphs of a run on one GPU.
 
-    The first step of a shape runs by itself: it finds the rasterizer's capacity, and libraries set
+    The first step of a shape has no graph: it finds the rasterizer's capacity, and libraries set
     themselves up. The second one is captured. All run on one stream, which is not torch's default.
     """
 

@@ -61,7 +61,7 @@ class RunLog:
         except Exception as error:  # TensorBoard's thread may raise anything
             if name not in self._said:
                 self._said.add(name)
-                say(f"gamba train: {name} cannot be written, the run goes on: {reason_of(error)}")
+                say(f"gamba train: {name} cannot be written, the run continues: {reason_of(error)}")
             if name == "tensorboard":
                 self._board = None
 

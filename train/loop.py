@@ -155,7 +155,7 @@ class Trainer:
         """Make one optimizer step.
 
         A step with a non-finite loss or gradient leaves the weights unchanged and is counted. A GPU
-        is not waited for: its numbers are read with the next step, and those of a log step at once.
+        is not waited for: its numbers are read with the next step, a log step's at once.
 
         Returns:
             On log steps the figures, some of them of the last batch only; with several processes,
@@ -342,7 +342,7 @@ class Trainer:
         self.world.on_main(validate_all)
 
     def _better(self, score: Score, name: str) -> bool:
-        """True if a score is better than that of ``name``, or there is none; False for NaN."""
+        """True if a score is better than ``name``'s, or the first; False for NaN."""
         other = self.scores.get(name)
         return score.psnr == score.psnr and (other is None or score.psnr > other.psnr)
 
@@ -390,7 +390,7 @@ class Trainer:
         self.world.on_main(write)
 
     def state(self) -> dict:
-        """Return everything a resumed run needs beside the weights: tensors and plain values."""
+        """Return everything a resumed run needs besides the weights: tensors and plain values."""
         return {
             "version": STATE_VERSION,
             "config": self.config.to_dict(),

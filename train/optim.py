@@ -19,7 +19,7 @@ from gamba_warp.model.gamba import Gamba
 from .config import OptimConfig
 
 # By name: the rate after the warm-up as a share of its peak. Arguments: the options, the step, the
-# steps of the warm-up and those of the run. A script may add to it (docs/train-your-own.md).
+# steps of the warm-up and of the run. A script may add to it (docs/train-your-own.md).
 SCHEDULES: dict[str, Callable[[OptimConfig, float, float, float], float]] = {
     "cosine": lambda optim, step, warmup, total: _half_cosine(
         (step - warmup) / max(1e-12, total - warmup)
@@ -80,7 +80,7 @@ def checked_moments(
             raise ValueError("the optimizer has no state")
         for index, entry in moments.items():
             if type(index) is not int or not 0 <= index < len(parameters):
-                raise ValueError(f"the optimizer has a state of parameter {str(index)[:40]!r}")
+                raise ValueError(f"unknown parameter {str(index)[:40]!r} in the optimizer's state")
             names = set(entry) if isinstance(entry, dict) else set()
             if names != {"step", "exp_avg", "exp_avg_sq"}:
                 raise ValueError(f"the optimizer's state of parameter {index} has other fields")
@@ -89,7 +89,7 @@ def checked_moments(
                 if not isinstance(value, Tensor) or value.dtype != torch.float32:
                     raise ValueError(f"{name} of parameter {index} is not a float32 tensor")
                 if value.shape != wanted:
-                    raise ValueError(f"{name} of parameter {index} is {tuple(value.shape)}")
+                    raise ValueError(f"{name} of parameter {index} has shape {tuple(value.shape)}")
                 if not value.isfinite().all() or (name != "exp_avg" and bool((value < 0).any())):
                     raise ValueError(f"{name} of parameter {index} is not finite, or negative")
     except ValueError as error:
@@ -248,9 +248,7 @@ class Schedule:
         rises = step < self.optim.warmup_steps or share < _LOW * wanted
         since = NewLength(step=step, elapsed=elapsed, share=share, rises=rises)
         rates = [f"{self.optim.lr * value:.3g}" for value in (share, wanted)]
-        text = (
-            f"the run's length is now {self}, not {old}: the learning rate goes on from {rates[0]}"
-        )
+        text = f"the run's length is now {self}, not {old}: the rate continues from {rates[0]}"
         if rises:
             text += f", goes to {rates[1]}, the new length's own, in a tenth of the rest,"
         text = f"{text} and falls to 0 at the end"

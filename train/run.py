@@ -200,6 +200,6 @@ def _report(trainer: Trainer, log: RunLog, code: int, failures: dict[str, str]) 
     for uid, reason in failures.items():
         say(f"could not read {uid}: {reason}", sys.stderr)
     if code > 128:
-        say(f"stopped by a signal at step {trainer.step}; the same command goes on from here")
+        say(f"stopped by a signal at step {trainer.step}; the same command resumes from here")
     elif code == 0:
         say(f"wrote {trainer.config.run.out / 'model.safetensors'}")

@@ -145,7 +145,7 @@ def compute_gradients(
     clip: float,
     count: int = 1,
 ) -> Gradients:
-    """Set the parameters' gradients to those of the mean loss over some batches, and clip them.
+    """Set the parameters' gradients to the gradients of the mean loss over some batches; clip them.
 
     Several processes exchange their gradients once, with the last batch.
 

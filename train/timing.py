@@ -90,7 +90,7 @@ class Step:
         """
         on_gpu = self.batch.inputs.is_cuda
         kind = "device_time_total" if on_gpu else "cpu_time_total"
-        # Without a driver kineto prints that there is none.
+        # Without a driver kineto prints that there is no driver.
         found = profile(use_device="cuda" if on_gpu else None, use_kineto=on_gpu)
         with found:
             self._step(self.batch, 0.0)
@@ -106,7 +106,7 @@ class Step:
         """Check that the gradient is finite and not 0, without an oracle."""
         _, norm, skipped = self.run().tolist()
         if skipped or norm == 0:
-            raise ValueError(f"gradient is {norm}")
+            raise ValueError(f"gradient norm is {norm}")
 
 
 def steps(settings: Settings) -> list[Variant]:

@@ -100,7 +100,7 @@ def make_hall(folder: Path, count: int, objects: int, seed: int) -> Gaussians:
             mine = count * (number + 1) // objects - count * number // objects
             part = sample(mesh, mine, np.random.default_rng([seed, number]))
         except UserError as error:
-            print(f"{entry.uid} is left out: {error}")
+            print(f"skipped {entry.uid}: {error}")
             continue
         cell = torch.tensor([number % columns, 0, number // columns], dtype=torch.float32)
         middle = torch.tensor([(columns - 1) / 2, 0, (columns - 1) / 2])
@@ -151,8 +151,8 @@ def save_picture(path: Path, rgb: Tensor) -> None:
 def main() -> None:
     """Read the options from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="meshes, or the .ply that a run has written")
-    parser.add_argument("--out", type=Path, help="the .ply to be written")
+    parser.add_argument("folder", type=Path, help="folder of meshes, or the .ply of an earlier run")
+    parser.add_argument("--out", type=Path, help="output .ply")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each kind of view")
     parser.add_argument("--count", type=int, default=1 << 20, help="Gaussians")
     parser.add_argument("--objects", type=int, default=256)

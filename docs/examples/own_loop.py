@@ -20,8 +20,8 @@ from gamba_warp.train.step import Objective, forward, validate
 
 parser = argparse.ArgumentParser()
 parser.add_argument("data", nargs="+", type=Path)
-parser.add_argument("--weights", nargs="+", type=float, help="how often each DATA is taken")
-parser.add_argument("--init", type=Path, help="a model, whose tensors of the same shape are taken")
+parser.add_argument("--weights", nargs="+", type=float, help="sampling weight of each DATA")
+parser.add_argument("--init", type=Path, help="model whose tensors of equal shape are loaded")
 parser.add_argument("--steps", type=int, default=200)
 parser.add_argument("--out", type=Path, default=Path("runs/own"))
 options = parser.parse_args()

@@ -86,7 +86,7 @@ def _run(command: str, *words: object) -> int:
     """Run a command, which reports failed objects; these are not an error here."""
     code = cli.run(command, [*map(str, words)])
     if code not in (0, 1):
-        raise UserError(f"gamba {command}: ended with exit code {code}")
+        raise UserError(f"gamba {command}: failed with exit code {code}")
     return code
 
 

@@ -88,7 +88,7 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
     held_out = [uid for uid in OBJECTS if split_of(groups[uid]) != "train"]
     leaked = [uid for uid in ICONS if split_of(meshes[uid].group) == "train"]
     if leaked:
-        raise UserError(f"the icon of {leaked[0]} is of a training object")
+        raise UserError(f"the icon of {leaked[0]} shows a training object")
     output_folder(out)
     rows = []
     for uid in sorted({*OBJECTS, *ICONS}):

@@ -146,5 +146,5 @@ def _keep_what_is_there(entries: list, files: Files) -> None:
             if isinstance(value, list):
                 _keep_what_is_there(value, files)
             if value == [] or (isinstance(value, str) and files.get_file_from_path(value) is None):
-                log.info("the navigation names %s, which is not there", value or entry)
+                log.info("the navigation names %s, which does not exist", value or entry)
                 entries.remove(entry)

@@ -57,7 +57,7 @@ def aligned(
         UserError: the prediction is a single point.
     """
     if steps and not np.ptp(predicted.positions, axis=0).any():
-        raise UserError("cannot be aligned: all points of the prediction are one")
+        raise UserError("cannot be aligned: the prediction's points coincide")
     motion, residual = Similarity(np.eye(3), np.zeros(3)), {}
     for step in steps:
         moved = motion.apply(predicted)

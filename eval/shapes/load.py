@@ -40,7 +40,7 @@ TO_Z_UP = {
     "opengl": Y_TO_Z_UP,
     "z-up": np.eye(3),
 }
-# Axes of the frames of predictions; those of "gt" depend on the file.
+# Axes of the frames of predictions; for "gt" they depend on the file.
 FRAME_AXES = {"unit": "z-up", "reference": "opencv"}
 DATASET = "dataset"  # axes stated by the dataset that was rendered from the meshes
 _FOLLOWED = "which was rendered of these meshes with another axis up; --up is followed"
@@ -99,7 +99,7 @@ def load_truth(
     Args:
         path: file.
         protocol: with the upward axis of the file and the refused flags.
-        rotation: ``[3, 3]``, applied first, for files whose object lies on its side; or None.
+        rotation: ``[3, 3]``, applied first, for files whose object is on its side; or None.
         placement: of the dataset's source mesh, or None. It replaces the protocol's axis and the
             rotation if the file has that mesh's bounding box and the protocol asks for no other
             upward axis.
@@ -110,7 +110,7 @@ def load_truth(
     """
     shape, axes = _read_shape(path)
     if isinstance(shape, Gaussians):
-        raise UserError(f"{path}: Gaussians, the truth must be a mesh or a point cloud")
+        raise UserError(f"{path}: holds Gaussians; the truth must be a mesh or a point cloud")
     try:
         asked, warning = {"y": "opengl", "z": "z-up"}.get(protocol.up), ""
         if placement is not None and placement.fits(_positions(shape)):
@@ -158,7 +158,7 @@ def load_prediction(
         protocol: with the file's axes, the options of surfaces, and the refused flags.
 
     Raises:
-        UserError: it cannot be read, has no surface, or lies far away.
+        UserError: it cannot be read, has no surface, or is too far away.
     """
     source, of_file = _read_shape(path)
     axes = protocol.pred_axes
@@ -197,12 +197,12 @@ def unit_motion(
     if rotation is not None:
         turn = turn @ np.asarray(rotation, np.float64)
         if abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
-            raise UserError("the rotation that its catalogue states also stretches or mirrors")
+            raise UserError("its catalogue's rotation stretches or mirrors, which is invalid")
     points = _positions(shape) @ turn.T
     low, high = points.min(0), points.max(0)
     extent = (high - low).max()
     if extent <= 1e-10 * max(abs(low).max(), abs(high).max()):
-        raise UserError("all its points are one, or too near to each other to tell apart")
+        raise UserError("all its points coincide, or are too close to tell apart")
     return Similarity(turn, -(low + high) / 2 / extent, 1 / extent)
 
 
@@ -230,11 +230,11 @@ def _loaded(
 def load_shape(path: Path) -> Shape:
     """Read Gaussians, a mesh or a point cloud, by the content of the file.
 
-    The counts in the header are compared with the file's size first, so that a false header costs
+    The counts in the header are compared with the file's size first, so an invalid header costs
     no memory. No native library reads the file.
 
     Raises:
-        UserError: missing, unreadable, empty, with a false header, or with values that are not
+        UserError: missing, unreadable, empty, with an invalid header, or with values that are not
             finite or beyond ``HUGE``.
     """
     return _read_shape(path)[0]
@@ -243,7 +243,7 @@ def load_shape(path: Path) -> Shape:
 def _read_shape(path: Path) -> tuple[Shape, str]:
     """Return a shape as ``load_shape`` does, and its file's axes, a key of ``TO_Z_UP``.
 
-    The axes are those of the format, or of the comment "axes NAME" of a ``.ply``; ``UNKNOWN``
+    The axes come from the format, or from the comment "axes NAME" of a ``.ply``; ``UNKNOWN``
     without either.
     """
     suffix, ply = path.suffix.lower(), None
@@ -290,7 +290,7 @@ def _points(cloud: Cloud) -> Points:
 
 
 def scale_note(shape: Mesh | Points, protocol: GeometryProtocol) -> str:
-    """Return a warning of a prediction of another size than the truth, whose side is 1; or none."""
+    """Return a warning if a prediction's size is far from the truth's, which is 1; else ""."""
     side = float(np.ptp(_positions(shape), axis=0).max())
     if {"box", "scale", "icp"} & {*protocol.align} or 0.1 <= side <= 10:
         return ""
@@ -321,10 +321,10 @@ def centers(gaussians: Gaussians, count: int, seed: int) -> Points:
     """Draw ``count`` centres with replacement, with probability proportional to opacity.
 
     Raises:
-        UserError: no Gaussian has any opacity.
+        UserError: all Gaussians are fully transparent.
     """
     weights = gaussians.opacities.double().cpu().numpy()
     if weights.sum() <= 0:
-        raise UserError("no Gaussian has any opacity")
+        raise UserError("all Gaussians are fully transparent")
     chosen = np.random.default_rng(seed).choice(len(weights), count, p=weights / weights.sum())
     return Points(gaussians.means.double().cpu().numpy()[chosen])

@@ -159,7 +159,7 @@ def shape_iou(
 def chamfer_by_turn(
     predicted: LoadedShape, truth: LoadedShape, protocol: GeometryProtocol
 ) -> dict[str, float]:
-    """Compute the Chamfer distance for other axes of the prediction's file.
+    """Compute the Chamfer distance with other axes for the prediction's file.
 
     The rotations are about the origin of the file. Gaussians are compared by their centres, because
     their surface is extracted near the truth only.

@@ -40,7 +40,7 @@ class Grid:
 def grid_around(*meshes: Mesh, resolution: int) -> Grid:
     """Return the voxel centres around several meshes, with one empty voxel on each side.
 
-    Voxel faces lie on multiples of their side, so the grid is the same for all meshes within a cube
+    Voxel faces are at multiples of their side, so the grid is the same for all meshes within a cube
     of side 2; for larger ones the voxels grow.
 
     Args:
@@ -130,7 +130,7 @@ def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Compute occupancy ``[X, Y, Z]`` bool. See ``RULES``.
 
     The generalised winding number (Jacobson et al. 2013) is the mean of a ray's signed crossings
-    over all directions; here over those of ``majority``.
+    over all directions; here over the directions of ``majority``.
     """
     scene, points, normals = mesh.scene(), grid.points().reshape(-1, 3), mesh.normals()
     total = np.zeros(len(points))

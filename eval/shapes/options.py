@@ -48,7 +48,7 @@ class ShapesOptions:
         align: Steps that align predictions with the truth, in order: box (bounding boxes), scale
             (centroids and spread of points), yaw and turn (rotation search about the upward axis or
             any), rigid and icp (ICP without and with scale); or none.
-        frame: Frame of the predictions: that of the GT file, its unit frame (z-up, longest side 1,
+        frame: Frame of the predictions: the GT file's, its unit frame (z-up, longest side 1,
             centred), or the reference camera's (needs --data).
         up: Upward axis of GT files; auto goes by the format: y for .obj, .glb and .gltf; for others
             it is unknown, and z is assumed.
@@ -69,7 +69,7 @@ class ShapesOptions:
         workers: Pairs evaluated at the same time, each in its own process.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.
-        sheet: Draw the worst and the best pairs, six of each, beside their truths.
+        sheet: Draw the worst and the best pairs, six of each, next to their truths.
     """
 
     pred: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PRED")] = None

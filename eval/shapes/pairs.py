@@ -106,7 +106,7 @@ def _by_name(uids: Iterable[str], folder: Path) -> dict[str, str]:
     uids, found = list(uids), dict[str, str]()
     for name, uid in zip(object_names([PurePosixPath(uid) for uid in uids]), uids):
         if found.setdefault(name, uid) != uid:
-            raise UserError(f"{folder}: '{uid}' and '{found[name]}' have one name, '{name}'")
+            raise UserError(f"{folder}: '{uid}' and '{found[name]}' have the same name, '{name}'")
     return found
 
 
@@ -118,7 +118,7 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         protocol: of the comparison; see ``chosen_protocol``.
 
     Returns:
-        The report: that of ``make_report``, ``inputs``, ``flags``, ``axes`` and ``warnings``.
+        The report of ``make_report``, with ``inputs``, ``flags``, ``axes`` and ``warnings``.
 
     Raises:
         UserError: something cannot be opened or written.
@@ -129,7 +129,7 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     if options.objects is not None and not listed:
         raise UserError("--objects: needs --protocol gso")
     if options.limit is not None and listed:
-        raise UserError("--limit: --protocol gso has its own objects; --objects names others")
+        raise UserError("--limit: --protocol gso has its own objects; select others with --objects")
     assert options.pred is not None and options.gt is not None  # checked by the command
     dataset, known = open_objects(options.data)
     pairs, failures = find_pairs(options.pred, options.gt, listed, known)
@@ -293,7 +293,7 @@ def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Pa
         other = f"{name}-{path.suffix[1:].lower()}"
         found.setdefault(other if name in found and other in rendered else name, []).append(path)
     if not found:
-        raise UserError(f"{folder}: no files of {', '.join(SUFFIXES)} in it")
+        raise UserError(f"{folder}: contains no files of type {', '.join(SUFFIXES)}")
     return found
 
 
@@ -432,5 +432,5 @@ def _attempt(
         return evaluate(pair, protocol, motion)
     except UserError as error:
         return failure(pair.name, error)
-    except Exception as error:  # of any library; the other pairs go on
+    except Exception as error:  # of any library; the other pairs continue
         return failure(pair.name, f"{type(error).__name__}: {error}")

@@ -194,7 +194,7 @@ def with_fields(protocol: GeometryProtocol, texts: Sequence[str]) -> GeometryPro
         target = value["surface"] if inner == "surface" else value
         if not sign or inner not in ("", "surface") or name not in target or field == "surface":
             known = ", ".join([*(k for k in value if k != "surface"), "surface.…"])
-            raise UserError(f"--set {text}: not FIELD=JSON, FIELD one of {known}")
+            raise UserError(f"--set {text}: expected FIELD=JSON, FIELD one of {known}")
         target[name] = value_of(given)
     return _checked(value, f"--set {' '.join(texts)}")
 
@@ -209,7 +209,7 @@ def _checked(value: dict[str, Any], whose: str | Path) -> GeometryProtocol:
 def read_protocol(choice: str) -> GeometryProtocol:
     """Find a preset by name, or read a JSON file: a protocol, or a report with one.
 
-    Missing fields are those of the preset of its ``name``, or of the default.
+    Missing fields come from the preset of its ``name``, or from the default.
 
     Raises:
         UserError: neither a preset nor a readable file; an unknown field, a value of the wrong type
@@ -219,9 +219,9 @@ def read_protocol(choice: str) -> GeometryProtocol:
         return PRESETS[choice]
     path = Path(choice)
     if choice in presets.PRESETS:
-        raise UserError(f"--protocol {choice}: is of views (gamba eval-views), not of shapes")
+        raise UserError(f"--protocol {choice}: is for views (gamba eval-views), not for shapes")
     if not path.is_file():
-        raise UserError(f"--protocol {choice}: neither {', '.join(PRESETS)} nor a file")
+        raise UserError(f"--protocol {choice}: expected {', '.join(PRESETS)} or a file")
     value = read_document(path, dict[str, Any])
     return protocol_of(inner if isinstance(inner := value.get("protocol"), dict) else value, path)
 
@@ -240,8 +240,8 @@ def protocol_of(value: Mapping[str, Any], path: Path) -> GeometryProtocol:
         for at, part, known in (("", value, base), ("surface.", surface, base["surface"])):
             if unknown := part.keys() - known.keys():
                 names = ", ".join(sorted(known))
-                raise UserError(f"{path}: {at}{min(unknown)} is unknown; known: {names}")
+                raise UserError(f"{path}: {at}{min(unknown)} is not a known field; known: {names}")
     protocol = _checked(base | value, path)
     if words is not None and words != protocol.definitions():
-        raise UserError(f"{path}: its definitions are not those of this program's version")
+        raise UserError(f"{path}: its definitions differ from this program's")
     return protocol

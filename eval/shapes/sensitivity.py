@@ -1,7 +1,7 @@
 """Sensitivity to the protocol: the same predictions under many protocols.
 
 Every named protocol, and the chosen one with one field changed at a time. Frames and axes describe
-the files, so they are always those of the chosen protocol.
+the files, so they always follow the chosen protocol.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class Mesh:
         """
         faces = merged(self.vertices)[1][self.faces]
         edges = np.sort(directed_edges(faces), axis=1)
-        edges = edges[edges[:, 0] != edges[:, 1]]  # without those of degenerate faces
+        edges = edges[edges[:, 0] != edges[:, 1]]  # without degenerate faces' edges
         counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
         return bool((counts % 2 == 0).all())
 

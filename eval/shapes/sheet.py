@@ -1,4 +1,4 @@
-"""Sheet of predictions beside their truths, in two views: the worst and the best of a report."""
+"""Sheet of predictions next to their truths, in two views: the worst and the best of a report."""
 
 from __future__ import annotations
 

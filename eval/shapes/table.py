@@ -51,7 +51,7 @@ def text_of(report: dict[str, Any], protocol: GeometryProtocol) -> str:
                 text = ", ".join(f"{count} {word}" for word, count in counts.items())
                 lines.append(f"{side + ' ' + key:<24} {text} of {report['num_ok']}")
     if any("unknown" in counts for counts in report["axes"].values()):
-        note = "unknown axes: coordinates are used as they are (--pred-axes, --up)"
+        note = "unknown axes: coordinates are used unchanged (--pred-axes, --up)"
         lines.append(f"{'':<24} {note}")
     lines += summary_lines(report)
     return "\n".join(lines) + "\n"

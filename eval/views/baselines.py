@@ -59,7 +59,7 @@ def input_copy(truth: Truth) -> Shown:
 def billboard(truth: Truth) -> Shown:
     """Render the input picture as a plane through the object's centre, parallel to its image plane.
 
-    The centre is the origin and the input camera's axes are those of the world, so the plane is
+    The centre is the origin and the input camera's axes are the world's, so the plane is
     z = 0. The intersection of each pixel's ray is projected into the input camera, which is exact.
     From behind the picture is mirrored; edge-on the plane is invisible.
     """
@@ -185,7 +185,7 @@ class Retrieval:
         needed, rows = chosen.unique(return_inverse=True)
         images = self.training.load(uid, needed.tolist(), truth.rgb.shape[1]).images
         if images.shape[1:3] != truth.rgb.shape[1:3]:
-            raise UserError(f"{uid}: its pictures have another shape")
+            raise UserError(f"{uid}: its pictures have a different size")
         return shown(images[rows].to(truth.images.device))
 
 
@@ -213,7 +213,7 @@ class TrainingMeshes:
         self.training = training
         self.meshes = {mesh.uid: mesh for mesh in find_meshes(folder)}
         if not self.meshes.keys() & set(training.uids):
-            raise UserError(f"{folder}: has a mesh of none of the {len(training)} training objects")
+            raise UserError(f"{folder}: has no mesh of any of the {len(training)} training objects")
 
     def place(self, found: NearestView, distance: float) -> Surface:
         """Place an object's mesh so that its nearest view coincides with the input picture.
@@ -230,7 +230,7 @@ class TrainingMeshes:
                 cannot be read.
         """
         if found.uid not in self.meshes:
-            raise UserError(f"there is no mesh of the training object {found.uid}")
+            raise UserError(f"no mesh of the training object {found.uid}")
         mesh = self.meshes[found.uid]
         loaded, placement = load_mesh(mesh.path), self.training.files(found.uid).placement
         if placement is None:

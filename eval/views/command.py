@@ -40,6 +40,6 @@ def eval_views_command(
     beside = len(report["failures"]) - report["num_failed"]
     print(count_line(report, options.out, beside), file=sys.stderr if json else sys.stdout)
     if report["interrupted"]:
-        print("gamba: interrupted; the report has what was evaluated before", file=sys.stderr)
+        print("gamba: interrupted; the report covers what was evaluated before", file=sys.stderr)
         return 130
     return 1 if report["failures"] else 0

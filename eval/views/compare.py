@@ -152,7 +152,7 @@ def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
         UserError: view ``reference`` is missing.
     """
     if not 0 <= reference < count:
-        raise UserError(f"no view {reference} for the input among its {count}")
+        raise UserError(f"the input view {reference} is not one of its {count} views")
     others = [view for view in range(count) if view != reference]
     return [reference, *evenly(others, len(others) if wanted is None else wanted - 1)]
 

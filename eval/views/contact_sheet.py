@@ -60,7 +60,7 @@ def choose_ranks(count: int, each: int) -> dict[int, str]:
 
 
 def label(record: dict[str, Any], place: str) -> list[str]:
-    """Return the lines beside an object's pictures: its name, rank and metrics."""
+    """Return the lines next to an object's pictures: its name, rank and metrics."""
     lines = [record["name"], place]
     for kind, values in (("novel", record), ("input", record["input"])):
         known = [

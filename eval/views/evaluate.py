@@ -131,7 +131,7 @@ def open_job(options: ViewsOptions) -> Job:
         names = gso.names_of(options.objects)
         evaluation, uids = gso.protocol_of(uids, names), [uid for uid in uids if uid in names]
         if not uids:
-            raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
+            raise UserError(f"{options.data}: contains none of the objects of --protocol gso")
     _check_outputs(options, uids)
     size = gso.SIZE if evaluation else options.size
     predictions = open_predictions(
@@ -287,7 +287,7 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
             ``pictures`` (the compared ones, in a folder for the model and for each baseline).
 
     Returns:
-        The object's record, including those of its baselines.
+        The object's record, including its baselines' records.
 
     Raises:
         UserError: a file cannot be read or written, or a number is not finite.
@@ -382,7 +382,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
     Args:
         job: shared state.
         data: the dataset, whose name the report holds.
-        objects: the records; those of ``job.missing`` are added.
+        objects: the records; the missing ones of ``job.missing`` are added.
     """
     protocol = asdict(job.protocol) | {
         "source": job.predictions.source,
@@ -411,7 +411,7 @@ def make_views_report(
     left_out: Mapping[str, str],
     failures: Iterable[dict[str, str]],
 ) -> dict[str, Any]:
-    """Return the report: that of ``make_report``, with entries for the baselines.
+    """Return the report of ``make_report`` with entries for the baselines.
 
     Args:
         protocol: definition of the numbers, with the objects.

@@ -30,7 +30,7 @@ class ViewsOptions:
             prediction | truth); without it only the table is printed.
         protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, with the
             first view as the input; the report lists missing objects. It fixes --size, --reference,
-            --views, --split and --limit. splatter-image, gamba: those of these papers, as far as
+            --views, --split and --limit. splatter-image, gamba: these papers' values, as far as
             published (gamba eval-geometry --protocol NAME --explain); these options change them,
             and the report notes that.
         split: Split of the dataset.

@@ -74,7 +74,7 @@ class PicturePredictions:
             folder: the folder.
             distance: as the attribute.
             device: torch device of the results.
-            resize: resize pictures of another size to that of the true ones.
+            resize: resize pictures to the size of the true ones.
         """
         self.folder, self.distance, self.device, self.resize = folder, distance, device, resize
         files = (p for p in visible(folder, "*") if _is_picture(p) or p.name == TRANSFORMS)
@@ -85,7 +85,7 @@ class PicturePredictions:
         """Raise UserError if no object has a folder, before any work."""
         if not any((self.folder / uid).is_dir() for uid in uids):
             raise UserError(
-                f"{self.folder}: has a folder of pictures for none of the {len(uids)} objects; "
+                f"{self.folder}: has no folder of pictures for any of the {len(uids)} objects; "
                 f"the first would be {self.folder / uids[0]}"
             )
 
@@ -124,7 +124,7 @@ class PicturePredictions:
                 rgba[row] = torch.from_numpy(fitted.astype(np.float32) / 255)
         if len(set(alphas.values())) > 1:
             odd = next(view for view, alpha in alphas.items() if not alpha)
-            raise UserError(f"{found[odd]}: has no alpha, and others of the object have")
+            raise UserError(f"{found[odd]}: has no alpha, but others of the object have")
         opaque = bool((rgba[there, ..., 3] == 1).all())
         if opaque:
             _check_white(folder, rgba[..., :3], truth, there)
@@ -152,7 +152,7 @@ class PicturePredictions:
                 "render it at this size, or give --resize-pictures"
             )
         if abs(width * tall - height * wide) > max(width, height) / 2:
-            raise UserError(f"{path}: {width}x{height} has not the shape of {wide}x{tall}")
+            raise UserError(f"{path}: {width}x{height} has another aspect ratio than {wide}x{tall}")
         # Like the dataset: PIL premultiplies RGBA, and its box filter is the area average.
         kind = Image.Resampling.BOX if tall < height else Image.Resampling.BILINEAR
         return np.asarray(Image.fromarray(picture).resize((wide, tall), kind))
@@ -190,7 +190,7 @@ def _match_by_camera(
         near = np.flatnonzero((off <= CAMERA).all(1))
         if len(near) > 1:
             names = " and ".join(given.images[i].name for i in near[:2])
-            raise UserError(f"{folder}: {names} are both at the camera of view {view}")
+            raise UserError(f"{folder}: {names} both have the camera of view {view}")
         if len(near):
             found[view] = given.images[near[0]]
         else:
@@ -200,7 +200,7 @@ def _match_by_camera(
         turn, move, lens = far[lacking[0]]
         raise UserError(
             f"{_missing_message(folder, lacking, views, 'camera')}; the nearest to view "
-            f"{lacking[0]} is turned by {np.degrees(turn):.3g} degrees, "
+            f"{lacking[0]} is rotated by {np.degrees(turn):.3g} degrees, "
             f"moved by {move:.3g} of the distance, and "
             f"its lens differs by {lens:.3g} of the picture"
         )

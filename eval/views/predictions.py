@@ -49,9 +49,9 @@ class PlyPredictions:
 
 
 class ModelPredictions:
-    """A checkpoint, given only the reference view; attributes as those of ``PlyPredictions``.
+    """A checkpoint, given only the reference view; attributes as in ``PlyPredictions``.
 
-    Its Gaussians are those of ``gamba reconstruct`` for that view, see ``model.predict``; but where
+    Its Gaussians are as from ``gamba reconstruct`` for that view, see ``model.predict``; but where
     they do not split they are the network's, since views of its size have no gaps.
     """
 
@@ -85,7 +85,7 @@ class ModelPredictions:
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
         """Run the model on the reference view, on the model's own background.
 
-        Arguments and result are those of ``PlyPredictions.gaussians``. The front splits by the
+        Arguments and result as in ``PlyPredictions.gaussians``. The front splits by the
         picture at the compared size.
         """
         config = self.model.config
@@ -124,7 +124,7 @@ def open_predictions(
         margin: ``background_margin`` of a model, see ``Gamba.forward``.
         precision: of a model's matrix products, see ``devices.pick_precision``.
         detail: of a model's front, see ``model.predict.reconstruct``.
-        size: height of the compared pictures; None: that of the files.
+        size: height of the compared pictures; None: the files' height.
 
     Raises:
         UserError: ``path`` is missing, the checkpoint cannot be read, or a margin, a precision or a

@@ -92,7 +92,7 @@ def means(rows: Rows, signed: bool = False) -> str:
     """Return a Markdown table of the rows' means on white, with intervals.
 
     Args:
-        rows: those of ``table_of`` or ``differences_of``.
+        rows: from ``table_of`` or ``differences_of``.
         signed: positive means get a plus sign.
     """
     return _markdown(rows, signed, {key: Column(m.head, m.digits) for key, m in METRICS.items()})
@@ -101,7 +101,7 @@ def means(rows: Rows, signed: bool = False) -> str:
 def _markdown(rows: Rows, signed: bool, columns: dict[str, Column], of: str = "mean") -> str:
     shown = []
     for row in rows:
-        error = row[MEAN_ERROR]  # neither mean nor median; shown beside the medians
+        error = row[MEAN_ERROR]  # neither mean nor median; shown next to the medians
         error = {"median": error["value"], "median_interval": error["interval"]}
         names = row["views"], row["name"], str(row["objects"])
         shown.append(Row(names, row | {MEAN_ERROR: error}, signed))

@@ -102,7 +102,7 @@ def ablate_command(
 
 
 def _run(folder: Path, task: dict[str, list[str]]) -> tuple[str | None, int]:
-    """Run the unfinished commands of a row with one seed; training resumes by itself.
+    """Run the unfinished commands of a row with one seed; training resumes automatically.
 
     Args:
         folder: of the row with one seed; has a log of each command.

@@ -156,14 +156,14 @@ def _check(plan: Plan) -> None:
     names = [plain_name(row.name, "row") for row in plan.rows]
     for row in plan.rows:
         if names.count(row.name) > 1:
-            raise UserError(f"row {row.name}: there are two of this name")
+            raise UserError(f"row {row.name}: duplicate name")
         if unknown := row.paper.keys() - {*METRICS}:
             known = ", ".join(METRICS)
-            raise UserError(f"row {row.name}: paper: no metric {min(unknown)}; known: {known}")
+            raise UserError(f"row {row.name}: paper: unknown metric {min(unknown)}; known: {known}")
         if budget := [name for name in BUDGET if name in _merged(row.options)]:
             raise UserError(f"row {row.name}: {budget[0]}: the budget is the same for every row")
     if len({*plan.seeds}) != len(plan.seeds):
-        raise UserError("a seed is repeated")
+        raise UserError("a seed is given twice")
     for name in filter(None, {plan.compare_with, *(row.compare_with for row in plan.rows)}):
         plan.row(name)
 
@@ -200,7 +200,7 @@ def train_config(
     if budget:
         options = {name: v for name, v in options.items() if name not in BUDGET} | budget
     if len(options.keys() & {*BUDGET, "epochs"}) != 1 or "epochs" in options:
-        raise UserError("the budget of a row: expected steps or minutes, once")
+        raise UserError("the budget of a row: expected either steps or minutes")
     values: dict[str, Any] = {
         "data": str(data),
         "preset": plan.base.preset,

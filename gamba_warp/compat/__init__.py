@@ -32,7 +32,7 @@ __all__ = ["take_names"]
 def take_names(*packages: str) -> None:
     """Make ``import mamba_ssm`` and so on load the modules of this folder.
 
-    They are those of ``VERSIONS``, and extension modules, over which alone a package's fork runs.
+    They are the packages of ``VERSIONS``, and extension modules, which suffice for forks.
 
     Call it once, before the first of these imports; it holds for the whole process.
     ``importlib.metadata`` reports their versions. An installed gsplat keeps its parts without CUDA
@@ -50,9 +50,9 @@ def take_names(*packages: str) -> None:
     known = *VERSIONS, *EXTENSIONS
     for name in packages or known:
         if name not in known:
-            raise ValueError(f"the package {name!r} is not here, allowed: {', '.join(known)}")
+            raise ValueError(f"the package {name!r} is not supported, allowed: {', '.join(known)}")
         if name in sys.modules:
-            raise ImportError(f"{name} is imported already: its names are taken before that")
+            raise ImportError(f"{name} is already imported: call this before importing it")
     for name in packages or known:
         if name in EXTENSIONS:
             sys.modules[name] = extension(name)

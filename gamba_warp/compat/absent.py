@@ -35,7 +35,7 @@ class _Absent(type):
 
 
 class _Module(ModuleType):
-    """Module with placeholders, found after its own names and those of its ``__getattr__``."""
+    """Module with placeholders, found after its own names and its ``__getattr__``'s."""
 
     _absent: dict[str, _Absent]
 

@@ -28,7 +28,7 @@ FORKS = {
     "ashawkey": "colour, radii, depth, alpha",
 }
 NEAR = float(np.nextafter(np.float32(0.2), np.float32(1)))  # nearer ones are culled
-# A pixel goes on down to this transmittance, itself included.
+# A pixel blends down to this transmittance, inclusive.
 LIMITS = Limits(ALPHA_MIN, ALPHA_MAX, float(np.nextafter(np.float32(T_MIN), np.float32(0))), True)
 SKIP = Skip().bits() | SQUARES
 _MAX_SH_DEGREE = 3
@@ -95,7 +95,7 @@ class GaussianRasterizationSettings(_Settings):
         """
         for name in kwargs:
             if name not in _Settings._fields:
-                raise TypeError(f"{name} is an option of another rasterizer, which is not here")
+                raise TypeError(f"{name} is an option of another rasterizer and is not supported")
         return super().__new__(cls, *args, **kwargs)
 
 
@@ -107,7 +107,7 @@ class _Results(tuple):
         code, at = frame.f_code.co_code, frame.f_lasti
         if at >= 0 and code[at] == _UNPACK and code[at + 1] != len(self):
             raise ValueError(
-                f"{code[at + 1]} results are wanted, the fork {_fork!r} has {len(self)}: choose "
+                f"{code[at + 1]} results are expected, the fork {_fork!r} has {len(self)}: choose "
                 "another by gamba_warp.compat.diff_gaussian_rasterization.use_fork or --fork: "
                 + "; ".join(f"{name} ({what})" for name, what in FORKS.items())
             )
@@ -132,7 +132,7 @@ class _InPicture(torch.autograd.Function):
 
 
 class _Scaled(torch.autograd.Function):
-    """Scales times the modifier; as in the original, the gradient is that of the product."""
+    """Scales times the modifier; as in the original, the gradient ignores the modifier."""
 
     @staticmethod
     def forward(ctx: Any, scales: Tensor, modifier: float) -> Tensor:

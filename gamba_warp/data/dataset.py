@@ -198,7 +198,7 @@ def _read_root(root: Path, layout: str, uid: str) -> ObjectFiles:
 
 
 def _read_renamed(read: Reader, prefix: int, uid: str) -> ObjectFiles:
-    """Read the object of a joined dataset, whose name has ``prefix`` letters more."""
+    """Read an object of a joined dataset, after removing ``prefix`` letters of its name."""
     return read(uid[prefix:])
 
 
@@ -310,7 +310,7 @@ class ViewDataset:
         return len(self.uids)
 
     def joined(self, name: str, other: ViewDataset) -> ViewDataset:
-        """Return a dataset with the objects of both; those of ``other`` come last, as ``name/uid``.
+        """Return a dataset with the objects of both; ``other``'s come last, as ``name/uid``.
 
         Raises:
             UserError: such a name already exists.
@@ -470,7 +470,7 @@ class ViewDataset:
                 pixels = np.empty((len(wanted), height, width, 4), np.uint8)
             if picture.shape != pixels.shape[1:]:
                 got, others = f"{width}x{height}", f"{pixels.shape[2]}x{pixels.shape[1]}"
-                raise UserError(f"{files.images[v]}: is {got}, the object's others {others}")
+                raise UserError(f"{files.images[v]}: is {got}, the object's others are {others}")
             pixels[number] = picture
         assert pixels is not None  # there is at least one view
         return pixels, Ks

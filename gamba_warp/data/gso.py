@@ -25,7 +25,7 @@ from ..untrusted.names import plain_name
 _MAX_LIST = 1 << 20  # bytes of a list of names
 
 SIZE = 512  # pixels, §4.1: "at a spatial resolution of 512 × 512"
-FOV = DEFAULT_FOV  # degrees; not stated, that of the reference camera
+FOV = DEFAULT_FOV  # degrees; not stated, so the reference camera's
 # The first view is the input: §4.1 "a default camera pose with both zero elevation and azimuth".
 # Number and poses of the other views are not stated.
 ELEVATIONS = (0.0, 20.0, 40.0)  # degrees
@@ -96,7 +96,7 @@ def scanned(uids: Iterable[str]) -> list[str]:
 
 
 def names_of(path: Path | None) -> tuple[str, ...]:
-    """Return the objects of the evaluation: ``NAMES``, or those of a file, one name a line.
+    """Return the objects of the evaluation: ``NAMES``, or the names in a file, one a line.
 
     Raises:
         UserError: the file cannot be read, has no names, or one of them is invalid or repeated.
@@ -109,7 +109,7 @@ def names_of(path: Path | None) -> tuple[str, ...]:
         raise UserError(f"{path}: not UTF-8 text") from error
     names = [plain_name(line.strip(), str(path)) for line in lines if line.strip()]
     if not names:
-        raise UserError(f"{path}: has no names")
+        raise UserError(f"{path}: contains no names")
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise UserError(f"{path}: {twice[0]} occurs twice")
     return tuple(sorted(names))

@@ -274,8 +274,8 @@ def _check_lens(values: dict, source: str) -> None:
         model = values.get(key)
         if model is not None and str(model).lower() not in _PINHOLES:
             raise UserError(
-                f"{source}: {key} is {repr(model)[:40]}; only pinholes are read, so the pictures "
-                "must be undistorted first"
+                f"{source}: {key} is {repr(model)[:40]}; only pinhole cameras are supported, "
+                "so the pictures must be undistorted first"
             )
     for key in sorted(_DISTORTIONS & values.keys()):
         value = values[key]
@@ -391,7 +391,7 @@ def _pictures(path: Path | str, frames: list[dict], find: Find) -> dict[str, lis
         repeated = next((p for p, n in Counter(paths).items() if n > 1), None)
         if repeated and key != "mask_path":  # frames may share a mask
             name = Path(str(repeated)).name
-            raise UserError(f"{path}: two frames have the picture {name}")
+            raise UserError(f"{path}: two frames name the picture {name}")
     if 0 < len(files["mask_path"]) < len(frames):
         raise UserError(f"{path}: {len(files['mask_path'])} of {len(frames)} frames have a mask")
     return files

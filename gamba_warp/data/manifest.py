@@ -5,7 +5,7 @@ and each picture. ``gamba data index`` makes them once; ``open_dataset`` then re
 and compares at most three sizes and times of each object, and the list of each folder above them.
 
 The first line is a ``Head``, each further line an ``Entry``. Times are of this machine's copy:
-a copy of the dataset keeps them (``rsync -a``), or needs a manifest of its own.
+a copy of the dataset keeps them (``rsync -a``), or needs its own manifest.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Manifest(NamedTuple):
 
 
 def list_of(folder: str) -> str:
-    """Return a digest of the names in a folder that decide which objects lie under it.
+    """Return a digest of the names in a folder that decide which objects it contains.
 
     Raises:
         OSError: it cannot be read.

@@ -18,7 +18,7 @@ from ..errors import UserError, first_line
 from ..images import load_rgba, picture_size
 from ..untrusted.torch_files import read_torch
 
-BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
+BORDER_RATIO = 0.2  # share of the square left free around the object's longer side
 WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model uses more
 
 SAM_FILES = (

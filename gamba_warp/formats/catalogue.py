@@ -17,7 +17,7 @@ from ..untrusted.documents import read_document
 from ..untrusted.names import MAX_NAME, parts_of, plain_name
 from .meshes import SUFFIXES
 
-CATALOGUE = "catalogue.json"  # beside the meshes: names and attribution, see ``find_meshes``
+CATALOGUE = "catalogue.json"  # next to the meshes: names and attribution, see ``find_meshes``
 # Names of files and folders that do not identify an object.
 NO_NAMES = frozenset(
     "mesh meshes model model_normalized models normalized_model object raw_model scene source "
@@ -77,7 +77,7 @@ def find_meshes(folder: Path) -> list[Mesh]:
         if uid in meshes and model not in known:
             uid = f"{uid}-{path.suffix[1:].lower()}"
         if uid in meshes:
-            raise UserError(f"{path} and {meshes[uid].path} would both be '{uid}'")
+            raise UserError(f"{path} and {meshes[uid].path} would both be named '{uid}'")
         name, group = entry.name or parts[-1], entry.group or uid
         about = entry.attribution or {}, entry.rotation, folder
         meshes[uid] = Mesh(path, uid, name, group, *about)
@@ -113,7 +113,7 @@ def _read_catalogue(path: Path) -> dict[str, _Entry]:
         if entry.rotation is not None:
             entry.rotation = check_rotation(entry.rotation, source).tolist()
         if model in known:
-            raise UserError(f"{source}: {entry.model!r} is there twice")
+            raise UserError(f"{source}: {entry.model!r} occurs twice")
         known[model] = entry
     return known
 
@@ -131,7 +131,7 @@ def check_rotation(value: object, source: str) -> np.ndarray:
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e3:
         raise UserError(f"{source}: the rotation is not finite, or over 1000")
     if abs(np.linalg.det(matrix)) < 1e-6:
-        raise UserError(f"{source}: the rotation cannot be turned back")
+        raise UserError(f"{source}: the rotation is not invertible")
     return matrix
 
 

@@ -53,7 +53,7 @@ def read_cloud(path: Path) -> Cloud:
 def _checked(path: Path, cloud: Cloud) -> Cloud:
     count = len(cloud.positions)
     if count == 0:
-        raise UserError(f"{path}: no points in it")
+        raise UserError(f"{path}: contains no points")
     if count > MAX_POINTS:
         raise UserError(f"{path}: {count} points, over the limit of {MAX_POINTS}")
     bad = count - np.count_nonzero(np.isfinite(cloud.positions).all(1))

@@ -59,7 +59,7 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
     for name in file.extensions:
         if name not in _KNOWN:
             warn = sides.warnings.append if name.startswith("KHR_materials") else sides.omit
-            warn(f"the extension {name[:60]} is not read")
+            warn(f"the extension {name[:60]} is not supported")
     scenes = len(file.document.entries("scenes"))
     if scenes > 1:
         sides.omit(f"one of {scenes} scenes is read")
@@ -71,7 +71,7 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
             continue
         skin, placed = node.get("skin", Index), matrix @ file.instances(node)
         if skin is not None and len(placed) > 1:
-            sides.omit(f"instances of a skinned mesh ({INSTANCING}) are not read")
+            sides.omit(f"instances of a skinned mesh ({INSTANCING}) are not supported")
         key = index, skin, node.get("weights", _Weights, ())
         poses.setdefault(key, []).append(placed)
     meshes = {index: file.item("meshes", index) for index, _, _ in poses}
@@ -108,10 +108,10 @@ class _Reader:
         """
         mode, given = primitive.get("mode", int, _TRIANGLES), primitive.entry("attributes")
         if mode in _OTHERS:
-            self.sides.omit(f"{_OTHERS[mode]} beside the triangles are left out")
+            self.sides.omit(f"only triangles are read, not {_OTHERS[mode]}")
             return None, None
         if "POSITION" not in given.values:
-            self.sides.omit("a primitive without POSITION is left out")
+            self.sides.omit("a primitive without POSITION is ignored")
             return None, None
         count = len(self.file.values(given.need("POSITION", Index)))
         indices = np.arange(count)
@@ -129,21 +129,21 @@ class _Reader:
                 return None
             base = self.file.values(given.need(name, Index))
             if base.shape[1] not in widths or len(base) != count:
-                self.warn(f"{name} of {len(base)} x {base.shape[1]} numbers is left out")
+                self.warn(f"{name} of {len(base)} x {base.shape[1]} numbers is ignored")
                 return None
             shape, base = base.shape, base[used]
             for weight, target in zip(weights, primitive.entries("targets")):
                 if weight and name in target.values:
                     moves = self.file.values(target.need(name, Index))
                     if moves.shape != shape:
-                        raise UserError(f"{self.file.path}: a morph target of another shape")
+                        raise UserError(f"{self.file.path}: a morph target has a different shape")
                     self.file.count(base.size)
                     base = base + weight * moves[used].astype(np.float64)
             return base
 
         vertices = attribute("POSITION", 3)
         if vertices is None:
-            raise UserError(f"{self.file.path}: vertices are not of 3 numbers")
+            raise UserError(f"{self.file.path}: vertices do not have 3 coordinates")
         material, opaque, uvs = None, True, None
         if (index := primitive.get("material", Index)) is not None:
             look = self.file.item("materials", index)
@@ -178,7 +178,7 @@ class _Reader:
             wraps = np.array([sampler.get(name, int, _REPEAT) for name in ("wrapS", "wrapT")])
             outside = (np.abs(uvs - 0.5) > 0.5 + 1e-4).any(0)
             if any(outside & (wraps != _REPEAT)):
-                self.warn("a texture that does not repeat is drawn as one that does")
+                self.warn("a clamped or mirrored texture is drawn as a repeating one")
         return uvs * [1, -1] + [0, 1]
 
     def material(self, look: Entry) -> tuple[Material, Entry]:
@@ -197,10 +197,10 @@ class _Reader:
         light = look.vector("emissiveFactor", (0, 0, 0))
         if light.any():
             if color[:3].any() and (texture is None or texture[..., :3].any()):
-                self.warn("light of a surface beside its base colour is not drawn")
+                self.warn("emission of a surface with a base colour is not drawn")
             else:
                 strength = more.entry("KHR_materials_emissive_strength")
-                self.warn("light of a surface is drawn as its colour, shaded")
+                self.warn("emission of a surface is drawn as its base colour, shaded")
                 color[:3] = light * strength.get("emissiveStrength", float, 1.0)
                 info = look.entry("emissiveTexture")
                 texture = self.texture(info)
@@ -248,7 +248,7 @@ class _Reader:
             source = webp.get("source", Index, texture.get("source", Index))
             if source is None:
                 names = ", ".join(x for x in self.file.extensions if x in _PICTURES) or "nothing"
-                raise UserError(f"a texture's picture is named by {names}, which is not read")
+                raise UserError(f"a texture's picture is named by {names}, which is not supported")
             if source not in self._pictures:
                 self._pictures[source] = None
                 self._pictures[source] = self.picture(source)
@@ -290,7 +290,7 @@ class _Reader:
             )
             same = chosen.shape == weights.shape == (len(used), 4)
             if not same or chosen.max(initial=0) >= len(joints):
-                raise UserError(f"{path}: JOINTS_{number} or WEIGHTS_{number} is false")
+                raise UserError(f"{path}: JOINTS_{number} or WEIGHTS_{number} is invalid")
             chosen, weights = chosen[used], weights[used]
             for column in range(4):
                 weight = weights[:, column, None, None]
@@ -312,12 +312,12 @@ def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
     """Return ``[F, 3]`` triangles of a list, a strip or a fan, with one orientation."""
     if mode == _TRIANGLES:
         if len(indices) % 3:
-            raise UserError(f"{path}: {len(indices)} corners, which are no whole triangles")
+            raise UserError(f"{path}: {len(indices)} corners are not whole triangles")
         return indices.reshape(-1, 3)
     if mode == _STRIP:
         return strip_faces(indices)
     if mode != _FAN:
-        raise UserError(f"{path}: a primitive of mode {mode}")
+        raise UserError(f"{path}: a primitive has the invalid mode {mode}")
     at = np.arange(max(len(indices) - 2, 0))
     faces = indices[np.stack([0 * at, at + 1, at + 2], 1)]
     return faces[(faces != np.roll(faces, 1, 1)).all(1)]
@@ -326,7 +326,7 @@ def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:
 def _placed(part: Part, poses: np.ndarray) -> Part:
     """Place a part at each of ``poses [N, 4, 4]``, or once by its vertices' own ``[1, V, 4, 4]``.
 
-    The attributes become those of corners.
+    The attributes become per-corner.
     """
     turns, moves, normals = poses[..., :3, :3], poses[..., :3, 3], part.normals
     if poses.ndim == 3:

@@ -54,7 +54,7 @@ class Entry:
         return default if self.values.get(name) is None else self.need(name, kind)
 
     def need(self, name: str, kind: Any) -> Any:
-        """Return a value of a declared type. Raises UserError if it is missing or of another."""
+        """Return a value of a declared type. Raises UserError if missing or of another type."""
         try:
             return msgspec.convert(self.values.get(name), kind)
         except msgspec.ValidationError as error:
@@ -78,7 +78,7 @@ class Entry:
 
 
 def _no_side_file(uri: str) -> bytes:
-    raise UserError("its numbers lie in another file, which is not read")
+    raise UserError("its data are in another file, which is not read")
 
 
 @dataclass
@@ -90,7 +90,7 @@ class GltfFile:
     extensions: list[str]  # names of all extensions anywhere in the document
     binary: bytes | None  # the binary chunk of a .glb
     side_file: Callable[[str], bytes]  # reads the file of a URI
-    size: int  # bytes, with those of the files beside it that were read
+    size: int  # bytes, including other files of it that were read
     _numbers: int = 0
     _buffers: dict[int, bytes] = field(default_factory=dict)
     _lists: dict[str, list[Entry]] = field(default_factory=dict)
@@ -101,7 +101,7 @@ class GltfFile:
         self._numbers += numbers
         if self._numbers > FREE_NUMBERS + NUMBERS_PER_BYTE * self.size:
             raise UserError(
-                f"{self.path}: its {self.size} bytes stand for over {self._numbers} numbers"
+                f"{self.path}: its {self.size} bytes expand to over {self._numbers} numbers"
             )
 
     def item(self, what: str, index: int) -> Entry:
@@ -114,7 +114,7 @@ class GltfFile:
         return items[index]
 
     def content(self, uri: str) -> bytes:
-        """Return the bytes of a URI: embedded data, or a file beside the document."""
+        """Return the bytes of a URI: embedded data, or a file in the document's folder."""
         if not uri.startswith("data:"):
             found = self.side_file(uri)
             self.size += len(found)
@@ -123,7 +123,7 @@ class GltfFile:
         try:
             return base64.b64decode(data) if head.endswith(";base64") else unquote_to_bytes(data)
         except ValueError as error:
-            raise UserError(f"data that are not base64 ({error})") from error
+            raise UserError(f"data are not valid base64 ({error})") from error
 
     def view(self, index: int) -> memoryview:
         """Return the bytes of a view."""
@@ -154,7 +154,7 @@ class GltfFile:
         """Raise UserError if the document has an extension that packs triangles."""
         for name in self.extensions:
             if name in PACKED:
-                reason = f"packed by {name}, which is not read; unpack it first"
+                reason = f"compressed by {name}, which is not supported; decompress it first"
                 raise UserError(f"{self.path}: {reason}")
 
     def values(self, index: int) -> np.ndarray:
@@ -212,7 +212,7 @@ class GltfFile:
             index, above, depth = left.pop()
             # A longer way has a node twice.
             if len(found) + len(left) > most or depth > len(own):
-                raise UserError(f"{self.path}: nodes in a circle, or shared in over {most} places")
+                raise UserError(f"{self.path}: nodes form a cycle, or are shared over {most} times")
             node, children, matrix = own[index]
             matrix = above @ matrix
             found.append((node, index, matrix))
@@ -245,7 +245,7 @@ class GltfFile:
     def instances(self, node: Entry) -> np.ndarray:
         """Return the matrices ``[N, 4, 4]`` of the instances of a node's mesh in the node's frame.
 
-        They are those of ``EXT_mesh_gpu_instancing``, or one unit matrix.
+        They come from ``EXT_mesh_gpu_instancing``; without it, one unit matrix.
         """
         given = node.entry("extensions").entry(INSTANCING).entry("attributes")
         if not given.values:

@@ -65,16 +65,16 @@ def compare_sizes(path: Path, says: str, wanted: int, there: int, exact: bool = 
     """
     if there < wanted:
         raise UserError(
-            f"{path}: truncated or false header, {says} take {wanted} bytes but {there} follow"
+            f"{path}: truncated or invalid header, {says} take {wanted} bytes but {there} follow"
         )
     if exact and there > wanted + SLACK:
-        raise UserError(f"{path}: false header, {says} take {wanted} bytes but {there} follow")
+        raise UserError(f"{path}: invalid header, {says} take {wanted} bytes but {there} follow")
 
 
 def check_lines(path: Path, says: str, wanted: int, there: int) -> None:
-    """Raise UserError if not as many lines are there as a header states by the words ``says``."""
+    """Raise UserError unless a file has the number of lines that its header states (``says``)."""
     if there != wanted:
-        raise UserError(f"{path}: truncated or false header, {says} but {there} lines follow")
+        raise UserError(f"{path}: truncated or invalid header, {says} but {there} lines follow")
 
 
 class Lines:
@@ -83,7 +83,7 @@ class Lines:
     Attributes:
         data: ``[B]`` uint8, the text with a line end behind it.
         lengths: ``[N]`` int64, bytes of each line with its end.
-        first: ``[N]`` int64, position of each line's first word; of blank lines any.
+        first: ``[N]`` int64, position of each line's first word; undefined for blank lines.
         sizes: ``[N]`` int64, number of words.
     """
 
@@ -98,14 +98,14 @@ class Lines:
         self.first = np.append(words, 0)[before - self.sizes]
 
     def begin_with(self, word: bytes) -> np.ndarray:
-        """Return ``[N]`` bool, True for the lines whose first word is this one, in this case."""
+        """Return ``[N]`` bool, True for the lines with this first word; case-sensitive."""
         found = self.sizes > 0
         for place, letter in enumerate(word):
             found &= self.data.take(self.first + place, mode="clip") == letter
         return found & is_blank(self.data.take(self.first + len(word), mode="clip"))
 
     def behind(self, word: bytes, lines: np.ndarray) -> bytes:
-        """Return the text of the lines ``[N]`` bool, which begin with a word, without it."""
+        """Return the text of the lines ``[N]`` bool with their first word blanked."""
         data = self.data.copy()
         for place in range(len(word)):
             data[self.first[lines] + place] = ord(" ")
@@ -113,12 +113,12 @@ class Lines:
 
 
 def is_blank(letters: np.ndarray) -> np.ndarray:
-    """Return True for the six blanks of ASCII among ``[N]`` uint8, as C has them."""
+    """Return True for ASCII whitespace among ``[N]`` uint8, as C's ``isspace``."""
     return (letters == ord(" ")) | (letters - np.uint8(ord("\t")) < 5)
 
 
 def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
-    """Yield a text in parts of whole lines, so that what is made of a part takes little memory.
+    """Yield a text in parts of whole lines, which bounds the memory of intermediate results.
 
     Raises:
         UserError: a line is longer than a part.
@@ -127,20 +127,20 @@ def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
     while at < len(text):
         end = text.find(b"\n", at + _BLOCK, at + 2 * _BLOCK) + 1
         if not end and len(text) > at + 2 * _BLOCK:
-            raise UserError(f"{source}: a line of more than {_BLOCK} letters")
+            raise UserError(f"{source}: a line of more than {_BLOCK} characters")
         yield text[at : end or len(text)]
         at = end or len(text)
 
 
 def parse_numbers(text: bytes, count: int, kind: Any = np.float64) -> np.ndarray | None:
-    """Return the ``count`` words of a text as numbers ``[count]``; None if one is no number."""
+    """Return the ``count`` words of a text as numbers ``[count]``; None if one is not a number."""
     if count == 0:
         return np.zeros(0, kind)
     try:
         found = np.fromstring(text, kind, sep=" ")
     except ValueError:
         return None
-    # "1-2" is one word but two numbers; older releases of numpy stop at a word that is none.
+    # "1-2" is one word but two numbers; older releases of numpy stop at an invalid word.
     return found if len(found) == count else None
 
 
@@ -151,7 +151,7 @@ class Rows(NamedTuple):
     sizes: np.ndarray  # [N] int64, how many each row has
 
     def columns(self, *numbers: int) -> np.ndarray:
-        """Return ``[N, C]`` float64, these numbers of each row; of shorter rows any."""
+        """Return these numbers of each row, ``[N, C]`` float64; undefined for shorter rows."""
         width = int(self.sizes[0]) if len(self.sizes) else 0
         if max(numbers) < width and (self.sizes == width).all():
             return self.values.reshape(-1, width)[:, numbers]
@@ -225,7 +225,7 @@ def joined_rows(parts: list[Rows]) -> Rows:
 
 
 def _no_number(block: bytes, source: str, before: int) -> UserError:
-    """Return the error of the first word that is no number, ``before`` rows from the start."""
+    """Return the error of the first word that is not a number, ``before`` rows from the start."""
     rows = (line.split() for line in block.split(b"\n") if not line.isspace() and line)
     words = ((word, row) for row, line in enumerate(rows, before + 1) for word in line)
     word, row = next((found for found in words if not is_number(found[0])), (b"", before))

@@ -22,7 +22,7 @@ from ..untrusted.names import inside
 
 GREY = 0.6  # display value of a surface whose colour is not known
 MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
-MAX_SIDE_FILE = 256 << 20  # bytes of a file beside the mesh
+MAX_SIDE_FILE = 256 << 20  # bytes of a file in the mesh's folder
 MAX_SIDE_FILES = 1 << 30  # bytes of all of them, and of all textures in memory
 # Bytes to which the pictures of a mesh may be decoded: a plain one has few bytes in its file.
 FREE_PIXELS, PIXELS_PER_BYTE = 192 << 20, 64
@@ -67,7 +67,7 @@ def plain(color: np.ndarray) -> np.ndarray:
 
 @dataclass
 class SideFiles:
-    """Files beside a mesh, found in any case, with any slashes or options; warnings of a mesh."""
+    """Files in a mesh's folder, found in any case, with any slashes or options; its warnings."""
 
     path: Path  # the mesh's file
     warnings: list[str] = field(default_factory=list)  # missing or unread content, one line each

@@ -201,7 +201,7 @@ def _joined(parts: list[TexturedMesh], sides: SideFiles) -> TexturedMesh:
     if 0 < extent < 1 / MAX_REACH:
         raise UserError(f"{sides.path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
     if extent <= 0:
-        raise UserError(f"{sides.path}: all vertices are one point")
+        raise UserError(f"{sides.path}: all vertices coincide")
     materials = list({id(part.materials[0]): part.materials[0] for part in parts}.values())
     numbers = {id(material): number for number, material in enumerate(materials)}
     if not any(map(_is_visible, parts)):

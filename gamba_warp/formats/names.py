@@ -23,7 +23,7 @@ def mesh_formats(chosen: Sequence[MeshChoice]) -> tuple[MeshFormat, ...]:
     """Return the formats of ``--mesh``, empty for ``none``.
 
     Raises:
-        UserError: ``none`` beside a format.
+        UserError: ``none`` is combined with a format.
     """
     if "none" in chosen and len({*chosen}) > 1:
         raise UserError(f"--mesh {' '.join(chosen)}: none cannot be combined with other formats")

@@ -45,7 +45,7 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
     with open_shape(path) as (file, _):
         text = file.read().removeprefix(BOM).replace(b"\\\r\n", b" ")
     if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise UserError(f"{path}: text in UTF-16, an .obj file is in UTF-8")
+        raise UserError(f"{path}: text in UTF-16, but an .obj file must be UTF-8")
     text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ")
     if b"1.#" in text:
         text = _NO_NUMBER.sub(b"nan", text)
@@ -86,7 +86,7 @@ def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
         if len(vertex_uvs) and (at := corners[mine, 1]).max(initial=-1) >= 0:
             part.uvs = np.where(at[..., None] >= 0, vertex_uvs[at], 0.0)
         if colors is not None and material is not None and material.texture is not None:
-            sides.warnings.append("colours beside a texture are not drawn")
+            sides.warnings.append("colours with a texture are not drawn")
         elif colors is not None:  # they stand for the material's
             part.colors = colors[part.faces]
             if material is not None:
@@ -115,7 +115,7 @@ class _Statements:
         corners: by block ``[C, 3]`` int64, of each corner the indices of v, vt and vn from 1, or 0.
         lengths: by block ``[F]``, number of corners of each face.
         faces: by block ``[F]``, line of each face.
-        names: of the materials, to their numbers; 0 is that of faces that name none.
+        names: numbers of the materials by name; 0 for faces without a material.
         libraries: names of MTL files.
         unread: first words of other statements.
     """
@@ -161,7 +161,7 @@ class _Statements:
             totals = (self._totals + np.cumsum(counts, axis=0))[which]
             corners += np.where(corners < 0, np.repeat(totals, lengths, axis=0) + 1, 0)
             if (corners < [1, 0, 0]).any():
-                raise UserError(f"{path}: a face names a vertex before the first")
+                raise UserError(f"{path}: a face refers to a vertex before the first")
         self._totals += counts.sum(0)
         self.corners.append(corners)
         self.lengths.append(lengths)
@@ -186,7 +186,7 @@ def _corners(text: bytes) -> tuple[np.ndarray, np.ndarray] | None:
     """Read the corners of faces, a face a line: ``7``, ``7/8``, ``7//9`` or ``7/8/9``.
 
     Returns:
-        ``[C, 3]`` int64, the indices as they are, 0 where there is none; and ``[F]`` int64, the
+        ``[C, 3]`` int64, the indices as written, 0 where one is missing; and ``[F]`` int64, the
         number of each face's corners. None if a corner is invalid.
     """
     lines = Lines(text)
@@ -226,11 +226,11 @@ def _invalid_line(path: Path, block: bytes, before: int) -> UserError:
         if not valid:
             shown = b" ".join(words)[:60].decode("ascii", "replace")
             return UserError(f"{path}: line {number}, '{shown}', is not a valid vertex or face")
-    return UserError(f"{path}: it is not a valid .obj file")
+    return UserError(f"{path}: not a valid .obj file")
 
 
 def _bare(name: str) -> str:
-    """Return a name without a comment behind it; names of some programs have a # themselves."""
+    """Return a name without a trailing comment; some programs write a # in names."""
     return name.partition(" #")[0].strip()
 
 
@@ -252,7 +252,7 @@ def _library(lines: list[str], sides: SideFiles) -> dict[str, dict[str, str]]:
 
 
 def _library_texts(line: str, sides: SideFiles) -> list[bytes]:
-    """Read the file of a line, whose name may have blanks, or else the files of its words."""
+    """Read the file that a line names, with any blanks, else one file for each word."""
     words = _bare(line).split()[:MAX_LIBRARIES]
     texts, reasons = [], []
     for name in dict.fromkeys((line, _bare(line), *words)):
@@ -275,10 +275,10 @@ def _material(options: dict[str, str], name: str, sides: SideFiles) -> Material:
     picture = options.get("map_kd", options.get("map_ka"))
     if light is not None and light.any():
         if color is not None and not color.any() and picture is None:
-            sides.warnings.append("light of a surface is drawn as its colour, shaded")
+            sides.warnings.append("emission of a surface is drawn as its base colour, shaded")
             color, picture = light, options.get("map_ke")
         else:
-            sides.warnings.append("light of a surface beside its base colour is not drawn")
+            sides.warnings.append("emission of a surface with a base colour is not drawn")
     texture = sides.picture(picture) if picture else None
     if texture is not None:
         color = np.ones(3)

@@ -32,7 +32,7 @@ def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
         counts = (found[4] or _next_line(file)).split() if found else []
         text = file.read()
     if found is None or len(counts) < 2 or not all(w.isdecimal() for w in counts[:2]):
-        raise UserError(f"{path}: broken header, not OFF and numbers of vertices and faces")
+        raise UserError(f"{path}: broken header, expected OFF and the vertex and face counts")
     count, faces = (int(word[:18]) for word in counts[:2])
     rows = read_rows(text, str(path), comments=True)
     check_lines(path, f"{count} vertices and {faces} faces,", count + faces, len(rows.sizes))

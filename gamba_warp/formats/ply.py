@@ -80,7 +80,7 @@ def save_ply(path: str | Path, gaussians: Gaussians, *, comments: Iterable[str] 
 
 
 def marked(gaussians: Gaussians, comments: Iterable[str]) -> list[str]:
-    """Return the comments of a ``.ply``, with that of antialiasing if it applies."""
+    """Return the comments of a ``.ply``, including antialiasing's if it applies."""
     return [*([MIP] if gaussians.antialiased else []), *comments]
 
 

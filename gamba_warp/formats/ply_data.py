@@ -33,7 +33,7 @@ TYPES = {
 # taken for a point cloud.
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _GAUSSIANS = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
-_END = re.compile(rb"[\r\n]end_header[ \t]*\r?\n")  # a line of its own; a comment may contain it
+_END = re.compile(rb"[\r\n]end_header[ \t]*\r?\n")  # on its own line; a comment may contain it
 
 
 class PlyProperty(NamedTuple):
@@ -147,7 +147,7 @@ def _property(path: Path, words: list[str]) -> PlyProperty:
     kinds = [TYPES.get(word, "") for word in words[1 + is_list : -1]]
     if len(kinds) != 1 + is_list or not all(kinds):
         text = " ".join(words[1:])[:80]
-        raise UserError(f"{path}: property '{text}' is not a plain number or a list of such")
+        raise UserError(f"{path}: property '{text}' is neither a number nor a list of numbers")
     return PlyProperty(words[-1], kinds[-1], kinds[0] if is_list else "")
 
 
@@ -180,7 +180,7 @@ def parse_ply(path: Path, file: BinaryIO, size: int) -> PlyData:
             found[element.name] = _from_text(path, rows.part(first, count), element)
             first += count
         if first < len(rows.sizes):
-            raise UserError(f"{path}: false header, more lines follow than {says}")
+            raise UserError(f"{path}: invalid header, more lines follow than {says}")
         return PlyData(header, found)
     least = sum(element.least_bytes() for element in header.elements)
     compare_sizes(path, says, least, size - header.start, exact=False)
@@ -189,7 +189,7 @@ def parse_ply(path: Path, file: BinaryIO, size: int) -> PlyData:
     for element in header.elements:
         elements[element.name], at = _from_bytes(path, data, at, element, ORDERS[header.format])
     if data[at:].strip(b"\r\n"):
-        raise UserError(f"{path}: false header, {says} take {at} bytes but {len(data)} follow")
+        raise UserError(f"{path}: invalid header, {says} take {at} bytes but {len(data)} follow")
     return PlyData(header, elements)
 
 
@@ -200,12 +200,12 @@ def _check_header(path: Path, header: PlyHeader) -> None:
         names = [item.name for item in element.properties]
         for name in names:
             if names.count(name) > 1:
-                raise UserError(f"{path}: {element.name} property {name} is given twice")
+                raise UserError(f"{path}: {element.name} property {name} occurs twice")
         if any(item.length.startswith("f") for item in element.properties):
-            raise UserError(f"{path}: the length of a list in {element.name} is a fraction")
+            raise UserError(f"{path}: the length of a list in {element.name} is not an integer")
     names = [element.name for element in header.elements]
     if len({*names}) < len(names):
-        raise UserError(f"{path}: the .ply header has an element twice")
+        raise UserError(f"{path}: the .ply header has a duplicate element")
 
 
 def spread(starts: np.ndarray, lengths: np.ndarray, step: int = 1) -> np.ndarray:
@@ -290,7 +290,7 @@ def _from_bytes(
             if head:
                 length = int.from_bytes(data[at : at + head], byteorder, signed=signed)
             if length < 0:
-                raise UserError(f"{path}: false header, a list of {length} in {element.name}")
+                raise UserError(f"{path}: invalid header, a list of {length} in {element.name}")
             lengths.append(length)
             at += head + length * size
         return lengths, at

@@ -65,7 +65,7 @@ def read_ply_mesh(path: Path, sides: SideFiles, data: PlyData | None = None) -> 
         if texture is not None:
             material = Material(np.ones(4, np.float32), texture)
             if colors is not None:
-                sides.warnings.append("colours beside a texture are not drawn")
+                sides.warnings.append("colours with a texture are not drawn")
                 colors = None
     normals = None if normals is None else normals[corners]
     yield Part(points, corners, material, normals, uvs, colors)

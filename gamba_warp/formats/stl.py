@@ -65,5 +65,5 @@ def _text_corners(path: Path, data: bytes, sides: SideFiles) -> np.ndarray:
         sides.omit("there is no endsolid: the end of the file may be missing")
     if not begun == ends == len(points) / 3:
         says = f"{begun} facets, {ends} of them with an end, and {len(points)} vertices"
-        raise UserError(f"{path}: truncated or false, {says}")
+        raise UserError(f"{path}: truncated or invalid, {says}")
     return points

@@ -226,7 +226,7 @@ class Inference:
         return result
 
     def check(self, run: Callable[[], Gaussians], truth: torch.dtype = torch.float32) -> Error:
-        """Measure the error of the Gaussians of ``run`` against those of ``eager`` in ``truth``."""
+        """Measure the error of the Gaussians of ``run`` against ``eager``'s in ``truth``."""
         got = run()
         synchronize(self.device)
         return compare(got.tensors(), self.eager(truth).tensors())

@@ -32,7 +32,7 @@ DEFAULT_CHECKPOINT = STARTER / "rays.safetensors"
 FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
 ENCODER_NAME = "encoder.safetensors"  # a frozen encoder's weights, in the same folder
-MAX_HEADER = 16 << 20  # bytes; that of a model of 256 blocks takes 1 MB
+MAX_HEADER = 16 << 20  # bytes; a model of 256 blocks needs 1 MB
 _DTYPES = ("F32", "BF16", "F16")  # allowed in a file; all become float32
 # Reserved keys of the header; extra_metadata may use any other key.
 _RESERVED_KEYS = ("format", "config", "encoder_sha256")
@@ -51,14 +51,14 @@ def load_model(
             the Hugging Face Hub with one, downloaded once; or None for the shipped model.
         device: the model's device.
         encoder_weights: as for ``build_encoder``; required by a frozen timm encoder. The default is
-            the ``encoder.safetensors`` beside the model, if there is one.
+            the ``encoder.safetensors`` in the model's folder, if there is one.
 
     Returns:
         The model in eval mode.
 
     Raises:
         UserError: the file is missing, damaged or of another format, its numbers are not finite,
-            the encoder differs from that of the training, or the repository cannot be read.
+            the encoder differs from the training's, or the repository cannot be read.
     """
     repository = _REPOSITORY.fullmatch(str(path))
     path = _download(repository[1]) if repository else Path(path or DEFAULT_CHECKPOINT)
@@ -85,7 +85,7 @@ def load_model(
     if model.encoder and model.encoder.frozen:
         if model.encoder.fingerprint != encoder_sha256:
             raise UserError(
-                f"{path}: was trained with other weights of {config.encoder} than those given"
+                f"{path}: was trained with weights of {config.encoder} other than the given ones"
             )
     return model.to(device).eval()
 
@@ -104,7 +104,7 @@ def _download(name: str) -> Path:
 
 
 def save_folder(folder: str | Path, model: Gamba) -> Path:
-    """Write a model, and a frozen timm encoder's weights beside it, into a folder.
+    """Write a model, and a frozen timm encoder's weights, into a folder.
 
     Args:
         folder: created if missing; existing files are replaced atomically.
@@ -255,9 +255,9 @@ def _opened(path: Path) -> Iterator[safe_open]:
             length = int.from_bytes(raw.read(8), "little")
         # The library would parse a header of up to 100 MB.
         if length > min(MAX_HEADER, path.stat().st_size):
-            raise UserError(f"{path}: not a whole safetensors file (its header is too large)")
+            raise UserError(f"{path}: not a valid safetensors file (its header is too large)")
         with safe_open(path, framework="pt") as file:
             yield file
     except (SafetensorError, OSError) as error:
         reason = first_line(error)[:200]
-        raise UserError(f"{path}: not a whole safetensors file ({reason})") from error
+        raise UserError(f"{path}: not a valid safetensors file ({reason})") from error

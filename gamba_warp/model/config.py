@@ -204,7 +204,7 @@ class GambaConfig:
         if self.mixed_tokens and (rays or not self.additive_image_tokens):
             raise UserError("config: mixed_tokens needs additive_image_tokens, and no decoder rays")
         if self.mixed_tokens and self.grid_size % 2:
-            raise UserError(f"config: mixed_tokens needs an even grid, not of {self.grid_size}²")
+            raise UserError(f"config: mixed_tokens needs an even grid, not {self.grid_size}²")
         if self.encoder == "vgg16" and not self.encoder_frozen:
             raise UserError("config: encoder vgg16 can only be used frozen")
 
@@ -215,7 +215,7 @@ class GambaConfig:
 
     @property
     def token_patch(self) -> int:
-        """Side of the patches that 3DGS tokens are made of, pixels."""
+        """Side of the patches that 3DGS tokens encode, pixels."""
         return self.patch_size * (2 if self.mixed_tokens else 1)
 
     @property
@@ -225,7 +225,7 @@ class GambaConfig:
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians: L, or with "rays" that of a picture without any background."""
+        """Number of Gaussians: L, or with "rays" the number for a picture without background."""
         if self.decoder == "rays":
             return self.ray_layers * (self.grid_size * self.ray_cells) ** 2
         return self.num_tokens
@@ -237,7 +237,7 @@ class GambaConfig:
 
     @property
     def pixel_channels(self) -> int:
-        """Channels of a pixel in a 3DGS token: those of the picture, and its Plücker ray."""
+        """Channels of a pixel in a 3DGS token: the picture's, and its Plücker ray."""
         return self.input_channels + 6
 
     @property

@@ -7,12 +7,12 @@ each front cell may therefore split into k x k children, each on the ray of its 
   ray are interpolated between the cells, weighted by alpha. The opacity is over a half where alpha
   is 1: a network uncertain of the depth makes a faint front, through which the colours of the
   layers behind it, without detail, would show.
-- Colour and alpha are those of the picture at k times the resolution of the cells.
+- Colour and alpha are taken from the picture at k times the resolution of the cells.
 - Sizes are the parent's, across the view 1/k of them, but large enough that neighbours overlap: at
   ``image_size`` a rasterizer's own widening covers the gaps between small Gaussians, at k times
   that size it does not. Sizes along the view stay, so that no crack opens from the side.
 - Gaussians that do not split are enlarged in the same way, across the view.
-- A parent lies up to a pixel off its ray. Its children take a part of that offset: without it they
+- A parent is up to a pixel off its ray. Its children take a part of that offset: without it they
   would separate from cells that do not split, and with all of it their pixels would be displaced.
 
 Plain cells do not split. Cells that contain or touch background split in 2 x 2 at most: a

@@ -244,7 +244,7 @@ def read_state(path: Path) -> dict[str, Any]:
 
         try:
             return load_file(path)
-        except Exception as error:  # the library's own class, and those of torch
+        except Exception as error:  # the library's own class, and torch's
             raise UserError(f"{path}: cannot be read as weights") from error
     state = read_torch(path, "cannot be read as weights")
     for key in ("model", "state_dict"):

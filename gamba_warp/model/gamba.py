@@ -93,7 +93,7 @@ class Gamba(nn.Module):
         """Compute the state of each block after picture and camera (``prefix_states``).
 
         It is the whole contribution of the prefix; with the decoder ``triplane`` the states of the
-        planes' blocks follow. Arguments and errors are those of ``forward``.
+        planes' blocks follow. Arguments and errors as in ``forward``.
         """
         self._check(images, cameras)
         camera = self.camera_token(cameras) if self.camera_token else None
@@ -134,7 +134,7 @@ class Gamba(nn.Module):
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or
-            the number of kept tokens, in their order. With ``rays`` N is that of the picture with
+            the number of kept tokens, in their order. With ``rays`` N belongs to the picture with
             the most foreground cells; the others are padded with Gaussians of opacity 0.
 
         Raises:
@@ -200,7 +200,7 @@ class Gamba(nn.Module):
         self.load_state_dict(state, strict=False)
 
     def check_stored_state(self, shapes: Mapping[str, Sequence[int]]) -> None:
-        """Check the names and shapes of tensors against those of ``stored_state``.
+        """Check the names and shapes of tensors against ``stored_state``.
 
         Raises:
             ValueError: a tensor is missing, unknown or of another shape; the message names the
@@ -211,7 +211,7 @@ class Gamba(nn.Module):
         unknown = sorted(shapes.keys() - state.keys())
         if missing or unknown:
             kind, names = ("no", missing) if missing else ("an unknown", unknown)
-            raise ValueError(f"{kind} tensor {names[0][:200]!r} ({len(names)} such)")
+            raise ValueError(f"{kind} tensor {names[0][:200]!r} ({len(names)} in total)")
         for name, value in state.items():
             if tuple(shapes[name]) != value.shape:
                 got, want = tuple(shapes[name]), tuple(value.shape)

@@ -147,7 +147,7 @@ def convert_released(
         raise UserError(f"{path}: not the released network: {error}") from error
     if found:
         first = sorted(found)[0][:100]
-        raise UserError(f"{path}: has an unknown tensor '{_ROOT}{first}' ({len(found)} such)")
+        raise UserError(f"{path}: has an unknown tensor '{_ROOT}{first}' ({len(found)} in total)")
     return config, weights
 
 
@@ -195,7 +195,7 @@ def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
     # the sum that made a float32 point.
     near = max(1e-6, limit * torch.finfo(stored).eps)
     if points.shape[0] != 3 or bins < 2 or not torch.allclose(points, even, rtol=0, atol=near):
-        raise ValueError(f"'{_COORDS}' is not the same even points on three axes")
+        raise ValueError(f"'{_COORDS}' is not the same evenly spaced points on three axes")
     grid = round((tokens / 4) ** 0.5)
     if tokens != 4 * grid**2 or not grid:
         raise ValueError(f"'transformer.pos_embed' has {tokens} tokens, not four for each patch")

@@ -1,6 +1,6 @@
 """Model cards: training data and metrics of a trained model.
 
-A card is the file ``NAME.json`` beside the weights ``NAME.safetensors``. It is optional: pages of
+A card is the file ``NAME.json`` next to the weights ``NAME.safetensors``. It is optional: pages of
 a model without one state that its training is unknown.
 """
 
@@ -145,7 +145,7 @@ def about_model(checkpoint: Path) -> list[tuple[str, str]]:
 
 
 def _in_short(card: ModelCard) -> Iterator[tuple[str, str]]:
-    """Yield the model's figures, each beside the best baseline's."""
+    """Yield the model's figures, each with the best baseline's."""
     names = {"novel": "new views", "input": "input view", "shape": "shape"}
     for own in card.figures:
         if own.name != "model":

@@ -73,7 +73,7 @@ class ObjectFiles:
         )
 
     def suffixes(self, meshes: bool = True) -> list[str]:
-        """Return the suffixes of an object's files, those of meshes last."""
+        """Return the suffixes of an object's files, meshes last."""
         options = self.options
         found = [splat_suffix(kind) for kind in options.splats]
         found += [f".{options.turntable}"] if options.turntable != "none" else []
@@ -180,9 +180,9 @@ class ExportJob(ObjectFiles):
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Resolve files and folders to files of Gaussians, each once; those of a folder are sorted.
+    """Resolve files and folders to files of Gaussians, each once; files of a folder are sorted.
 
-    In folders a .glb with a mesh is skipped, because commands write them beside the Gaussians. So
+    In folders a .glb with a mesh is skipped, because commands write them next to the Gaussians. So
     are names that begin with a dot: hidden files, and unfinished ones of killed commands.
 
     Returns:

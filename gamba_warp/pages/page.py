@@ -41,8 +41,8 @@ class Section:
         strip: one wide picture ``[H, W, 3]``, floats in [0, 1].
         views: pictures ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
             such as "Predicted" above "Truth".
-        links: thumbnails ``[H, W, 3]`` uint8 by name, which link to NAME.html beside the page.
-        files: names of files beside the page, for download.
+        links: thumbnails ``[H, W, 3]`` uint8 by name, which link to NAME.html in the page's folder.
+        files: names of files in the page's folder, for download.
         table: rows of cells; text is left-aligned, numbers right-aligned. Below a header, texts of
             numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval.
         header: names of the table's columns.
@@ -91,7 +91,7 @@ def page_text(title: str, text: str, sections: Sequence[Section], auto: bool = F
 
 
 def reconstruction_page(path: str | Path, section: Section) -> None:
-    """Write the page of one reconstruction atomically; its viewer is large and starts by itself.
+    """Write the page of one reconstruction atomically; its viewer is large and starts on load.
 
     Raises:
         UserError: the file cannot be written.
@@ -111,7 +111,7 @@ def demo_page(
 
 
 def index_page(path: str | Path, title: str, results: Mapping[str, np.ndarray]) -> None:
-    """Write atomically a page with links to the pages of many reconstructions beside it.
+    """Write atomically a page with links to the pages of many reconstructions in its folder.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""HTML of pages from Jinja2 templates beside this file, with all text escaped."""
+"""HTML of pages from Jinja2 templates in this folder, with all text escaped."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from .texture import Texture
 def save_mesh(path: str | Path, surface: Surface, axes: Axes = "opengl") -> None:
     """Write a surface atomically, with vertex colours if the format has them (not .stl).
 
-    A texture is embedded in a ``.glb``; beside an ``.obj`` it is NAME.png, named by NAME.mtl; the
+    A texture is embedded in a ``.glb``; for an ``.obj`` it is NAME.png, named by NAME.mtl; the
     other formats have vertex colours. Those of a ``.glb`` are linear, as the format requires. A
     ``.ply`` states its axes in a comment, which ``eval-geometry`` reads.
 
@@ -133,7 +133,7 @@ def write_meshes(
         device: device that renders.
         texture: side of a texture, pixels; 0: none.
         size_mm: longest side in the files, in millimetres (in a .glb, whose unit is the metre, a
-            thousandth of that); None: that of the Gaussians.
+            thousandth of that); None: the Gaussians' size.
 
     Returns:
         The surface in the Gaussians' own frame.

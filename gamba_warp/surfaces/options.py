@@ -33,11 +33,11 @@ class SurfaceOptions:
         method: tsdf (depth of many views, fused), density (marching cubes on 1 - prod(1 - alpha)),
             or centers (opacity-weighted centres; biased inwards, a diagnostic without volume).
         voxels: voxels per unit, of the TSDF and of the density; 8 to 1024.
-        views: TSDF cameras, on a Fibonacci sphere; also those of the colours.
+        views: TSDF cameras, on a Fibonacci sphere; also used for the colours.
         pixels: side of a depth map.
         truncation: of the TSDF, in voxels.
         transmittance: depth is where a ray's transmittance has fallen to this. Fitted and predicted
-            Gaussians are half transparent, so the median (0.5) lies behind the surface.
+            Gaussians are half transparent, so the median (0.5) is behind the surface.
         min_alpha: pixels with less have no depth.
         clear_alpha: pixels with less are empty.
         max_slope: pixels of a steeper surface, depth over width, have no depth.

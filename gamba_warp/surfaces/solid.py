@@ -56,7 +56,7 @@ def solid_of(
     # Near a hole the votes are noisy: the median closes tunnels of a voxel.
     inside = median_filter(2 * votes.reshape(shape) > _VOTES, 3)
     filled = np.asarray(binary_fill_holes(inside))
-    # Only points beside the surface need their distance; the walls of a filled cavity are none.
+    # Only points near the surface need their distance; the walls of a filled cavity do not count.
     depth = np.where(filled, 1.0, -1.0)
     beside = binary_dilation(filled, iterations=5) & ~binary_erosion(filled, iterations=5)
     beside &= inside | ~filled

@@ -187,7 +187,7 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
 
 
 def covered_texels(uvs: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the texels whose centres lie in a face.
+    """Return the texels whose centres are in a face.
 
     Args:
         uvs: ``[F, 3, 2]``, v up.

@@ -60,7 +60,7 @@ def sphere_cameras(count: int, radius: float, pixels: int) -> Cameras:
 def look_around(gaussians: Gaussians, options: SurfaceOptions) -> Views:
     """Render an object from all around, on a Fibonacci sphere.
 
-    On slanted surfaces the depth is that of a Gaussian's near edge, which would enlarge the object.
+    On slanted surfaces the depth belongs to a Gaussian's near edge, which would enlarge the object.
     So pixels of a surface steeper than ``max_slope`` have no depth.
 
     Args:

@@ -116,7 +116,7 @@ def plan_path(
         return cameras, False, count / (turns * SECONDS)
     given = [name for name, value in {**view, "frames": frames}.items() if value is not None]
     if given:
-        raise UserError(f"--{given[0]} goes with a turntable or a spiral, not with a file")
+        raise UserError(f"--{given[0]} applies to a turntable or a spiral, not to a file")
     path = load_path(trajectory, size)
     for side in (path.cameras.width, path.cameras.height):
         if side > int(_SIDES.le or 0) or side < 1:

@@ -101,7 +101,7 @@ def save_movie(
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
-        raise UserError(f"{path}: a turntable is a .gif or an .mp4")
+        raise UserError(f"{path}: a turntable is written as a .gif or an .mp4")
     with atomic_path(path) as temporary:
         if suffix == ".gif":
             _write_gif(temporary, frames, rate, sample, background)

@@ -110,7 +110,7 @@ def _around(
 ) -> Cameras:
     width, height = (size, size) if isinstance(size, int) else size
     K = intrinsics(width, height, fov)
-    if width < height:  # the angle is that of the width, so that a centred object is not cropped
+    if width < height:  # the angle applies to the width, so that a centred object is not cropped
         K[[0, 1], [0, 1]] *= width / height
     viewmats = orbit(azimuths, elevation, distance)
     return Cameras(viewmats, K.expand(len(azimuths), 3, 3), width, height)
@@ -124,7 +124,7 @@ def upright(elevation: float) -> Tensor:
 
     Returns:
         Rotates points in the camera's axes, about the object's centre, into a world whose up is -y:
-        there the camera is that of ``orbit([0], elevation)``.
+        there the camera is ``orbit([0], elevation)``.
     """
     return orbit(torch.zeros(1), elevation)[0, :3, :3].T.contiguous()
 

@@ -51,11 +51,11 @@ def _parse(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
         header = _HEADERS[npy.read_magic(file)]
         stated, columns_first, dtype = header(file)
     except Exception as error:  # numpy uses Python's parser, which raises a dozen types
-        raise UserError("its header is not that of an array") from error
+        raise UserError("its array header is invalid") from error
     wanted = "x".join(map(str, shape))
     if tuple(stated) != shape:
         got = "x".join(map(str, stated))[:40] or "a single number"
-        raise UserError(f"expected {wanted} numbers, it states {got}")
+        raise UserError(f"expected {wanted} numbers, its header states {got}")
     array = plain_array(data[file.tell() :], dtype.str, shape, columns_first)
     with np.errstate(over="ignore", invalid="ignore"):
         return array.astype(np.float64)

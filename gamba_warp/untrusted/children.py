@@ -150,8 +150,8 @@ class _Child:
         self.end()
         if not self.ready:
             raise RuntimeError(
-                f"a child process ended at its start ({_describe_exit(code)}); a script must have "
-                "its calls below 'if __name__ == \"__main__\":'"
+                f"a child process exited at its start ({_describe_exit(code)}); a script must "
+                "guard its calls with 'if __name__ == \"__main__\":'"
             )
         return Failed(f"its process {_describe_exit(code)}")
 

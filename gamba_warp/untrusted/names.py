@@ -37,7 +37,7 @@ def inside(folder: str | Path, name: object, source: str) -> Path:
 class Within:
     """``inside`` for many names of one folder: each of its subfolders is listed once.
 
-    A listed name that is no link needs no further system call; others are followed by ``inside``.
+    A listed name that is not a link needs no further system call; ``inside`` follows others.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -46,7 +46,7 @@ class Within:
         self._plain: dict[tuple[str, ...], set[str]] = {}
 
     def path(self, name: object, source: str) -> Path:
-        """Return the path of a name. Arguments, result and errors are those of ``inside``."""
+        """Return the path of a name. Arguments, result and errors as in ``inside``."""
         parts = parts_of(name, source)
         above = parts[:-1]
         if above not in self._plain:
@@ -56,7 +56,7 @@ class Within:
         return inside(self._folder, name, source)
 
     def _list(self, above: tuple[str, ...], source: str) -> set[str]:
-        """Names in a subfolder that are no links; none if it is missing or leaves the folder."""
+        """Names in a subfolder except links; empty if it is missing or leaves the folder."""
         try:
             folder = inside(self._folder, "/".join(above), source) if above else self._folder
             with os.scandir(folder) as found:
@@ -73,7 +73,7 @@ def plain_name(name: object, source: str) -> str:
     """
     parts = parts_of(name, source)
     if len(parts) != 1 or parts[0] != name:
-        raise UserError(f"{source}: the name {name!r} is not that of one file")
+        raise UserError(f"{source}: the name {name!r} is not a plain file name")
     if parts[0].startswith("."):
         raise UserError(f"{source}: the name {name!r} begins with a dot")
     return parts[0]

@@ -43,7 +43,7 @@ def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any
         else:
             with open(path, "rb") as file:
                 if file.read(len(_OLD)) != _OLD:  # else torch would allocate arbitrary sizes
-                    raise ValueError("it does not begin like a file of torch")
+                    raise ValueError("it does not begin like a torch file")
         # Memory-mapped, a tensor cannot reach beyond the file; torch's other reader trusts the
         # stated size of a tensor. Only old files, which are not zip, need that one.
         with warnings.catch_warnings():
@@ -67,7 +67,7 @@ def _check_zip(path: Path, size: int) -> None:
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-            raise ValueError("its members are packed, unlike those of torch")
+            raise ValueError("its members are compressed, which torch never does")
         if sum(member.file_size for member in members) > size:
             raise ValueError("its members are larger than the file")
         wrong = archive.testzip()
@@ -98,7 +98,7 @@ class _Copier:
             return value.detach().clone(memory_format=torch.contiguous_format)
         if isinstance(value, dict):
             if not all(isinstance(key, (str, int)) for key in value):
-                raise ValueError("a key is neither a text nor a number")
+                raise ValueError("a key is neither text nor a number")
             return {k: self.copy(v, depth + 1) for k, v in value.items()}
         if isinstance(value, (list, tuple)):
             items = [self.copy(item, depth + 1) for item in value]

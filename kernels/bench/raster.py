@@ -97,7 +97,7 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
 
 def knobs(settings: Settings) -> list[Variant]:
     """Accuracy traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
-    threshold of alpha or T and no radius clip. The defaults are those of trained Gaussians and
+    threshold of alpha or T and no radius clip. The defaults suit trained Gaussians and
     other renderers.
     """
     scene = make_scene(settings, 2).changed(exact=_NO_THRESHOLDS)
@@ -180,7 +180,7 @@ def _call_all(runs: list) -> None:
 
 
 def many_views(settings: Settings) -> list[Variant]:
-    """32 views of 512² in one launch, beside gsplat."""
+    """32 views of 512² in one launch, compared with gsplat."""
     scene = make_scene(settings, views=32)
     return _pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
 

@@ -25,7 +25,7 @@ _WORK = {
     "share of rasterizer": "rasterizer",
     "share of products": "products",
 }
-_UNSTEADY = 1.3  # the 80 % quantile over that of 20 %, from which a time is marked
+_UNSTEADY = 1.3  # ratio of the 80 % and 20 % quantiles from which a time is marked
 _BUSY = 1.2  # wall time over CPU time from which a machine is busy
 _EXPLANATION = (
     "Times are medians in milliseconds, with the 20 % and 80 % quantiles; variants of one table "
@@ -68,7 +68,7 @@ def _work_text(r: dict) -> str:
 
 
 def _row(r: dict) -> list[str]:
-    """Return a record's cells: those of ``_HEADER``, the comparison with a peer, and the work."""
+    """Return a record's cells: the columns of ``_HEADER``, the comparison with a peer, the work."""
     name = r["variant"] + (" (default)" if r["is_default"] and r["variant"] != "default" else "")
     error = _number(r["rel_rms_error"])
     if r["status"] != "ok":
@@ -91,7 +91,7 @@ def _table(records: Sequence[dict]) -> str:
 def busy_line(document: dict) -> str:
     """Return a line if runs on the CPU waited for it; empty if not.
 
-    It has the load of the machine, the number of tasks that wanted a core, at both ends.
+    It has the machine's load, the number of runnable tasks, at both ends.
     """
     timed = [r for r in document["records"] if r["ms_p50"] and r["device"] == "cpu"]
     late = sum(r["ms_p50"] > _BUSY * r["cpu_ms"] for r in timed)

@@ -15,7 +15,7 @@ from ..selective_scan import selective_scan_fn
 from . import peers
 from .measure import Case, Settings, Variant, pair, saved_bytes, variant
 
-# Tokens, channels, and tokens that the oracle looks at.
+# Tokens, channels, and tokens that the oracle computes.
 SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (16961, 1024, 16961)}
 _HALF = {"dtype": torch.bfloat16}
 
@@ -87,7 +87,7 @@ def knobs(settings: Settings) -> list[Variant]:
 
 
 def lengths(settings: Settings) -> list[Variant]:
-    """Cost against the number of tokens. Saved: tensors of the forward pass beside its inputs;
+    """Cost against the number of tokens. Saved: tensors of the forward pass besides its inputs;
     history: the states of all tokens.
     """
     made = []
@@ -135,7 +135,7 @@ def layers(settings: Settings) -> list[Variant]:
 
 
 def packed(settings: Settings) -> list[Variant]:
-    """Sequences of many lengths in one packed row beside one sequence as long. The oracle sees the
+    """Sequences of many lengths in one packed row, and one sequence as long. The oracle sees the
     first of them.
     """
     length, width, _ = SIZES[settings.level]
@@ -153,7 +153,7 @@ def packed(settings: Settings) -> list[Variant]:
 
 
 def training_batch(settings: Settings) -> list[Variant]:
-    """A layer of the paper's training: 16 sequences in bfloat16, beside mamba-ssm."""
+    """A layer of the paper's training: 16 sequences in bfloat16, compared with mamba-ssm."""
     length, width, tokens = SIZES[settings.level]
     inputs = make_inputs(2 if settings.level == "quick" else 16, length, width)
     problem = scan_problem(inputs, settings.device, min(tokens, 2048))

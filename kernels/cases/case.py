@@ -128,7 +128,7 @@ class Op:
         name: name of the op.
         kinds: by kind of values, the options that it fixes: a value, or a tuple of values of which
             one is drawn. The first kind is the plain one.
-        options: by name the values to draw from, of which the first is the plain one.
+        options: by name the values to draw from; the first is the plain one.
         fit: function that returns the nearest options that make sense together.
         evaluate: function that runs a case on a device; each trial has other random roundings.
     """
@@ -146,7 +146,7 @@ class Op:
 
 
 def mostly(plain: Any, values: Sequence[Any]) -> tuple:
-    """Return values of which ``plain`` is drawn in seven cases of ten, and stands first."""
+    """Return values with ``plain`` first, which is drawn in seven cases of ten."""
     return (plain,) * (7 * len(values) // 3) + (*values,)
 
 
@@ -296,7 +296,7 @@ class Runs:
         leaves: tensors that need a gradient, by name.
         truths: the formula's results, and perhaps more, ``[SAMPLES, ..]``.
         samples: the formula's leaves.
-        without: mask of the results of which no gradient is asked.
+        without: mask of the results that need no gradient.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ from .scan import LAYOUTS, SEQUENCES, borders, laid
 
 LIMITS = {"forward": 1e-6, BOTH: 1e-5}
 HALF_LIMITS = {torch.bfloat16: 1e-2, torch.float16: 2e-3}
-TOKENS = 2048  # that the oracle looks at
+TOKENS = 2048  # that the oracle computes
 
 
 def _reference(**inputs: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ def compare(got: Mapping[str, Tensor], want: Mapping[str, Tensor]) -> Error:
         if not truth.numel():
             continue
         difference = value - truth
-        # If the truth is all zeros, the difference is taken as it is.
+        # If the truth is all zeros, the absolute difference is used.
         rms = truth.square().mean().sqrt().item() or 1.0
         relative = difference.square().mean().sqrt().item() / rms
         if relative >= rel_rms:
@@ -64,10 +64,10 @@ class Operator:
         text: the oracle in words.
         sizes: for the records.
         limits: largest relative rms error to float64 by direction.
-        half_limits: those of half precision, explained by the rounding of inputs and output.
+        half_limits: limits in half precision, explained by the rounding of inputs and output.
         cast: names of the inputs that a dtype holds for.
         corner: index of the corner by name of an input, or "out".
-        turned: inputs, and "out", of which ``function`` wants the last two dimensions exchanged.
+        turned: inputs, and "out", whose last two dimensions are exchanged for ``function``.
         fixed: inputs without a gradient.
         compared: True to compare gradients too, not only the output.
     """
@@ -98,7 +98,7 @@ class Operator:
         return self.half_limits.get(dtype, self.limits[direction])
 
     def at(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-        """Return the inputs on the device, as ``function`` wants them, with ``cast`` in a dtype."""
+        """Return the inputs on the device, as ``function`` takes them, with ``cast`` in a dtype."""
         if dtype not in self._laid:
             self._laid[dtype] = {
                 k: self._turn(k, x).to(self.device, dtype if k in self.cast else None)

@@ -316,7 +316,7 @@ def _cameras(o: dict, kind: str, batch: int, g: torch.Generator) -> tuple[Tensor
 
 
 def _shapes(o: dict, kind: str, sizes: tuple[int, int], g: dict) -> dict[str, Tensor | None]:
-    """Return quaternions, scales (log-normal around 0.06 unless the kind says else), opacities."""
+    """Return quaternions, scales (log-normal around 0.06 unless the kind differs), opacities."""
     quats = torch.randn(*sizes, 4, generator=g["quats"])
     if kind == "odd quaternions":  # of any length, 0 included; some have one entry only
         uniform = torch.rand(*sizes, 1, generator=g["quats"])
@@ -415,7 +415,7 @@ def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor 
 
 
 def gaussians_axis(o: dict, name: str) -> int:
-    """Return the dimension of a leaf along which the Gaussians lie."""
+    """Return the dimension of a leaf that indexes the Gaussians."""
     return len(LEADS[o["lead"]]) + (name == "colors" and o["colors_per_view"])
 
 
@@ -527,11 +527,11 @@ def _poison_faults(case: Case, x: dict, run, runs: Runs) -> list[str]:
         other, of_gaussian = others[name], name in LEAVES
         axis = gaussians_axis(case.options, name)
         kept = other.index_select(axis, old.to(other.device)) if of_gaussian else other
-        # A gradient beyond its dtype's range is infinite, beside whatever Gaussians.
+        # A gradient beyond its dtype's range is infinite, whatever the other Gaussians.
         beyond = ~fits(runs.true_grads[name][0], kept.dtype).to(kept.device)
         allowed = int((beyond & ~kept.isfinite()).sum())
         if int((~other.isfinite()).sum()) > allowed:
-            faults.append(f"gradient of {name} not finite beside Gaussians that are not")
+            faults.append(f"gradient of {name} not finite next to Gaussians that are not")
         elif of_gaussian and not torch.equal(kept, gradient):
             faults.append(f"gradient of {name} changed by Gaussians that are not finite")
     return faults

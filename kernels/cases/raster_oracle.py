@@ -204,7 +204,7 @@ def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
     channels = s.channels[:, None]
     moved = back[..., None] * (channels - channels.detach())
     blended = r(r(weight[..., None] * channels.detach() + moved).sum(2))
-    # alpha is 1 - T_end, and its gradient is that of Σ T α: the rasterizer's README, eq. 7 and 10
+    # alpha is 1 - T_end, and its gradient that of Σ T α: the rasterizer's README, eq. 7 and 10
     alphas = r(r.stored(weight, torch.float32).sum(-1))
     left = torch.cumprod(torch.where(on & going, r(1 - alpha), 1.0), -1)[..., -1]
     alphas = alphas + (r(1 - left) - alphas).detach()

@@ -72,7 +72,7 @@ class Rounding:
         return self.rounded(torch.full((SAMPLES, 1), float(value), dtype=torch.float64), 1.0)
 
     def stored(self, x: Tensor, dtype: torch.dtype) -> Tensor:
-        """Returns ``x`` as it is, but rounds its gradient on this path to ``dtype``."""
+        """Returns ``x`` unchanged, but rounds its gradient on this path to ``dtype``."""
         return self(x, 0.0, torch.finfo(dtype).eps / 2 / UNIT)
 
     def exp(self, x: Tensor, ulps: float) -> Tensor:
@@ -139,7 +139,9 @@ class Rounding:
         x = x.movedim(dims, tuple(range(-len(dims), 0))).flatten(-len(dims))
         squares, rounded = torch.zeros_like(x.sum(-1)), x[-1].float()
         small = torch.where(x[1:-1].abs() < UNDERFLOW, x[1:-1], 0.0)
-        small[2:4].clamp_(min=0.0)  # all terms, or those of one sign, which may be the smaller ones
+        small[2:4].clamp_(
+            min=0.0
+        )  # all terms, or the terms of one sign, which may be the smaller ones
         small[4:].clamp_(max=0.0)
         dropped = small.sum(-1)
         while x.shape[-1] > 1:
@@ -156,7 +158,7 @@ class Rounding:
         return total
 
     def underflow(self, x: Tensor, up: bool = False) -> Tensor | float:
-        """Draw the error where ``x`` is tiny; ``up`` is that of ``rounded``."""
+        """Draw the error where ``x`` is tiny; ``up`` is as in ``rounded``."""
         small = x[1:-1].abs() < 2.0**-100
         if not small.any():
             return 0.0

@@ -245,7 +245,7 @@ def laid(x: Tensor, layout: str) -> Tensor:
 
 
 def borders(case: Case, device: torch.device) -> Tensor | None:
-    """Return ``cu_seqlens`` of the packed sequences, some without tokens; None of a single one."""
+    """Return ``cu_seqlens`` of the packed sequences, some without tokens; None for a single one."""
     length, count = case.options["length"], case.options["sequences"]
     if count == 1:
         return None
@@ -319,7 +319,7 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     o, r, x = case.options, Rounding(case.seed, trial), build(case, device)
     samples: dict[str, Any] = {name: samples_of(t) for name, t in x.items()}
     used = dict(samples)
-    if o["constant_B"]:  # every channel is a group of its own
+    if o["constant_B"]:  # every channel is its own group
         used["B"] = scan_oracle.over_tokens(r(samples["B"]), samples["u"], r)
     exact = partial(
         scan_oracle.scan, softplus=o["softplus"], discretization=o["discretization"], r=r

@@ -123,7 +123,7 @@ def causal_conv1d(
 
 
 def last_tokens(x: Tensor, initial_state: Tensor, packed: Tensor) -> Tensor:
-    """The last tokens of each sequence, in front those before its first.
+    """Last tokens of each sequence; in a short one, preceded by its initial state.
 
     Args:
         x: ``[B, L, D]``.
@@ -136,7 +136,7 @@ def last_tokens(x: Tensor, initial_state: Tensor, packed: Tensor) -> Tensor:
     row, begin, end = packed.long().unbind(1)
     history = initial_state.shape[1]
     t = end[:, None] + torch.arange(-history, 0, device=x.device)
-    before = t - begin[:, None] + history  # of those that are tokens before the first
+    before = t - begin[:, None] + history  # index into the initial state
     old = initial_state.gather(1, before.clamp(0, history - 1)[..., None].expand_as(initial_state))
     if not x.shape[1]:
         return old
@@ -155,14 +155,14 @@ def causal_conv1d_fn(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Convolve with the arguments and layout of causal-conv1d's ``causal_conv1d_fn``.
 
-    A CPU reads x as it lies, with adjacent tokens or channels, and the output lies as x.
+    A CPU reads x without a copy, with dense tokens or channels; the output has x's layout.
 
     Args:
         x: ``[B, D, L]`` float32, bfloat16 or float16.
         weight: ``[D, W]``, W from 2 to 4.
         bias: ``[D]``, or None.
         seq_idx: ``[B, L]`` int32, the sequence of each token, or None; below 0 the output is 0.
-        initial_states: ``[B, D, W-1]``, or None; must be None beside ``seq_idx``.
+        initial_states: ``[B, D, W-1]``, or None; must be None with ``seq_idx``.
         return_final_states: also return ``[B, D, W-1]``.
         final_states_out: where to write the final states, or None.
         activation: None, "silu" or "swish".
@@ -172,10 +172,10 @@ def causal_conv1d_fn(
 
     Raises:
         TypeError: as ``causal_conv1d``.
-        ValueError: as ``causal_conv1d``; also for states beside a ``seq_idx``.
+        ValueError: as ``causal_conv1d``; also for states with a ``seq_idx``.
     """
     if seq_idx is not None and (initial_states is not None or return_final_states):
-        raise ValueError("seq_idx is given beside states, which causal_conv1d with cu_seqlens has")
+        raise ValueError("seq_idx and states are given; causal_conv1d with cu_seqlens takes both")
     made = causal_conv1d(
         tokens_first(x, "x"),
         weight,

@@ -15,7 +15,7 @@ from ..runtime.native import PRELUDE, WARP_DTYPES, W, lanes, native, native_kern
 from ..runtime.scalars import BITS, EXP2, RECIPROCAL
 
 TAPS = 4
-# Tokens of a forward task; on a CPU few, because each row may lie in another page, but many where x
+# Tokens of a forward task; on a CPU few, because each row may be in another page, but many where x
 # is turned.
 STRIP = {"cpu": 16, "cuda": 128}
 TURNED_STRIP = 512
@@ -71,7 +71,7 @@ def forward_kernel(device_type: str, io: torch.dtype, turned: bool) -> Any:
 
 @functools.cache
 def backward_kernel(device_type: str, io: torch.dtype, turned: bool) -> Any:
-    """The kernel of the gradients (README, equation 2); those of the weight are one sum a chunk.
+    """The kernel of the gradients (README, equation 2); the weight's are one sum per chunk.
 
     It is ``turned`` where x or the gradient of the output is.
     """

@@ -23,7 +23,7 @@ def _like(x: Tensor) -> Tensor:
 def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
     """``[D, rows]`` to float32 ``[rows, channels]``, zeros in front of too few rows.
 
-    The result may lie in the memory of ``x``.
+    The result may share the memory of ``x``.
     """
     if x is None:
         return torch.zeros(rows, channels, dtype=torch.float32, device=like.device)
@@ -52,7 +52,7 @@ def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list
 
 
 def _pieces(x: Tensor, rows: Tensor | None, tokens: int) -> tuple[int, Tensor]:
-    """Return the number of pieces of so many tokens, and those of packed rows."""
+    """Return the number of pieces of that many tokens, and the pieces of packed rows."""
     batch, length, _ = x.shape
     if rows is None:
         return batch * -(-length // tokens), torch.empty(0, 5, dtype=torch.int32, device=x.device)

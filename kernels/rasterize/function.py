@@ -97,7 +97,7 @@ def rasterization(
         (see ``Meta``).
 
     Raises:
-        TypeError: a tensor has another dtype, or is no tensor.
+        TypeError: a tensor has another dtype, or is not a tensor.
         ValueError: a shape, device or option is not as above; the message names it. Or there are
             over 2^31 pairs of tiles and Gaussians, and this is not CUDA, or the first such call.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered before.
@@ -118,7 +118,7 @@ def rasterization(
         radius_clip=radius_clip, eps2d=eps2d, alpha_min=alpha_min,
         antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
     ).numbers()  # fmt: skip
-    # colours only cull here, so their gradient is no reason to compute that of the geometry
+    # colours only cull here, so their gradient does not require the geometry's
     gaussians = x.means, x.quats, x.scales, None, x.opacities
     projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, lens))
     channels = _channels(render_mode, colors, projected.depths)

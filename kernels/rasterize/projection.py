@@ -33,7 +33,7 @@ class LensOptions(NamedTuple):
         antialiased: not 0 for ``rasterize_mode="antialiased"``.
         skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
         rounded: not 0 to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
-            does; a Gaussian that this keeps beside the picture has no pair.
+            does; a Gaussian that this keeps outside the picture has no pair.
         original: not 0 for the conventions of the first 3D Gaussian splatting code (README.md §7).
     """
 
@@ -50,7 +50,7 @@ class LensOptions(NamedTuple):
     original: float = 0.0
 
     def numbers(self) -> list[float]:
-        """The attributes in their order; ``LensOptions(*numbers)`` is the way back."""
+        """The attributes in their order; ``LensOptions(*numbers)`` is the inverse."""
         return [float(x) for x in self]
 
 
@@ -112,7 +112,7 @@ class Scene:
 
 
 def make_lens(options: LensOptions) -> Lens:
-    """The scalars of a projection as one kernel argument, which is shared: not to be changed."""
+    """The scalars of a projection as one kernel argument, which is shared: do not modify it."""
     return filled(Lens, *options[:7], *map(int, options[7:]))
 
 

@@ -1,7 +1,7 @@
 """Depth at which a ray's transmittance has fallen to a given value, from a rendering's own lists.
 
 ``render_mode="ED"`` is the mean of all depths that a ray meets, and where the front is half
-transparent that lies between front and back. A quantile lies on one of the surfaces.
+transparent that is between front and back. A quantile is on one of the surfaces.
 """
 
 import math
@@ -43,7 +43,7 @@ def _quantile(
     depth = wp.float32(0.0)
     k = lists_in.starts[tile]
     end = lists_in.starts[tile + 1]
-    # where the lists were too short, the list is that of all Gaussians of the view
+    # where the lists were too short, the list has all Gaussians of the view
     listed = lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0])
     if not listed:
         k = image * grid.num
@@ -79,7 +79,7 @@ def depth_quantile(
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
 ) -> Tensor:
-    """Depth of the first Gaussian behind which each pixel's transmittance is no larger than asked.
+    """Depth of the first Gaussian behind which each pixel's transmittance is at most the given one.
 
     ``z_i`` of the least i with ``Π_{j<=i} (1 - α_j) <= transmittance``: 0.5 is the median depth of
     2DGS (Huang et al. 2024). Without gradient.

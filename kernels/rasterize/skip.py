@@ -39,7 +39,7 @@ class Skip:
 
     @classmethod
     def from_bits(cls, bits: int) -> Skip:
-        """The way back from ``bits``."""
+        """The inverse of ``bits``."""
         return cls(**{field.name: bool(bits >> i & 1) for i, field in enumerate(fields(cls))})
 
 

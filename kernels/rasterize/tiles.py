@@ -46,11 +46,11 @@ class Tiling(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """The lists of tiles: P pairs of (tile, Gaussian) in I views; int32 unless it is said.
+    """The lists of tiles: P pairs of (tile, Gaussian) in I views; int32 unless stated.
 
     On CUDA the lists may be longer: ``count`` says how many pairs there are, and entries behind
-    them belong to no tile. If they are more than P, all lists are empty, and pictures are made of
-    ``order``, in which only Gaussians count that have pairs by ``offsets``. Then P >= I * N.
+    them belong to no tile. If they are more than P, all lists are empty, and pictures use
+    ``order``, restricted to Gaussians that have pairs by ``offsets``. Then P >= I * N.
 
     Attributes:
         order: ``[I * N]`` view-major Gaussian indices in the order in which pairs are numbered:
@@ -139,7 +139,7 @@ class Grid:
 
 
 def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
-    """The scalars of a binning launch as one kernel argument, which is shared: not to be changed.
+    """The scalars of a binning launch as one kernel argument, which is shared: do not modify it.
 
     Args:
         tiling: the cut of each view's picture.
@@ -158,7 +158,7 @@ class Size(NamedTuple):
         width: of a picture, pixels.
         height: of a picture, pixels.
         views: of an object.
-        colors_per_view: 1 if each view has colours of its own, 0 if an object's views share them.
+        colors_per_view: 1 if each view has its own colours, 0 if an object's views share them.
         skip: from ``Skip.bits``.
     """
 
@@ -203,7 +203,7 @@ class Picture:
 
 
 def make_picture(size: Size, limits: Limits, *, num: int) -> Picture:
-    """The scalars of a compositing launch as one kernel argument, not to be changed either.
+    """The scalars of a compositing launch as one kernel argument; do not modify it either.
 
     Args:
         size: the integers.

@@ -96,7 +96,7 @@ auto exp2_parts_ = [&](F x, F& near, F& low, F& f) -> F {
 #endif
 };
 // 2^x of the same x. Where |x| < 1/32, fm1 is 2^x - 1 and keeps the digits that 2^x rounds away;
-// elsewhere it is any number.
+// elsewhere it is undefined.
 auto exp2_fm1_ = [&](F x, F& fm1) -> F {
     F near, low, f;
     const F p = exp2_parts_(x, near, low, f);
@@ -206,7 +206,7 @@ auto put_ = [&](const auto& rows, int t, F v, bool stream) __attribute__((always
     else write_(rows, t, v);
 };
 
-// Sixteen values of sixteen lanes are turned: lane j of value i becomes lane i of value j. A round
+// Transposes sixteen values of sixteen lanes: lane j of value i becomes lane i of value j. A round
 // exchanges a bit of i and one of j, of which the last two count within 128 bits, the first two
 // count these; so no instruction moves numbers across these 128 bits one by one, which is slow.
 auto transpose_ = [](F* v) __attribute__((always_inline)) {
@@ -239,20 +239,20 @@ auto transpose_ = [](F* v) __attribute__((always_inline)) {
     for (int i = 0; i < 16; ++i) v[i] = w[place(i)];
 };
 // Calls tile(t, width, end) for the tokens from begin to before ``end`` of turned rows, by sixteen
-// or fewer at the end; tiles without missing lanes are compiled by themselves.
+// or fewer at the end; full tiles are compiled separately.
 auto tiles_ = [](const auto& rows, int begin, int end, auto tile) __attribute__((always_inline)) {
     for (int t = begin; t < end; t += 16)
         if (rows.width >= 16 && t + 16 <= end) tile(t, 16, t + 16);
         else tile(t, rows.width, t + 16 < end ? t + 16 : end);
 };
-// Tokens in memory, from ``begin`` on, each as lanes: ``step`` bytes lie between them.
+// Tokens in memory, from ``begin`` on, each as lanes, ``step`` bytes apart.
 struct Lanes {
     float* first;
     size_t step;
     int begin, width;
     float* row(int t) const { return (float*)((char*)first + (t - begin) * step); }
 };
-// Brings tokens to ``to``.
+// Copies tokens to ``to``.
 auto gather_ = [&](const auto& rows, int begin, int end, F* to, size_t step)
                    __attribute__((always_inline)) -> Lanes {
     const Lanes lanes = {(float*)to, step, begin, 16};

@@ -8,7 +8,7 @@ On the CPU a launch is cut into pieces, which run on the threads of torch's own 
 operator torch's OpenMP threads wait for the next one by spinning, for milliseconds, and other
 threads would share the cores with them; the same team starts within microseconds. Where torch has
 another runtime than GNU's or one with its interface, in a forked child, and with a Warp whose
-recorded launch has other attributes than those of 1.18 and 1.19, which are not public, there is no
+recorded launch has other attributes than in 1.18 and 1.19, which are not public, there is no
 team, and Python's threads run the pieces.
 """
 
@@ -96,7 +96,7 @@ _entries: dict[Any, Entry] = {}
 
 
 class _Job(ctypes.Structure):
-    """The pieces, which lie one after the other in memory, and the number of the next one."""
+    """The pieces, contiguous in memory, and the index of the next one."""
 
     _fields_ = [
         ("entry", ctypes.c_void_p),
@@ -185,8 +185,8 @@ def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> Entry | None:
         except (AttributeError, TypeError) as error:
             if has_team():
                 warnings.warn(
-                    f"warp-lang {wp.__version__} keeps launches in another form ({error}): those "
-                    "on the CPU take threads of their own, which is slower beside torch's own",
+                    f"warp-lang {wp.__version__} stores launches in another form ({error}): those "
+                    "on the CPU use a second pool of threads, which is slower than sharing torch's",
                     RuntimeWarning,
                     stacklevel=2,
                 )
@@ -401,7 +401,7 @@ def launch(
 ) -> None:
     """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing.
 
-    The threads are those of ``parallel_launch``, on a CPU; ``block_dim`` is of CUDA.
+    The threads are as in ``parallel_launch``, on a CPU; ``block_dim`` is for CUDA.
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return

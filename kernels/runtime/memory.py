@@ -5,7 +5,7 @@ virtual machine to ask the host for it. Memory of the size of a result goes back
 the result is freed, so every call would pay again. Here it goes to a pool instead, as soon as no
 tensor holds its storage any more, and the next result of about that size is taken from there.
 
-Only our operators' results come from here. For those of torch's operators a command can tell the C
+Only our operators' results come from here. For torch's operators a command can tell the C
 library to keep freed memory (``gamba_warp.devices.keep_memory``); that is a setting of the whole
 process, which a library must not change, and it reaches no block of 256 MiB and more, as each
 result of a scan of 65,536 tokens and 1,024 channels is.
@@ -44,7 +44,7 @@ class _Block(mmap.mmap):
 class Pool:
     """Blocks of memory that no tensor holds.
 
-    The blocks that came last stay as they are, up to ``touched`` bytes. The others are lent to the
+    The newest blocks are kept, up to ``touched`` bytes. The others are lent to the
     system, which may take their pages when it needs them (``MADV_FREE``); they are then fresh ones
     at the next use. The first write to a lent page costs more than filling it, even where the
     system did not take it. Beyond ``most`` bytes the blocks that have waited longest go back at
@@ -107,7 +107,7 @@ class Pool:
                 continue
             with contextlib.suppress(ValueError):  # another thread has taken it
                 place = self._free.index(block)
-                self._free.remove(block)  # nobody may take it while its pages are given away
+                self._free.remove(block)  # not available while its pages are given away
                 with contextlib.suppress(OSError, AttributeError):  # an old kernel keeps it
                     block.madvise(mmap.MADV_FREE)
                 block.lent = True
@@ -150,7 +150,7 @@ def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     size = math.prod(shape) * dtype.itemsize
     if pool is None or pool.most == 0 or size < LARGE:
         return torch.empty(*shape, dtype=dtype)
-    # Not a view: autograd lets nobody change a view in place that was made inside an operator.
+    # Not a view: autograd forbids in-place changes of a view made inside an operator.
     return torch.empty(0, dtype=dtype).set_(pool.take(size).untyped_storage()).resize_(shape)
 
 

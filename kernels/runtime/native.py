@@ -1,4 +1,4 @@
-"""C++ of the kernels: files beside an operator, as the text of native functions and CPU kernels.
+"""C++ of the kernels: an operator's files as the text of native functions and CPU kernels.
 
 The kernels of ``[B, L, D]`` hold sixteen adjacent channels as one SIMD value, in the compiler's
 vector types, which become AVX-512, AVX2 or NEON instructions (``lanes.h``).

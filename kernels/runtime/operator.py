@@ -49,7 +49,7 @@ def operator(
     """Register a gradient, and return a function that calls the operator directly where it can.
 
     torch's dispatcher takes longer to call an operator that is written in Python than a launch of
-    its kernel takes. So in eager mode the body is called as it is, or from a
+    its kernel takes. So in eager mode the body is called directly, or from a
     ``torch.autograd.Function`` with the same gradient; the first call does not import torch's
     compiler either. Compilers, modes, transforms and profilers see the registered operator.
 
@@ -57,7 +57,7 @@ def operator(
         op: a ``torch.library.custom_op`` with its fake results.
         name: of the public function, for messages.
         setup_context: as ``op.register_autograd`` takes it, like ``backward``.
-        backward: None: the operator is no part of a graph, or its gradient has no gradient.
+        backward: None: the operator is not part of a graph, or its gradient has no gradient.
 
     Returns:
         A function of the same positional arguments. It raises ``NotImplementedError`` for a

@@ -51,7 +51,7 @@ def sequences(
     Raises:
         TypeError: an argument is not a dense tensor, or of another dtype.
         ValueError: both are given, a shape or device differs, ``cu_seqlens`` falls, does not begin
-            at 0 or end at L, or ``seq_idx`` comes back to an earlier number of its row.
+            at 0 or end at L, or ``seq_idx`` repeats an earlier number of its row.
     """
     if cu_seqlens is None and seq_idx is None:
         return None
@@ -75,7 +75,7 @@ def sequences(
         return _runs(given)
     if given.dim() != 1 or len(given) == 0 or batch != 1:
         raise ValueError(
-            f"cu_seqlens has shape {tuple(given.shape)}, must be [S + 1] beside one row of tokens; "
+            f"cu_seqlens has shape {tuple(given.shape)}, must be [S + 1] with one row of tokens; "
             f"there are {batch}"
         )
     if given.device.type == "cpu" and not torch.compiler.is_compiling():
@@ -84,7 +84,7 @@ def sequences(
             raise ValueError(f"cu_seqlens goes from {first} to {last}, must go from 0 to {length}")
         if len(fall):
             s = int(fall[0])
-            raise ValueError(f"cu_seqlens falls from {given[s]} to {given[s + 1]} at entry {s + 1}")
+            raise ValueError(f"cu_seqlens decreases from {given[s]} to {given[s + 1]} at {s + 1}")
     ends = given.clamp(0, length).int().cummax(0).values  # no two sequences have a token in common
     begins = ends[:-1]
     return torch.stack([torch.zeros_like(begins), begins, ends[1:]], 1)
@@ -99,7 +99,7 @@ def _runs(seq_idx: Tensor) -> Tensor:
     if len(of_row.unique(dim=0)) < len(of_row):
         values, counts = of_row.unique(dim=0, return_counts=True)
         b, number = values[counts > 1][0].tolist()
-        raise ValueError(f"seq_idx of row {b} comes back to {number}; equal numbers must be a run")
+        raise ValueError(f"seq_idx of row {b} repeats {number}; equal numbers must be contiguous")
     last = torch.cat([row[1:] != row[:-1], torch.ones_like(row[:1], dtype=torch.bool)])
     end = torch.where(last, length, torch.cat([begin[1:], begin[:1]]))
     return torch.stack([row, begin, end], 1).int()

@@ -7,7 +7,7 @@ import signal
 
 
 def end_signals() -> list[signal.Signals]:
-    """Signals that ask this process to end: SIGTERM, and SIGHUP unless ignored, as below nohup."""
+    """Signals that ask this process to end: SIGTERM, and SIGHUP unless ignored, as under nohup."""
     ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     return [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGHUP]
 

@@ -82,7 +82,7 @@ def _describe(tensor: Tensor, dtype, name: str) -> Any:
 
 
 class Packed:
-    """A Warp struct as a launch takes it, made of tensors and numbers.
+    """A Warp struct of tensors and numbers, as a launch takes it.
 
     An instance of the struct itself would take 10 µs for each array that it is given; this takes
     what ``view`` does, so that kernels may have structs of arrays. Its parts stay in ``values``.
@@ -134,7 +134,7 @@ def _filled_with(cls: Any, values: tuple) -> Any:
 
 @functools.lru_cache(1024)
 def filled(cls: type[_Class], *values: float) -> _Class:
-    """An instance of a struct of numbers, in the order of its fields; shared: not to be changed.
+    """An instance of a struct of numbers, in the order of its fields; shared: do not modify it.
 
     It is kept, because to fill one takes as long as a short launch.
     """

@@ -284,7 +284,7 @@ def selective_scan_fn(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Run the scan with the arguments and layout of mamba-ssm's ``selective_scan_fn``.
 
-    A CPU reads tensors as they lie, with adjacent tokens or channels, in any mixture, also slices.
+    A CPU reads tensors without a copy, with dense tokens or channels, in any mixture, also slices.
 
     Args:
         u: ``[B, D, L]`` float32, bfloat16 or float16; likewise delta and z.

@@ -11,7 +11,7 @@ from ..runtime.views import laid_as
 from .cpu import launch as cpu
 from .problem import Inputs, Options, Scan
 
-# the fields of ``Inputs``, then those of ``Options``
+# the fields of ``Inputs``, then of ``Options``
 _SCAN = (
     "Tensor u, Tensor delta, Tensor A, Tensor B, Tensor? C, Tensor? D, Tensor? z, "
     "Tensor? delta_bias, Tensor? initial_state, Tensor? packed, bool softplus, "
@@ -89,7 +89,7 @@ def _gradient(ctx, dout, dlast, _):
     *tensors, packed, saved = ctx.saved_tensors
     x = Scan(Inputs(*tensors), ctx.options._replace(packed=packed))
     if not x.options.save:
-        raise RuntimeError("selective_scan: this call kept nothing for a gradient")
+        raise RuntimeError("selective_scan: this call saved nothing for the backward pass")
     needs = Inputs(*ctx.needs_input_grad[: len(Inputs._fields)])
     if x.inputs.C is None:
         dout = None

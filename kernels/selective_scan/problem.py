@@ -75,9 +75,9 @@ class Scan(NamedTuple):
 
 
 def like_inputs(gradients: Inputs, inputs: Inputs, needs: Inputs) -> Inputs:
-    """Return the needed gradients in the dtypes of their inputs, those of B and C in their layout.
+    """Return the needed gradients in the dtypes of their inputs, B's and C's in their layout.
 
-    Those of u, delta and z have it, the others are dense. That of ``initial_state``, which a
+    Only those for u, delta and z have that layout; others are dense. ``initial_state``'s, which a
     backward pass does not have, is float32 as ``A``.
     """
 
@@ -121,7 +121,7 @@ def sum_parts(parts: Tensor) -> Tensor:
     """Sums ``[B, G, parts, ..]`` over the parts, in the memory of the first.
 
     One is added after the other. The order of torch's own sum depends on the shape, and so would
-    the bits of a sequence on the others beside it.
+    the bits of a sequence on the other sequences.
     """
     first, *rest = parts.unbind(2)
     for part in rest:
@@ -130,7 +130,7 @@ def sum_parts(parts: Tensor) -> Tensor:
 
 
 def macros(name: str, on_cpu: bool) -> dict[str, object]:
-    """For the kernels' C++: MODE is that of the numbers MAMBA, BILINEAR, ZOH."""
+    """Macros of the kernels' C++: MODE is one of the numbers MAMBA, BILINEAR, ZOH."""
     numbers: dict[str, object] = {key.upper(): i for i, key in enumerate(DISCRETIZATIONS)}
     numbers |= {"MODE": name.upper(), "WEIGHTED": DISCRETIZATIONS[name].weighted}
     return numbers | {"ON_CPU": on_cpu}

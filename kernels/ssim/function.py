@@ -16,7 +16,7 @@ def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tenso
     A picture's value depends on no other picture. Windows in which two pictures are equal, as they
     are on the background, add 0 and have no slope; a CPU skips pixels of no other window.
     float32 on a CPU has kernels; other dtypes and devices take matrix products, which have to keep
-    all digits: where the process lets them round, the caller has to switch that off.
+    all digits: where the process allows rounding, the caller has to switch it off.
 
     Args:
         got: ``[P, H, W, C]`` of a floating dtype, H and W at least 11.
@@ -28,18 +28,18 @@ def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tenso
         in the dtype of the pictures.
 
     Raises:
-        TypeError: the dtypes differ or are no floating dtype, or the devices differ.
+        TypeError: the dtypes differ or are not floating, or the devices differ.
         ValueError: the shapes differ or are too small.
     """
     for name, x in (("got", got), ("want", want)):
         if not x.is_floating_point() or x.dtype != got.dtype or x.device != got.device:
             raise TypeError(
-                f"{name} is {x.dtype} on {x.device}, must be of a floating dtype, that of got, and "
-                "on the device of got"
+                f"{name} is {x.dtype} on {x.device}, must have the floating dtype "
+                "and the device of got"
             )
         if x.ndim != 4 or x.shape != got.shape or min(x.shape[1:3]) < WINDOW:
             raise ValueError(
-                f"{name} has shape {tuple(x.shape)}, must be that of got, [P, H, W, C] with H and "
+                f"{name} has shape {tuple(x.shape)}, must be got's, [P, H, W, C] with H and "
                 f"W >= {WINDOW}"
             )
     on_lanes = got.device.type == "cpu" and got.dtype == torch.float32

@@ -21,7 +21,7 @@ from .reference import C1, C2, EDGE, SIGMA, WINDOW
 
 _LANES = 16
 _STRIP = 8  # rows of windows of a task, whose values are summed before they are stored
-# Pictures of a launch have at most so many numbers: data between two launches is some ten
+# Largest size of a launch's pictures, in numbers: data between two launches is some ten
 # times as large, and should stay in the cache.
 _TOGETHER = 1 << 18
 

@@ -73,7 +73,7 @@ def _compute(got: Tensor, want: Tensor, slope: Tensor | None, band: Tensor) -> T
         got, want = got[..., box[0], box[1]], want[..., box[0], box[1]]
         slope = None if slope is None else slope[..., box[0], box[1]]
     # The variances do not depend on a constant. Without the background, which a corner has as a
-    # rule, those of flat regions are no differences of large numbers.
+    # rule, flat regions' values are not differences of large numbers.
     shift = 2 * want[..., :1, :1]
     maps = got.new_empty(4, *got.shape)
     torch.sub(torch.add(got, want, out=maps[0]), shift, out=maps[0])

@@ -8,7 +8,7 @@ from torch import Tensor
 WINDOW = 11  # pixels, side of the Gaussian window
 SIGMA = 1.5  # pixels
 C1, C2 = 0.01**2, 0.03**2  # for pictures in [0, 1]
-EDGE = WINDOW - 1  # a picture has so many fewer windows than pixels, in each direction
+EDGE = WINDOW - 1  # pixels minus windows of a picture, in each direction
 
 
 def dissimilarity_reference(got: Tensor, want: Tensor) -> Tensor:

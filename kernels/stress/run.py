@@ -21,7 +21,7 @@ from ..cases.case import Case, Op, Outcome, run_case
 from ..runtime.tables import markdown
 
 _SLICE = 10.0  # seconds for an operator before the next one has its turn
-_SHRINK = 30.0  # seconds for making a failing case smaller
+_SHRINK = 30.0  # seconds for shrinking a failing case
 _HEAD = (
     *("op", "kind", "cases", "forward error", "of", "gradient error", "of", "error / limit"),
     *("undecided pixels", "steep", "non-finite", "failures"),
@@ -153,7 +153,7 @@ class StressRun:
                 if not found:
                     until = time.monotonic() + _SHRINK
                 found.append((case, outcome))
-                say("making a failing case smaller")
+                say("shrinking a failing case")
                 raise _FAILURES[failure["what"]]
             say(f"worst {max(r['ratio'] for r in self._rows.values()):.2f} of its limit")
 

@@ -14,7 +14,7 @@ def told(path, tmp_path):
 @pytest.mark.parametrize(
     "b, reason",
     [
-        ({"name": "a"}, "row a: there are two"),
+        ({"name": "a"}, "row a: duplicate name"),
         ({"name": "../b"}, "$.rows[1].name"),
         ({"sett": {}}, "unknown field `sett`"),
         ({"background_margin": -1}, "background_margin"),
@@ -32,7 +32,7 @@ def told(path, tmp_path):
         ({"options": {"lr": "--x"}}, "row b: lr: '--x' is not a valid value"),
         ({"options": {"lr": "a\0"}}, "row b: lr: 'a\\x00' is not a valid value"),
         ({"note": "a\nb"}, "a title or note has an unprintable"),
-        ({"paper": {"speed": 1}}, "row b: paper: no metric speed"),
+        ({"paper": {"speed": 1}}, "row b: paper: unknown metric speed"),
     ],
 )
 def test_errors_name_the_row(b, reason, tmp_path):
@@ -44,10 +44,10 @@ def test_errors_name_the_row(b, reason, tmp_path):
     "rows, more, reason",
     [
         ("a", {"compare_with": "c"}, "plan trial has no row c; it has a"),
-        ("a", {"seeds": [1, 1]}, "a seed is repeated"),
-        ("a", {"base": {"options": {}}}, "the budget of a row: expected steps or minutes"),
-        ("a", {"base": {"options": {"steps": 1, "minutes": 1}}}, "expected steps or minutes"),
-        ("a", {"base": {"options": {"epochs": 1}}}, "expected steps or minutes"),
+        ("a", {"seeds": [1, 1]}, "a seed is given twice"),
+        ("a", {"base": {"options": {}}}, "the budget of a row: expected either steps or minutes"),
+        ("a", {"base": {"options": {"steps": 1, "minutes": 1}}}, "either steps or minutes"),
+        ("a", {"base": {"options": {"epochs": 1}}}, "either steps or minutes"),
         ("a", {"base": {"preset": "huge"}}, "row a: preset: Invalid enum value 'huge'"),
         ("a", {"plugin": ["a.py"]}, "unknown field `plugin`"),
         ([], {}, "$.rows"),

@@ -63,8 +63,8 @@ def test_version(flag, capsys):
         (["data", "render"], "Missing from gamba data render: PATH --out PATH; gamba data render"),
         ("render a.ply --size".split(), "Missing value for argument '--size'. Expected 1 values;"),
         ("view a b".split(), "Unrecognized options: b; gamba view --help"),
-        ("eval-geometry a b --protocol absent.json".split(), "neither default, gamba, gso, sf3d,"),
-        ("eval-geometry a b --protocol splatter-image".split(), "is of views (gamba eval-views)"),
+        ("eval-geometry a b --protocol absent.json".split(), "expected default, gamba, gso, sf3d,"),
+        ("eval-geometry a b --protocol splatter-image".split(), "is for views (gamba eval-views)"),
         (["bench", "a"], "unknown case 'a'; there are scan, conv, raster, model, step and all"),
         ("bench scan --quick --full".split(), "choose one"),
         (["stress", "sort"], "unknown case 'sort'; there are scan, raster, model and all"),
@@ -116,10 +116,10 @@ def _with_lists(
 @pytest.mark.parametrize(
     "words, said",
     [
-        ("f --number 1 --change a --number 1", "give --number once\n"),
-        ("f --change a --change=b", "give --change once\n"),
-        ("f --page --no-page", "give --no-page once\n"),
-        ("f --number=1 --number", "give --number once\n"),
+        ("f --number 1 --change a --number 1", "--number may be given only once\n"),
+        ("f --change a --change=b", "--change may be given only once\n"),
+        ("f --page --no-page", "--no-page may be given only once\n"),
+        ("f --number=1 --number", "--number may be given only once\n"),
         ("f --nmber 1", "Unrecognized options: --nmber"),
         ("f --nonsense", "Unrecognized options: --nonsense"),
         ("f -o out", "Unrecognized options: --out"),
@@ -149,7 +149,7 @@ def test_common_options(command, capsys, monkeypatch):
     assert exit_code(["try", "--steps", "2", "-v"]) == 0
     assert re.fullmatch(r"[\d.]+ s of CPU time\n", capsys.readouterr().err)
     assert exit_code(["try", "-o", "a", "--out", "b"]) == 2
-    assert "give --out once" in capsys.readouterr().err
+    assert "--out may be given only once" in capsys.readouterr().err
     assert exit_code(["help", "try"]) == 0
     out = capsys.readouterr().out
     assert "--out PATH" in out and "(default: here)" in out and "-q, --quiet" in out

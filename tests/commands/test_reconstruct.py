@@ -118,7 +118,7 @@ def test_mp4_of_odd_size(tmp_path):
 
 
 def test_turntables_that_cannot_be_written(tmp_path):
-    with pytest.raises(UserError, match=r"a\.avi: a turntable is a \.gif or an \.mp4"):
+    with pytest.raises(UserError, match=r"a\.avi: a turntable is written as a \.gif or an \.mp4"):
         save_turntable(tmp_path / "a.avi", moving())
     for suffix in ("gif", "mp4"):
         with pytest.raises(UserError, match=f"cannot write /dev/null/a.{suffix}"):

@@ -63,10 +63,10 @@ def test_results_of_forks(fork, name):
 
 def test_another_number_of_results_names_the_switch(fork):
     settings, scene = settings_of(), scene_of(9)
-    line = "3 results are wanted, the fork 'graphdeco' has 2: .*--fork"
+    line = "3 results are expected, the fork 'graphdeco' has 2: .*--fork"
     with pytest.raises(ValueError, match=line):
         _, _, _ = draw(scene, settings)
-    with pytest.raises(ValueError, match="2 results are wanted, the fork 'graphdeco' has 3"):
+    with pytest.raises(ValueError, match="2 results are expected, the fork 'graphdeco' has 3"):
         _, _ = draw(scene, settings._replace(antialiasing=False))
     fork("ashawkey")
     _, _, _, _ = draw(scene, settings)

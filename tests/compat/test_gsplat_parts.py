@@ -327,7 +327,7 @@ def test_refusals():
         compat.proj(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3, 3), scene["Ks"][0], 4, 4, "ortho")
     parts = torch.zeros(1, 3, 2), torch.ones(1, 3, 3), torch.zeros(1, 3, 3), torch.zeros(1, 3)
     lists = torch.zeros(1, 1, 1, dtype=torch.int32), torch.tensor([3], dtype=torch.int32)
-    with pytest.raises(ValueError, match="flatten_ids has 3 to 3 of 3 rows"):
+    with pytest.raises(ValueError, match="flatten_ids goes from 3 to 3"):
         compat.rasterize_to_pixels(*parts, 4, 4, 16, *lists)
 
 

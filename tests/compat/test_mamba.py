@@ -139,7 +139,7 @@ def test_the_block_is_that_of_float64(constant_B, constant_C, norms, taps):
         ({"checkpoint_lvl": 2}, ValueError, "checkpoint_lvl is 2, allowed"),
         ({"x_proj_weight": torch.ones(9, 10)}, ValueError, "x_proj_weight has 9 rows, must"),
         ({"conv1d_weight": torch.ones(10, 4)}, ValueError, "conv1d_weight has shape .10, 4., al"),
-        ({"B": torch.ones(10, 3)}, ValueError, "B_proj_bias is given; it has no use"),
+        ({"B": torch.ones(10, 3)}, ValueError, "B_proj_bias is given, must be None"),
     ],
 )  # fmt: skip
 def test_the_block_refuses(change, error, text):
@@ -306,7 +306,7 @@ def test_refuses_tokens():
         layer(tokens, InferenceParams(9, 2))
     layer.layer_idx, params = 4, InferenceParams(9, 2)
     layer(tokens, params)
-    with pytest.raises(ValueError, match="^hidden_states has a batch of 1, the cache of layer"):
+    with pytest.raises(ValueError, match="^hidden_states has batch size 1, the cache of layer"):
         layer(tokens[:1], params)
 
 

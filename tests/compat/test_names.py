@@ -95,8 +95,8 @@ def test_names_are_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "causal_conv1d", object())
     known = {name: sys.modules.get(name) for name in ("mamba_ssm", "causal_conv1d", "gsplat")}
     for names, kind, text in (
-        ((), ImportError, "causal_conv1d is imported already"),
-        (("mamba_ssm", "causal_conv1d"), ImportError, "causal_conv1d is imported already"),
+        ((), ImportError, "causal_conv1d is already imported"),
+        (("mamba_ssm", "causal_conv1d"), ImportError, "causal_conv1d is already imported"),
         (("flash_attn",), ValueError, "allowed: mamba_ssm, causal_conv1d, gsplat"),
     ):
         with pytest.raises(kind, match=text):

@@ -276,10 +276,10 @@ def test_uids_of_paths(tmp_path):
     assert [mesh.uid for mesh in find_meshes(tmp_path)] == ["chair", "chair-stl", "old_chair_2_"]
     entries = [{"uid": "same", "model": name} for name in ("chair/chair.ply", "chair.stl")]
     (tmp_path / "catalogue.json").write_text(json.dumps({"objects": entries}))
-    refused("would both be 'same'", find_meshes, tmp_path)
+    refused("would both be named 'same'", find_meshes, tmp_path)
     entries = [{"uid": "x", "model": "chair.stl"}, {"uid": "y", "model": "./chair.stl"}]
     (tmp_path / "catalogue.json").write_text(json.dumps({"objects": entries}))
-    refused("is there twice", find_meshes, tmp_path)
+    refused("occurs twice", find_meshes, tmp_path)
 
 
 def test_where_a_file_says_nothing_its_folder_gives_the_name(tmp_path):
@@ -348,7 +348,7 @@ def test_limit(meshes, tmp_path, capsys):
     [
         ({"uid": "/../x"}, "relative"),
         ({"uid": "../x"}, "leaves"),
-        ({"uid": "a/b"}, "one file"),
+        ({"uid": "a/b"}, "plain file name"),
         ({"uid": ""}, "not text"),
         ({"uid": "a" * 300}, "too long"),
         ({"uid": 3}, "uid"),

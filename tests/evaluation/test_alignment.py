@@ -84,7 +84,7 @@ def test_steps_are_repeatable_and_a_single_point_is_refused(steps):
         apart = np.abs(np.array(getattr(one[0], name)) - getattr(two[0], name)).max()
         assert apart <= slack, name
     assert one[1] == pytest.approx(two[1], rel=slack)
-    refused("all points of the prediction are one", aligned, Points(np.zeros((5, 3))), truth, steps)
+    refused("the prediction's points coincide", aligned, Points(np.zeros((5, 3))), truth, steps)
 
 
 def test_boxes_and_moments_are_matched():

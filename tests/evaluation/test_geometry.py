@@ -164,7 +164,7 @@ def test_what_a_protocol_needs_and_a_file_has_not(tmp_path, name):
     # a single point has a place, but nothing that a search or ICP could align
     lone = {"point"} if name == "sf3d" else set()
     assert code == 1 and reasons.keys() == {"line", "speck", *lone}
-    said = {"line": "no area", "point": "align", "speck": "one point"}
+    said = {"line": "no area", "point": "align", "speck": "coincide"}
     assert all(said[uid] in reason for uid, reason in reasons.items())
     assert done["good"]["chamfer"] == 0 and done["cloud"]["normal_consistency"] is None
     assert done["cloud"]["iou"] is None and done["cloud"]["iou_reason"]

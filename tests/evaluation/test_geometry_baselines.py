@@ -167,4 +167,4 @@ def test_a_truth_is_turned_as_its_catalogue_says(world):
     assert code == 0
     assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
     for wrong in ([1.0, 1, 2], [-1.0, 1, 1]):
-        refused("also stretches or mirrors", load_truth, path, protocol, np.diag(wrong).tolist())
+        refused("stretches or mirrors", load_truth, path, protocol, np.diag(wrong).tolist())

@@ -68,8 +68,8 @@ def test_another_list_of_objects(data, tmp_path, monkeypatch, capsys):
     found = json.loads((tmp_path / "shapes" / "report.json").read_text())
     assert (found["evaluation"]["objects"], found["evaluation"]["evaluated"]) == (1, 1)
     capsys.readouterr()
-    refusals = {b"": "has no names", b"a\na\n": "a occurs twice", b"\xff": "not UTF-8"}
-    refusals |= {b"../x\n": "leaves its folder", b"a/b\n": "not that of one file"}
+    refusals = {b"": "contains no names", b"a\na\n": "a occurs twice", b"\xff": "not UTF-8"}
+    refusals |= {b"../x\n": "leaves its folder", b"a/b\n": "not a plain file name"}
     for text, reason in refusals.items():
         own.write_bytes(text)
         refused(reason, gso.names_of, own)

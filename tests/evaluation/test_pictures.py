@@ -187,9 +187,9 @@ def two_at_one_camera(folder):
         (double_a_number, "has the same number"),
         (shrink, "is 12x12, the pictures compared are 24x24"),
         (on_black, "background rgb(0, 0, 0)"),
-        (turned_cameras, "turned by 3 degrees"),
+        (turned_cameras, "rotated by 3 degrees"),
         (other_lens, "its lens differs by"),
-        (two_at_one_camera, "view2.png and view3.png are both at the camera of view 2"),
+        (two_at_one_camera, "view2.png and view3.png both have the camera of view 2"),
         (lambda x: (x / "view1.png").write_bytes(b""), "view1.png: the file is empty"),
         (shutil.rmtree, "no such folder"),
     ],
@@ -212,7 +212,7 @@ def test_resizing_is_asked_for_and_stated(data):
     assert report["objects"][0]["pictures"]["resized"] == VIEWS
     Image.fromarray(np.zeros((20, 48, 4), np.uint8)).save(data / "pred" / "a" / "view1.png")
     reason = evaluate(data, "--resize-pictures")[1]["failures"][0]["reason"]
-    assert "48x20 has not the shape of 24x24" in reason
+    assert "48x20 has another aspect ratio than 24x24" in reason
 
 
 def test_pictures_of_the_files_size_are_resized_as_the_truth_is(data):
@@ -223,7 +223,7 @@ def test_pictures_of_the_files_size_are_resized_as_the_truth_is(data):
 @pytest.mark.parametrize(
     "case, said",
     [
-        ("none", "pictures for none of the 2 objects"),
+        ("none", "no folder of pictures for any of the 2 objects"),
         ("gaussians", "--save-gaussians"),
         ("over", "would be overwritten"),
     ],

@@ -20,7 +20,7 @@ from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
     [
         ("{", "not valid JSON"),
         ("[]", "object"),
-        ('{"num_point": 5}', "num_point is unknown"),
+        ('{"num_point": 5}', "num_point is not a known field"),
         ('{"num_points": "5"}', "Expected `int`, got `str` - at `$.num_points`"),
         ('{"num_points": true}', "Expected `int`, got `bool` - at `$.num_points`"),
         ('{"num_points": 0}', "Expected `int` >= 1 - at `$.num_points`"),
@@ -29,7 +29,7 @@ from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
         ('{"thresholds": ["a"]}', "Expected `float`, got `str` - at `$.thresholds[0]`"),
         ('{"occupancy": "magic"}', "Invalid enum value 'magic' - at `$.occupancy`"),
         ('{"surface": {"voxels": 1.5}}', "Expected `int`, got `float` - at `$.surface.voxels`"),
-        ('{"surface": {"speed": 1}}', "surface.speed is unknown"),
+        ('{"surface": {"speed": 1}}', "surface.speed is not a known field"),
         ('{"surface": 3}', "Expected `object`, got `int` - at `$.surface`"),
         ('{"version": 1}', "version 1"),
         ('{"definitions": {"chamfer": "mine"}}', "definitions"),
@@ -97,10 +97,10 @@ def test_any_field_can_be_changed_and_the_change_is_named(capsys):
 @pytest.mark.parametrize(
     "text, reason",
     [
-        ("unit", "not FIELD=JSON"),
-        ("speed=1", "not FIELD=JSON, FIELD one of name, points,"),
-        ("surface={}", "not FIELD=JSON"),
-        ("surface.speed=1", "not FIELD=JSON"),
+        ("unit", "expected FIELD=JSON"),
+        ("speed=1", "expected FIELD=JSON, FIELD one of name, points,"),
+        ("surface={}", "expected FIELD=JSON"),
+        ("surface.speed=1", "expected FIELD=JSON"),
         ("unit=0", "Expected `float` >= 0.001 - at `$.unit`"),
         ("chamfer=half", "Invalid enum value 'half' - at `$.chamfer`"),
         ('align=["fly"]', "Invalid enum value 'fly' - at `$.align[0]`"),

@@ -73,5 +73,5 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
 @pytest.mark.parametrize("code", [2, 130])
 def test_a_command_that_was_refused_ends_it(tmp_path, monkeypatch, code):
     monkeypatch.setattr(scanned.cli, "run", lambda command, words: code)
-    with pytest.raises(scanned.UserError, match=f"gamba data render: ended with exit code {code}"):
+    with pytest.raises(scanned.UserError, match=f"gamba data render: failed with exit code {code}"):
         scanned.main(tmp_path, out=tmp_path / "out")

@@ -152,7 +152,7 @@ def test_choose_views():
     assert choose_views(5, 2, None) == [2, 0, 1, 3, 4]
     assert choose_views(9, 0, 5) == [0, 1, 3, 5, 7]
     assert choose_views(3, 0, 1) == [0] and choose_views(3, 1, 9) == [1, 0, 2]
-    refused("no view 3", choose_views, 3, 3, None)
+    refused("the input view 3", choose_views, 3, 3, None)
 
 
 def test_lpips_without_weights(data, painted, monkeypatch):

@@ -44,7 +44,7 @@ BAD = {
     "truncated.ply": (ply(ROWS[:-1]), f"but {COUNT - 1} lines follow"),
     "longer.ply": (ply([*ROWS, ROWS[0]]), "more lines follow"),
     "rows.ply": (ply([*ROWS[:-1], "1 2"]), "number of columns changed"),
-    "twice.ply": (ply(ROWS).replace(b"float z", b"float y"), "property y is given twice"),
+    "twice.ply": (ply(ROWS).replace(b"float z", b"float y"), "property y occurs twice"),
     "no_z.ply": (ply(ROWS).replace(b"float z", b"float w"), "no x, y and z"),
 }
 

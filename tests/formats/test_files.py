@@ -206,7 +206,7 @@ def test_who_reads_the_older_file_reads_it_to_its_end(tmp_path):
 def test_a_folder_has_no_files_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("model.glb", "m.webm", "A.PLY", "views.tar.gz", "page.html"):
-        refused(f"{name}: a file's name", output_folder, name)
+        refused(f"{name}: looks like a file", output_folder, name)
     assert not list(tmp_path.iterdir())
     (tmp_path / "old.zip").mkdir()
     for name in ("old.zip", "run.v2", "2026.11.27", "out"):

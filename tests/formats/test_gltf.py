@@ -177,7 +177,7 @@ def test_surfaces_that_only_emit_light(tmp_path):
     document.tree["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [0, 0, 0, 1]}
     mesh = document.load(tmp_path)
     assert [seen(mesh, at) for at in FOUR] == [RED, GREEN, BLUE, WHITE]
-    assert mesh.warnings == ["light of a surface is drawn as its colour, shaded"]
+    assert mesh.warnings == ["emission of a surface is drawn as its base colour, shaded"]
     assert mesh.materials[0].color.tolist() == [1, 1, 1, 1]
     strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 0.5}}
     document.tree["materials"][0] |= {"extensions": strength, "emissiveFactor": [1, 0.5, 0]}
@@ -337,7 +337,7 @@ def test_instances_that_are_not_read(tmp_path):
     document = skinned()
     given = {"TRANSLATION": document.array(rows)}
     document.tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": given}}
-    warning = "instances of a skinned mesh (EXT_mesh_gpu_instancing) are not read"
+    warning = "instances of a skinned mesh (EXT_mesh_gpu_instancing) are not supported"
     assert warning in document.load(tmp_path).warnings
 
 
@@ -392,7 +392,7 @@ def test_skins_follow_their_joints(tmp_path):
         assert "a skin with joints outside of the scene is not applied" in mesh.warnings
         assert places(mesh).max() == 1  # the node of a skinned mesh does not move it
     document = skinned(joints=[1])
-    refused("JOINTS_0 or WEIGHTS_0 is false", document.load, tmp_path)
+    refused("JOINTS_0 or WEIGHTS_0 is invalid", document.load, tmp_path)
 
 
 def test_weights_of_a_skin(tmp_path):
@@ -409,7 +409,7 @@ def test_weights_of_a_skin(tmp_path):
     want = np.array([[1, 0, 0], [3, 0, 0], [3, 1, 0], [1, 1, 0]])[CORNERS.reshape(2, 3)]
     np.testing.assert_allclose(places(mesh), want)
     document.attributes["JOINTS_1"] = document.array(np.full((4, 4), 2, "u1"))
-    refused("JOINTS_1 or WEIGHTS_1 is false", document.load, tmp_path)
+    refused("JOINTS_1 or WEIGHTS_1 is invalid", document.load, tmp_path)
 
 
 @pytest.mark.parametrize("at, valid", [(3, True), (4, False)])
@@ -509,23 +509,23 @@ def beside(mode):
 
 MATERIAL = ("materials", 0)
 UNREAD = {
-    "points": (beside(0), "points beside the triangles are left out"),
-    "lines": (beside(1), "lines beside the triangles are left out"),
-    "a line loop": (beside(2), "a line loop beside the triangles are left out"),
-    "a line strip": (beside(3), "a line strip beside the triangles are left out"),
-    "no POSITION": (without_position, "a primitive without POSITION is left out"),
+    "points": (beside(0), "only triangles are read, not points"),
+    "lines": (beside(1), "only triangles are read, not lines"),
+    "a line loop": (beside(2), "only triangles are read, not a line loop"),
+    "a line strip": (beside(3), "only triangles are read, not a line strip"),
+    "no POSITION": (without_position, "a primitive without POSITION is ignored"),
     "scenes": (lambda d: d.tree["scenes"].append({}), "one of 2 scenes is read"),
     "KTX2": (
         changed(("textures", 0), {"extensions": {"KHR_texture_basisu": {"source": 0}}}),
-        "a texture's picture is named by KHR_texture_basisu, which is not read",
+        "a texture's picture is named by KHR_texture_basisu, which is not supported",
     ),
     "DDS": (
         changed(("textures", 0), {"extensions": {"MSFT_texture_dds": {"source": 0}}}),
-        "a texture's picture is named by MSFT_texture_dds, which is not read",
+        "a texture's picture is named by MSFT_texture_dds, which is not supported",
     ),
     "no source": (
         changed(("textures", 0), {}),
-        "a texture's picture is named by nothing, which is not read",
+        "a texture's picture is named by nothing, which is not supported",
     ),
     "no picture": (changed(("images", 0), {"uri": "a.png"}), "a.png: not found"),
     "clamp": (
@@ -534,11 +534,11 @@ UNREAD = {
             changed(("textures", 0, "sampler"), 0)(d),
             d.attributes.update(TEXCOORD_0=d.array(2 * UVS)),
         ),
-        "a texture that does not repeat is drawn as one that does",
+        "a clamped or mirrored texture is drawn as a repeating one",
     ),
     "light": (
         changed((*MATERIAL, "emissiveFactor"), [0, 1, 0]),
-        "light of a surface beside its base colour is not drawn",
+        "emission of a surface with a base colour is not drawn",
     ),
     **{
         name: (changed((*MATERIAL, name), {"index": 0}), f"{name} is not drawn")
@@ -550,21 +550,24 @@ UNREAD = {
     ),
     "short colours": (
         lambda d: d.attributes.update(COLOR_0=d.array(SQUARE[:3])),
-        "COLOR_0 of 3 x 3 numbers is left out",
+        "COLOR_0 of 3 x 3 numbers is ignored",
     ),
     "short normals": (
         lambda d: d.attributes.update(NORMAL=d.array(SQUARE[:3])),
-        "NORMAL of 3 x 3 numbers is left out",
+        "NORMAL of 3 x 3 numbers is ignored",
     ),
     "long coordinates": (
         lambda d: d.attributes.update(TEXCOORD_0=d.array(SQUARE)),
-        "TEXCOORD_0 of 4 x 3 numbers is left out",
+        "TEXCOORD_0 of 4 x 3 numbers is ignored",
     ),
     **{
-        name: (changed((*MATERIAL, "extensions"), {name: {}}), f"the extension {name} is not read")
+        name: (
+            changed((*MATERIAL, "extensions"), {name: {}}),
+            f"the extension {name} is not supported",
+        )
         for name in ("KHR_materials_clearcoat", "KHR_materials_transmission", "MSFT_lod")
     },
-    "listed": (changed(("extensionsUsed",), ["ADOBE_x"]), "the extension ADOBE_x is not read"),
+    "listed": (changed(("extensionsUsed",), ["ADOBE_x"]), "the extension ADOBE_x is not supported"),
 }
 
 
@@ -592,6 +595,6 @@ def test_packed_triangles_are_refused_by_name(tmp_path, name):
     document = Document(extensionsUsed=[name])
     assert len(document.load(tmp_path).faces) == 2
     del document.tree["accessors"][0]["bufferView"]
-    refused(f"packed by {name}", document.load, tmp_path)
+    refused(f"compressed by {name}", document.load, tmp_path)
     document = Document(extensionsRequired=[name])
-    refused(f"packed by {name}", document.load, tmp_path)
+    refused(f"compressed by {name}", document.load, tmp_path)

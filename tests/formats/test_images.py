@@ -137,7 +137,7 @@ def test_chunks_of_colour_that_are_not_read_are_named(tmp_path):
             lines = []
             path.write_bytes(chunked(name, struct.pack(f">{len(values)}I", *values)))
             load_rgba(path, warn=lines.append)
-            text = f"{path}: its {name.decode()} chunk is not read; colours are taken for sRGB"
+            text = f"{path}: its {name.decode()} chunk is ignored; colours are taken as sRGB"
             assert lines == ([text] if values is bad else [])
     path.write_bytes(chunked(b"sRGB", b"\0"))
     load_rgba(path, warn=lines.append)
@@ -209,8 +209,8 @@ def test_cmyk_goes_by_its_profile(tmp_path):
     [
         ("RGB", b"no profile", ""),
         ("RGBA", colour_profile(ADOBE_RGB)[:200], ""),
-        ("RGB", colour_profile("CMYK"), "it is of CMYK, the picture of RGB"),
-        ("CMYK", colour_profile(SRGB), "it is of RGB, the picture of CMYK"),
+        ("RGB", colour_profile("CMYK"), "it is for CMYK, but the picture is RGB"),
+        ("CMYK", colour_profile(SRGB), "it is for RGB, but the picture is CMYK"),
         ("L", bytes(5 << 20), "damaged or too large"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Mesh files with false headers, with names outside their folder, or far too large."""
+"""Mesh files with invalid headers, with names outside their folder, or far too large."""
 
 import contextlib
 import io
@@ -38,7 +38,7 @@ BAD = {
     "points.obj": (V, "no faces"),
     "nan.obj": (V.replace("v 1", "v nan") + "f 1 2 3\n", "1 of 3 vertices are not finite"),
     "beyond.obj": (V + "f 1 2 9\n", "names vertex 8 of 4"),
-    "one_point.obj": ("v 1 1 1\n" * 3 + "f 1 2 3\n", "all vertices are one point"),
+    "one_point.obj": ("v 1 1 1\n" * 3 + "f 1 2 3\n", "all vertices coincide"),
     "binary.obj": (b"\x00\x01 binary \xff", "no faces"),
     "nonsense.glb": (b"glTF nonsense", "cannot be read as a mesh"),
     "nothing.stl": ("solid nothing\nendsolid", "no faces"),
@@ -59,7 +59,7 @@ BAD = {
         V + "".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(100_000)),
         "uses 100000 materials",
     ),
-    "few_faces.off": (OFF[:-8], "false header, 4 vertices and 2 faces, but 5 lines follow"),
+    "few_faces.off": (OFF[:-8], "invalid header, 4 vertices and 2 faces, but 5 lines follow"),
     "more_faces.off": (OFF + "3 0 1 2\n", "but 7 lines follow"),
     "short_face.off": (OFF[:-3] + "\n", "row 6 has too few numbers"),
     "long_face.off": (OFF.replace("3 0 1 2", "999999999 0 1 2"), "row 5 has too few numbers"),
@@ -187,9 +187,9 @@ LIES = {
     "sparse_beyond": ({"accessors": [ACCESSOR | SPARSE]}, "changes value 63 of 3"),
     "zeros": (
         {"accessors": [{**ACCESSOR, "bufferView": None, "count": FREE_NUMBERS}]},
-        "bytes stand for over",
+        "bytes expand to over",
     ),
-    "circle": ({"nodes": [{"mesh": 0, "children": [0]}]}, "nodes in a circle"),
+    "circle": ({"nodes": [{"mesh": 0, "children": [0]}]}, "nodes form a cycle"),
     "no_mesh": ({"nodes": [{"mesh": 1}]}, "meshes[1] of 1"),
     "lists": ({"accessors": {}}, "array"),
     "deep": (DEEP, "nested"),

@@ -245,12 +245,15 @@ def test_light_and_moved_textures_of_mtl(tmp_path):
     mtl = "newmtl paint\nKd 0 0 0\nKe 1 0.5 0\n"
     mesh = load_mesh(write_quad(tmp_path, mtl=mtl, texture=None))
     np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear([1, 0.5, 0]))
-    assert mesh.warnings == ["light of a surface is drawn as its colour, shaded"]
+    assert mesh.warnings == ["emission of a surface is drawn as its base colour, shaded"]
     moved = MTL.replace("paint.png", "-s 2 2 1 paint.png")
     for files, warning in (
-        ({"mtl": MTL + "Ke 1 1 1\n"}, "light of a surface beside its base colour is not drawn"),
+        ({"mtl": MTL + "Ke 1 1 1\n"}, "emission of a surface with a base colour is not drawn"),
         ({"mtl": moved}, "-s 2 2 1 paint.png: the option -s is not read"),
-        ({"obj": QUAD.replace("-1 0 0", "-1 0 0 1 0 0")}, "colours beside a texture are not drawn"),
+        (
+            {"obj": QUAD.replace("-1 0 0", "-1 0 0 1 0 0")},
+            "colours with a texture are not drawn",
+        ),
     ):
         assert load_mesh(write_quad(tmp_path, **files)).warnings == [warning]
 

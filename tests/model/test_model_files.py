@@ -52,7 +52,7 @@ def test_frozen_encoder_must_be_the_same(tmp_path):
     with torch.no_grad():
         model.encoder.network.vit.norm.weight[0] += 0.5
     save_model(tmp_path / "m.safetensors", model)
-    with pytest.raises(UserError, match="m.safetensors: was trained with other weights"):
+    with pytest.raises(UserError, match="m.safetensors: was trained with weights of"):
         load_model(tmp_path / "m.safetensors", encoder_weights="random")
     refused("must be given", load_model, tmp_path / "m.safetensors")
 
@@ -106,9 +106,9 @@ def _damage(path, kind):
 @pytest.mark.parametrize(
     "kind, words",
     [
-        ("truncated", "not a whole safetensors file"),
-        ("empty", "not a whole safetensors file"),
-        ("text", "not a whole safetensors file"),
+        ("truncated", "not a valid safetensors file"),
+        ("empty", "not a valid safetensors file"),
+        ("text", "not a valid safetensors file"),
         ("missing", "no such checkpoint"),
         ("no metadata", "not a Gamba checkpoint"),
         ("other format", "not a Gamba checkpoint .format gamba_warp.model.0"),
@@ -122,8 +122,8 @@ def _damage(path, kind):
         ("nested", "configuration: nested deeper than 32 levels"),
         ("integers", "'.*' is of I32, not F32, BF16, F16"),
         ("not finite", "2 of 16 numbers of 'norm.weight' are not finite"),
-        ("no text", "not a whole safetensors file"),
-        ("header", "not a whole safetensors file .its header is too large"),
+        ("no text", "not a valid safetensors file"),
+        ("header", "not a valid safetensors file .its header is too large"),
         ("pipe", "not a plain file"),
     ],
 )

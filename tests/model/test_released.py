@@ -194,7 +194,7 @@ def test_any_float_dtype(golden, tmp_path, wide, dtype):
         assert torch.equal(a, b), name
     for wrong in (points.square(), points + 0.02, points * torch.tensor([[1], [1], [1.02]])):
         state = rounded | {"model.decoder.coords": wrong.to(dtype)}
-        refused("not the same even points", convert_released, state, "wrong", 2)
+        refused("not the same evenly spaced points", convert_released, state, "wrong", 2)
 
 
 @pytest.mark.parametrize("depth, found", [(2, 1), (14, 2), (1, 2)])
@@ -249,8 +249,8 @@ def test_an_object_in_the_file_is_named(golden, tmp_path, thing, name):
         ("model.transformer.pos_embed", torch.ones(255, 64), "255 tokens"),
         ("model.transformer.pos_embed", torch.ones(256), "not 2 axes"),
         ("model.transformer.pos_embed", torch.ones(256, 63), "tokens.embedding' is"),
-        ("model.decoder.coords", torch.rand(3, 21), "not the same even points"),
-        ("model.decoder.coords", torch.ones(3, 0), "not the same even points"),
+        ("model.decoder.coords", torch.rand(3, 21), "not the same evenly spaced points"),
+        ("model.decoder.coords", torch.ones(3, 0), "not the same evenly spaced points"),
         ("model.decoder.gs_layer.rgb.bias", torch.full((3,), torch.nan), "not finite"),
         ("model.decoder.gs_layer.rgb.bias", torch.ones(3).int(), "not a tensor of floating"),
         ("model.stem_layer.weight", torch.ones(64, 8, 8, 8), "takes 8 channels, not 9"),

@@ -90,10 +90,10 @@ def test_without_a_home_weights_need_a_folder(tmp_path, monkeypatch):
 
     monkeypatch.delenv("GAMBA_CACHE", raising=False)
     monkeypatch.setattr(Path, "home", nowhere)
-    refused("no home folder; let GAMBA_CACHE name one", cache_folder)
+    refused("no home folder; set GAMBA_CACHE to", cache_folder)
     (tmp_path / "file").touch()
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "file"))
-    refused("file: .*; GAMBA_CACHE names another folder", store_weights)
+    refused("file: .*; GAMBA_CACHE can name another folder", store_weights)
 
 
 def test_a_lock_that_is_a_link_is_not_followed(tmp_path):

@@ -103,7 +103,7 @@ def test_shards_part_the_list(tmp_path, capsys):
     assert run("data gso", [*words, "--shard", "1/60", "--workers", "1"]) == 0
     assert open_dataset(tmp_path / "out" / "views", "test").uids == [SECOND]
     assert run("data gso", [*words, "--shard", "0/60"]) == 2  # this shard has no objects
-    assert "holds none of the 1 models" in capsys.readouterr().err
+    assert "contains none of the 1 models" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def test_other_model_is_named(tmp_path, model):
 
     path = save_checkpoint(tmp_path, 1, {"model": model}, {}, keep=1)
     other = Gamba(replace(model.config, width=24, norm="rms"))
-    refused("another width, norm", load_weights, path / "model.safetensors", other)
+    refused("a different width, norm", load_weights, path / "model.safetensors", other)
 
 
 @pytest.fixture
@@ -164,11 +164,11 @@ def test_a_flipped_bit_is_found_and_the_older_checkpoint_taken(tmp_path, two, na
     flip(two[1] / name, share)
     said = []
     assert find_checkpoint(tmp_path, "auto", said.append) == two[0]
-    assert len(said) == 1 and "step_000002" in said[0] and f"going on from {two[0]}" in said[0]
+    assert len(said) == 1 and "step_000002" in said[0] and f"resuming from {two[0]}" in said[0]
     words = f"step_000002/.*; whole is: --resume {two[0]}"
     refused(words, find_checkpoint, tmp_path, str(two[1]))
     flip(two[0] / "model.safetensors", 0.6)
-    refused("no checkpoint of this run is whole", find_checkpoint, tmp_path, "auto")
+    refused("no checkpoint of this run is intact", find_checkpoint, tmp_path, "auto")
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link", "folder"])
@@ -243,7 +243,10 @@ def test_fields_of_a_state_are_checked(field, value):
         (lambda s: s["state"].update({99: {}}), "parameter '99'"),
         (lambda s: s["state"][0].pop("step"), "parameter 0 has other fields"),
         (lambda s: s["state"].update({0: 5}), "parameter 0 has other fields"),
-        (lambda s: s["state"][0].update(exp_avg=torch.ones(3)), r"exp_avg of parameter 0 is \(3,"),
+        (
+            lambda s: s["state"][0].update(exp_avg=torch.ones(3)),
+            "parameter 0 has shape",
+        ),
         (lambda s: s["state"][0].update(exp_avg=1.0), "exp_avg of parameter 0 is not a float32"),
         (lambda s: s["state"][0].update(step=torch.ones((), dtype=torch.int64)), "not a float32"),
         (lambda s: s["state"][0]["exp_avg"].fill_(math.nan), "exp_avg .* not finite"),
@@ -282,7 +285,7 @@ def test_a_state_that_claims_more_than_it_holds(tmp_path):
     refused("state.pt: damaged.*", read_state, tmp_path)
     torch.save({"a": torch.arange(10.0)}, path)
     repacked(path, lambda data: data, zipfile.ZIP_DEFLATED)
-    refused("state.pt: damaged.*packed", read_state, tmp_path)
+    refused("state.pt: damaged.*compressed", read_state, tmp_path)
     torch.save({"a": torch.ones(1).expand(10**6, 10**6)}, path)  # one number, 4 TB after a copy
     refused("state.pt: damaged.*larger than the file", read_state, tmp_path)
     endless = []
@@ -295,6 +298,6 @@ def test_a_state_that_claims_more_than_it_holds(tmp_path):
     torch.save({"a": wide}, path)
     refused("state.pt: damaged.*over 1,000,000 values", read_state, tmp_path)
     torch.save([1], path)
-    refused("state.pt: damaged.*not hold the state", read_state, tmp_path)
+    refused("state.pt: damaged.*not contain the state", read_state, tmp_path)
     torch.save({"a": torch.ones(3).to_sparse()}, path)
     refused("state.pt: damaged.*not dense", read_state, tmp_path)

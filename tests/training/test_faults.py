@@ -44,7 +44,9 @@ def test_a_log_that_cannot_be_written_is_said_once_and_training_goes_on(data, tm
     (out / "log.jsonl").symlink_to("/dev/full")
     assert run(data, out, length={"steps": 3}) == 0
     said = capsys.readouterr().out
-    assert said.count("log.jsonl cannot be written, the run goes on: No space left on device") == 1
+    assert (
+        said.count("log.jsonl cannot be written, the run continues: No space left on device") == 1
+    )
 
 
 def test_a_log_is_of_whole_lines_whatever_happens(tmp_path, capsys):

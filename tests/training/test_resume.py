@@ -44,7 +44,7 @@ def test_another_length_goes_on_at_the_rate_of_the_checkpoint(data, done, tmp_pa
     resumed = {"resume": source, "save_every": 1}
     assert run(data, tmp_path, run=resumed, **groups) == 0
     (note,) = (line["message"] for line in lines(tmp_path, "warning"))
-    assert f"length is now {total} steps, not 8 steps" in note and "goes on from" in note
+    assert f"length is now {total} steps, not 8 steps" in note and "continues from" in note
     rates = [line["lr"] for line in lines(tmp_path, "train")]
     assert rates[0] == pytest.approx(lines(done, "train")[4]["lr"], rel=1e-4)
     assert rates == sorted(rates, reverse=True) and len(rates) == total - 4
@@ -113,7 +113,7 @@ def test_init_passes_over_a_damaged_checkpoint(data, done, tmp_path, capsys):
     (last / "ema.safetensors").write_bytes(b"")
     assert run(data, tmp_path / "a", run={"init": copy}, **STILL) == 0
     assert same_weights(tmp_path / "a" / "model.safetensors", first / "ema.safetensors")
-    assert f"going on from {first}" in capsys.readouterr().out
+    assert f"resuming from {first}" in capsys.readouterr().out
     with pytest.raises(UserError, match="--init .*step_000008/ema.safetensors: damaged"):
         run(data, tmp_path / "b", run={"init": last}, **STILL)
 

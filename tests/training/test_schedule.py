@@ -50,7 +50,7 @@ def test_no_jump_where_the_length_changes(shape, step, total):
     old, new = steps(40_000, shape, 100), steps(total, shape, 100)
     made, text, values = extended(old, new, step)
     before = old.share(step - 1, 0.0)
-    assert abs(values[0] - before) < 0.002 and "goes on from" in text
+    assert abs(values[0] - before) < 0.002 and "continues from" in text
     assert max(abs(a - b) for a, b in itertools.pairwise(values)) < 0.01
     assert values[-1] == pytest.approx(0.0, abs=1e-9)
     if not made.since.rises:

@@ -150,9 +150,9 @@ def test_a_damaged_newest_checkpoint_is_passed_over_and_named(data, tmp_path, ca
     assert run(data, tmp_path, **short) == 0
     out = capsys.readouterr().out
     assert "step_000004/state.pt: damaged" in out and "resumed" in out and "at step 2" in out
-    assert any("going on from" in line["message"] for line in lines(tmp_path, "warning"))
+    assert any("resuming from" in line["message"] for line in lines(tmp_path, "warning"))
     assert run(data, tmp_path, **short) == 0  # the fourth step has been written again
-    assert "going on from" not in capsys.readouterr().out
+    assert "resuming from" not in capsys.readouterr().out
 
 
 def test_nothing_is_loaded_where_a_part_is_damaged(data, tmp_path, monkeypatch):
@@ -264,7 +264,7 @@ def test_collapse_warns_once(data, tmp_path):
 def test_a_run_is_resumed_only_as_asked(data, tmp_path):
     assert run(data, tmp_path / "a", length={"steps": 2}) == 0
     refused("already holds a run", run, data, tmp_path / "a", run={"resume": "never"})
-    with pytest.raises(UserError, match="no checkpoint there"):
+    with pytest.raises(UserError, match="no checkpoint found"):
         run(data, tmp_path / "b", run={"resume": str(tmp_path / "nothing")})
     refused("optim.lr", run, data, tmp_path / "a", optim={"lr": 2e-3})
     refused("loss.radial_mask", run, data, tmp_path / "a", loss={"radial_mask": False})

@@ -48,7 +48,7 @@ def test_every_kind_of_number_is_read(tmp_path, dtype, order):
         (stored(WANTED)[:90], "header"),
         (stored(WANTED)[:-1], "47 bytes"),
         (stored(WANTED) + b"1", "49 bytes"),
-        (stored(WANTED.T), "it states 2x3"),
+        (stored(WANTED.T), "its header states 2x3"),
         (stored(np.float64(1)), "a single number"),
         (stored(np.array([["a"] * 2] * 3)), "not numbers"),
         (stored(WANTED > 0), "not numbers"),

@@ -1,4 +1,4 @@
-"""Groups of similar objects, which must lie on one side of a split.
+"""Groups of similar objects, which must be on one side of a split.
 
 Two objects belong to one group if
 

@@ -191,7 +191,7 @@ def _shade(
     first = 3 * face
     to_camera = -wp.normalize(directions_in[ray])
     normal = a * s.normals[first] + b * s.normals[first + 1] + c * s.normals[first + 2]
-    # Faces are two-sided; the normal is that of the side facing the camera.
+    # Faces are two-sided; the normal points to the side facing the camera.
     side = wp.dot(s.face_normals[face], to_camera)
     normal = wp.normalize(normal) * wp.where(side > 0.0, 1.0, wp.where(side < 0.0, -1.0, 0.0))
     material = s.materials[face]

@@ -129,7 +129,7 @@ class Batch:
 
 
 def copied(batch: Batch) -> Batch:
-    """Return a copy of a batch, with tensors of its own."""
+    """Return a copy of a batch that shares no tensors."""
     return _combined([batch], lambda values: values[0].clone())
 
 

@@ -27,7 +27,7 @@ class Settings:
         views: number of views of an object.
         size: pixels a side.
         fov: vertical field of view, degrees.
-        seed: seed of cameras and lights; those of an object also depend on its uid.
+        seed: seed of cameras and lights, which also depend on the object's uid.
         depth: also write 16-bit depth pictures, of the first and of the last surface.
         format: format of the pictures; both are lossless.
         up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
@@ -36,7 +36,7 @@ class Settings:
         stretch: stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
         fov_spread: draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
         light: varied makes the lights of the objects differ more.
-        poses: "drawn", or "gso": those of that evaluation, the input view first.
+        poses: "drawn", or "gso": that evaluation's poses, the input view first.
     """
 
     views: Annotated[int, Meta(ge=1, le=10_000)] = 24

@@ -37,7 +37,7 @@ _ADDRESS = re.compile("https?://[A-Za-z0-9][A-Za-z0-9_.:/@%~+-]{0,999}")
 
 
 class Unreachable(UserError):
-    """A shard cannot be read: no fault of its objects, so a training stops."""
+    """A shard cannot be read: its objects are not at fault, so the training stops."""
 
 
 class _Shard(msgspec.Struct):
@@ -122,7 +122,7 @@ class Shards:
     def stream(self, seed: int) -> Iterator[dict[str, Any] | Unreachable]:
         """Yield samples for ``dataset_of`` without end, shuffled.
 
-        Each process of a group reads shards of its own. Once a tar cannot be read, or if there are
+        Each process of a group reads its own shards. Once a tar cannot be read, or if there are
         fewer shards than processes, each further item is the error.
 
         Args:

@@ -333,7 +333,7 @@ TERMS: dict[str, Term] = {
 
 
 def term_weights(loss: LossConfig, at: Progress) -> dict[str, float]:
-    """Return the weight of each of ``TERMS``, and as ``novel`` that of the novel views."""
+    """Return the weight of each of ``TERMS``, and as ``novel`` the novel views' weight."""
     weights = {name: term.weight(loss, at) for name, term in TERMS.items()}
     return weights | {"novel": loss.novel_weight}
 

@@ -1,7 +1,7 @@
 """Radial mask constraint (paper eq. radial_mask): Gaussians stay inside the silhouettes.
 
 A mask becomes U distances, one per ray, from the image centre to the outermost contour. A Gaussian
-whose projected centre lies farther out than the contour at its angle is pulled back.
+whose projected centre is farther out than the contour at its angle is pulled back.
 
 Distances are in units of half the image height, so the loss is independent of the picture size.
 """
@@ -36,7 +36,7 @@ def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -
     """
     height, width = masks.shape[-2:]
     angles = torch.arange(rays, device=masks.device) * (2 * math.pi / rays)
-    count = math.ceil(math.hypot(width, height) / 2 / _STEP) + 3  # the last samples lie outside
+    count = math.ceil(math.hypot(width, height) / 2 / _STEP) + 3  # the last samples are outside
     radii = torch.arange(count, device=masks.device) * _STEP
     directions = torch.stack([angles.cos(), angles.sin()], -1)
     size = _pair(width, height, angles)

@@ -2,7 +2,7 @@
 
 A model is a folder ``<Name>/``, or its zip from the Fuel server, with ``meshes/model.obj`` and
 ``model.mtl``, ``materials/textures/texture.png``, ``metadata.pbtxt`` and ``thumbnails/``. The
-``.mtl`` refers to the texture as if it lay beside it, so mesh, materials and textures are put into
+``.mtl`` expects the texture in its own folder, so mesh, materials and textures are put into
 one folder, where every reader finds them.
 """
 
@@ -43,7 +43,7 @@ def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Pat
     """Find models in a local copy of the set, as folders or as zips.
 
     Args:
-        source: folder of the set; the models lie in it or in ``models/``.
+        source: folder of the set; the models are in it or in ``models/``.
         names: names of the models.
 
     Returns:
@@ -63,7 +63,7 @@ def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Pat
             found[name] = path
     if not found:
         raise UserError(
-            f"--source {source}: holds none of the {len(names)} models "
+            f"--source {source}: contains none of the {len(names)} models "
             f"(such as {names[0]}/{MESH} or {names[0]}.zip)"
         )
     return found
@@ -126,7 +126,7 @@ def _max_size(member: str) -> int:
 
 
 def attribution_of(folder: Path) -> dict[str, str]:
-    """Creator, licence and source of a model by its metadata, else those of the set."""
+    """Creator, licence and source of a model by its metadata, else the set's."""
     known = dict(_ATTRIBUTION)
     if (folder / METADATA).is_file():
         text = read_bytes(folder / METADATA, _MAX_METADATA).decode("utf-8", "replace")

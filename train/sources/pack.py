@@ -30,7 +30,7 @@ _OWN = re.compile(r"(train|val|test)-\d+\.tar|shards-(train|val|test)\.json")
 def write_pack(
     data: Path, out: Path, size: int | None = None, shard_mb: float = 1000, workers: int = 1
 ) -> tuple[Counter[str], dict[str, str]]:
-    """Write the shards of a dataset; their order is that of the hash of the names.
+    """Write the shards of a dataset, ordered by the hash of the names.
 
     Args:
         data: the dataset.

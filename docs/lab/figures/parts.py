@@ -34,6 +34,6 @@ def with_parts(text: str, writer: str, parts: Mapping[str, str]) -> str:
         head, found, rest = text.partition(begin)
         tail = rest.partition(end)
         if not found or not tail[1]:
-            raise ValueError(f"no mark {begin if not found else end}")
+            raise ValueError(f"missing marker {begin if not found else end}")
         text = f"{head}{begin}\n\n{part}\n\n{end}{tail[2]}"
     return text

@@ -25,7 +25,7 @@ ACTIVATIONS = (None, "silu", "swish")
 
 @functools.wraps(_causal_conv1d_fn)
 def causal_conv1d_fn(x, weight, bias=None, seq_idx=None, *others, **named):
-    """Convolve as the kernels' function; an activation in the place of ``seq_idx`` is taken too."""
+    """Convolve as the kernels' function; ``seq_idx`` may also be an activation."""
     if isinstance(seq_idx, str) and not others:  # version 1.0 has the activation there
         return _causal_conv1d_fn(x, weight, bias, activation=seq_idx)
     return _causal_conv1d_fn(x, weight, bias, cast(Any, seq_idx), *others, **named)

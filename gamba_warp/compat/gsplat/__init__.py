@@ -56,7 +56,7 @@ _OF_GSPLAT = {
 # Which parts gsplat was built with.
 has_3dgs = has_adam = has_reloc = partial(bool, True)
 has_2dgs = has_3dgut = has_camera_wrappers = has_losses = partial(bool, False)
-# Names of gsplat 1.5.3; in the first entry those of later versions follow.
+# Names of gsplat 1.5.3; in the first entry later versions' names follow.
 ABSENT = complete(
     __name__,
     "gsplat",

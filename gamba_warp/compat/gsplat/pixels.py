@@ -93,7 +93,7 @@ def isect_tiles(
         images = torch.arange(count, device=means2d.device).repeat_interleave(num)
     tiles = tile_width * tile_height
     if count.bit_length() + tiles.bit_length() + 32 > 63:
-        raise ValueError(f"{count} images of {tiles} tiles: their numbers do not fit 63 bits")
+        raise ValueError(f"{count} images of {tiles} tiles: their indices do not fit in 63 bits")
     size = means2d.new_tensor([tile_width, tile_height])
     center, reach = (x.reshape(-1, 2) / tile_size for x in (means2d, radii))
     first = (center - reach).floor().clamp_min(0).minimum(size).long()
@@ -234,9 +234,11 @@ def rasterize_to_pixels(
     total, ids, begins = math.prod(rows), flatten_ids.long(), isect_offsets.flatten().long()
     counts = F.pad(begins, (0, 1), value=len(ids)).diff()
     if len(begins) and (int(begins[0]) != 0 or int(counts.min()) < 0):
-        raise ValueError(f"isect_offsets do not rise from 0 to {len(ids)}, the length of ids")
+        raise ValueError(f"isect_offsets do not increase from 0 to {len(ids)}, the length of ids")
     if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < total:
-        raise ValueError(f"flatten_ids has {int(ids.min())} to {int(ids.max())} of {total} rows")
+        raise ValueError(
+            f"flatten_ids goes from {int(ids.min())} to {int(ids.max())}, must be in [0, {total})"
+        )
 
     # From gsplat's xx, xy, yy to (a, k, e) in float64, because e = yy - xy²/xx cancels for needles.
     xx, xy, yy = conics.reshape(total, 3).double().unbind(-1)

@@ -23,7 +23,7 @@ from ..shared import at_least_0, check_tensor, one_device, one_of, positive, sid
 from .relocation import quat_scale_to_covar_preci
 
 MAX_SH_DEGREE = 4
-# Without opacities gsplat's box has 3.33 standard deviations, that of this opacity, about 1.
+# Without opacities gsplat's box has 3.33 standard deviations, as for this opacity, about 1.
 _OPAQUE = ALPHA_MIN * math.exp(0.5 * 3.33**2)
 _LARGE = 1e15  # stays over alpha_min with any antialiasing factor from 4e-18
 _NEARLY = 1 + 1e-5  # tolerance of a float32 product of an opacity and the smallest factor

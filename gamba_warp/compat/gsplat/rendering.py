@@ -94,7 +94,7 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians of each object in each of its C views.
 
-    The arguments, their order and defaults are those of gsplat 1.5.3; the keywords after the star
+    The arguments, their order and defaults match gsplat 1.5.3; the keywords after the star
     came later. ``tile_size``, ``channel_chunk`` and ``segmented`` have no effect. Options that are
     not listed below must have their defaults. docs/drop-ins.md lists the differences of each
     argument.

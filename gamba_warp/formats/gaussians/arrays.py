@@ -17,7 +17,7 @@ MAX_REACH = 1e18  # of means and scales: the squares of larger numbers overflow 
 MIN_SCALE = 1e-12  # keeps the logarithm of a scale finite
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}  # degree of the harmonics by their number K
 _NAMES = ("means", "quats", "scales", "opacities", "colors")
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices beside each index
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # other indices, by index
 
 
 def flip_axes(gaussians: Gaussians) -> Gaussians:
@@ -48,7 +48,7 @@ def export_arrays(
         shape = tuple(gaussians.opacities.shape[:-1])
         raise ValueError(f"one object expected, got leading shape {shape}")
     if gaussians.num == 0:
-        raise UserError(f"{path}: not written, there is no Gaussian")
+        raise UserError(f"{path}: not written, there are no Gaussians")
     gaussians = gaussians.detach().to("cpu", torch.float32)
     if axes == "opengl":
         gaussians = flip_axes(gaussians)
@@ -74,7 +74,7 @@ def checked_gaussians(
 ) -> Gaussians:
     """Validate the activated values of a file, and return them as one object.
 
-    Colours may lie outside of [0, 1]; a rendering cuts them at 0. A line warns where positions are
+    Colours may be outside of [0, 1]; a rendering clamps them at 0. A line warns where positions are
     too coarse for the object.
 
     Args:
@@ -134,7 +134,7 @@ def warn_of_steps(path: str | Path, means: torch.Tensor, step: float = 0.0) -> N
     Args:
         path: named in the warning.
         means: ``[N, 3]`` float32, N > 0.
-        step: of the file's format; that of float32 counts if it is larger.
+        step: the file format's; float32's is used instead if it is larger.
     """
     reach, extent = means.abs().max(), (means.amax(0) - means.amin(0)).max().item()
     step = max(step, float(np.spacing(np.float32(reach))))

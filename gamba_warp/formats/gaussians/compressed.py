@@ -82,7 +82,7 @@ def unpacked(path: Path, data: PlyData) -> dict[str, np.ndarray]:
     there = sum(element.count for element in data.header.elements if element.name == "chunk")
     if there != wanted:
         raise UserError(
-            f"{path}: false header, {count} packed vertices have {wanted} chunks, not {there}"
+            f"{path}: invalid header, {count} packed vertices have {wanted} chunks, not {there}"
         )
     at = np.arange(count) // CHUNK
     means = _between(path, data, _MEANS, at, _split(words[:, 0], (11, 10, 11)))
@@ -109,7 +109,7 @@ def _harmonics(path: Path, data: PlyData, count: int) -> np.ndarray:
         return np.zeros((count, 0, 3))
     table = _table(path, data, "sh", rest_names(len(found)), np.uint8)
     if len(table) != count:
-        raise UserError(f"{path}: false header, {count} vertices but {len(table)} harmonics")
+        raise UserError(f"{path}: invalid header, {count} vertices but {len(table)} harmonics")
     # The middle of each step, but the ends are the ends.
     middle = np.where(table == 0, 0.0, np.where(table == 255, 1.0, (table + 0.5) / 256))
     return harmonics_of(path, (middle - 0.5) * 2 * _REACH)
@@ -137,7 +137,7 @@ def _between(
     )
     with np.errstate(all="ignore"):  # untrusted bounds; the result is checked
         values = low.astype(np.float64) * (1 - steps) + high.astype(np.float64) * steps
-    # Nothing lies between bounds if one is infinite.
+    # No value is between bounds if one is infinite.
     return np.where(np.isfinite(low) & np.isfinite(high), values, np.nan)
 
 

@@ -77,14 +77,14 @@ def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gauss
     reader = readers[0] if readers else by_name.get(path.suffix.lower())  # which names the error
     if path.suffix.lower() in _CONVERTED:
         tool = "SuperSplat (superspl.at/editor) and splat-transform convert it to .ply"
-        raise UserError(f"{path}: the format {path.suffix.lower()} is not read; {tool}")
+        raise UserError(f"{path}: the format {path.suffix.lower()} is not supported; {tool}")
     if reader is None:
         raise UserError(f"{path}: not Gaussians ({', '.join(SPLAT_SUFFIXES)})")
     return reader(path, left_out)
 
 
 def comments_of(path: str | Path) -> list[str]:
-    """Return the comments of a ``.ply``, such as its origin; of other formats none.
+    """Return the comments of a ``.ply``, such as its origin; empty for other formats.
 
     At most 32 lines of 200 characters, so that a file with all of them can be read again.
 

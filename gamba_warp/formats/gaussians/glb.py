@@ -68,7 +68,7 @@ def load_glb(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
             poses = matrix @ file.instances(node)
             parts += [_moved(path, part, pose, left_out) for pose in poses]
     if not parts:
-        raise UserError(f"{path}: no Gaussians in it (no primitive has {EXTENSION})")
+        raise UserError(f"{path}: contains no Gaussians (no primitive has {EXTENSION})")
     return flip_axes(_joined(parts))
 
 
@@ -78,12 +78,12 @@ def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> 
     mode, given = primitive.get("mode", int, 4), primitive.entry("attributes")
     if options.get("extensions"):
         names = ", ".join(str(name)[:60] for name in options["extensions"])
-        raise UserError(f"{path}: its Gaussians are packed by {names[:200]}, which is not read")
+        raise UserError(f"{path}: its Gaussians' compression {names[:200]} is not supported")
     space, kernel = options.get("colorSpace", COLOR_SPACE), options.get("kernel", "ellipse")
     if space != COLOR_SPACE or kernel != "ellipse" or mode != POINTS:
         raise UserError(
             f"{path}: Gaussians of colour space {str(space)[:40]!r}, kernel {str(kernel)[:40]!r} "
-            f"and mode {mode}; only {COLOR_SPACE}, ellipse and {POINTS} are read"
+            f"and mode {mode}; only {COLOR_SPACE}, ellipse and {POINTS} are supported"
         )
 
     def read(name: str, width: int) -> np.ndarray:
@@ -100,7 +100,7 @@ def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> 
     while f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in given.values:
         degree += 1
     if degree > 3:
-        raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are read")
+        raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are supported")
     arrays = {
         "means": read("POSITION", 3),
         "quats": np.roll(read(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
@@ -112,12 +112,12 @@ def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> 
     counts = {name: len(value) for name, value in arrays.items()}
     counts |= {f"coefficient {i}": len(value) for i, value in enumerate(harmonics)}
     if len(set(counts.values())) > 1:
-        raise UserError(f"{path}: false header, its attributes have {counts} values")
+        raise UserError(f"{path}: invalid header, its attributes have {counts} values")
     if harmonics:
         arrays["harmonics"] = np.stack(harmonics, 1)
     if (arrays["scales"] < 0).any():
         raise UserError(
-            f"{path}: scales below 0; a draft of {EXTENSION} stored logarithms, which is not read"
+            f"{path}: negative scales; drafts of {EXTENSION} with logarithms are not supported"
         )
     return checked_gaussians(path, arrays, left_out)
 
@@ -127,7 +127,7 @@ def _moved(
 ) -> Gaussians:
     """Return the Gaussians moved by a node. Raises UserError if it stretches or mirrors."""
     if not np.isfinite(matrix).all():
-        raise UserError(f"{path}: a node's place is not finite")
+        raise UserError(f"{path}: a node's transform is not finite")
     if (matrix == np.eye(4)).all():
         return gaussians
     with np.errstate(all="ignore"):
@@ -135,7 +135,7 @@ def _moved(
         turn = matrix[:3, :3] / scale
         straight = np.abs(turn @ turn.T - np.eye(3)).max() < _STRAIGHT
     if not (scale > 0 and straight):
-        raise UserError(f"{path}: a node stretches or mirrors its Gaussians, which is not read")
+        raise UserError(f"{path}: a node that stretches or mirrors Gaussians is not supported")
     moved = gaussians.transformed(
         torch.from_numpy(turn).float(), torch.from_numpy(matrix[:3, 3].copy()).float(), scale
     )

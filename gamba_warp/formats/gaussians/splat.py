@@ -59,7 +59,7 @@ def load_splat(path: str | Path, left_out: list[str] | None = None) -> Gaussians
     with open_shape(path) as (file, size):
         if size % RECORD.itemsize:
             raise UserError(
-                f"{path}: truncated or no .splat file, {size} bytes are not a multiple of "
+                f"{path}: truncated or not a .splat file, {size} bytes are not a multiple of "
                 f"{RECORD.itemsize}"
             )
         records = np.frombuffer(file.read(), RECORD)

@@ -86,7 +86,7 @@ def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
 
 
 def _chunks(count: int) -> Iterator[slice]:
-    """Yield parts of ``count`` rows, so that what is made of a part takes little memory."""
+    """Yield parts of ``count`` rows, which bounds the memory of intermediate results."""
     return (slice(at, at + _CHUNK) for at in range(0, count, _CHUNK))
 
 
@@ -137,13 +137,13 @@ def _activated(found: Unpacked, columns: list[np.ndarray]) -> dict[str, np.ndarr
         "opacities": opacities[:, 0] / 255,
         "colors": (colors / 255 - 0.5) / _COLOR * SH_C0 + 0.5,
     }
-    for rest in harmonics:  # of degree 0 there are none
+    for rest in harmonics:  # empty at degree 0
         arrays["harmonics"] = (rest.reshape(len(rest), -1, 3).astype(np.float64) - 128) / 128
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
 
 def _packed_means(means: np.ndarray, bits: int) -> bytes:
-    """Return 24-bit fixed point numbers with so many bits behind the point."""
+    """Return 24-bit fixed point numbers with ``bits`` fractional bits."""
     fixed = np.rint(means.astype(np.float64) * 2**bits).astype("<i4")
     return fixed[:, :, None].view(np.uint8)[..., :3].tobytes()
 

@@ -65,7 +65,7 @@ def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]
     """
     _, version, count, degree, bits, flags, _ = HEADER.unpack(header)
     if degree not in COUNTS:
-        raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are read")
+        raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are supported")
     if bits > _MAX_BITS or count > MAX_POINTS:
         raise UserError(f"{path}: broken header, {count} Gaussians, {bits} bits")
     position, rotation = 6 if version == 1 else 9, 4 if version > 2 else 3
@@ -85,7 +85,7 @@ def _from_gzip(path: Path, content: bytes) -> Unpacked:
             raise UserError(f"{path}: not an .spz file")
         _, version, count, _, _, flags, _ = HEADER.unpack(head)
         if version not in (1, 2, 3):
-            raise UserError(f"{path}: .spz of version {version}, in gzip only 1 to 3 are read")
+            raise UserError(f"{path}: .spz of version {version}, in gzip only 1 to 3 are supported")
         sizes, found = _sizes(path, head, len(content))
         wanted = sum(sizes)
         body = stream.decompress(stream.unconsumed_tail, wanted + 1)
@@ -96,7 +96,7 @@ def _from_gzip(path: Path, content: bytes) -> Unpacked:
         raise UserError(f"{path}: truncated or damaged ({error})") from error
     compare_sizes(path, f"{count} Gaussians", wanted, len(body), exact=False)
     if records and not flags & _MORE:
-        raise UserError(f"{path}: false header, more follows than {count} Gaussians")
+        raise UserError(f"{path}: invalid header, more data follows than {count} Gaussians need")
     if not stream.eof:
         raise UserError(f"{path}: truncated, the gzip stream has no end")
     _check_axes(path, records)
@@ -111,7 +111,7 @@ def _from_streams(path: Path, content: bytes) -> Unpacked:
     _, version, _, _, _, flags, streams = HEADER.unpack_from(content)
     (table,) = _PLAIN.unpack_from(content, HEADER.size)
     if version != 4:
-        raise UserError(f"{path}: .spz of version {version}, without gzip only 4 is read")
+        raise UserError(f"{path}: .spz of version {version}, without gzip only 4 is supported")
     sizes, found = _sizes(path, content[: HEADER.size], len(content))
     if streams != len(sizes) or table < start:
         raise UserError(f"{path}: broken header, {streams} streams, their table at byte {table}")
@@ -121,8 +121,8 @@ def _from_streams(path: Path, content: bytes) -> Unpacked:
     for number, (size, (_, promised)) in enumerate(zip(sizes, entries)):
         if promised != size:
             raise UserError(
-                f"{path}: false header, stream {number} has {promised} bytes unpacked by the table"
-                f" of contents, {size} by the number of Gaussians"
+                f"{path}: invalid header, stream {number} has {promised} bytes in the table of"
+                f" contents, {size} by the number of Gaussians"
             )
     packed = [entry[0] for entry in entries]
     compare_sizes(path, "the streams", sum(packed), len(content) - at)
@@ -147,10 +147,10 @@ def _stream(path: Path, zstd: Any, number: int, packed: memoryview, size: int) -
         reason = first_line(error)
         raise UserError(f"{path}: stream {number} is truncated or damaged ({reason})") from error
     if len(found) > size or decoder.unused_data:
-        raise UserError(f"{path}: false header, stream {number} holds more than {size} bytes")
+        raise UserError(f"{path}: invalid header, stream {number} holds more than {size} bytes")
     if not decoder.eof or len(found) < size:
         raise UserError(
-            f"{path}: truncated or false header, stream {number} ends after {len(found)} of"
+            f"{path}: truncated or invalid header, stream {number} ends after {len(found)} of"
             f" {size} bytes"
         )
     return found
@@ -177,6 +177,6 @@ def _check_axes(path: Path, records: bytes) -> None:
             if system not in (0, _RUB):
                 raise UserError(
                     f"{path}: its axes are number {system} of the format's extension, only {_RUB}"
-                    " (x right, y up, z backward) is read"
+                    " (x right, y up, z backward) is supported"
                 )
         at += length

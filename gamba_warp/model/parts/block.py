@@ -4,7 +4,7 @@ In a Mamba block a token depends on the tokens before it only through two small 
 prepends the condition, drops its outputs, and the next block prepends it again. The condition thus
 contributes only the pair of states after it, which does not depend on the 3DGS tokens.
 ``prefix_states`` computes the states of all blocks at once, and ``run_blocks`` then runs the blocks
-over the 3DGS tokens only. The result equals that of prepending and dropping.
+over the 3DGS tokens only. The result equals prepending and dropping.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ class Mamba(nn.Module):
     ) -> tuple[Tensor, State | None]:
         """Map ``[B, L, width]`` to ``[B, L, width]``; a token sees itself and earlier ones.
 
-        ``state`` is that of earlier tokens, or None without any. With ``keep`` the state after the
-        last token is returned beside the tokens. ``packed`` are S sequences in one row; B of the
+        ``state`` is the earlier tokens', None without any. With ``keep`` the state after the
+        last token is returned with the tokens. ``packed`` are S sequences in one row; B of the
         states is then S.
         """
         conv_state, scan_state, A = state or (None, None, None)
@@ -292,7 +292,7 @@ def run_blocks(
 
     Args:
         blocks: the network's blocks, all of one kind, in their order.
-        tokens: ``[B, L, width]``; with ``packed`` ``[1, T, width]``, those of all pictures.
+        tokens: ``[B, L, width]``; with ``packed`` ``[1, T, width]``, all pictures' tokens.
         states: the result of ``prefix_states``, one entry per block.
         recompute: with gradients, keep only each block's input and recompute the block in the
             backward pass.

@@ -1,7 +1,7 @@
 """Foreground of pictures: the patches and cells that are not fully transparent.
 
 Only these are computed. Their lists are made on the CPU, from the pictures' alpha, so that no GPU
-is asked for their numbers; a training makes them beside the data.
+is asked for their numbers; a training makes them while it loads the data.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Foreground:
     def padded(self, cells: int) -> Foreground:
         """Return lists of one of few lengths, so that a CUDA graph of one batch fits many.
 
-        Added tokens follow those of the last picture, so no other token depends on them. Added
+        Added tokens follow the last picture's tokens, so no other token depends on them. Added
         patches and cells repeat the first of picture 0; these cells are transparent, and share a
         row behind the cells of picture 0.
 
@@ -126,7 +126,7 @@ class Foreground:
 
 
 def _rounded_up(number: float, bits: int) -> int:
-    """Return the next number of so many significant bits."""
+    """Return the next number with that many significant bits."""
     step = 1 << max(0, math.ceil(number).bit_length() - bits)
     return math.ceil(number / step) * step
 

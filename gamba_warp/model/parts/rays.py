@@ -108,7 +108,7 @@ class RayDecoder(nn.Module):
 
         Returns:
             ``[B, N]``, float32, in the world of ``cameras``: the cells row by row, the layers of a
-            cell adjacent. N is that of the picture with the most cells; the others are padded with
+            cell adjacent. N belongs to the picture with the most cells; the others are padded with
             Gaussians of opacity 0.
         """
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².

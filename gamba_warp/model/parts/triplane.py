@@ -97,7 +97,7 @@ class TriplaneDecoder(GaussianDecoder):
             planes: the result of ``PlaneBranch``.
 
         Returns:
-            ``[B, L]``; the ranges are those of ``GaussianDecoder``. Positions get no gradient
+            ``[B, L]``; the ranges are as in ``GaussianDecoder``. Positions get no gradient
             through the sampling of the planes (nor do they in the authors' public code).
         """
         parts = self.shapes(self.mlp(tokens))

@@ -11,9 +11,9 @@ struct Staged {
 
 #if SORT
 // A worker sorts lists by depth, stably, one after the other: of views, whose Gaussians they put in
-// order, or of tiles, whose staged intersections lie in the order of the Gaussians' index. Sorted
+// order, or of tiles, whose staged intersections are in the order of the Gaussians' index. Sorted
 // are words of the key and the place; digits of at most 11 bits from those bits in which the keys
-// of a list differ. Depths are not negative, so their bits are ordered as they are.
+// of a list differ. Depths are not negative, so their bits sort like the depths.
 const bool views = !staged.data;
 const int size = splats.depths.shape[0] / count;  // Gaussians of a view
 for (;;) {
@@ -73,7 +73,7 @@ for (;;) {
 }
 
 #elif OFFSETS
-// Running sums: the lists of all views lie one after the other, a list has its parts in turn, and
+// Running sums: the lists of all views are contiguous, a list has its parts in turn, and
 // the counts of the parts become their first numbers. Too many intersections overflow here, and are
 // refused by their sum, which has 64 bits.
 long long intersections = 0;
@@ -189,7 +189,7 @@ auto rows_ = [&](int i, auto visit) {
 
 // A window of 4 x 4 tiles of a Gaussian: its first tile, and a bit for each tile that is touched.
 // A Gaussian that does not fit its window has the first tile -1, one that is culled has no bits.
-// Words hold the bits of four Gaussians, so that a loop over them seldom ends.
+// A word holds the bits of four Gaussians, so that a loop over them seldom exits.
 const int within[16] = {0, 1, 2, 3, tiles_x, tiles_x + 1, tiles_x + 2, tiles_x + 3, 2 * tiles_x,
     2 * tiles_x + 1, 2 * tiles_x + 2, 2 * tiles_x + 3, 3 * tiles_x, 3 * tiles_x + 1,
     3 * tiles_x + 2, 3 * tiles_x + 3};

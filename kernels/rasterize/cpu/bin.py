@@ -4,7 +4,7 @@ The Gaussians of a view are cut into parts, one task each. ``count`` finds the t
 Gaussian, leaves them as a window of 4 x 4 tiles, and finds how many intersections each (part, tile)
 has; their running sum is where ``scatter`` writes. Views of few Gaussians are sorted by depth
 before that. A sort of a million Gaussians, and every later step in that random order, would wait
-for memory: those go as they lie, and each list, which fits the nearest cache, is sorted at the end.
+for memory: large views keep their order, and each list, which fits a cache, is sorted last.
 README.md §2 holds the maths.
 """
 

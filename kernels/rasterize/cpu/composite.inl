@@ -3,7 +3,7 @@
 //     EMPTY_TILES, BLOCK_TEST, STOPPED, v
 // gives: the bodies of composite, composite_vjp and sum_rows
 // Compositing on the CPU (README.md §3, §5), three kernels: the pictures, with GRADIENT the sums of
-// each intersection, with SUM_ROWS those of each Gaussian.
+// each intersection, with SUM_ROWS the sums of each Gaussian.
 #include "sixteen.h"
 
 #if SUM_ROWS
@@ -84,7 +84,7 @@ auto tile_at = [&](int index) -> Tile {
             tile.inside |= 1 << b;
     return tile;
 };
-// `visit(l, pixel)` for each pixel of a block that lies in the picture
+// `visit(l, pixel)` for each pixel of a block inside the picture
 auto pixels_of = [&](const Tile& tile, int b, auto visit) {
     const int x = tile.x + b % COLUMNS * 4, y = tile.y + b / COLUMNS * 4;
     const int nx = picture.width - x < 4 ? picture.width - x : 4;
@@ -126,7 +126,7 @@ auto u_of = [&](const Splat& s, int b) -> F {
     const float y = s.dy + (float)(b / COLUMNS * 4), x = s.dx + (float)(b % COLUMNS * 4);
     return X + Y * s.shear + (x + s.shear * y);
 };
-// Their alpha, not clamped. The exponent is rounded to an integer n by adding 1.5 * 2^23 (+127, the
+// Their unclamped alpha. The exponent is rounded to an integer n by adding 1.5 * 2^23 (+127, the
 // bias), 2^rest is a minimax polynomial p of f, whose relative error is at most 3e-7.
 auto alpha_of = [&](const Splat& s, F U, F V) -> F {
     const F shifter = F{} + 12583039.0f;
@@ -222,7 +222,7 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
             if (rows.geometry) {
                 const F diff = sum - Rs[b];
                 Rs[b] = fma_(alpha, diff, Rs[b]);
-                // past the clamp it is that of the alpha that is not clamped
+                // past the clamp it is the gradient of the unclamped alpha
                 const F over = PASSES ? T * free * diff : F{};
                 const F h = alpha < picture.alpha_max ? weight * diff : over;
                 const F u = h * U, w = h * V;

@@ -114,7 +114,7 @@ auto to_camera_ = [&](const Camera& camera, const F* mean, F* t) {
         t[r] = add_(sum, splat(row[3]));
     }
 };
-// (x, y)/z, clamped, and the rows of J W: those of J are (fx, 0, -fx sx) and (0, fy, -fy sy)
+// (x, y)/z, clamped, and the rows of J W: J has the rows (fx, 0, -fx sx) and (0, fy, -fy sy)
 auto jacobian_ = [&](const Camera& camera, const F* t, F* slopes, F (*rows)[3]) {
     const float *V = camera.V, *K = camera.K;
     const F fx = K[0] / t[2], fy = K[4] / t[2];

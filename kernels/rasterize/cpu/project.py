@@ -1,5 +1,5 @@
 """The projection and its gradient on the CPU: sixteen Gaussians as lanes. README.md §1 and §4 have
-the maths; the bits are those of the kernels of ``../cuda/project.py``.
+the maths; the results equal ``../cuda/project.py``'s to the last bit.
 """
 
 from pathlib import Path

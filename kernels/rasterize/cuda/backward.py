@@ -45,7 +45,7 @@ class Rows:
 
     A row has for each chunk of channels the six moments, the two sums of absolute values if they
     are asked for, and the colours: the first eight of these numbers, a sector of memory, in
-    ``heads``, the others in ``tails``. A row of a pair that is not ``written`` holds nothing.
+    ``heads``, the others in ``tails``. A row of a pair that is not ``written`` is undefined.
     """
 
     heads: wp.array2d[wp.float32]
@@ -103,7 +103,7 @@ class Sums(NamedTuple):
 
 @functools.cache
 def _storing(asked: Sums, adding: bool):
-    """The function that stores a vector of a chunk of a row, or adds it to what is there."""
+    """The function that stores a vector of a chunk of a row, or adds it to the stored values."""
     pitch = Sums(CHUNK, False, asked.absolute).tail()
 
     @wp.func
@@ -151,7 +151,7 @@ def _completing(asked: Sums, parts: int):
         i: wp.int32,
         sums: values_type,
     ):
-        # stores a lane's sums of a pair, to be completed together with those of other pairs
+        # stores a lane's sums of a pair, to be completed together with other pairs' sums
         at = base + wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
         for v in range(wp.static(values)):
             memory.put(arena, at + wp.static(v * PITCH), sums[v])
@@ -216,7 +216,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
         k: wp.int32,
         bits: wp.int32,
     ):
-        # of a pair's bits, which are those of all tiles together, those within this tile's test
+        # of a pair's bits, which combine all tiles, only the ones within this tile's test
         left = wp.int32(0)
         if L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1):
             g = L.load_int(lists.order, k)
@@ -250,8 +250,8 @@ def _walking(asked: Sums, parts: int, listed: bool):
         else:
             begin = p.image * picture.num
             walked = -walked_in[p.tile]
-        # T is as forward left it, negative until the walk comes to where the pixel stopped; R is
-        # that of README eq. 10, less the gradient of alpha, which is the same for all pairs
+        # T is as forward left it, negative until the walk reaches where the pixel stopped; R is
+        # R of README eq. 10, less the gradient of alpha, which is the same for all pairs
         T = pixels_type()
         R = pixels_type()
         upstream = upstream_type()
@@ -275,13 +275,13 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 if wp.static(every):
                     for c in range(gaussians.channels):
                         largest += wp.abs(L.load(v_pixels_in.renders, first, step + c))
-                # NaN is not taken for zero
+                # NaN does not count as zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
         if (picture.skip & ZERO_UPSTREAM) == 0:
             some = wp.static(part_blocks)
         wanted = any_of(some)
-        of_all = wanted  # those of the tile, of which each part has its own
+        of_all = wanted  # the whole tile's bits; each part has its own
         if wp.static(parts > 1):
             memory.put_int(arena, base, wanted << (p.part * wp.static(16 // parts)))
             together()
@@ -381,7 +381,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                     sync()
                     waiting = 0
                 if (bits >> STOP) != 0:
-                    # pixels that stopped here take part from the next pair on
+                    # pixels that stopped here contribute from the next pair on
                     k = end - WARP + i
                     at = wp.int64(L.opaque(p.index)) * wp.int64(wp.static(pixels * WARP))
                     at += wp.int64(p.lane)

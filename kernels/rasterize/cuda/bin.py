@@ -86,7 +86,7 @@ def _count(
                 L.store_word(spans_out, at, 0, _span(columns))
             ty = L.opaque(ty + 1)  # keeps the loop from being unrolled, which splits warps more
     if j == 0:
-        L.store_long(counts_out, 0, wp.int64(0))  # their running sum says where each begins
+        L.store_long(counts_out, 0, wp.int64(0))  # their running sum is where each begins
     L.store_long(counts_out, j + 1, wp.int64(count))
 
 
@@ -185,7 +185,7 @@ def _tile_kernels(number: Any):
         count = wp.int32(0)
         if count_in[0] <= wp.int64(size):
             count = wp.int32(count_in[0])
-        # all loads before the stores, so that they are under way together
+        # all loads before the stores, so that they are in flight together
         left = count - k
         row = wp.vec4i()
         g = wp.vec4i()
@@ -217,7 +217,7 @@ def _tile_kernels(number: Any):
 def bin_views(
     grid: Grid, projected: Projected, check: Callable[[int], None], exact: bool = False
 ) -> Bins:
-    """As ``bin_views`` of the CPU, but the lists may have a capacity above the number of pairs.
+    """Make the lists as on the CPU; their capacity may exceed the number of pairs.
 
     Args:
         grid: from ``make_grid``.
@@ -272,8 +272,8 @@ def _list_capacity(
     if known is None:
         if capturing:
             raise RuntimeError(
-                "a CUDA graph cannot begin with shapes that were never rendered: run the same "
-                "call once before the capture, as torch asks for all that it captures"
+                "a CUDA graph cannot capture shapes that were never rendered: run the same "
+                "call once before the capture, as torch requires of all captured work"
             )
         total = int(count)
         check(total)

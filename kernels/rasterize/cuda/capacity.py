@@ -2,7 +2,7 @@
 
 The first call of a shape reads its number of pairs back. Later calls allocate the capacity that
 earlier ones needed; the device copies their counts into pinned memory, which the host reads without
-waiting. A count over the capacity is no error: see ``composite_unlisted``. Pictures and gradients
+waiting. A count over the capacity is allowed: see ``composite_unlisted``. Pictures and gradients
 have the same bits for any capacity, so it does not matter when a count arrives.
 """
 

@@ -25,7 +25,7 @@ from .warp import WARP
 
 
 def parts_of_tile(tiles: int, device: torch.device) -> int:
-    """Into how many warps' work a tile is cut: 1, or where tiles are few, 2 or 4.
+    """Number of warps that share a tile: 1, or where tiles are few, 2 or 4.
 
     A few views do not fill the machine: the tile with the longest list sets the time, and its parts
     run side by side. With more views, parts would only repeat the work of a Gaussian for each warp.
@@ -58,7 +58,7 @@ def _launch(
 
 
 def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tensor, Tensor, Walk]:
-    """As ``composite_forward`` of the CPU.
+    """Blend I views, like ``composite_forward`` on the CPU.
 
     A ``Walk``'s pixels are in the order of the lanes, its ``stops`` are set where a pixel stopped
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
@@ -100,7 +100,7 @@ def composite_backward(
     absolute: Tensor | None = None,
     passes: bool = False,
 ) -> Drawn:
-    """As ``composite_backward`` of the CPU."""
+    """Gradients of ``composite_forward``, like ``composite_backward`` on the CPU."""
     colors = splats.colors
     tiles, channels = walk.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)

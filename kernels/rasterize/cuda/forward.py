@@ -45,19 +45,19 @@ def _walking(channels: int, parts: int, listed: bool):
 
     Unless ``listed``, the tiles of a view share one list of all its Gaussians, in which ``offsets``
     says where the pairs of each would begin, if the lists held them. Bits of tiles are then joined,
-    and numbers of walked pairs are stored with a minus, so that the gradient knows them.
+    and numbers of walked pairs are stored negated, which marks them for the gradient.
     """
     memory = shared_memory(_SIZE)
     arena_type = memory.arena
     lane_pixels, touched, stage = pixels_of_lane(parts), touching(parts), staging(_SIZE)
-    pixels = SUB_TILES // parts  # how many a lane has
+    pixels = SUB_TILES // parts  # pixels per lane
     pixels_type = wp.types.vector(pixels, wp.float32)
     sums_type = wp.types.matrix((pixels, channels), wp.float32)
 
     @wp.func
     @no_type_check
     def leave(blocks: wp.array[wp.int32], k: wp.int32, part: wp.int32, mine: wp.int32):
-        # stores the bits of a pair, or joins those of the parts, or of the tiles that share it
+        # stores the bits of a pair, or combines them over the parts or tiles that share it
         if wp.static(parts == 1 and listed):
             L.store_int(blocks, k, mine)
         else:
@@ -85,7 +85,7 @@ def _walking(channels: int, parts: int, listed: bool):
             k0 = p.image * picture.num
             end = k0 + picture.num
         half = p.lane // 4 % 2  # which of a sub-tile's two blocks of 4 x 4 pixels
-        # T is positive where a pixel goes on, negative where it stopped, 0 outside of the picture
+        # T is positive where a pixel continues, negative where it stopped, 0 outside of the picture
         T = pixels_type()
         inside = wp.int32(0)
         for j in range(wp.static(pixels)):
@@ -99,7 +99,7 @@ def _walking(channels: int, parts: int, listed: bool):
             end = k0
         evaluated = wp.int32(0)
         while k0 < end:
-            # each lane looks at one of the next 32 Gaussians, past the end at the last one
+            # each lane tests one of the next 32 Gaussians; past the end, the last one
             k = wp.min(k0 + p.lane, end - 1)
             seen = k == k0 + p.lane
             if wp.static(listed):
@@ -116,7 +116,7 @@ def _walking(channels: int, parts: int, listed: bool):
             if not seen:
                 lane_mask = 0
             memory.put_int(arena, wp.static(_MASKS) + p.lane, lane_mask)
-            # those that touch something lie side by side
+            # compacts the Gaussians that touch something
             todo = ballot(lane_mask)
             slot = L.count_bits(todo & ((1 << p.lane) - 1))
             if lane_mask != 0:
@@ -180,7 +180,7 @@ def _walking(channels: int, parts: int, listed: bool):
                 leave(walked_out.blocks, k0 + p.lane, p.part, mine)
             k0 += WARP
 
-        # computed again, so that no registers hold the lane's pixels during the walk
+        # recomputed, so that no registers hold the lane's pixels during the walk
         p = lane_pixels(picture, L.opaque(p.index), p.lane)
         if p.lane == 0:
             if wp.static(listed):
@@ -209,7 +209,7 @@ def forward_kernels(channels: int, parts: int):
     ``composite`` walks the lists of tiles; ``composite_unlisted`` makes the pictures where the
     lists are too short.
     """
-    options = kernel_options(24 if channels < 4 else 20)  # warps that there are registers for
+    options = kernel_options(24 if channels < 4 else 20)  # as many warps as the registers allow
     lane_pixels = pixels_of_lane(parts)
     walk, walk_unlisted = _walking(channels, parts, True), _walking(channels, parts, False)
 

@@ -2,7 +2,7 @@
 
 Forward has a thread for each (view, Gaussian). The gradient has one for each Gaussian, which loops
 over its views: sums over views are then in a fixed order. A CPU runs the gradient here as well
-where that of viewmats or of antialiasing is needed; else both run in ``../cpu/project.py``.
+where the gradient of viewmats or of antialiasing is needed; else both run in ``../cpu/project.py``.
 """
 
 import functools

@@ -21,7 +21,7 @@ class Gaussians:
     """Gaussians to composite, in view-major order.
 
     A record has mean x, y, a', k; e', log2 of opacity, limit, top; then the colours, in chunks of
-    four. a', e' and the limit of q are those of README §1 times log2(e)/2, the first two with a
+    four. a', e' and the limit of q are README §1's times log2(e)/2, the first two with a
     minus; ``top`` is y* of eq. 6.
     """
 

@@ -84,7 +84,7 @@ def _add_rows(
             v_opacity = h / splats_in.view_opacities[i]
         v_splats_out.view_opacities[i] = v_opacity
         if absolute_out:
-            # README eq. 14, of which the compositor has the second times a factor
+            # README eq. 14; the compositor's second sum has a factor
             absolute_out[i] = wp.vec2(a * high[2], high[3] / LOG2_E_HALF)
 
 

@@ -125,7 +125,7 @@ def shared_memory(size: int) -> Memory:
 class LanePixels:
     """Tile and pixels of a warp and a lane."""
 
-    index: wp.int32  # of the warp's part among those of all tiles
+    index: wp.int32  # of the warp's part among all tiles' parts
     lane: wp.int32
     image: wp.int32
     tile: wp.int32
@@ -133,14 +133,14 @@ class LanePixels:
     px: wp.int32  # the lane's pixel in the first sub-tile
     py: wp.int32
     pixel: wp.int64  # its number in all pictures
-    walk_row: wp.int64  # its number by tiles and sub-tiles; those of the next ones are WARP apart
+    walk_row: wp.int64  # its number by tiles and sub-tiles; the next sub-tiles' are WARP apart
     x: wp.vec2  # centres of the lane's pixels, by columns of sub-tiles
     y: wp.vec4  # by rows of sub-tiles
 
 
 @functools.cache
 def pixels_of_lane(parts: int):
-    """The function that finds a lane's ``LanePixels``, with tiles cut into so many parts."""
+    """The function that finds a lane's ``LanePixels``, with tiles cut into that many parts."""
     pixels = SUB_TILES // parts
 
     @wp.func
@@ -156,7 +156,7 @@ def pixels_of_lane(parts: int):
         y = p.tile // picture.tiles_x % picture.tiles_y * TILE + p.part * wp.static(TILE // parts)
         p.px = x + lane % WIDTH
         p.py = y + lane // WIDTH
-        line = p.image * picture.height + p.py  # among those of all pictures
+        line = p.image * picture.height + p.py  # row among all pictures
         p.pixel = wp.int64(line) * wp.int64(picture.width) + wp.int64(p.px)
         p.walk_row = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
         for i in range(2):

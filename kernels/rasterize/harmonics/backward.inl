@@ -16,7 +16,7 @@ auto total_ = [](F x) -> float {
         for (int l = 0; l < w; ++l) s[l] += s[l + w];
     return s[0];
 };
-// the way back from load_rows_, and zeros for the coefficients that are not used
+// the inverse of load_rows_, with zeros for unused coefficients
 auto store_rows_ = [&](float* row, int live, const F* from) {
     for (int o = 0; o < FLOATS; o += 16) {
         F r[16];

@@ -1,7 +1,7 @@
 """The harmonics on CUDA: one thread a Gaussian, which loops over its views.
 
 So the gradients by coefficients and by the mean are summed by one thread, without atomics. A thread
-holds the coefficients of all channels where they are few, else those of one channel at a time.
+holds the coefficients of all channels where they are few, else of one channel at a time.
 README.md §6 of the rasterizer holds the maths.
 """
 
@@ -25,7 +25,7 @@ _OPTIONS = {"max_unroll": 25}
 @wp.func
 @no_type_check
 def _direction(mean: wp.vec3, center: wp.vec3) -> wp.vec4:
-    # the direction from the centre, and the length as it is
+    # the direction from the centre, and the unclamped length
     t = mean - center
     size = wp.length(t)
     t = t / wp.max(size, SHORTEST)
@@ -82,7 +82,7 @@ def _leaves(degree: int, channels: int) -> SimpleNamespace:
 
 @functools.cache
 def forward_kernel(degree: int, channels: int, clamped: bool):
-    """As the CPU's."""
+    """Fills the colours or sums, like the kernel of the CPU."""
     count, leaves = (degree + 1) ** 2, _leaves(degree, channels)
     group, load, basis = leaves.group, leaves.load, leaves.basis
     used_are_finite = leaves.used_are_finite
@@ -123,7 +123,7 @@ def forward_kernel(degree: int, channels: int, clamped: bool):
 
 @functools.cache
 def backward_kernel(degree: int, channels: int, clamped: bool):
-    """As the CPU's."""
+    """Computes the gradient of the forward kernel, like the kernel of the CPU."""
     count, leaves = (degree + 1) ** 2, _leaves(degree, channels)
     above = _ABOVE[clamped]
     group, part, load, store = leaves.group, leaves.part, leaves.load, leaves.store

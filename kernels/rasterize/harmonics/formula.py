@@ -75,7 +75,7 @@ def colors_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers:
 
 
 def sums_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
-    """As ``colors_by_formula``, of ``sums_seen_from``."""
+    """The sums of ``sums_seen_from``, computed as in ``colors_by_formula``."""
     used = coefficients[..., : (degree + 1) ** 2, :]
     used = used if used.dim() == 5 else used[:, None]
     # no NaN or infinity may meet a zero gradient: 0 * NaN would spread to the whole view

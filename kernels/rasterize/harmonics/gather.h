@@ -2,8 +2,8 @@
 // gives: F, I, COUNT, FLOATS, PADDED, fma_, b, any_, not_finite_, transpose_, num, views, per_view,
 //     coefficients, centers, K_D, stop, load_rows_, direction_, basis_, shown_, passes_, chunks,
 //     begin, end, means_
-// Sixteen Gaussians as the lanes of one SIMD value. Rows of coefficients are turned, 16 x 16 floats
-// at a time, so that a lane holds those of one Gaussian; the gradient is turned back. A row is K_D
+// Sixteen Gaussians as the lanes of one SIMD value. Coefficients are transposed, 16 x 16 floats
+// at a time, so that a lane holds one Gaussian's; the gradient is transposed back. A row is K_D
 // floats, of which FLOATS are used. Lanes beyond the last Gaussian hold the last one again.
 typedef float F __attribute__((vector_size(64), aligned(4)));
 typedef int I __attribute__((vector_size(64), aligned(4)));
@@ -41,7 +41,7 @@ const wp::array_t<float>& coefficients = arrays.coefficients;
 const float* const centers = (const float*)arrays.centers.data;
 const size_t K_D = coefficients.shape[1] * coefficients.shape[2];
 const float* const stop = coefficients.data + (size_t)coefficients.shape[0] * K_D;
-// turns the rows of ``live`` Gaussians: the i-th float of each becomes into[i]
+// transposes the rows of ``live`` Gaussians: the i-th float of each becomes into[i]
 auto load_rows_ = [&](const float* row, int live, F* into) {
     const bool inside = row + (live - 1) * K_D + PADDED <= stop;
     for (int o = 0; o < FLOATS; o += 16) {

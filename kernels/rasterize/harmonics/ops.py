@@ -15,7 +15,7 @@ from .formula import colors_by_formula, sums_by_formula
 from .shared import Arrays, Size
 
 _OP = "gamba_warp::rasterize_harmonics"
-MOST_CHANNELS = 64  # of the kernels: on a CPU the rows of coefficients lie on a thread's stack
+MOST_CHANNELS = 64  # of the kernels: on a CPU the rows of coefficients are on a thread's stack
 
 
 def _kernels(device: torch.device):
@@ -23,7 +23,7 @@ def _kernels(device: torch.device):
 
 
 def _launch(kernel, chunk: int, tensors: list, outputs: list) -> None:
-    """Run a kernel on chunks of Gaussians; ``tensors`` are those of ``Arrays``."""
+    """Run a kernel on chunks of Gaussians; ``tensors`` are the fields of ``Arrays``."""
     coefficients, means, centers, _ = tensors
     size = Packed(Size, means.shape[1], centers.shape[1], int(coefficients.dim() == 5))
     tasks = means.shape[0] * -(-means.shape[1] // chunk)

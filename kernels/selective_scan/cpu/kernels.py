@@ -2,8 +2,8 @@
 
 A task is one batch element, a segment of its tokens, and lane groups of one channel group. In a
 strip it holds values that do not depend on the state n, and walks the tokens once per few n and
-lane group: their h_n live in registers and N is free. The loops are C++ in the files beside this
-one. Equations are those of README.md.
+lane group: their h_n are in registers and N is free. The loops are C++ in the files next to this
+one. Equations are numbered as in README.md.
 """
 
 import functools
@@ -136,7 +136,7 @@ def gradient_states_kernel(kind: Kind) -> Any:
 
 @functools.cache
 def backward_kernel(kind: Kind) -> Any:
-    """Computes all gradients from those of the states after each segment, ``dlast_in``."""
+    """Computes all gradients from the gradients of the states after each segment, ``dlast_in``."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     inputs = {
         **_channels(kind),

@@ -33,7 +33,7 @@ class Extent(NamedTuple):
 
     @classmethod
     def of(cls, x: Inputs) -> Extent:
-        """Return those of a scan's inputs, with torch's threads."""
+        """Return the extent of a scan's inputs, with torch's threads."""
         batch, length, channels = x.u.shape
         sizes = batch, length, channels, x.A.shape[1], x.B.shape[2]
         return cls(*sizes, torch.get_num_threads())
@@ -51,7 +51,7 @@ class Layout:
     A task is a segment of one sequence's tokens and a span of blocks of one group. The blocks
     of a span are walked side by side, so that rows are read in long parts. Segments are for inputs
     with too few channels for torch's threads; finding their first states costs a second walk.
-    Packed sequences are each cut as they are alone, so that their bits are the same; those with
+    Packed sequences are each cut as if alone, so that their bits are the same; those with
     fewer segments than others have empty ones behind.
     """
 
@@ -184,7 +184,7 @@ class _Operands:
         parallel_launch(kernel, y.tasks, [sizes, *self.inputs, *inputs], outputs)
 
     def memory(self, values: int):
-        """Memory of so many lanes for each piece of a launch."""
+        """Memory of that many lanes for each piece of a launch."""
         pieces = max(1, min(torch.get_num_threads(), self.layout.tasks))
         return view(torch.empty(pieces, values, W, dtype=torch.float32), lanes)
 
@@ -244,7 +244,7 @@ def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
 def backward(
     dout: Tensor | None, dlast: Tensor | None, scan: Scan, starts: Tensor, needs: Inputs
 ) -> Inputs:
-    """Gradients of ``forward`` from those of its output and last state.
+    """Gradients of ``forward`` from the gradients of its output and last state.
 
     Args:
         dout: of the output; None for 0.

@@ -44,7 +44,7 @@ auto prepare_ = [&](const auto& sizes, const Position& p, const Group& group, au
             per_token[t] = {u, slope, gate};
         }
     };
-    // usual: compiled by itself
+    // the usual case: compiled separately
     if (p.width >= 16 && sizes.use_softplus && sizes.use_z) prepare(16, true, true);
     else prepare(p.width, sizes.use_softplus, sizes.use_z);
     return max_rate;

@@ -5,8 +5,8 @@
 //     One, visit_
 // A strip: TOKENS tokens of a lane group, or fewer at the end. Its memory, its rows, and the loop
 // over the states.
-// The values of a token lie together, because arrays of 4 KiB would evict one another from the
-// cache; those that the states do not need lie apart. A rate is δ times SCALE.
+// The values of a token are adjacent, because arrays of 4 KiB would evict one another from the
+// cache; values that the states do not need are separate. A rate is δ times SCALE.
 #if GRADIENT
 struct Token {
     F rate, du, dy, y, s, p;
@@ -34,7 +34,7 @@ struct Group {
     Group(const F* a, int states)
         : a(a), states(states), max_a(a[states]), skip(a[states + 1]), bias(a[states + 2]) {}
 };
-// Brings them there; arrays without elements are zeros.
+// Loads them; arrays without elements are zeros.
 auto load_group_ = [&](const auto& rates, const auto& skips, const auto& biases, const Position& p,
                        F* a) {
     const int states = rates.shape[1];
@@ -49,10 +49,10 @@ auto load_group_ = [&](const auto& rates, const auto& skips, const auto& biases,
     }
 };
 
-// The rows of a strip as they lie.
+// The rows of a strip in their own layout.
 auto here_ = [&](auto& array, const Position& p, int width)
                  __attribute__((always_inline)) { return rows_(array, p.b, p.t0, p.d, width); };
-// The same to be read, a token's lanes together: turned ones are first brought to a field of the
+// The same to be read, a token's lanes together: turned rows are first copied to a field of the
 // tokens, unless they are not ``used``.
 auto lanes_ = [&](auto& array, const Position& p, int width, F& field, bool used = true) {
     const auto rows = here_(array, p, width);
@@ -60,7 +60,7 @@ auto lanes_ = [&](auto& array, const Position& p, int width, F& field, bool used
     else return rows;
 };
 
-// A row's cache lines lie together, but a lane group reads one line of each row. So the rows of the
+// A row's cache lines are adjacent, but a lane group reads one line of each row. So the rows of the
 // next strip are prefetched in their order, each lane group its share, while the states are walked:
 // those loops leave the memory idle. The lines that this lane group will write are prefetched too.
 struct Fetch {
@@ -88,7 +88,7 @@ struct Fetches {
         }
     }
 };
-// Of turned rows a channel's lines lie together. A strip may begin or end within one; the strip
+// In turned rows a channel's lines are adjacent. A strip may begin or end within one; the strip
 // before has fetched that, so they are met at their ends, or in the gradient at their begins.
 auto lines_ = [](const auto& rows, int64_t ahead) -> Fetch {
     const int lines = TOKENS * sizeof(*rows.first) / 64;
@@ -160,7 +160,7 @@ struct Slow {
     }
     void store(F& high, F& low) const { high = h, low = change - (h - base); }
 };
-// True if the largest x of the lanes justify ``Slow``; without branches, which would be guessed.
+// True if the largest x of the lanes justify ``Slow``; without branches, which would mispredict.
 auto worth_slow_ = [&](F x) -> int {
     return (int)(__builtin_reduce_or(within_(x, SLOWEST)) != 0)
         | (int)(__builtin_reduce_or(~within_(x, MODERATE)) == 0);
@@ -191,7 +191,7 @@ struct One {
     I slow[1];
 };
 // Walks all states: ``several`` at once, so that values that do not depend on them are read and
-// written once, unless an exponential needs a clamp. The order of all sums is that of one state
+// written once, unless an exponential needs a clamp. The order of all sums is as for one state
 // after the other, to the last bit. ``walk`` gets the kind of state, the range of x, and the
 // states; ``max_rate`` is the largest |rate| of each lane.
 auto visit_ = [&](const Group& group, F max_rate, bool several,

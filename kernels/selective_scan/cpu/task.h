@@ -2,7 +2,7 @@
 // gives: Position, position_, row_, states_, fill_, pairs_, load_, store_, piece_, each_
 // A task: a segment of the tokens of one sequence, and lane groups of one channel group. Tasks that
 // follow one another have the same lane groups and adjacent tokens, also in the backward order: the
-// rows that one prefetches beyond its tokens are those of the next.
+// rows that one prefetches beyond its tokens belong to the next.
 struct Position {
     int b, row, group;  // ``row``: of the segment, which are ordered by number, then sequence
     int begin, end;     // tokens
@@ -44,7 +44,7 @@ auto row_ = [](auto& array, auto... indices) -> F* {
     for (; dim < array.ndim; ++dim) at *= array.shape[dim];
     return (F*)array.data + at;
 };
-// States, gradients of states and products of decays lie in the caller's order, [rows, D, N]; an
+// States, gradients of states and products of decays are in the caller's order, [rows, D, N]; an
 // array without rows is zeros, or not needed. While a task walks its tokens they are lanes in the
 // workspace of the launch's piece: pairs, N values, then the rounding error of each (strip.h).
 auto states_ = [](const auto& array, const Position& p) -> float* {

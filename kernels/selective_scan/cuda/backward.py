@@ -92,15 +92,15 @@ def backward_kernel(
     origin_matrix, fetch_matrix = row_io(f, matrix, TILE)
     _, fetch_mark_matrix = row_io(f, matrix, MARK_TILE)
     scale = DISCRETIZATIONS[mode].scale
-    # beside its marks a thread keeps δ and the slope of softplus for its own tokens of the chunk
+    # besides its marks a thread keeps δ and the slope of softplus for its own tokens of the chunk
     at_steps = MARK // SUB * f.walks * f.held
     at_slopes = at_steps + MARK // f.rows
     own_size = at_slopes + MARK // f.rows + 4
-    # without outputs 168 registers do, which a compiler left alone exceeds or undercuts with spills
+    # without outputs 168 registers suffice; the compiler's own choice is more, or fewer with spills
     resident = 1 if read or f.walks > 1 else max(1, 3 * 128 // f.block)
     bounds = (f.block, resident) if resident > 1 else f.block
 
-    # a thread takes so many sums for dB and dC at a time
+    # sums for dB and dC that a thread takes at a time
     wanted = ("dB" in flags) + ("dC" in flags)
     every = wanted * g.tokens * f.width
     taken = max([v for v in (1, 2, 4) if f.width % v == 0 and every // v >= f.block] or [1])
@@ -165,7 +165,7 @@ def backward_kernel(
         p: Position, arena: arena_type, left: int,
         u_raw: raw, steps: elements, dout_raw: raw, z_raw: raw,
     ):  # fmt: skip
-        # values of a channel: operands of the walk; those of the gradients after it are returned
+        # values of a channel: operands of the walk; the gradients after it are returned
         inputs = elements()
         u = elements()
         for i in range(wp.static(g.count)):
@@ -307,7 +307,7 @@ def backward_kernel(
                 tile.left = end - t0
                 tile.mark = (t0 - chunk) / wp.static(SUB)
                 state = reverse(arena, own, tile, p, a, state, db_out, dc_out)
-                # their loads are on their way while the sums are completed
+                # their loads are in flight while the sums are completed
                 before = wp.max(t0 - wp.static(TILE), chunk)
                 ahead = before + p.row * wp.static(g.adjacent)
                 u_raw = fetch(u_in, u_at, ahead, end - 1)
@@ -353,7 +353,7 @@ def backward_kernel(
                     dskip += dys[i] * u[i]
                 sums += wp.vec2(dskip, dbias)
             sync()
-            # the chunk's sums join those of its run, which begin at 0 in memory
+            # the chunk's sums are added to its run's, which begin at 0 in memory
             run = p.run + back / RUN
             write_states(da_out, run, p, second_half(state) + read_states(da_out, run, p))
             state = join(first_half(state), vec())

@@ -4,7 +4,7 @@ A block holds adjacent channels of one group. For the recurrence a thread owns `
 ``states`` of them (an outer product, so that values from shared memory are used more than
 once), and ``lanes`` threads share a channel; for loads, stores and values of a channel,
 a thread owns one channel and every ``rows``-th token, so that a warp touches adjacent addresses.
-The loops are C++ in the files beside this one, for a CPU as well, where the tests run it.
+The loops are C++ in the files next to this one, for a CPU as well, where the tests run it.
 """
 
 import dataclasses
@@ -77,7 +77,7 @@ class BlockShape:
         return 32 // self.lanes if self.lanes > 1 else 0
 
     def text(self, file: str, **macros: object) -> str:
-        """C++ of a file beside this one for blocks of this shape."""
+        """C++ of a file in this folder, for blocks of this shape."""
         names = (*vars(self), "width", "padded", "slots", "span", "rows", "held", "pad")
         shape = {name.upper(): getattr(self, name) for name in names}
         return _HEAD + native(_HERE / file, **shape, **macros)
@@ -159,7 +159,7 @@ class Position:
 # Shared memory is one tile of floats that is addressed by plain offsets, because each assignment to
 # an element of a tile has a barrier.
 def offsets(parts: dict) -> tuple[dict, int]:
-    """Return the offsets of parts of so many floats in shared memory, and their sum."""
+    """Return the offsets in shared memory of parts of these sizes in floats, and their sum."""
     starts, size = {}, 0
     for name, count in parts.items():
         starts[name] = size
@@ -301,7 +301,7 @@ def channel_io(f: BlockShape, io: torch.dtype, tokens: int):
 
 @functools.cache
 def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
-    """As ``channel_io`` for a block's tile of B or C, ``[B, L, G, N]``; ``put_rows`` as floats."""
+    """``channel_io`` for a block's tile of B or C, ``[B, L, G, N]``; ``put_rows`` as floats."""
     scalar = WARP_DTYPES[io]
     size = tokens * f.padded
     count = -(-size // f.block)
@@ -338,7 +338,7 @@ def recurrence(
 ):
     """The recurrence over a tile, and for rules whose decays are not exponentials their product.
 
-    Equations are those of README.md. The operands of a tile are floats in shared memory, channels
+    Equations are README.md's. The operands of a tile are floats in shared memory, channels
     or states adjacent. Tokens past the end have δ = 0 and change nothing. Forward it is equation 1,
     and with ``read`` the sums of equation 5 as partial sums of the lanes; in reverse it is equation
     6, dh from after a tile to before it.

@@ -32,11 +32,11 @@ class Groups:
 
     @property
     def adjacent(self) -> int:
-        """Of these so many tokens are adjacent."""
+        """Number of adjacent tokens among them."""
         return min(self.most, self.count)
 
     def text(self, file: str, **macros: object) -> str:
-        """C++ of a file beside this one for these groups."""
+        """C++ of a file in this folder, for these groups."""
         sizes = {"COUNT": self.count, "ADJACENT": self.adjacent, "TOKENS": self.tokens}
         sizes |= {"STEP": self.step, "LANE_STRIDE": self.lane_stride}
         return self.shape.text(file, **sizes, **macros)
@@ -87,7 +87,7 @@ def group_io(g: Groups, io: torch.dtype):
 
 @functools.cache
 def row_io(f: BlockShape, io: torch.dtype, tokens: int):
-    """As ``group_io`` for a block's tile of B or C, ``[B, L, G, N]``; for ``blocks.matrix_io``."""
+    """``group_io`` for a block's tile of B or C, ``[B, L, G, N]``; for ``blocks.matrix_io``."""
     scalar = WARP_DTYPES[io]
     count = -(-tokens * f.padded // f.block)
     raw = wp.types.vector(count, wp.uint32)

@@ -55,7 +55,7 @@ return h;
 
 #elif LOAD_CHANNEL  // (x_in, p, t, left)
 // The bits of a thread's elements of a tile of [B, L, D], every ROWS-th token of its channel; 0
-// from ``left`` on. Bits: loads are on their way while the tile before is worked on, and converting
+// from ``left`` on. Bits: loads are in flight while the tile before is processed, and converting
 // would wait for them.
 const char* at = (char*)((ELEMENT*)x_in.data + p.d) + wide_(p.b, x_in.strides[0]);
 at += wide_(t, x_in.strides[1]);
@@ -89,7 +89,7 @@ at += wide_(t, x_out.strides[1]);
 *(ELEMENT*)at = (ELEMENT)v;
 
 #elif ORIGIN  // (x_in, b, d) or (x_in, b, g)
-// A place in device memory as one number: the compiler would otherwise find it again at each
+// An address in device memory as one number: the compiler would otherwise recompute it at each
 // access, from the tensor's address and two strides.
 const char* at = (const char*)FROM;
 unsigned long long r;
@@ -150,7 +150,7 @@ for (int k = 0; k < COUNT; ++k) x.c[k] = v[k];
 return x;
 
 #elif PUT || GET || SUM_LANES  // (arena, base, p, x)
-// A thread's elements of a tile in shared memory, ADJACENT tokens at a time; ``jump`` floats lie
+// A thread's elements of a tile in shared memory, ADJACENT tokens at a time, with ``jump`` floats
 // between four tokens.
 auto group_ = [&](int k, int jump) -> float* {
     return arena.data.ptr + base + ((k * ROWS + p.row) * ADJACENT) / 4 * jump
@@ -174,7 +174,7 @@ for (int k = 0; k < COUNT / ADJACENT; ++k) {
 }
 return x;
 #else
-// The lanes' sums, which lie ``[token / 4, channel of a slot, slot, 4]``.
+// The lanes' sums, in the layout ``[token / 4, channel of a slot, slot, 4]``.
 wp::vec_t<COUNT, float> x;
 WP_PRAGMA_UNROLL
 for (int k = 0; k < COUNT / ADJACENT; ++k) {

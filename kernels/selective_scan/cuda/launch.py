@@ -61,7 +61,7 @@ FORCED: Tuning | None = None  # overrides the choice, for tests and studies
 def choose(
     batch: int, length: int, channels: int, states: int, groups: int, multiprocessors: int
 ) -> Tuning:
-    """The tuning for a shape on a device of so many multiprocessors.
+    """The tuning for a shape on a device with that many multiprocessors.
 
     The model: a multiprocessor holds ``RESIDENT`` blocks at a time, and k blocks at once take
     k + 1/2 times as long as one would take at its full rate. P segments are walked (2 - 1/P) times
@@ -266,7 +266,7 @@ def saved_shape(x: Scan) -> tuple[int, ...]:
 
 
 def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
-    """Runs the scan on CUDA; results as those of the CPU's."""
+    """Runs the scan on CUDA; results as on the CPU."""
     x, options = scan
     read = x.C is not None
     o = _Operands(scan, x.initial_state, back=False)
@@ -290,7 +290,7 @@ def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
 def backward(
     dout: Tensor | None, dlast: Tensor | None, scan: Scan, saved: Tensor, needs: Inputs
 ) -> Inputs:
-    """Gradients of ``forward``; arguments and results as those of the CPU's."""
+    """Gradients of ``forward``; arguments and results as on the CPU."""
     x, options = scan
     o = _Operands(scan, dlast, back=True)
     read = dout is not None

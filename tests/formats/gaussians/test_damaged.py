@@ -87,7 +87,7 @@ def test_an_spz_with_a_false_count(sound, wrong):
 
 @pytest.mark.parametrize(
     "at, value, word",
-    [(4, 4, "version 4"), (4, 0, "version 0"), (12, 4, "degree 4"), (12, 0, "more follows")],
+    [(4, 4, "version 4"), (4, 0, "version 0"), (12, 4, "degree 4"), (12, 0, "more data follows")],
 )
 def test_an_spz_with_a_false_header(sound, at, value, word):
     path, data = sound("spz")
@@ -101,7 +101,7 @@ def test_an_spz_bomb_and_a_damaged_stream(sound):
     path, data = sound("spz")
     path.write_bytes(gzip.compress(gzip.decompress(data) + bytes(1 << 26), 9))
     tracemalloc.start()
-    refused(path, "more follows")
+    refused(path, "more data follows")
     assert tracemalloc.get_traced_memory()[1] < 5e6
     tracemalloc.stop()
     path.write_bytes(data[:-8] + b"\0\0\0\0" + data[-4:])
@@ -120,9 +120,9 @@ def test_an_spz_with_extensions_is_read(sound, tmp_path):
 @pytest.mark.parametrize(
     "old, new, word",
     [
-        (b"element chunk 2", b"element chunk 1", "false header"),
-        (b"element vertex 300", b"element vertex 900", "truncated or false header"),
-        (b"element sh 300", b"element sh 299", "false header"),
+        (b"element chunk 2", b"element chunk 1", "invalid header"),
+        (b"element vertex 300", b"element vertex 900", "truncated or invalid header"),
+        (b"element sh 300", b"element sh 299", "invalid header"),
         (b"uint packed_scale", b"int packed_scales", "packed_scale"),
         (b"float max_scale_y", b"float max_scale_q", "max_scale_y"),
         (b"uchar f_rest_8", b"uchar f_rest_9", "f_rest_8"),
@@ -226,13 +226,13 @@ CHANGES = {
     "packed": (lambda t, p: p["extensions"][NAME].update({"extensions": {"X_y": {}}}), "X_y"),
     "linear": (lambda t, p: p["extensions"][NAME].update({"colorSpace": "lin"}), "lin"),
     "triangles": (lambda t, p: p.update({"mode": 4}), "mode 4"),
-    "other counts": (lambda t, p: t["accessors"][3].update({"count": 9}), "false header"),
-    "other harmonics": (lambda t, p: t["accessors"][7].update({"count": 9}), "false header"),
-    "too many": (lambda t, p: t["accessors"][0].update({"count": 9999}), "truncated or false"),
-    "circle": (lambda t, p: t["nodes"][0].update({"children": [0]}), "circle"),
+    "other counts": (lambda t, p: t["accessors"][3].update({"count": 9}), "invalid header"),
+    "other harmonics": (lambda t, p: t["accessors"][7].update({"count": 9}), "invalid header"),
+    "too many": (lambda t, p: t["accessors"][0].update({"count": 9999}), "truncated or invalid"),
+    "circle": (lambda t, p: t["nodes"][0].update({"children": [0]}), "cycle"),
     "stretched": (lambda t, p: t["nodes"][0].update({"scale": [1, 2, 1]}), "stretches"),
     "mirrored": (lambda t, p: t["nodes"][0].update({"scale": [1, -1, 1]}), "stretches"),
-    "no extension": (lambda t, p: p.pop("extensions"), "no Gaussians in it"),
+    "no extension": (lambda t, p: p.pop("extensions"), "contains no Gaussians"),
 }
 
 

@@ -136,7 +136,7 @@ def test_refusals(tmp_path, kind):
     gaussians = some(degree=1)
     path, _ = written(tmp_path, gaussians, kind)
     before = path.read_bytes()
-    refused("a.*: not written, there is no Gaussian", written, tmp_path, some(0), kind)
+    refused("a.*: not written, there are no Gaussians", written, tmp_path, some(0), kind)
     for name, value in gaussians.tensors().items():
         bad = replace(gaussians, **{name: value.clone()})
         getattr(bad, name)[4] = float("nan")

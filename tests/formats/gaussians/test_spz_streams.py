@@ -129,7 +129,7 @@ def test_cut_short_anywhere(tmp_path, pack):
     data = container(two(), 2, 1, pack=pack, extensions=SAFE_ORBIT)
     for length in range(4, len(data)):
         refused(tmp_path / "a.spz", data[:length], "truncated")
-    refused(tmp_path / "a.spz", data + bytes(3), "false header")
+    refused(tmp_path / "a.spz", data + bytes(3), "invalid header")
 
 
 def sizes_with(number, packed=None, unpacked=None):

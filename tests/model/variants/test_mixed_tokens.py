@@ -54,7 +54,7 @@ def test_paper_sizes():
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"image_size": 12}, "mixed_tokens needs an even grid, not of 3²"),
+        ({"image_size": 12}, "mixed_tokens needs an even grid, not 3²"),
         ({"decoder": "rays"}, "mixed_tokens needs additive_image_tokens, and no decoder rays"),
         ({"additive_image_tokens": False}, "mixed_tokens needs additive_image_tokens"),
     ],

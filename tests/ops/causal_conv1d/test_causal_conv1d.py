@@ -166,7 +166,7 @@ def test_bad_options():
     inputs = make(2, 5, 6, 4)
     with pytest.raises(ValueError, match="activation is 'relu'"):
         causal_conv1d(**inputs, activation="relu")
-    with pytest.raises(ValueError, match="seq_idx is given beside states"):
+    with pytest.raises(ValueError, match="seq_idx and states are given"):
         causal_conv1d_fn(
             inputs["x"].transpose(1, 2),
             inputs["weight"],

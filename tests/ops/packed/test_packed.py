@@ -229,7 +229,7 @@ def test_pieces_cover_each_token_once():
 @pytest.mark.parametrize(
     "given, error, text",
     [
-        ({"cu_seqlens": [0, 4, 3, 7]}, ValueError, "falls from 4 to 3 at entry 2"),
+        ({"cu_seqlens": [0, 4, 3, 7]}, ValueError, "decreases from 4 to 3"),
         ({"cu_seqlens": [1, 7]}, ValueError, "goes from 1 to 7, must go from 0 to 7"),
         ({"cu_seqlens": [0, 6]}, ValueError, "goes from 0 to 6"),
         ({"cu_seqlens": []}, ValueError, r"shape \(0,\), must be \[S \+ 1\]"),
@@ -237,7 +237,7 @@ def test_pieces_cover_each_token_once():
         ({"cu_seqlens": "all"}, TypeError, "cu_seqlens is str"),
         ({"cu_seqlens": torch.tensor([0, 7]).to_sparse()}, TypeError, "cu_seqlens has layout"),
         ({"seq_idx": torch.zeros(1, 7).int().to_sparse()}, TypeError, "seq_idx has layout"),
-        ({"seq_idx": [[0, 0, 1, 1, 0, 2, 2]]}, ValueError, "row 0 comes back to 0"),
+        ({"seq_idx": [[0, 0, 1, 1, 0, 2, 2]]}, ValueError, "row 0 repeats 0"),
         ({"seq_idx": [[0, 1]]}, ValueError, r"shape \(1, 2\), must be \(1, 7\)"),
         ({"seq_idx": [[0] * 7], "cu_seqlens": [0, 7]}, ValueError, "allowed is one of them"),
     ],

@@ -90,7 +90,7 @@ def test_another_warp_has_no_team_and_says_so_once(monkeypatch, lacks):
     monkeypatch.setattr(launches, "_entries", {})
     monkeypatch.setattr(launches, "_parallel", launches._parallel)  # comes back after the test
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    with pytest.warns(RuntimeWarning, match="keeps launches in another form") as said:
+    with pytest.warns(RuntimeWarning, match="stores launches in another form") as said:
         got, want = mix(torch.randn(100), None)
     assert torch.equal(got, want) and len(said) == 1 and not has_team()
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Looks of surfaces, and textured meshes made of solids.
+"""Looks of surfaces, and textured meshes from solids.
 
 A *stamped* solid stores the rest position of each vertex (its *skin*) and the number of its look.
 Both survive booleans, turns and bends, so textures follow the parts as they were made.
@@ -184,7 +184,7 @@ def _normals(
 ) -> np.ndarray:
     """Unit normals ``[F, 3, 3]`` of corners: area-weighted means over the faces of a smooth patch.
 
-    A flat face beside a rounded edge thus stays flat, and slivers left by a cut have little effect.
+    A flat face at a rounded edge thus stays flat, and slivers left by a cut have little effect.
 
     Args:
         rough: ``[V, 3]`` normals, equal if a vertex's faces belong to one patch.

@@ -16,7 +16,7 @@ from gamba_warp.formats.meshes import TexturedMesh
 from .composition import composition
 from .looks import Maker, finished
 
-GROUP = "made"  # one group, so that all objects lie in one part of the split: train
+GROUP = "made"  # one group, so that all objects are in one part of the split: train
 ATTRIBUTION = {"creator": "made by gamba data made", "licence": "CC0 1.0", "source": ""}
 TURNED = 0.12  # share of objects that are turned about y by any angle
 

@@ -127,7 +127,7 @@ def ripple(
     """A solid displaced by a smooth random field.
 
     Args:
-        solid: with faces that are small beside ``length``.
+        solid: with faces that are small relative to ``length``.
         rng: random generator.
         height: typical displacement.
         length: wavelength of the field.

@@ -54,6 +54,6 @@ def _init_weights(
             nn.init.zeros_(module.bias)
     for name, weight in module.named_parameters() if rescale_prenorm_residual else ():
         if name in ("out_proj.weight", "fc2.weight"):
-            nn.init.kaiming_uniform_(weight, a=math.sqrt(5))  # afresh, as it is called repeatedly
+            nn.init.kaiming_uniform_(weight, a=math.sqrt(5))  # again, as it is called repeatedly
             with torch.no_grad():
                 weight /= math.sqrt(n_residuals_per_layer * n_layer)

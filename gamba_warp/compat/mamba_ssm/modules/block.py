@@ -12,7 +12,7 @@ from ..ops.triton.layer_norm import RMSNorm, layer_norm_fn
 
 
 class Block(nn.Module):
-    """Block of mamba-ssm 2; that of 1 is in ``mamba_simple``. Weights: ``norm``, ``mixer``; with
+    """Block of mamba-ssm 2; version 1 is in ``mamba_simple``. Weights: ``norm``, ``mixer``; with
     an MLP also ``norm2``, ``mlp``.
     """
 

@@ -58,7 +58,7 @@ class Mamba(nn.Module):
             device: of the weights.
             dtype: of the weights, except A_log and D, which are float32.
             bimamba_type: "none"; the forks' other layers run from their own files.
-            of_fork: none; those of forks are refused.
+            of_fork: none; the arguments of forks are refused.
 
         Raises:
             TypeError: an argument is one of a fork's layer, as ``bimamba`` and ``nslices`` are.
@@ -229,8 +229,8 @@ class Mamba(nn.Module):
         states = cache[self.layer_idx]
         if len(states[0]) != batch_size:
             raise ValueError(
-                f"hidden_states has a batch of {batch_size}, "
-                f"the cache of layer {self.layer_idx} one of {len(states[0])}"
+                f"hidden_states has batch size {batch_size}, "
+                f"the cache of layer {self.layer_idx} has {len(states[0])}"
             )
         return states
 

@@ -60,7 +60,7 @@ def mamba_inner_fn_no_out_proj(
         conv1d_weight: ``[D, 1, W]``, W from 2 to 4; ``conv1d_bias`` is ``[D]``, or None.
         x_proj_weight: ``[R + N + N, D]``: rows for the step, B and C; none for a given B or C.
         delta_proj_weight: ``[D, R]``; D and ``delta_bias`` are ``[D]``, or None for 0.
-        A: ``[D, N]`` float32, real. ``A_b`` is that of a second scan, added, from the last token
+        A: ``[D, N]`` float32, real. ``A_b`` belongs to a second scan, added, from the last token
             to the first, or None.
         B: ``[D, N]`` constant, or None: from the tokens, with ``B_proj_bias [N]`` added and an RMS
             norm with ``b_rms_weight [N]``, where these are given. C is as B; ``dt_rms_weight [D]``
@@ -83,7 +83,7 @@ def mamba_inner_fn_no_out_proj(
         unused |= {"C_proj_bias": C_proj_bias, "c_rms_weight": c_rms_weight}
     for name, value in unused.items():
         if value is not None:
-            raise ValueError(f"{name} is given; it has no use beside a constant {name[0].upper()}")
+            raise ValueError(f"{name} is given, must be None with a constant {name[0].upper()}")
     rows = rank + states * ((B is None) + (C is None))
     if x_proj_weight.shape[0] != rows:
         raise ValueError(f"x_proj_weight has {x_proj_weight.shape[0]} rows, must have {rows}")
@@ -124,7 +124,7 @@ def mamba_inner_fn(
 ) -> Tensor:  # fmt: skip
     """Run a Mamba block after its first projection: convolution, small projections, scan, output.
 
-    The arguments are those of ``mamba_inner_fn_no_out_proj``, with a last projection
+    The arguments are as in ``mamba_inner_fn_no_out_proj``, with a last projection
     ``out_proj_weight [M, D]`` and ``out_proj_bias [M]`` or None. Returns ``[B, L, M]``.
     """
     weights = conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight

@@ -32,7 +32,7 @@ def layer_norm_fn(
 
     Raises:
         TypeError: an argument is not a tensor.
-        ValueError: a shape is another, or ``rowscale`` is given beside ``x1``.
+        ValueError: a shape is wrong, or ``rowscale`` and ``x1`` are both given.
     """
     check_tensor("x", x, ("..", "D"))
     for name, value in {"residual": residual, "x1": x1}.items():
@@ -41,7 +41,7 @@ def layer_norm_fn(
         check_tensor(name, value, (x.shape[-1],), optional=name != "weight")
     check_tensor("rowscale", rowscale, tuple(x.shape[:-1]), optional=True)
     if rowscale is not None and x1 is not None:
-        raise ValueError("rowscale is given beside x1, allowed is one of them")
+        raise ValueError("rowscale and x1 are given, allowed is one of them")
     wide = torch.promote_types(x.dtype, torch.float32)
     total: Any = x.to(wide) if rowscale is None else x.to(wide) * rowscale[..., None]
     masks = []
