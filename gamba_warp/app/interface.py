@@ -77,6 +77,7 @@ def build(actions: Actions) -> gr.Blocks:
                     elem_id="examples",
                 )
                 with gr.Column(visible=False, elem_id="cut") as cut_part:
+                    note = gr.HTML(elem_id="note")
                     editor = gr.ImageEditor(
                         label="Cut-out",
                         type="numpy",
@@ -92,7 +93,6 @@ def build(actions: Actions) -> gr.Blocks:
                         buttons=[],
                         elem_id="editor",
                     )
-                    note = gr.HTML(elem_id="note")
                     choices, first = list(_BRUSHES), next(iter(_BRUSHES))
                     plain: dict[str, Any] = {"show_label": False, "container": False}
                     brush = gr.Radio(choices, value=first, elem_id="brush", **plain)
