@@ -355,6 +355,8 @@ def test_a_phone_and_a_small_frame_hold_all_buttons(viewer):
         boxes = [button.bounding_box() for button in page.query_selector_all("#bar button")]
         boxes = [box for box in boxes if box]
         assert len(boxes) >= 8
+        wide = "button => button.offsetParent && button.scrollWidth - button.clientWidth"
+        assert not any(page.locator("#bar button").evaluate_all(f"all => all.map({wide})"))
         for box in boxes:
             assert box["x"] >= 0 and box["x"] + box["width"] <= width
             assert box["y"] + box["height"] <= height
