@@ -100,7 +100,7 @@ class Actions:
         name = given.get("orig_name") or "picture"
         progress(0.2, "Looking for the object")
         try:
-            cut = self._main_thread.call(cut_picture, Path(given["path"]), name, self._ways)
+            cut = self._call(request, cut_picture, Path(given["path"]), name, self._ways)
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This picture cannot be used")
             return self.leave()
@@ -116,7 +116,7 @@ class Actions:
         if type(index) is not int or not 0 <= index < len(found):
             raise UserError(f"not one of the {len(found)} examples")
         path, title = found[index]
-        cut = self._main_thread.call(cut_picture, path, title, self._ways)
+        cut = self._call(request, cut_picture, path, title, self._ways)
         return *self._shown(cut, request), str(path)
 
     def mend(self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request) -> tuple:
@@ -149,7 +149,7 @@ class Actions:
         before = _given(cut)
         after = apply_strokes(before, _layers(painted))
         progress(0.1, "Running the network")
-        made = self._main_thread.call(work.solve, self._model, after, elevation)
+        made = self._call(request, work.solve, self._model, after, elevation)
         progress(0.8, "Making the viewer")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
@@ -174,13 +174,18 @@ class Actions:
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
             folder = self._new_folder(request)
             mesh = work.MeshChoice.of(faces, texture, watertight)
-            path, note = self._main_thread.call(work.write, made, kind, folder, self._device, mesh)
+            path, note = self._call(request, work.write, made, kind, folder, self._device, mesh)
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
             files = [*(old for old in older if old.name != path.name and old.is_file()), path]
             return (made, files), gr.update(value=[str(file) for file in files], visible=True)
 
         return with_page_errors(write)
+
+    def _call(self, request: gr.Request, function: Callable, *args: Any) -> Any:
+        """Call a function on the main thread, as long as the page is open."""
+        page = request.session_hash or ""
+        return self._main_thread.call(function, *args, wanted=lambda: self._files.is_active(page))
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
         note = f"<p>{html.escape(cut.note)}</p>"

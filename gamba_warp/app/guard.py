@@ -43,6 +43,7 @@ POLICY = (
     "form-action 'self'; frame-ancestors 'self'"
 )
 VISITOR = "gamba.visitor"  # key in the scope of an accepted request
+_PAGE = "gamba.page"  # of a request that lasts as long as a page or its calls: the session
 _HEADERS = (
     (b"content-security-policy", POLICY.encode()),
     (b"referrer-policy", b"no-referrer"),
@@ -232,7 +233,8 @@ class Guard:
             if path == _JOIN:  # the page shows the detail of a call's answer
                 line, kind = msgspec.json.encode({"detail": line}).decode(), "application/json"
             answer = Response(f"{line}\n", error.status_code, media_type=kind)
-        await answer(scope, read, guarded)
+        with self._files.visited(scope.get(_PAGE, "")):
+            await answer(scope, read, guarded)
 
     def _check_read(self, scope: Message, visitor: str | None) -> None:
         """Allow only the visitor's own files; append the visitor to the session."""
@@ -247,6 +249,8 @@ class Guard:
                 raise HTTPException(403, _NO_COOKIE)
             if path != _DATA:
                 scope["path"] += visitor
+            asked_by = asked.decode("latin-1") if path == _DATA else path
+            scope[_PAGE] = re.split("[/=]", asked_by)[-1] + visitor
         scope["query_string"] = b""
         if visitor and _SESSION.fullmatch(asked):
             scope["query_string"] = asked + visitor.encode()

@@ -2,6 +2,7 @@
 
 import signal
 import socket
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from gamba_warp.app.cutting import examples
 from gamba_warp.app.work import KINDS
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
+ZIP = MAKE + 2 + 2 * list(KINDS).index("zip")
 AREAS = MAKE + 2 + 2 * len(KINDS)  # after the two functions of each kind of file
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
@@ -221,6 +223,27 @@ def test_a_page_that_is_open_is_heard_of(served, program):
     answer, status = raw(served, place, host, cookie)
     assert status == 200
     assert "data: ALIVE\n" in iter(lambda: answer.readline().decode(), "")
+
+
+def test_the_job_of_a_closed_page_ends(served, program, private):
+    """The next visitor does not wait until all files of the one who left are written."""
+    picture = Image.new("RGB", (200, 200), "white")
+    picture.paste((200, 30, 20), (50, 50, 150, 150))
+    program.result(TAKE, [given(program.upload(bytes_of(picture)))])
+    assert "data" in program.result(MAKE, [None, None, 0])
+    assert program.join(ZIP, [None, "200,000 faces", "Texture 2048", True]).status == 200
+    cookie, host = f"Cookie: {program.headers['Cookie']}", f"Host: {served.host}"
+    place = f"GET /gradio_api/queue/data?session_hash={program.session} HTTP/1.1"
+    answer, _ = raw(served, place, host, cookie)
+    assert "process_starts" in next(
+        line for line in map(bytes.decode, answer) if "process_" in line
+    )
+    time.sleep(3)  # it is in the middle
+    answer.close()
+    other = Program(served.host).opened()
+    started = time.monotonic()
+    assert "data" in other.result(TAKE, [given(other.upload(private.read_bytes()))])
+    assert time.monotonic() - started < 20
 
 
 def test_half_sent_requests_stop_nothing(served, program):
