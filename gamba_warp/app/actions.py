@@ -20,6 +20,7 @@ from .cutting import (
     cut_picture,
     editor_picture,
     examples,
+    note_of,
     read_strokes,
     reset_mask,
     switch_areas,
@@ -122,12 +123,12 @@ class Actions:
     def mend(self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request) -> tuple:
         """Apply the strokes to the mask."""
         cut = apply_strokes(_given(cut), _layers(painted))
-        return cut, self._editor(cut, request)
+        return self._edited(cut, request)
 
     def restart(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Reset the mask, without strokes."""
         cut = reset_mask(_given(cut))
-        return cut, self._editor(cut, request)
+        return self._edited(cut, request)
 
     def areas(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Clear the enclosed areas of a plain background's colour, or fill them."""
@@ -135,7 +136,7 @@ class Actions:
         if not cut.areas.any():
             raise UserError("the object encloses no area of a plain background's colour")
         cut = switch_areas(cut)
-        return cut, self._editor(cut, request)
+        return self._edited(cut, request)
 
     def make(
         self,
@@ -153,9 +154,9 @@ class Actions:
         progress(0.8, "Making the viewer")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
-        editor = gr.skip() if after is before else self._editor(after, request)
+        edited = (gr.skip(),) * 3 if after is before else self._edited(after, request)
         files = gr.update(value=None, visible=False)
-        return after, editor, (made, []), frame, gr.update(visible=True), files
+        return *edited, (made, []), frame, gr.update(visible=True), files
 
     def writer(self, kind: str) -> Callable:
         """Return the handler that writes files of one kind, and adds them to the list."""
@@ -188,8 +189,12 @@ class Actions:
         return self._main_thread.call(function, *args, wanted=lambda: self._files.is_active(page))
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
-        note = f"<p>{html.escape(cut.note)}</p>"
-        return cut, gr.update(visible=True), self._editor(cut, request), note
+        cut, *edited = self._edited(cut, request)
+        return cut, gr.update(visible=True), *edited
+
+    def _edited(self, cut: Cut, request: gr.Request) -> tuple:
+        note = html.escape(self._call(request, note_of, cut))
+        return cut, self._editor(cut, request), f"<p>{note}</p>"
 
     def _new_folder(self, request: gr.Request) -> Path:
         inner = request.request

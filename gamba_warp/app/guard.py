@@ -58,7 +58,7 @@ _NO_COOKIE = "open the page first; it needs its cookie"
 _SESSION = re.compile(b"session_hash=[a-z0-9]{1,32}")  # the only allowed query
 # All paths that the page reads; gradio itself serves eighty.
 _READ = re.compile(
-    "/|/theme[.]css|/favicon[.]ico|/(assets|static)/.*|/gradio_api/(file=.*|heartbeat/[a-z0-9]+"
+    "/|/theme[.]css|/favicon[.]ico|/manifest[.]json|/(assets|static)/.*|/gradio_api/(file=.*|heartbeat/[a-z0-9]+"
     "|queue/data|upload_progress)",
     re.DOTALL,
 )
@@ -207,6 +207,8 @@ class Guard:
                     cookie = f"{_COOKIE}={secrets.token_hex(16)}; HttpOnly; SameSite=Lax; Path=/"
                     more.append((b"set-cookie", cookie.encode()))
                 self._check_read(scope, visitor)
+                if path == "/manifest.json":  # gradio has one for pages that are installed only
+                    answer = Response("{}", media_type="application/manifest+json")
                 if path == _PROGRESS:
                     answer = Response('data: {"msg": "done"}\n\n', media_type="text/event-stream")
             elif request.method != "POST" or path not in (_UPLOAD, _JOIN):

@@ -145,19 +145,19 @@ def build(actions: Actions) -> gr.Blocks:
         # loaded its new picture.
         quick = {**one, "show_progress": "hidden"}
         taking = {**one, "show_progress_on": picture}
-        shown, mask = [cut, cut_part, editor, note, picture], [cut, editor]
+        shown, mask = [cut, cut_part, editor, note, picture], [cut, editor, note]
         # (The event ``input`` sends the old picture when it is cleared.)
         picture.upload(actions.take, picture, shown, **taking)
         picture.clear(actions.leave, None, shown, **quick)
         gallery.select(actions.example, None, shown, **taking)
         # Has its own queue, so that it waits for no other event.
         brush.change(_painting, brush, editor, **{**quick, "concurrency_id": "brush"})
-        mend.click(actions.mend, mask, mask, **quick)
+        mend.click(actions.mend, mask[:2], mask, **quick)
         restart.click(actions.restart, cut, mask, **quick)
         make.click(
             actions.make,
             [cut, editor, elevation],
-            [cut, editor, made, stage, files_part, made_files],
+            [*mask, made, stage, files_part, made_files],
             show_progress_on=stage,
             **one,
         )

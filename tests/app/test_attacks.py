@@ -61,7 +61,10 @@ def test_a_program_that_does_as_the_page_does(program, private):
     assert program.ask(f"/gradio_api/file={shown}").status == 200
     layer = Image.new("RGBA", (720, 720), (0, 0, 255, 255))
     painted = {"layers": [given(program.upload(bytes_of(layer)))], "background": {"path": "/"}}
-    after = program.result(MEND, [None, painted])["data"][1]["background"]["path"]
+    _, editor, note = program.result(MEND, [None, painted])["data"]
+    assert "edited" in note and "touches the picture" in note
+    after = editor["background"]["path"]
+    assert program.ask("/manifest.json").body == b"{}"  # the page links it
     assert Path(after).read_bytes() != Path(shown).read_bytes()
 
 
@@ -270,7 +273,7 @@ def test_what_is_closed(served, program):
     for route in (
         *("docs", "redoc", "openapi.json", "gradio_api/openapi.json", "gradio_api/info", "config"),
         *("monitoring", "monitoring/summary", "gradio_api/app_id", "gradio_api/proxy=http://a/"),
-        *("gradio_api/file", "gradio_api/runs", "gradio_api/queue/status", "manifest.json"),
+        *("gradio_api/file", "gradio_api/runs", "gradio_api/queue/status"),
         *("gradio_api/call/take/1", "gradio_api/vibe-code", "gradio_api/deep_link", "nothing"),
     ):
         answer = program.ask(f"/{route}")
