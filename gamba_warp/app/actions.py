@@ -31,7 +31,7 @@ from .visitor_files import VisitorFiles
 
 if TYPE_CHECKING:
     from ..model.gamba import Gamba
-    from ..photo.cutout import Ways
+    from ..photo.cutout import CutoutOptions
 
 _FRAME = (
     '<iframe class="stage" title="3D view of {name}" sandbox="allow-scripts allow-downloads" '
@@ -72,21 +72,34 @@ class Actions:
 
     Args:
         model: the network.
-        ways: options of the cut-out.
+        options: options of the cut-out.
         files: store of the visitors' files.
         device: device that renders.
         main_thread: runs all computations.
     """
 
     def __init__(
-        self, model: Gamba, ways: Ways, files: VisitorFiles, device: str, main_thread: MainThread
+        self,
+        model: Gamba,
+        options: CutoutOptions,
+        files: VisitorFiles,
+        device: str,
+        main_thread: MainThread,
     ) -> None:
         self._main_thread = main_thread
         self._model = model
-        self._ways = ways
+        self._options = options
         self._files = files
         self._device = device
-        for name in ("take", "leave", "example", "mend", "restart", "areas", "make"):
+        for name in (
+            "take",
+            "end_session",
+            "load_example",
+            "apply_strokes",
+            "restart",
+            "toggle_holes",
+            "reconstruct",
+        ):
             setattr(self, name, with_page_errors(getattr(self, name)))
 
     def take(
@@ -97,30 +110,32 @@ class Actions:
     ) -> tuple:
         """Take a dropped or pasted picture; the guard has checked its owner."""
         if not given or not given.get("path"):
-            return self.leave()
+            return self.end_session()
         name = given.get("orig_name") or "picture"
         progress(0.2, "Looking for the object")
         try:
-            cut = self._call(request, cut_picture, Path(given["path"]), name, self._ways)
+            cut = self._call(request, cut_picture, Path(given["path"]), name, self._options)
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This picture cannot be used")
-            return self.leave()
+            return self.end_session()
         return *self._shown(cut, request), gr.skip()
 
-    def leave(self) -> tuple:
+    def end_session(self) -> tuple:
         """Clear the picture; its results stay."""
         return None, gr.update(visible=False), None, "", None
 
-    def example(self, event: gr.EventData, request: gr.Request) -> tuple:
+    def load_example(self, event: gr.EventData, request: gr.Request) -> tuple:
         """Take an example of the gallery."""
         found, index = examples(), event._data["index"]
         if type(index) is not int or not 0 <= index < len(found):
             raise UserError(f"not one of the {len(found)} examples")
         path, title = found[index]
-        cut = self._call(request, cut_picture, path, title, self._ways)
+        cut = self._call(request, cut_picture, path, title, self._options)
         return *self._shown(cut, request), str(path)
 
-    def mend(self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request) -> tuple:
+    def apply_strokes(
+        self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request
+    ) -> tuple:
         """Apply the strokes to the mask."""
         cut = apply_strokes(_given(cut), _layers(painted))
         return self._edited(cut, request)
@@ -130,7 +145,7 @@ class Actions:
         cut = reset_mask(_given(cut))
         return self._edited(cut, request)
 
-    def areas(self, cut: Cut | None, request: gr.Request) -> tuple:
+    def toggle_holes(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Clear the enclosed areas of a plain background's colour, or fill them."""
         cut = _given(cut)
         if not cut.areas.any():
@@ -138,7 +153,7 @@ class Actions:
         cut = switch_areas(cut)
         return self._edited(cut, request)
 
-    def make(
+    def reconstruct(
         self,
         cut: Cut | None,
         painted: dict[str, Any] | None,
@@ -150,7 +165,7 @@ class Actions:
         before = _given(cut)
         after = apply_strokes(before, _layers(painted))
         progress(0.1, "Running the network")
-        made = self._call(request, work.solve, self._model, after, elevation)
+        made = self._call(request, work.run_model, self._model, after, elevation)
         progress(0.8, "Making the viewer")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)

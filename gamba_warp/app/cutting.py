@@ -15,7 +15,7 @@ from ..errors import UserError
 from ..files import STARTER
 
 if TYPE_CHECKING:
-    from ..photo.cutout import Ways
+    from ..photo.cutout import CutoutOptions
 
 
 SIDE = 720  # longer side of the editor's picture, pixels
@@ -55,13 +55,13 @@ class Cut:
     areas: np.ndarray
 
 
-def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
+def cut_picture(path: Path, name: str, options: CutoutOptions) -> Cut:
     """Read a picture and find its object; the mask is empty if none is found.
 
     Args:
         path: an untrusted file.
         name: the visitor's name of it.
-        ways: options of the cut-out.
+        options: options of the cut-out.
 
     Raises:
         UserError: the picture cannot be read; the message has the visitor's name.
@@ -76,7 +76,7 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
         shown = name if len(name) <= 60 else f"{name[:40]}...{name[-15:]}"
         raise UserError(str(error).replace(str(path), shown)) from error
     try:
-        cut = cut_out(path, ways)
+        cut = cut_out(path, options)
     except UserError as error:  # the picture is valid, so the object can be painted by hand
         reason = str(error).removeprefix(f"{path}: ")
         mask = np.zeros(rgba.shape[:2], np.float32)

@@ -148,14 +148,14 @@ def build(actions: Actions) -> gr.Blocks:
         shown, mask = [cut, cut_part, editor, note, picture], [cut, editor, note]
         # (The event ``input`` sends the old picture when it is cleared.)
         picture.upload(actions.take, picture, shown, **taking)
-        picture.clear(actions.leave, None, shown, **quick)
-        gallery.select(actions.example, None, shown, **taking)
+        picture.clear(actions.end_session, None, shown, **quick)
+        gallery.select(actions.load_example, None, shown, **taking)
         # Has its own queue, so that it waits for no other event.
         brush.change(_painting, brush, editor, **{**quick, "concurrency_id": "brush"})
-        mend.click(actions.mend, mask[:2], mask, **quick)
+        mend.click(actions.apply_strokes, mask[:2], mask, **quick)
         restart.click(actions.restart, cut, mask, **quick)
         make.click(
-            actions.make,
+            actions.reconstruct,
             [cut, editor, elevation],
             [*mask, made, stage, files_part, made_files],
             show_progress_on=stage,
@@ -171,7 +171,7 @@ def build(actions: Actions) -> gr.Blocks:
                 **one,
             )
             written.success(None, made_files, None, js=_FETCH, api_visibility="private")
-        areas.click(actions.areas, cut, mask, **quick)
+        areas.click(actions.toggle_holes, cut, mask, **quick)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
 

@@ -63,10 +63,10 @@ def app_command(
         print("loading the model", flush=True)
         from ..devices import pick_device
         from ..model.checkpoint import load_model
-        from ..photo.cutout import Ways
+        from ..photo.cutout import CutoutOptions
 
         chosen = pick_device(device)
-        ways = Ways(matte_model=matte_model, device=chosen).checked()
+        options = CutoutOptions(matte_model=matte_model, device=chosen).checked()
         model = load_model(checkpoint, chosen, encoder_weights)
         print("loading the page's libraries", flush=True)
         configure_gradio(folder)
@@ -75,7 +75,7 @@ def app_command(
 
         main_thread = MainThread()
         files = VisitorFiles(folder, per_visitor=max(MAX_PER_VISITOR, max_upload_mb << 20))
-        page = build(Actions(model, ways, files, str(chosen), main_thread))
+        page = build(Actions(model, options, files, str(chosen), main_thread))
         serve(page, files, listening, max_upload_mb, open_browser, main_thread)
 
 

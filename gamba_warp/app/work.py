@@ -73,7 +73,7 @@ class Reconstruction:
     seconds: float
 
 
-def solve(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
+def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
     """Run one forward pass.
 
     Args:

@@ -89,7 +89,7 @@ def reconstruct_command(
     from ..pages.card import about_model
     from ..pages.export import Outputs, write_outputs
     from ..pages.sheet import Sheet
-    from ..photo.cutout import Ways, cut_out
+    from ..photo.cutout import CutoutOptions, cut_out
 
     pictures, failures = _find_pictures(images, mask, recursive)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
@@ -116,8 +116,10 @@ def reconstruct_command(
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     checked_detail(detail, model.config, 0)  # before any cut-out
-    ways = Ways(mask, matte_model, sam, recenter, chosen, cutout=cutout, keep_holes=keep_holes)
-    ways.checked()
+    options = CutoutOptions(
+        mask, matte_model, sam, recenter, chosen, cutout=cutout, keep_holes=keep_holes
+    )
+    options.checked()
     output_folder(files.out)
     targets = [files.out / (name + suffix) for name in names for suffix in outputs.suffixes()]
     if older := sum(target.exists() for target in targets):
@@ -126,7 +128,7 @@ def reconstruct_command(
 
     def one(name: str, path: Path) -> None:
         STAGES.begin("cutting out")
-        cut = cut_out(path, ways)
+        cut = cut_out(path, options)
         say(f"{places[name] if len(names) > 1 else ''}{path}: {cut.how}")
         if cut.warning:
             warn(path, [f"{cut.warning} --save-inputs writes the cut-out for a picture editor."])

@@ -50,9 +50,9 @@ def reconstruct(
     """
     rgba = picture
     if not isinstance(rgba, np.ndarray):
-        from ..photo.cutout import Ways, cut_out
+        from ..photo.cutout import CutoutOptions, cut_out
 
-        rgba = cut_out(rgba, Ways(fetch=False)).rgba
+        rgba = cut_out(rgba, CutoutOptions(fetch=False)).rgba
     if rgba.ndim != 3 or rgba.shape[0] != rgba.shape[1] or rgba.shape[2] != 4:
         raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config

@@ -61,13 +61,15 @@ _UNSURE = 0.4  # largest share of alpha's sum in pixels that are neither object 
 # A result is doubted if the object
 _BORDER = 0.02  # covers more than this share of the picture's border,
 _PART = 0.15  # has further parts of at least this share of its largest,
-_ALIKE = 0.06  # differs by less than this from the background beside it
-_ALIKE_SHARE = 0.3  # along more than this share of its outline,
-_VAGUE = 0.03  # has more than this share of its alpha in wide areas that are neither 0 nor 1
+_MIN_EDGE_CONTRAST = 0.06  # differs by less than this from the background beside it
+_MAX_WEAK_SHARE = 0.3  # along more than this share of its outline,
+_MAX_SOFT_SHARE = (
+    0.03  # has more than this share of its alpha in wide areas that are neither 0 nor 1
+)
 
 _LIKE_GROUND = "it is coloured like the background: parts may be lost, or enclosed background kept"
 
-_BESIDE = 360  # longer side of each picture of ``CutOut.beside``
+_PREVIEW_SIDE = 360  # longer side of each picture of ``CutOut.beside``
 _HAZE = 0.1  # lower alpha is set to 0
 _OPAQUE = 0.5  # a warning is given if alpha is lower everywhere
 # An object of a smaller longer side in the reduced picture is cut from the whole one.
@@ -77,7 +79,7 @@ _FEW_PIXELS = 128  # longer side of an object, below which a result is blurred
 
 
 @dataclass
-class Ways:
+class CutoutOptions:
     """Options and loaded models of the cut-out, shared by all pictures of a command.
 
     Attributes:
@@ -89,7 +91,7 @@ class Ways:
             its frame, padded to a square.
         device: device of Segment Anything; the matting model runs on the CPU.
         fetch: allow fetching a matting model.
-        say: called with a line before anything is fetched, and if the matting model is missing.
+        notify: called with a line before anything is fetched, and if the matting model is missing.
         cutout: the only method to use; auto: the first that finds an object.
         keep_holes: keep enclosed areas of a plain background's colour.
     """
@@ -100,14 +102,14 @@ class Ways:
     recenter: bool = True
     device: str | torch.device = "cpu"
     fetch: bool = True
-    say: Callable[[str], None] = to_stderr
+    notify: Callable[[str], None] = to_stderr
     cutout: Cutout = "auto"
     keep_holes: bool = False
     _segmenter: SamSegmenter | None = field(default=None, init=False, repr=False)
     _matte: Matte | None = field(default=None, init=False, repr=False)
     _no_matte: bool = field(default=False, init=False, repr=False)
 
-    def checked(self) -> Ways:
+    def checked(self) -> CutoutOptions:
         """Open the given files, so that errors come before any picture; return ``self``.
 
         Raises:
@@ -127,7 +129,7 @@ class Ways:
 
     @property
     def without_network(self) -> bool:
-        """True once the matting model was found to be unavailable, which ``say`` has reported."""
+        """True once the matting model was found to be unavailable, which ``notify`` has reported."""
         return self._no_matte
 
     def segmenter(self) -> SamSegmenter | None:
@@ -137,13 +139,13 @@ class Ways:
         return self._segmenter
 
     def matte(self) -> Matte | None:
-        """Return the matting model, opened once; None if unavailable, reported by ``say``."""
+        """Return the matting model, opened once; None if unavailable, reported by ``notify``."""
         if self._matte is None and not self._no_matte:
             try:
-                self._matte = Matte(self.matte_model, self.fetch, self.say)
+                self._matte = Matte(self.matte_model, self.fetch, self.notify)
             except NoMatte as error:
                 self._no_matte = True
-                self.say(str(error))
+                self.notify(str(error))
         return self._matte
 
 
@@ -153,7 +155,7 @@ class CutOut:
 
     Attributes:
         rgba: ``[S, S, 4]`` float32 in [0, 1]: the object in the middle, its longer side
-            ``0.8 · S``; without ``Ways.recenter`` at its place.
+            ``0.8 · S``; without ``CutoutOptions.recenter`` at its place.
         method: of the cut-out.
         how: the method in a sentence.
         source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels per side.
@@ -182,7 +184,7 @@ class CutOut:
         """Return the picture beside its cut-out on grey, ``[H, 2 W, 3]``."""
         whole = np.ones_like(self.editable[..., :1])
         both = np.dstack([self.source_rgb, whole]), self.editable
-        small = np.hstack([shrink(half, _BESIDE) for half in both])
+        small = np.hstack([shrink(half, _PREVIEW_SIDE) for half in both])
         return over_background(small, GREY)
 
 
@@ -197,7 +199,7 @@ class _Found(NamedTuple):
     doubt: str = ""
 
 
-def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
+def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     """Read a picture and cut its object out.
 
     A given mask comes first; then the picture's own transparency, Segment Anything or a matting
@@ -206,28 +208,30 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
 
     Args:
         path: any picture that ``load_rgba`` reads.
-        ways: options.
+        options: options.
 
     Raises:
-        UserError: the picture or a file of ``ways`` cannot be read, or no method finds an object.
-        ModuleNotFoundError: a library for a file of ``ways`` is not installed.
+        UserError: the picture or a file of ``options`` cannot be read, or no method finds an object.
+        ModuleNotFoundError: a library for a file of ``options`` is not installed.
     """
-    ways = Ways() if ways is None else ways
-    rgba = load_rgba(path, WORKING_SIZE, ways.say)
+    options = CutoutOptions() if options is None else options
+    rgba = load_rgba(path, WORKING_SIZE, options.notify)
     method: Method | None = None
-    if ways.mask is not None:
-        rgba[..., 3] = read_mask(ways.mask, path)
+    if options.mask is not None:
+        rgba[..., 3] = read_mask(options.mask, path)
         method = "mask"
-    elif ways.cutout == "none":
+    elif options.cutout == "none":
         rgba[..., 3] = 1
         method = "none"
-    elif ways.cutout in ("auto", "alpha") and has_alpha(rgba, ways.cutout == "alpha"):
+    elif options.cutout in ("auto", "alpha") and has_alpha(rgba, options.cutout == "alpha"):
         method = "alpha"
-    elif ways.cutout == "alpha":
+    elif options.cutout == "alpha":
         raise UserError(f"{path}: has no transparency, which --cutout alpha uses")
-    few = method is None and ways.cutout == "auto" and has_alpha(rgba, any_share=True)
+    few = method is None and options.cutout == "auto" and has_alpha(rgba, any_share=True)
     if few:
-        ways.say(f"{path}: its few transparent pixels are no cut-out (--cutout alpha takes them)")
+        options.notify(
+            f"{path}: its few transparent pixels are no cut-out (--cutout alpha takes them)"
+        )
     whole, rgba = rgba, shrink(rgba, WORKING_SIZE)
     source, fringe = rgba[..., :3].copy(), None
     if method == "alpha":
@@ -237,27 +241,27 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     found = None if method is None else _Found(method, rgba)
     if found is None:
         try:
-            found = _cut_by_methods(path, source, ways)
+            found = _cut_by_methods(path, source, options)
         except UserError:
             if not few:
                 raise
     if found is None or few and not found.rgba[..., 3].any():
         found = _Found("alpha", rgba)  # the object may well fill the picture
     method, rgba = found.method, found.rgba
-    close = _at_own_pixels(path, whole, found, ways) if ways.recenter else rgba
+    close = _at_own_pixels(path, whole, found, options) if options.recenter else rgba
     try:
-        centred = recenter(close, BORDER_RATIO if ways.recenter else None)
+        centred = recenter(close, BORDER_RATIO if options.recenter else None)
     except ValueError as error:
-        raise UserError(f"{ways.mask or path}: {error}") from error
-    model = ways.matte() if method == "matte" else None
+        raise UserError(f"{options.mask or path}: {error}") from error
+    model = options.matte() if method == "matte" else None
     how = _HOW[method].format(
-        mask=Path(ways.mask or "").name,
+        mask=Path(options.mask or "").name,
         model=model and model.path.name,
         holes=found.holes,
         why=found.why,
         fringe=f", without the {fringe} mixed into its edge" if fringe else "",
     )
-    if ways.recenter and (pixels := round((1 - BORDER_RATIO) * len(centred))) < _FEW_PIXELS:
+    if options.recenter and (pixels := round((1 - BORDER_RATIO) * len(centred))) < _FEW_PIXELS:
         how += f" Its longer side has {pixels} pixels, so the result is blurred."
     if (most := rgba[..., 3].max()) < _OPAQUE:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
@@ -268,7 +272,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
         doubts.append("colours alone fail for more than half of photographs")
     if doubts:
         warning = f"The cut-out may be wrong: {'; '.join(doubts)}."
-        if method in ("plain", "grabcut") and not ways.without_network:
+        if method in ("plain", "grabcut") and not options.without_network:
             best = models.PUBLISHED[0]
             about = f"{best.name}, {best.megabytes} MB, {best.licence}, fetched once"
             warning += f" Try a network: gamba reconstruct --cutout matte ({about})."
@@ -278,14 +282,16 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     return CutOut(centred, method, how, source, rgba[..., 3], editable, warning, areas)
 
 
-def _at_own_pixels(path: str | Path, whole: np.ndarray, found: _Found, ways: Ways) -> np.ndarray:
+def _at_own_pixels(
+    path: str | Path, whole: np.ndarray, found: _Found, options: CutoutOptions
+) -> np.ndarray:
     """Return an object that is small in the reduced picture as it is in the whole one.
 
     Args:
         path: named in errors.
         whole: ``[H, W, 4]``, the picture with its alpha or the mask's.
         found: its cut-out in the reduced picture.
-        ways: options.
+        options: options.
 
     Returns:
         ``[h, w, 4]``, the object and what is around it; or the reduced picture's.
@@ -312,7 +318,7 @@ def _at_own_pixels(path: str | Path, whole: np.ndarray, found: _Found, ways: Way
     if found.method == "none":
         return part
     alpha = resize_rgba(small, *part.shape[:2])[..., 3]
-    same = copy.copy(ways)  # with its opened networks
+    same = copy.copy(options)  # with its opened networks
     same.cutout = "matte" if found.method == "sam" else found.method
     try:
         again = _cut_by_methods(path, part[..., :3], same).rgba
@@ -325,38 +331,38 @@ def _at_own_pixels(path: str | Path, whole: np.ndarray, found: _Found, ways: Way
     return _blended(part[..., :3], alpha)
 
 
-def _methods(ways: Ways) -> list[Method]:
+def _methods(options: CutoutOptions) -> list[Method]:
     """Return the methods to try, in order: networks that are here come before colours."""
-    networks: list[Method] = ["matte"] if ways.sam is None else ["sam", "matte"]
-    if ways.cutout == "matte":
-        return networks if ways.sam is None or ways.matte_model is not None else ["sam"]
-    if ways.cutout == "plain" or ways.cutout == "grabcut":
-        return [ways.cutout]
+    networks: list[Method] = ["matte"] if options.sam is None else ["sam", "matte"]
+    if options.cutout == "matte":
+        return networks if options.sam is None or options.matte_model is not None else ["sam"]
+    if options.cutout == "plain" or options.cutout == "grabcut":
+        return [options.cutout]
     here = find_spec("onnxruntime") is not None and models.cached() is not None
-    if ways.sam is not None or ways.matte_model is not None or here:
+    if options.sam is not None or options.matte_model is not None or here:
         return [*networks, "plain", "grabcut"]
     return ["plain", "matte", "grabcut"]
 
 
-def _cut_by_methods(path: str | Path, rgb: np.ndarray, ways: Ways) -> _Found:
+def _cut_by_methods(path: str | Path, rgb: np.ndarray, options: CutoutOptions) -> _Found:
     """Return the result of the first successful method, with the failures of earlier ones."""
     reasons: list[str] = []
-    for method in _methods(ways):
+    for method in _methods(options):
         why = f" ({'; '.join(reasons)})" if reasons else ""
         if method == "plain":
             if find_spec("skimage") is not None:
                 from .plain import plain_matte
 
-                if (plain := plain_matte(rgb, ways.keep_holes)) is not None:
+                if (plain := plain_matte(rgb, options.keep_holes)) is not None:
                     holes = counted(len(plain.holes), "enclosed area")
                     said = f", with {holes} of it (--keep-holes keeps them)" if plain.holes else ""
                     doubt = _LIKE_GROUND if plain.alike else ""
                     return _Found("plain", plain.rgba, plain.areas, said, why, doubt)
-            if ways.cutout == "plain":
+            if options.cutout == "plain":
                 reasons.append("its border is not plain")
             continue
         try:
-            cut = {"sam": ways.segmenter, "matte": ways.matte}.get(method, lambda: grabcut)()
+            cut = {"sam": options.segmenter, "matte": options.matte}.get(method, lambda: grabcut)()
             alpha = None if cut is None else cut(rgb)
         except NoMatte as error:
             reasons.append(str(error))
@@ -395,12 +401,16 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
     grown = torch.nn.functional.max_pool2d(planes, 3, 1, 1)[0, 0].numpy() > 0.5
     outline = grown & ~inside
     ours, theirs = (x[0].permute(1, 2, 0).numpy() for x in local_colors(rgb, alpha, 3))
-    alike = (np.abs(ours - theirs).max(-1)[outline] < _ALIKE).mean() if outline.any() else 0.0
-    if alike > _ALIKE_SHARE:
+    alike = (
+        (np.abs(ours - theirs).max(-1)[outline] < _MIN_EDGE_CONTRAST).mean()
+        if outline.any()
+        else 0.0
+    )
+    if alike > _MAX_WEAK_SHARE:
         found.append(f"along {alike:.0%} of its outline it looks like the background")
     unsure = ((planes > 0.1) & (planes < 0.9)).float()
     wide = -torch.nn.functional.max_pool2d(-unsure, 5, 1, 2)
-    if float((wide * planes).sum()) > _VAGUE * float(planes.sum()):
+    if float((wide * planes).sum()) > _MAX_SOFT_SHARE * float(planes.sum()):
         found.append("parts of it are half transparent")
     return found
 

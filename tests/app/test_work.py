@@ -19,7 +19,7 @@ from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import load_model
-from gamba_warp.photo.cutout import Ways
+from gamba_warp.photo.cutout import CutoutOptions
 from gamba_warp.surfaces import extract, files  # noqa: F401 (it must not find the stand-in)
 
 RED, GREEN = (0.8, 0.1, 0.1), (0.1, 0.6, 0.2)
@@ -39,15 +39,15 @@ def two(tmp_path_factory):
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     picture = cut_out(tmp_path_factory.mktemp("made") / "thing.png")
-    cut = cutting.cut_picture(picture, "My  thing.v2.png", Ways())
-    return work.solve(load_model(STARTER / "tiny.safetensors"), cut)
+    cut = cutting.cut_picture(picture, "My  thing.v2.png", CutoutOptions())
+    return work.run_model(load_model(STARTER / "tiny.safetensors"), cut)
 
 
 def test_a_picture_from_above_stands_upright(tmp_path, made):
     """Rotation like ``reconstruct --elevation``, in the viewer's camera and in every file."""
     picture = cut_out(tmp_path / "thing.png")
-    cut = cutting.cut_picture(picture, "thing.png", Ways())
-    above = work.solve(load_model(STARTER / "tiny.safetensors"), cut, 30.0)
+    cut = cutting.cut_picture(picture, "thing.png", CutoutOptions())
+    above = work.run_model(load_model(STARTER / "tiny.safetensors"), cut, 30.0)
     turn = orbit(torch.zeros(1), 30.0)[0, :3, :3]
     torch.testing.assert_close(above.gaussians.means @ turn.T, made.gaussians.means)
     assert above.camera == (*made.camera[:2], 30.0) and made.camera[2] == 0
@@ -68,7 +68,7 @@ def stroke(shape, box, color):
 
 
 def test_a_plain_picture_is_cut_out(two):
-    cut = cutting.cut_picture(two, "two.png", Ways())
+    cut = cutting.cut_picture(two, "two.png", CutoutOptions())
     assert cut.mask.shape == (60, 100) and cut.name == "two"
     assert cut.mask[30, 25] == 1 and cut.mask[30, 70] == 1 and cut.mask[5, 5] == 0
     assert "plain background" in cut.note
@@ -77,7 +77,7 @@ def test_a_plain_picture_is_cut_out(two):
 
 @pytest.mark.parametrize("size", [(60, 100), (432, 720), (31, 57)])
 def test_strokes_keep_and_remove(two, size):
-    cut = cutting.cut_picture(two, "two.png", Ways())
+    cut = cutting.cut_picture(two, "two.png", CutoutOptions())
     without = cutting.apply_strokes(cut, [stroke(size, (0.2, 0.5, 0.8, 1.0), cutting.REMOVE)])
     assert without.mask[30, 25] == 1 and without.mask[30, 70] == 0
     assert "2 separate parts" in cut.note == cutting.note_of(cut)
@@ -99,7 +99,7 @@ def test_enclosed_areas_are_cleared_and_filled(tmp_path):
     rgb[20:40, 30:50] = 1  # a hole
     rgb[42:46, 30:50] = 0.95  # of another white: matter
     save_image(tmp_path / "ring.png", rgb)
-    cut = cutting.cut_picture(tmp_path / "ring.png", "ring.png", Ways())
+    cut = cutting.cut_picture(tmp_path / "ring.png", "ring.png", CutoutOptions())
     assert cut.mask[30, 40] == 0 and cut.mask[44, 40] == 1 and "1 enclosed area" in cut.note
     cleared = cutting.switch_areas(cut)
     assert cleared.mask[30, 40] == 0 and cleared.mask[44, 40] == 0 and cleared.mask[15, 40] == 1
@@ -114,7 +114,7 @@ def test_a_mended_object_has_no_fringe(tmp_path):
     picture.paste((200, 20, 20), (100, 120, 300, 280))
     picture = picture.rotate(20, Image.Resampling.BICUBIC, fillcolor="white")
     picture.resize((100, 100), Image.Resampling.LANCZOS).save(tmp_path / "a.png")
-    cut = cutting.cut_picture(tmp_path / "a.png", "a.png", Ways())
+    cut = cutting.cut_picture(tmp_path / "a.png", "a.png", CutoutOptions())
     mended = cutting.apply_strokes(cut, [stroke((50, 50), (0.4, 0.4, 0.6, 0.6), cutting.REMOVE)])
     rgba = cutting.model_picture(mended)
     edge = rgba[(rgba[..., 3] > 0.3) & (rgba[..., 3] < 0.95)]
@@ -123,7 +123,7 @@ def test_a_mended_object_has_no_fringe(tmp_path):
 
 
 def test_what_is_painted_on(two):
-    cut = cutting.cut_picture(two, "two.png", Ways())
+    cut = cutting.cut_picture(two, "two.png", CutoutOptions())
     shown = cutting.editor_picture(cut)
     assert shown.shape == (432, 720, 3) and shown.dtype == np.uint8
     np.testing.assert_allclose(shown[216, 180], np.multiply(RED, 255), atol=2)
@@ -139,7 +139,7 @@ def test_what_is_painted_on(two):
 def test_without_an_object_it_can_be_painted(tmp_path):
     """A uniform picture has no object; the painted area is cut out."""
     save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
-    cut = cutting.cut_picture(tmp_path / "even.png", "even.png", Ways())
+    cut = cutting.cut_picture(tmp_path / "even.png", "even.png", CutoutOptions())
     assert not cut.mask.any() and cut.note.startswith("No object was found (")
     assert str(tmp_path) not in cut.note
     refused("no object found.*paint over the object", cutting.model_picture, cut)
@@ -152,7 +152,9 @@ def test_without_an_object_it_can_be_painted(tmp_path):
 
 def test_no_pictures(tmp_path):
     for name, path, reason in bad_files(tmp_path):
-        said = refused(re.escape(reason) or None, cutting.cut_picture, path, "given.png", Ways())
+        said = refused(
+            re.escape(reason) or None, cutting.cut_picture, path, "given.png", CutoutOptions()
+        )
         assert said.startswith("given.png: ") and str(tmp_path) not in said, name
 
 

@@ -215,7 +215,7 @@ def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--frame", "opencv") == 0
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--no-recenter") == 0
-    kept = cutout.cut_out(picture, cutout.Ways(recenter=False)).rgba
+    kept = cutout.cut_out(picture, cutout.CutoutOptions(recenter=False)).rgba
     want = reconstruct(load_model(checkpoint), kept).means
     got = load_ply(tmp_path / "thing.ply").means
     torch.testing.assert_close(got, want.detach(), atol=1e-5, rtol=0)  # the file's rounding
@@ -223,7 +223,7 @@ def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     save_image(tmp_path / "mask.png", np.eye(20, 30))
     mask = ["--mask", tmp_path / "mask.png"]
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, *mask) == 0
-    masked = cutout.cut_out(picture, cutout.Ways(mask=mask[1])).rgba
+    masked = cutout.cut_out(picture, cutout.CutoutOptions(mask=mask[1])).rgba
     want = reconstruct(load_model(checkpoint), masked).means
     got = load_ply(tmp_path / "thing.ply").means
     torch.testing.assert_close(got, want.detach(), atol=1e-5, rtol=0)

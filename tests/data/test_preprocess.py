@@ -11,7 +11,7 @@ from PIL import Image
 from gamba_warp.data.preprocess import SamSegmenter, composite, recenter, shrink
 from gamba_warp.errors import UserError
 from gamba_warp.images import save_image
-from gamba_warp.photo.cutout import Ways, cut_out
+from gamba_warp.photo.cutout import CutoutOptions, cut_out
 from gamba_warp.photo.plain import plain_matte
 
 
@@ -33,7 +33,7 @@ def write(path, picture):
 
 
 def prepare(path, **more):
-    return cut_out(path, Ways(fetch=False, say=lambda line: None, **more)).rgba
+    return cut_out(path, CutoutOptions(fetch=False, notify=lambda line: None, **more)).rgba
 
 
 RED = (0.9, 0.2, 0.1)

@@ -28,7 +28,7 @@ from gamba_warp.images import load_rgba
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.encoders import read_state
 from gamba_warp.model.released import convert_released
-from gamba_warp.photo.cutout import Ways, cut_out
+from gamba_warp.photo.cutout import CutoutOptions, cut_out
 from gamba_warp.photo.matte import Matte
 from gamba_warp.train.checkpoint import find_checkpoint
 from gamba_warp.train.data.shards import Shards
@@ -71,7 +71,7 @@ def attempt(read: Callable, *arguments: Any) -> Any:
 
 def _prepare(path: Path, out: Path) -> Any:
     mask = next((p for p in sorted(path.parent.iterdir()) if p.stem == "mask"), None)
-    return cut_out(path, Ways(None if mask == path else mask, fetch=False)).rgba
+    return cut_out(path, CutoutOptions(None if mask == path else mask, fetch=False)).rgba
 
 
 def _view(path: Path, out: Path) -> Any:

@@ -20,7 +20,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.photo import cutout, matte, models
-from gamba_warp.photo.cutout import Ways, cut_out, fault_of
+from gamba_warp.photo.cutout import CutoutOptions, cut_out, fault_of
 
 SIZE = (140, 211)
 
@@ -54,26 +54,28 @@ def test_each_way_in_its_order(tmp_path, network, busy):
     save_image(transparent, np.dstack([on_white, alpha - half]))
     save_image(plain, on_white)
     save_image(mask, half)
-    ways = Ways(matte_model=network)
+    options = CutoutOptions(matte_model=network)
     for file, how, want in (
         (transparent, "alpha", alpha - half),
         (path, "matte", alpha),
         (plain, "matte", alpha),  # a given network comes before colours
         (plain, "plain", alpha),
     ):
-        found = cut_out(file, Ways() if how == "plain" else ways)
+        found = cut_out(file, CutoutOptions() if how == "plain" else options)
         assert found.method == how and iou(found.mask, want) > 0.93
         assert found.source_rgb.shape == (*SIZE, 3) and found.mask.shape == SIZE
         assert found.rgba.shape[0] == found.rgba.shape[1] and found.rgba.dtype == np.float32
         assert found.note.startswith(found.how) and "--save-inputs" in found.note
-    assert "red.onnx" in cut_out(path, ways).how
+    assert "red.onnx" in cut_out(path, options).how
     said: list[str] = []
-    found = cut_out(path, Ways(say=said.append))  # conftest.py forbids the network; none is kept
+    found = cut_out(
+        path, CutoutOptions(notify=said.append)
+    )  # conftest.py forbids the network; none is kept
     assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85
     assert " (no matting model)." in found.how and len(said) == 1
     assert "no matting model is here" in said[0] and models.PUBLISHED[0].address in said[0]
     for file in (path, transparent, plain):  # a mask is somebody's word
-        found = cut_out(file, Ways(mask=mask, matte_model=network))
+        found = cut_out(file, CutoutOptions(mask=mask, matte_model=network))
         assert found.method == "mask" and iou(found.mask, half) > 0.99 and "mask.png" in found.how
 
 
@@ -84,11 +86,11 @@ def test_the_chosen_method_is_used(tmp_path, network, busy):
     for name, rgb in (("noise", rgba[..., :3]), ("plain", plain)):
         save_image(tmp_path / f"{name}.png", np.dstack([rgb * np.ones(3), alpha]))
     for name, method, way in (
-        ("noise", "alpha", Ways(matte_model=network)),
-        ("noise", "matte", Ways(cutout="matte", matte_model=network)),
-        ("noise", "grabcut", Ways(cutout="grabcut")),
-        ("plain", "plain", Ways(cutout="plain")),
-        ("plain", "none", Ways(cutout="none")),
+        ("noise", "alpha", CutoutOptions(matte_model=network)),
+        ("noise", "matte", CutoutOptions(cutout="matte", matte_model=network)),
+        ("noise", "grabcut", CutoutOptions(cutout="grabcut")),
+        ("plain", "plain", CutoutOptions(cutout="plain")),
+        ("plain", "none", CutoutOptions(cutout="none")),
     ):
         found = cut_out(tmp_path / f"{name}.png", way.checked())
         assert found.method == method, name
@@ -98,9 +100,9 @@ def test_the_chosen_method_is_used(tmp_path, network, busy):
         ("plain", "its border is not plain"),
         ("matte", "no matting model"),
     ):
-        refused(reason, cut_out, path, Ways(cutout=only, say=lambda line: None))
+        refused(reason, cut_out, path, CutoutOptions(cutout=only, notify=lambda line: None))
     with pytest.raises(UserError, match="--matte-model is not used by --cutout plain"):
-        Ways(cutout="plain", matte_model=network).checked()
+        CutoutOptions(cutout="plain", matte_model=network).checked()
 
 
 def test_a_cached_network_comes_before_colours(tmp_path, monkeypatch, network, busy):
@@ -137,14 +139,14 @@ def test_a_doubt_names_the_way_to_a_network_unless_it_is_refused(tmp_path, monke
     rgb = np.ones((60, 80, 3))
     rgb[20:, 30:50] = 0.8, 0.2, 0.1  # down to the lower edge
     save_image(tmp_path / "post.png", rgb)
-    ways = Ways(say=lambda line: None)
+    options = CutoutOptions(notify=lambda line: None)
     about = "isnet-general-use, 179 MB, Apache 2.0, fetched once"
     advice = (
         f"Try a network: gamba reconstruct --cutout matte ({about})"  # the app has no such choice
     )
-    assert advice in cut_out(tmp_path / "post.png", ways).warning
-    assert ways.matte() is None
-    found = cut_out(tmp_path / "post.png", ways)
+    assert advice in cut_out(tmp_path / "post.png", options).warning
+    assert options.matte() is None
+    found = cut_out(tmp_path / "post.png", options)
     assert (
         found.warning.endswith("it touches the picture's border.") and found.warning in found.note
     )
@@ -153,14 +155,14 @@ def test_a_doubt_names_the_way_to_a_network_unless_it_is_refused(tmp_path, monke
 def test_a_matte_without_an_object_gives_way(tmp_path, busy):
     pytest.importorskip("onnxruntime")
     path, alpha = busy
-    for name, options, reason in (
+    for name, network, reason in (
         ("none", dict(bias=-60.0), "nothing stands out"),
         ("all", dict(bias=60.0), "all of the picture would be the object"),
         ("vague", dict(weights=(0.1, 0, 0), bias=0.05), "it has no clear border"),
     ):
         file = tmp_path / f"{name}.onnx"
-        file.write_bytes(matting_network(size=352, **options))
-        found = cut_out(path, Ways(matte_model=file))
+        file.write_bytes(matting_network(size=352, **network))
+        found = cut_out(path, CutoutOptions(matte_model=file))
         # vague is over one half everywhere
         assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85, name
         assert reason in found.how or name == "vague"
@@ -168,14 +170,14 @@ def test_a_matte_without_an_object_gives_way(tmp_path, busy):
 
 def test_sam_comes_before_the_matte(network, busy, monkeypatch):
     path, alpha = busy
-    ways = Ways(matte_model=network, sam="sam.pth")
+    options = CutoutOptions(matte_model=network, sam="sam.pth")
     square = np.zeros(SIZE, np.float32)
     square[40:100, 60:140] = 1
     monkeypatch.setattr(cutout, "SamSegmenter", lambda *_: lambda rgb: square)
-    found = cut_out(path, ways)
+    found = cut_out(path, options)
     assert found.method == "sam" and iou(found.mask, square) == 1
     square[:] = 0
-    assert cut_out(path, ways).method == "matte"
+    assert cut_out(path, options).method == "matte"
 
 
 @pytest.mark.parametrize("soft, reason", [(0.36, None), (0.44, "it has no clear border")])
@@ -213,19 +215,19 @@ def test_an_object_may_stay_where_it_is(tmp_path, height, width):
     pixels[5:15, 30:50] = 200, 90, 30, 255
     path = tmp_path / "off.png"
     Image.fromarray(pixels).save(path)
-    kept = cut_out(path, Ways(recenter=False)).rgba
+    kept = cut_out(path, CutoutOptions(recenter=False)).rgba
     top = (60 - height) // 2
     assert kept.shape == (60, 60, 4)
     np.testing.assert_array_equal(kept[top : top + height] * 255, pixels)
     assert not kept[:top].any() and not kept[top + height :].any()
     assert cut_out(path).rgba.shape == (25, 25, 4)
     Image.fromarray(np.zeros((60, 60, 4), np.uint8)).save(path)
-    refused("no object found", cut_out, path, Ways(recenter=False))
+    refused("no object found", cut_out, path, CutoutOptions(recenter=False))
 
 
 def test_the_cut_out_can_be_mended_and_given_again(tmp_path, network, busy):
     path, _ = busy
-    first = cut_out(path, Ways(matte_model=network))
+    first = cut_out(path, CutoutOptions(matte_model=network))
     assert first.editable.shape == (*SIZE, 4)
     away = first.mask == 0
     np.testing.assert_array_equal(first.editable[away][:, :3], first.source_rgb[away])
@@ -302,14 +304,17 @@ def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypat
         raise ConnectionError("no route")
 
     monkeypatch.setattr(pooch, "retrieve", retrieve)
-    assert cut_out(path, Ways(say=said.append)).method == "grabcut"
+    assert cut_out(path, CutoutOptions(notify=said.append)).method == "grabcut"
     assert not asked and "no matting model is here" in said.pop()  # GAMBA_OFFLINE
     monkeypatch.setenv("GAMBA_OFFLINE", "0")
-    assert cut_out(path, Ways(fetch=False, say=said.append)).method == "grabcut" and not asked
+    assert (
+        cut_out(path, CutoutOptions(fetch=False, notify=said.append)).method == "grabcut"
+        and not asked
+    )
     assert "no matting model is here" in said.pop() and not said
-    ways = Ways(say=said.append)
+    options = CutoutOptions(notify=said.append)
     for _ in range(2):
-        found = cut_out(path, ways)
+        found = cut_out(path, options)
         assert found.method == "grabcut" and " (no matting model)." in found.how
     ((address, digest, before),) = asked
     assert (
@@ -367,8 +372,10 @@ def mirror(tmp_path, monkeypatch):
 
 def test_a_model_comes_from_the_address_of_a_copy(tmp_path, monkeypatch, busy, mirror):
     said = []
-    ways = Ways(matte_model=f"{mirror}/u2netp.onnx?download=true", say=said.append).checked()
-    how = cut_out(busy[0], ways).how
+    options = CutoutOptions(
+        matte_model=f"{mirror}/u2netp.onnx?download=true", notify=said.append
+    ).checked()
+    how = cut_out(busy[0], options).how
     assert how.startswith("The matting model u2netp.onnx cut the object out.")
     assert len(said) == 1 and f"from {mirror}" in said[0] and models.cached() is not None
     (tmp_path / "rembg" / "models" / "u2netp" / "u2netp.onnx").unlink()
@@ -380,11 +387,11 @@ def test_a_model_comes_from_the_address_of_a_copy(tmp_path, monkeypatch, busy, m
         (f"{http}/u2netp.onnx", "only addresses of https are fetched"),
         (f"{mirror}/plain/u2netp.onnx", "redirected to http://127.0.0.1:9/u2netp.onnx, which is"),
     ):
-        ways = Ways(matte_model=address, say=said.append)
-        assert f"--matte-model {address}: " in refused(reason, ways.checked)
+        options = CutoutOptions(matte_model=address, notify=said.append)
+        assert f"--matte-model {address}: " in refused(reason, options.checked)
     assert not list((tmp_path / "rembg").rglob("*.*"))
     monkeypatch.setenv("GAMBA_OFFLINE", "1")
-    refused("GAMBA_OFFLINE", Ways(matte_model=f"{mirror}/u2netp.onnx").checked)
+    refused("GAMBA_OFFLINE", CutoutOptions(matte_model=f"{mirror}/u2netp.onnx").checked)
 
 
 def test_a_kept_model_that_is_damaged_gives_way(tmp_path, monkeypatch, busy):
@@ -399,10 +406,10 @@ def test_without_the_extra_colours_alone_cut(monkeypatch, busy):
     for module in (cutout, matte, versions):
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     said = []
-    found = cut_out(busy[0], Ways(say=said.append))
+    found = cut_out(busy[0], CutoutOptions(notify=said.append))
     assert found.method == "grabcut" and len(said) == 1 and "pip install '.[photo]'" in said[0]
     with pytest.raises(ModuleNotFoundError, match="onnxruntime"):
-        Ways(matte_model="model.onnx").checked()
+        CutoutOptions(matte_model="model.onnx").checked()
 
 
 @pytest.mark.parametrize("kind", ["rounded corners", "faint corner pixels"])
@@ -422,12 +429,12 @@ def test_a_few_transparent_pixels_are_no_cut_out(tmp_path, kind):
         rgba[:2, :3, 3] = rgba[-2:, -3:, 3] = 0
     Image.fromarray(rgba).save(tmp_path / "a.png")
     said = []
-    found = cut_out(tmp_path / "a.png", Ways(fetch=False, say=said.append))
+    found = cut_out(tmp_path / "a.png", CutoutOptions(fetch=False, notify=said.append))
     assert found.method != "alpha"
     kept = found.mask > 0.5
     assert (kept & inside).sum() > 0.95 * (kept | inside).sum()
     assert any("no cut-out" in line for line in said)
-    alone = cut_out(tmp_path / "a.png", Ways(cutout="alpha"))
+    alone = cut_out(tmp_path / "a.png", CutoutOptions(cutout="alpha"))
     assert alone.method == "alpha"
 
 
@@ -452,8 +459,8 @@ def test_a_small_object_of_a_large_picture_keeps_its_pixels(tmp_path, network, w
         mask = name.with_name(f"{name.stem}-mask.png") if way == "mask" else None
         model = network if way == "matte" else None
         cutout = way if way == "matte" else "auto"
-        ways = Ways(mask=mask, matte_model=model, fetch=False, cutout=cutout)
-        found.append(cut_out(name, ways))
+        options = CutoutOptions(mask=mask, matte_model=model, fetch=False, cutout=cutout)
+        found.append(cut_out(name, options))
     whole, close = found
     assert whole.method == close.method == way
     assert abs(len(whole.rgba) - len(close.rgba)) <= 4 and len(whole.rgba) >= 200
@@ -468,5 +475,5 @@ def test_an_object_of_few_pixels_is_named(tmp_path):
     rgb = np.full((300, 300, 3), 255, np.uint8)
     rgb[(x - 150) ** 2 + (y - 150) ** 2 < 40**2] = (30, 60, 200)
     Image.fromarray(rgb).save(tmp_path / "a.png")
-    found = cut_out(tmp_path / "a.png", Ways(fetch=False))
+    found = cut_out(tmp_path / "a.png", CutoutOptions(fetch=False))
     assert " pixels, so the result is blurred." in found.how

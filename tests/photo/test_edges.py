@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gamba_warp.images import save_image
-from gamba_warp.photo.cutout import Ways, cut_out
+from gamba_warp.photo.cutout import CutoutOptions, cut_out
 from gamba_warp.photo.edges import without_background, without_matte
 
 SIZE = (61, 83)
@@ -80,13 +80,15 @@ def test_a_photograph_keeps_the_colours_of_solid_pixels():
 def test_a_picture_keeps_no_fringe_of_its_background(tmp_path):
     clean = disc((0.7, 0.0, 0.1))
     save_image(tmp_path / "icon.png", mixed(clean, 1.0))
-    icon = cut_out(tmp_path / "icon.png", Ways(recenter=False))
+    icon = cut_out(tmp_path / "icon.png", CutoutOptions(recenter=False))
     assert "is the cut-out, without the white mixed into its edge." in icon.how
     save_image(tmp_path / "clean.png", clean)
     assert "is the cut-out." in cut_out(tmp_path / "clean.png").how
     save_image(tmp_path / "photo.png", mixed(clean, 0.9)[..., :3])
     save_image(tmp_path / "mask.png", clean[..., 3])
-    photo = cut_out(tmp_path / "photo.png", Ways(mask=tmp_path / "mask.png", recenter=False))
+    photo = cut_out(
+        tmp_path / "photo.png", CutoutOptions(mask=tmp_path / "mask.png", recenter=False)
+    )
     edge = (clean[..., 3] > 0.3) & (clean[..., 3] < 0.9)
     for cut in (icon, photo):
         inner = cut.editable[edge]

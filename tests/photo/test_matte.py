@@ -17,7 +17,7 @@ from PIL import Image
 from gamba_warp import cli
 from gamba_warp.images import save_image
 from gamba_warp.photo import matte
-from gamba_warp.photo.cutout import Ways, cut_out
+from gamba_warp.photo.cutout import CutoutOptions, cut_out
 from gamba_warp.photo.matte import Matte
 from gamba_warp.untrusted.children import end_idle
 
@@ -152,6 +152,6 @@ def _fetch(path):
 def test_a_real_network_cuts_a_real_photograph(real_model):
     """A photograph of scikit-image's, with boxes of certain object and background."""
     data = Path(pytest.importorskip("skimage").__file__).parent / "data"
-    found = cut_out(data / "coffee.png", Ways(matte_model=real_model))
+    found = cut_out(data / "coffee.png", CutoutOptions(matte_model=real_model))
     assert found.method == "matte"
     assert found.mask[200:260, 240:330].min() > 0.9 and found.mask[:60, :100].max() < 0.1
