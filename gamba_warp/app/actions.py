@@ -20,6 +20,7 @@ from .cutting import (
     cut_picture,
     editor_picture,
     examples,
+    note_of,
     read_strokes,
     reset_mask,
     switch_areas,
@@ -113,7 +114,7 @@ class Actions:
         name = given.get("orig_name") or "picture"
         progress(0.2, "Looking for the object")
         try:
-            cut = self._main_thread.call(cut_picture, Path(given["path"]), name, self._options)
+            cut = self._call(request, cut_picture, Path(given["path"]), name, self._options)
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This picture cannot be used")
             return self.end_session()
@@ -129,7 +130,7 @@ class Actions:
         if type(index) is not int or not 0 <= index < len(found):
             raise UserError(f"not one of the {len(found)} examples")
         path, title = found[index]
-        cut = self._main_thread.call(cut_picture, path, title, self._options)
+        cut = self._call(request, cut_picture, path, title, self._options)
         return *self._shown(cut, request), str(path)
 
     def apply_strokes(
@@ -137,12 +138,12 @@ class Actions:
     ) -> tuple:
         """Apply the strokes to the mask."""
         cut = apply_strokes(_given(cut), _layers(painted))
-        return cut, self._editor(cut, request)
+        return self._edited(cut, request)
 
     def restart(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Reset the mask, without strokes."""
         cut = reset_mask(_given(cut))
-        return cut, self._editor(cut, request)
+        return self._edited(cut, request)
 
     def toggle_holes(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Clear the enclosed areas of a plain background's colour, or fill them."""
@@ -150,7 +151,7 @@ class Actions:
         if not cut.areas.any():
             raise UserError("the object encloses no area of a plain background's colour")
         cut = switch_areas(cut)
-        return cut, self._editor(cut, request)
+        return self._edited(cut, request)
 
     def reconstruct(
         self,
@@ -164,13 +165,13 @@ class Actions:
         before = _given(cut)
         after = apply_strokes(before, _layers(painted))
         progress(0.1, "Running the network")
-        made = self._main_thread.call(work.run_model, self._model, after, elevation)
+        made = self._call(request, work.run_model, self._model, after, elevation)
         progress(0.8, "Making the viewer")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
-        editor = gr.skip() if after is before else self._editor(after, request)
+        edited = (gr.skip(),) * 3 if after is before else self._edited(after, request)
         files = gr.update(value=None, visible=False)
-        return after, editor, (made, []), frame, gr.update(visible=True), files
+        return *edited, (made, []), frame, gr.update(visible=True), files
 
     def writer(self, kind: str) -> Callable:
         """Return the handler that writes files of one kind, and adds them to the list."""
@@ -189,7 +190,7 @@ class Actions:
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
             folder = self._new_folder(request)
             mesh = work.MeshChoice.of(faces, texture, watertight)
-            path, note = self._main_thread.call(work.write, made, kind, folder, self._device, mesh)
+            path, note = self._call(request, work.write, made, kind, folder, self._device, mesh)
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
             files = [*(old for old in older if old.name != path.name and old.is_file()), path]
@@ -197,9 +198,18 @@ class Actions:
 
         return with_page_errors(write)
 
+    def _call(self, request: gr.Request, function: Callable, *args: Any) -> Any:
+        """Call a function on the main thread, as long as the page is open."""
+        page = request.session_hash or ""
+        return self._main_thread.call(function, *args, wanted=lambda: self._files.is_active(page))
+
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
-        note = f"<p>{html.escape(cut.note)}</p>"
-        return cut, gr.update(visible=True), self._editor(cut, request), note
+        cut, *edited = self._edited(cut, request)
+        return cut, gr.update(visible=True), *edited
+
+    def _edited(self, cut: Cut, request: gr.Request) -> tuple:
+        note = html.escape(self._call(request, note_of, cut))
+        return cut, self._editor(cut, request), f"<p>{note}</p>"
 
     def _new_folder(self, request: gr.Request) -> Path:
         inner = request.request

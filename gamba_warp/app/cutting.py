@@ -41,7 +41,7 @@ class Cut:
         found: ``[S, S, 4]`` float32, the object cut out and centred before any stroke, without
             background colour along its edge; None if no object was found.
         ghost: True if the picture has colours where the mask is 0.
-        note: method of the cut-out and doubts, for the page.
+        note: method of the cut-out and doubts, for the page, before any stroke.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour.
     """
 
@@ -170,6 +170,16 @@ def apply_strokes(cut: Cut, layers: Sequence[np.ndarray]) -> Cut:
     if mask is cut.mask:
         return cut
     return replace(cut, mask=np.clip(mask, 0.0, 1.0).astype(np.float32))
+
+
+def note_of(cut: Cut) -> str:
+    """Return the note on a cut-out with its present mask, for the page."""
+    from ..photo.cutout import doubts_of
+
+    if cut.mask is cut.first:
+        return cut.note
+    doubts = doubts_of(cut.rgb, cut.mask)
+    return "The cut-out is edited." + (f" It may be wrong: {'; '.join(doubts)}." if doubts else "")
 
 
 def reset_mask(cut: Cut) -> Cut:

@@ -43,6 +43,7 @@ POLICY = (
     "form-action 'self'; frame-ancestors 'self'"
 )
 VISITOR = "gamba.visitor"  # key in the scope of an accepted request
+_PAGE = "gamba.page"  # of a request that lasts as long as a page or its calls: the session
 _HEADERS = (
     (b"content-security-policy", POLICY.encode()),
     (b"referrer-policy", b"no-referrer"),
@@ -57,7 +58,7 @@ _NO_COOKIE = "open the page first; it needs its cookie"
 _SESSION = re.compile(b"session_hash=[a-z0-9]{1,32}")  # the only allowed query
 # All paths that the page reads; gradio itself serves eighty.
 _READ = re.compile(
-    "/|/theme[.]css|/favicon[.]ico|/(assets|static)/.*|/gradio_api/(file=.*|heartbeat/[a-z0-9]+"
+    "/|/theme[.]css|/favicon[.]ico|/manifest[.]json|/(assets|static)/.*|/gradio_api/(file=.*|heartbeat/[a-z0-9]+"
     "|queue/data|upload_progress)",
     re.DOTALL,
 )
@@ -206,6 +207,8 @@ class Guard:
                     cookie = f"{_COOKIE}={secrets.token_hex(16)}; HttpOnly; SameSite=Lax; Path=/"
                     more.append((b"set-cookie", cookie.encode()))
                 self._check_read(scope, visitor)
+                if path == "/manifest.json":  # gradio has one for pages that are installed only
+                    answer = Response("{}", media_type="application/manifest+json")
                 if path == _PROGRESS:
                     answer = Response('data: {"msg": "done"}\n\n', media_type="text/event-stream")
             elif request.method != "POST" or path not in (_UPLOAD, _JOIN):
@@ -232,7 +235,8 @@ class Guard:
             if path == _JOIN:  # the page shows the detail of a call's answer
                 line, kind = msgspec.json.encode({"detail": line}).decode(), "application/json"
             answer = Response(f"{line}\n", error.status_code, media_type=kind)
-        await answer(scope, read, guarded)
+        with self._files.visited(scope.get(_PAGE, "")):
+            await answer(scope, read, guarded)
 
     def _check_read(self, scope: Message, visitor: str | None) -> None:
         """Allow only the visitor's own files; append the visitor to the session."""
@@ -247,6 +251,8 @@ class Guard:
                 raise HTTPException(403, _NO_COOKIE)
             if path != _DATA:
                 scope["path"] += visitor
+            asked_by = asked.decode("latin-1") if path == _DATA else path
+            scope[_PAGE] = re.split("[/=]", asked_by)[-1] + visitor
         scope["query_string"] = b""
         if visitor and _SESSION.fullmatch(asked):
             scope["query_string"] = asked + visitor.encode()

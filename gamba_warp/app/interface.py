@@ -77,6 +77,7 @@ def build(actions: Actions) -> gr.Blocks:
                     elem_id="examples",
                 )
                 with gr.Column(visible=False, elem_id="cut") as cut_part:
+                    note = gr.HTML(elem_id="note")
                     editor = gr.ImageEditor(
                         label="Cut-out",
                         type="numpy",
@@ -92,7 +93,6 @@ def build(actions: Actions) -> gr.Blocks:
                         buttons=[],
                         elem_id="editor",
                     )
-                    note = gr.HTML(elem_id="note")
                     choices, first = list(_BRUSHES), next(iter(_BRUSHES))
                     plain: dict[str, Any] = {"show_label": False, "container": False}
                     brush = gr.Radio(choices, value=first, elem_id="brush", **plain)
@@ -145,19 +145,19 @@ def build(actions: Actions) -> gr.Blocks:
         # loaded its new picture.
         quick = {**one, "show_progress": "hidden"}
         taking = {**one, "show_progress_on": picture}
-        shown, mask = [cut, cut_part, editor, note, picture], [cut, editor]
+        shown, mask = [cut, cut_part, editor, note, picture], [cut, editor, note]
         # (The event ``input`` sends the old picture when it is cleared.)
         picture.upload(actions.take, picture, shown, **taking)
         picture.clear(actions.end_session, None, shown, **quick)
         gallery.select(actions.load_example, None, shown, **taking)
         # Has its own queue, so that it waits for no other event.
         brush.change(_painting, brush, editor, **{**quick, "concurrency_id": "brush"})
-        mend.click(actions.apply_strokes, mask, mask, **quick)
+        mend.click(actions.apply_strokes, mask[:2], mask, **quick)
         restart.click(actions.restart, cut, mask, **quick)
         make.click(
             actions.reconstruct,
             [cut, editor, elevation],
-            [cut, editor, made, stage, files_part, made_files],
+            [*mask, made, stage, files_part, made_files],
             show_progress_on=stage,
             **one,
         )

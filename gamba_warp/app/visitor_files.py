@@ -42,7 +42,7 @@ class VisitorFiles:
 
     @contextmanager
     def visited(self, visitor: str) -> Iterator[int]:
-        """Mark a visitor as active during a request; yields the visitor's number of requests."""
+        """Mark a visitor or page as active during a request; yields its number of requests."""
         self._active[visitor] += 1
         try:
             yield self._active[visitor]
@@ -50,6 +50,10 @@ class VisitorFiles:
             self._active[visitor] -= 1
             if not self._active[visitor]:
                 del self._active[visitor]
+
+    def is_active(self, visitor: str) -> bool:
+        """Return True during a request of a visitor or page."""
+        return visitor in self._active
 
     def new_folder(self, visitor: str, coming: int = 0) -> Path:
         """Make a new folder of a visitor with an unpredictable name.

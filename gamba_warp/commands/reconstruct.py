@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
+import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +62,7 @@ def reconstruct_command(
     """Turn pictures of single objects into 3D Gaussians, in one forward pass each.
 
     Args:
-        images: Picture files, or folders of them.
+        images: Picture files, or folders of them; - is a picture from the standard input.
         checkpoint: Trained model (.safetensors); the shipped model by default.
         encoder_weights: The image encoder's weights, if the model has a pretrained one.
         files: Outputs to write.
@@ -152,7 +155,8 @@ def _find_pictures(
     if not images:
         example = next(iter(sorted((STARTER / "icons").glob("*.png"))), "photo.png")
         raise UserError(f"give at least one picture or folder, such as {example}")
-    pictures, failures = find_pictures(images, recursive)
+    given = [_standard_input() if str(path) == "-" else path for path in dict.fromkeys(images)]
+    pictures, failures = find_pictures(given, recursive)
     if mask is not None and len(pictures) != 1:
         raise UserError(f"--mask goes with one picture, {len(pictures)} are given")
     if not pictures:
@@ -161,3 +165,12 @@ def _find_pictures(
         if line := passed_over(folder, recursive):
             say(f"{folder}: {line}")
     return pictures, failures
+
+
+def _standard_input() -> Path:
+    """Return a copy of the standard input, of 256 MB at most, which is removed at the end."""
+    folder = tempfile.TemporaryDirectory(prefix="gamba-")
+    atexit.register(folder.cleanup)
+    path = Path(folder.name) / "stdin"
+    path.write_bytes(sys.stdin.buffer.read(1 << 28))
+    return path

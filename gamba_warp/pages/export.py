@@ -324,7 +324,6 @@ def write_outputs(
     """
     view = outputs.view(config)
     gaussians, count = to_be_written(gaussians, outputs.options.min_opacity)
-    say(f"{name}: {count}")
     gaussians = set_up(gaussians, view.elevation)
     if outputs.inputs:
         save_image(outputs.options.out / f"{name}-input.png", cut.editable)
@@ -338,7 +337,7 @@ def write_outputs(
         section.strip = cut.beside()
     comments = [f"from {name} by {outputs.checkpoint.name}"]
     lost, turn = outputs.write(gaussians, None, view, section, device, comments)
-    for line in lost:
+    for line in (f"{name}: {count}", *lost):
         say(line)
     if outputs.sheet is not None:
         outputs.sheet.add(name, cut.rgba, gaussians, view)

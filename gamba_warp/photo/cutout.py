@@ -275,7 +275,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
         if method in ("plain", "grabcut") and not options.without_network:
             best = models.PUBLISHED[0]
             about = f"{best.name}, {best.megabytes} MB, {best.licence}, fetched once"
-            warning += f" Try a network: --cutout matte ({about})."
+            warning += f" Try a network: gamba reconstruct --cutout matte ({about})."
     colors = np.where(rgba[..., 3:] > 0, rgba[..., :3], source)
     editable = np.dstack([colors, rgba[..., 3]])
     areas = np.zeros(rgba.shape[:2], bool) if found.areas is None else found.areas > 0

@@ -2,6 +2,7 @@
 
 import signal
 import socket
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from gamba_warp.app.cutting import examples
 from gamba_warp.app.work import KINDS
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
+ZIP = MAKE + 2 + 2 * list(KINDS).index("zip")
 AREAS = MAKE + 2 + 2 * len(KINDS)  # after the two functions of each kind of file
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
@@ -59,7 +61,10 @@ def test_a_program_that_does_as_the_page_does(program, private):
     assert program.ask(f"/gradio_api/file={shown}").status == 200
     layer = Image.new("RGBA", (720, 720), (0, 0, 255, 255))
     painted = {"layers": [given(program.upload(bytes_of(layer)))], "background": {"path": "/"}}
-    after = program.result(MEND, [None, painted])["data"][1]["background"]["path"]
+    _, editor, note = program.result(MEND, [None, painted])["data"]
+    assert "edited" in note and "touches the picture" in note
+    after = editor["background"]["path"]
+    assert program.ask("/manifest.json").body == b"{}"  # the page links it
     assert Path(after).read_bytes() != Path(shown).read_bytes()
 
 
@@ -223,6 +228,27 @@ def test_a_page_that_is_open_is_heard_of(served, program):
     assert "data: ALIVE\n" in iter(lambda: answer.readline().decode(), "")
 
 
+def test_the_job_of_a_closed_page_ends(served, program, private):
+    """The next visitor does not wait until all files of the one who left are written."""
+    picture = Image.new("RGB", (200, 200), "white")
+    picture.paste((200, 30, 20), (50, 50, 150, 150))
+    program.result(TAKE, [given(program.upload(bytes_of(picture)))])
+    assert "data" in program.result(MAKE, [None, None, 0])
+    assert program.join(ZIP, [None, "200,000 faces", "Texture 2048", True]).status == 200
+    cookie, host = f"Cookie: {program.headers['Cookie']}", f"Host: {served.host}"
+    place = f"GET /gradio_api/queue/data?session_hash={program.session} HTTP/1.1"
+    answer, _ = raw(served, place, host, cookie)
+    assert "process_starts" in next(
+        line for line in map(bytes.decode, answer) if "process_" in line
+    )
+    time.sleep(3)  # it is in the middle
+    answer.close()
+    other = Program(served.host).opened()
+    started = time.monotonic()
+    assert "data" in other.result(TAKE, [given(other.upload(private.read_bytes()))])
+    assert time.monotonic() - started < 20
+
+
 def test_half_sent_requests_stop_nothing(served, program):
     """More connections than the limit; the page is still answered."""
     host, port = served.host.split(":")
@@ -247,7 +273,7 @@ def test_what_is_closed(served, program):
     for route in (
         *("docs", "redoc", "openapi.json", "gradio_api/openapi.json", "gradio_api/info", "config"),
         *("monitoring", "monitoring/summary", "gradio_api/app_id", "gradio_api/proxy=http://a/"),
-        *("gradio_api/file", "gradio_api/runs", "gradio_api/queue/status", "manifest.json"),
+        *("gradio_api/file", "gradio_api/runs", "gradio_api/queue/status"),
         *("gradio_api/call/take/1", "gradio_api/vibe-code", "gradio_api/deep_link", "nothing"),
     ):
         answer = program.ask(f"/{route}")

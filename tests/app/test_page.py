@@ -162,6 +162,32 @@ def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
     assert page.locator("iframe.stage").count() == 0
 
 
+def test_the_next_step_is_in_the_window(opened, tmp_path):
+    page = opened.page
+    give(page, red_square(tmp_path))
+    page.wait_for_selector("#editor canvas")
+    seen = """make => {
+      const { left, top, width, height } = make.getBoundingClientRect();
+      const over = [[0, 0], [1, 0], [0, 1], [1, 1]].map(([x, y]) =>
+        document.elementFromPoint(left + 9 + x * (width - 18), top + 9 + y * (height - 18)));
+      return over.every((element) => make.contains(element));
+    }"""
+    for width, height in ((1280, 900), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        until(lambda: page.locator("#make").evaluate(seen), f"it is seen at {width} x {height}")
+    assert page.evaluate("scrollY") == 0
+    page.locator("#make").click()
+    page.wait_for_selector("#mesh")
+    choices = page.locator("#mesh > *").evaluate_all(
+        "all => all.map(each => [each.getBoundingClientRect().right, each.scrollWidth"
+        " - each.clientWidth, each.querySelector('input').clientWidth])"
+    )
+    assert len(choices) == 3 and all(right < 390 and over <= 0 for right, over, _ in choices)
+    assert all(width > 90 for _, _, width in choices[:2]), choices  # of "Texture 1024"
+    page.get_by_text("Closed, for printing").click()
+    assert page.locator("#mesh input[type=checkbox]").is_checked()
+
+
 def test_no_picture_is_one_line(opened, tmp_path):
     page = opened.page
     bad = tmp_path / "<b>no.png"

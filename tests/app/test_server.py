@@ -1,10 +1,12 @@
 """Requests, leftover files and threads of the page's server."""
 
 import asyncio
+import contextlib
 import hashlib
 import json
 import logging
 import os
+import signal
 import threading
 import time
 from pathlib import Path
@@ -13,7 +15,7 @@ import pytest
 from helpers.app import FORM, form
 from helpers.refusals import refused
 
-from gamba_warp.app import guard, server, visitor_files
+from gamba_warp.app import guard, main_thread, server, visitor_files
 from gamba_warp.app.main_thread import MainThread
 from gamba_warp.app.visitor_files import VisitorFiles
 from gamba_warp.errors import UserError
@@ -97,6 +99,7 @@ def test_a_session_is_told_apart_by_its_visitor(place):
     for token in ("a" * 32, "b" * 32):
         [scope] = answered("localhost", path=path, token=token)[1]
         got = f"{scope['path']}?{scope['query_string'].decode()}"
+        assert scope["gamba.page"] == f"abc{visitor_of(token)}"
         assert got.rstrip("?") == path + visitor_of(token)
     sent, inside = answered("localhost", path=path)
     assert not inside and sent[0]["status"] == 403
@@ -405,6 +408,37 @@ def test_jobs_are_done_by_the_one_that_works():
         "ours",
         "gamba app was ended; start it again",
     ]
+
+
+def test_a_job_that_nobody_wants_is_ended(monkeypatch):
+    """It ends between two steps, but not within an import or the load of kernels."""
+    monkeypatch.setattr(main_thread, "LOOK_SECONDS", 0.05)
+    jobs, found = MainThread(), []
+
+    def steps(count):
+        for _ in range(count):
+            time.sleep(0.01)
+        return count
+
+    def load():
+        return steps(40)
+
+    def ask():
+        try:
+            jobs.call(steps, 10**6, wanted=lambda: False)
+        except UserError as error:
+            found.append(str(error))
+        found.append(jobs.call(load, wanted=lambda: False))
+        found.append(jobs.call(steps, 40, wanted=lambda: True))
+        with contextlib.suppress(UserError):
+            jobs.call(signal.raise_signal, signal.SIGINT)
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        jobs.work()
+    thread.join(timeout=10)
+    assert found == ["its page was closed", 40, 40]
 
 
 def test_who_waits_does_not_wait_for_ever():

@@ -80,12 +80,16 @@ def test_strokes_keep_and_remove(two, size):
     cut = cutting.cut_picture(two, "two.png", CutoutOptions())
     without = cutting.apply_strokes(cut, [stroke(size, (0.2, 0.5, 0.8, 1.0), cutting.REMOVE)])
     assert without.mask[30, 25] == 1 and without.mask[30, 70] == 0
+    assert "2 separate parts" in cut.note == cutting.note_of(cut)
+    assert "edited" in cutting.note_of(without) and "parts" not in cutting.note_of(without)
     side = cutting.model_picture(without).shape[0]
     assert side == 25  # 20 pixels are four fifths of it
     assert cut.mask[30, 70] == 1, "the first one is as it was"
     again = cutting.apply_strokes(without, [stroke(size, (0.2, 0.5, 0.8, 0.9), cutting.KEEP)])
     assert again.mask[30, 70] == 1 and again.mask[5, 70] == 0
+    assert "2 separate parts" in cutting.note_of(again)
     np.testing.assert_array_equal(cutting.reset_mask(again).mask, cut.mask)
+    assert cutting.note_of(cutting.reset_mask(again)) == cut.note
     assert cutting.apply_strokes(cut, [np.zeros((*size, 4), np.uint8)]) is cut
 
 
@@ -143,6 +147,7 @@ def test_without_an_object_it_can_be_painted(tmp_path):
     assert cutting.model_picture(painted).shape == (38, 38, 4)  # 30 pixels over 0.8
     removed = cutting.apply_strokes(painted, [stroke((8, 10), (0, 0, 1, 1), cutting.REMOVE)])
     refused("no object found", cutting.model_picture, removed)
+    assert "may be wrong" not in cutting.note_of(removed)
 
 
 def test_no_pictures(tmp_path):

@@ -199,6 +199,16 @@ def test_help_shows_no_choice_none(capsys):
     assert "none" in text.split("--mesh ")[1].split("}")[0]
 
 
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_a_wrong_choice_lists_the_others_without_none(name):
+    command = cli.load_command(name)
+    text = cli.help_text(name, command, [])
+    for option in re.findall(r"(--[a-z-]+) \S*\{", text):
+        with pytest.raises(UserError, match="invalid choice 'zz'.* one of \\w+") as told:
+            cli._parsed(command, [option, "zz"], f"gamba {name}")
+        assert "None" not in str(told.value)
+
+
 def test_every_command_has_one_line_of_help():
     assert all(row.about.endswith(".") and len(row.about) < 60 for row in cli.COMMANDS.values())
 

@@ -1,3 +1,4 @@
+import io
 import re
 from dataclasses import replace
 from urllib.parse import unquote
@@ -148,6 +149,27 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     assert "Trained on: not known: this model has no card" in card
     said = capsys.readouterr().out
     assert "thing: 64 Gaussians.\n" in said and "1 picture, 0 failures" in said
+
+
+def test_a_picture_of_the_standard_input(tmp_path, picture, checkpoint, monkeypatch, capsys):
+    for content, code in ((picture.read_bytes(), 0), (b"", 1)):
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
+        assert run_reconstruct("-", *quick(checkpoint, tmp_path / "out")) == code
+    texts = capsys.readouterr()
+    assert "stdin: 64 Gaussians." in texts.out and (tmp_path / "out" / "stdin.ply").is_file()
+    assert "stdin: the file is empty\n" in texts.err and texts.err.count("\n") == 1
+
+
+def test_the_number_of_gaussians_is_told_once_they_are_written(
+    tmp_path, picture, checkpoint, monkeypatch, capsys
+):
+    def full(*_, **__):
+        raise UserError("no space left")
+
+    monkeypatch.setattr("gamba_warp.pages.export.write_gaussians", full)
+    assert run_reconstruct(picture, *quick(checkpoint, tmp_path)) == 1
+    texts = capsys.readouterr()
+    assert "Gaussians" not in texts.out and "no space left" in texts.err
 
 
 @pytest.mark.parametrize("frame", ["opencv", "opengl", None])

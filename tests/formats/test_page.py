@@ -166,3 +166,13 @@ def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):
     phone = browser_page(path, 390, 800).page
     assert phone.query_selector(".viewer").bounding_box()["width"] > 300
     assert phone.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_a_wide_table_fits_a_phone(tmp_path, browser_page):
+    header = ["", "views", "PSNR on black", "LPIPS on black", "PSNR on grey", "LPIPS on grey"]
+    rows = [["the training object most like it", "new views", 13.552, "absent", 20.957, "absent"]]
+    demo_page(tmp_path / "a.html", [Section("Numbers", header=header, table=rows)])
+    phone = browser_page(tmp_path / "a.html", 390, 800).page
+    assert phone.evaluate(
+        "(box => box.scrollWidth <= box.clientWidth)(document.querySelector('.scroll'))"
+    )

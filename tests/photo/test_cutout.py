@@ -140,7 +140,10 @@ def test_a_doubt_names_the_way_to_a_network_unless_it_is_refused(tmp_path, monke
     rgb[20:, 30:50] = 0.8, 0.2, 0.1  # down to the lower edge
     save_image(tmp_path / "post.png", rgb)
     options = CutoutOptions(notify=lambda line: None)
-    advice = "--cutout matte (isnet-general-use, 179 MB, Apache 2.0, fetched once)"
+    about = "isnet-general-use, 179 MB, Apache 2.0, fetched once"
+    advice = (
+        f"Try a network: gamba reconstruct --cutout matte ({about})"  # the app has no such choice
+    )
     assert advice in cut_out(tmp_path / "post.png", options).warning
     assert options.matte() is None
     found = cut_out(tmp_path / "post.png", options)

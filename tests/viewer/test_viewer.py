@@ -263,10 +263,13 @@ def test_the_tools_cover_no_part_of_the_picture_and_can_be_left_out(viewer, tmp_
     assert page.evaluate("background()") == [140 / 255] * 3 + [1]
 
 
-def test_it_turns_until_it_is_touched(viewer):
+@pytest.mark.parametrize("slow", [False, True])
+def test_it_turns_until_it_is_touched(viewer, slow):
     opened = viewer(colourful(40), reduced_motion="no-preference")
     page = opened.page
     page.reload()
+    if slow:  # the coarsest picture
+        page.evaluate("Object.assign(gambaViewer, { adapt() {}, coarse: SIZES.length - 1 })")
     for _ in range(100):
         page.wait_for_timeout(100)
         if page.evaluate("gambaViewer.camera.azimuth < 0"):
@@ -335,7 +338,11 @@ def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
         ("chair.ply", good.replace(b"f_dc_1", b"f_xx_1"), "Only uncompressed"),
         ("chair.ply", good.replace(b"binary_little_endian", b"ascii"), "Only uncompressed"),
         ("chair.ply", b"", "Only uncompressed"),
-        ("chair.glb", b"glTF", "Only uncompressed"),
+        ("chair.glb", b"glTF", "gamba view FILE"),
+        ("chair.SPZ", b"", "gamba view FILE"),
+        ("chair.ply", b"ply\nformat ascii 1.0\n", "gamba view FILE"),
+        ("chair.stl", b"", "gamba view GAUSSIANS --mesh FILE"),
+        ("chair.txt", b"", "Only uncompressed Gaussians open here (.ply, .splat)."),
         ("chair.splat", b"0" * 33, "cut short"),
         ("chair.splat", b"", "No Gaussian"),
         ("chair.splat", b"\0" * 32, "No Gaussian"),
@@ -355,6 +362,8 @@ def test_a_phone_and_a_small_frame_hold_all_buttons(viewer):
         boxes = [button.bounding_box() for button in page.query_selector_all("#bar button")]
         boxes = [box for box in boxes if box]
         assert len(boxes) >= 8
+        wide = "button => button.offsetParent && button.scrollWidth - button.clientWidth"
+        assert not any(page.locator("#bar button").evaluate_all(f"all => all.map({wide})"))
         for box in boxes:
             assert box["x"] >= 0 and box["x"] + box["width"] <= width
             assert box["y"] + box["height"] <= height

@@ -191,9 +191,8 @@ class Viewer {
     if (fast || this.turning || (!this.finished && ordered)) this.schedule();
   }
 
-  // Turns the object a little; returns true if it does. A slow graphics card ends it.
+  // Turns the object a little, however slow the frames are; returns true if it does.
   turn(now) {
-    if (this.coarse === SIZES.length - 1) this.turning = false;
     if (!this.turning || !this.shownOnce) return false;
     this.camera.azimuth -= TURN * Math.min(100, now - (this.turnedAt ?? now));
     this.turnedAt = now;

@@ -9,7 +9,7 @@ const SCALARS = {
   int16: ["Int16", 2], uint16: ["Uint16", 2], int32: ["Int32", 4], uint32: ["Uint32", 4],
   float32: ["Float32", 4], float64: ["Float64", 8],
 };
-const OTHER = "Only uncompressed Gaussians open here (.ply, .splat); for other files use gamba view.";
+const HERE = "Only uncompressed Gaussians open here (.ply, .splat)", OTHER = `${HERE}; for this file try: gamba view FILE`;
 
 // Rows of a .ply's vertices, or an error with a reason for the user.
 function plyTable(buffer) {
@@ -110,7 +110,8 @@ function frameOf({ means, scales, opacities }, seen) {
 function packedFile(name, buffer) {
   if (!globalThis.Float16Array) throw new Error("This browser is too old to open files; use gamba view.");
   const kind = /\.(ply|splat)$/i.exec(name)?.[1].toLowerCase();
-  if (!kind) throw new Error(OTHER);
+  if (/\.(obj|stl)$/i.test(name)) throw new Error(`${HERE}; a mesh beside them: gamba view GAUSSIANS --mesh FILE`);
+  if (!kind) throw new Error(/\.(spz|glb)$/i.test(name) ? OTHER : `${HERE}.`);
   const file = { ply: readPly, splat: readSplat }[kind](buffer);
   const seen = visibleOf(file), frame = frameOf(file, seen), { degree, antialiased = false } = file;
   const records = new ArrayBuffer(32 * seen.length), clip = (x) => Math.max(-LARGEST, Math.min(LARGEST, x));
