@@ -129,7 +129,7 @@ class CutoutOptions:
 
     @property
     def without_network(self) -> bool:
-        """True once the matting model was found to be unavailable, which ``notify`` has reported."""
+        """True once the matting model was found to be unavailable, as ``notify`` reported."""
         return self._no_matte
 
     def segmenter(self) -> SamSegmenter | None:
@@ -211,7 +211,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
         options: options.
 
     Raises:
-        UserError: the picture or a file of ``options`` cannot be read, or no method finds an object.
+        UserError: the picture or a file of ``options`` cannot be read, or no object is found.
         ModuleNotFoundError: a library for a file of ``options`` is not installed.
     """
     options = CutoutOptions() if options is None else options
