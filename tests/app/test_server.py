@@ -411,7 +411,7 @@ def test_jobs_are_done_by_the_one_that_works():
 
 
 def test_a_job_that_nobody_wants_is_ended(monkeypatch):
-    """It ends between two steps, but not within an import or the load of kernels."""
+    """The end comes between two steps, but not within an import or the load of kernels."""
     monkeypatch.setattr(main_thread, "LOOK_SECONDS", 0.05)
     jobs, found = MainThread(), []
 
