@@ -94,7 +94,7 @@ def test_what_is_not_known_is_used_as_it_is_and_told(files, capfd):
     names = [str(files / name) for name in ("true.obj", "true.ply")]
     assert run("eval-geometry", [*names, "--protocol", str(files / "protocol.json")]) == 0
     out, err = capfd.readouterr()
-    assert "unknown axes: coordinates are used as they are" in out and "warning: 1 of 1" in err
+    assert "unknown axes: coordinates are used unchanged" in out and "warning: 1 of 1" in err
     asked, _ = evaluate(capfd, files / "made.ply", files / "true.ply", "--up", "z", *CENTERS)
     assert asked["mean"]["chamfer"] < 0.02 and asked["axes"]["gt"] == {"z-up": 1}
     content = (
