@@ -91,17 +91,8 @@ class Actions:
         self._options = options
         self._files = files
         self._device = device
-        for name in (
-            "take",
-            "end_session",
-            "load_example",
-            "apply_strokes",
-            "restart",
-            "toggle_holes",
-            "reconstruct",
-        ):
-            setattr(self, name, with_page_errors(getattr(self, name)))
 
+    @with_page_errors
     def take(
         self,
         given: dict[str, Any] | None,
@@ -120,10 +111,12 @@ class Actions:
             return self.end_session()
         return *self._shown(cut, request), gr.skip()
 
+    @with_page_errors
     def end_session(self) -> tuple:
         """Clear the picture; its results stay."""
         return None, gr.update(visible=False), None, "", None
 
+    @with_page_errors
     def load_example(self, event: gr.EventData, request: gr.Request) -> tuple:
         """Take an example of the gallery."""
         found, index = examples(), event._data["index"]
@@ -133,6 +126,7 @@ class Actions:
         cut = self._call(request, cut_picture, path, title, self._options)
         return *self._shown(cut, request), str(path)
 
+    @with_page_errors
     def apply_strokes(
         self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request
     ) -> tuple:
@@ -140,11 +134,13 @@ class Actions:
         cut = apply_strokes(_given(cut), _layers(painted))
         return self._edited(cut, request)
 
+    @with_page_errors
     def restart(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Reset the mask, without strokes."""
         cut = reset_mask(_given(cut))
         return self._edited(cut, request)
 
+    @with_page_errors
     def toggle_holes(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Clear the enclosed areas of a plain background's colour, or fill them."""
         cut = _given(cut)
@@ -153,6 +149,7 @@ class Actions:
         cut = switch_areas(cut)
         return self._edited(cut, request)
 
+    @with_page_errors
     def reconstruct(
         self,
         cut: Cut | None,

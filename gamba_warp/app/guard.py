@@ -58,8 +58,8 @@ _NO_COOKIE = "open the page first; it needs its cookie"
 _SESSION = re.compile(b"session_hash=[a-z0-9]{1,32}")  # the only allowed query
 # All paths that the page reads; gradio itself serves eighty.
 _READ = re.compile(
-    "/|/theme[.]css|/favicon[.]ico|/manifest[.]json|/(assets|static)/.*|/gradio_api/(file=.*|heartbeat/[a-z0-9]+"
-    "|queue/data|upload_progress)",
+    "/|/theme[.]css|/favicon[.]ico|/manifest[.]json|/(assets|static)/.*"
+    "|/gradio_api/(file=.*|heartbeat/[a-z0-9]+|queue/data|upload_progress)",
     re.DOTALL,
 )
 _MAX_CALL = 1 << 20  # bytes of a function call; a real one takes 2 kB

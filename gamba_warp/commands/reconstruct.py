@@ -20,6 +20,8 @@ from ..files import STARTER, output_folder
 from ..pages.options import RECONSTRUCTED, FileOptions
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 
+MAX_STDIN = 1 << 28  # bytes of a picture from the standard input
+
 
 @dataclass(frozen=True)
 class CameraOptions:
@@ -168,9 +170,12 @@ def _find_pictures(
 
 
 def _standard_input() -> Path:
-    """Return a copy of the standard input, of 256 MB at most, which is removed at the end."""
+    """Return a copy of the standard input, which is removed at the end."""
     folder = tempfile.TemporaryDirectory(prefix="gamba-")
     atexit.register(folder.cleanup)
     path = Path(folder.name) / "stdin"
-    path.write_bytes(sys.stdin.buffer.read(1 << 28))
+    content = sys.stdin.buffer.read(MAX_STDIN + 1)
+    if len(content) > MAX_STDIN:
+        raise UserError(f"-: over {MAX_STDIN >> 20} MB on the standard input")
+    path.write_bytes(content)
     return path

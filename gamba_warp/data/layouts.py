@@ -43,6 +43,7 @@ MAX_VIEWS = 10_000  # of an object
 MAX_SIDE = 16_384  # pixels of a camera
 NEAREST, FARTHEST = 1e-3, 1e4  # camera's distance from the object's centre, in the file's units
 SHORTEST, LONGEST = 1e-2, 1e3  # focal lengths, in sides of the picture
+_LAST_ROW = 0.0, 0.0, 0.0, 1.0  # of a pose
 _LARGEST = 1e9  # of any number in a camera file
 _MAX_TEXT = 500  # letters of a name or of an attribution
 _MAX_DEPTH = 64  # levels of nested folders
@@ -170,7 +171,12 @@ def _matrix(value: object, source: str, what: str = "the pose") -> np.ndarray:
         raise UserError(f"{source}: {what} is not a matrix of numbers") from error
     if matrix.shape not in ((3, 4), (4, 4)):
         raise UserError(f"{source}: {what} has shape {matrix.shape}, expected 3x4 or 4x4")
-    return np.concatenate([matrix[:3], [[0.0, 0.0, 0.0, 1.0]]])
+    return np.concatenate([matrix, [_LAST_ROW]])[:4]
+
+
+def _is_last_row(row: np.ndarray) -> np.ndarray:
+    """Return whether rows ``[.., 4]`` are 0 0 0 1, up to rounding."""
+    return np.isclose(row, _LAST_ROW, atol=1e-6).all(-1)
 
 
 def check_cameras(
@@ -178,7 +184,7 @@ def check_cameras(
     Ks: np.ndarray,
     sizes: Sequence[tuple[int, int] | None],
     names: Sequence[str],
-    near: bool = True,
+    around_object: bool = True,
 ) -> None:
     """Check that cameras are plausible.
 
@@ -187,7 +193,7 @@ def check_cameras(
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: V widths and heights, pixels, or None.
         names: names of the V views, for the message.
-        near: they look at an object about the origin, which bounds their distance.
+        around_object: they look at an object at the origin, which bounds their distance.
 
     Raises:
         UserError: a pose is not a rotation with a position, or a K does not match the size.
@@ -203,7 +209,7 @@ def check_cameras(
             "the pose is not finite, or over {most:g}": (np.abs(poses) <= _LARGEST).all((1, 2)),
             "the pose's 3x3 part is not a rotation": orthogonal & ~(np.linalg.det(rotations) < 0),
             "the camera is {distance:g} from the object's centre, expected {near:g} to {far:g}": (
-                (distances >= NEAREST) & (distances <= FARTHEST) | (not near)
+                (distances >= NEAREST) & (distances <= FARTHEST) | (not around_object)
             ),
             "focal lengths must be positive": positive,
             "focal lengths of {focal[0]:g} and {focal[1]:g} sides of the picture, expected "
@@ -211,6 +217,7 @@ def check_cameras(
             "the principal point is far outside the picture": (
                 ((center >= -1) & (center <= 2)).all(1)
             ),
+            "the pose's last row is not 0 0 0 1": _is_last_row(poses[:, 3]),
         }
     limits = {
         "most": _LARGEST,
@@ -241,13 +248,14 @@ def read_placement(values: dict[str, Any], source: str) -> Placement | None:
     """
     if values.get("applied_transform") is None:
         return None
-    matrix = _matrix(values["applied_transform"], source, "applied_transform")[:3]
+    matrix = _matrix(values["applied_transform"], source, "applied_transform")
     scale = _number({"applied_scale": 1.0, **values}, "applied_scale", source)
     with np.errstate(all="ignore"):  # non-finite numbers are reported here
-        valid = (np.abs(matrix) <= _LARGEST).all() and scale > 0
-        if not valid or np.linalg.matrix_rank(matrix[:, :3]) < 3:
-            raise UserError(f"{source}: applied_transform or applied_scale is not invertible")
-    return Placement(matrix, scale)
+        valid = (np.abs(matrix) <= _LARGEST).all() and scale > 0 and _is_last_row(matrix[3])
+        if not valid or np.linalg.matrix_rank(matrix[:3, :3]) < 3:
+            reason = "is not affine, or not invertible"
+            raise UserError(f"{source}: applied_transform or applied_scale {reason}")
+    return Placement(matrix[:3], scale)
 
 
 def _side(values: dict[str, Any], key: str, source: str) -> int:
@@ -330,7 +338,7 @@ def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
         UserError: the file is invalid; one line says where.
     """
     top, frames = _frames(path, read_document(path, object))
-    return _cameras(path, top, frames, None, near=False)
+    return _cameras(path, top, frames, None, around_object=False)
 
 
 def _frames(path: Path | str, top: object) -> tuple[dict, list[dict]]:
@@ -352,7 +360,7 @@ def _cameras(
     top: dict,
     frames: list[dict],
     size: Callable[[], tuple[int, int]] | None,
-    near: bool = True,
+    around_object: bool = True,
 ) -> tuple[np.ndarray, np.ndarray, Sizes]:
     poses, lenses, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
     shared = None  # most files have one lens for all frames
@@ -364,7 +372,7 @@ def _cameras(
             shared = shared or _intrinsics(top, source, size)
             lenses.append(shared)
     Ks, sizes = np.stack([K for K, _ in lenses]), [size for _, size in lenses]
-    check_cameras(np.stack(poses), Ks, sizes, names, near)
+    check_cameras(np.stack(poses), Ks, sizes, names, around_object)
     return np.stack(poses), Ks, sizes
 
 

@@ -15,11 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import UserError
-from .headers import (
-    MAX_VALUES,
-    open_shape,
-    read_rows,
-)
+from .headers import MAX_VALUES, open_shape, read_rows
 from .ply_data import PlyData, read_ply
 
 SUFFIXES = (".xyz", ".ply")

@@ -56,14 +56,14 @@ def solid_of(
     # Near a hole the votes are noisy: the median closes tunnels of a voxel.
     inside = median_filter(2 * votes.reshape(shape) > _VOTES, 3)
     filled = np.asarray(binary_fill_holes(inside))
+    if not filled.any():
+        raise UserError(_EMPTY)
     # Only points near the surface need their distance; the walls of a filled cavity do not count.
     depth = np.where(filled, 1.0, -1.0)
     beside = binary_dilation(filled, iterations=5) & ~binary_erosion(filled, iterations=5)
     beside &= inside | ~filled
     distance = scene.compute_distance(points[beside.ravel()]).numpy() * voxels
     depth[beside] *= np.maximum(distance, _LEAST)
-    if not filled.any():
-        raise UserError(_EMPTY)
     corners, triangles, _, _ = marching_cubes(depth, 0.0, gradient_direction="ascent")
     made = Manifold(Triangles(corners.astype(np.float32), triangles.astype(np.uint32)))
     large = [part for part in made.decompose() if part.volume() > _SHARE * made.volume()]

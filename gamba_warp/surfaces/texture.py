@@ -66,12 +66,13 @@ def point_colors(
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     cameras = views.cameras
     for depth, rgb, viewmat, K in zip(views.depth, views.rgb, cameras.viewmats, cameras.Ks):
-        # Only points that face the camera are looked at.
-        facing = torch.nonzero((normals * (points - _center(viewmat))).sum(-1) < 0)[:, 0]
-        given = points[facing], normals[facing], depth, rgb, viewmat, K
-        share, color = _seen(*given, 4.0 / voxels)
-        total.index_add_(0, facing, share**2 * color)
-        weight.index_add_(0, facing, share**2)
+        rays = points + viewmat[:3, :3].T @ viewmat[:3, 3]
+        cosines = -(normals * rays).sum(-1) / rays.norm(dim=-1)
+        facing = torch.nonzero(cosines > 0)[:, 0]
+        visible, color = _seen(points[facing], depth, rgb, viewmat, K, 4.0 / voxels)
+        share = (visible * cosines[facing] ** 2)[:, None]
+        total.index_add_(0, facing, share * color)
+        weight.index_add_(0, facing, share)
     known = weight[:, 0] > 0
     if not known.any():
         raise UserError("no view sees the surface")
@@ -82,24 +83,12 @@ def point_colors(
     return colors
 
 
-def _center(viewmat: Tensor) -> Tensor:
-    """Return the position ``[3]`` of a camera."""
-    return -viewmat[:3, :3].T @ viewmat[:3, 3]
-
-
 def _seen(
-    points: Tensor,
-    normals: Tensor,
-    depth: Tensor,
-    rgb: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    near: float,
+    points: Tensor, depth: Tensor, rgb: Tensor, viewmat: Tensor, K: Tensor, near: float
 ) -> tuple[Tensor, Tensor]:
-    """Return cosines ``[P, 1]``, 0 for points hidden in a view, and colours ``[P, 3]``."""
+    """Return which points a view sees, ``[P]`` bool, and their colours ``[P, 3]``."""
     height, width = depth.shape
     seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    facing = -(normals @ viewmat[:3, :3].T * seen).sum(-1) / seen.norm(dim=-1)
     at = seen[:, :2] / seen[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
     size = torch.tensor([width, height])
     pixel = at.floor().long()
@@ -113,7 +102,7 @@ def _seen(
     grid = (at / size * 2 - 1)[None, None]
     sampled = torch.nn.functional.grid_sample(picture, grid, align_corners=False)[0, :, 0].T
     color = sampled[:, :3] / sampled[:, 3:].clamp_min(1e-6)
-    return torch.where(visible, facing.clamp_min(0), 0)[:, None], color
+    return visible, color
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Camera files: NeRF's transforms.json, which is also written, and nerfstudio's camera path.
 
 - ``transforms.json``: ``frames`` of ``transform_matrix``, read like ``data.layouts``; and ``fps``,
-  which is ours.
+  an addition of this project.
 - nerfstudio's camera path: ``camera_path`` of ``camera_to_world`` (16 numbers by rows, OpenGL) and
   ``fov`` (degrees, vertical); ``render_width, render_height, fps, seconds``.
 
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from msgspec import Meta, Struct
 from torch import Tensor
@@ -127,15 +128,15 @@ def _of_nerfstudio(path: _Nerfstudio, source: str) -> CameraPath:
         kind = repr(path.camera_type)[:40]
         raise UserError(f"{source}: camera_type is {kind}; only perspective is rendered")
     width, height = round(path.render_width), round(path.render_height)
-    poses = _tensor([posed.camera_to_world for posed in path.camera_path]).view(-1, 4, 4)
-    poses[:, 3] = _tensor([0, 0, 0, 1])  # whatever the file has, as in a transforms.json
     Ks = torch.stack([_centred(width, height, posed.fov) for posed in path.camera_path])
-    names = [f"{source}: frame {number}" for number in range(len(poses))]
-    check_cameras(poses.numpy(), Ks.numpy(), [(width, height)] * len(poses), names, near=False)
+    names = [f"{source}: frame {number}" for number in range(len(Ks))]
+    poses = np.reshape([posed.camera_to_world for posed in path.camera_path], (-1, 4, 4))
+    sizes = [(width, height)] * len(poses)
+    check_cameras(poses, Ks.numpy(), sizes, names, around_object=False)
     rate = path.fps
     if path.seconds is not None:  # like nerfstudio: the length counts, not the rate
         rate = min(1000.0, len(poses) / path.seconds)
-    return CameraPath(Cameras(from_opengl(poses), Ks, width, height), rate)
+    return CameraPath(Cameras(from_opengl(torch.from_numpy(poses)), Ks, width, height), rate)
 
 
 def _of_transforms(file: Path, source: str) -> Cameras:

@@ -100,7 +100,7 @@ def busy_line(document: dict) -> str:
     loads = " and ".join(f"{load:.1f}" for load in document["machine"]["load"])
     return (
         f"The machine was busy: {late} of {len(timed)} variants took over {_BUSY:.0%} of their CPU "
-        f"time; its load was {loads} at the begin and the end."
+        f"time; its load was {loads} at the start and the end."
     )
 
 

@@ -158,6 +158,9 @@ def test_a_picture_of_the_standard_input(tmp_path, picture, checkpoint, monkeypa
     texts = capsys.readouterr()
     assert "stdin: 64 Gaussians." in texts.out and (tmp_path / "out" / "stdin.ply").is_file()
     assert "stdin: the file is empty\n" in texts.err and texts.err.count("\n") == 1
+    monkeypatch.setattr("gamba_warp.commands.reconstruct.MAX_STDIN", 8)
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(bytes(9))))
+    refused_command(capsys, "reconstruct", ["-"], "-: over 0 MB on the standard input")
 
 
 def test_the_number_of_gaussians_is_told_once_they_are_written(

@@ -124,8 +124,10 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"frame": {"camera_angle_x": 4, "fl_x": None}}, "fl_x is None"),
         ({"frame": {"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
         ({"frame": {"transform_matrix": np.diag([2.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
+        ({"frame": {"transform_matrix": [*POSE[:3], [0, 0, 0.5, 1]]}}, "last row is not 0 0 0 1"),
+        ({"applied_transform": [*np.eye(3, 4).tolist(), [0, 0, 0, 2]]}, "is not affine"),
     ],
-    ids=range(42),
+    ids=range(44),
 )
 def test_numbers_without_sense_are_one_line(tmp_path, values, message):
     transforms(tmp_path / "x", **values)

@@ -179,6 +179,14 @@ BAD = {
         },
         "only perspective is rendered",
     ),
+    "last row": (
+        {
+            "render_width": 9,
+            "render_height": 9,
+            "camera_path": [{"camera_to_world": [*np.eye(4).ravel()[:14], 1, 1], "fov": 50}],
+        },
+        "frame 0: the pose's last row is not 0 0 0 1",
+    ),
     "lens": (
         {"w": 9, "h": 9, "fl_x": 9, "k1": 0.5, "frames": [{"transform_matrix": [[1]]}]},
         "the pose has shape",

@@ -17,7 +17,7 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from gamba_warp.batch import progress_bar
-from gamba_warp.errors import UserError, first_line
+from gamba_warp.errors import UserError
 from gamba_warp.files import PART, atomic_folder, output_folder, write_json
 from gamba_warp.formats.catalogue import CATALOGUE, check_rotation
 from gamba_warp.untrusted.archives import open_zip
@@ -103,7 +103,7 @@ def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
         raise UserError(f"dpkg-deb is missing: unpack {deb}, and pass the folder as --tree")
     result = subprocess.run(["dpkg-deb", "--extract", str(deb), str(scratch / "deb")], **_TEXT)
     if result.returncode:
-        raise UserError(f"{deb}: cannot be unpacked ({first_line(Exception(result.stderr))})")
+        raise UserError(f"{deb}: cannot be unpacked ({result.stderr.strip()})")
     return _find_libraries(None, scratch / "deb", scratch)
 
 

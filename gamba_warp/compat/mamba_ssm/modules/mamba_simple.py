@@ -16,7 +16,7 @@ from ..ops.triton.selective_state_update import selective_state_update
 from ..utils.generation import InferenceParams
 from . import block
 
-_WAY_OUT = (
+_OF_FORK = (
     "which is not supported: a fork's own layer file runs over the functions here "
     "(docs/drop-ins.md, 'Without any change')"
 )
@@ -67,9 +67,9 @@ class Mamba(nn.Module):
         """
         super().__init__()
         if bimamba_type != "none":
-            raise ValueError(f"bimamba_type is {bimamba_type!r}, {_WAY_OUT}")
+            raise ValueError(f"bimamba_type is {bimamba_type!r}, {_OF_FORK}")
         for name, value in of_fork.items():
-            raise TypeError(f"{name} is {value!r}, {_WAY_OUT}")
+            raise TypeError(f"{name} is {value!r}, {_OF_FORK}")
         if not 1 <= d_state <= 256:
             raise ValueError(f"d_state is {d_state}, allowed is 1 to 256")
         one_of("d_conv", d_conv, 2, 3, 4)  # supported by the convolution's kernel
