@@ -162,27 +162,6 @@ def counted(count: int, unit: str) -> str:
     return f"{count:,} {unit}" + ("" if count == 1 else "s")
 
 
-def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: Path) -> int:
-    """Print the failures and the folder of the results.
-
-    Args:
-        count: number of inputs.
-        unit: the noun for one input.
-        failures: as ``for_each`` returns them.
-        out: folder of the results.
-
-    Returns:
-        The exit code: 1 if an input failed, else 0.
-    """
-    for item, reason in failures:
-        print(f"gamba: failed: {item}: {reason}", file=sys.stderr)
-    # An input that is a folder holds none of the counted ones.
-    lost = sum(not (isinstance(item, Path) and item.is_dir()) for item, _ in failures)
-    where = f", results in {out}" if lost < count else ""
-    print(f"{counted(count, unit)}, {counted(len(failures), 'failure')}{where}")
-    return 1 if failures else 0
-
-
 def plan_outputs(
     inputs: Sequence[Path],
     suffixes: Sequence[str],

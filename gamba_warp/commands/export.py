@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ..batch import for_each, plan_outputs, report, say
+from ..batch import for_each, plan_outputs
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -23,8 +23,10 @@ from ..surfaces.options import (
     Voxels,
 )
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
+from .results import Results, reported
 
 
+@reported
 @ranged
 def export_command(
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
@@ -44,7 +46,7 @@ def export_command(
     distance: Distance | None = None,
     drop_bad: bool = False,
     device: DeviceChoice = "auto",
-) -> int:
+) -> Results:
     """Turn files of Gaussians into meshes, other splat formats, pages and turntables.
 
     Meshes are NAME-mesh.FORMAT, splats NAME.FORMAT (compressed-ply: NAME.compressed.ply). Existing
@@ -101,9 +103,10 @@ def export_command(
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     names = plan_outputs(found, job.suffixes(), files.out)
     output_folder(files.out)
+    results = Results("file", len(found), files.out, failures)
 
     def one(name: str, path: Path) -> None:
-        say(export(name, path, job))
+        results.made.append({"input": str(path), "name": name, **export(name, path, job)})
 
     for_each(names, one, "export", "file", failures)
-    return report(len(found), "file", failures, files.out)
+    return results

@@ -12,13 +12,14 @@ from typing import Annotated
 
 import tyro
 
-from ..batch import STAGES, check_not_read, counted, for_each, plan_outputs, report, say, warn
+from ..batch import STAGES, check_not_read, counted, for_each, plan_outputs, say, warn
 from ..conventions import Cutout, Detail, DeviceChoice, Precision
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
 from ..pages.options import RECONSTRUCTED, FileOptions
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
+from .results import Results, reported
 
 MAX_STDIN = 1 << 28  # bytes of a picture from the standard input
 
@@ -40,6 +41,7 @@ class CameraOptions:
     distance: Distance | None = None
 
 
+@reported
 @ranged
 def reconstruct_command(
     images: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")],
@@ -60,7 +62,7 @@ def reconstruct_command(
     save_inputs: bool = False,
     device: DeviceChoice = "auto",
     precision: Precision = "float32",
-) -> int:
+) -> Results:
     """Turn pictures of single objects into 3D Gaussians, in one forward pass each.
 
     Args:
@@ -126,6 +128,7 @@ def reconstruct_command(
     targets = [files.out / (name + suffix) for name in names for suffix in outputs.suffixes()]
     if older := sum(target.exists() for target in targets):
         say(f"{files.out}: {counted(older, 'file')} of an earlier run will be replaced")
+    results = Results("picture", len(pictures), files.out, failures)
     places = {name: f"[{n}/{len(names)}] " for n, name in enumerate(names, 1)}
 
     def one(name: str, path: Path) -> None:
@@ -139,13 +142,15 @@ def reconstruct_command(
         made = reconstruct(model, cut.rgba, precision, detail)
         gaussians = made.to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
-        write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
+        told = {"input": str(path), "name": name, "cutout": cut.how, "warning": cut.warning}
+        made = write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
+        results.made.append(told | made)
 
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:
         outputs.sheet.write()
     outputs.write_index()
-    return report(len(pictures), "picture", failures, files.out)
+    return results
 
 
 def _find_pictures(

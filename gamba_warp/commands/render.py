@@ -8,17 +8,19 @@ from typing import Annotated, Literal, cast
 import tyro
 from msgspec import Meta
 
-from ..batch import check_not_read, for_each, plan_outputs, progress_bar, report
+from ..batch import check_not_read, for_each, plan_outputs, progress_bar
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
 from ..untrusted.ranges import Distance, Elevation, Fov, Rate, ranged
+from .results import Results, reported
 
 Kind = Literal["gif", "mp4", "png"]
 _SUFFIXES = (".gif", ".mp4", ".png")
 
 
+@reported
 @ranged
 def render_command(
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
@@ -36,7 +38,7 @@ def render_command(
     depth: bool = False,
     drop_bad: bool = False,
     device: DeviceChoice = "auto",
-) -> int:
+) -> Results:
     """Render Gaussians along a camera path to a GIF, a video, or a folder of pictures.
 
     A turntable and a spiral go around the object's centre, with -y up as in gamba's files. Cameras
@@ -46,7 +48,8 @@ def render_command(
         inputs: Gaussians (.ply in the 3DGS layout), or folders of them.
         trajectory: turntable, spiral (two turns, up and down), or a file of cameras: gamba's
             (docs/cameras.md), transforms.json, or nerfstudio's camera path.
-        out: Folder for the results; for a single input also a .gif, an .mp4, or a .png of one view.
+        out: Folder for the results; for a single input also a .gif, an .mp4, a .png of one view, or
+            - for such a file on the standard output.
         kind: Kind of output; png is a folder of pictures and a transforms.json. By default
             that of --out, else gif.
         size: Width of the pictures, or width and height, pixels; by default the file's, else 512.
@@ -112,4 +115,4 @@ def render_command(
             shoot(Path(target), kind, gaussians, unit_frame(gaussians), film, chosen, bar.update)
 
     for_each(targets, one, "render", "file", failures)
-    return report(len(files), "file", failures, out)
+    return Results("file", len(files), out, failures)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -94,7 +95,7 @@ class ObjectFiles:
         section: Section,
         device: torch.device,
         comments: Sequence[str],
-    ) -> tuple[list[str], np.ndarray | None]:
+    ) -> tuple[dict[str, Any], np.ndarray | None]:
         """Write the files of one object, ``NAME.*`` by the section's title.
 
         Args:
@@ -107,8 +108,8 @@ class ObjectFiles:
             comments: lines for the header of a ``.ply``.
 
         Returns:
-            Sentences about losses of formats and about the mesh, and the turntable ``[F, S, S, 3]``
-            uint8, if one was made.
+            Names of the files, number of Gaussians, sizes of the mesh and sentences about it and
+            about losses of formats; and the turntable ``[F, S, S, 3]`` uint8, if one was made.
 
         Raises:
             UserError: a file cannot be written, or the object has no surface.
@@ -117,6 +118,8 @@ class ObjectFiles:
         base, turn = options.out / section.title, None
         STAGES.begin("Gaussians")
         notes = []
+        files = [section.title + end for end in self.suffixes()]
+        told: dict[str, Any] = {"files": files, "gaussians": gaussians.num}
         for kind in options.splats:
             path = base.with_name(base.name + splat_suffix(kind))
             notes.append(write_gaussians(path, gaussians, kind, comments=comments))
@@ -140,10 +143,15 @@ class ObjectFiles:
             counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
             colors = f", texture of {self.texture} pixels" if self.texture else ""
             notes.append(f"Mesh: {counts}{colors}, {_closedness(mesh)}, {seconds:.1f} s.")
+            told["mesh"] = {
+                "vertices": len(mesh.vertices),
+                "faces": len(mesh.faces),
+                "closed": mesh.is_watertight(),
+            }
             section.mesh = mesh if shown is None else None
             self._write_page(section, meshes=True)
         STAGES.begin("rest")
-        return [*filter(None, notes)], turn
+        return told | {"notes": [*filter(None, notes)]}, turn
 
     def _write_page(self, section: Section, meshes: bool) -> None:
         """Write the page, if requested; with ``meshes`` it also links to these."""
@@ -236,8 +244,8 @@ def read_with_warning(path: Path, drop_bad: bool) -> Gaussians:
     return gaussians
 
 
-def export(name: str, path: Path, job: ExportJob) -> str:
-    """Write all requested outputs of one file of Gaussians.
+def export(name: str, path: Path, job: ExportJob) -> dict[str, Any]:
+    """Write all requested outputs of one file of Gaussians; print a line about them.
 
     Args:
         name: stem of the outputs.
@@ -245,7 +253,7 @@ def export(name: str, path: Path, job: ExportJob) -> str:
         job: options.
 
     Returns:
-        A line about the outputs.
+        Figures, as of ``ObjectFiles.write``.
 
     Raises:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
@@ -254,8 +262,9 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     drawn = job.options.page or job.options.turntable != "none"
     shown = gaussians.in_unit(*unit_frame(gaussians)) if drawn else gaussians
     section = Section(name, table=[("Gaussians", f"{gaussians.num:,}")], **asdict(job.view))
-    notes, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
-    return " ".join([f"{name}: {count}", *notes])
+    told, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
+    say(" ".join([f"{name}: {count}", *told["notes"]]))
+    return told
 
 
 @dataclass(kw_only=True)
@@ -308,7 +317,7 @@ def write_outputs(
     outputs: Outputs,
     config: GambaConfig,
     seconds: float,
-) -> None:
+) -> dict[str, Any]:
     """Write all requested outputs of one reconstruction, as ``NAME.*`` in the folder.
 
     Args:
@@ -318,6 +327,9 @@ def write_outputs(
         outputs: options.
         config: of the model, for the camera.
         seconds: run time of the model.
+
+    Returns:
+        Figures, as of ``ObjectFiles.write``.
 
     Raises:
         UserError: a file cannot be written, or all Gaussians are invalid.
@@ -336,8 +348,8 @@ def write_outputs(
     if cut.warning:
         section.strip = cut.beside()
     comments = [f"from {name} by {outputs.checkpoint.name}"]
-    lost, turn = outputs.write(gaussians, None, view, section, device, comments)
-    for line in (f"{name}: {count}", *lost):
+    told, turn = outputs.write(gaussians, None, view, section, device, comments)
+    for line in (f"{name}: {count}", *told["notes"]):
         say(line)
     if outputs.sheet is not None:
         outputs.sheet.add(name, cut.rgba, gaussians, view)
@@ -346,3 +358,4 @@ def write_outputs(
         small = Image.fromarray(np.hstack([flat, turn[len(turn) // 8]]))  # rotated a little
         small.thumbnail(_SMALL)
         outputs.made[name] = np.asarray(small)
+    return told

@@ -19,7 +19,9 @@ class FileOptions:
     """Output files of each object.
 
     Attributes:
-        out: Folder for the results.
+        out: Folder for the results; - writes one file to the standard output, such as the .ply, and
+            neither page nor turntable.
+        json: Print the results as a JSON object in place of text.
         splats: Files of the Gaussians.
         mesh: Files of a mesh of the surface, in colour except .stl (gamba export has more options).
         faces: Largest number of faces of the mesh; 0 keeps all. By default 50,000, with a texture
@@ -38,6 +40,7 @@ class FileOptions:
     """
 
     out: Path = Path("out")
+    json: bool = False
     splats: tuple[SplatFormat, ...] = ()
     mesh: tuple[MeshChoice, ...] = ()
     faces: Faces | None = None

@@ -1,11 +1,11 @@
-"""Loop over many inputs: recorded failures, fatal errors, and the final report."""
+"""Loop over many inputs: recorded failures, fatal errors, and the names of outputs."""
 
 from pathlib import Path
 
 import pytest
 from helpers.refusals import refused
 
-from gamba_warp.batch import check_not_read, for_each, plan_outputs, report
+from gamba_warp.batch import check_not_read, for_each, plan_outputs
 from gamba_warp.errors import UserError
 
 FAILURES = {
@@ -46,16 +46,6 @@ def test_defects_and_ctrl_c_stop_it_but_keep_what_was_noted(error):
     with pytest.raises(type(error)):
         for_each({"a": 1, "b": 2, "c": 3}, function, "test", "item", failures)
     assert failures == [(1, "wrong")]
-
-
-def test_the_report_names_failures_and_gives_the_exit_code(capsys):
-    assert report(2, "file", [], Path("out")) == 0
-    assert capsys.readouterr() == ("2 files, 0 failures, results in out\n", "")
-    assert report(2, "file", [(Path("a.ply"), "empty")], Path("out")) == 1
-    said = capsys.readouterr()
-    assert said.err == "gamba: failed: a.ply: empty\n" and "2 files, 1 failure, results" in said.out
-    assert report(1, "file", [(Path("a.ply"), "empty")], Path("out")) == 1
-    assert capsys.readouterr().out == "1 file, 1 failure\n"
 
 
 def planned(inputs, suffixes, folder, reads=()):

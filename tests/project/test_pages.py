@@ -25,7 +25,7 @@ from gamba_warp.images import load_rgba
 README = ROOT / "README.md"
 MAKEFILE = (ROOT / "Makefile").read_text()
 # Programs of others, and words of the shell, that stand in blocks.
-OTHERS = {*"git cd docker source pip for do done sbatch export apt-get ulimit".split()}
+OTHERS = {"cat", *"git cd docker source pip for do done sbatch export apt-get ulimit".split()}
 OTHERS.add("docs/lab/gpu_train.sh")
 SHELL = blocks("bash")
 PYTHON = blocks("python")

@@ -1,0 +1,109 @@
+"""Results of a command over many inputs: printed as text or JSON, or one file on stdout."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, redirect_stdout
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ..batch import counted
+from ..errors import UserError
+
+STREAM = Path("-")  # as --out: the standard output
+
+
+@dataclass
+class Results:
+    """Results of a command.
+
+    Attributes:
+        unit: the noun for one input.
+        count: number of inputs.
+        out: folder or file of the results.
+        failures: as ``for_each`` returns them.
+        made: figures of each other input, with its ``input`` and ``name``.
+    """
+
+    unit: str
+    count: int
+    out: Path
+    failures: list[tuple[Path, str]]
+    made: list[dict[str, Any]] = field(default_factory=list)
+
+    def text(self) -> str:
+        """Return a line with counts and the folder."""
+        # An input that is a folder holds none of the counted ones.
+        lost = sum(not item.is_dir() for item, _ in self.failures)
+        where = f", results in {self.out}" if lost < self.count and self.out != STREAM else ""
+        failures = counted(len(self.failures), "failure")
+        return f"{counted(self.count, self.unit)}, {failures}{where}"
+
+    def json(self) -> str:
+        """Return the same as a JSON object."""
+        failures = [{"input": str(item), "reason": reason} for item, reason in self.failures]
+        values = {"out": str(self.out), "results": self.made, "failures": failures}
+        return json.dumps(values, indent=2)
+
+
+def reported(command: Callable[..., Results]) -> Callable[..., int]:
+    """Decorate a command to print its results, and return the exit code: 1 if an input failed.
+
+    The command has either an option ``out``, or ``files`` of ``FileOptions``. With ``--out -`` it
+    gets a temporary folder, without page and turntable, whose one file goes to stdout. With that or
+    ``--json`` all text goes to stderr.
+    """
+
+    @functools.wraps(command)
+    def run(*args: Any, **options: Any) -> int:
+        given = inspect.signature(command).bind(*args, **options)
+        given.apply_defaults()
+        values, files = given.arguments, given.arguments.get("files")
+        piped = (files.out if files else values["out"]) == STREAM
+        as_json = files is not None and files.json
+        if piped and as_json:
+            raise UserError("--out - writes a file to the standard output; --json cannot, too")
+        stdout = sys.stdout
+        with redirect_stdout(sys.stderr) if piped or as_json else nullcontext():
+            with _one_file() if piped else nullcontext() as folder:
+                if folder and files:
+                    values["files"] = replace(files, out=folder, page=False, turntable="none")
+                elif folder:
+                    values["out"] = folder / f"stdout.{values['kind'] or 'gif'}"
+                results = command(*given.args, **given.kwargs)
+            results.out = STREAM if piped else results.out
+            for item, reason in results.failures:
+                print(f"gamba: failed: {item}: {reason}", file=sys.stderr)
+            print(results.json() if as_json else results.text(), file=stdout if as_json else None)
+        return 1 if results.failures else 0
+
+    return run
+
+
+@contextmanager
+def _one_file() -> Iterator[Path]:
+    """Yield an empty folder; write the one file that is then in it to stdout.
+
+    Raises:
+        UserError: there are several files, or stdout is a terminal.
+    """
+    stdout = sys.__stdout__
+    if stdout is None or stdout.isatty():
+        raise UserError("--out -: the standard output is a terminal; redirect it to a file")
+    with tempfile.TemporaryDirectory(prefix="gamba-") as folder:
+        yield Path(folder)
+        made = sorted(Path(folder).iterdir())
+        if len(made) > 1:
+            names = ", ".join(path.name for path in made[:4])
+            raise UserError(f"--out - writes one file, but {len(made)} were made: {names}")
+        for path in made:
+            with open(path, "rb") as file:
+                shutil.copyfileobj(file, stdout.buffer)
+            stdout.flush()
