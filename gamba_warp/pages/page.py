@@ -159,6 +159,7 @@ def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
         section.title,
         section.gaussians,
         mesh=section.mesh,
+        picture=section.picture,
         poster=poster,
         auto=auto,
         **{which: viewpoint},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import json
 import math
 import re
@@ -12,14 +13,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..files import write_text
 from ..gaussians import Gaussians
+from ..images import to_uint8
 from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
 
 # In order of their dependencies.
 _SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "open", "ui", "main")
+_PICTURE = 512  # longest side of the input, pixels
 # The page may load only inlined content; the sorting worker is made from a text of the page.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
@@ -83,6 +87,7 @@ def viewer_parts(
     mesh: Any = None,
     camera: tuple[float, float, float] | None = None,
     view: tuple[float, float, float] | None = None,
+    picture: np.ndarray | None = None,
     note: str = "",
 ) -> ViewerParts:
     """Return the texts for the slots of ``program_page``.
@@ -97,6 +102,7 @@ def viewer_parts(
             lines. None: without an input; the object may have any size and position.
         view: the initial view without a camera; its distance is from the object's centre, in units
             of the object's longest side.
+        picture: the input from ``camera``, ``[S, S, 3|4]`` in [0, 1], which a slider shows.
         note: a few words below the title.
 
     Raises:
@@ -121,10 +127,18 @@ def viewer_parts(
         "faces": faces,
         "home": home,
         "input": None if camera is None else home,
+        "picture": "" if picture is None else _data_url(picture),
         "frame": {"center": frame.center.tolist(), "size": frame.size},
     }
     packed = (base64.b64encode(part).decode() for part in (records, harmonics, surface))
     return ViewerParts(json_text(about), *packed)
+
+
+def _data_url(picture: np.ndarray) -> str:
+    content, image = io.BytesIO(), Image.fromarray(to_uint8(picture))
+    image.thumbnail((_PICTURE, _PICTURE))
+    image.save(content, "WEBP", quality=90)
+    return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def frame_element(

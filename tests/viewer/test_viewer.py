@@ -44,9 +44,11 @@ def tetrahedron():
 def viewer(browser_page, tmp_path):
     """Opens the page of some Gaussians, and waits for its first picture."""
 
-    def opened(gaussians, width=WIDE, height=HIGH, mesh=None, camera=CAMERA, **options):
+    def opened(
+        gaussians, width=WIDE, height=HIGH, mesh=None, camera=CAMERA, picture=None, **options
+    ):
         path = tmp_path / "view.html"
-        write_viewer(path, "A chair", gaussians, mesh=mesh, camera=camera)
+        write_viewer(path, "A chair", gaussians, mesh=mesh, camera=camera, picture=picture)
         options = {"color_scheme": "light", "reduced_motion": "reduce", **options}
         found = browser_page(path, width, height, **options)
         found.promised("gambaViewer.rest()")
@@ -222,6 +224,39 @@ def test_what_it_shows(viewer):
     assert not page.is_visible("#help") and not opened.messages
 
 
+def test_a_slider_compares_the_object_with_the_input_and_the_mesh(viewer):
+    page = (opened := viewer(colourful())).page
+    assert not page.is_visible("#wipe")
+    splats = canvas(opened)
+    picture = np.zeros((40, 40, 4))
+    picture[10:30, 10:30] = 1, 0, 0, 1
+    page = (opened := viewer(colourful(), 700, HIGH + 300, tetrahedron(), picture=picture)).page
+    slide = "value => { const s = document.querySelector('#wipe input');"
+    slide += "s.value = value; s.dispatchEvent(new Event('input', { bubbles: true })); }"
+    splats = canvas(opened)
+    page.click("[data-mode=mesh]")
+    mesh = canvas(opened)
+    page.click("[data-mode=gaussians]")
+    page.evaluate(slide, 0.25)
+    both, edge = canvas(opened), round(0.25 * 700)
+    np.testing.assert_array_equal(both[:, :edge], mesh[:, :edge])
+    np.testing.assert_array_equal(both[:, edge:], splats[:, edge:])
+    assert np.abs(splats - mesh)[:, :edge].max() > 0.1 < np.abs(splats - mesh)[:, edge:].max()
+    look_from(page, 80, 20, 2)
+    page.evaluate(slide, -0.5)
+    opened.promised("gambaViewer.rest()")
+    assert state(page)["azimuth"] == 0  # the input's camera
+    with Image.open(io.BytesIO(page.screenshot())) as seen:
+        rgb = np.asarray(seen.convert("RGB")).astype(int)
+    side = page.locator("#canvas").bounding_box()["height"]  # the picture's, in the middle
+    column, row = round(350 - side / 8), round(side / 2)
+    assert rgb[row, column, 0] > 240 > 20 > rgb[row, column, 1]
+    assert rgb[row, round(350 - 3 * side / 8)].min() > 250 < rgb[row, 20].min()
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate("gambaViewer.wipe") == 0 and not page.is_visible("#seen")
+    assert not opened.messages
+
+
 def test_a_picture_is_saved(viewer, tmp_path):
     opened = viewer(colourful())
     shown = canvas(opened)
@@ -357,8 +392,12 @@ def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
 
 
 def test_a_phone_and_a_small_frame_hold_all_buttons(viewer):
-    for width, height in ((390, 700), (300, 300), (640, 300)):
+    for width, height in ((390, 700), (345, 700), (820, 700), (300, 300), (640, 300)):
         page = viewer(colourful(), width, height, mesh=tetrahedron()).page
+        if min(width, height) > 300:
+            area = page.locator("#canvas").bounding_box()
+            assert page.locator("#bar").bounding_box()["y"] >= area["height"] - 1
+            assert page.locator("#wipe input").is_visible()
         boxes = [button.bounding_box() for button in page.query_selector_all("#bar button")]
         boxes = [box for box in boxes if box]
         assert len(boxes) >= 8

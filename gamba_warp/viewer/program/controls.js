@@ -59,7 +59,7 @@ function takeHands(surface, act) {
     const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     const key = act.keys[event.shiftKey ? `Shift+${name}` : name] || act.keys[name];
     const onButton = event.target.closest?.("button") && (name === "Enter" || name === " ");
-    if (!key || onButton) return;
+    if (!key || onButton || event.target.closest?.("input")) return;
     event.preventDefault();
     key();
   });

@@ -69,6 +69,7 @@ class Viewer {
     this.fence = this.spare = this.sortedFor = this.askedFor = null;
     this.about = about;
     dressPage(about);
+    this.setWipe(0);
     this.setMode("gaussians");
     this.send({ kind: "load", ...parts, vertices: about.vertices, faces: about.faces });
   }
@@ -110,6 +111,7 @@ class Viewer {
   }
 
   moving(change) {
+    if (this.wipe < 0) this.setWipe(0); // the picture is of the first view only
     change();
     this.redraw();
   }
@@ -214,6 +216,8 @@ class Viewer {
   }
 
   show(now, fast) {
+    if (this.wipe > 0)
+      this.renderer.draw("mesh", this.camera, background(), fast ? SIZES[this.coarse] : 1, 0, 0, this.wipe);
     this.renderer.present();
     this.ask(now, fast);
     this.stats.frames++;
@@ -243,6 +247,14 @@ class Viewer {
     this.mode = mode;
     for (const button of document.querySelectorAll("[data-mode]"))
       button.setAttribute("aria-pressed", button.dataset.mode === mode);
+    this.redraw();
+  }
+
+  // Compares with the input's picture (to -1), from its camera, or with the mesh (to 1).
+  setWipe(wipe) {
+    if (wipe < 0 && !(this.wipe < 0)) this.goHome();
+    this.wipe = wipe;
+    showWipe(wipe);
     this.redraw();
   }
 

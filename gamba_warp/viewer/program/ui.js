@@ -17,8 +17,26 @@ function dressPage(about) {
   byId("about").textContent = parts.join(" · ");
   document.querySelector("[data-mode=mesh]").hidden = !about.faces;
   byId("do-input").hidden = !about.input;
+  const wipe = byId("wipe"), [left, right] = wipe.querySelectorAll("span"), slider = wipe.querySelector("input");
+  wipe.hidden = !about.picture && !about.faces;
+  document.documentElement.classList.toggle("wipes", !wipe.hidden);
+  left.hidden = !about.picture;
+  right.hidden = !about.faces;
+  Object.assign(slider, { min: about.picture ? -1 : 0, max: about.faces ? 1 : 0 });
+  if (about.picture) byId("seen").src = about.picture;
   byId("do-full").hidden = !document.fullscreenEnabled;
   document.documentElement.classList.toggle("bare", asked("controls") === "0");
+}
+
+// Shows `wipe`: to -1 the input's picture covers the left of the view, to 1 the mesh does.
+function showWipe(wipe) {
+  const share = 100 * Math.abs(wipe), seen = byId("seen"), edge = byId("edge");
+  byId("wipe").querySelector("input").value = wipe;
+  seen.hidden = wipe >= 0;
+  edge.hidden = wipe === 0;
+  edge.style.left = `${share}%`;
+  seen.style.clipPath = `inset(0 ${100 - share}% 0 0)`;
+  byId("canvas").style.clipPath = wipe < 0 ? `inset(0 0 0 ${share}%)` : "";
 }
 
 function say(text, title = "") {
@@ -111,6 +129,7 @@ function startButtons(viewer) {
     };
   for (const button of document.querySelectorAll("[data-side]"))
     button.onclick = () => viewer.save(Number(button.dataset.side));
+  byId("wipe").oninput = (event) => viewer.setWipe(Number(event.target.value));
   const turn = (x, y) => () => viewer.act.turn(x * STEP, y * STEP);
   const pan = (x, y) => () => viewer.act.pan(x * STEP, y * STEP);
   const zoom = (factor) => () => viewer.act.zoom(factor);
