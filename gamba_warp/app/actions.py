@@ -6,7 +6,7 @@ import functools
 import html
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gradio as gr
 
@@ -25,7 +25,7 @@ from .cutting import (
     reset_mask,
     switch_areas,
 )
-from .guard import VISITOR
+from .guard import MAX_PICTURES, VISITOR
 from .main_thread import MainThread
 from .visitor_files import VisitorFiles
 
@@ -37,6 +37,16 @@ _FRAME = (
     '<iframe class="stage" title="3D view of {name}" sandbox="allow-scripts allow-downloads" '
     'allow="fullscreen" srcdoc="{document}"></iframe>'
 )
+
+
+State = tuple[work.Reconstruction, list[Path]]  # the shown result, and its files
+
+
+class Result(NamedTuple):
+    """A result of the strip, and the file of its small picture."""
+
+    made: work.Reconstruction
+    picture: Path
 
 
 def with_page_errors(function: Callable) -> Callable:
@@ -155,6 +165,7 @@ class Actions:
         cut: Cut | None,
         painted: dict[str, Any] | None,
         elevation: float,
+        results: list[Result],
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
@@ -164,26 +175,68 @@ class Actions:
         progress(0.1, "Running the network")
         made = self._call(request, work.run_model, self._model, after, elevation)
         progress(0.8, "Making the viewer")
-        document = html.escape(work.viewer(made), quote=True)
-        frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
         edited = (gr.skip(),) * 3 if after is before else self._edited(after, request)
-        files = gr.update(value=None, visible=False)
-        return *edited, (made, []), frame, gr.update(visible=True), files
+        return *edited, *self._added(results, [made], request)
+
+    @with_page_errors
+    def take_all(
+        self,
+        given: list[dict[str, Any]] | None,
+        results: list[Result],
+        request: gr.Request,
+        progress: gr.Progress = gr.Progress(),  # noqa: B008
+    ) -> tuple:
+        """Reconstruct several pictures, each with the cut-out that is found."""
+        made, doubted = [], []
+        for number, file in enumerate(given or [], 1):
+            name = file.get("orig_name") or "picture"
+            progress((number - 1) / len(given or []), f"Picture {number} of {len(given or [])}")
+            try:
+                cut = self._call(request, cut_picture, Path(file["path"]), name, self._options)
+                made.append(self._call(request, work.run_model, self._model, cut))
+                doubted += [html.escape(name)] * bool(cut.warning)
+            except UserError as error:
+                gr.Warning(html.escape(f"{name}: {error}"), title="This picture cannot be used")
+        if doubted:
+            text = f"{', '.join(doubted)}. Give such a picture alone to correct it."
+            gr.Warning(text, title="These cut-outs may be wrong")
+        if not made:
+            raise UserError("none of these pictures can be used")
+        return self._added(results, made, request)
+
+    @with_page_errors
+    def choose(self, results: list[Result], event: gr.EventData) -> tuple:
+        """Show an earlier result again."""
+        index = event._data["index"]
+        if type(index) is not int or not 0 <= index < len(results):
+            raise UserError("this result has expired")
+        return self._presented(results[index].made)
+
+    @with_page_errors
+    def trim(
+        self,
+        state: State | None,
+        opacity: float,
+        distance: float,
+        request: gr.Request,
+    ) -> tuple:
+        """Leave out Gaussians; the viewer and all later files lack them."""
+        made = self._call(request, work.trim, _state(state)[0], opacity, distance, self._device)
+        return self._presented(made)[:4]
 
     def writer(self, kind: str) -> Callable:
         """Return the handler that writes files of one kind, and adds them to the list."""
 
         def write(
-            state: tuple[work.Reconstruction, list[Path]] | None,
+            state: State | None,
             faces: str,
             texture: str,
             watertight: bool,
             request: gr.Request,
             progress: gr.Progress = gr.Progress(),  # noqa: B008
         ) -> tuple:
-            if state is None:
-                raise UserError("make the object first; an older one may have expired")
-            made, older = state
+            made, older = _state(state)
+            before = [*made.surfaces.values()]
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
             folder = self._new_folder(request)
             mesh = work.MeshChoice.of(faces, texture, watertight)
@@ -191,9 +244,30 @@ class Actions:
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
             files = [*(old for old in older if old.name != path.name and old.is_file()), path]
-            return (made, files), gr.update(value=[str(file) for file in files], visible=True)
+            listed = gr.update(value=[str(file) for file in files], visible=True)
+            same = [*made.surfaces.values()] == before
+            return (made, files), listed, gr.skip() if same else _frame(made)
 
         return with_page_errors(write)
+
+    def _added(
+        self, results: list[Result], made: list[work.Reconstruction], request: gr.Request
+    ) -> tuple:
+        """Append results, and show the last one."""
+        new = []
+        for each in made:
+            path = self._new_folder(request) / "result.png"
+            self._call(request, work.thumbnail, each, path, self._device)
+            new.append(Result(each, path))
+        kept = [*results, *new][-MAX_PICTURES:]
+        strip = [(str(result.picture), result.made.name) for result in kept]
+        shown = gr.update(value=strip, visible=len(kept) > 1, selected_index=None)
+        return kept, shown, *self._presented(new[-1].made)
+
+    def _presented(self, made: work.Reconstruction) -> tuple:
+        """Return state, viewer, the buttons of files, no files, and sliders at their ends."""
+        files = gr.update(value=None, visible=False)
+        return (made, []), _frame(made), gr.update(visible=True), files, 0.0, work.FARTHEST
 
     def _call(self, request: gr.Request, function: Callable, *args: Any) -> Any:
         """Call a function on the main thread, as long as the page is open."""
@@ -221,6 +295,17 @@ class Actions:
         path = self._new_folder(request) / "cut-out.png"
         save_image(path, editor_picture(cut) / 255.0)
         return {"background": str(path), "layers": [], "composite": str(path)}
+
+
+def _frame(made: work.Reconstruction) -> str:
+    document = html.escape(work.viewer(made), quote=True)
+    return _FRAME.format(name=html.escape(made.name, quote=True), document=document)
+
+
+def _state(state: State | None) -> State:
+    if state is None:
+        raise UserError("make the object first; an older one may have expired")
+    return state
 
 
 def _given(cut: Cut | None) -> Cut:

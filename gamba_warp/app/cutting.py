@@ -42,6 +42,7 @@ class Cut:
             background colour along its edge; None if no object was found.
         ghost: True if the picture has colours where the mask is 0.
         note: method of the cut-out and doubts, for the page, before any stroke.
+        warning: the doubts alone.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour.
     """
 
@@ -52,6 +53,7 @@ class Cut:
     found: np.ndarray | None
     ghost: bool
     note: str
+    warning: str
     areas: np.ndarray
 
 
@@ -82,11 +84,11 @@ def cut_picture(path: Path, name: str, options: CutoutOptions) -> Cut:
         mask = np.zeros(rgba.shape[:2], np.float32)
         note = f"No object was found ({reason}). Paint over the object with the blue brush."
         nothing = np.zeros(mask.shape, bool)
-        return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note, nothing)
+        return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note, note, nothing)
     ghost = cut.method != "alpha"  # colours of transparent pixels are arbitrary
     rgb = _clean_edge(cut.source_rgb, cut.mask, cut.rgba)
     note = f"{cut.how} {cut.warning}".strip()
-    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, note, cut.areas)
+    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, note, cut.warning, cut.areas)
 
 
 def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -67,6 +67,7 @@ _HEAD = 1 << 16  # bytes of an upload besides its files
 _CALL_SECONDS = READ_SECONDS  # to receive it completely
 UPLOAD_SECONDS = 300.0
 MAX_AT_ONCE = 16  # requests of one visitor
+MAX_PICTURES = 12  # of one upload, and results of one page
 # Others are ignored: gradio fails with several ranges, or with non-ASCII digits.
 _RANGE = re.compile(b"bytes=([0-9]{1,15}-[0-9]{0,15}|-[0-9]{1,15})")
 
@@ -275,11 +276,12 @@ class Guard:
 
         form = FormData()
         try:
-            sent = Request(request.scope, counted).form(max_files=4, max_fields=0)
+            sent = Request(request.scope, counted).form(max_files=MAX_PICTURES, max_fields=0)
             form = await asyncio.wait_for(sent, UPLOAD_SECONDS)
             if not form:
                 raise HTTPException(400, "not an upload of files")
-            return [await asyncio.to_thread(self._store, f, visitor) for f in form.values()]
+            given = (file for _, file in form.multi_items())
+            return [await asyncio.to_thread(self._store, file, visitor) for file in given]
         except MultiPartException as error:
             raise HTTPException(400, f"not an upload of files ({first_line(error)})") from None
         except UserError as error:
@@ -309,7 +311,7 @@ class Guard:
             for item in given:
                 if isinstance(item, Painted):
                     item.background = item.composite = None
-                for file in getattr(item, "layers", [item]):
+                for file in item if isinstance(item, list) else getattr(item, "layers", [item]):
                     if isinstance(file, GivenFile):
                         self._files.file(file.path, visitor)
                         file.meta = {"_type": "gradio.FileData"}  # else gradio ignores it

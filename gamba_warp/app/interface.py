@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gradio as gr
 from gradio import themes
+from msgspec import Meta
 
-from ..untrusted.ranges import Elevation
 from . import work
 from .actions import Actions
 from .cutting import FOLDER, KEEP, REMOVE, SIDE, STROKE, examples
-from .guard import GivenFile, Painted
+from .guard import MAX_PICTURES, GivenFile, Painted
 from .visitor_files import KEEP_SECONDS
 
 WAITING = 16  # queued requests; further ones are rejected
@@ -49,9 +49,8 @@ def build(actions: Actions) -> gr.Blocks:
     page = gr.Blocks(title="Gamba", analytics_enabled=False, fill_width=True)
     with page:
         gr.HTML(_TITLE, elem_id="title")
-        cut, made = (
-            gr.State(None, time_to_live=KEEP_SECONDS),
-            gr.State(None, time_to_live=KEEP_SECONDS),
+        cut, made, results = (
+            gr.State(first, time_to_live=KEEP_SECONDS) for first in (None, None, [])
         )
         with gr.Row(elem_id="bench"):
             with gr.Column(scale=5, min_width=300):
@@ -75,6 +74,14 @@ def build(actions: Actions) -> gr.Blocks:
                     buttons=[],
                     interactive=False,
                     elem_id="examples",
+                    elem_classes="strip",
+                )
+                several = gr.UploadButton(
+                    f"Several pictures at once (up to {MAX_PICTURES})",
+                    file_count="multiple",
+                    file_types=["image"],
+                    size="sm",
+                    elem_id="several",
                 )
                 with gr.Column(visible=False, elem_id="cut") as cut_part:
                     note = gr.HTML(elem_id="note")
@@ -114,8 +121,35 @@ def build(actions: Actions) -> gr.Blocks:
                     make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
             with gr.Column(scale=8, min_width=300, elem_id="right"):
                 stage = gr.HTML(_EMPTY, elem_id="stage")
+                strip = gr.Gallery(
+                    label="Results",
+                    visible=False,
+                    columns=12,
+                    height="auto",
+                    allow_preview=False,
+                    object_fit="contain",
+                    buttons=[],
+                    interactive=False,
+                    elem_id="results",
+                    elem_classes="strip",
+                )
                 buttons: dict[str, gr.Button] = {}
                 with gr.Column(visible=False, elem_id="files") as files_part:
+                    with gr.Row(elem_id="trim"):
+                        opacity = gr.Slider(
+                            0,
+                            0.9,
+                            value=0,
+                            step=0.05,
+                            label="Haze: least opacity",
+                        )
+                        distance = gr.Slider(
+                            0.5,
+                            work.FARTHEST,
+                            value=work.FARTHEST,
+                            step=0.5,
+                            label="Haze: most distance from the surface, %",
+                        )
                     with gr.Row(elem_id="mesh"):
                         small: dict[str, Any] = {"container": False, "min_width": 120}
                         faces = gr.Dropdown([*work.FACES], value="10,000 faces", **small)
@@ -154,10 +188,28 @@ def build(actions: Actions) -> gr.Blocks:
         brush.change(_painting, brush, editor, **{**quick, "concurrency_id": "brush"})
         mend.click(actions.apply_strokes, mask[:2], mask, **quick)
         restart.click(actions.restart, cut, mask, **quick)
+        seen = [made, stage, files_part, made_files, opacity, distance]
         make.click(
             actions.reconstruct,
-            [cut, editor, elevation],
-            [*mask, made, stage, files_part, made_files],
+            [cut, editor, elevation, results],
+            [*mask, results, strip, *seen],
+            show_progress_on=stage,
+            **one,
+        )
+        several.upload(
+            actions.take_all,
+            [several, results],
+            [results, strip, *seen],
+            show_progress_on=stage,
+            **one,
+        )
+        strip.select(actions.choose, results, seen, **quick)
+        gr.on(
+            [opacity.input, distance.input],
+            actions.trim,
+            [made, opacity, distance],
+            seen[:4],
+            trigger_mode="always_last",
             show_progress_on=stage,
             **one,
         )
@@ -166,7 +218,7 @@ def build(actions: Actions) -> gr.Blocks:
             written = button.click(
                 actions.writer(kind),
                 [made, faces, texture, closed],
-                [made, made_files],
+                [made, made_files, stage],
                 show_progress_on=made_files,
                 **one,
             )
@@ -174,6 +226,9 @@ def build(actions: Actions) -> gr.Blocks:
         areas.click(actions.toggle_holes, cut, mask, **quick)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
+
+
+_Several: Any = Annotated[list[GivenFile], Meta(max_length=MAX_PICTURES)]
 
 
 def _brush(color: str) -> gr.Brush:
@@ -191,17 +246,23 @@ def _painting(choice: str) -> Any:
 
 def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
     """Return the types of the inputs that the page sends, by the function's number."""
-    kinds = {
+    kinds: dict[type, Any] = {
         gr.State: None,
         gr.Image: GivenFile | None,
         gr.ImageEditor: Painted | None,
-        gr.Slider: Elevation,
+        gr.UploadButton: _Several | None,
         gr.Dropdown: Literal[(*work.FACES, *work.TEXTURES)],  # type: ignore[invalid-type-form]
         gr.Checkbox: bool,
         gr.Radio: Literal[tuple(_BRUSHES)],  # type: ignore[invalid-type-form]
     }
     ours = {number: fn.inputs for number, fn in page.fns.items() if fn.fn is not None}
-    return {number: [kinds[type(block)] for block in given] for number, given in ours.items()}
+
+    def kind(block: Any) -> Any:
+        if isinstance(block, gr.Slider):
+            return Annotated[float, Meta(ge=block.minimum, le=block.maximum)]
+        return kinds[type(block)]
+
+    return {number: [kind(block) for block in given] for number, given in ours.items()}
 
 
 CSS = Path(__file__).parent / "look.css"

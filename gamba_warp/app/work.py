@@ -5,9 +5,12 @@ from __future__ import annotations
 import tempfile
 import time
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
 
 from ..errors import UserError
 from ..files import atomic_path
@@ -17,6 +20,7 @@ from .cutting import Cut, model_picture
 if TYPE_CHECKING:
     from ..gaussians import Gaussians
     from ..model.gamba import Gamba
+    from ..surfaces.extract import Surface
 
 FRAMES, SIZE = 48, 320  # views of the turntable; their side in pixels
 # By kind of file: the label of its button, and the suffix after the object's name.
@@ -32,6 +36,8 @@ IN_ZIP = ("ply", "mesh-glb", "mesh-stl", "gif", "html")
 FACES = {f"{count:,} faces": count for count in (2_000, 10_000, 50_000, 200_000)}
 TEXTURES = {"No texture": 0, **{f"Texture {side}": side for side in (512, 1024, 2048)}}
 KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
+FARTHEST = 10.0  # percent of the longest side: Gaussians at any distance from the surface stay
+_PICTURE, _SMALL = 512, 128  # largest side of a kept input; side of a thumbnail, pixels
 
 
 class MeshChoice(NamedTuple):
@@ -65,12 +71,18 @@ class Reconstruction:
         gaussians: ``[N]`` on the CPU, upright, OpenCV's axes.
         camera: distance (object units), field of view and elevation (degrees) of the input's.
         seconds: run time of the model.
+        picture: the model's input ``[S, S, 4]`` uint8, reduced.
+        whole: the reconstruction that was trimmed to this one, or None.
+        surfaces: the last surface, by the number of faces at most and if it is closed.
     """
 
     name: str
     gaussians: Gaussians
     camera: tuple[float, float, float]
     seconds: float
+    picture: np.ndarray
+    whole: Reconstruction | None = None
+    surfaces: dict[tuple[int, bool], Surface] = field(default_factory=dict)
 
 
 def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
@@ -84,6 +96,8 @@ def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
     Raises:
         UserError: the mask is empty.
     """
+    from ..data.preprocess import shrink
+    from ..images import to_uint8
     from ..model.predict import reconstruct
     from ..trajectories.paths import set_up
 
@@ -92,18 +106,98 @@ def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
     gaussians = reconstruct(model, rgba).to("cpu")
     seconds = time.perf_counter() - started
     camera = model.config.distance, model.config.fov, elevation
-    return Reconstruction(cut.name, set_up(gaussians, elevation), camera, seconds)
+    upright, picture = set_up(gaussians, elevation), to_uint8(shrink(rgba, _PICTURE))
+    return Reconstruction(cut.name, upright, camera, seconds, picture)
+
+
+def trim(
+    made: Reconstruction, opacity: float, distance: float, device: str = "cpu"
+) -> Reconstruction:
+    """Leave out faint Gaussians, and those far from the surface.
+
+    Args:
+        made: the reconstruction, trimmed or not.
+        opacity: the least that stays, 0 to 1.
+        distance: the largest that stays, of the centre from the surface, percent of the object's
+            longest side; from ``FARTHEST`` on all stay.
+        device: device that renders.
+
+    Raises:
+        UserError: nothing stays, or the object has no surface.
+    """
+    whole = made.whole or made
+    gaussians = whole.gaussians
+    keep = gaussians.opacities >= opacity
+    if distance < FARTHEST:
+        from ..surfaces.solid import distances
+
+        surface = surface_of(whole, MESH, device)
+        side = float(np.ptp(surface.vertices, axis=0).max())
+        away = distances(gaussians.means.double().numpy(), surface.vertices, surface.faces)
+        keep &= torch.from_numpy(away <= distance / 100 * side)
+    if not keep.any():
+        raise UserError("no Gaussian would stay; choose less")
+    return replace(whole, gaussians=gaussians.select(keep), whole=whole, surfaces={})
+
+
+def surface_of(
+    made: Reconstruction, mesh: MeshChoice, device: str = "cpu", texture: int = 0
+) -> Surface:
+    """Return the surface of a reconstruction, and keep it.
+
+    Args:
+        made: the reconstruction.
+        mesh: number of faces, and if it is closed.
+        device: device that renders.
+        texture: side of a texture, pixels; without one the surface may have any.
+
+    Raises:
+        UserError: there is none, or a library is missing.
+    """
+    from ..surfaces import extract
+    from ..surfaces.options import SurfaceOptions
+
+    key = mesh.faces, mesh.watertight
+    kept = made.surfaces.get(key)
+    if kept is None or (texture and (kept.texture is None or len(kept.texture.image) != texture)):
+        options = SurfaceOptions(colors=True, faces=mesh.faces, watertight=mesh.watertight)
+        options.require(texture)
+        chosen = torch.device(device)
+        kept = extract.surface_of(made.gaussians.to(chosen), options, chosen, texture)
+        made.surfaces.clear()
+        made.surfaces[key] = kept
+    return kept
+
+
+def thumbnail(made: Reconstruction, path: Path, device: str = "cpu") -> None:
+    """Write a small picture of the object, turned by an eighth.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    from ..images import save_image
+    from ..pages.turntable import turntable_frames
+
+    distance, fov, elevation = made.camera
+    view = {"distance": distance, "fov": fov, "elevation": elevation}
+    frames = turntable_frames(made.gaussians.to(device), size=_SMALL, frames=8, **view)
+    save_image(path, frames[1] / 255.0)
 
 
 def viewer(made: Reconstruction) -> str:
-    """Return the viewer of a reconstruction, a complete HTML document.
+    """Return the viewer of a reconstruction, with its last surface: a complete HTML document.
 
     Raises:
         UserError: the object is invisible.
     """
     from ..viewer.page import viewer_page
 
-    return viewer_page(made.name, made.gaussians, camera=made.camera)
+    return viewer_page(made.name, made.gaussians, **_shown(made))
+
+
+def _shown(made: Reconstruction) -> dict:
+    mesh = next(iter(made.surfaces.values()), None)
+    return {"camera": made.camera, "mesh": mesh, "picture": made.picture / 255.0}
 
 
 def write(
@@ -139,16 +233,11 @@ def write(
         lost = write_gaussians(path, gaussians, kind)  # type: ignore[arg-type]
         note = f"{lost} {count}" if lost else count
     elif kind in MESHES:
-        import torch
-
-        from ..surfaces.extract import surface_of
         from ..surfaces.files import save_mesh
-        from ..surfaces.options import SurfaceOptions
 
-        options = SurfaceOptions(colors=True, faces=mesh.faces, watertight=mesh.watertight)
-        chosen, texture = torch.device(device), mesh.texture if kind == "mesh-glb" else 0
-        options.require(texture)
-        save_mesh(path, surface_of(made.gaussians.to(chosen), options, chosen, texture))
+        texture = mesh.texture if kind == "mesh-glb" else 0
+        surface = surface_of(made, mesh, device, texture)
+        save_mesh(path, surface if texture else replace(surface, texture=None))
     elif kind == "zip":
         with tempfile.TemporaryDirectory(dir=folder) as inner, atomic_path(path) as temporary:
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -165,5 +254,5 @@ def write(
     else:
         from ..viewer.page import write_viewer
 
-        write_viewer(path, made.name, made.gaussians, camera=made.camera)
+        write_viewer(path, made.name, made.gaussians, **_shown(made))
     return path, note

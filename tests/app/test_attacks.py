@@ -12,11 +12,13 @@ from helpers.images import bytes_of
 from PIL import Image
 
 from gamba_warp.app.cutting import examples
+from gamba_warp.app.guard import MAX_PICTURES
 from gamba_warp.app.work import KINDS
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
-ZIP = MAKE + 2 + 2 * list(KINDS).index("zip")
-AREAS = MAKE + 2 + 2 * len(KINDS)  # after the two functions of each kind of file
+SEVERAL, CHOOSE, TRIM = 7, 8, 9
+ZIP = TRIM + 2 + 2 * list(KINDS).index("zip")
+AREAS = TRIM + 2 + 2 * len(KINDS)  # after the two functions of each kind of file
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
 
@@ -95,10 +97,14 @@ def test_only_files_of_the_visitor_are_taken(served, program, private, meta):
         *(f"{Path(mine).parent}/../{Path(mine).parent.name}/a.png", f"/{mine}", "x" * 4000),
         *("http://127.0.0.1/", "file:///etc/passwd", next(served.temporary.iterdir()) / ".lock"),
     ):
-        for item in (given(path, meta=meta), {"layers": [given(path, meta=meta)]}):
-            data = [item] if "path" in item else [None, item]
-            answer = program.join(TAKE if "path" in item else MEND, data)
-            lines[str(path), len(data)] = answer.status, answer.line
+        item = given(path, meta=meta)
+        for number, data in (
+            (TAKE, [item]),
+            (MEND, [None, {"layers": [item]}]),
+            (SEVERAL, [[item], None]),
+        ):
+            answer = program.join(number, data)
+            lines[str(path), number] = answer.status, answer.line
     assert len(set(lines.values())) == 1, lines
     assert set(lines.values()) == {
         (400, "this file is missing or has expired; give the picture again")
@@ -233,7 +239,7 @@ def test_the_job_of_a_closed_page_ends(served, program, private):
     picture = Image.new("RGB", (200, 200), "white")
     picture.paste((200, 30, 20), (50, 50, 150, 150))
     program.result(TAKE, [given(program.upload(bytes_of(picture)))])
-    assert "data" in program.result(MAKE, [None, None, 0])
+    assert "data" in program.result(MAKE, [None, None, 0, None])
     assert program.join(ZIP, [None, "200,000 faces", "Texture 2048", True]).status == 200
     cookie, host = f"Cookie: {program.headers['Cookie']}", f"Host: {served.host}"
     place = f"GET /gradio_api/queue/data?session_hash={program.session} HTTP/1.1"
@@ -291,7 +297,7 @@ def test_what_is_closed(served, program):
     assert program.ask("/?deep_link=../../../etc/passwd").status == 200
 
 
-@pytest.mark.parametrize("number", [-1, 7, 99, 1 << 70, 1.5, "0", None, [0]])
+@pytest.mark.parametrize("number", [-1, TRIM + 1, 99, 1 << 70, 1.5, "0", None, [0]])
 def test_no_such_function_is_one_line(program, number):
     answer = program.join(number, [None])
     assert answer.status == 400 and answer.line
@@ -302,7 +308,10 @@ def test_no_such_function_is_one_line(program, number):
     "number, data",
     [
         *[(TAKE, []), (TAKE, [None, None]), (BRUSH, ["Paint it black"]), (BRUSH, [0])],
-        *[(MAKE, [None, None]), *((MAKE, [None, None, value]) for value in (91, "up", None))],
+        *[(MAKE, [None] * 3), *((MAKE, [None, None, value, None]) for value in (91, "up", None))],
+        *[(TRIM, [None, value, 10]) for value in (-1, 0.95, "x", None)],
+        *[(TRIM, [None, 0, value]) for value in (0, 11)],
+        *[(SEVERAL, [[{"path": "x"}] * (MAX_PICTURES + 1), None]), (SEVERAL, ["x", None])],
     ],
 )
 def test_other_inputs_are_one_line(program, number, data):
@@ -314,6 +323,12 @@ def test_other_inputs_are_one_line(program, number, data):
 def test_no_such_example_is_one_line(program, index):
     output = program.result(EXAMPLE, [], event_data={"index": index, "value": 1})
     assert "not one of the" in output["error"]
+
+
+@pytest.mark.parametrize("index", [-1, 1, 1.0, "0", None, True])
+def test_no_such_result_is_one_line(program, index):
+    output = program.result(CHOOSE, [None], event_data={"index": index, "value": 1})
+    assert output["error"] == "this result has expired"
 
 
 @pytest.mark.parametrize(
@@ -345,7 +360,7 @@ def test_uploads_are_bounded(served, program, bare):
         (huge, FORM, 413),
         (form(b"x"), {}, 400),
         (b"nothing", FORM, 400),
-        (head * 5 + b"--edge--\r\n", FORM, 400),
+        (head * (MAX_PICTURES + 1) + b"--edge--\r\n", FORM, 400),
         (field, FORM, 400),
         (iter([form(b"x")]), FORM, 411),
     ):

@@ -146,6 +146,42 @@ def test_the_whole_way(opened, served, tmp_path):
     assert "my-square.ply" in listed and "my-square.spz" in listed
 
 
+def test_several_pictures_a_strip_and_haze(opened, tmp_path):
+    page = opened.page
+    pictures = [red_square(tmp_path), tmp_path / "blue.png"]
+    pixels = np.ones((200, 200, 3))
+    pixels[50:150, 80:190] = 0.1, 0.2, 0.8
+    save_image(pictures[1], pixels)
+    with page.expect_file_chooser() as chosen:
+        page.locator("#several").click()
+    chosen.value.set_files(pictures)
+    page.wait_for_selector("#results button >> nth=1")
+
+    def viewed():
+        frame = page.wait_for_selector("iframe.stage").content_frame()
+        frame.wait_for_selector("#message", state="hidden")
+        name, about = (frame.locator(part).inner_text() for part in ("#name", "#about"))
+        return name, int(about.split(" ")[0].replace(",", ""))
+
+    name, whole = viewed()
+    assert name == "blue"
+    page.locator("#results button").first.click()
+    until(lambda: viewed()[0] == "my-square", "the first one is shown again")
+    _, whole = viewed()
+    page.locator("#trim input[type=number]").first.fill("0.1")
+    until(lambda: viewed()[1] < whole, "faint ones are left out")
+    with page.expect_download() as download:
+        page.locator("#file-ply").click()
+    download.value.save_as(tmp_path / "some.ply")
+    assert read_gaussians(tmp_path / "some.ply").opacities.min() > 0.099
+    with page.expect_download() as download:
+        page.locator("#file-mesh-stl").click()
+    assert download.value.suggested_filename == "my-square-mesh.stl"
+    frame = page.wait_for_selector("iframe.stage").content_frame()
+    frame.wait_for_selector("[data-mode=mesh]")
+    assert frame.locator("#wipe input").get_attribute("max") == "1"
+
+
 def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
     page = opened.page
     page.locator("#examples button").last.click()

@@ -223,4 +223,35 @@ def test_a_mesh(made, tmp_path, monkeypatch):
     with zipfile.ZipFile(path) as archive:
         names = {f"My-thing-v2{work.KINDS[kind][1]}" for kind in work.IN_ZIP}
         assert {*archive.namelist()} == names and archive.testzip() is None
-    assert [p for p in tmp_path.iterdir() if p.is_dir()] == [] and len(asked) == 2
+    assert [p for p in tmp_path.iterdir() if p.is_dir()] == []
+    assert len(asked) == 1  # both of its meshes are of one surface
+
+
+def test_haze_is_left_out(made, tmp_path, monkeypatch):
+    made = replace(made, surfaces={})
+    gaussians = made.gaussians
+    corners = gaussians.means.double().numpy().min(0) + [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    plane = extract.Surface(corners[:3], np.array([[0, 1, 2]]), np.full((3, 3), 0.5, np.float32))
+    monkeypatch.setattr(extract, "surface_of", lambda *_: plane)
+    half = float(gaussians.opacities.median())
+    opaque = work.trim(made, half, work.FARTHEST)
+    assert 0 < opaque.gaussians.num == (gaussians.opacities >= half).sum() < gaussians.num
+    near = work.trim(opaque, 0.0, 5.0)
+    inside = (gaussians.means[:, 2] - corners[0, 2]) <= 0.05 * 1.0  # its plane has a side of 1
+    assert near.gaussians.num <= int(inside.sum()) and near.gaussians.num > 0
+    both = work.trim(near, half, 5.0)
+    assert both.gaussians.num < min(near.gaussians.num, opaque.gaussians.num) and both.whole is made
+    path, note = work.write(near, "ply", tmp_path)
+    assert load_ply(path).num == near.gaussians.drawn().num
+    again = work.trim(both, 0.0, work.FARTHEST)
+    torch.testing.assert_close(again.gaussians.means, gaussians.means, rtol=0, atol=0)
+    refused("no Gaussian would stay", work.trim, replace(made, gaussians=gaussians[:0]), 0.9, 10.0)
+
+
+def test_the_viewer_has_the_input_and_the_last_mesh(made):
+    made = replace(made, surfaces={})
+    bare = work.viewer(made)
+    assert '"faces": 0' in bare and '"picture": "data:image/webp;base64,' in bare
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    made.surfaces[1, False] = extract.Surface(corners, np.array([[0, 1, 2]]))
+    assert '"faces": 1,' in work.viewer(made)

@@ -20,8 +20,8 @@ function dressPage(about) {
   const wipe = byId("wipe"), [left, right] = wipe.querySelectorAll("span"), slider = wipe.querySelector("input");
   wipe.hidden = !about.picture && !about.faces;
   document.documentElement.classList.toggle("wipes", !wipe.hidden);
-  left.hidden = !about.picture;
-  right.hidden = !about.faces;
+  left.textContent = about.picture ? "Input" : "Gaussians";
+  right.textContent = about.faces ? "Mesh" : "Gaussians";
   Object.assign(slider, { min: about.picture ? -1 : 0, max: about.faces ? 1 : 0 });
   if (about.picture) byId("seen").src = about.picture;
   byId("do-full").hidden = !document.fullscreenEnabled;
