@@ -1,6 +1,7 @@
 """The viewer in a browser: pictures like our rasterizer's, controls, and no errors."""
 
 import base64
+import gzip
 import io
 import math
 
@@ -13,8 +14,8 @@ from PIL import Image
 
 from gamba_warp import render
 from gamba_warp.cameras import Cameras, intrinsics, orbit
-from gamba_warp.formats.gaussians.files import read_gaussians
-from gamba_warp.formats.gaussians.splat import save_splat
+from gamba_warp.formats.gaussians.files import read_gaussians, write_gaussians
+from gamba_warp.formats.names import splat_suffix
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import Surface
@@ -337,14 +338,25 @@ def drop(opened, name, content):
     )
 
 
-@pytest.mark.parametrize("suffix, coefficients", [("ply", None), ("ply", 8), ("splat", None)])
-def test_a_dropped_file_is_shown_as_gamba_view_shows_it(viewer, tmp_path, suffix, coefficients):
+@pytest.mark.parametrize(
+    "kind, coefficients",
+    [
+        *[("ply", None), ("ply", 8), ("splat", None), ("compressed-ply", None)],
+        *[("compressed-ply", 15), ("spz", None), ("spz", 3), ("spz", 15), ("spz 2", 8)],
+    ],
+)
+def test_a_dropped_file_is_shown_as_gamba_view_shows_it(viewer, tmp_path, kind, coefficients):
     """The page's reader in JavaScript and ours are two programs for the same pixels."""
     gaussians = colourful(coefficients=coefficients)
     gaussians.means += torch.tensor([30.0, -20.0, 7.0])
     gaussians.opacities[:5] = 0.003  # not seen
-    path = tmp_path / f"chair.{suffix}"
-    (save_ply if suffix == "ply" else save_splat)(path, gaussians)
+    path = tmp_path / f"chair{splat_suffix(kind.split()[0])}"
+    write_gaussians(path, gaussians, kind.split()[0])
+    if kind == "spz 2":  # rotations of three bytes
+        body, end = gzip.decompress(path.read_bytes()), 16 + 16 * gaussians.num
+        turns = np.random.default_rng(0).integers(55, 200, 3 * gaussians.num).astype(np.uint8)
+        body = body[:4] + b"\2" + body[5:end] + turns.tobytes() + body[end + 4 * gaussians.num :]
+        path.write_bytes(gzip.compress(body))
     wanted = canvas(viewer(read_gaussians(path), camera=None))
 
     opened = viewer(colourful(40), mesh=tetrahedron())
@@ -354,7 +366,7 @@ def test_a_dropped_file_is_shown_as_gamba_view_shows_it(viewer, tmp_path, suffix
     opened.until("gambaViewer.ready && gambaViewer.about.title.startsWith('chair')")
     # The last bit of a float16 may differ; over 400 Gaussians that is a level of colour.
     assert np.abs(canvas(opened) - wanted).max() <= 4 / 255 < np.abs(wanted - before).max()
-    assert opened.page.inner_text("#about") == "400 Gaussians"
+    assert opened.page.inner_text("#about").endswith(" Gaussians")
     assert not opened.page.is_visible("[data-mode=mesh]") and not opened.messages
     opened.page.keyboard.press("3")  # the former object's mesh is gone
     assert np.abs(canvas(opened) - wanted).max() <= 4 / 255
@@ -363,28 +375,35 @@ def test_a_dropped_file_is_shown_as_gamba_view_shows_it(viewer, tmp_path, suffix
 def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
     save_ply(tmp_path / "chair.ply", colourful(40))
     good = (tmp_path / "chair.ply").read_bytes()
+    write_gaussians(tmp_path / "small.ply", colourful(40), "compressed-ply")
+    packed = (tmp_path / "small.ply").read_bytes()
     opened = viewer(colourful(40))
     before = canvas(opened)
     for name, content, reason in (
         ("chair.ply", good[:-1], "cut short"),
         ("chair.ply", good + b"0", "more than its 40 Gaussians"),
-        ("chair.ply", good.replace(b"float nx", b"float ny"), "Only uncompressed"),
+        ("chair.ply", good.replace(b"float nx", b"float ny"), "Only Gaussians"),
         ("chair.ply", good[:-4] + b"\0\0\x80\x7f", "1 of 40 Gaussians are invalid"),
-        ("chair.ply", good.replace(b"f_dc_1", b"f_xx_1"), "Only uncompressed"),
-        ("chair.ply", good.replace(b"binary_little_endian", b"ascii"), "Only uncompressed"),
-        ("chair.ply", b"", "Only uncompressed"),
+        ("chair.ply", good.replace(b"f_dc_1", b"f_xx_1"), "Only Gaussians"),
+        ("chair.ply", good.replace(b"binary_little_endian", b"ascii"), "Only Gaussians"),
+        ("chair.ply", b"", "Only Gaussians"),
         ("chair.glb", b"glTF", "gamba view FILE"),
-        ("chair.SPZ", b"", "gamba view FILE"),
+        ("chair.SPZ", b"NGSP" + bytes(40), "gamba view FILE"),
+        ("chair.spz", b"\x1f\x8b" + bytes(40), "is damaged"),
+        ("chair.spz", gzip.compress(b"NGSP\3\0\0\0\1\0\0\0" + bytes(8)), "is damaged"),
+        ("chair.spz", gzip.compress(b"NGSP\7\0\0\0" + bytes(8)), "gamba view FILE"),
+        ("chair.ply", packed.replace(b"chunk 1", b"chunk 0"), "cut short|more than|do not match"),
+        ("chair.ply", packed[:-1], "cut short"),
         ("chair.ply", b"ply\nformat ascii 1.0\n", "gamba view FILE"),
         ("chair.stl", b"", "gamba view GAUSSIANS --mesh FILE"),
-        ("chair.txt", b"", "Only uncompressed Gaussians open here (.ply, .splat)."),
+        ("chair.txt", b"", r"Only Gaussians open here \(.ply, .splat, .spz\)\."),
         ("chair.splat", b"0" * 33, "cut short"),
         ("chair.splat", b"", "No Gaussian"),
         ("chair.splat", b"\0" * 32, "No Gaussian"),
         ("chair.splat", b"\0" * 24 + b"\xff" * 8, "at one point"),
     ):
         drop(opened, name, content)
-        opened.until(f"byId('message-text').textContent.includes('{reason}')")
+        opened.until(f"byId('message-text').textContent.match(/{reason}/)")
         assert name in opened.page.inner_text("#message-title")
         opened.page.evaluate("say('')")
     assert opened.page.evaluate("gambaViewer.about.title") == "A chair" and not opened.messages

@@ -1,5 +1,5 @@
-// Files that are dropped on the page: Gaussians as a .ply of 3DGS or as .splat. They are read with
-// the meaning of formats/ply.py and formats/gaussians/splat.py, and packed as pack.py packs them.
+// Files that are dropped on the page: Gaussians as .ply, compressed .ply, .splat or .spz. They are read
+// with the meaning of formats/ply.py and formats/gaussians, and packed as pack.py packs them.
 
 const HOME = { azimuth: 0, elevation: 0, distance: 1.5, target: [0, 0, 0], fov: 49.1 }; // of gamba view
 const SH_C0 = 0.28209479177387814, FAINTEST = 1 / 255, LARGEST = 6e4;
@@ -9,50 +9,61 @@ const SCALARS = {
   int16: ["Int16", 2], uint16: ["Uint16", 2], int32: ["Int32", 4], uint32: ["Uint32", 4],
   float32: ["Float32", 4], float64: ["Float64", 8],
 };
-const HERE = "Only uncompressed Gaussians open here (.ply, .splat)", OTHER = `${HERE}; for this file try: gamba view FILE`;
+const HERE = "Only Gaussians open here (.ply, .splat, .spz)", OTHER = `${HERE}; for this file try: gamba view FILE`;
 
-// Rows of a .ply's vertices, or an error with a reason for the user.
-function plyTable(buffer) {
+// Elements of a .ply by name, each with its count, the names of its properties and `get`, or an
+// error with a reason for the user.
+function plyElements(buffer) {
   const head = new TextDecoder("latin1").decode(buffer.slice(0, 65536));
   const end = /(^|\n)end_header\r?\n/.exec(head);
   const lines = end ? head.slice(0, end.index).split(/\r?\n/) : [];
-  const [, count] = /^element vertex (\d+)$/.exec(lines.find((line) => line.startsWith("element "))) || [];
-  if (!lines.includes("format binary_little_endian 1.0") || !count || lines.includes("comment frame opengl"))
-    throw new Error(OTHER);
-  const columns = {};
-  let size = 0;
-  for (const line of lines.slice(lines.findIndex((text) => text.startsWith("element ")) + 1)) {
-    if (line.startsWith("element ")) break;
+  if (!lines.includes("format binary_little_endian 1.0") || lines.includes("comment frame opengl")) throw new Error(OTHER);
+  const elements = {};
+  let element;
+  for (const line of lines) {
     const [word, type, name] = line.split(" ");
+    if (word === "element") element = elements[type] = { count: Number(name), columns: {}, names: [], size: 0 };
     if (word !== "property") continue;
-    if (!(type in SCALARS) || name in columns) throw new Error(OTHER);
-    columns[name] = { at: size, get: `get${SCALARS[type][0]}` };
-    size += SCALARS[type][1];
+    if (!element || !(type in SCALARS) || name in element.columns) throw new Error(OTHER);
+    element.columns[name] = { at: element.size, read: `get${SCALARS[type][0]}` };
+    element.names.push(name);
+    element.size += SCALARS[type][1];
   }
-  const start = end.index + end[0].length;
-  if (start + count * size > buffer.byteLength) throw new Error("The file is cut short.");
-  if (start + count * size < buffer.byteLength) throw new Error(`It has more than its ${count} Gaussians. ${OTHER}`);
-  const antialiased = lines.includes("comment SplatRenderMode: mip");
-  return { count: Number(count), columns, size, antialiased, view: new DataView(buffer, start) };
+  let start = end.index + end[0].length;
+  for (const each of Object.values(elements)) {
+    const length = each.count * each.size;
+    if (!Number.isInteger(each.count)) throw new Error(OTHER);
+    if (start + length > buffer.byteLength) throw new Error("The file is cut short.");
+    const view = new DataView(buffer, start);
+    each.get = (row, name) => {
+      if (!(name in each.columns)) throw new Error(OTHER);
+      const { at, read } = each.columns[name];
+      return view[read](row * each.size + at, true);
+    };
+    start += length;
+  }
+  const { vertex } = elements;
+  if (!vertex) throw new Error(OTHER);
+  if (start < buffer.byteLength) throw new Error(`It has more than its ${vertex.count} Gaussians. ${OTHER}`);
+  return [elements, { antialiased: lines.includes("comment SplatRenderMode: mip") }];
 }
 
 function readPly(buffer) {
-  const { count, columns, size, antialiased, view } = plyTable(buffer);
-  const read = (names, change = (x) => x) => {
-    const values = new Float32Array(count * names.length);
-    names.forEach((name, k) => {
-      if (!(name in columns)) throw new Error(OTHER);
-      const { at, get } = columns[name];
-      for (let i = 0; i < count; i++) values[i * names.length + k] = change(view[get](i * size + at, true));
+  const [elements, about] = plyElements(buffer), { vertex } = elements, { count, names } = vertex;
+  if (elements.chunk) return readCompressed(elements, about);
+  const read = (wanted, change = (x) => x) => {
+    const values = new Float32Array(count * wanted.length);
+    wanted.forEach((name, k) => {
+      for (let i = 0; i < count; i++) values[i * wanted.length + k] = change(vertex.get(i, name));
     });
     return values;
   };
   const several = (name, number) => Array.from({ length: number }, (_, i) => `${name}_${i}`);
-  const rest = Object.keys(columns).filter((name) => name.startsWith("f_rest_")).length / 3;
+  const rest = names.filter((name) => name.startsWith("f_rest_")).length / 3;
   if (![0, 3, 8, 15].includes(rest)) throw new Error(OTHER);
   const byColor = several("f_rest", 3 * rest); // all of red, then of green, then of blue
   return {
-    count, antialiased, means: read(["x", "y", "z"]), scales: read(several("scale", 3), Math.exp), quats: read(several("rot", 4)),
+    count, ...about, means: read(["x", "y", "z"]), scales: read(several("scale", 3), Math.exp), quats: read(several("rot", 4)),
     opacities: read(["opacity"], (x) => 1 / (1 + Math.exp(-x))), colors: read(several("f_dc", 3), (x) => x * SH_C0 + 0.5),
     harmonics: read(byColor.map((_, i) => byColor[(i % 3) * rest + Math.floor(i / 3)])), degree: Math.sqrt(rest + 1) - 1,
   };
@@ -107,12 +118,12 @@ function frameOf({ means, scales, opacities }, seen) {
 }
 
 // The object and its records, in the arguments of Viewer.open.
-function packedFile(name, buffer) {
+async function packedFile(name, buffer) {
   if (!globalThis.Float16Array) throw new Error("This browser is too old to open files; use gamba view.");
-  const kind = /\.(ply|splat)$/i.exec(name)?.[1].toLowerCase();
+  const kind = /\.(ply|splat|spz)$/i.exec(name)?.[1].toLowerCase();
   if (/\.(obj|stl)$/i.test(name)) throw new Error(`${HERE}; a mesh beside them: gamba view GAUSSIANS --mesh FILE`);
-  if (!kind) throw new Error(/\.(spz|glb)$/i.test(name) ? OTHER : `${HERE}.`);
-  const file = { ply: readPly, splat: readSplat }[kind](buffer);
+  if (!kind) throw new Error(/\.glb$/i.test(name) ? OTHER : `${HERE}.`);
+  const file = await { ply: readPly, splat: readSplat, spz: readSpz }[kind](buffer);
   const seen = visibleOf(file), frame = frameOf(file, seen), { degree, antialiased = false } = file;
   const records = new ArrayBuffer(32 * seen.length), clip = (x) => Math.max(-LARGEST, Math.min(LARGEST, x));
   const floats = new Float32Array(records), halves = new Float16Array(records), shorts = new Int16Array(records);
@@ -140,14 +151,14 @@ function takeFiles(open) {
   const read = async (file) => {
     if (!file) return;
     try {
-      open(...packedFile(file.name, await file.arrayBuffer()));
+      open(...await packedFile(file.name, await file.arrayBuffer()));
     } catch (error) {
       say(error.message, `Cannot open ${file.name}`);
       setTimeout(say, 6000, "");
     }
   };
   input.type = "file";
-  input.accept = ".ply,.splat";
+  input.accept = ".ply,.splat,.spz";
   input.onchange = () => read(input.files[0]).then(() => { input.value = ""; });
   for (const kind of ["dragover", "dragleave", "drop"])
     window.addEventListener(kind, (event) => {
