@@ -194,12 +194,14 @@ class Actions:
             try:
                 cut = self._call(request, cut_picture, Path(file["path"]), name, self._options)
                 made.append(self._call(request, work.run_model, self._model, cut))
-                doubted += [html.escape(name)] * bool(cut.warning)
+                if cut.warning:
+                    doubted.append(name)
             except UserError as error:
-                gr.Warning(html.escape(f"{name}: {error}"), title="This picture cannot be used")
+                text = f"{name}: {str(error).removeprefix(f'{name}: ')}"
+                gr.Warning(html.escape(text), title="This picture cannot be used")
         if doubted:
             text = f"{', '.join(doubted)}. Give such a picture alone to correct it."
-            gr.Warning(text, title="These cut-outs may be wrong")
+            gr.Warning(html.escape(text), title="These cut-outs may be wrong")
         if not made:
             raise UserError("none of these pictures can be used")
         return self._added(results, made, request)
@@ -210,6 +212,7 @@ class Actions:
         index = event._data["index"]
         if type(index) is not int or not 0 <= index < len(results):
             raise UserError("this result has expired")
+        _forget_surfaces(results)
         return self._presented(results[index].made)
 
     @with_page_errors
@@ -236,7 +239,7 @@ class Actions:
             progress: gr.Progress = gr.Progress(),  # noqa: B008
         ) -> tuple:
             made, older = _state(state)
-            before = [*made.surfaces.values()]
+            before = made.surface
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
             folder = self._new_folder(request)
             mesh = work.MeshChoice.of(faces, texture, watertight)
@@ -245,8 +248,8 @@ class Actions:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
             files = [*(old for old in older if old.name != path.name and old.is_file()), path]
             listed = gr.update(value=[str(file) for file in files], visible=True)
-            same = [*made.surfaces.values()] == before
-            return (made, files), listed, gr.skip() if same else _frame(made)
+            shown = gr.skip() if made.surface is before else _frame(made)
+            return (made, files), listed, shown
 
         return with_page_errors(write)
 
@@ -259,6 +262,7 @@ class Actions:
             path = self._new_folder(request) / "result.png"
             self._call(request, work.thumbnail, each, path, self._device)
             new.append(Result(each, path))
+        _forget_surfaces(results)
         kept = [*results, *new][-MAX_PICTURES:]
         strip = [(str(result.picture), result.made.name) for result in kept]
         shown = gr.update(value=strip, visible=len(kept) > 1, selected_index=None)
@@ -295,6 +299,12 @@ class Actions:
         path = self._new_folder(request) / "cut-out.png"
         save_image(path, editor_picture(cut) / 255.0)
         return {"background": str(path), "layers": [], "composite": str(path)}
+
+
+def _forget_surfaces(results: list[Result]) -> None:
+    """Free the surfaces of results that are not shown; one with a texture takes up to 60 MB."""
+    for result in results:
+        result.made.surfaces.clear()
 
 
 def _frame(made: work.Reconstruction) -> str:

@@ -84,6 +84,11 @@ class Reconstruction:
     whole: Reconstruction | None = None
     surfaces: dict[tuple[int, bool], Surface] = field(default_factory=dict)
 
+    @property
+    def surface(self) -> Surface | None:
+        """The last surface, if any."""
+        return next(iter(self.surfaces.values()), None)
+
 
 def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
     """Run one forward pass.
@@ -196,8 +201,7 @@ def viewer(made: Reconstruction) -> str:
 
 
 def _shown(made: Reconstruction) -> dict:
-    mesh = next(iter(made.surfaces.values()), None)
-    return {"camera": made.camera, "mesh": mesh, "picture": made.picture / 255.0}
+    return {"camera": made.camera, "mesh": made.surface, "picture": made.picture / 255.0}
 
 
 def write(
