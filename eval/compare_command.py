@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from gamba_warp.batch import print_json
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.ranges import ranged
 
@@ -48,5 +49,8 @@ def compare_command(
         folder = output_folder(out)
         write_json(folder / "compare.json", joined)
         write_text(folder / "compare.md", markdown_page(joined))
-    print(json_of(joined) if json else markdown_page(joined), end="")
+    if json:
+        print_json(json_of(joined))
+    else:
+        print(markdown_page(joined), end="")
     return 0

@@ -111,6 +111,11 @@ def say(line: str, stream: TextIO | None = None) -> None:
         print(line, file=stream or sys.stdout)
 
 
+def print_json(text: str, stream: TextIO | None = None) -> None:
+    """Print the JSON that an option asks for on stdout, or on another stream, even with --quiet."""
+    print(text.rstrip("\n"), file=STAGES.stdout or stream or sys.stdout)
+
+
 def warn(path: Path, lines: Iterable[str]) -> None:
     """Print warnings about a file on stderr, in one line above the bar, if there are any."""
     if text := "; ".join(lines):
@@ -122,12 +127,14 @@ class Stages:
 
     Attributes:
         quiet: no bar is drawn.
+        stdout: the standard output while ``sys.stdout`` drops all text, else None.
         show: shows a name; None without a bar.
         seconds: wall-clock and CPU seconds of each stage, over all items.
     """
 
     def __init__(self) -> None:
         self.quiet = False
+        self.stdout: TextIO | None = None
         self.show: Callable[[str], object] | None = None
         self.seconds: dict[str, list[float]] = {}
         self._name, self._since = "start", (None, 0.0)

@@ -253,13 +253,13 @@ def _expanded(command: Callable, arguments: list[str]) -> list[str]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Print nothing on stdout, and draw no progress bars."""
-    STAGES.quiet = True
+    """Print nothing on stdout but JSON, and draw no progress bars."""
+    STAGES.quiet, STAGES.stdout = True, sys.stdout
     try:
         with open(os.devnull, "w", encoding="utf-8") as nothing, redirect_stdout(nothing):
             yield
     finally:
-        STAGES.quiet = False
+        STAGES.quiet, STAGES.stdout = False, None
 
 
 def _user_message(error: Exception, command: str) -> str | None:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from gamba_warp.batch import print_json
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.ranges import ranged
 
@@ -53,7 +54,7 @@ def eval_geometry_command(
     for text in report["warnings"]:
         print(f"warning: {text}", file=sys.stderr)
     if json:
-        print(json_of(report), end="")
+        print_json(json_of(report))
     else:
         print(text_of(report, protocol), count_line(report, options.out), sep="")
     return 1 if report["failures"] else 0

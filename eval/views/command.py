@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from gamba_warp.batch import print_json
 from gamba_warp.untrusted.ranges import ranged
 
 from .options import ViewsOptions
@@ -32,7 +33,10 @@ def eval_views_command(
     from .table import page
 
     report = evaluate_views(filled)
-    print(json_of(report) if json else page(report), end="")
+    if json:
+        print_json(json_of(report))
+    else:
+        print(page(report), end="")
     for name, reason in report["left_out_baselines"].items():
         print(f"left out: {name}: {reason}", file=sys.stderr)
     for item in report["failures"]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..batch import counted
+from ..batch import STAGES, counted, print_json
 from ..errors import UserError
 
 STREAM = Path("-")  # as --out: the standard output
@@ -71,7 +71,8 @@ def reported(command: Callable[..., Results]) -> Callable[..., int]:
         if piped and as_json:
             raise UserError("--out - writes a file to the standard output; --json cannot, too")
         stdout = sys.stdout
-        with redirect_stdout(sys.stderr) if piped or as_json else nullcontext():
+        aside = (piped or as_json) and not STAGES.quiet
+        with redirect_stdout(sys.stderr) if aside else nullcontext():
             with _one_file() if piped else nullcontext() as folder:
                 if folder and files:
                     values["files"] = replace(files, out=folder, page=False, turntable="none")
@@ -81,7 +82,10 @@ def reported(command: Callable[..., Results]) -> Callable[..., int]:
             results.out = STREAM if piped else results.out
             for item, reason in results.failures:
                 print(f"gamba: failed: {item}: {reason}", file=sys.stderr)
-            print(results.json() if as_json else results.text(), file=stdout if as_json else None)
+            if as_json:
+                print_json(results.json(), stdout)
+            else:
+                print(results.text())
         return 1 if results.failures else 0
 
     return run

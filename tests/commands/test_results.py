@@ -91,3 +91,6 @@ def test_results_as_json(tmp_path, checkpoint, splats, capsys):
         "closed",
     }
     refused_command(capsys, "export", [splats, "-o", "-", "--json"], "--json cannot, too")
+    assert run("export", ["-q", splats, "--out", str(out), *options]) == 0
+    texts = capsys.readouterr()
+    assert json.loads(texts.out)["results"] and not texts.err
