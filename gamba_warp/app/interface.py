@@ -64,17 +64,20 @@ def build(actions: Actions) -> gr.Blocks:
                     placeholder="Drop a picture here\nor click to choose one",
                     elem_id="picture",
                 )
+                small_pictures: dict[str, Any] = {
+                    "height": "auto",
+                    "allow_preview": False,
+                    "object_fit": "contain",
+                    "buttons": [],
+                    "interactive": False,
+                    "elem_classes": "strip",
+                }
                 gallery = gr.Gallery(
                     [(str(path), title) for path, title in examples()],
                     label="Or take an example",
                     columns=6,
-                    height="auto",
-                    allow_preview=False,
-                    object_fit="contain",
-                    buttons=[],
-                    interactive=False,
                     elem_id="examples",
-                    elem_classes="strip",
+                    **small_pictures,
                 )
                 several = gr.UploadButton(
                     f"Several pictures at once (up to {MAX_PICTURES})",
@@ -124,14 +127,9 @@ def build(actions: Actions) -> gr.Blocks:
                 strip = gr.Gallery(
                     label="Results",
                     visible=False,
-                    columns=12,
-                    height="auto",
-                    allow_preview=False,
-                    object_fit="contain",
-                    buttons=[],
-                    interactive=False,
+                    columns=MAX_PICTURES,
                     elem_id="results",
-                    elem_classes="strip",
+                    **small_pictures,
                 )
                 buttons: dict[str, gr.Button] = {}
                 with gr.Column(visible=False, elem_id="files") as files_part:

@@ -22,7 +22,7 @@ from ..images import to_uint8
 from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
 
 # In order of their dependencies.
-_SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "packed", "open", "ui", "main")
+_SCRIPTS = "shaders gl sorter camera controls packed meshes open ui main".split()
 _PICTURE = 512  # longest side of the input, pixels
 # The page may load only inlined content; the sorting worker is made from a text of the page.
 POLICY = (

@@ -19,6 +19,9 @@ from gamba_warp.formats.names import splat_suffix
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import Surface
+from gamba_warp.surfaces.files import save_mesh
+from gamba_warp.surfaces.texture import Texture
+from gamba_warp.viewer.pack import read_viewed_mesh
 from gamba_warp.viewer.page import write_viewer
 
 CAMERA = (1.5, 49.1, 0.0)
@@ -372,6 +375,29 @@ def test_a_dropped_file_is_shown_as_gamba_view_shows_it(viewer, tmp_path, kind, 
     assert np.abs(canvas(opened) - wanted).max() <= 4 / 255
 
 
+@pytest.mark.parametrize("kind", ["glb", "textured glb", "bare glb", "obj", "bare obj", "stl"])
+def test_a_dropped_mesh_is_shown_as_gamba_view_shows_it(viewer, tmp_path, kind):
+    mesh = tetrahedron()
+    if kind == "textured glb":
+        image = np.random.default_rng(0).random((8, 8, 3), np.float32)
+        uvs = np.array([[[0.1, 0.1], [0.9, 0.2], [0.4, 0.8]]] * 4, np.float32)
+        mesh.texture = Texture(uvs, image)
+    if kind.startswith("bare"):
+        mesh.colors = None
+    path = tmp_path / f"chair.{kind.split()[-1]}"
+    save_mesh(path, mesh)
+    gaussians = colourful(40)
+    opened = viewer(gaussians, mesh=read_viewed_mesh(path), camera=None)
+    opened.page.keyboard.press("3")
+    wanted = canvas(opened)
+    opened = viewer(gaussians, camera=None)
+    before = canvas(opened)
+    drop(opened, path.name, path.read_bytes())
+    opened.until("gambaViewer.mode === 'mesh'")
+    assert np.abs(canvas(opened) - wanted).max() <= 2 / 255 < np.abs(wanted - before).max()
+    assert "4 faces" in opened.page.inner_text("#about") and not opened.messages
+
+
 def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
     save_ply(tmp_path / "chair.ply", colourful(40))
     good = (tmp_path / "chair.ply").read_bytes()
@@ -387,7 +413,13 @@ def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
         ("chair.ply", good.replace(b"f_dc_1", b"f_xx_1"), "Only Gaussians"),
         ("chair.ply", good.replace(b"binary_little_endian", b"ascii"), "Only Gaussians"),
         ("chair.ply", b"", "Only Gaussians"),
-        ("chair.glb", b"glTF", "gamba view FILE"),
+        ("chair.glb", b"glTF" + bytes(40), "beyond the page"),
+        ("chair.glb", b"glTF", "beyond the page"),
+        ("chair.stl", b"solid", "beyond the page"),
+        ("chair.obj", b"usemtl red", "beyond the page"),
+        ("chair.obj", b"v 0 0 0", "no triangles"),
+        ("chair.obj", b"v 0 0 0\nf 1 2 3", "a vertex that is missing"),
+        ("chair.obj", b"v 0 0 x\nf 1 1 1", "not finite"),
         ("chair.SPZ", b"NGSP" + bytes(40), "gamba view FILE"),
         ("chair.spz", b"\x1f\x8b" + bytes(40), "is damaged"),
         ("chair.spz", gzip.compress(b"NGSP\3\0\0\0\1\0\0\0" + bytes(8)), "is damaged"),
@@ -395,8 +427,7 @@ def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
         ("chair.ply", packed.replace(b"chunk 1", b"chunk 0"), "cut short|more than|do not match"),
         ("chair.ply", packed[:-1], "cut short"),
         ("chair.ply", b"ply\nformat ascii 1.0\n", "gamba view FILE"),
-        ("chair.stl", b"", "gamba view GAUSSIANS --mesh FILE"),
-        ("chair.txt", b"", r"Only Gaussians open here \(.ply, .splat, .spz\)\."),
+        ("chair.txt", b"", "open here[.]$"),
         ("chair.splat", b"0" * 33, "cut short"),
         ("chair.splat", b"", "No Gaussian"),
         ("chair.splat", b"\0" * 32, "No Gaussian"),

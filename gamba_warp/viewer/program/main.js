@@ -22,7 +22,7 @@ class Viewer {
       focus: (x, y) => this.focus(x, y),
     };
     this.camera = new OrbitCamera(about.home, about.home.fov);
-    this.choose = asked("controls") === "0" ? () => {} : takeFiles((...object) => this.open(...object));
+    this.choose = asked("controls") === "0" ? () => {} : takeFiles(this);
     this.act.keys = startButtons(this);
     this.turning = !matchMedia("(prefers-reduced-motion: reduce)").matches && asked("turn") !== "0";
     for (const kind of ["pointerdown", "wheel", "keydown"])
@@ -91,6 +91,19 @@ class Viewer {
       this.redraw();
     };
     next();
+  }
+
+  // Shows another mesh with the object, as packedMesh returns it.
+  addMesh(packed) {
+    this.about.faces = packed.faces;
+    dressPage(this.about);
+    this.send({ kind: "addMesh", ...packed });
+  }
+
+  meshed({ mesh }) {
+    if (!this.renderer) return;
+    this.renderer.setMesh(mesh);
+    this.setMode("mesh");
   }
 
   sorted({ buffer, used, id }) {

@@ -9,7 +9,8 @@ const SCALARS = {
   int16: ["Int16", 2], uint16: ["Uint16", 2], int32: ["Int32", 4], uint32: ["Uint32", 4],
   float32: ["Float32", 4], float64: ["Float64", 8],
 };
-const HERE = "Only Gaussians open here (.ply, .splat, .spz)", OTHER = `${HERE}; for this file try: gamba view FILE`;
+const HERE = "Only Gaussians (.ply, .splat, .spz) and meshes (.glb, .obj, .stl) open here";
+const OTHER = `${HERE}; for this file try: gamba view FILE`;
 
 // Elements of a .ply by name, each with its count, the names of its properties and `get`, or an
 // error with a reason for the user.
@@ -121,8 +122,7 @@ function frameOf({ means, scales, opacities }, seen) {
 async function packedFile(name, buffer) {
   if (!globalThis.Float16Array) throw new Error("This browser is too old to open files; use gamba view.");
   const kind = /\.(ply|splat|spz)$/i.exec(name)?.[1].toLowerCase();
-  if (/\.(obj|stl)$/i.test(name)) throw new Error(`${HERE}; a mesh beside them: gamba view GAUSSIANS --mesh FILE`);
-  if (!kind) throw new Error(/\.glb$/i.test(name) ? OTHER : `${HERE}.`);
+  if (!kind) throw new Error(`${HERE}.`);
   const file = await { ply: readPly, splat: readSplat, spz: readSpz }[kind](buffer);
   const seen = visibleOf(file), frame = frameOf(file, seen), { degree, antialiased = false } = file;
   const records = new ArrayBuffer(32 * seen.length), clip = (x) => Math.max(-LARGEST, Math.min(LARGEST, x));
@@ -146,19 +146,21 @@ async function packedFile(name, buffer) {
 }
 
 // Opens files that are dropped, or chosen after `choose`, which is returned.
-function takeFiles(open) {
+function takeFiles(viewer) {
   const root = document.documentElement, input = document.createElement("input");
   const read = async (file) => {
     if (!file) return;
     try {
-      open(...await packedFile(file.name, await file.arrayBuffer()));
+      const content = await file.arrayBuffer(), { frame } = viewer.about;
+      if (/\.(glb|obj|stl)$/i.test(file.name)) viewer.addMesh(await packedMesh(file.name, content, frame));
+      else viewer.open(...await packedFile(file.name, content));
     } catch (error) {
       say(error.message, `Cannot open ${file.name}`);
       setTimeout(say, 6000, "");
     }
   };
   input.type = "file";
-  input.accept = ".ply,.splat,.spz";
+  input.accept = ".ply,.splat,.spz,.glb,.obj,.stl";
   input.onchange = () => read(input.files[0]).then(() => { input.value = ""; });
   for (const kind of ["dragover", "dragleave", "drop"])
     window.addEventListener(kind, (event) => {

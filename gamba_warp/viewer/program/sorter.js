@@ -170,7 +170,12 @@ function sorterProgram(post) {
     post({ kind: "picked", depth, id });
   }
 
-  const tasks = { load, sort, pick };
+  function addMesh(message) {
+    mesh = meshOf(message.mesh, message.vertices, message.faces);
+    post({ kind: "meshed", mesh });
+  }
+
+  const tasks = { load, addMesh, sort, pick };
   return (message) => tasks[message.kind](message);
 }
 
