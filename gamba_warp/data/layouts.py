@@ -176,7 +176,7 @@ def _matrix(value: object, source: str, what: str = "the pose") -> np.ndarray:
 
 def _is_last_row(row: np.ndarray) -> np.ndarray:
     """Return whether rows ``[.., 4]`` are 0 0 0 1, up to rounding."""
-    return np.isclose(row, _LAST_ROW, atol=1e-6).all(-1)
+    return np.asarray(np.isclose(row, _LAST_ROW, atol=1e-6).all(-1))
 
 
 def check_cameras(
