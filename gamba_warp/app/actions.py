@@ -213,19 +213,15 @@ class Actions:
         if type(index) is not int or not 0 <= index < len(results):
             raise UserError("this result has expired")
         _forget_surfaces(results)
-        return self._presented(results[index].made)
+        return _presented(results[index].made)
 
     @with_page_errors
     def trim(
-        self,
-        state: State | None,
-        opacity: float,
-        distance: float,
-        request: gr.Request,
+        self, state: State | None, opacity: float, distance: float, request: gr.Request
     ) -> tuple:
         """Leave out Gaussians; the viewer and all later files lack them."""
         made = self._call(request, work.trim, _state(state)[0], opacity, distance, self._device)
-        return self._presented(made)[:4]
+        return _presented(made)[:4]
 
     def writer(self, kind: str) -> Callable:
         """Return the handler that writes files of one kind, and adds them to the list."""
@@ -264,14 +260,11 @@ class Actions:
             new.append(Result(each, path))
         _forget_surfaces(results)
         kept = [*results, *new][-MAX_PICTURES:]
+        if len(kept) < len(results) + len(new):
+            gr.Info(f"The strip keeps the last {MAX_PICTURES} results.")
         strip = [(str(result.picture), result.made.name) for result in kept]
         shown = gr.update(value=strip, visible=len(kept) > 1, selected_index=None)
-        return kept, shown, *self._presented(new[-1].made)
-
-    def _presented(self, made: work.Reconstruction) -> tuple:
-        """Return state, viewer, the buttons of files, no files, and sliders at their ends."""
-        files = gr.update(value=None, visible=False)
-        return (made, []), _frame(made), gr.update(visible=True), files, 0.0, work.FARTHEST
+        return kept, shown, *_presented(new[-1].made)
 
     def _call(self, request: gr.Request, function: Callable, *args: Any) -> Any:
         """Call a function on the main thread, as long as the page is open."""
@@ -304,7 +297,13 @@ class Actions:
 def _forget_surfaces(results: list[Result]) -> None:
     """Free the surfaces of results that are not shown; one with a texture takes up to 60 MB."""
     for result in results:
-        result.made.surfaces.clear()
+        result.made.surface = None
+
+
+def _presented(made: work.Reconstruction) -> tuple:
+    """Return state, viewer, the buttons of files, no files, and sliders at their ends."""
+    files = gr.update(value=None, visible=False)
+    return (made, []), _frame(made), gr.update(visible=True), files, 0.0, work.FARTHEST
 
 
 def _frame(made: work.Reconstruction) -> str:

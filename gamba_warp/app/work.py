@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 import zipfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -62,7 +62,7 @@ class MeshChoice(NamedTuple):
 MESH = MeshChoice()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Reconstruction:
     """One reconstruction.
 
@@ -73,7 +73,8 @@ class Reconstruction:
         seconds: run time of the model.
         picture: the model's input ``[S, S, 4]`` uint8, reduced.
         whole: the reconstruction that was trimmed to this one, or None.
-        surfaces: the last surface, by the number of faces at most and if it is closed.
+        surface: the last one that was extracted, or None.
+        choice: its number of faces at most, and if it is closed.
     """
 
     name: str
@@ -82,12 +83,8 @@ class Reconstruction:
     seconds: float
     picture: np.ndarray
     whole: Reconstruction | None = None
-    surfaces: dict[tuple[int, bool], Surface] = field(default_factory=dict)
-
-    @property
-    def surface(self) -> Surface | None:
-        """The last surface, if any."""
-        return next(iter(self.surfaces.values()), None)
+    surface: Surface | None = None
+    choice: tuple[int, bool] | None = None
 
 
 def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
@@ -142,7 +139,7 @@ def trim(
         keep &= torch.from_numpy(away <= distance / 100 * side)
     if not keep.any():
         raise UserError("no Gaussian would stay; choose less")
-    return replace(whole, gaussians=gaussians.select(keep), whole=whole, surfaces={})
+    return replace(whole, gaussians=gaussians.select(keep), whole=whole, surface=None)
 
 
 def surface_of(
@@ -162,20 +159,19 @@ def surface_of(
     from ..surfaces import extract
     from ..surfaces.options import SurfaceOptions
 
-    key = mesh.faces, mesh.watertight
-    kept = made.surfaces.get(key)
-    if kept is None or (texture and (kept.texture is None or len(kept.texture.image) != texture)):
+    kept, choice = made.surface, (mesh.faces, mesh.watertight)
+    baked = 0 if kept is None or kept.texture is None else len(kept.texture.image)
+    if kept is None or made.choice != choice or texture not in (0, baked):
         options = SurfaceOptions(colors=True, faces=mesh.faces, watertight=mesh.watertight)
         options.require(texture)
         chosen = torch.device(device)
         kept = extract.surface_of(made.gaussians.to(chosen), options, chosen, texture)
-        made.surfaces.clear()
-        made.surfaces[key] = kept
+        made.surface, made.choice = kept, choice
     return kept
 
 
 def thumbnail(made: Reconstruction, path: Path, device: str = "cpu") -> None:
-    """Write a small picture of the object, turned by an eighth.
+    """Write a small picture of the object, from the input's camera.
 
     Raises:
         UserError: the file cannot be written.
@@ -185,8 +181,8 @@ def thumbnail(made: Reconstruction, path: Path, device: str = "cpu") -> None:
 
     distance, fov, elevation = made.camera
     view = {"distance": distance, "fov": fov, "elevation": elevation}
-    frames = turntable_frames(made.gaussians.to(device), size=_SMALL, frames=8, **view)
-    save_image(path, frames[1] / 255.0)
+    frames = turntable_frames(made.gaussians.to(device), size=_SMALL, frames=1, **view)
+    save_image(path, frames[0] / 255.0)
 
 
 def viewer(made: Reconstruction) -> str:

@@ -142,9 +142,9 @@ def reconstruct_command(
         made = reconstruct(model, cut.rgba, precision, detail)
         gaussians = made.to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
-        told = {"input": str(path), "name": name, "cutout": cut.how, "warning": cut.warning}
-        made = write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
-        results.made.append(told | made)
+        figures = write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
+        source = {"input": str(path), "name": name, "cutout": cut.how, "warning": cut.warning}
+        results.made.append(source | figures)
 
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:

@@ -119,7 +119,7 @@ class ObjectFiles:
         STAGES.begin("Gaussians")
         notes = []
         files = [section.title + end for end in self.suffixes()]
-        told: dict[str, Any] = {"files": files, "gaussians": gaussians.num}
+        figures: dict[str, Any] = {"files": files, "gaussians": gaussians.num}
         for kind in options.splats:
             path = base.with_name(base.name + splat_suffix(kind))
             notes.append(write_gaussians(path, gaussians, kind, comments=comments))
@@ -143,7 +143,7 @@ class ObjectFiles:
             counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
             colors = f", texture of {self.texture} pixels" if self.texture else ""
             notes.append(f"Mesh: {counts}{colors}, {_closedness(mesh)}, {seconds:.1f} s.")
-            told["mesh"] = {
+            figures["mesh"] = {
                 "vertices": len(mesh.vertices),
                 "faces": len(mesh.faces),
                 "closed": mesh.is_watertight(),
@@ -151,7 +151,7 @@ class ObjectFiles:
             section.mesh = mesh if shown is None else None
             self._write_page(section, meshes=True)
         STAGES.begin("rest")
-        return told | {"notes": [*filter(None, notes)]}, turn
+        return figures | {"notes": [*filter(None, notes)]}, turn
 
     def _write_page(self, section: Section, meshes: bool) -> None:
         """Write the page, if requested; with ``meshes`` it also links to these."""
@@ -262,9 +262,9 @@ def export(name: str, path: Path, job: ExportJob) -> dict[str, Any]:
     drawn = job.options.page or job.options.turntable != "none"
     shown = gaussians.in_unit(*unit_frame(gaussians)) if drawn else gaussians
     section = Section(name, table=[("Gaussians", f"{gaussians.num:,}")], **asdict(job.view))
-    told, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
-    say(" ".join([f"{name}: {count}", *told["notes"]]))
-    return told
+    figures, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
+    say(" ".join([f"{name}: {count}", *figures["notes"]]))
+    return figures
 
 
 @dataclass(kw_only=True)
@@ -348,8 +348,8 @@ def write_outputs(
     if cut.warning:
         section.strip = cut.beside()
     comments = [f"from {name} by {outputs.checkpoint.name}"]
-    told, turn = outputs.write(gaussians, None, view, section, device, comments)
-    for line in (f"{name}: {count}", *told["notes"]):
+    figures, turn = outputs.write(gaussians, None, view, section, device, comments)
+    for line in (f"{name}: {count}", *figures["notes"]):
         say(line)
     if outputs.sheet is not None:
         outputs.sheet.add(name, cut.rgba, gaussians, view)
@@ -358,4 +358,4 @@ def write_outputs(
         small = Image.fromarray(np.hstack([flat, turn[len(turn) // 8]]))  # rotated a little
         small.thumbnail(_SMALL)
         outputs.made[name] = np.asarray(small)
-    return told
+    return figures

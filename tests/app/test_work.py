@@ -228,7 +228,7 @@ def test_a_mesh(made, tmp_path, monkeypatch):
 
 
 def test_haze_is_left_out(made, tmp_path, monkeypatch):
-    made = replace(made, surfaces={})
+    made = replace(made, surface=None)
     gaussians = made.gaussians
     corners = gaussians.means.double().numpy().min(0) + [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     plane = extract.Surface(corners[:3], np.array([[0, 1, 2]]), np.full((3, 3), 0.5, np.float32))
@@ -249,9 +249,9 @@ def test_haze_is_left_out(made, tmp_path, monkeypatch):
 
 
 def test_the_viewer_has_the_input_and_the_last_mesh(made):
-    made = replace(made, surfaces={})
+    made = replace(made, surface=None)
     bare = work.viewer(made)
     assert '"faces": 0' in bare and '"picture": "data:image/webp;base64,' in bare
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
-    made.surfaces[1, False] = extract.Surface(corners, np.array([[0, 1, 2]]))
+    made.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
     assert '"faces": 1,' in work.viewer(made)

@@ -3,7 +3,9 @@
 import base64
 import gzip
 import io
+import json
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -398,6 +400,37 @@ def test_a_dropped_mesh_is_shown_as_gamba_view_shows_it(viewer, tmp_path, kind):
     assert "4 faces" in opened.page.inner_text("#about") and not opened.messages
 
 
+def glb(nodes=({"mesh": 0},), attributes=(), primitive=(), material=(), **top):
+    """A .glb of a triangle with something else in it."""
+    floats = np.eye(3, dtype="<f4").tobytes()
+    triangle = {"attributes": {"POSITION": 0, **dict(attributes)}, "material": 0, **dict(primitive)}
+    tree = {
+        "nodes": list(nodes),
+        "meshes": [{"primitives": [triangle]}],
+        "materials": [dict(material)],
+        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 0}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(floats)}],
+        **top,
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(floats))
+    chunks = [struct.pack("<I4s", len(text), b"JSON"), text]
+    return b"".join([head, *chunks, struct.pack("<I4s", len(floats), b"BIN\0"), floats])
+
+
+PARTS = [
+    ({"extensionsUsed": ["KHR_texture_transform"]}, "extensions .KHR_texture_transform"),
+    ({"animations": [{}]}, "animations or skins"),
+    ({"nodes": [{"mesh": 0, "scale": [2, 2, 2]}]}, "moved or unused parts"),
+    ({"nodes": [{}]}, "moved or unused parts"),
+    ({"attributes": {"JOINTS_0": 0}}, "the attribute JOINTS_0"),
+    ({"primitive": {"targets": [{}]}}, "morph targets"),
+    ({"primitive": {"mode": 0}}, "points"),
+    ({"material": {"emissiveFactor": [1, 0, 0]}}, "light of its own"),
+]
+
+
 def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
     save_ply(tmp_path / "chair.ply", colourful(40))
     good = (tmp_path / "chair.ply").read_bytes()
@@ -405,7 +438,9 @@ def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
     packed = (tmp_path / "small.ply").read_bytes()
     opened = viewer(colourful(40))
     before = canvas(opened)
+    more = good.replace(b"end_header", b"element camera 0\nproperty float x\nend_header")
     for name, content, reason in (
+        ("chair.ply", more, "Only Gaussians"),
         ("chair.ply", good[:-1], "cut short"),
         ("chair.ply", good + b"0", "more than its 40 Gaussians"),
         ("chair.ply", good.replace(b"float nx", b"float ny"), "Only Gaussians"),
@@ -413,10 +448,19 @@ def test_a_dropped_file_that_cannot_be_shown(viewer, tmp_path):
         ("chair.ply", good.replace(b"f_dc_1", b"f_xx_1"), "Only Gaussians"),
         ("chair.ply", good.replace(b"binary_little_endian", b"ascii"), "Only Gaussians"),
         ("chair.ply", b"", "Only Gaussians"),
-        ("chair.glb", b"glTF" + bytes(40), "beyond the page"),
-        ("chair.glb", b"glTF", "beyond the page"),
-        ("chair.stl", b"solid", "beyond the page"),
-        ("chair.obj", b"usemtl red", "beyond the page"),
+        ("chair.glb", b"glTF" + bytes(40), "is damaged"),
+        ("chair.glb", b"glTF", "another form than .glb"),
+        (
+            "chair.stl",
+            b"solid",
+            "another form than binary .stl, .*gamba view GAUSSIANS --mesh FILE",
+        ),
+        ("chair.obj", b"usemtl red", "materials in other files"),
+        ("chair.obj", b"v 0 0 0 2", "other than 3 or 6 numbers"),
+        ("chair.obj", b"v 0 0 0 255 0 0", "outside of 0 to 1"),
+        ("chair.obj", b"v 0 0 0\ncurv 1 2", "lines curv"),
+        ("chair.obj", b"v 0 0 0\nf 0 1 1", "a vertex that is missing"),
+        *(("chair.glb", glb(**part), reason) for part, reason in PARTS),
         ("chair.obj", b"v 0 0 0", "no triangles"),
         ("chair.obj", b"v 0 0 0\nf 1 2 3", "a vertex that is missing"),
         ("chair.obj", b"v 0 0 x\nf 1 1 1", "not finite"),

@@ -43,8 +43,8 @@ function plyElements(buffer) {
     };
     start += length;
   }
-  const { vertex } = elements;
-  if (!vertex) throw new Error(OTHER);
+  const { vertex } = elements, known = elements.chunk ? ["chunk", "vertex", "sh"] : ["vertex"];
+  if (!vertex || Object.keys(elements).some((name) => !known.includes(name))) throw new Error(OTHER);
   if (start < buffer.byteLength) throw new Error(`It has more than its ${vertex.count} Gaussians. ${OTHER}`);
   return [elements, { antialiased: lines.includes("comment SplatRenderMode: mip") }];
 }
