@@ -248,12 +248,21 @@ def warn_of_others(folder: Path, files: Iterable[Path], known: Container[str]) -
 
     Files that often accompany others, such as textures, count as known.
     """
+    if others := other_kinds((f for f in files if f.suffix.lower() not in _BESIDE), known):
+        warnings.warn(f"{folder}: {others} skipped", FileWarning, stacklevel=2)
+
+
+def other_kinds(files: Iterable[Path], known: Container[str]) -> str:
+    """Return the count and the suffixes of files without a known one; nothing if there are none.
+
+    Hidden files do not count.
+    """
     suffixes = [path.suffix.lower() for path in files if not path.name.startswith(".")]
-    others = [suffix for suffix in suffixes if suffix not in known and suffix not in _BESIDE]
-    if others:
-        kinds = ", ".join(sorted({suffix or "no suffix" for suffix in others})[:9])
-        count = f"{len(others)} file{'s' * (len(others) > 1)} of other kinds"
-        warnings.warn(f"{folder}: {count} skipped ({kinds})", FileWarning, stacklevel=2)
+    others = [suffix for suffix in suffixes if suffix not in known]
+    if not others:
+        return ""
+    kinds = ", ".join(sorted({suffix or "no suffix" for suffix in others})[:9])
+    return f"{len(others)} file{'s' * (len(others) > 1)} of other kinds ({kinds})"
 
 
 def plain_file(path: str | Path, links: bool = True) -> os.stat_result:

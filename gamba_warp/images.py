@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError, features
 
 from .errors import FileWarning, UserError, first_line, one_line
-from .files import atomic_path
+from .files import atomic_path, other_kinds
 from .versions import to_install
 
 MAX_PIXELS = 64 * 1024 * 1024
@@ -488,24 +488,22 @@ def find_pictures(
             continue
         pictures.update(dict.fromkeys(inside))
         if not inside:
-            more = passed_over(path, recursive)
+            more = left_out(path, recursive)
             failures.append((path, "the folder holds no pictures" + (f" ({more})" if more else "")))
     return list(pictures), failures
 
 
-def passed_over(path: Path, recursive: bool = False) -> str:
+def left_out(path: Path, recursive: bool = False) -> str:
     """Return the entries of a folder that ``find_pictures`` leaves out; none for a file."""
     try:
         files, folders = _inside(path, recursive) if path.is_dir() else ([], [])
     except OSError:
         return ""
-    others = sum(not _is_picture(file) for file in files)
-    counts = [f"{others} file{'s' * (others != 1)} of other kinds"] * (others > 0)
-    number = 0 if recursive else len(folders)
-    counts += [f"{number} folder{'s' * (number != 1)}"] * (number > 0)
-    if not counts:
-        return ""
-    return f"{', '.join(counts)} passed over" + ("; --recursive takes the folders" * (number > 0))
+    counts = [others] if (others := other_kinds(files, PICTURE_SUFFIXES)) else []
+    if folders and not recursive:
+        counts.append(f"{len(folders)} folder{'s' * (len(folders) > 1)}")
+    hint = "; --recursive takes the folders" if folders and not recursive else ""
+    return f"{', '.join(counts)} skipped{hint}" if counts else ""
 
 
 def _is_picture(path: Path) -> bool:

@@ -276,6 +276,9 @@ class Trainer:
                     if stop or late or (self.total is not None and self.step >= self.total):
                         break
                     self._after_step(self.train_step(), bar)
+                if late and self.log is not None and self.step < (self.total or 0):
+                    line = f"--minutes ends the run at step {self.step} of {self.total}, "
+                    self.log.warn(self.step, line + "before the learning rate's schedule does")
                 if not stop:
                     self._validate()
                     self._compare_ends()

@@ -157,7 +157,7 @@ def _find_pictures(
     images: tuple[Path, ...], mask: Path | None, recursive: bool
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Return picture files, and failures with reasons. Raises UserError without a file."""
-    from ..images import find_pictures, passed_over
+    from ..images import find_pictures, left_out
 
     if not images:
         example = next(iter(sorted((STARTER / "icons").glob("*.png"))), "photo.png")
@@ -169,7 +169,7 @@ def _find_pictures(
     if not pictures:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     for folder in images:
-        if line := passed_over(folder, recursive):
+        if line := left_out(folder, recursive):
             say(f"{folder}: {line}")
     return pictures, failures
 

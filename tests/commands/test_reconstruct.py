@@ -287,7 +287,7 @@ def test_folders_are_searched(tmp_path, checkpoint, capsys):
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.ply", "b.ply"]
     said = capsys.readouterr()
     assert f"{empty}: the folder holds no pictures" in said.err
-    assert f"{folder}: 1 file of other kinds passed over\n" in said.out
+    assert f"{folder}: 1 file of other kinds (.txt) skipped\n" in said.out
     assert (
         f"[2/2] {folder / 'b.png'}: " in said.out and f"results in {tmp_path / 'out'}" in said.out
     )
@@ -295,7 +295,7 @@ def test_folders_are_searched(tmp_path, checkpoint, capsys):
     cut_out(folder / "more" / "c.png")
     assert run_reconstruct(*quick(checkpoint, tmp_path / "out"), folder) == 0
     said = capsys.readouterr().out
-    assert "1 file of other kinds, 1 folder passed over; --recursive takes the folders\n" in said
+    assert "1 file of other kinds (.txt), 1 folder skipped; --recursive takes the folders\n" in said
     assert f"{tmp_path / 'out'}: 2 files of an earlier run will be replaced\n" in said
     assert run_reconstruct(*quick(checkpoint, tmp_path / "all"), folder, "--recursive") == 0
     assert sorted(p.name for p in (tmp_path / "all").iterdir()) == ["a.ply", "b.ply", "c.ply"]

@@ -19,12 +19,13 @@ SMALL = ("--size", "16", "--frames", "2", "--out")
 
 
 def sent(folder: Path) -> Path:
-    """The build context: what ``.dockerignore`` lets pass of the files under version control."""
+    """The build context: what ``.dockerignore`` lets pass of the files that git does not ignore."""
     lines = (ROOT / ".dockerignore").read_text(encoding="utf-8").split("\n")
     rules = [line for line in lines if line and not line.startswith("#")]
     assert rules[0] == "*"
     kept = [rule[1:] for rule in rules if rule.startswith("!")]
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, check=True)
     for name in listed.stdout.decode().split("\0")[:-1]:
         if any(fnmatch.fnmatch(name, rule) or name.startswith(f"{rule}/") for rule in kept):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

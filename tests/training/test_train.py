@@ -301,6 +301,10 @@ def test_minutes_alone_limit_the_run(data, tmp_path, monkeypatch):
     # One step in 29 is left at the end of the cosine: 0.5 (1 + cos(28/29 π)) = 0.003.
     assert rates[-1] < 0.02 * max(rates)
     assert max(rates) > 0.9e-3
+    options = {"length": {"steps": 99, "minutes": 0.1}}
+    assert run(data, tmp_path / "both", **options) == 0
+    (warning,) = (record["message"] for record in lines(tmp_path / "both", "warning"))
+    assert "ends the run at step" in warning and "of 99, before the learning rate" in warning
 
 
 def test_views_are_distinct_while_they_last():
