@@ -364,7 +364,7 @@ class Batches:
         if self._copies is None:
             self._copies = torch.cuda.Stream(self.world.device)
         with torch.cuda.stream(self._copies):  # in parallel with the steps
-            batch = batch.for_gpu(self.model).to(self.world.device)
+            batch = batch.for_gpu().to(self.world.device)
             return Prepared(batch, failures, self._copies.record_event())
 
     def _record_failures(self, prepared: Prepared) -> Batch:

@@ -69,7 +69,7 @@ class Step:
         )
         self.batch = with_foreground(self.batch, config)
         if device.type == "cuda":
-            self.batch = self.batch.for_gpu(config).to(device)
+            self.batch = self.batch.for_gpu().to(device)
 
     def run(self) -> Tensor:
         """Make the whole step and return loss and norm of the gradient (timed)."""

@@ -93,7 +93,7 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
     ]
     for ours, theirs in zip(*grads):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
-    assert seen.boxes == [(5, 4, 6, 5), (0, 0, 1, 1), (2, 0, 10, 10)]
+    assert seen.boxes == [(5, 4, 9, 8), (0, 0, 4, 4), (2, 0, 10, 10)]
 
 
 @pytest.mark.parametrize("additive, orders", [(True, 4), (False, 4), (True, 2)])

@@ -113,19 +113,12 @@ class Batch:
         """Keep the memory of the batch, once it is freed, until ``stream`` has done its work."""
         _combined([self], lambda values: values[0].record_stream(stream))
 
-    def for_gpu(self, config: GambaConfig) -> Batch:
-        """Return the batch with its CPU tensors in page-locked memory, and padded lists.
+    def for_gpu(self) -> Batch:
+        """Return the batch with its CPU tensors in page-locked memory.
 
         Only such memory is copied to a GPU asynchronously.
-
-        Args:
-            config: of the model.
         """
-        own = self.foreground and self.foreground.padded(config.ray_cells**2)
-        whole = replace(self, foreground=own)
-        return _combined(
-            [whole], lambda v: v[0].pin_memory() if v[0].device.type == "cpu" else v[0]
-        )
+        return _combined([self], lambda v: v[0].pin_memory() if v[0].device.type == "cpu" else v[0])
 
 
 def copied(batch: Batch) -> Batch:
@@ -142,10 +135,11 @@ def join(samples: list[Batch], config: GambaConfig) -> Batch:
 
 
 def with_foreground(batch: Batch, config: GambaConfig) -> Batch:
-    """Return the batch with the foreground of its inputs, if the model needs it."""
+    """Return the batch with the padded foreground of its inputs, if the model needs it."""
     if config.decoder != "rays":
         return batch
-    return replace(batch, foreground=find_foreground(batch.inputs[..., 3].cpu(), config))
+    found = find_foreground(batch.inputs[..., 3].cpu(), config)
+    return replace(batch, foreground=found.padded(config.ray_cells**2))
 
 
 def _combined(parts: list[Any], make: Callable[[list[Tensor]], Any]) -> Any:

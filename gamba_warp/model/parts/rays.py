@@ -132,22 +132,24 @@ class RayDecoder(nn.Module):
     def _stem(self, pixels: Tensor, foreground: Foreground) -> Tensor:
         """Apply ``stem`` to ``pixels``, at the cells: ``[T, C]``.
 
-        A CPU only computes each picture's rows and columns with cells; a GPU is faster with all
-        pictures at once, and padded cells are of any picture.
+        A CPU only computes each picture's box with cells; a GPU is faster with all pictures at
+        once. The result of padding is arbitrary.
         """
-        if pixels.device.type != "cpu" or foreground.void is not None:
+        if pixels.device.type != "cpu" or not foreground.boxes:
             picture, row, column = foreground.cell
             return self.stem(pixels).permute(0, 2, 3, 1)[picture, row, column]
         count, found = self.config.ray_cells, []
         step, side = self.config.patch_size // count, self.config.grid_size * count
-        positions = (each.split(foreground.counts) for each in foreground.cell[1:])
+        cells = foreground.cell[1:, : sum(foreground.counts)]
+        positions = (each.split(foreground.counts) for each in cells)
         for picture, box, row, column in zip(pixels.split(1), foreground.boxes, *positions):
-            top, left = (max(0, first * count - STEM_REACH) for first in box[:2])
-            bottom, right = (min(side, last * count + STEM_REACH) for last in box[2:])
+            (top, bottom), (left, right) = (
+                _with_reach(count * box[axis], count * box[axis + 2], side) for axis in (0, 1)
+            )
             cut = picture[..., top * step : bottom * step, left * step : right * step]
             rows = self.stem(cut)[0].flatten(1).T
             found.append(rows.index_select(0, (row - top) * (right - left) + column - left))
-        return torch.cat(found)
+        return F.pad(torch.cat(found), (0, 0, 0, len(foreground.number) - cells.shape[1]))
 
     def _activated(
         self, out: Tensor, colors: Tensor, alpha: Tensor, cell: Tensor, cameras: Cameras
@@ -179,6 +181,16 @@ class RayDecoder(nn.Module):
             opacities=torch.sigmoid(self.opacity_bias + EMPTY * (alpha - 1) + opacity),
             colors=torch.sigmoid(base[:, None] + 2 * color),
         )
+
+
+def _with_reach(first: int, end: int, side: int) -> tuple[int, int]:
+    """Return the range of cells that the stem needs for those from ``first`` to ``end``.
+
+    Its length depends on theirs alone, also at the picture's edge.
+    """
+    length = min(side, end - first + 2 * STEM_REACH)
+    begin = min(max(0, first - STEM_REACH), side - length)
+    return begin, begin + length
 
 
 def _padded(made: Gaussians, foreground: Foreground) -> Gaussians:
