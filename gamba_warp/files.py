@@ -261,8 +261,9 @@ def other_kinds(files: Iterable[Path], known: Container[str]) -> str:
     others = [suffix for suffix in suffixes if suffix not in known]
     if not others:
         return ""
-    kinds = ", ".join(sorted({suffix or "no suffix" for suffix in others})[:9])
-    return f"{len(others)} file{'s' * (len(others) > 1)} of other kinds ({kinds})"
+    kinds = sorted({suffix or "no suffix" for suffix in others})
+    shown = ", ".join(kinds[:9]) + ", ..." * (len(kinds) > 9)
+    return f"{len(others)} file{'s' * (len(others) > 1)} of other kinds ({shown})"
 
 
 def plain_file(path: str | Path, links: bool = True) -> os.stat_result:

@@ -499,11 +499,12 @@ def left_out(path: Path, recursive: bool = False) -> str:
         files, folders = _inside(path, recursive) if path.is_dir() else ([], [])
     except OSError:
         return ""
-    counts = [others] if (others := other_kinds(files, PICTURE_SUFFIXES)) else []
+    counts, hint = [other_kinds(files, PICTURE_SUFFIXES)], ""
     if folders and not recursive:
         counts.append(f"{len(folders)} folder{'s' * (len(folders) > 1)}")
-    hint = "; --recursive takes the folders" if folders and not recursive else ""
-    return f"{', '.join(counts)} skipped{hint}" if counts else ""
+        hint = "; --recursive takes the folders"
+    said = ", ".join(filter(None, counts))
+    return f"{said} skipped{hint}" if said else ""
 
 
 def _is_picture(path: Path) -> bool:

@@ -278,7 +278,7 @@ class Trainer:
                     self._after_step(self.train_step(), bar)
                 if late and self.log is not None and self.step < (self.total or 0):
                     line = f"--minutes ends the run at step {self.step} of {self.total}, "
-                    self.log.warn(self.step, line + "before the learning rate's schedule does")
+                    self.log.warn(self.step, line + "before the learning rate's schedule ends")
                 if not stop:
                     self._validate()
                     self._compare_ends()

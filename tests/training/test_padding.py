@@ -57,20 +57,20 @@ def test_a_padded_batch_has_the_same_loss_and_gradients(boxes):
     model = Gamba(config)
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
     padded = batch_of(config, boxes)
-    plain = replace(padded, foreground=find_foreground(padded.inputs[..., 3], config))
+    batch = replace(padded, foreground=find_foreground(padded.inputs[..., 3], config))
     made = []
-    for given in (plain, padded):
+    for given in (batch, padded):
         model.zero_grad()
         result = forward(model, given, Objective(WEIGHTS))
         result.loss.backward()
         grads = {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
         made.append((result, grads))
-    (alone, wanted), (other, got) = made
-    assert other.gaussians.num > alone.gaussians.num
+    (plain, wanted), (other, got) = made
+    assert other.gaussians.num > plain.gaussians.num
     assert got.keys() == wanted.keys()
     # Sums of float32 in another order: padding changes where a scan is cut.
-    torch.testing.assert_close(other.loss, alone.loss, rtol=1e-6, atol=0)
-    torch.testing.assert_close(other.rendering.rgb, alone.rendering.rgb, rtol=0, atol=1e-6)
+    torch.testing.assert_close(other.loss, plain.loss, rtol=1e-6, atol=0)
+    torch.testing.assert_close(other.rendering.rgb, plain.rendering.rgb, rtol=0, atol=1e-6)
     for name, want in wanted.items():
         scale = want.abs().max().item()
         torch.testing.assert_close(got[name], want, rtol=1e-5, atol=1e-6 * scale, msg=name)

@@ -428,6 +428,8 @@ PARTS = [
     ({"primitive": {"targets": [{}]}}, "morph targets"),
     ({"primitive": {"mode": 0}}, "points"),
     ({"material": {"emissiveFactor": [1, 0, 0]}}, "light of its own"),
+    ({"material": {"normalTexture": {"index": 0}}}, "a normalTexture"),
+    ({"material": {"alphaMode": "BLEND"}}, "transparent materials"),
 ]
 
 

@@ -22,8 +22,8 @@ from ..config import GambaConfig, Orders
 # share of a patch's cells that have an object, in the mean over 1,120 pictures of training data.
 _FINE, _COARSE = 5, 2
 _FILLED = 0.72
-# Sides of ``Foreground.boxes`` are multiples of so many patches: oneDNN makes a kernel for each
-# shape of a convolution, and keeps some 1,000.
+# Patches by which the sides of ``Foreground.boxes`` grow: oneDNN compiles a kernel for each shape
+# of a convolution, and keeps 1,024.
 _BOX = 4
 
 
@@ -95,8 +95,8 @@ class Foreground:
     def padded(self, cells: int) -> Foreground:
         """Return lists of one of few lengths.
 
-        A CUDA graph of one batch then fits many. On a CPU a step takes 6 % less: oneDNN has a
-        kernel for each of the shapes, and the allocator finds memory of each size again.
+        A CUDA graph of one batch then fits many. On a CPU a step takes 6 % less: oneDNN compiles
+        few kernels, and the allocator reuses blocks of the same sizes (docs/lab/step.md).
 
         Added tokens follow the last picture's tokens, so no other token depends on them. Added
         patches and cells repeat the first of picture 0; these cells are transparent, and share a

@@ -6,6 +6,7 @@ const NUMBERS = { 5121: ["Uint8", 1, 255], 5123: ["Uint16", 2, 65535], 5125: ["U
 const WIDTHS = { SCALAR: 1, VEC2: 2, VEC3: 3, VEC4: 4 };
 const GREY = [153, 153, 153]; // of a mesh without colours
 const READ = ["POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"]; // attributes; normals are computed
+const UNDRAWN = ["normalTexture", "occlusionTexture", "metallicRoughnessTexture"];
 const displayed = (x) => 255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
 const linear = (byte) => (byte <= 10.31475 ? byte / 255 / 12.92 : ((byte / 255 + 0.055) / 1.055) ** 2.4);
 
@@ -67,7 +68,11 @@ async function readGlb(buffer) {
       if (other) throw unread(`the attribute ${other}`);
       if (tree.accessors[attributes.POSITION].componentType !== 5126) throw unread("positions of integers");
       const [points, paint, uvs] = ["POSITION", "COLOR_0", "TEXCOORD_0"].map((name) => name in attributes ? rows(attributes[name]) : null);
-      const { pbrMetallicRoughness = {}, emissiveFactor = [], emissiveTexture } = tree.materials?.[material] || {};
+      const look = tree.materials?.[material] || {};
+      const { pbrMetallicRoughness = {}, emissiveFactor = [], emissiveTexture, alphaMode = "OPAQUE" } = look;
+      const undrawn = UNDRAWN.find((name) => name in look || name in pbrMetallicRoughness);
+      if (undrawn) throw unread(`a ${undrawn}`);
+      if (alphaMode !== "OPAQUE") throw unread("transparent materials");
       const { baseColorFactor = [1, 1, 1], baseColorTexture } = pbrMetallicRoughness;
       if (emissiveTexture || emissiveFactor.some(Boolean) || baseColorTexture?.texCoord) throw unread("light of its own or a second texture");
       const texture = baseColorTexture && uvs ? await pixelsOf(tree, buffer, start, baseColorTexture.index) : null;
