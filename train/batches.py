@@ -38,8 +38,8 @@ _TRIES = 100  # objects tried in turn until one can be read
 VAL_VIEWS = 4  # novel views of an object in a validation
 
 
-class HeldOut(NamedTuple):
-    """Objects of one dataset that a run validates on.
+class FixedObjects(NamedTuple):
+    """Objects of one dataset whose figures a validation computes.
 
     Attributes:
         dataset: the dataset.
@@ -58,13 +58,15 @@ class TrainingData:
         train: dataset with the objects to train on.
         objects: indices into ``train``, possibly repeated; one pass over the list is an epoch.
         held_out: validation objects; None without any.
+        seen: as many training objects, whose figures show what is learned; None without any.
         notes: lines for the user.
         shards: the shards to train on; ``train`` is then empty, and ``objects`` are numbers.
     """
 
     train: ViewDataset
     objects: list[int]
-    held_out: HeldOut | None = None
+    held_out: FixedObjects | None = None
+    seen: FixedObjects | None = None
     notes: list[str] = field(default_factory=list)
     shards: Shards | None = None
 
@@ -111,7 +113,7 @@ def open_data(config: TrainConfig) -> TrainingData:
     notes += filter(None, [background_note(train)])
     held_out = None
     try:
-        held_out = _held_out(open_dataset(config.data, "val"), config.run.val_objects)
+        held_out = _fixed_objects(open_dataset(config.data, "val"), config.run.val_objects)
     except UserError as error:
         notes.append(f"no validation: {error}")
     used = {train.uids[i] for i in objects}
@@ -123,7 +125,8 @@ def open_data(config: TrainConfig) -> TrainingData:
             f"the data has Google Scanned Objects, which are for evaluation ({shown}): leave them "
             "out"
         )
-    return TrainingData(train, objects, held_out, notes)
+    seen = FixedObjects(train, evenly(sorted(set(objects)), config.run.val_objects))
+    return TrainingData(train, objects, held_out, seen, notes)
 
 
 def _open_shards(config: TrainConfig, source: str) -> TrainingData:
@@ -137,18 +140,19 @@ def _open_shards(config: TrainConfig, source: str) -> TrainingData:
         raise UserError(f"{name}: needs a folder of objects, and {config.data} has shards")
     shards, notes, held_out = Shards(source, "train"), [], None
     try:
-        held_out = _held_out(Shards(source, "val").first(config.run.val_objects))
+        held_out = _fixed_objects(Shards(source, "val").first(config.run.val_objects))
     except UserError as error:
         notes.append(f"no validation: {error}")
-    return TrainingData(dataset_of(), [*range(shards.count)], held_out, notes, shards)
+    everything = [*range(shards.count)]
+    return TrainingData(dataset_of(), everything, held_out, notes=notes, shards=shards)
 
 
-def _held_out(dataset: ViewDataset, count: int | None = None) -> HeldOut | None:
+def _fixed_objects(dataset: ViewDataset, count: int | None = None) -> FixedObjects | None:
     """Choose ``count`` evenly spaced readable objects, or all; None without any."""
     bad = dataset.check()
     good = [i for i, uid in enumerate(dataset.uids) if uid not in bad]
     chosen = evenly(good, len(good) if count is None else count)
-    return HeldOut(dataset, chosen) if chosen else None
+    return FixedObjects(dataset, chosen) if chosen else None
 
 
 class Prepared(NamedTuple):
@@ -381,7 +385,7 @@ class Batches:
 
 
 def fixed_batches(
-    part: HeldOut, config: GambaConfig, size: int, failures: dict[str, str]
+    part: FixedObjects, config: GambaConfig, size: int, failures: dict[str, str]
 ) -> Iterator[Batch]:
     """Yield the batches of a validation: one object each, fixed views, on white.
 

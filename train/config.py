@@ -175,7 +175,7 @@ class RunConfig:
         encoder_weights: File of the image encoder's weights, or "random" to train one from scratch.
         log_every: Steps between two lines of the log.
         val_every: Steps between two validations (and sample pictures); 0 for none.
-        val_objects: Held-out objects to validate on.
+        val_objects: Held-out objects to validate on, and as many training objects beside them.
         save_every: Steps between two checkpoints; one is always saved at the end, and the last two
             are kept.
         device: Device to train on; "auto" is the GPU if there is one.

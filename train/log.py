@@ -73,7 +73,7 @@ class RunLog:
     def write(self, event: str, step: int, **values: object) -> None:
         """Write a line; non-finite numbers become null.
 
-        The events are start, train, val, best, warning and end.
+        The events are start, train, seen, val, best, warning and end.
         """
         line = {"event": event, "step": step, "time": round(time.time(), 3), **_to_json(values)}
         data = (json.dumps(line) + "\n").encode()

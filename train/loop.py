@@ -19,7 +19,7 @@ from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.processes import stop_requests
 
-from .batches import Batches, TrainingData, fixed_batches
+from .batches import Batches, FixedObjects, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
 from .data.samples import Batch
@@ -326,23 +326,33 @@ class Trainer:
         def validate_all() -> None:
             if self.log is None or self.data.held_out is None:
                 return
-            objective = Objective(self._weights(validates=True), self.lpips)
-            best, size = [*self.models.values()][-1], self.config.views.size
-            batches = fixed_batches(self.data.held_out, best.config, size, self._unread)
-            figures, rows = validate(best, batches, objective, self.world.device)
-            self._name_failures()
+            if self.data.seen is not None:
+                self._figures_of("seen", "training objects", self.data.seen)
+            figures, rows = self._figures_of("val", "validation", self.data.held_out)
             if not rows:
                 self.log.warn(self.step, "no validation: none of its objects can be read")
                 return
-            self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
-            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
-            say(f"step {self.step}: validation {text}")
             score = figures.get("psnr_novel", figures["psnr_input"])
             self._keep_best(Score(self.step, score))
             path = self.config.run.out / "samples" / f"step_{self.step:06d}.png"
             self.log.sample(self.step, path, rows)
 
         self.world.on_main(validate_all)
+
+    def _figures_of(
+        self, event: str, words: str, part: FixedObjects
+    ) -> tuple[dict[str, float], list[Tensor]]:
+        """Compute, log and print what ``validate`` returns; empty if no object can be read."""
+        objective = Objective(self._weights(validates=True), self.lpips)
+        best, size = [*self.models.values()][-1], self.config.views.size
+        batches = fixed_batches(part, best.config, size, self._unread)
+        figures, rows = validate(best, batches, objective, self.world.device)
+        self._name_failures()
+        if rows and self.log is not None:
+            self.log.write(event, self.step, minutes=self.elapsed / 60, **figures)
+            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+            say(f"step {self.step}: {words} {text}")
+        return figures, rows
 
     def _better(self, score: Score, name: str) -> bool:
         """True if a score is better than ``name``'s, or the first; False for NaN."""

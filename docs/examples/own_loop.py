@@ -14,7 +14,7 @@ from gamba_warp import Gamba, load_model
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.config import PRESETS
-from gamba_warp.train.batches import HeldOut, fixed_batches
+from gamba_warp.train.batches import FixedObjects, fixed_batches
 from gamba_warp.train.data.samples import choose_views, join, load_sample
 from gamba_warp.train.step import Objective, forward, validate
 
@@ -28,7 +28,7 @@ options = parser.parse_args()
 device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 sets = [open_dataset(folder, "train") for folder in options.data]
 shares = np.array(options.weights or [len(each) for each in sets], float)
-held_out = HeldOut(open_dataset(options.data[0], "val"), [0])  # its first object
+held_out = FixedObjects(open_dataset(options.data[0], "val"), [0])  # its first object
 config = replace(PRESETS["tiny"], image_size=64, depth=2)
 model, rng, best = Gamba(config).to(device).train(), np.random.default_rng(0), -np.inf
 if options.init:

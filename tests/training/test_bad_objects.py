@@ -6,7 +6,7 @@ from helpers.micro import ALONE, lines
 
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
-from gamba_warp.train.batches import Batches, HeldOut, fixed_batches, open_data
+from gamba_warp.train.batches import Batches, FixedObjects, fixed_batches, open_data
 from gamba_warp.train.run import train
 
 
@@ -74,7 +74,7 @@ def test_whatever_one_object_raises_stops_no_other(root, monkeypatch, error):
 
 def test_a_validation_passes_over_what_it_cannot_read(root):
     config, failures = micro.options(root, root), {}
-    part = HeldOut(open_data(config).train, [0, 1, 2])
+    part = FixedObjects(open_data(config).train, [0, 1, 2])
     spoil(root, "b")
     found = fixed_batches(part, config.model_config(), micro.SIZE, failures)
     assert [batch.uids for batch in found] == [["clouda"], ["cloudc"]]

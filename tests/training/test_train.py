@@ -179,6 +179,8 @@ def test_a_run_learns_and_writes_everything(tmp_path):
     records = lines(tmp_path, "val")
     assert [record["step"] for record in records] == [60, 120]
     assert records[-1]["psnr_novel"] > 20 and records[-1]["psnr_input"] > 20
+    seen = lines(tmp_path, "seen")[-1]  # the same object
+    assert seen == records[-1] | {key: seen[key] for key in ("event", "time", "minutes")}
     assert records[-1]["psnr_grey_novel"] > 15 < records[-1]["psnr_black_input"]
     train_records = lines(tmp_path, "train")
     wanted = "loss loss_rgb loss_mask loss_rdist lr grad_norm views_per_second mean_alpha "
