@@ -124,7 +124,7 @@ class Actions:
     @with_page_errors
     def end_session(self) -> tuple:
         """Clear the picture; its results stay."""
-        return None, gr.update(visible=False), None, "", None
+        return None, gr.update(visible=False), None, "", gr.skip(), None
 
     @with_page_errors
     def load_example(self, event: gr.EventData, request: gr.Request) -> tuple:
@@ -272,8 +272,9 @@ class Actions:
         return self._main_thread.call(function, *args, wanted=lambda: self._files.is_active(page))
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
+        elevation = self._call(request, work.guess_elevation, self._model, cut)
         cut, *edited = self._edited(cut, request)
-        return cut, gr.update(visible=True), *edited
+        return cut, gr.update(visible=True), *edited, elevation
 
     def _edited(self, cut: Cut, request: gr.Request) -> tuple:
         note = html.escape(self._call(request, note_of, cut))

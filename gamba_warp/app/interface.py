@@ -118,7 +118,7 @@ def build(actions: Actions) -> gr.Blocks:
                         value=0,
                         step=1,
                         label="Camera above the object, degrees",
-                        info="If the camera looked down, this makes the object upright.",
+                        info="An estimate, which sets the object upright; change it if it leans.",
                         elem_id="elevation",
                     )
                     make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
@@ -177,7 +177,8 @@ def build(actions: Actions) -> gr.Blocks:
         # loaded its new picture.
         quick = {**one, "show_progress": "hidden"}
         taking = {**one, "show_progress_on": picture}
-        shown, mask = [cut, cut_part, editor, note, picture], [cut, editor, note]
+        shown = [cut, cut_part, editor, note, elevation, picture]
+        mask = [cut, editor, note]
         # (The event ``input`` sends the old picture when it is cleared.)
         picture.upload(actions.take, picture, shown, **taking)
         picture.clear(actions.end_session, None, shown, **quick)

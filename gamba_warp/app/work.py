@@ -87,13 +87,26 @@ class Reconstruction:
     choice: tuple[int, bool] | None = None
 
 
-def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
+def guess_elevation(model: Gamba, cut: Cut) -> int:
+    """Estimate the elevation of the picture's camera, whole degrees; 0 for an empty mask."""
+    from ..model.predict import reconstruct
+    from ..trajectories.elevation import estimate_elevation
+
+    try:
+        rgba = model_picture(cut)
+    except UserError:
+        return 0
+    return estimate_elevation(reconstruct(model, rgba, detail=1))
+
+
+def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconstruction:
     """Run one forward pass.
 
     Args:
         model: on any device.
         cut: the object.
-        elevation: of the picture's camera above the object, degrees; the result is upright.
+        elevation: of the picture's camera above the object, degrees; None for the estimate. The
+            result is upright.
 
     Raises:
         UserError: the mask is empty.
@@ -101,12 +114,15 @@ def run_model(model: Gamba, cut: Cut, elevation: float = 0.0) -> Reconstruction:
     from ..data.preprocess import shrink
     from ..images import to_uint8
     from ..model.predict import reconstruct
+    from ..trajectories.elevation import estimate_elevation
     from ..trajectories.paths import set_up
 
     rgba = model_picture(cut)
     started = time.perf_counter()
     gaussians = reconstruct(model, rgba).to("cpu")
     seconds = time.perf_counter() - started
+    if elevation is None:
+        elevation = estimate_elevation(gaussians)
     camera = model.config.distance, model.config.fov, elevation
     upright, picture = set_up(gaussians, elevation), to_uint8(shrink(rgba, _PICTURE))
     return Reconstruction(cut.name, upright, camera, seconds, picture)

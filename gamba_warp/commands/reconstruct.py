@@ -30,13 +30,13 @@ class CameraOptions:
 
     Attributes:
         elevation: Elevation of the picture's camera above the object, degrees; all results are
-            rotated so that the object is upright.
+            rotated so that the object is upright. By default it is estimated from the Gaussians.
         fov: Field of view of turntable, sheet and 3D viewer, degrees; by default the model's
             (49.1). Without --distance the object keeps its size in the picture.
         distance: Distance of their camera, object units; by default the model's (1.5).
     """
 
-    elevation: Elevation = 0.0
+    elevation: Elevation | None = None
     fov: Fov | None = None
     distance: Distance | None = None
 
@@ -94,6 +94,7 @@ def reconstruct_command(
     from ..pages.export import Outputs, write_outputs
     from ..pages.sheet import Sheet
     from ..photo.cutout import CutoutOptions, cut_out
+    from ..trajectories.elevation import estimate_elevation
 
     pictures, failures = _find_pictures(images, mask, recursive)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
@@ -107,7 +108,7 @@ def reconstruct_command(
         options=files,
         checkpoint=checkpoint,
         about=about_model(file),
-        camera=(camera.elevation, camera.distance, camera.fov),
+        camera=(camera.distance, camera.fov),
         inputs=save_inputs,
     )
     outputs.require()
@@ -142,9 +143,14 @@ def reconstruct_command(
         made = reconstruct(model, cut.rgba, precision, detail)
         gaussians = made.to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
-        figures = write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
+        elevation = camera.elevation
+        if elevation is None:
+            elevation = estimate_elevation(gaussians)
+            say(f"{name}: the camera's elevation is about {elevation} degrees (--elevation).")
+        view = outputs.view(model.config, elevation)
+        figures = write_outputs(name, cut, gaussians.to(chosen), outputs, view, seconds)
         source = {"input": str(path), "name": name, "cutout": cut.how, "warning": cut.warning}
-        results.made.append(source | figures)
+        results.made.append(source | {"elevation": elevation} | figures)
 
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:

@@ -276,9 +276,8 @@ class Outputs(ObjectFiles):
         about: labels and texts about the model for the page, which shows the first one; the others
             are its model card, opened by a click.
         sheet: gets a row of each picture, or None.
-        camera: elevation of the input's camera above the object, degrees (outputs are upright);
-            distance and field of view, degrees, of the camera of turntable, sheet and viewer, None
-            for the model's.
+        camera: distance and field of view, degrees, of the camera of turntable, sheet and viewer;
+            None for the model's.
         inputs: also write each cut-out as ``NAME-input.png``.
         made: thumbnails of results with a page, by name.
     """
@@ -287,7 +286,7 @@ class Outputs(ObjectFiles):
     checkpoint: Path
     about: Sequence[tuple[str, str]] = ()
     sheet: Sheet | None = None
-    camera: tuple[float, float | None, float | None] = (0.0, None, None)
+    camera: tuple[float | None, float | None] = (None, None)
     inputs: bool = False
     made: dict[str, np.ndarray] = field(default_factory=dict, init=False)
 
@@ -305,9 +304,9 @@ class Outputs(ObjectFiles):
             title = f"{len(self.made):,} reconstructions"
             index_page(self.options.out / INDEX, title, self.made)
 
-    def view(self, config: GambaConfig) -> Viewpoint:
+    def view(self, config: GambaConfig, elevation: float) -> Viewpoint:
         """Return the viewpoint of turntable, sheet and viewer: the input's with the options."""
-        return Viewpoint(0.0, config.distance, config.fov).changed(*self.camera)
+        return Viewpoint(elevation, config.distance, config.fov).changed(None, *self.camera)
 
 
 def write_outputs(
@@ -315,7 +314,7 @@ def write_outputs(
     cut: CutOut,
     gaussians: Gaussians,
     outputs: Outputs,
-    config: GambaConfig,
+    view: Viewpoint,
     seconds: float,
 ) -> dict[str, Any]:
     """Write all requested outputs of one reconstruction, as ``NAME.*`` in the folder.
@@ -325,7 +324,7 @@ def write_outputs(
         cut: the cut-out object.
         gaussians: ``[N]``, on the device that renders the turntable.
         outputs: options.
-        config: of the model, for the camera.
+        view: result of ``outputs.view``; by its elevation the outputs are set upright.
         seconds: run time of the model.
 
     Returns:
@@ -334,7 +333,6 @@ def write_outputs(
     Raises:
         UserError: a file cannot be written, or all Gaussians are invalid.
     """
-    view = outputs.view(config)
     gaussians, count = to_be_written(gaussians, outputs.options.min_opacity)
     gaussians = set_up(gaussians, view.elevation)
     if outputs.inputs:

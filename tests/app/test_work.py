@@ -52,8 +52,8 @@ def test_a_picture_from_above_stands_upright(tmp_path, made):
     torch.testing.assert_close(above.gaussians.means @ turn.T, made.gaussians.means)
     assert above.camera == (*made.camera[:2], 30.0) and made.camera[2] == 0
     path, _ = work.write(above, "ply", tmp_path)
-    options = quick(STARTER / "tiny.safetensors", tmp_path / "out")
-    assert run_reconstruct(picture, *options, "--elevation", 30) == 0
+    options = quick(STARTER / "tiny.safetensors", tmp_path / "out", 30)
+    assert run_reconstruct(picture, *options) == 0
     theirs = load_ply(tmp_path / "out" / "thing.ply")
     torch.testing.assert_close(load_ply(path).means, theirs.means)
 

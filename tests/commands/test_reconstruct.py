@@ -130,7 +130,7 @@ def test_turntables_that_cannot_be_written(tmp_path):
 def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     out = tmp_path / "deep" / "out"
     arguments = [picture, "--checkpoint", checkpoint, "--out", out, "--size", 32, "--frames", 4]
-    assert run_reconstruct(*arguments, "--splats", "ply", "splat", "spz") == 0
+    assert run_reconstruct(*arguments, "--splats", "ply", "splat", "spz", "--elevation", 0) == 0
     files = {path.name: path.stat().st_size for path in out.iterdir()}
     names = ["thing.gif", "thing.html", "thing.ply", "thing.splat", "thing.spz"]
     assert sorted(files) == names and all(files.values())
@@ -207,6 +207,7 @@ def test_the_precision_reaches_the_network(tmp_path, picture, checkpoint, monkey
 
 def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     arguments = [picture, "--checkpoint", checkpoint, "--out", tmp_path, "--no-page"]
+    arguments += ["--elevation", 0]
     assert run_reconstruct(*arguments, "--turntable", "mp4", "--size", 16, "--frames", 2) == 0
     assert (tmp_path / "thing.mp4").stat().st_size > 0 and not (tmp_path / "thing.html").exists()
     plain = load_ply(tmp_path / "thing.ply")

@@ -75,13 +75,18 @@ def test_results_as_json(tmp_path, checkpoint, splats, capsys):
     assert made["failures"] == [{"input": str(missing), "reason": "no such file"}]
     (result,) = made["results"]
     assert sorted(result.pop("files")) == sorted(path.name for path in out.iterdir())
-    assert result.pop("cutout") and result == {
-        "input": str(picture),
-        "name": "thing",
-        "warning": "",
-        "gaussians": 64,
-        "notes": [],
-    }
+    assert (
+        result.pop("cutout")
+        and -20 <= result.pop("elevation") <= 65
+        and result
+        == {
+            "input": str(picture),
+            "name": "thing",
+            "warning": "",
+            "gaussians": 64,
+            "notes": [],
+        }
+    )
     options = ["--mesh", "ply", "--voxels", "24", "--views", "8", "--pixels", "48", "--json"]
     assert run("export", [splats, "--out", str(out), *options]) == 0
     (result,) = json.loads(capsys.readouterr().out)["results"]

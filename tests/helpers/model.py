@@ -123,6 +123,7 @@ def run_reconstruct(*arguments) -> int:
     return cli.run("reconstruct", [str(a) for a in arguments])
 
 
-def quick(checkpoint, out):
+def quick(checkpoint, out, elevation=0):
     """Options of ``gamba reconstruct`` that only make the Gaussians."""
-    return ["--checkpoint", checkpoint, "--out", out, "--turntable", "none", "--no-page"]
+    options = ["--checkpoint", checkpoint, "--out", out, "--elevation", elevation]
+    return [*options, "--turntable", "none", "--no-page"]

@@ -51,7 +51,7 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
     picture = cut_out(tmp_path / "thing.png")
     plain, turned = tmp_path / "plain", tmp_path / "turned"
     common = [picture, "--checkpoint", model, "--size", 48, "--frames", 4]
-    assert run_reconstruct(*common, "--out", plain) == 0
+    assert run_reconstruct(*common, "--out", plain, "--elevation", 0) == 0
     options = ["--elevation", 30, "--mesh", "ply"]
     assert run_reconstruct(*common, "--out", turned, *options) == 0
     before, after = load_ply(plain / "thing.ply"), load_ply(turned / "thing.ply")
@@ -72,7 +72,7 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
 
 def test_field_of_view_and_distance_are_those_of_what_is_rendered(tmp_path, model):
     picture = cut_out(tmp_path / "thing.png")
-    common = [picture, "--checkpoint", model, "--size", 48, "--frames", 2]
+    common = [picture, "--checkpoint", model, "--size", 48, "--frames", 2, "--elevation", 0]
     assert run_reconstruct(*common, "--out", tmp_path / "a", "--fov", 20, "--distance", 4) == 0
     assert run_reconstruct(*common, "--out", tmp_path / "b") == 0
     same = load_ply(tmp_path / "a" / "thing.ply"), load_ply(tmp_path / "b" / "thing.ply")

@@ -1,0 +1,84 @@
+"""The camera's elevation from the Gaussians, and results that stand upright."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers.model import run_reconstruct
+
+from gamba_warp.app import cutting, work
+from gamba_warp.files import STARTER
+from gamba_warp.formats.ply import load_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.model.checkpoint import load_model
+from gamba_warp.model.predict import reconstruct
+from gamba_warp.photo.cutout import CutoutOptions
+from gamba_warp.trajectories.elevation import estimate_elevation
+from gamba_warp.trajectories.paths import upright
+
+ICON = STARTER / "icons" / "scopia-cardboard-box.png"
+
+
+def table(count=4000) -> Gaussians:
+    """Top and four legs, upright: 0.8 wide, 0.5 deep, 0.5 high."""
+    rng = np.random.default_rng(5)
+    top = rng.uniform([-0.4, -0.25, -0.25], [0.4, -0.2, 0.25], (count, 3))
+    corners = rng.choice([-1, 1], (count, 2)) * [0.37, 0.22]
+    legs = np.stack([corners[:, 0], rng.uniform(-0.2, 0.25, count), corners[:, 1]], 1)
+    means = torch.tensor(np.concatenate([top, legs + rng.normal(0, 0.01, legs.shape)])).float()
+    alike = torch.ones(len(means))
+    return Gaussians(means, None, 0.01 * alike[:, None].expand(-1, 3), alike, 0.5 + 0 * means)
+
+
+@pytest.mark.parametrize("elevation", [-8, 0, 17, 40])
+def test_a_table_is_set_upright(elevation):
+    """Also turned about the vertical, and with faint Gaussians around it, which do not count."""
+    lying = table()
+    for azimuth in (0.0, 30.0):
+        a, b = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+        turn = torch.tensor([[a, 0, b], [0, 1, 0], [-b, 0, a]], dtype=torch.float32)
+        seen = upright(elevation).T @ turn
+        assert abs(estimate_elevation(lying.transformed(seen, torch.zeros(3))) - elevation) <= 6
+    fog = table()
+    fog.means, fog.opacities = torch.randn_like(fog.means), 0.2 * fog.opacities
+    names = "means", "scales", "opacities", "colors"
+    both = {name: torch.cat([getattr(lying, name), getattr(fog, name)]) for name in names}
+    found = estimate_elevation(Gaussians(quats=None, **both).transformed(seen, torch.zeros(3)))
+    assert abs(found - elevation) <= 6
+
+
+def test_nothing_to_estimate_from():
+    few = table().select(torch.arange(8000) < 49)
+    assert estimate_elevation(few) == 0
+    assert estimate_elevation(table().select(torch.arange(8000) < 0)) == 0
+
+
+def test_reconstruct_turns_by_the_estimate(tmp_path, capsys):
+    common = ICON, "--no-page", "--turntable", "none", "--json", "--out"
+    said = run_json(capsys, *common, tmp_path / "auto")
+    assert run_json(capsys, *common, tmp_path / "flat", "--elevation", 0)["elevation"] == 0
+    auto, flat = (load_ply(tmp_path / name / f"{ICON.stem}.ply") for name in ("auto", "flat"))
+    assert said["elevation"] == estimate_elevation(flat) != 0
+    want = flat.transformed(upright(said["elevation"]), torch.zeros(3)).means
+    torch.testing.assert_close(auto.means, want, rtol=1e-4, atol=1e-5)
+
+
+def run_json(capsys, *words) -> dict:
+    capsys.readouterr()
+    assert run_reconstruct(*words) == 0
+    return json.loads(capsys.readouterr().out)["results"][0]
+
+
+def test_the_app_begins_with_the_estimate():
+    cut = cutting.cut_picture(ICON, "thing.png", CutoutOptions())
+    guess, made = work.guess_elevation(load_model(), cut), work.run_model(load_model(), cut)
+    assert abs(guess - made.camera[2]) <= 2 and guess > 10  # of fewer Gaussians
+    assert work.run_model(load_model(), cut, 3.0).camera[2] == 3.0
+
+
+@pytest.mark.parametrize("name, above", [("scopia-cardboard-box", 15), ("scopia-jacuzzi", 25)])
+def test_pictures_from_above(name, above):
+    """The shipped model; both pictures show the top."""
+    gaussians = reconstruct(load_model(), STARTER / "icons" / f"{name}.png", detail=1)
+    assert above <= estimate_elevation(gaussians) <= 45
