@@ -40,6 +40,8 @@ def main(*data: Path) -> None:
     """
     from gamba_warp import load_model, reconstruct
     from gamba_warp.pages.turntable import turntable_frames
+    from gamba_warp.trajectories.elevation import estimate_elevation
+    from gamba_warp.trajectories.paths import set_up
 
     model = load_model()
     cells = []
@@ -48,7 +50,9 @@ def main(*data: Path) -> None:
         rgba = load_rgba(path)
         seen = Image.fromarray(to_uint8(over_background(rgba, GREY)))
         still = np.asarray(seen.resize((SIDE, SIDE), Image.Resampling.BICUBIC))
-        turn = turntable_frames(reconstruct(model, rgba), size=SIDE, frames=FRAMES, elevation=10.0)
+        gaussians = reconstruct(model, rgba)
+        upright = set_up(gaussians, estimate_elevation(gaussians))
+        turn = turntable_frames(upright, size=SIDE, frames=FRAMES, elevation=10.0)
         pair = np.stack([np.broadcast_to(still, turn.shape), turn])[:, :, CROP:-CROP, CROP:-CROP]
         cells.append(np.concatenate([*pair], 2))
     rows = [np.concatenate(cells[i : i + COLUMNS], 2) for i in range(0, len(cells), COLUMNS)]
