@@ -196,7 +196,7 @@ def test_a_run_learns_and_writes_everything(tmp_path):
     assert board.Images("val/pictures")[-1].height == 2 * micro.SIZE
 
 
-def test_validation_is_on_held_out_objects(data, tmp_path, monkeypatch):
+def test_validation_is_on_training_and_held_out_objects(data, tmp_path, monkeypatch):
     seen = []
     real = step.forward
 
@@ -207,7 +207,8 @@ def test_validation_is_on_held_out_objects(data, tmp_path, monkeypatch):
     monkeypatch.setattr(step, "forward", spy)
     assert run(data, tmp_path, length={"steps": 2}, run={"val_every": 1}) == 0
     assert {uid for training, uids in seen if training for uid in uids} <= {"clouda", "cloudb"}
-    assert [uids for training, uids in seen if not training] == [("cloudc",)] * 2
+    validated = [("clouda",), ("cloudb",), ("cloudc",)]
+    assert [uids for training, uids in seen if not training] == 2 * validated
 
 
 def test_a_validation_is_of_pictures_in_range(monkeypatch):

@@ -210,6 +210,7 @@ def test_a_busy_machine_is_told():
     document = run(case(variant("idle", lambda: time.sleep(0.02)), variant("b"), variant("c")))
     record = document["records"][0]
     assert record["cpu_ms"] < 0.5 * record["ms_p50"]
+    record |= {"ms_p20": record["ms_p50"], "ms_p80": record["ms_p50"]}  # steady also under load
     load = "{} and {}".format(*(f"{load:.1f}" for load in document["machine"]["load"]))
     assert "The machine was busy: " in (page := markdown(document)) and f"load was {load}" in page
     record |= {"ms_p20": 1.0, "ms_p80": 1.5}
