@@ -58,7 +58,7 @@ class TrainingData:
         train: dataset with the objects to train on.
         objects: indices into ``train``, possibly repeated; one pass over the list is an epoch.
         held_out: validation objects; None without any.
-        seen: as many training objects, whose figures show what is learned; None without any.
+        seen: as many training objects, whose figures are logged beside; None for shards.
         notes: lines for the user.
         shards: the shards to train on; ``train`` is then empty, and ``objects`` are numbers.
     """

@@ -342,7 +342,7 @@ class Trainer:
     def _figures_of(
         self, event: str, words: str, part: FixedObjects
     ) -> tuple[dict[str, float], list[Tensor]]:
-        """Compute, log and print what ``validate`` returns; empty if no object can be read."""
+        """Return the result of ``validate``, logged and printed; empty if no object is readable."""
         objective = Objective(self._weights(validates=True), self.lpips)
         best, size = [*self.models.values()][-1], self.config.views.size
         batches = fixed_batches(part, best.config, size, self._unread)

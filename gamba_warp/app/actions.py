@@ -272,7 +272,7 @@ class Actions:
         return self._main_thread.call(function, *args, wanted=lambda: self._files.is_active(page))
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
-        elevation = self._call(request, work.guess_elevation, self._model, cut)
+        elevation = self._call(request, work.estimated_elevation, self._model, cut)
         cut, *edited = self._edited(cut, request)
         return cut, gr.update(visible=True), *edited, elevation
 

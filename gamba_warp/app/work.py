@@ -87,8 +87,8 @@ class Reconstruction:
     choice: tuple[int, bool] | None = None
 
 
-def guess_elevation(model: Gamba, cut: Cut) -> int:
-    """Estimate the elevation of the picture's camera, whole degrees; 0 for an empty mask."""
+def estimated_elevation(model: Gamba, cut: Cut) -> int:
+    """Return the estimate of the camera's elevation, whole degrees; 0 for an empty mask."""
     from ..model.predict import reconstruct
     from ..trajectories.elevation import estimate_elevation
 

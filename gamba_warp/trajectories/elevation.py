@@ -32,9 +32,10 @@ def estimate_elevation(gaussians: Gaussians) -> int:
         gaussians: ``[N]``, the object in object units, in the reference camera's frame.
 
     Returns:
-        Between -20 and 65; 0 for an object of fewer than 50 opaque Gaussians.
+        Between -20 and 65; 0 for an object of fewer than 50 opaque, finite Gaussians.
     """
-    chosen = (gaussians.opacities > LEAST_OPACITY).nonzero()[:, 0]
+    finite = (gaussians.means + gaussians.scales).isfinite().all(-1)
+    chosen = (finite & (gaussians.opacities > LEAST_OPACITY)).nonzero()[:, 0]
     chosen = chosen[:: max(1, len(chosen) // _MOST)]
     if len(chosen) < _FEWEST:
         return 0

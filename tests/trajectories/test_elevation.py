@@ -48,6 +48,13 @@ def test_a_table_is_set_upright(elevation):
     assert abs(found - elevation) <= 6
 
 
+def test_invalid_gaussians_do_not_count():
+    broken = table()
+    broken.means[::7], broken.scales = torch.nan, broken.scales.clone()
+    broken.scales[3::7] = torch.inf
+    assert abs(estimate_elevation(broken)) <= 6
+
+
 def test_nothing_to_estimate_from():
     few = table().select(torch.arange(8000) < 49)
     assert estimate_elevation(few) == 0
@@ -72,8 +79,8 @@ def run_json(capsys, *words) -> dict:
 
 def test_the_app_begins_with_the_estimate():
     cut = cutting.cut_picture(ICON, "thing.png", CutoutOptions())
-    guess, made = work.guess_elevation(load_model(), cut), work.run_model(load_model(), cut)
-    assert abs(guess - made.camera[2]) <= 2 and guess > 10  # of fewer Gaussians
+    first, made = work.estimated_elevation(load_model(), cut), work.run_model(load_model(), cut)
+    assert abs(first - made.camera[2]) <= 2 and first > 10  # of fewer Gaussians
     assert work.run_model(load_model(), cut, 3.0).camera[2] == 3.0
 
 
