@@ -18,6 +18,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 from PIL import Image, UnidentifiedImageError, features
 
+from .color_spaces import conversion
 from .errors import FileWarning, UserError, first_line, one_line
 from .files import atomic_path, other_kinds
 from .versions import to_install
@@ -33,7 +34,6 @@ PICTURE_SUFFIXES |= {".heic", ".heif", ".avif"}
 _COUNT_FRAMES_UP_TO = 16 << 20  # bytes of a file; counting frames reads all of it
 _BAND = 1 << 22  # pixels converted at once
 _PLAIN = ("L", "LA", "RGB", "RGBA", "CMYK")  # modes of 8 bits without a palette
-_MAX_PROFILE = 4 << 20  # bytes; a profile for printing takes 3 MB
 _ORIENTATION = 0x0112  # of EXIF
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -46,11 +46,6 @@ _UPRIGHT = {
 }
 # Pillow keeps the high bytes of PNGs of 16 bits a channel; these raw modes give the low ones.
 _LOW_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L", "LA;16B": "RGBA"}
-# Chunks of PNG, by Pillow's names, and their values in sRGB.
-_CHUNKS = {
-    "gAMA": ("gamma", [1 / 2.2]),
-    "cHRM": ("chromaticity", [0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06]),
-}
 _QUIET = threading.Lock()  # warning filters are process-wide
 
 
@@ -138,8 +133,8 @@ def load_rgba(
 ) -> np.ndarray:
     """Read one still picture.
 
-    Grey, palette, RGB, CMYK and RGBA files of 8 and 16 bits are converted to sRGB, by their colour
-    profile if present, and EXIF rotation is applied. HEIC needs pillow-heif.
+    Grey, palette, RGB, CMYK and RGBA files of 8 and 16 bits are converted to sRGB
+    (``color_spaces``), and EXIF rotation is applied. HEIC needs pillow-heif.
 
     Args:
         path: the file.
@@ -254,14 +249,15 @@ def to_rgba(
         dtype: float32 or uint8 of the result.
         longest: as for ``load_rgba``.
         turned: apply EXIF rotation.
-        profiled: convert colours to sRGB by the profile in the file.
-        warn: called with a line if the profile cannot be used and colours are taken for sRGB.
+        profiled: convert colours to sRGB by the profile or the numbers in the file.
+        warn: called with a line if these cannot be used and colours are taken for sRGB.
             None: Python's warnings, once per line.
 
     Returns:
         ``[H, W, 4]`` float32 in [0, 1] or uint8, colour not premultiplied.
     """
-    convert = _conversion(image, name, warn or _warn_once) if profiled else None
+    warn = warn or _warn_once
+    convert = conversion(image, lambda line: warn(f"{name}: {line}")) if profiled else None
     plain = _with_alpha(image)
     orientation = _orientation(image) if turned else 1
     factor = 1 if longest is None else max(plain.size) // (2 * longest)
@@ -363,79 +359,6 @@ def _pixels(
         else:
             part[...] = np.asarray(band.convert("RGBA"))
     return out
-
-
-def _conversion(
-    image: Image.Image, name: object, warn: Callable[[str], None]
-) -> Callable[[Image.Image], Image.Image] | None:
-    """Return the conversion of 8-bit pixels to sRGB; None if not needed or not possible."""
-    if "icc_profile" not in image.info:
-        for chunk, (key, srgb) in _CHUNKS.items() if "srgb" not in image.info else ():
-            values = np.ravel(image.info.get(key, srgb))
-            if len(values) != len(srgb) or np.abs(values - srgb).max() > 0.01:
-                warn(f"{name}: its {chunk} chunk is ignored; colours are taken as sRGB")
-        return None
-    profile = image.info["icc_profile"]
-    try:
-        if not isinstance(profile, bytes) or not 0 < len(profile) <= _MAX_PROFILE:
-            raise ValueError("it is damaged or too large")
-        grey = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
-        mode = "L" if grey else "CMYK" if image.mode == "CMYK" else "RGB"
-        return _from_profile(profile, mode)
-    except Exception as error:  # littleCMS is missing, or raises errors of many types
-        reason = first_line(error)
-        warn(f"{name}: its colour profile is not used ({reason}); colours are taken as sRGB")
-        return None
-
-
-@functools.lru_cache(8)
-def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Image] | None:
-    """Return the conversion of L, RGB or CMYK pixels from a profile to sRGB; alpha is kept.
-
-    None if no value changes by more than 1: then the profile is sRGB up to rounding.
-    """
-    from PIL import ImageCms
-
-    source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-    space = cast(Any, source.profile).xcolor_space.strip()  # missing in Pillow's stub
-    if space not in {"L": ("GRAY", "RGB"), "RGB": ("RGB",), "CMYK": ("CMYK",)}[mode]:
-        raise ValueError(f"it is for {space}, but the picture is {mode}")
-    source_mode = "L" if space == "GRAY" else space
-    # For speed littleCMS interpolates grey between a few steps; the table below has all 256.
-    flags = ImageCms.Flags.NOOPTIMIZE if mode == "L" else ImageCms.Flags.NONE
-    srgb = ImageCms.createProfile("sRGB")
-    transform = ImageCms.buildTransform(source, srgb, source_mode, "RGB", flags=flags)
-
-    def colours(band: Image.Image) -> Image.Image:
-        made = ImageCms.applyTransform(band.convert(source_mode), transform)
-        assert made is not None  # because it is not in place
-        return made
-
-    levels = np.arange(256, dtype=np.uint8)
-    if mode == "L":  # grey stays grey, as masks must
-        table = np.asarray(colours(Image.fromarray(levels[None])))[0, :, 1]
-        if np.abs(table.astype(int) - levels).max() <= 1:
-            return None
-        return _keeping_alpha(lambda band: band.convert("L").point(table.tolist()))
-    if mode == "RGB":
-        grid = np.stack(np.meshgrid(*3 * [levels[::15]]), -1).reshape(18, -1, 3)
-        if np.abs(np.asarray(colours(Image.fromarray(grid))).astype(int) - grid).max() <= 1:
-            return None
-    return _keeping_alpha(colours)
-
-
-def _keeping_alpha(
-    colours: Callable[[Image.Image], Image.Image],
-) -> Callable[[Image.Image], Image.Image]:
-    """Extend a conversion to pictures with alpha, which is copied."""
-
-    def convert(band: Image.Image) -> Image.Image:
-        made = colours(band)
-        if "A" in band.mode:
-            made.putalpha(band.getchannel("A"))
-        return made
-
-    return convert
 
 
 @functools.lru_cache(1024)

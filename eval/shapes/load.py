@@ -25,7 +25,7 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import extract_surface
 from gamba_warp.surfaces.options import SurfaceOptions
 
-from .flags import STRICT, clean_mesh
+from .flags import FLAGS, STRICT, clean_mesh
 from .protocol import GeometryProtocol
 from .shape import SUFFIXES, Mesh, Points, Shape, Similarity
 
@@ -219,6 +219,8 @@ def _loaded(
     if isinstance(shape, Points):
         return LoadedShape(source, shape, [], motion, axes)
     mesh, flags = clean_mesh(shape, protocol.strict)
+    if isinstance(source, Mesh) and source.flat:
+        flags = [flag for flag in FLAGS if flag in (*flags, "degenerate")]
     if len(mesh.faces) == 0:
         raise UserError("the mesh has no area")
     refused = [flag for flag in flags if flag in STRICT]
@@ -276,7 +278,7 @@ def _read_shape(path: Path) -> tuple[Shape, str]:
 
 def _mesh(path: Path, ply: PlyData | None = None) -> Mesh:
     mesh = load_mesh(path, ply=ply)
-    return Mesh(mesh.vertices, mesh.faces, tuple(mesh.omitted))
+    return Mesh(mesh.vertices, mesh.faces, tuple(mesh.omitted), mesh.flat)
 
 
 def _points(cloud: Cloud) -> Points:

@@ -66,11 +66,13 @@ class Mesh:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64, F > 0.
         omitted: parts of the file that are not read, one line each.
+        flat: number of the file's faces without area, which are left out.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     omitted: tuple[str, ...] = ()
+    flat: int = 0
 
     def scene(self):
         """Return an Open3D ``RaycastingScene`` of these triangles."""

@@ -13,6 +13,7 @@ from urllib.parse import unquote
 import numpy as np
 from PIL import Image
 
+from ..color_spaces import to_display
 from ..errors import UserError
 from .gltf_file import (
     INSTANCING,
@@ -25,7 +26,7 @@ from .gltf_file import (
     open_gltf,
 )
 from .headers import open_shape
-from .materials import Material, SideFiles, plain, to_display
+from .materials import Material, SideFiles, plain
 from .parts import Part, strip_faces, to_rgba8
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ..color_spaces import to_linear
 from ..errors import UserError
 from ..images import FORMATS, open_picture, to_rgba
 from ..untrusted.documents import read_bytes
@@ -44,19 +45,6 @@ class Material:
 
     color: np.ndarray
     texture: np.ndarray | None = None
-
-
-def to_linear(display: np.ndarray | float) -> np.ndarray:
-    """Convert sRGB display values in [0, 1] to linear light (IEC 61966-2-1), float32."""
-    x = np.asarray(display, dtype=np.float32)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def to_display(linear: np.ndarray) -> np.ndarray:
-    """Convert linear light in [0, 1] to sRGB display values, float32."""
-    x = np.asarray(linear, dtype=np.float32)
-    curve = 1.055 * np.maximum(x, 1e-8) ** (1 / 2.4) - 0.055
-    return np.where(x <= 0.0031308, 12.92 * x, curve).astype(np.float32)
 
 
 def plain(color: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
 """Mesh files as flat arrays: one list of triangles with their corners' normals, UVs and materials.
 
-The readers of the formats yield parts, which are joined without unused vertices; normals are
-computed when they are asked for. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up
-by convention and are turned by ``normalized`` (front +z becomes front -y, as in Blender).
+The readers of the formats yield parts, which are joined without faces of no area, which would set
+the bounding box unseen, and without unused vertices; normals are computed when they are asked for.
+The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up by convention and are turned by
+``normalized`` (front +z becomes front -y, as in Blender).
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..color_spaces import to_linear
 from ..errors import UserError
 from .gltf import read_gltf
-from .materials import GREY, Material, SideFiles, to_linear
+from .materials import GREY, Material, SideFiles
 from .obj import read_obj
 from .off import read_off
 from .parts import Part, used_vertices
@@ -38,6 +40,7 @@ Y_UP = (".obj", ".glb", ".gltf")
 MAX_REACH = 1e18  # the squares of larger coordinates overflow float32
 MAX_PARTS = 40_000_000  # vertices and faces; their arrays take 4 GB
 CREASE = np.cos(np.radians(40))  # a vertex normal farther than this from its face's is not used
+THIN = 1e-7  # height of a face over its longest side, below which float32 gives it no area
 
 Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
@@ -56,6 +59,7 @@ class TexturedMesh:
         given_normals: ``[F, 3, 3]`` of the file, of any length and side, not checked; or None.
         warnings: missing content that was replaced, or unread content, one line each.
         omitted: the warnings that concern the shape.
+        flat: number of faces that are left out because they have no area.
     """
 
     vertices: np.ndarray
@@ -67,6 +71,7 @@ class TexturedMesh:
     given_normals: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)
     omitted: list[str] = field(default_factory=list)
+    flat: int = 0
 
     @cached_property
     def normals(self) -> np.ndarray:
@@ -127,7 +132,7 @@ def load_mesh(
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
     texture without UV coordinates by its mean colour, and the alpha of a mesh that would be
-    invisible by 1; ``warnings`` names each.
+    invisible by 1; ``warnings`` names each. Faces of no area stay only if no face has one.
 
     Args:
         path: the file.
@@ -157,7 +162,7 @@ def load_mesh(
                 raise UserError(f"{path}: {limit}")
         if not parts:
             raise UserError(f"{path}: no faces")
-        return _joined(parts, sides)
+        return _without_flat(_joined(parts, sides))
     except MemoryError as error:
         raise UserError(f"{path}: not enough memory for it") from error
 
@@ -225,6 +230,31 @@ def _joined(parts: list[TexturedMesh], sides: SideFiles) -> TexturedMesh:
     warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
     arrays = vertices, all_of("faces"), all_of("uvs"), colors, all_of("material_ids")
     return TexturedMesh(*arrays, materials, normals, warnings, omitted)
+
+
+def _without_flat(mesh: TexturedMesh) -> TexturedMesh:
+    """Return a mesh without the faces of no area, unless all are; then it is warned of."""
+    first, second, third = (mesh.vertices[corner] for corner in mesh.faces.T)
+    one, two = second - first, third - first
+    longest = np.maximum((one * one).sum(1), (two * two).sum(1))
+    solid = (np.cross(one, two) ** 2).sum(1) > (THIN * longest) ** 2
+    if solid.all():
+        return mesh
+    if not solid.any():
+        mesh.warnings.append("no face has an area")
+        return mesh
+    faces, kept = used_vertices(mesh.faces[solid], len(mesh.vertices))
+    normals = mesh.given_normals
+    return replace(
+        mesh,
+        vertices=mesh.vertices if kept is None else mesh.vertices[kept],
+        faces=faces,
+        uvs=mesh.uvs[solid],
+        colors=mesh.colors[solid],
+        material_ids=mesh.material_ids[solid],
+        given_normals=None if normals is None else normals[solid],
+        flat=int((~solid).sum()),
+    )
 
 
 def _is_visible(part: TexturedMesh) -> bool:

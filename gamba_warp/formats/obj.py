@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ..color_spaces import to_linear
 from ..errors import UserError
 from .headers import (
     BOM,
@@ -23,7 +24,7 @@ from .headers import (
     parse_rows,
     without_comments,
 )
-from .materials import GREY, Material, SideFiles, plain, to_linear
+from .materials import GREY, Material, SideFiles, plain
 from .parts import Part, color_range, cut_polygons, to_rgba8
 
 MAX_MATERIALS = 20_000  # of a file: each is a part

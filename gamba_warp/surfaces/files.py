@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 import torch
 
+from ..color_spaces import to_linear
 from ..conventions import Axes
 from ..errors import UserError
 from ..files import atomic_path
-from ..formats.materials import to_linear
 from ..formats.names import MESH_FORMATS, MeshFormat
 from ..formats.parts import merged
 from ..gaussians import Gaussians

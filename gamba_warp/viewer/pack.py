@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from ..color_spaces import to_display, to_linear
 from ..conventions import Axes
 from ..errors import UserError
-from ..formats.materials import to_display, to_linear
 from ..formats.meshes import TexturedMesh, load_mesh
 from ..gaussians import Gaussians
 from ..images import to_uint8

@@ -11,8 +11,8 @@ from PIL import Image
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.cli import run
+from gamba_warp.color_spaces import to_linear
 from gamba_warp.formats.gaussians.files import write_gaussians
-from gamba_warp.formats.materials import to_linear
 from gamba_warp.formats.names import MESH_FORMATS
 from gamba_warp.formats.ply import load_ply, save_ply
 

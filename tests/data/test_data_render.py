@@ -16,11 +16,11 @@ from PIL import Image
 
 from gamba_warp.cameras import from_opengl, intrinsics
 from gamba_warp.cli import run
+from gamba_warp.color_spaces import to_linear
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.files import PART
 from gamba_warp.formats.catalogue import find_meshes, object_names
-from gamba_warp.formats.materials import to_linear
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.train.data import render
 from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses

@@ -202,12 +202,13 @@ FLAGGED = {
     "open": changed(lambda f: f[1:]),
     "inverted": changed(lambda f: f[:, ::-1]),
     "inconsistent": changed(lambda f: np.concatenate([f[:1, ::-1], f[1:]])),
-    "degenerate": changed(lambda f: np.concatenate([f, [[0, 1, 1]]])),
+    "degenerate": changed(lambda f: np.concatenate([f, [[0, 8, 8]]])),
     "duplicate": changed(lambda f: np.concatenate([f, f[:3, ::-1]])),
     "nonmanifold": changed(more=box(0.5, (0.75, 0.75, 0.0))),
     "selfintersecting": changed(more=box(0.5, (0.4, 0.3, 0.2))),
 }
 FLAGGED["nonmanifold"].vertices[8:, 2] *= 2  # now they share an edge
+FLAGGED["degenerate"].vertices = np.concatenate([box().vertices, [[50, 0, 0]]])  # shows nothing
 
 
 @pytest.mark.parametrize("flag", FLAGGED)

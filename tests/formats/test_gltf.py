@@ -10,7 +10,7 @@ from helpers.meshes import glb
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.formats.materials import to_linear
+from gamba_warp.color_spaces import to_linear
 from gamba_warp.formats.meshes import load_mesh
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")

@@ -121,27 +121,93 @@ def test_a_colour_near_the_transparent_one_stays(tmp_path):
     assert load_rgba8(tmp_path / "a.png")[0, :, 3].tolist() == [0, 255]
 
 
-def chunked(name, data):
-    """Return a PNG with one more chunk."""
-    content = png16(np.full((2, 2, 3), 99), bits=8)
-    chunk = struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-    return content[:33] + chunk + content[33:]
+def chunked(*chunks, pixel=(200, 60, 30)):
+    """Return a PNG of one colour with more chunks."""
+    content = png16(np.full((2, 2, 3), pixel), bits=8)
+    for name, data in chunks:
+        crc = struct.pack(">I", zlib.crc32(name + data))
+        content = content[:33] + struct.pack(">I", len(data)) + name + data + crc + content[33:]
+    return content
 
 
-def test_chunks_of_colour_that_are_not_read_are_named(tmp_path):
-    path = tmp_path / "a.png"
-    primaries = [31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000]
-    wide = [31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000]
-    for name, good, bad in ((b"gAMA", [45455], [100000]), (b"cHRM", primaries, wide)):
-        for values in (good, bad):
-            lines = []
-            path.write_bytes(chunked(name, struct.pack(f">{len(values)}I", *values)))
-            load_rgba(path, warn=lines.append)
-            text = f"{path}: its {name.decode()} chunk is ignored; colours are taken as sRGB"
-            assert lines == ([text] if values is bad else [])
-    path.write_bytes(chunked(b"sRGB", b"\0"))
-    load_rgba(path, warn=lines.append)
-    assert len(lines) == 1  # of the last before
+def numbers(*values):
+    """Return numbers of a chunk."""
+    return struct.pack(f">{len(values)}I", *values)
+
+
+CHRM = [31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000]
+ADOBE = [31270, 32900, 64000, 33000, 21000, 71000, 15000, 6000]
+EXIF_R03 = b"II*\0\x08\0\0\0\1\0\x05\xa0\4\0\1\0\0\0\x1a\0\0\0\0\0\0\0"
+EXIF_R03 += b"\1\0\1\0\2\0\4\0\0\0R03\0\0\0\0\0"
+STATED = {  # sRGB values of (200, 60, 30) in the space, by the published primaries and curves
+    "sRGB by its numbers": ((b"cICP", bytes([1, 13, 0, 1])), (200, 60, 30)),
+    "Display P3": ((b"cICP", bytes([12, 13, 0, 1])), (217, 42, 0)),
+    "cHRM, gAMA of sRGB": ((b"cHRM", numbers(*CHRM)), (b"gAMA", numbers(45455)), (200, 60, 30)),
+    "cHRM, gAMA of Adobe RGB": (
+        (b"cHRM", numbers(*ADOBE)), (b"gAMA", numbers(45470)), (232, 57, 21),
+    ),
+    "linear gAMA": ((b"gAMA", numbers(100000)), (228, 132, 96)),
+    "sRGB before gAMA": ((b"gAMA", numbers(100000)), (b"sRGB", b"\0"), (200, 60, 30)),
+    "cICP before gAMA": (
+        (b"gAMA", numbers(100000)), (b"cICP", bytes([12, 13, 0, 1])), (217, 42, 0),
+    ),
+    "Adobe RGB by EXIF": ((b"eXIf", EXIF_R03), (232, 57, 21)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_colour_spaces_told_by_numbers(tmp_path, name):
+    *chunks, want = STATED[name]
+    lines, path = [], tmp_path / "a.png"
+    path.write_bytes(chunked(*chunks))
+    got = 255 * load_rgba(path, warn=lines.append)[0, 0, :3]
+    np.testing.assert_allclose(got, want, atol=1)  # of rounding, and of a curve for another
+    assert not lines
+
+
+def test_colours_of_pq(tmp_path):
+    """A grey of 203 cd/m² is white; half of its light is half of white's."""
+    for value, want in ((148, 255), (130, 188)):
+        (tmp_path / "a.png").write_bytes(
+            chunked((b"cICP", bytes([9, 16, 0, 1])), pixel=[value] * 3)
+        )
+        got = load_rgba8(tmp_path / "a.png")[0, 0]
+        assert np.ptp(got[:3]) == 0
+        np.testing.assert_allclose(got[:3], want, atol=3)  # a step of PQ is two there
+
+
+@pytest.mark.parametrize(
+    "chunk, reason",
+    [
+        ((b"cICP", bytes([9, 18, 0, 1])), r"primaries 9, transfer 18 of H.273"),
+        ((b"cICP", bytes([1, 13, 0, 0])), "narrow range"),
+        ((b"cHRM", numbers(*[0] * 8)), ""),
+        ((b"gAMA", numbers(0)), ""),
+    ],
+)
+def test_invalid_colour_spaces_are_named(tmp_path, chunk, reason):
+    lines, path = [], tmp_path / "a.png"
+    path.write_bytes(chunked(chunk))
+    assert load_rgba(path, warn=lines.append)[0, 0, 0] == np.float32(200 / 255)
+    (line,) = lines
+    assert line.startswith(f"{path}: its colour space is not used") and reason in line
+
+
+@pytest.mark.parametrize("suffix", ["avif", "heic"])
+def test_colours_of_phones_told_by_numbers(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    image = Image.new("RGB", (64, 64), (200, 60, 30))
+    if suffix == "heic":
+        heif = pytest.importorskip("pillow_heif")
+        file = heif.from_pillow(image)
+        file.save(path, quality=-1, chroma=444, color_primaries=12, transfer_characteristics=13)
+    else:
+        image.save(path, quality=100, subsampling="4:4:4")
+        content = path.read_bytes()
+        at = content.index(b"colrnclx") + 8
+        path.write_bytes(content[:at] + struct.pack(">2H", 12, 13) + content[at + 4 :])
+    # Lossy files are a step or two off, which the wider primaries double.
+    np.testing.assert_allclose(load_rgba8(path)[32, 32, :3], (217, 42, 0), atol=4)
 
 
 def in_srgb(pixels, columns, gamma):

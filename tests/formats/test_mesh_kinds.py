@@ -9,7 +9,8 @@ from helpers.meshes import FACET, MTL, QUAD, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.formats.materials import SideFiles, to_display, to_linear
+from gamba_warp.color_spaces import to_display, to_linear
+from gamba_warp.formats.materials import SideFiles
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.parts import cut_polygons
 from gamba_warp.surfaces.extract import Surface
@@ -111,17 +112,25 @@ def test_concave_polygons_of_files(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "ply"])
-def test_vertices_of_no_face_are_left_out(tmp_path, suffix):
+def test_vertices_of_no_visible_face_are_left_out(tmp_path, suffix):
     """Otherwise they move and shrink the object in every picture."""
-    rows = ["9 9 9", *FOUR, "nan 0 0"]
+    rows = ["9 3 1", *FOUR, "nan 0 0", "8.1 2.7 0.9"]
+    line = "3 0 1 6"  # the third corner lies between the others up to rounding
     text = {
-        "obj": "".join(f"v {row}\n" for row in rows) + "f 2 3 4 5\n",
-        "off": "OFF\n6 1 0\n" + "\n".join([*rows, "4 1 2 3 4"]),
-        "ply": ply(rows, ["4 1 2 3 4"]),
+        "obj": "".join(f"v {row}\n" for row in rows) + "f 2 3 4 5\nf 1 2 7\nf 1 1 1\n",
+        "off": "OFF\n7 3 0\n" + "\n".join([*rows, "4 1 2 3 4", line, "3 0 0 0"]),
+        "ply": ply(rows, ["4 1 2 3 4", line, "3 0 0 0"]),
     }[suffix]
     mesh = loaded(tmp_path, f"a.{suffix}", text)
+    assert mesh.flat == 2 and len(mesh.faces) == len(mesh.uvs) == len(mesh.normals) == 2
     assert len(mesh.vertices) == 4 and places(mesh).max((0, 1)).tolist() == [1, 1, 0]
     assert mesh.normalized("z")[2] == 1
+    flat = loaded(
+        tmp_path,
+        f"b.{suffix}",
+        text.replace(*{"obj": ("f 2 3 4 5\n", "")}.get(suffix, ("4 1 2 3 4", "3 0 1 6"))),
+    )
+    assert flat.warnings[-1:] == ["no face has an area"] and flat.normalized("z")[2] == 1 / 9
 
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\n"

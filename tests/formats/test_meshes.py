@@ -7,7 +7,7 @@ from helpers.images import ADOBE_RGB, colour_profile, colours
 from helpers.meshes import MTL, QUAD, write_quad
 from PIL import Image
 
-from gamba_warp.formats.materials import to_display, to_linear
+from gamba_warp.color_spaces import to_display, to_linear
 from gamba_warp.formats.meshes import default_up, load_mesh
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from gamba_warp.formats.materials import to_display, to_linear
+from gamba_warp.color_spaces import to_display, to_linear
 from gamba_warp.formats.meshes import TexturedMesh
 from gamba_warp.kernels.runtime.views import struct
 from gamba_warp.versions import import_open3d

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from manifold3d import Manifold, Mesh
 
-from gamba_warp.formats.materials import Material, to_linear
+from gamba_warp.color_spaces import to_linear
+from gamba_warp.formats.materials import Material
 from gamba_warp.formats.meshes import CREASE, TexturedMesh
 
 from . import textures
