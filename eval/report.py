@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gamba_warp.errors import UserError, first_line
+from gamba_warp.errors import UserError, escaped, first_line
 from gamba_warp.files import write_json, write_text
 
 from .averages import BOOTSTRAP, intervals_of, mean_of, median_of
@@ -192,7 +192,8 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         if ends is not None:
             shown += f" [{ends[0]:.5g}, {ends[1]:.5g}]  median {medians[name]:.5g}"
         lines.append(f"{name:<24} {shown}")
-    return lines + [f"failed: {item['name']}: {item['reason']}" for item in report["failures"]]
+    failed = (f"failed: {item['name']}: {item['reason']}" for item in report["failures"])
+    return lines + [escaped(line) for line in failed]
 
 
 def count_line(report: dict[str, Any], folder: Path | None, beside: int = 0) -> str:

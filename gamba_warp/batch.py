@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 from unicodedata import normalize
 
-from .errors import UserError, first_line, one_line
+from .errors import UserError, escaped, first_line, one_line
 from .files import check_folder_name
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ def for_each(
             try:
                 function(name, item)
             except EXPECTED as error:
-                failures.append((item, first_line(error).removeprefix(f"{item}: ")))
+                named_twice = f"{escaped(str(item))}: "
+                failures.append((item, first_line(error).removeprefix(named_twice)))
         STAGES.show = None
     return failures
 
@@ -104,11 +105,11 @@ def _terminal(stream: Any) -> Any:
 
 
 def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line on stdout, or on another stream, above the progress bars."""
+    """Print a line on stdout, or on another stream, above the progress bars; ``escaped``."""
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=_terminal(sys.stderr)):
-        print(line, file=stream or sys.stdout)
+        print(escaped(line), file=stream or sys.stdout)
 
 
 def print_json(text: str, stream: TextIO | None = None) -> None:

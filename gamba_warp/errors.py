@@ -18,7 +18,10 @@ class UserError(Exception):
 
 
 class FileWarning(UserWarning):
-    """Warning of one line about a file that is only partly used."""
+    """Warning about a file that is only partly used, in one line as a ``UserError``'s."""
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(one_line(str(message)))
 
 
 def first_line(error: BaseException | str) -> str:
@@ -28,14 +31,22 @@ def first_line(error: BaseException | str) -> str:
 
 def one_line(text: str, most: int = MOST_LETTERS) -> str:
     """Return the text as one printable line of at most ``most`` characters (over 20)."""
-    line = " ".join(part.strip() for part in text.strip().splitlines())
+    line = text.strip()
     if len(line) > 2 * most:  # before the escapes, which may take long
         line = f"{line[:most]}{line[-most:]}"
-    line = printable(line)
+    line = escaped(line)
     if len(line) > most:
         head = 2 * most // 3
         line = f"{line[:head]} ... {line[head + 5 - most :]}"
     return line
+
+
+def escaped(text: str) -> str:
+    """Return a text that is to be a line, with escapes for line ends and as ``printable``.
+
+    So a name that holds a line end starts no line of its own in an output.
+    """
+    return printable(text).replace("\n", "\\n").replace("\t", "\\t")
 
 
 def printable(text: str) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError, features
 
 from .color_spaces import conversion
-from .errors import FileWarning, UserError, first_line, one_line
+from .errors import FileWarning, UserError, first_line
 from .files import atomic_path, other_kinds
 from .versions import to_install
 
@@ -46,6 +46,8 @@ _UPRIGHT = {
 }
 # Pillow keeps the high bytes of PNGs of 16 bits a channel; these raw modes give the low ones.
 _LOW_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L", "LA;16B": "RGBA"}
+# Tags of TIFF, which raw photographs are; of the second, bit 1 marks a reduced copy.
+_DNG_VERSION, _SUBFILE_TYPE = 0xC612, 0xFE
 _QUIET = threading.Lock()  # warning filters are process-wide
 
 
@@ -70,8 +72,8 @@ def open_picture(
         The picture, not decoded yet. EXIF rotation is not applied.
 
     Raises:
-        UserError: it is missing, empty, not a plain file or picture of these formats, larger than
-            ``max_pixels`` or ``MAX_SIDE``, or damaged.
+        UserError: it is missing, empty, not a plain file or picture of these formats, a raw
+            photograph, larger than ``max_pixels`` or ``MAX_SIDE``, or damaged.
     """
     name = source if name is None else name
     if isinstance(source, (str, Path)):
@@ -80,6 +82,7 @@ def open_picture(
         with _without_warnings():
             image = Image.open(source, formats=tuple(formats))
         with image:
+            _check_raw(image, name)
             check_size(image.width, image.height, name, max_pixels)
             yield image
     except UserError:
@@ -91,6 +94,16 @@ def open_picture(
     except Exception as error:  # decoders raise errors of nearly any type on damaged files
         reason = first_line(error)
         raise UserError(f"{name}: cannot be decoded ({reason})") from error
+
+
+def _check_raw(image: Image.Image, name: object) -> None:
+    """Refuse a camera's raw file, of which Pillow sees only a preview. Raises UserError."""
+    tags: Any = getattr(image, "tag_v2", {})
+    if image.format == "TIFF" and (_DNG_VERSION in tags or tags.get(_SUBFILE_TYPE, 0) & 1):
+        raise UserError(
+            f"{name}: a raw photograph, of which only a preview of {image.width}x{image.height} "
+            "can be read; export it as JPEG, PNG or TIFF"
+        )
 
 
 def check_size(width: int, height: int, name: object, max_pixels: int = MAX_PIXELS) -> None:
@@ -364,7 +377,7 @@ def _pixels(
 @functools.lru_cache(1024)
 def _warn_once(line: str) -> None:
     with _QUIET:  # else another thread's filter could drop it
-        warnings.warn(one_line(line), FileWarning, stacklevel=2)
+        warnings.warn(line, FileWarning, stacklevel=2)
 
 
 def to_uint8(picture: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from gamba_warp.batch import print_json
+from gamba_warp.batch import print_json, say
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.ranges import ranged
 
@@ -48,11 +48,11 @@ def eval_geometry_command(
         print(table, end="")
         failed = [record for record in records if record["status"] == FAILED]
         for record in failed:
-            print(f"failed: {record['name']}: {record['reason']}", file=sys.stderr)
+            say(f"failed: {record['name']}: {record['reason']}", sys.stderr)
         return 1 if failed else 0
     report = evaluate_shapes(options, protocol)
     for text in report["warnings"]:
-        print(f"warning: {text}", file=sys.stderr)
+        say(f"warning: {text}", sys.stderr)
     if json:
         print_json(json_of(report))
     else:

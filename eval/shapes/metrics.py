@@ -11,21 +11,24 @@ import torch
 from gamba_warp.cameras import intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
 
-from .align import aligned, match_moments, symmetry
+from .align import aligned, symmetry
 from .load import LoadedShape, centers
 from .occupancy import RULES, grid_around, syncdreamer_grid
 from .options import ChamferForm
 from .protocol import GeometryProtocol
 from .shape import Mesh, Points, halves, nearest, sample, visible_points
+from .table import AS_IS, MIRRORED
 
-# Rotations by which files are often wrong: by 180 degrees, and between y-up and z-up.
-TURNS = {
-    "as it is": np.eye(3),
-    "180 degrees about x": np.diag([1.0, -1, -1]),
-    "180 degrees about y": np.diag([-1.0, 1, -1]),
-    "180 degrees about z": np.diag([-1.0, -1, 1]),
-    "90 degrees about x": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-    "-90 degrees about x": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+# Transforms by which files are often wrong: rotations by 180 degrees, between y-up and z-up, and
+# the mirrors of left-handed axes.
+TRANSFORMS = {
+    AS_IS: np.eye(3),
+    "turned by 180 degrees about x": np.diag([1.0, -1, -1]),
+    "turned by 180 degrees about y": np.diag([-1.0, 1, -1]),
+    "turned by 180 degrees about z": np.diag([-1.0, -1, 1]),
+    "turned by 90 degrees about x": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "turned by -90 degrees about x": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    **{f"{MIRRORED} along {axis}": np.diag(1.0 - 2 * np.eye(3)[i]) for i, axis in enumerate("xyz")},
 }
 _FEW = 5_000  # points, enough for a warning
 
@@ -156,31 +159,32 @@ def shape_iou(
     return {"iou": iou, "iou_error": error, "iou_voxel": grid.step}
 
 
-def chamfer_by_turn(
+def chamfer_by_transform(
     predicted: LoadedShape, truth: LoadedShape, protocol: GeometryProtocol
 ) -> dict[str, float]:
     """Compute the Chamfer distance with other axes for the prediction's file.
 
-    The rotations are about the origin of the file. Gaussians are compared by their centres, because
-    their surface is extracted near the truth only.
+    The transforms are about the origin of the file. Gaussians are compared by their centres,
+    because their surface is extracted near the truth only.
 
     Args:
         predicted: before any alignment.
         truth: the true shape.
-        protocol: with the seed; if it aligns, centroids and sizes are matched first.
+        protocol: with the seed and the alignment, which follows each transform. If it searches all
+            rotations, one mirror stands for the other transforms.
 
     Returns:
-        Distances between few points, by the key of ``TURNS``.
+        Distances between few points, by the key of ``TRANSFORMS``.
     """
     true = Points(sample(truth.shape, _FEW, protocol.seed).positions)
     few = (_FEW, protocol.seed + 1)
     source, found = predicted.source, {}
     of = centers(source, *few) if isinstance(source, Gaussians) else sample(source, *few)
     points = of.positions
-    for name, turn in TURNS.items():
-        turned = Points(predicted.motion.after(turn).points(points))
-        if protocol.align:
-            turned = match_moments(turned, true).apply(turned)
+    searched = (AS_IS, f"{MIRRORED} along x")
+    for name in searched if "turn" in protocol.align else TRANSFORMS:
+        turned = Points(predicted.motion.after(TRANSFORMS[name]).points(points))
+        turned = aligned(turned, true, protocol.align)[0].apply(turned)
         ways = nearest(turned, true), nearest(true, turned)
         found[name] = float(np.mean([distances.mean() for distances, _ in ways]))
     return found

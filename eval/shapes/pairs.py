@@ -333,7 +333,7 @@ def evaluate_pair(
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
     from .load import FRAME_AXES, load_prediction, load_truth, scale_note
-    from .metrics import chamfer_by_turn, compare
+    from .metrics import chamfer_by_transform, compare
 
     stages = Stopwatch(3)
     with stages("load"):
@@ -345,7 +345,7 @@ def evaluate_pair(
             predicted.notes.append(note)
         metrics = compare(predicted.shape, truth.shape, protocol)
         check_finite(metrics)
-        turned = check_finite(chamfer_by_turn(predicted, truth, protocol))
+        turned = check_finite(chamfer_by_transform(predicted, truth, protocol))
     return {
         "name": pair.name,
         "status": OK,

@@ -15,10 +15,11 @@ _SHOWN = {
     "chamfer": Column("Chamfer", 4),
     "normal_consistency": Column("normal consistency", 4),
 }
-# Largest shares of the Chamfer distance after a rotation for a warning: of one object's, or of the
+# Largest shares of the Chamfer distance after a transform for a warning: of one object's, or of the
 # mean over at least MANY.
 FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
-AS_IS = "as it is"  # key of the identity
+AS_IS, MIRRORED = "as it is", "mirrored"  # key of the identity, first word of the mirrors'
+_MIRROR = 0.8  # share of the best rotation's distance: many shapes are their own mirror images
 _NAMED = 3  # most objects named in a warning
 
 
@@ -84,26 +85,33 @@ def file_warnings(done: list[dict[str, Any]]) -> list[str]:
 
 
 def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
-    """Warn about rotations of the predictions' files that would improve the score a lot.
+    """Warn about rotations and mirrors of the predictions' files that would improve it a lot.
 
-    A rotation that improves the mean of many objects gives one warning; else there is one for each
-    rotation that improves single objects by ``FAR_BETTER``.
+    One that improves the mean of many objects gives one warning; else there is one for each that
+    improves single objects by ``FAR_BETTER``.
 
     Args:
         done: records of the evaluated objects.
     """
-    ask = "are the axes right? (--pred-axes, --up, --frame)"
 
     def straight_and_best(turned: dict[str, float]) -> tuple[float, str, float]:
-        best = min((t for t in turned if t != AS_IS), key=turned.__getitem__)
+        def judged(name: str) -> float:
+            return turned[name] / (_MIRROR if name.startswith(MIRRORED) else 1)
+
+        best = min((name for name in turned if name != AS_IS), key=judged)
         return turned[AS_IS], best, turned[best]
+
+    def ask(name: str) -> str:
+        if name.startswith(MIRRORED):
+            return "does the file have left-handed axes?"
+        return "are the axes right? (--pred-axes, --up, --frame)"
 
     if len(done) >= MANY:
         straight, turn, value = straight_and_best(mean_of([r["chamfer_turned"] for r in done]))
         if value <= BETTER * straight:
             return [
                 f"the mean Chamfer distance of {len(done)} predictions would be {value:.3g} "
-                f"in place of {straight:.3g} if all were turned by {turn}; {ask}"
+                f"in place of {straight:.3g} if all were {turn}; {ask(turn)}"
             ]
     found: dict[str, list[str]] = {}
     for record in done:
@@ -112,7 +120,7 @@ def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
             text = f"{record['name']} {value:.3g} in place of {straight:.3g}"
             found.setdefault(turn, []).append(text)
     return [
-        f"{len(texts)} of {len(done)} predictions would have a far smaller Chamfer distance turned "
-        f"by {turn} ({'; '.join(texts[:_NAMED])}{'; ...' if len(texts) > _NAMED else ''}); {ask}"
+        f"{len(texts)} of {len(done)} predictions would have a far smaller Chamfer distance {turn} "
+        f"({'; '.join(texts[:_NAMED])}{'; ...' if len(texts) > _NAMED else ''}); {ask(turn)}"
         for turn, texts in found.items()
     ]

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from gamba_warp.batch import print_json
+from gamba_warp.batch import print_json, say
 from gamba_warp.untrusted.ranges import ranged
 
 from .options import ViewsOptions
@@ -38,9 +38,9 @@ def eval_views_command(
     else:
         print(page(report), end="")
     for name, reason in report["left_out_baselines"].items():
-        print(f"left out: {name}: {reason}", file=sys.stderr)
+        say(f"left out: {name}: {reason}", sys.stderr)
     for item in report["failures"]:
-        print(f"failed: {item['name']}: {item['reason']}", file=sys.stderr)
+        say(f"failed: {item['name']}: {item['reason']}", sys.stderr)
     beside = len(report["failures"]) - report["num_failed"]
     print(count_line(report, options.out, beside), file=sys.stderr if json else sys.stdout)
     if report["interrupted"]:

@@ -55,6 +55,7 @@ def ablate_command(
         device: Device of every command; auto is the GPU if there is one.
         dry_run: Only print the commands.
     """
+    from ..data.dataset import open_dataset
     from .plan import commands, open_plan
 
     chosen = open_plan(plan, data)
@@ -77,9 +78,11 @@ def ablate_command(
         for words in (words for task in tasks.values() for words in task.values()):
             print(f"gamba {shlex.join(words)}")
         return 0
+    open_dataset(data)
     for folder, task in tasks.items():
         record = folder / "commands.json"
-        if record.exists() and read_document(record, dict[str, list[str]]) != task:
+        begun = record.exists() and (folder / "run").exists()
+        if begun and read_document(record, dict[str, list[str]]) != task:
             raise UserError(f"{folder}: was run with other options; give another --out")
     failed = False
     with only_process(output_folder(out), "runs an ablation"):

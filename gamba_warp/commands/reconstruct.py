@@ -72,7 +72,7 @@ def reconstruct_command(
         files: Outputs to write.
         camera: Camera of the picture, and of its results.
         sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
-        mask: Picture that is white on the object (for a single image).
+        mask: Picture that is brighter, or opaque, on the object (for a single image).
         matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or a URL of one of rembg's.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
         cutout: How the object is cut out; auto is the first that finds one. none takes the whole

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..batch import STAGES, counted, print_json
+from ..batch import STAGES, counted, print_json, say
 from ..errors import UserError
 
 STREAM = Path("-")  # as --out: the standard output
@@ -81,11 +81,11 @@ def reported(command: Callable[..., Results]) -> Callable[..., int]:
                 results = command(*given.args, **given.kwargs)
             results.out = STREAM if piped else results.out
             for item, reason in results.failures:
-                print(f"gamba: failed: {item}: {reason}", file=sys.stderr)
+                say(f"gamba: failed: {item}: {reason}", sys.stderr)
             if as_json:
                 print_json(results.json(), stdout)
             else:
-                print(results.text())
+                say(results.text())
         return 1 if results.failures else 0
 
     return run

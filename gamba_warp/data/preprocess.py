@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..conventions import over_background
 from ..errors import UserError, first_line
-from ..images import load_rgba, picture_size
+from ..images import load_rgba, picture_size, to_uint8
 from ..untrusted.torch_files import read_torch
 
 BORDER_RATIO = 0.2  # share of the square left free around the object's longer side
@@ -33,6 +33,8 @@ _TRANSPARENT = 0.5  # a pixel of lower alpha is outside of a cut-out object
 _CUT_BORDER, _CUT_SHARE = 0.15, 0.05
 PRESENT = 0.05  # least alpha of a pixel within the object's bounds
 _MIN_OBJECT = 16  # least size of an object, pixels
+_COLORED = 0.1  # difference of channels from which a mask is of labels in colours,
+_LABELS = 64  # of 255: a mask with only darker greys is of labels by numbers
 
 
 def has_alpha(rgba: np.ndarray, any_share: bool = False) -> bool:
@@ -49,15 +51,32 @@ def has_alpha(rgba: np.ndarray, any_share: bool = False) -> bool:
 def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
     """Read alpha ``[H, W]`` in [0, 1] from a mask file, reduced like the picture in ``load_rgba``.
 
+    The object is brighter than the rest, by whatever two values, or it is the mask's own alpha.
+
     Raises:
-        UserError: the mask, or the picture's size, cannot be read, or they differ in size.
+        UserError: the mask, or the picture's size, cannot be read, they differ in size, or the mask
+            has several labels.
     """
     sizes = [picture_size(file) for file in (mask, path)]
     if sizes[0] != sizes[1]:
         stated = [f"{width}x{height}" for width, height in sizes]
         raise UserError(f"{mask}: the mask is {stated[0]} but {path} is {stated[1]}")
     values = load_rgba(mask, longest=WORKING_SIZE)
-    return values[..., :3].mean(-1) * values[..., 3]
+    colors, alpha = values[..., :3], values[..., 3]
+    grey = colors.mean(-1)
+    inside = grey[alpha > PRESENT]
+    if alpha.min() < 1 and not (len(inside) and np.ptp(inside) > 1 / 255):
+        return alpha
+    levels = np.unique(to_uint8(grey))
+    if np.ptp(colors, axis=-1).max() > _COLORED:
+        levels = np.unique(to_uint8(colors).reshape(-1, 3), axis=0)
+    elif levels.max() >= _LABELS:
+        levels = levels[:2]  # grey levels of one object's edge
+    if len(levels) > 2:
+        raise UserError(f"{mask}: has {len(levels)} labels; a mask is bright on the object alone")
+    grey = grey * alpha
+    low, high = grey.min(), grey.max()
+    return (grey - low) / (high - low) if low < high else grey
 
 
 def without_specks(alpha: np.ndarray) -> np.ndarray:

@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 from urllib.parse import unquote
 
+import msgspec
 import numpy as np
 from PIL import Image
 
@@ -36,6 +38,7 @@ _FREE_PRIMITIVES, _PRIMITIVE = 1000, 500  # in any file; bytes of each further o
 _GLOSSY = 4 << 20  # largest picture of an older material in memory, bytes
 _EACH = 3  # numbers that a vertex or a face of the scene counts as
 _Weights = tuple[float, ...]
+_SomeWeights = Annotated[_Weights, msgspec.Meta(min_length=1)]
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 _GLOSS = "KHR_materials_pbrSpecularGlossiness"
 _PICTURES = ("EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds")
@@ -61,6 +64,9 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
         if name not in _KNOWN:
             warn = sides.warnings.append if name.startswith("KHR_materials") else sides.omit
             warn(f"the extension {name[:60]} is not supported")
+    least = file.document.entry("asset").get("minVersion", str, "2.0")
+    if least > "2.0":
+        sides.omit(f"the file needs a reader of glTF {least[:9]}, and is read as 2.0")
     scenes = len(file.document.entries("scenes"))
     if scenes > 1:
         sides.omit(f"one of {scenes} scenes is read")
@@ -73,7 +79,7 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
         skin, placed = node.get("skin", Index), matrix @ file.instances(node)
         if skin is not None and len(placed) > 1:
             sides.omit(f"instances of a skinned mesh ({INSTANCING}) are not supported")
-        key = index, skin, node.get("weights", _Weights, ())
+        key = index, skin, node.get("weights", _SomeWeights, ())
         poses.setdefault(key, []).append(placed)
     meshes = {index: file.item("meshes", index) for index, _, _ in poses}
     primitives = {index: mesh.entries("primitives") for index, mesh in meshes.items()}
@@ -82,7 +88,7 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
         raise UserError(f"{path}: over {most} primitives, too many for its {file.size} bytes")
     for (index, skin, weights), placed in poses.items():
         for primitive in primitives[index]:
-            weights = weights or meshes[index].get("weights", _Weights, ())
+            weights = weights or meshes[index].get("weights", _SomeWeights, ())
             part, used = reader.triangles(primitive, weights)
             if part is None or used is None:
                 continue

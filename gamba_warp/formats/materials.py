@@ -11,6 +11,7 @@ import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from unicodedata import normalize
 
 import numpy as np
 from PIL import Image
@@ -137,6 +138,11 @@ def _shown(name: str) -> str:
     return " ".join(name[:100].split())
 
 
+def _folded(name: str) -> str:
+    """Return a name as systems compare it that ignore case, or store umlauts as two characters."""
+    return normalize("NFC", name).lower()
+
+
 def _find_file(folder: Path, root: Path, *names: str) -> Path | None:
     """Return the file of the first name found from a folder on, in a root; None without one."""
     for name in names:
@@ -153,7 +159,7 @@ def _find_file(folder: Path, root: Path, *names: str) -> Path | None:
                 for part in inside(base, relative, "a mesh").relative_to(base).parts:
                     exact = place / part
                     if not exact.exists() and place.is_dir():
-                        same = [p for p in place.iterdir() if p.name.lower() == part.lower()]
+                        same = [p for p in place.iterdir() if _folded(p.name) == _folded(part)]
                         exact = same[0] if same else exact
                     place = exact
                 if place.is_file():

@@ -270,6 +270,8 @@ def _library_texts(line: str, sides: SideFiles) -> list[bytes]:
 def _material(options: dict[str, str], name: str, sides: SideFiles) -> Material:
     """Return a material of an MTL file: a texture replaces the colour, light replaces black."""
     color, light = _color(options, "kd"), _color(options, "ke")
+    if color is None and "kd" in options:
+        sides.warnings.append(f"the colour of {name[:60]} is not read: Kd {options['kd'][:60]}")
     if color is not None and color_range(color) > 1:
         sides.warnings.append(f"the colour of {name[:60]} goes to 255")
         color = color / 255

@@ -9,13 +9,14 @@ red, then all of green, then all of blue.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import UserError
+from ..errors import FileWarning, UserError
 from ..files import atomic_path
 from ..gaussians import SH_C0, Gaussians
 from ..versions import __version__
@@ -29,7 +30,7 @@ from .gaussians.arrays import (
 )
 from .gaussians.compressed import unpacked
 from .parts import color_range
-from .ply_data import PlyData, read_ply
+from .ply_data import WORDS, PlyData, read_ply
 
 MIP = "SplatRenderMode: mip"  # comment of Gaussians that were fitted with antialiasing
 TURNED = "frame opengl"  # comment of files with y up, which earlier versions could write
@@ -44,6 +45,9 @@ _GROUPS = {
 }
 _RGB = ("red", "green", "blue")
 _REST = re.compile(r"f_rest_\d+")
+_WITHOUT_EFFECT = ("nx", "ny", "nz", *_RGB, "alpha")
+# Properties of Gaussians that change with time: SpacetimeGaussians, 4DGS and their like.
+_TIME = re.compile(r"trbf_\w+|(motion|omega|rot_r)_\d+|t|time|(scale|scaling|opacity)_t|\w+_t\d+")
 
 
 def save_ply(path: str | Path, gaussians: Gaussians, *, comments: Iterable[str] = ()) -> None:
@@ -95,25 +99,35 @@ def header_bytes(comments: Iterable[str], elements: Iterable[str]) -> bytes:
 def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
     """Read a 3DGS ``.ply``, from this or another program, as one object.
 
-    It may be binary, text, or compressed (``formats.gaussians.compressed``). Normals, other
-    properties and other elements are ignored. Without ``f_dc_*``, ``red green blue`` are the
-    colours, as nerfstudio's ``ns-export`` writes them. Two scales, of flat Gaussians (2DGS), get a
-    third of 1e-6. A scale of -inf is size 0; an opacity of inf is 1, of -inf 0. ``left_out`` as for
-    ``checked_gaussians``.
+    It may be binary, text, or compressed (``formats.gaussians.compressed``). Normals and other
+    elements are ignored, other properties named by a warning. Without ``f_dc_*``,
+    ``red green blue`` are the colours, as nerfstudio's ``ns-export`` writes them. Two scales, of
+    flat Gaussians (2DGS), get a third of 1e-6. A scale of -inf is size 0; an opacity of inf is 1,
+    of -inf 0. ``left_out`` as for ``checked_gaussians``.
 
     Returns:
         Float32 Gaussians on the CPU, ``quats`` normalised.
 
     Raises:
         UserError: the file is missing, not a ``.ply``, truncated or longer than it states, an
-            attribute is missing, or ``checked_gaussians`` refuses the Gaussians.
+            attribute is missing, the Gaussians change with time, or ``checked_gaussians`` refuses
+            them.
     """
     return gaussians_of(Path(path), read_ply(Path(path)), left_out)
 
 
 def gaussians_of(path: Path, data: PlyData, left_out: list[str] | None = None) -> Gaussians:
     """Return the Gaussians of a file's content, as ``load_ply`` does."""
-    arrays = (unpacked if data.header.is_packed else _activated)(path, data)
+    packed = data.header.is_packed
+    read = {*WORDS} if packed else {name for names in _GROUPS.values() for name in names}
+    unread = data.elements.get("vertex", {}).keys() - read - {*_WITHOUT_EFFECT}
+    names = ", ".join(sorted(name for name in unread if not _REST.fullmatch(name)))
+    if any(_TIME.fullmatch(name) for name in unread):
+        advice = "write those of one moment as a .ply of 3DGS"
+        raise UserError(f"{path}: its Gaussians change with time ({names}); {advice}")
+    if names:
+        warnings.warn(f"{path}: properties that are not read: {names}", FileWarning, stacklevel=2)
+    arrays = (unpacked if packed else _activated)(path, data)
     gaussians = checked_gaussians(path, arrays, left_out)
     gaussians = replace(gaussians, antialiased=MIP in data.header.comments)
     return flip_axes(gaussians) if TURNED in data.header.comments else gaussians

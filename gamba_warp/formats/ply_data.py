@@ -33,13 +33,14 @@ TYPES = {
 # taken for a point cloud.
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _GAUSSIANS = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
-_END = re.compile(rb"[\r\n]end_header[ \t]*\r?\n")  # on its own line; a comment may contain it
+# On its own line; a comment may contain it.
+_END = re.compile(rb"[\r\n]end_header[ \t]*(\r?\n|\r)")
 
 
 class PlyProperty(NamedTuple):
     """One property of an element, a number or a list of numbers."""
 
-    name: str
+    name: str  # in lower case; some programs write Red Green Blue
     kind: str  # numpy's type of the number, or of each number in the list, without byte order
     length: str = ""  # numpy's type of the list's length; empty for a number
 
@@ -119,6 +120,9 @@ def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
     end = _END.search(head)
     if end is None:
         raise UserError(f"{path}: the .ply header has no end")
+    start = end.end()
+    if b"\n" not in head[: end.start() + 1]:  # lines end with CR alone, and LF would be data
+        start = head.index(b"\r", end.start() + 1) + 1
     layout, comments = "none", []
     elements: list[PlyElement] = []
     for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
@@ -139,7 +143,7 @@ def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
                 if not elements:
                     raise UserError(f"{path}: the .ply header has a property before any element")
                 elements[-1].properties.append(_property(path, words))
-    return PlyHeader(layout, comments, elements, end.end())
+    return PlyHeader(layout, comments, elements, start)
 
 
 def _property(path: Path, words: list[str]) -> PlyProperty:
@@ -148,7 +152,7 @@ def _property(path: Path, words: list[str]) -> PlyProperty:
     if len(kinds) != 1 + is_list or not all(kinds):
         text = " ".join(words[1:])[:80]
         raise UserError(f"{path}: property '{text}' is neither a number nor a list of numbers")
-    return PlyProperty(words[-1], kinds[-1], kinds[0] if is_list else "")
+    return PlyProperty(words[-1].lower(), kinds[-1], kinds[0] if is_list else "")
 
 
 def read_ply(path: Path) -> PlyData:
@@ -174,7 +178,9 @@ def parse_ply(path: Path, file: BinaryIO, size: int) -> PlyData:
     file.seek(header.start)
     says = ", ".join(f"{element.count} {element.name}" for element in header.elements)
     if header.format == "ascii":
-        rows, first, found = read_rows(file.read(), str(path)), 0, {}
+        text, first, found = file.read(), 0, {}
+        text = text if b"\n" in text else text.replace(b"\r", b"\n")
+        rows = read_rows(text, str(path))
         for element in header.elements:
             count = element.count if element.properties else 0
             found[element.name] = _from_text(path, rows.part(first, count), element)

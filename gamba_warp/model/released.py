@@ -52,7 +52,7 @@ for _theirs, _ours in (
 ):  # fmt: skip
     for _end in ("weight", "bias"):
         _NAMES[f"decoder.{_theirs}.{_end}"] = f"decoder.{_ours}.{_end}"
-_COORDS = "decoder.coords"
+_COORDS, _STEM = "decoder.coords", "stem_layer.weight"
 _WRAPPERS = re.compile(r"(?<![^.])(?:module|_orig_mod)\.")
 # DINOv2 with registers, by the channels of its tokens.
 _VITS = {
@@ -104,8 +104,8 @@ def convert_released(
     """Convert their state dict to a configuration and weights with our names.
 
     Args:
-        state: their state dict; either some names begin with ``model.``, or none. Tensors of the
-            image encoder and of losses are ignored. ``module.`` and ``_orig_mod.``, added to names
+        state: their state dict, its names behind any prefix. Tensors of the image encoder, and
+            those without the prefix, are ignored. ``module.`` and ``_orig_mod.``, added to names
             by training on several GPUs and by torch's compiler, are removed.
         path: for the error message.
         depth: the expected number of blocks: missing last blocks cannot be detected otherwise.
@@ -152,13 +152,20 @@ def convert_released(
 
 
 def _plain_names(state: dict[str, Any], path: str) -> dict[str, Any]:
-    """Restore the names of their code: without the parts of wrappers, and below ``model.``."""
+    """Restore the names of their code: without the parts of wrappers, and below ``model.``.
+
+    The prefix of the network's own tensors may be any.
+    """
     plain = {_WRAPPERS.sub("", name): value for name, value in state.items()}
     if len(plain) < len(state):
         raise UserError(f"{path}: has a tensor twice, with 'module.' or '_orig_mod.' and without")
-    if any(name.startswith(_ROOT) for name in plain):
-        return plain
-    return {_ROOT + name: value for name, value in plain.items()}
+    roots = [name.removesuffix(_STEM) for name in plain if name.endswith(_STEM)]
+    root = min(roots, key=len, default=_ROOT)
+    return {
+        _ROOT + name.removeprefix(root): value
+        for name, value in plain.items()
+        if name.startswith(root)
+    }
 
 
 def released_names(depth: int) -> dict[str, str]:

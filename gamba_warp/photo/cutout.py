@@ -83,7 +83,7 @@ class CutoutOptions:
     """Options and loaded models of the cut-out, shared by all pictures of a command.
 
     Attributes:
-        mask: picture of the same size, white (or opaque) on the object.
+        mask: picture of the same size, brighter (or opaque) on the object.
         matte_model: an ISNet or U2-Net in ONNX, or the URL of a copy of one of rembg's; None: one
             of rembg's, from its cache or fetched.
         sam: a checkpoint of Segment Anything, used instead of the matting model.
@@ -267,6 +267,9 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
     warning, own = "", method in ("mask", "alpha", "none")
     doubts = [] if own else doubts_of(source, rgba[..., 3])
+    if method == "mask" and (edge := _on_border(rgba[..., 3] > 0.5)) > _BORDER:
+        inverted = " (is the mask inverted?)" if edge > _MOST_EDGE else ""
+        doubts.append(f"it touches the picture's border{inverted}")
     doubts += [found.doubt] if found.doubt else []
     if method == "grabcut":  # docs/reconstruct.md has the figure
         doubts.append("colours alone fail for more than half of photographs")
@@ -388,8 +391,7 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
         alpha: ``[H, W]`` in [0, 1].
     """
     inside, found = alpha > 0.5, []
-    edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
-    if edge.mean() > _BORDER:
+    if _on_border(inside) > _BORDER:
         found.append("it touches the picture's border")
     if find_spec("skimage") is not None:
         from skimage.measure import label
@@ -415,6 +417,11 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
     return found
 
 
+def _on_border(inside: np.ndarray) -> float:
+    """Return the fraction of a picture's border that an object ``[H, W]`` bool covers."""
+    return float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean())
+
+
 def fault_of(alpha: np.ndarray) -> str | None:
     """Return why a mask cannot be a single object completely in the picture; None if it can.
 
@@ -423,13 +430,12 @@ def fault_of(alpha: np.ndarray) -> str | None:
     """
     inside = alpha > 0.5
     share = inside.mean()
-    edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
     if share < _LEAST_SHARE:
         return "nothing stands out"
     if share > _MOST_SHARE:
         return "all of the picture would be the object"
-    if edge.mean() > _MOST_EDGE:
-        return f"it would touch {edge.mean():.0%} of the picture's border"
+    if (edge := _on_border(inside)) > _MOST_EDGE:
+        return f"it would touch {edge:.0%} of the picture's border"
     if alpha[(alpha > 0.1) & (alpha < 0.9)].sum() > _UNSURE * alpha.sum():
         return "it has no clear border"
     return None

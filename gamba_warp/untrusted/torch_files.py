@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tarfile
 import warnings
 import zipfile
 from pathlib import Path
@@ -37,6 +38,8 @@ def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any
         if not path.is_file():
             raise UserError(f"{path}: {'not a plain file' if path.exists() else 'no such file'}")
         size = path.stat().st_size
+        if tarfile.is_tarfile(path):  # which may hold a zip
+            raise ValueError("a tar archive; unpack it first")
         zipped = zipfile.is_zipfile(path)
         if zipped:
             _check_zip(path, size)
@@ -66,6 +69,9 @@ def _check_zip(path: Path, size: int) -> None:
     """Raise for compressed or overlapping members, and for wrong checksums."""
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
+        if not any(member.filename.endswith("data.pkl") for member in members):
+            names = ", ".join(member.filename for member in members[:3])
+            raise ValueError(f"a zip archive of {names[:200]}; unpack it first")
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
             raise ValueError("its members are compressed, which torch never does")
         if sum(member.file_size for member in members) > size:

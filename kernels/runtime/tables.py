@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]], aligned: bool = False) -> str:
-    """A table in Markdown; a ``|`` inside a cell is escaped.
+    """A table in Markdown; a ``|`` and a line end inside a cell are escaped.
 
     Args:
         header: names of the columns.
         rows: cells of each row, as many as there are columns.
         aligned: True to align the columns in plain text too.
     """
-    lines = [[cell.replace("|", "\\|") for cell in line] for line in (header, *rows)]
+    escapes = str.maketrans({"|": "\\|", "\n": "\\n"})
+    lines = [[cell.translate(escapes) for cell in line] for line in (header, *rows)]
     widths = [max(map(len, column)) if aligned else 0 for column in zip(*lines)]
     lines.insert(1, ["-" * max(3, width) for width in widths])
     return "\n".join("| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines)

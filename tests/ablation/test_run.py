@@ -32,6 +32,7 @@ def gamba(tmp_path, monkeypatch):
     """Runs ``gamba ablate`` on a plan, and returns its exit code and the commands that it ran."""
     monkeypatch.setenv("FAKE_CALLS", str(tmp_path / "calls"))
     monkeypatch.setattr(processes, "GAMBA", FAKE)
+    micro.write_dataset(tmp_path / "data")
 
     def run(path, *words):
         (tmp_path / "calls").write_text("")
@@ -106,6 +107,19 @@ def test_a_dry_run_prints_the_commands(gamba, tmp_path, capsys):
     assert code == 0 and not called and not (tmp_path / "out").exists()
     assert first.startswith("gamba train ") and "--threads 3" in first and "--seed 0" in first
     assert second.startswith("gamba eval-views ")
+
+
+def test_invalid_data_stop_before_the_first_run(gamba, tmp_path, capsys):
+    """And options may change until a run has begun."""
+    path, data = write_plan(tmp_path, "a"), tmp_path / "data"
+    data.rename(tmp_path / "elsewhere")
+    assert gamba(path) == (2, []) and not (tmp_path / "out").exists()
+    assert capsys.readouterr().err.count("\n") == 1
+    (tmp_path / "elsewhere").rename(data)
+    folder = tmp_path / "out" / "rows" / "a" / "seed-0"
+    folder.mkdir(parents=True)
+    (folder / "commands.json").write_text('{"an earlier": ["try"]}')
+    assert gamba(path)[0] == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

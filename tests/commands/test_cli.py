@@ -307,7 +307,7 @@ def test_a_value_out_of_its_range_is_one_line_before_anything_starts(
         (OSError(28, "No space left on device"), "No space left on device"),
         (OSError(24, "Too many open files"), "Too many open files"),
         (UnicodeEncodeError("utf-8", "caf\udce9", 3, 4, "surrogates not allowed"), "not UTF-8"),
-        (UserError("two\nlines"), "two lines\n"),
+        (UserError("two\nlines"), "two\\nlines\n"),
         (KeyboardInterrupt(), "interrupted\n"),
         *[(error, None) for error in (ZeroDivisionError(), RecursionError())],
         *[(error("a defect"), None) for error in (OSError, UnicodeError)],

@@ -12,8 +12,9 @@ from gamba_warp import batch, cli
 from gamba_warp.errors import PrintableStream, printable
 from gamba_warp.formats.gaussians.files import write_gaussians
 
-# Sets a terminal's title, rings, clears the screen, and turns the direction of the text.
-ODD = "a\x1b]0;title\x07\x1b[2J\r\u202e\u2066b\x9b"
+# Sets a terminal's title, rings, clears the screen, turns the direction of the text, and starts a
+# line of its own.
+ODD = "a\x1b]0;title\x07\x1b[2J\r\u202e\u2066b\x9b\nFORGED"
 
 
 def obeyed(text):
@@ -67,9 +68,11 @@ def test_output_of_commands(name, folder, checkpoint, monkeypatch, capfd):
     texts = capfd.readouterr()
     assert texts.out + texts.err
     assert not obeyed(texts.out) | obeyed(texts.err)
+    assert not any(line.startswith("FORGED") for line in (texts.out + texts.err).splitlines())
     if name == "export":  # what must not be there is there with escapes
         assert "\\x1b]0;title\\x07" in texts.out and "\\u202e" in texts.out
         assert "\\x1b]0;title\\x07" in texts.err
+        assert all(line.count("FORGED") < 2 for line in texts.err.splitlines())
 
 
 def test_printable():

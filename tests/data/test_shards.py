@@ -4,6 +4,7 @@ import io
 import json
 import os
 import tarfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -106,8 +107,12 @@ def test_shards_give_the_bits_of_the_files(data, tmp_path, size):
     refused("shards, which only gamba train reads", open_dataset, tmp_path / "pack")
 
 
-def test_shards_keep_the_bytes_of_the_pictures(data, tmp_path):
+def test_shards_keep_the_bytes_of_the_pictures(data, tmp_path, monkeypatch):
     packed(data, tmp_path / "pack")
+    content = {path.name: path.read_bytes() for path in (tmp_path / "pack").iterdir()}
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    packed(data, tmp_path / "pack")
+    assert content == {path.name: path.read_bytes() for path in (tmp_path / "pack").iterdir()}
     with tarfile.open(tmp_path / "pack" / "train-00000.tar") as tar:
         found = {member.name: tar.extractfile(member).read() for member in tar}
     assert found["a.001.png"] == (data / "a/1.png").read_bytes()

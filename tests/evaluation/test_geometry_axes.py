@@ -82,7 +82,7 @@ def test_misstated_axes_are_warned_of(files, capfd):
         assert said.startswith("1 of 1 predictions") and "by 180 degrees about x" in said
         assert f"warning: {said}" in err and err.count("warning:") == 1
         turned = report["objects"][0]["chamfer_turned"]
-        assert turned["180 degrees about x"] < 0.2 * turned["as it is"]
+        assert turned["turned by 180 degrees about x"] < 0.2 * turned["as it is"]
         assert "chamfer_turned" not in report["mean"]
 
 
@@ -134,6 +134,32 @@ def test_axes_can_be_asked_for(files, capfd):
     assert report["mean"]["iou"] > 0.99
 
 
+def test_mirrored_files_are_told_from_rotated_ones(tmp_path, capfd):
+    """Also after an alignment that searches all rotations, which mends rotations alone."""
+    sides = [(1.0, 0.2, 0.3), (0.2, 0.7, 0.2), (0.3, 0.2, 0.5)]
+    boxes = [trimesh.creation.box(side) for side in sides]
+    for mesh, place in zip(boxes, np.eye(3) * 0.4):
+        mesh.apply_translation(place)
+    mesh = trimesh.util.concatenate(boxes)
+    mesh.export(tmp_path / "true.obj")
+    for name, matrix in (
+        ("mirrored along z", [1, 1, -1]),
+        ("turned by 180 degrees about x", [1, -1, -1]),
+    ):
+        wrong = mesh.copy()
+        wrong.vertices = mesh.vertices * matrix
+        wrong.export(tmp_path / "pred.obj")
+        report, _ = evaluate(capfd, tmp_path / "pred.obj", tmp_path / "true.obj")
+        assert f"far smaller Chamfer distance {name} (" in report["warnings"][0]
+        words = [tmp_path / "pred.obj", tmp_path / "true.obj", "--align", "turn", "icp"]
+        report, _ = evaluate(capfd, *words)
+        if name.startswith("turned"):
+            assert report["warnings"] == []
+        else:
+            (said,) = report["warnings"]
+            assert "mirrored along x (" in said and "left-handed" in said
+
+
 def test_good_shapes_are_not_warned_of(tmp_path, capfd):
     """A symmetric cube, and a poor prediction that no rotation improves."""
     trimesh.creation.box().export(tmp_path / "cube.obj")
@@ -146,7 +172,11 @@ def test_one_turn_of_many_is_one_warning():
     """Poor predictions, all slightly improved by a rotation, but none a lot."""
 
     def record(straight, turned):
-        values = {"as it is": straight, "180 degrees about x": turned, "180 degrees about y": 0.2}
+        values = {
+            "as it is": straight,
+            "turned by 180 degrees about x": turned,
+            "mirrored along x": 0.2,
+        }
         return {"name": "a", "chamfer_turned": values}
 
     (said,) = turn_warnings([record(0.06, 0.045)] * 4 + [record(0.05, 0.05)])

@@ -454,6 +454,9 @@ def test_morph_targets_and_sparse_values(tmp_path):
     assert places(document.load(tmp_path))[..., 2].max() == 2.5
     document.tree["nodes"][0]["weights"] = [2]
     assert places(document.load(tmp_path))[..., 2].max() == 10
+    document.tree["nodes"][0]["weights"] = []
+    refused(r"nodes\[0\].weights: Expected .* of length >= 1", document.load, tmp_path)
+    del document.tree["nodes"][0]["weights"]
     document.attributes["POSITION"] = document.array(SQUARE, sparse=sparse)
     document.primitive["targets"] = []
     assert places(document.load(tmp_path))[:, :, 2].tolist() == [[0, 0, 5], [0, 5, 0]]
@@ -568,6 +571,10 @@ UNREAD = {
         for name in ("KHR_materials_clearcoat", "KHR_materials_transmission", "MSFT_lod")
     },
     "listed": (changed(("extensionsUsed",), ["ADOBE_x"]), "the extension ADOBE_x is not supported"),
+    "version": (
+        changed(("asset", "minVersion"), "2.1"),
+        "the file needs a reader of glTF 2.1, and is read as 2.0",
+    ),
 }
 
 

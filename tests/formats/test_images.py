@@ -165,6 +165,13 @@ def test_colour_spaces_told_by_numbers(tmp_path, name):
     assert not lines
 
 
+@pytest.mark.parametrize("tag, value", [(0xC612, b"\1\4\0\0"), (0xFE, 1)])
+def test_raw_photographs_are_refused(tmp_path, tag, value):
+    """Of these Pillow would read a preview."""
+    colours().save(tmp_path / "a.dng", "TIFF", tiffinfo={tag: value})
+    refused("a raw photograph, .* preview of 7x5", load_rgba, tmp_path / "a.dng")
+
+
 def test_colours_of_pq(tmp_path):
     """A grey of 203 cd/m² is white; half of its light is half of white's."""
     for value, want in ((148, 255), (130, 188)):

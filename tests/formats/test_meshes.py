@@ -1,4 +1,5 @@
 import re
+import unicodedata
 
 import numpy as np
 import pytest
@@ -84,6 +85,18 @@ def test_texture_without_uvs_becomes_its_mean(tmp_path):
 def test_texture_names_of_other_systems(tmp_path, name):
     mesh = load_mesh(write_quad(tmp_path, mtl=MTL.replace("paint.png", name)))
     assert mesh.materials[0].texture is not None, mesh.warnings
+
+
+def test_texture_names_may_be_decomposed(tmp_path):
+    """Archives made on macOS store an umlaut as a letter and a mark."""
+    stored = unicodedata.normalize("NFD", "wörk.png")
+    path = write_quad(tmp_path, mtl=MTL.replace("paint.png", "wörk.png"), texture=stored)
+    assert load_mesh(path).materials[0].texture is not None
+
+
+def test_colours_that_are_not_rgb_are_named(tmp_path):
+    mesh = load_mesh(write_quad(tmp_path, mtl="newmtl paint\nKd xyz 0.1 0.2 0.3\n"))
+    assert mesh.warnings == ["the colour of paint is not read: Kd xyz 0.1 0.2 0.3"]
 
 
 def test_negative_indices_count_back_from_their_line(tmp_path):

@@ -2,6 +2,8 @@
 
 import inspect
 import os
+import tarfile
+import zipfile
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -214,6 +216,8 @@ WRAPPED = (
     lambda name: "module._orig_mod." + name,
     lambda name: name.replace("model.", "model._orig_mod.", 1),
     lambda name: name.removeprefix("model."),
+    lambda name: "net." + name.removeprefix("model."),
+    lambda name: "model." + name,
     lambda name: "_orig_mod." + name.removeprefix("model."),
 )
 
@@ -229,6 +233,12 @@ def test_wrappers_names_are_left_out(golden, tmp_path, wide):
         assert torch.equal(got.decoder.position.weight, want.decoder.position.weight)
     torch.save(content | {"module." + name: value for name, value in content.items()}, path)
     refused("has a tensor twice, with 'module.'", load_released, path, depth=2)
+    with zipfile.ZipFile(tmp_path / "a.pth", "w") as archive:
+        archive.write(path, "theirs.pth")
+    refused("a zip archive of theirs.pth; unpack it first", load_released, tmp_path / "a.pth")
+    with tarfile.open(tmp_path / "a.pth", "w") as archive:
+        archive.add(path, "theirs.pth")
+    refused("a tar archive; unpack it first", load_released, tmp_path / "a.pth")
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,35 @@ def test_each_way_in_its_order(tmp_path, network, busy):
         assert found.method == "mask" and iou(found.mask, half) > 0.99 and "mask.png" in found.how
 
 
+def grey(values):
+    return Image.fromarray(np.asarray(values).astype(np.uint8))
+
+
+MASKS = {  # of an object, in the values of files
+    "white": lambda inside: grey(255 * inside),
+    "one": lambda inside: grey(inside),
+    "label": lambda inside: grey(7 + 8 * inside),
+    "color": lambda inside: grey([128, 0, 0] * inside[..., None]),
+    "alpha": lambda inside: grey([0, 0, 0, 255] * inside[..., None]),
+    "inverted": lambda inside: grey(255 * ~inside),
+    "labels": lambda inside: grey(1 * inside + (np.arange(SIZE[1]) > 50)),
+}
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_masks_of_any_two_values(tmp_path, busy, name):
+    path, alpha = busy
+    MASKS[name](alpha > 0.5).save(tmp_path / "mask.png")
+    options = CutoutOptions(mask=tmp_path / "mask.png")
+    if name == "labels":
+        return refused("has 3 labels; a mask is bright on the object alone", cut_out, path, options)
+    found = cut_out(path, options)
+    if name == "inverted":
+        assert "the picture's border (is the mask inverted?)" in found.warning
+    else:
+        assert iou(found.mask, alpha > 0.5) == 1 and not found.warning
+
+
 def test_the_chosen_method_is_used(tmp_path, network, busy):
     path, alpha = busy
     rgba = load_rgba(path)

@@ -27,7 +27,7 @@ from msgspec import Meta
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.data.gso import scanned
 from gamba_warp.data.layouts import EncodedPicture, ObjectFiles, object_of
-from gamba_warp.errors import FileWarning, UserError, first_line, one_line
+from gamba_warp.errors import FileWarning, UserError, first_line
 from gamba_warp.untrusted.documents import MAX_BYTES, parse_document, read_bytes
 
 INDEX = "shards-{}.json"  # of a split
@@ -173,5 +173,5 @@ def _read_object(sample: dict[str, Any], uid: str) -> ObjectFiles:
     files = object_of([(source, document, find)])
     if contents:
         line = f"{sample['__url__']}: files that no .json of their object names are not read"
-        warnings.warn(one_line(line), FileWarning, stacklevel=2)
+        warnings.warn(line, FileWarning, stacklevel=2)
     return files

@@ -16,7 +16,7 @@ from typing import Annotated, Literal, TypeVar
 import tyro
 from msgspec import Meta
 
-from gamba_warp.batch import counted
+from gamba_warp.batch import counted, say
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
 from gamba_warp.untrusted.ranges import Seed, ranged, shard_numbers
@@ -64,9 +64,9 @@ class Share:
 def _report(failures: Mapping[str, str], what: str, warnings: Mapping[str, list[str]]) -> int:
     """Print failures and warnings; return the exit code."""
     for name, lines in sorted(warnings.items()):
-        print(f"warning: {name}: {'; '.join(lines)}")
+        say(f"warning: {name}: {'; '.join(lines)}")
     for name, reason in sorted(failures.items()):
-        print(f"{what}: {name}: {reason}", file=sys.stderr)
+        say(f"{what}: {name}: {reason}", sys.stderr)
     return 1 if failures else 0
 
 
@@ -210,7 +210,7 @@ def data_index_command(data: tyro.conf.Positional[Path]) -> int:
     path, count, bad = index_dataset(data)
     print(f"{counted(count, 'object')}, {len(bad):,} left out, listed in {path}")
     for uid, reason in list(bad.items())[:_MAX_SHOWN]:
-        print(f"left out: {uid}: {reason}", file=sys.stderr)
+        say(f"left out: {uid}: {reason}", sys.stderr)
     if (rest := len(bad) - _MAX_SHOWN) > 0:
         print(f"left out: {rest:,} more, see {path}", file=sys.stderr)
     return 1 if bad else 0

@@ -56,7 +56,7 @@ def write_pack(
     splits = splits_of(data, dataset.uids)
     by_hash = sorted(dataset.uids, key=lambda uid: hashlib.sha256(uid.encode()).digest())
     counts, failures = Counter[str](), dict[str, str]()
-    options = {"maxsize": shard_mb * 2**20, "encoder": False, "verbose": 0}
+    options = {"maxsize": shard_mb * 2**20, "encoder": False, "verbose": 0, "mtime": 0}
     with (
         atomic_folder(out, replace=True) as made,
         progress_bar(total=len(by_hash), desc="packing", unit="object") as bar,

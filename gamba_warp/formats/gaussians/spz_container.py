@@ -8,7 +8,9 @@ anything is unpacked, and no more is unpacked than they say.
 
 from __future__ import annotations
 
+import gzip
 import importlib
+import io
 import struct
 import zlib
 from dataclasses import dataclass
@@ -78,9 +80,9 @@ def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]
 
 
 def _from_gzip(path: Path, content: bytes) -> Unpacked:
-    stream = zlib.decompressobj(31)  # 31: with gzip's header and checksum
+    stream = gzip.GzipFile(fileobj=io.BytesIO(content))
     try:
-        head = stream.decompress(content, HEADER.size)
+        head = stream.read(HEADER.size)
         if len(head) < HEADER.size or not head.startswith(MAGIC):
             raise UserError(f"{path}: not an .spz file")
         _, version, count, _, _, flags, _ = HEADER.unpack(head)
@@ -88,17 +90,15 @@ def _from_gzip(path: Path, content: bytes) -> Unpacked:
             raise UserError(f"{path}: .spz of version {version}, in gzip only 1 to 3 are supported")
         sizes, found = _sizes(path, head, len(content))
         wanted = sum(sizes)
-        body = stream.decompress(stream.unconsumed_tail, wanted + 1)
+        body = stream.read(wanted + 1)
         records = body[wanted:]
-        if flags & _MORE and stream.unconsumed_tail:
-            records += stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
-    except zlib.error as error:
-        raise UserError(f"{path}: truncated or damaged ({error})") from error
+        if flags & _MORE and records:
+            records += stream.read(_MAX_EXTENSIONS)
+    except (EOFError, OSError, zlib.error) as error:
+        raise UserError(f"{path}: truncated or damaged ({first_line(error)})") from error
     compare_sizes(path, f"{count} Gaussians", wanted, len(body), exact=False)
     if records and not flags & _MORE:
         raise UserError(f"{path}: invalid header, more data follows than {count} Gaussians need")
-    if not stream.eof:
-        raise UserError(f"{path}: truncated, the gzip stream has no end")
     _check_axes(path, records)
     found.body = body[:wanted]
     return found

@@ -108,6 +108,14 @@ def test_an_spz_bomb_and_a_damaged_stream(sound):
     refused(path, "damaged")
 
 
+def test_an_spz_of_two_members_is_read(sound):
+    """gzip files may be joined."""
+    path, data = sound("spz")
+    want, inner = read_gaussians(path), gzip.decompress(data)
+    path.write_bytes(gzip.compress(inner[:30]) + gzip.compress(inner[30:]))
+    assert torch.equal(read_gaussians(path).means, want.means)
+
+
 def test_an_spz_with_extensions_is_read(sound, tmp_path):
     path, data = sound("spz")
     want = read_gaussians(path)

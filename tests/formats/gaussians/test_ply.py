@@ -144,6 +144,32 @@ def test_red_green_blue_are_colours_where_there_are_no_harmonics(tmp_path, form,
     assert loaded.means.tolist() == [[1, 1, 1]] * 2 and loaded.degree == 0
 
 
+def test_properties_that_are_not_read_are_named_and_moments_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    others = ["nx", "ny", "nz", "red", "green", "blue", *rest_names(9)]
+    write(path, header(1, properties=[*PROPERTIES, *others]), np.ones(29, "<f4").tobytes())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert splat_kind(path) == "ply" and load_ply(path).num == 1
+    write(path, header(1, properties=[*PROPERTIES, "filter_3D"]), np.ones(15, "<f4").tobytes())
+    with pytest.warns(FileWarning, match="properties that are not read: filter_3d"):
+        load_ply(path)
+    for name in ("trbf_center", "motion_0", "omega_3", "rot_r_0", "t", "scale_t", "delta_x_t7"):
+        write(path, header(1, properties=[*PROPERTIES, name]), np.ones(15, "<f4").tobytes())
+        refused(rf"Gaussians change with time \({name}\)", load_ply, path)
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_lines_may_end_with_cr_alone(tmp_path, form):
+    """The first byte of the data is then no line end, also if it is 10."""
+    row = np.ones((1, 14), "<f4")
+    row.view(np.uint8)[0, 0] = 10
+    body = row.tobytes() if form != "ascii" else (" ".join(["1"] * 14) + "\r").encode()
+    lines = "\r".join(["ply", *header(1, form=form), "end_header", ""]).encode()
+    (tmp_path / "a.ply").write_bytes(lines + body)
+    np.testing.assert_allclose(load_ply(tmp_path / "a.ply").means, 1, atol=1e-5)
+
+
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
 def test_another_element_may_come_first_and_a_comment_may_say_end_header(tmp_path, form):
     first = ["element camera 2", "property uchar id", "property list uchar float lens"]
