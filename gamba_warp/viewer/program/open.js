@@ -11,6 +11,7 @@ const SCALARS = {
 };
 const HERE = "Only Gaussians (.ply, .splat, .spz) and meshes (.glb, .obj, .stl) open here";
 const OTHER = `${HERE}; for this file try: gamba view FILE`;
+const KNOWN = /^([xyz]|n[xyz]|f_dc_[012]|f_rest_\d+|opacity|scale_[012]|rot_[0-3]|red|green|blue|alpha|packed_\w+)$/;
 
 // Elements of a .ply by name, each with its count, the names of its properties and `get`, or an
 // error with a reason for the user.
@@ -51,6 +52,8 @@ function plyElements(buffer) {
 
 function readPly(buffer) {
   const [elements, about] = plyElements(buffer), { vertex } = elements, { count, names } = vertex;
+  const unread = names.filter((name) => !KNOWN.test(name));
+  if (unread.length) throw new Error(`The properties ${unread.slice(0, 5).join(", ")} are not read here; try: gamba view FILE`);
   if (elements.chunk) return readCompressed(elements, about);
   const read = (wanted, change = (x) => x) => {
     const values = new Float32Array(count * wanted.length);
