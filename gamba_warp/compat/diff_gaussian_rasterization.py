@@ -259,12 +259,13 @@ def rasterize_gaussians(
     bins = bin_op(*(s.detach() for s in splats), width, height, ALPHA_MIN, SKIP, True)
     size = Size(width, height, 1, int(channels.dim() == 3), SKIP)
     drawn = centers, projected.conics, shown, channels
-    renders, alphas, *_ = composite(*drawn, list(bins), list(size), list(LIMITS), None, None)
+    given = list(bins), list(size), list(LIMITS), None, None
+    renders, transmittances, *_ = composite(*drawn, *given)
     layers = renders[0].permute(2, 0, 1)
-    alpha = alphas[0].permute(2, 0, 1)
+    clear = transmittances[0].permute(2, 0, 1)
     bg = settings.bg.detach().to(layers)[:, None, None]
-    color = (layers[: len(bg)] + (1 - alpha) * bg).contiguous()
-    results = [color, radii, layers[len(bg) :].contiguous(), alpha.contiguous()]
+    color = (layers[: len(bg)] + clear * bg).contiguous()
+    results = [color, radii, layers[len(bg) :].contiguous(), (1 - clear).contiguous()]
     return _Results(results[: 2 if channels is colors else 4 if fork == "ashawkey" else 3])
 
 

@@ -131,13 +131,13 @@ def rasterization(
     skipped = None if compiling else bins.starts.new_zeros(tiles)
     drawn = projected.means2d, projected.conics, projected.view_opacities, channels
     lists = list(bins), list(size), list(limits)
-    renders, alphas, *walk = composite(*drawn, *lists, skipped, None)
-    renders = _finish(render_mode, renders, alphas, x.backgrounds)
+    renders, transmittances, *walk = composite(*drawn, *lists, skipped, None)
+    renders = _finish(render_mode, renders, transmittances, x.backgrounds)
     meta = Meta(call, bins, Walk(*walk), skipped)
     # under gsplat's names
     meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
     meta.update(opacities=projected.view_opacities, width=width, height=height, tile_size=TILE)
-    return renders, alphas, meta
+    return renders, 1.0 - transmittances, meta
 
 
 def _dense(x: Tensor | None) -> Tensor | None:
@@ -165,8 +165,13 @@ def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
     return torch.cat(parts, -1)
 
 
-def _finish(render_mode: str, renders: Tensor, alphas: Tensor, backgrounds: Tensor | None):
-    """Expected depth, and the background behind the colour channels."""
+def _finish(
+    render_mode: str, renders: Tensor, transmittances: Tensor, backgrounds: Tensor | None
+) -> Tensor:
+    """Expected depth, and the background behind the colour channels.
+
+    The background's weight is T: 1 - alpha has lost digits where a pixel is almost opaque.
+    """
     depth = None
     if render_mode.endswith("ED"):
         depth, weight, renders = renders.split([1, 1, renders.shape[-1] - 2], -1)
@@ -174,5 +179,5 @@ def _finish(render_mode: str, renders: Tensor, alphas: Tensor, backgrounds: Tens
     elif render_mode != "RGB":
         depth, renders = renders.split([1, renders.shape[-1] - 1], -1)
     if backgrounds is not None and renders.shape[-1]:
-        renders = renders + (1.0 - alphas) * backgrounds[..., None, None, :]
+        renders = renders + transmittances * backgrounds[..., None, None, :]
     return renders if depth is None else torch.cat([renders, depth], -1)

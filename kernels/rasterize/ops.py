@@ -220,7 +220,7 @@ def composite(
     skipped: Tensor | None,
     absolute: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blend the pairs: pictures, alphas and the fields of a ``Walk``.
+    """Blend the pairs: pictures, their final transmittances and the fields of a ``Walk``.
 
     ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
     Gaussians or, shared by the views, one for each of an object's. The lists hold the values of
@@ -231,8 +231,8 @@ def composite(
     """
     splats = Drawn(means2d, conics, view_opacities, colors.flatten(0, -2))
     given = splats, Bins(*bins), _picture(means2d, size, limits)
-    renders, alphas, walk = _compositor(means2d.device).composite_forward(*given)
-    return renders, alphas, *walk
+    renders, transmittances, walk = _compositor(means2d.device).composite_forward(*given)
+    return renders, transmittances, *walk
 
 
 def _picture(means2d: Tensor, size: list[int], limits: list[float]) -> Picture:
@@ -292,11 +292,11 @@ def _(splats, bins, size, limits, walk, v_pixels, skipped, geometry, absolute):
 
 def _composite_setup(ctx, inputs, output):
     *splats, bins, ctx.size, ctx.limits, ctx.skipped, ctx.absolute = inputs
-    renders, alphas, *walk = output
+    renders, transmittances, *walk = output
     ctx.mark_non_differentiable(*walk)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*splats, *bins, *walk)
-    ctx.shapes = renders.shape, alphas.shape
+    ctx.shapes = renders.shape, transmittances.shape
 
 
 def _composite_backward(ctx, *cotangents):

@@ -104,7 +104,7 @@ class Pixels:
     """The pictures, or the gradient that comes from them; by pixels of all of them."""
 
     renders: wp.array2d[wp.float32]
-    alphas: wp.array2d[wp.float32]
+    transmittances: wp.array2d[wp.float32]  # the final ones
 
 
 class Drawn(NamedTuple):

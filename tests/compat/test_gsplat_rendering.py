@@ -58,6 +58,23 @@ def test_pictures_and_gradients(packed, mode, lead, kind):
         assert_rel_rms(got[name].grad, want[name].grad, limit, name)
 
 
+def test_the_background_behind_almost_opaque_pixels():
+    """Its weight is T, of which 1 - alpha would have lost four digits; also of given lists."""
+    scene = make(1, 1, num=7, width=21, height=18)
+    scene["scales"][:], scene["opacities"][:] = 1e3, 0.7  # every pixel alike: no error averages out
+    got, want, again = asking(scene), asking(scene), asking(scene)["backgrounds"]
+    renders, alphas, meta = rasterization(**got, packed=False)
+    assert alphas.min() > 0.9997
+    lists = 21, 18, 16, meta["isect_offsets"], meta["flatten_ids"]
+    splats = (meta[name].detach() for name in ("means2d", "conics"))
+    colors = scene["colors"][:, None]
+    other = rasterize_to_pixels(*splats, colors, meta["opacities"].detach(), *lists, again)[0]
+    for picture in (renders, other, ours(**want, alpha_max=0.999)[0]):
+        picture.sum().backward()
+    for found in (got["backgrounds"], again):
+        assert_rel_rms(found.grad, want["backgrounds"].grad, 1e-6, "backgrounds")
+
+
 @pytest.mark.parametrize("per_view", [False, True])
 @pytest.mark.parametrize("degree", [0, 3, 4])
 def test_harmonics(per_view, degree):

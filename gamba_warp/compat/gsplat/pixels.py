@@ -147,7 +147,7 @@ def blend(
     views: int = 1,
     keep: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Composite I pictures ``[I, H, W, C]`` and alphas ``[I, H, W, 1]``, with gradients.
+    """Composite I pictures ``[I, H, W, C]``, with their transmittances ``[I, H, W, 1]``.
 
     Args:
         layers: R rows of each picture: means2d ``[I, R, 2]`` pixels, conics ``[I, R, 3]`` (a, k, e
@@ -166,8 +166,8 @@ def blend(
         means2d = means2d.view_as(means2d)  # it has no other gradient than the compositor's
         means2d.register_hook(lambda _: keep(sums.flatten(0, 1).clone()))
     given = list(bins), list(size), list(LIMITS), None, sums
-    renders, alphas, *_ = composite(means2d, *layers[1:], *given)
-    return renders, alphas
+    renders, transmittances, *_ = composite(means2d, *layers[1:], *given)
+    return renders, transmittances
 
 
 def rasterize_to_pixels(
@@ -295,7 +295,7 @@ def rasterize_to_pixels(
         whole = apart[:, :, :tile_size, :, :tile_size].flatten(3, 4).flatten(1, 2)
         whole = whole[:, :image_height, :image_width]
         found.append(whole.reshape(*lead, *whole.shape[1:]))
-    renders, alphas = found
+    renders, transmittances = found
     if backgrounds is not None:
-        renders = renders + (1 - alphas) * backgrounds.expand(shape)[..., None, None, :]
-    return renders, alphas
+        renders = renders + transmittances * backgrounds.expand(shape)[..., None, None, :]
+    return renders, 1 - transmittances

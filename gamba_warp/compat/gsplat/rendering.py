@@ -205,12 +205,13 @@ def rasterization(
         meta["means2d"].absgrad = shown(values.view(splats.means2d.shape))
 
     shared = views if blended.dim() == 3 else 1
-    renders, alphas = blend(layers, bins, tiling, shared, keep if absgrad else None)
+    renders, transmittances = blend(layers, bins, tiling, shared, keep if absgrad else None)
+    alphas = 1 - transmittances
     if render_mode != "RGB":
         renders, depth = renders.split([renders.shape[-1] - 1, 1], -1)
         depth = depth / alphas.clamp_min(1e-10) if render_mode.endswith("ED") else depth
     if colored and backgrounds is not None:
-        renders = renders + (1 - alphas) * flat(backgrounds, lead).flatten(0, 1)[:, None, None]
+        renders = renders + transmittances * flat(backgrounds, lead).flatten(0, 1)[:, None, None]
     if render_mode != "RGB":
         renders = torch.cat([renders, depth], -1)
 

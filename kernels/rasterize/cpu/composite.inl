@@ -171,7 +171,7 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
         for (int c = 0; c <= channels; ++c) v[c] = F{};
         pixels_of(tile, b, [&](int l, size_t pixel) {
             for (int c = 0; c < channels; ++c) v[c][l] = pixels.renders.data[pixel * channels + c];
-            v[channels][l] = pixels.alphas.data[pixel];
+            v[channels][l] = -pixels.transmittances.data[pixel];
         });
         for (int c = 0; c <= channels; ++c) nonzero |= v[c] != 0.0f;
     }
@@ -339,7 +339,7 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
     for (int b = 0; b < BLOCKS; ++b)
         pixels_of(tile, b, [&](int l, size_t pixel) {
             const float T = Ts[b][l];
-            pixels.alphas.data[pixel] = 1.0f - (T < 0.0f ? -T : T);
+            pixels.transmittances.data[pixel] = T < 0.0f ? -T : T;
             for (int c = 0; c < channels; ++c)
                 pixels.renders.data[pixel * channels + c] = sums[b * channels + c][l];
         });

@@ -97,13 +97,13 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         picture: from ``make_picture``.
 
     Returns:
-        ``renders [.., H, W, C]``, ``alphas [.., H, W, 1]`` and a ``Walk``.
+        ``renders [.., H, W, C]``, transmittances ``[.., H, W, 1]`` and a ``Walk``.
     """
     colors = splats.colors
     images, channels = splats.means2d.shape[:-2], colors.shape[1]
     tiles = images.numel() * picture.tiles_x * picture.tiles_y
     renders = colors.new_zeros(*images, picture.height, picture.width, channels)
-    alphas = colors.new_zeros(*images, picture.height, picture.width, 1)
+    transmittances = colors.new_ones(*images, picture.height, picture.width, 1)
     walk = Walk(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
@@ -117,11 +117,11 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         as_struct(splats),
         as_struct(bins),
         as_struct(walk),
-        Packed(Pixels, renders, alphas),
+        Packed(Pixels, renders, transmittances),
         _workers(BLOCKS * channels),
     ]
     parallel_launch(_composite, torch.get_num_threads(), arguments)
-    return renders, alphas, walk
+    return renders, transmittances, walk
 
 
 def composite_backward(
@@ -142,7 +142,7 @@ def composite_backward(
         bins: as forward.
         picture: as forward.
         walk: as returned forward.
-        v_pixels: gradients of the renders ``[.., H, W, C]`` and the alphas ``[.., H, W, 1]``.
+        v_pixels: gradients of the renders and the transmittances.
         skipped: ``[tiles]`` int32, raised to 1 for a tile that is skipped and 2 for one walked.
         geometry: True to compute more than the gradient of the colours.
         absolute: ``[.., N, 2]``, set to the pixels' absolute gradients of means2d, summed; or None.

@@ -251,7 +251,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
             begin = p.image * picture.num
             walked = -walked_in[p.tile]
         # T is as forward left it, negative until the walk reaches where the pixel stopped; R is
-        # R of README eq. 10, less the gradient of alpha, which is the same for all pairs
+        # R of README eq. 10, plus the gradient of T_end, which is the same for all pairs
         T = pixels_type()
         R = pixels_type()
         upstream = upstream_type()
@@ -266,7 +266,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 largest = wp.float32(0.0)
                 if gaussians.first == 0:
-                    R[j] = -L.load(v_pixels_in.alphas, p.pixel, step)
+                    R[j] = L.load(v_pixels_in.transmittances, p.pixel, step)
                     largest += wp.abs(R[j])
                 step *= gaussians.channels
                 for c in range(wp.static(channels)):

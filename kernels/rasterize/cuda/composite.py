@@ -67,7 +67,7 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
     images, channels = splats.means2d.shape[:-2], colors.shape[1]
     tiles = images.numel() * picture.tiles_x * picture.tiles_y
     renders = colors.new_empty(*images, picture.height, picture.width, channels)
-    alphas = colors.new_empty(*images, picture.height, picture.width, 1)
+    transmittances = colors.new_empty(*images, picture.height, picture.width, 1)
     parts = parts_of_tile(tiles, colors.device)
     walk = Walk(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
@@ -84,9 +84,9 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         walk.records,
         channels,
         [as_struct(bins)],
-        [as_struct(walk), Packed(Pixels, renders, alphas)],
+        [as_struct(walk), Packed(Pixels, renders, transmittances)],
     )
-    return renders, alphas, walk
+    return renders, transmittances, walk
 
 
 def composite_backward(

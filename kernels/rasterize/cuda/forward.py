@@ -194,7 +194,7 @@ def _walking(channels: int, parts: int, listed: bool):
             L.store(walked_out.transmittances, p.walk_row, j * WARP, T[j])
             if T[j] != 0.0:
                 step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
-                L.store(pixels_out.alphas, p.pixel, step, 1.0 - wp.abs(T[j]))
+                L.store(pixels_out.transmittances, p.pixel, step, wp.abs(T[j]))
                 step *= gaussians.channels
                 for c in range(wp.static(channels)):
                     L.store(pixels_out.renders, first, step + c, sums[j, c])

@@ -142,6 +142,25 @@ def test_faint_pixels(mode, alpha_min):
     assert got["colors"].grad is None or not got["colors"].grad.any()
 
 
+@pytest.mark.parametrize("cuda", [False, True])
+def test_the_background_behind_almost_opaque_pixels(on_cuda, cuda):
+    """Its weight is T = 2e-4, of which 1 - alpha would have lost four digits."""
+    scene = make(1, 1, num=7, width=21, height=18)
+    scene["means"] *= 0.1
+    scene["scales"][:], scene["opacities"][:] = 1e3, 0.7  # every pixel alike: no error averages out
+    got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
+    if cuda:
+        on_cuda()
+    renders, alphas, _ = rasterization(**got)
+    expected, _, alpha = rasterization_reference(**want)
+    assert (1e-4 < 1 - alpha).all() and (1 - alpha < 3e-4).all()
+    assert (alphas - alpha).abs().max() < 1e-7
+    renders.sum().backward()
+    expected.sum().backward()
+    # exp has 1e-7, and alpha / (1 - alpha) of that are in the factor of each Gaussian
+    assert_rel_rms(got["backgrounds"].grad, want["backgrounds"].grad, 3e-6, "backgrounds")
+
+
 def test_one_gaussian_has_its_own_depth_wherever_it_is_seen():
     """The weights cancel, even where alpha has three digits left beside 1."""
     scene = make(1, 1, num=1, size=0.1)
