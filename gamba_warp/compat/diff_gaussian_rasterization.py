@@ -80,7 +80,8 @@ class GaussianRasterizationSettings(_Settings):
         projmatrix: ``[4, 4]`` the same times a perspective projection, which has the slopes of
             ``tanfovx`` and ``tanfovy``; its centre may be anywhere.
         sh_degree: 0 to 3.
-        campos: ``[3]`` the camera's centre, from which harmonics are seen.
+        campos: ``[3]`` the camera's centre, from which harmonics are seen. It and the matrices may
+            have leading dimensions of 1.
         prefiltered: no effect.
         debug: no effect.
         antialiasing: None for the code before 2024; True scales opacities by the part of a
@@ -160,7 +161,7 @@ class GaussianRasterizer(torch.nn.Module):
     def markVisible(self, positions: Tensor) -> Tensor:
         """Return which of the positions ``[N, 3]`` are deeper than 0.2, ``[N]`` bool."""
         check_tensor("positions", positions, ("N", 3))
-        view = self.raster_settings.viewmatrix
+        view = _plain(self.raster_settings).viewmatrix
         return positions @ view[:3, 2].to(positions) + view[3, 2].to(positions) >= NEAR
 
     def forward(
@@ -214,7 +215,7 @@ def rasterize_gaussians(
     raster_settings: GaussianRasterizationSettings,
 ) -> tuple[Tensor, ...]:
     """Render as ``GaussianRasterizer``; an empty tensor is the same as None."""
-    settings = raster_settings
+    settings = _plain(raster_settings)
     optional: dict[str, Any] = dict(
         shs=sh, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
         cov3D_precomp=cov3Ds_precomp,
@@ -225,7 +226,7 @@ def rasterize_gaussians(
         if x is not None and (empty or not isinstance(x, Tensor) or x.numel()):
             given[name] = x
     _check(given, settings)
-    height, width = side(image_height=settings.image_height, image_width=settings.image_width)
+    width, height = settings.image_width, settings.image_height
     viewmat, K = _camera(settings, width, height, means3D.device)
 
     x = {name: value.float().contiguous() for name, value in given.items()}
@@ -267,6 +268,18 @@ def rasterize_gaussians(
     color = (layers[: len(bg)] + clear * bg).contiguous()
     results = [color, radii, layers[len(bg) :].contiguous(), (1 - clear).contiguous()]
     return _Results(results[: 2 if channels is colors else 4 if fork == "ashawkey" else 3])
+
+
+def _plain(settings: GaussianRasterizationSettings) -> GaussianRasterizationSettings:
+    """Return settings with ints for sizes, and a camera without leading dimensions of 1."""
+    height, width = side(image_height=settings.image_height, image_width=settings.image_width)
+    camera = {}
+    for name, dims in {"viewmatrix": 2, "projmatrix": 2, "campos": 1}.items():
+        x = getattr(settings, name)
+        while isinstance(x, Tensor) and x.dim() > dims and len(x) == 1:
+            x = x[0]
+        camera[name] = x
+    return settings._replace(image_height=height, image_width=width, **camera)
 
 
 def _check(given: dict[str, Any], settings: GaussianRasterizationSettings) -> None:

@@ -8,7 +8,14 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers import first_splatting as first
-from helpers.first_splatting import CASES, compare, draw, draw_first, scene_of, settings_of
+from helpers.first_splatting import (
+    CASES,
+    compare,
+    draw,
+    draw_first,
+    scene_of,
+    settings_of,
+)
 from helpers.forked import python
 
 from gamba_warp.compat import diff_gaussian_rasterization as drop_in
@@ -59,6 +66,19 @@ def test_results_of_forks(fork, name):
     half = {key: value.detach().bfloat16().requires_grad_() for key, value in scene.items()}
     draw(half, settings)[0].sum().backward()
     assert all(value.grad.dtype == torch.bfloat16 for value in half.values())
+
+
+def test_cameras_may_have_leading_dimensions_of_1():
+    """As SplaTAM, Dynamic3DGaussians and SuGaR make them."""
+    settings, scene = settings_of(2), scene_of(40, shs=9)
+    names = "viewmatrix", "projmatrix", "campos"
+    more = settings._replace(**{name: getattr(settings, name)[None] for name in names})
+    assert torch.equal(draw(scene, more)[0], draw(scene, settings)[0])
+    views = [GaussianRasterizer(x).markVisible(scene["means3D"]) for x in (more, settings)]
+    assert torch.equal(*views)
+    twice = settings._replace(viewmatrix=settings.viewmatrix.expand(2, 4, 4))
+    with pytest.raises(ValueError, match="viewmatrix has shape .2, 4, 4., allowed is .4, 4."):
+        draw(scene, twice)
 
 
 def test_another_number_of_results_names_the_switch(fork):
