@@ -121,15 +121,14 @@ class _InPicture(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, pixels: Tensor, means2D: Tensor, half: tuple[float, float]) -> Tensor:
         """Return the centres."""
-        ctx.half, ctx.dtype = half, means2D.dtype
+        ctx.half = half
         return pixels.view_as(pixels)
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> tuple[Tensor, Tensor, None]:
         """Return the gradient, and itself scaled with a third entry of 0."""
         (v,) = grads
-        scaled = torch.nn.functional.pad(v[0] * v.new_tensor(ctx.half), (0, 1))
-        return v, scaled.to(ctx.dtype), None
+        return v, torch.nn.functional.pad(v[0] * v.new_tensor(ctx.half), (0, 1)), None
 
 
 class _Scaled(torch.autograd.Function):
@@ -163,6 +162,23 @@ class GaussianRasterizer(torch.nn.Module):
         check_tensor("positions", positions, ("N", 3))
         view = _plain(self.raster_settings).viewmatrix
         return positions @ view[:3, 2].to(positions) + view[3, 2].to(positions) >= NEAR
+
+    @torch.no_grad()
+    def visible_filter(
+        self,
+        means3D: Tensor,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> Tensor:
+        """Return the radii of ``forward``, which do not depend on opacities and colours."""
+        check_tensor("means3D", means3D, ("N", 3), dtypes=DTYPES)
+        settings, ones = _plain(self.raster_settings), torch.ones_like(means3D)
+        x = _checked(
+            settings, means3D, ones, ones[:, :1], colors_precomp=ones, scales=scales,
+            rotations=rotations, cov3D_precomp=cov3D_precomp,
+        )  # fmt: skip
+        return _radii(_project(x, ones, settings, *_camera(settings, means3D.device)))
 
     def forward(
         self,
@@ -216,37 +232,20 @@ def rasterize_gaussians(
 ) -> tuple[Tensor, ...]:
     """Render as ``GaussianRasterizer``; an empty tensor is the same as None."""
     settings = _plain(raster_settings)
-    optional: dict[str, Any] = dict(
-        shs=sh, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
-        cov3D_precomp=cov3Ds_precomp,
+    x = _checked(
+        settings, means3D, means2D, opacities, shs=sh, colors_precomp=colors_precomp, scales=scales,
+        rotations=rotations, cov3D_precomp=cov3Ds_precomp,
     )  # fmt: skip
-    given: dict[str, Any] = dict(means3D=means3D, means2D=means2D, opacities=opacities)
-    empty = isinstance(means3D, Tensor) and len(means3D) == 0
-    for name, x in optional.items():
-        if x is not None and (empty or not isinstance(x, Tensor) or x.numel()):
-            given[name] = x
-    _check(given, settings)
-    width, height = settings.image_width, settings.image_height
-    viewmat, K = _camera(settings, width, height, means3D.device)
-
-    x = {name: value.float().contiguous() for name, value in given.items()}
+    viewmat, K = _camera(settings, means3D.device)
+    center = settings.campos.detach().float().view(1, 1, 3).to(means3D.device)
     if "shs" in x:
-        center = settings.campos.detach().float().view(1, 1, 3).to(means3D.device)
         colors = colors_seen_from(settings.sh_degree, x["shs"][None], x["means3D"][None], center)
         colors = colors[0]
     else:
         colors = x["colors_precomp"]
-    if "scales" in x and settings.scale_modifier != 1:
-        x["scales"] = _Scaled.apply(x["scales"], settings.scale_modifier)
-    lens = LensOptions(
-        width, height, NEAR, float("inf"), 0.0, EPS2D, ALPHA_MIN, bool(settings.antialiasing),
-        skip_unused=True, original=True,
-    ).numbers()  # fmt: skip
-    shapes = x.get("rotations"), x.get("scales"), x.get("cov3D_precomp")
-    gaussians = x["means3D"], *shapes, x["opacities"].flatten()
-    projected = Projected(*project(*gaussians, colors.detach(), viewmat, K, lens))
-    radii = projected.extents[0, :, 0].int()
-    centers: Any = _InPicture.apply(projected.means2d, given["means2D"], (width / 2, height / 2))
+    projected = _project(x, colors, settings, viewmat, K)
+    width, height = settings.image_width, settings.image_height
+    centers: Any = _InPicture.apply(projected.means2d, x["means2D"], (width / 2, height / 2))
 
     fork = _fork
     depth, channels = projected.depths[..., None], colors
@@ -266,8 +265,37 @@ def rasterize_gaussians(
     clear = transmittances[0].permute(2, 0, 1)
     bg = settings.bg.detach().to(layers)[:, None, None]
     color = (layers[: len(bg)] + clear * bg).contiguous()
-    results = [color, radii, layers[len(bg) :].contiguous(), (1 - clear).contiguous()]
-    return _Results(results[: 2 if channels is colors else 4 if fork == "ashawkey" else 3])
+    results = [color, _radii(projected)]
+    if channels is not colors:
+        results.append(layers[len(bg) :].contiguous())
+    if fork == "ashawkey":
+        results.append((1 - clear).contiguous())
+    return _Results(results)
+
+
+def _radii(projected: Projected) -> Tensor:
+    """Return the radii ``[N]`` int32 of a view."""
+    return projected.extents[0, :, 0].int()
+
+
+def _project(
+    x: dict[str, Tensor],
+    colors: Tensor,
+    settings: GaussianRasterizationSettings,
+    viewmat: Tensor,
+    K: Tensor,
+) -> Projected:
+    """Project by the original's conventions."""
+    scales = x.get("scales")
+    if scales is not None and settings.scale_modifier != 1:
+        scales = _Scaled.apply(scales, settings.scale_modifier)
+    lens = LensOptions(
+        settings.image_width, settings.image_height, NEAR, float("inf"), 0.0, EPS2D, ALPHA_MIN,
+        bool(settings.antialiasing), skip_unused=True, original=True,
+    ).numbers()  # fmt: skip
+    shapes = x.get("rotations"), scales, x.get("cov3D_precomp")
+    gaussians = x["means3D"], *shapes, x["opacities"].flatten()
+    return Projected(*project(*gaussians, colors.detach(), viewmat, K, lens))
 
 
 def _plain(settings: GaussianRasterizationSettings) -> GaussianRasterizationSettings:
@@ -282,8 +310,19 @@ def _plain(settings: GaussianRasterizationSettings) -> GaussianRasterizationSett
     return settings._replace(image_height=height, image_width=width, **camera)
 
 
-def _check(given: dict[str, Any], settings: GaussianRasterizationSettings) -> None:
-    """Check the arguments by name, before any launch."""
+def _checked(
+    settings: GaussianRasterizationSettings,
+    means3D: Tensor,
+    means2D: Tensor,
+    opacities: Tensor,
+    **optional: Tensor | None,
+) -> dict[str, Tensor]:
+    """Check the arguments by name, before any launch; return the given ones in float32."""
+    given: dict[str, Any] = dict(means3D=means3D, means2D=means2D, opacities=opacities)
+    empty = isinstance(means3D, Tensor) and len(means3D) == 0
+    for name, x in optional.items():
+        if x is not None and (empty or not isinstance(x, Tensor) or x.numel()):
+            given[name] = x
     names = {*given}
     if len(names & {"shs", "colors_precomp"}) != 1:
         raise ValueError("shs, colors_precomp: exactly one of them must be given")
@@ -309,11 +348,10 @@ def _check(given: dict[str, Any], settings: GaussianRasterizationSettings) -> No
     check_tensor("viewmatrix", settings.viewmatrix, (4, 4))
     check_tensor("projmatrix", settings.projmatrix, (4, 4))
     one_device(given)
+    return {name: value.float().contiguous() for name, value in given.items()}
 
 
-def _camera(
-    settings: GaussianRasterizationSettings, width: int, height: int, device: torch.device
-) -> tuple[Tensor, Tensor]:
+def _camera(settings: GaussianRasterizationSettings, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return the viewmat ``[1, 4, 4]`` and the K ``[1, 3, 3]`` of settings."""
     view, full = (
         x.detach().double().cpu().numpy() for x in (settings.viewmatrix, settings.projmatrix)
@@ -330,7 +368,7 @@ def _camera(
         raise ValueError(
             "projmatrix is not viewmatrix times the perspective of tanfovx and tanfovy, transposed"
         )
-    size = np.array([width, height])
+    size = np.array([settings.image_width, settings.image_height])
     focal, middle = size / (2 * half), size * (1 + center) / 2
     K = [[focal[0], 0, middle[0]], [0, focal[1], middle[1]], [0, 0, 1]]
     viewmat = settings.viewmatrix.detach().float().mT.contiguous().to(device)

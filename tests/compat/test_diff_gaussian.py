@@ -15,6 +15,7 @@ from helpers.first_splatting import (
     draw_first,
     scene_of,
     settings_of,
+    with_covariances,
 )
 from helpers.forked import python
 
@@ -66,6 +67,18 @@ def test_results_of_forks(fork, name):
     half = {key: value.detach().bfloat16().requires_grad_() for key, value in scene.items()}
     draw(half, settings)[0].sum().backward()
     assert all(value.grad.dtype == torch.bfloat16 for value in half.values())
+
+
+@pytest.mark.parametrize("covars", [False, True])
+def test_radii_alone(covars):
+    settings, scene = settings_of(scale_modifier=1.7), scene_of()
+    if covars:
+        scene = with_covariances(scene, 1.0)
+    names = {"means3D", "scales", "rotations", "cov3D_precomp"} & {*scene}
+    radii = GaussianRasterizer(settings).visible_filter(**{name: scene[name] for name in names})
+    assert torch.equal(radii, draw(scene, settings)[1]) and radii.dtype == torch.int32
+    with pytest.raises(ValueError, match="scales and rotations, or cov3D_precomp"):
+        GaussianRasterizer(settings).visible_filter(scene["means3D"])
 
 
 def test_cameras_may_have_leading_dimensions_of_1():
