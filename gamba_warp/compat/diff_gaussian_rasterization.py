@@ -116,19 +116,35 @@ class _Results(tuple):
 
 
 class _InPicture(torch.autograd.Function):
-    """Centres in pixels, whose gradient also goes to ``means2D``, in units of half the picture."""
+    """Centres in pixels, whose gradient also goes to ``means2D``, in units of half the picture.
+
+    In the same units the sums of absolute values, which the compositor's gradient has set before,
+    go to ``means2D_densify``.
+    """
 
     @staticmethod
-    def forward(ctx: Any, pixels: Tensor, means2D: Tensor, half: tuple[float, float]) -> Tensor:
+    def forward(
+        ctx: Any,
+        pixels: Tensor,
+        means2D: Tensor,
+        means2D_densify: Tensor | None,
+        absolute: Tensor | None,
+        half: tuple[float, float],
+    ) -> Tensor:
         """Return the centres."""
-        ctx.half = half
+        ctx.half, ctx.absolute = half, absolute
         return pixels.view_as(pixels)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, Tensor, None]:
-        """Return the gradient, and itself scaled with a third entry of 0."""
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor | None, ...]:
+        """Return the gradient, and both scaled with a third entry of 0."""
+
+        def scaled(v: Tensor) -> Tensor:
+            return torch.nn.functional.pad(v[0] * v.new_tensor(ctx.half), (0, 1))
+
         (v,) = grads
-        return v, torch.nn.functional.pad(v[0] * v.new_tensor(ctx.half), (0, 1)), None
+        absolute = None if ctx.absolute is None else scaled(ctx.absolute)
+        return v, scaled(v), absolute, None, None
 
 
 class _Scaled(torch.autograd.Function):
@@ -190,6 +206,7 @@ class GaussianRasterizer(torch.nn.Module):
         scales: Tensor | None = None,
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
+        means2D_densify: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """Render N Gaussians, differentiable in all arguments.
 
@@ -203,6 +220,8 @@ class GaussianRasterizer(torch.nn.Module):
             scales: ``[N, 3]`` standard deviations; or None.
             rotations: ``[N, 4]`` wxyz of length 1, which is not made so here; or None.
             cov3D_precomp: ``[N, 6]`` in their place: xx, xy, xz, yy, yz, zz of covariances.
+            means2D_densify: ``[N, 3]``, like ``means2D``; its gradient is the sum of the absolute
+                values of the pixels' gradients (Ye et al. 2024, "AbsGS").
 
         Returns:
             The colour ``[C, H, W]`` and the radii ``[N]`` int32, pixels, 0 where culled, and what
@@ -215,7 +234,7 @@ class GaussianRasterizer(torch.nn.Module):
         """
         return rasterize_gaussians(
             means3D, means2D, shs, colors_precomp, opacities, scales, rotations, cov3D_precomp,
-            self.raster_settings,
+            self.raster_settings, means2D_densify,
         )  # fmt: skip
 
 
@@ -229,12 +248,13 @@ def rasterize_gaussians(
     rotations: Tensor | None,
     cov3Ds_precomp: Tensor | None,
     raster_settings: GaussianRasterizationSettings,
+    means2D_densify: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
     """Render as ``GaussianRasterizer``; an empty tensor is the same as None."""
     settings = _plain(raster_settings)
     x = _checked(
         settings, means3D, means2D, opacities, shs=sh, colors_precomp=colors_precomp, scales=scales,
-        rotations=rotations, cov3D_precomp=cov3Ds_precomp,
+        rotations=rotations, cov3D_precomp=cov3Ds_precomp, means2D_densify=means2D_densify,
     )  # fmt: skip
     viewmat, K = _camera(settings, means3D.device)
     center = settings.campos.detach().float().view(1, 1, 3).to(means3D.device)
@@ -245,7 +265,10 @@ def rasterize_gaussians(
         colors = x["colors_precomp"]
     projected = _project(x, colors, settings, viewmat, K)
     width, height = settings.image_width, settings.image_height
-    centers: Any = _InPicture.apply(projected.means2d, x["means2D"], (width / 2, height / 2))
+    densify = x.get("means2D_densify")
+    absolute = None if densify is None else torch.zeros_like(projected.means2d)
+    half = width / 2, height / 2
+    centers: Any = _InPicture.apply(projected.means2d, x["means2D"], densify, absolute, half)
 
     fork = _fork
     depth, channels = projected.depths[..., None], colors
@@ -259,7 +282,7 @@ def rasterize_gaussians(
     bins = bin_op(*(s.detach() for s in splats), width, height, ALPHA_MIN, SKIP, True)
     size = Size(width, height, 1, int(channels.dim() == 3), SKIP)
     drawn = centers, projected.conics, shown, channels
-    given = list(bins), list(size), list(LIMITS), None, None
+    given = list(bins), list(size), list(LIMITS), None, absolute
     renders, transmittances, *_ = composite(*drawn, *given)
     layers = renders[0].permute(2, 0, 1)
     clear = transmittances[0].permute(2, 0, 1)
@@ -337,7 +360,7 @@ def _checked(
         "means2D": ((num, 3),), "opacities": ((num, 1), (num,)),
         "shs": ((num, f"K >= {(settings.sh_degree + 1) ** 2}", 3),),
         "colors_precomp": ((num, "C >= 1"),), "scales": ((num, 3),), "rotations": ((num, 4),),
-        "cov3D_precomp": ((num, 6),),
+        "cov3D_precomp": ((num, 6),), "means2D_densify": ((num, 3),),
     }  # fmt: skip
     for name, allowed in shapes.items():
         if name in given:

@@ -69,6 +69,25 @@ def test_results_of_forks(fork, name):
     assert all(value.grad.dtype == torch.bfloat16 for value in half.values())
 
 
+def test_absolute_gradients_for_densification(fork):
+    """The sums of what each pixel's colour gives the centres."""
+    fork("ingra14m")
+    settings, scene = settings_of(), scene_of()
+    scene |= dict(means2D_densify=torch.zeros(150, 3))
+    leaves = {key: value.requires_grad_() for key, value in scene.items()}
+    color, *_ = draw(leaves, settings)
+    del scene["means2D_densify"]
+    pixels = first.HEIGHT * first.WIDTH
+    want, expected = draw_first({**scene, "means2D": torch.zeros(pixels, 150, 3)}, settings)
+    v = torch.randn_like(color) * ~want["close"]
+    color.backward(v)
+    want["color"].backward(v.double())
+    each = expected["means2D"].grad
+    assert_rel_rms(leaves["means2D"].grad, each.sum(0), first.GRADIENT, "means2D")
+    found = leaves["means2D_densify"].grad
+    assert_rel_rms(found, each.abs().sum(0), first.GRADIENT, "means2D_densify")
+
+
 @pytest.mark.parametrize("covars", [False, True])
 def test_radii_alone(covars):
     settings, scene = settings_of(scale_modifier=1.7), scene_of()
@@ -166,6 +185,7 @@ REFUSED = {
     "projmatrix is not viewmatrix": dict(settings=dict(projmatrix=torch.eye(4))),
     "projmatrix is not": dict(settings=dict(tanfovx=0.4)),
     "tanfovx, tanfovy are": dict(settings=dict(tanfovy=0.0)),
+    "means2D_densify has shape": dict(means2D_densify=torch.zeros(39, 3)),
 }
 
 

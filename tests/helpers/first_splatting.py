@@ -74,7 +74,8 @@ def render(
 
     Args:
         means: ``[N, 3]``, float64 as all.
-        means2d: ``[N, 3]`` zeros, which are added in units of half the picture.
+        means2d: ``[N, 3]`` zeros, or ``[H * W, N, 3]`` for each pixel, which are added in units of
+            half the picture.
         opacities: ``[N]``.
         colors: ``[N, C]``.
         covars: ``[N, 3, 3]``.
@@ -91,8 +92,7 @@ def render(
     t = torch.where(seen[:, None], t, torch.tensor([0.0, 0.0, 1.0]).double())
     clip = means @ full[:3] + full[3]
     clip = torch.where(seen[:, None], clip, torch.ones(4).double())
-    ndc = clip[:, :2] / clip[:, 3:] + means2d[:, :2]
-    centers = ((ndc + 1) * size - 1) / 2
+    centers = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2
 
     focal, z = size / (2 * tan), t[:, 2]
     slopes = t[:, :2] / z[:, None]
@@ -130,7 +130,8 @@ def render(
     order = order[seen[order]]
     py, px = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([px, py], -1).reshape(-1, 2)
-    dx, dy = (centers[order] - pixels[:, None]).unbind(-1)
+    moved = centers + means2d[..., :2] * size / 2
+    dx, dy = (moved[..., order, :] - pixels[:, None]).unbind(-1)
     a, b, c = (part[order] / det[order] for part in (yy, -xy, xx))
     free = shown[order] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
     alpha = free + (free.clamp_max(ALPHA_MAX) - free).detach()  # the gradient passes the clamp

@@ -59,21 +59,18 @@ _composite = native_kernel(
 )
 # with the sums of absolute values, and with a gradient that passes the clamp of alpha, which cost
 # nothing where they are not asked for
-_composite_vjp, _composite_vjp_absolute, _composite_vjp_passing = (
-    native_kernel(
-        f"composite_vjp{name}",
+_composite_vjp = {
+    (absolute, passes): native_kernel(
+        "composite_vjp" + "_absolute" * absolute + "_passing" * passes,
         native(
             _HERE / "composite.inl", GRADIENT=True, **_DEFINES, ABSOLUTE=absolute, PASSES=passes
         ),
         inputs={**_SPLATS, **_WALK},
         outputs={"workers": Workers, "rows": Rows},
     )
-    for name, absolute, passes in (
-        ("", False, False),
-        ("_absolute", True, False),
-        ("_passing", False, True),
-    )
-)
+    for absolute in (False, True)
+    for passes in (False, True)
+}
 _sum_rows = native_kernel(
     "sum_rows",
     native(_HERE / "composite.inl", SUM_ROWS=True, RUN=_RUN),
@@ -147,7 +144,7 @@ def composite_backward(
         geometry: True to compute more than the gradient of the colours.
         absolute: ``[.., N, 2]``, set to the pixels' absolute gradients of means2d, summed; or None.
             With it ``geometry`` is True.
-        passes: the gradient passes the clamp of alpha; not with ``absolute``.
+        passes: the gradient passes the clamp of alpha.
     """
     channels = splats.colors.shape[1]
     moments = 6 if absolute is None else 8
@@ -162,8 +159,7 @@ def composite_backward(
         _workers(channels + BLOCKS * (channels + 1)),
         Packed(Rows, sums, written, skipped, int(geometry)),
     ]
-    kernel = _composite_vjp_passing if passes else _composite_vjp
-    kernel = kernel if absolute is None else _composite_vjp_absolute
+    kernel = _composite_vjp[absolute is not None, passes]
     parallel_launch(kernel, torch.get_num_threads(), arguments)
     return reduce_rows(sums, written, splats, bins, geometry, absolute)
 

@@ -123,5 +123,5 @@ def composite_backward(
     flags = geometry and not apart, absolute is not None, passes
     _launch(lambda count: backward_kernels(Sums(count, *flags), parts), *given)
     if apart:
-        _launch(lambda _: backward_kernels(Sums(0, True, True, False), parts), *given, channels)
+        _launch(lambda _: backward_kernels(Sums(0, True, True, passes), parts), *given, channels)
     return reduce_rows(rows, splats, bins, geometry, absolute)

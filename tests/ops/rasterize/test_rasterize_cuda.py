@@ -1,6 +1,7 @@
 """The CUDA path executed from PTX beside the CPU's, and what skips change."""
 
 from dataclasses import fields
+from functools import partial
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import warp as wp
 from helpers import assert_rel_rms
 from helpers.raster import absolute_gradients, crowded, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, rasterization
+from gamba_warp.kernels.rasterize import Skip, function, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 from gamba_warp.kernels.rasterize.cuda import leaves as leaves_cuda
@@ -82,9 +83,11 @@ def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
     assert block_counts == lane_counts and lane_counts["tiles_skipped"] >= 2
 
 
+@pytest.mark.parametrize("passes", [False, True])
 @pytest.mark.parametrize("channels, parts", [(3, 1), (4, 2), (1, 4), (5, 1), (11, 2)])
-def test_absolute_gradients(monkeypatch, on_cuda, channels, parts):
-    """Also with more channels than one launch has."""
+def test_absolute_gradients(monkeypatch, on_cuda, channels, parts, passes):
+    """Also with more channels than one launch has, and of a gradient that passes the clamp."""
+    monkeypatch.setattr(function, "Limits", partial(Limits, passes=float(passes)))
     scene = crowded(channels)
     given = scene, *upstream(channels)
     plain, _ = run(*given)
