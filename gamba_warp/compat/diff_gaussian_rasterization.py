@@ -16,8 +16,9 @@ from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, 
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.ops import bin_op, composite, project
 from gamba_warp.kernels.rasterize.projection import LensOptions, Projected
+from gamba_warp.kernels.rasterize.quantile import counts_in_front
 from gamba_warp.kernels.rasterize.skip import SQUARES
-from gamba_warp.kernels.rasterize.tiles import Limits, Size
+from gamba_warp.kernels.rasterize.tiles import Bins, Limits, Size, Tiling
 
 from .shared import DTYPES, check_tensor, one_device, one_of, side
 
@@ -26,6 +27,7 @@ FORKS = {
     "graphdeco": "colour, radii; with antialiasing in the settings also inverse depth",
     "ingra14m": "colour, radii, depth",
     "ashawkey": "colour, radii, depth, alpha",
+    "monogs": "colour, radii, depth, alpha without gradient, n_touched",
 }
 NEAR = float(np.nextafter(np.float32(0.2), np.float32(1)))  # nearer ones are culled
 # A pixel blends down to this transmittance, inclusive.
@@ -64,6 +66,7 @@ class _Settings(NamedTuple):
     prefiltered: bool = False
     debug: bool = False
     antialiasing: bool | None = None
+    projmatrix_raw: Tensor | None = None
 
 
 class GaussianRasterizationSettings(_Settings):
@@ -86,6 +89,7 @@ class GaussianRasterizationSettings(_Settings):
         debug: no effect.
         antialiasing: None for the code before 2024; True scales opacities by the part of a
             footprint's area that dilation has not added.
+        projmatrix_raw: no effect; the fork "monogs" has the projection alone there.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> GaussianRasterizationSettings:
@@ -147,6 +151,30 @@ class _InPicture(torch.autograd.Function):
         return v, scaled(v), absolute, None, None
 
 
+class _Moved(torch.autograd.Function):
+    """A camera, whose gradient also goes to the twist (rho, theta) by which it would be moved.
+
+    Its world-to-camera matrix would be exp(rho, theta) times this one; the gradient is that at 0.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, viewmat: Tensor, center: Tensor, theta: Tensor, rho: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the matrix ``[1, 4, 4]`` and the camera's centre ``[1, 1, 3]``."""
+        ctx.save_for_backward(viewmat)
+        return viewmat.view_as(viewmat), center.view_as(center)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor | None, ...]:
+        """Return the gradients of theta and rho."""
+        (viewmat,) = ctx.saved_tensors
+        v_viewmat, v_center = grads
+        upper, v_upper = viewmat[0, :3], v_viewmat[0, :3]
+        v_theta = torch.linalg.cross(upper, v_upper, dim=0).sum(1)
+        return None, None, v_theta, v_upper[:, 3] - upper[:, :3] @ v_center[0, 0]
+
+
 class _Scaled(torch.autograd.Function):
     """Scales times the modifier; as in the original, the gradient ignores the modifier."""
 
@@ -206,6 +234,8 @@ class GaussianRasterizer(torch.nn.Module):
         scales: Tensor | None = None,
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
+        theta: Tensor | None = None,
+        rho: Tensor | None = None,
         means2D_densify: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """Render N Gaussians, differentiable in all arguments.
@@ -220,12 +250,18 @@ class GaussianRasterizer(torch.nn.Module):
             scales: ``[N, 3]`` standard deviations; or None.
             rotations: ``[N, 4]`` wxyz of length 1, which is not made so here; or None.
             cov3D_precomp: ``[N, 6]`` in their place: xx, xy, xz, yy, yz, zz of covariances.
+            theta: ``[3]``, whose values are not used; its gradient is that of the camera's rotation
+                vector, about the axes of the camera.
+            rho: ``[3]``, likewise; its gradient is that of the translation, along these axes. The
+                world-to-camera matrix would be multiplied by exp(rho, theta) from the left.
             means2D_densify: ``[N, 3]``, like ``means2D``; its gradient is the sum of the absolute
                 values of the pixels' gradients (Ye et al. 2024, "AbsGS").
 
         Returns:
             The colour ``[C, H, W]`` and the radii ``[N]`` int32, pixels, 0 where culled, and what
-            else the chosen fork has: Σ T α / z, Σ T α z or Σ T α, each ``[1, H, W]``.
+            else the chosen fork has: Σ T α / z, Σ T α z or Σ T α, each ``[1, H, W]``, and
+            n_touched ``[N]`` int32, the number of pixels to which a Gaussian contributes and whose
+            transmittance is above 0.5 behind it.
 
         Raises:
             TypeError: an argument is not a tensor, or of another dtype.
@@ -234,7 +270,7 @@ class GaussianRasterizer(torch.nn.Module):
         """
         return rasterize_gaussians(
             means3D, means2D, shs, colors_precomp, opacities, scales, rotations, cov3D_precomp,
-            self.raster_settings, means2D_densify,
+            self.raster_settings, theta, rho, means2D_densify,
         )  # fmt: skip
 
 
@@ -248,16 +284,22 @@ def rasterize_gaussians(
     rotations: Tensor | None,
     cov3Ds_precomp: Tensor | None,
     raster_settings: GaussianRasterizationSettings,
+    theta: Tensor | None = None,
+    rho: Tensor | None = None,
     means2D_densify: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
     """Render as ``GaussianRasterizer``; an empty tensor is the same as None."""
     settings = _plain(raster_settings)
     x = _checked(
         settings, means3D, means2D, opacities, shs=sh, colors_precomp=colors_precomp, scales=scales,
-        rotations=rotations, cov3D_precomp=cov3Ds_precomp, means2D_densify=means2D_densify,
+        rotations=rotations, cov3D_precomp=cov3Ds_precomp, theta=theta, rho=rho,
+        means2D_densify=means2D_densify,
     )  # fmt: skip
     viewmat, K = _camera(settings, means3D.device)
     center = settings.campos.detach().float().view(1, 1, 3).to(means3D.device)
+    if "theta" in x or "rho" in x:
+        zero = center.new_zeros(3)
+        viewmat, center = _Moved.apply(viewmat, center, x.get("theta", zero), x.get("rho", zero))
     if "shs" in x:
         colors = colors_seen_from(settings.sh_degree, x["shs"][None], x["means3D"][None], center)
         colors = colors[0]
@@ -291,8 +333,11 @@ def rasterize_gaussians(
     results = [color, _radii(projected)]
     if channels is not colors:
         results.append(layers[len(bg) :].contiguous())
-    if fork == "ashawkey":
-        results.append((1 - clear).contiguous())
+    if fork in ("ashawkey", "monogs"):
+        alpha = (1 - clear).contiguous()
+        results.append(alpha if fork == "ashawkey" else alpha.detach())
+    if fork == "monogs":
+        results.append(counts_in_front(projected, Bins(*bins), Tiling(width, height), LIMITS)[0])
     return _Results(results)
 
 
@@ -360,7 +405,8 @@ def _checked(
         "means2D": ((num, 3),), "opacities": ((num, 1), (num,)),
         "shs": ((num, f"K >= {(settings.sh_degree + 1) ** 2}", 3),),
         "colors_precomp": ((num, "C >= 1"),), "scales": ((num, 3),), "rotations": ((num, 4),),
-        "cov3D_precomp": ((num, 6),), "means2D_densify": ((num, 3),),
+        "cov3D_precomp": ((num, 6),), "theta": ((3,),), "rho": ((3,),),
+        "means2D_densify": ((num, 3),),
     }  # fmt: skip
     for name, allowed in shapes.items():
         if name in given:

@@ -7,6 +7,7 @@ transparent that is between front and back. A quantile is on one of the surfaces
 import math
 from typing import no_type_check
 
+import torch
 import warp as wp
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from ..runtime.views import as_struct, struct_of
 from .constants import ALPHA_MAX, ALPHA_MIN
 from .meta import Meta
 from .projection import Projected
-from .tiles import Bins, Grid, make_grid
+from .tiles import Bins, Grid, Limits, Tiling, make_grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,6 +32,7 @@ def _quantile(
     splats_in: struct_of(Projected),
     lists_in: struct_of(Bins),
     depths_out: wp.array[wp.float32],
+    counts_out: wp.array[wp.int32],
 ):
     pixel = offset + wp.tid()
     image = pixel // (grid.width * grid.height)
@@ -68,6 +70,8 @@ def _quantile(
                 if clear <= transmittance:
                     depth = splats_in.depths[g]
                     k = end
+                elif counts_out.shape[0] > 0:
+                    wp.atomic_add(counts_out, g, 1)
         k += 1
     depths_out[pixel] = depth
 
@@ -99,12 +103,49 @@ def depth_quantile(
     """
     if not 0 < transmittance < 1:
         raise ValueError(f"transmittance is {transmittance}, allowed is 0 < transmittance < 1")
-    cut, centers = meta.tiling, meta["depths"].detach()
-    depths = centers.new_empty(*centers.shape[:-1], cut.height, cut.width, 1)
-    limit = 2 * math.log(1 / alpha_min) + 1e-3  # where q is larger, no opacity reaches alpha_min
-    grid = make_grid(cut, num=centers.shape[-1], alpha_min=alpha_min, skip=0)
-    of = (meta[name].detach().contiguous() for name in ("means2d", "conics", "depths", "opacities"))
-    splats = as_struct(Projected(*of))
-    inputs = [grid, transmittance, limit, alpha_max, splats, as_struct(meta.bins)]
-    launch(_quantile, depths.numel(), inputs, [depths.view(-1)], depths.device)
+    splats = Projected(*(meta[name] for name in ("means2d", "conics", "depths", "opacities")))
+    return _walk(splats, meta.bins, meta.tiling, transmittance, Limits(alpha_min, alpha_max, 0.0))
+
+
+def counts_in_front(
+    splats: Projected, bins: Bins, tiling: Tiling, limits: Limits, transmittance: float = 0.5
+) -> Tensor:
+    """Number of pixels to which a Gaussian contributes in front of the depth of ``depth_quantile``.
+
+    These are the pixels whose transmittance is above the given one behind the Gaussian, too.
+
+    Args:
+        splats: the projection.
+        bins: the tile lists.
+        tiling: the cut into tiles.
+        limits: of alpha.
+        transmittance: in (0, 1), and above ``limits.t_min``.
+
+    Returns:
+        ``[.., V, N]`` int32, without gradient.
+    """
+    counts = splats.depths.new_zeros(splats.depths.shape, dtype=torch.int32)
+    _walk(splats, bins, tiling, transmittance, limits, counts)
+    return counts
+
+
+def _walk(
+    splats: Projected,
+    bins: Bins,
+    tiling: Tiling,
+    transmittance: float,
+    limits: Limits,
+    counts: Tensor | None = None,
+) -> Tensor:
+    """Depths of the quantile; adds to the counts of the Gaussians in front of it."""
+    splats = Projected(*(x.detach().contiguous() for x in splats[:4]))
+    num = splats.depths.shape[-1]
+    depths = splats.depths.new_empty(*splats.depths.shape[:-1], tiling.height, tiling.width, 1)
+    # where q is larger, no opacity reaches alpha_min
+    limit = 2 * math.log(1 / limits.alpha_min) + 1e-3
+    grid = make_grid(tiling, num=num, alpha_min=limits.alpha_min, skip=0)
+    inputs = [grid, transmittance, limit, limits.alpha_max, as_struct(splats), as_struct(bins)]
+    outputs = [depths.view(-1), None if counts is None else counts.view(-1)]
+    threads = None if counts is None else 1  # an addition on a CPU is not atomic
+    launch(_quantile, depths.numel(), inputs, outputs, depths.device, threads)
     return depths

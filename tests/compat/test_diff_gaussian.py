@@ -13,6 +13,7 @@ from helpers.first_splatting import (
     compare,
     draw,
     draw_first,
+    moved_by,
     scene_of,
     settings_of,
     with_covariances,
@@ -67,6 +68,42 @@ def test_results_of_forks(fork, name):
     half = {key: value.detach().bfloat16().requires_grad_() for key, value in scene.items()}
     draw(half, settings)[0].sum().backward()
     assert all(value.grad.dtype == torch.bfloat16 for value in half.values())
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_gradients_of_the_pose(fork, degree):
+    """Compare with rendering in float64, the camera moved by exp(rho, theta); differences too."""
+    fork("monogs")
+    settings, scene = settings_of(degree), scene_of(60, shs=9)
+    scene["means3D"] *= 0.2  # beside the picture and past the clamp gradients are not derivatives
+    scene["opacities"] *= 0.98
+    rho, theta, twist = (torch.zeros(n, requires_grad=True) for n in (3, 3, 6))
+    color, _, depth, alpha, _ = draw({**scene, "rho": rho, "theta": theta}, settings)
+    want, _ = draw_first(scene, moved_by(settings, twist.double()))
+    clear = ~want["close"]
+    v, v_depth = (torch.randn(n, first.HEIGHT, first.WIDTH) * clear for n in (3, 1))
+    torch.autograd.backward([color, depth], [v, v_depth])
+
+    def loss(results):
+        return (results["color"] * v).sum() + (results["depth"] * v_depth).sum()
+
+    loss(want).backward()
+    got = torch.cat([rho.grad, theta.grad])
+    assert_rel_rms(got, twist.grad, first.GRADIENT, "pose")
+    steps = 1e-6 * torch.eye(6, dtype=torch.float64)
+    ends = [[loss(draw_first(scene, moved_by(settings, s * x))[0]) for s in (1, -1)] for x in steps]
+    slopes = torch.stack([(after - before) / 2e-6 for after, before in ends])
+    assert_rel_rms(got, slopes, first.GRADIENT, "differences")
+    assert not alpha.requires_grad
+
+
+def test_pixels_in_which_a_gaussian_is_seen(fork):
+    fork("monogs")
+    settings, scene = settings_of()._replace(projmatrix_raw=torch.eye(4)), scene_of()
+    touched, want = draw(scene, settings)[4], draw_first(scene, settings)[0]["touched"]
+    assert touched.dtype == torch.int32 and not touched.requires_grad
+    # where alpha or T lies on a threshold, a pixel may be on the other side
+    assert (touched - want).abs().sum() <= 2 and want.sum() > 1000 and (want == 0).sum() > 20
 
 
 def test_absolute_gradients_for_densification(fork):
@@ -185,6 +222,7 @@ REFUSED = {
     "projmatrix is not viewmatrix": dict(settings=dict(projmatrix=torch.eye(4))),
     "projmatrix is not": dict(settings=dict(tanfovx=0.4)),
     "tanfovx, tanfovy are": dict(settings=dict(tanfovy=0.0)),
+    "theta has shape": dict(theta=torch.zeros(4)),
     "means2D_densify has shape": dict(means2D_densify=torch.zeros(39, 3)),
 }
 

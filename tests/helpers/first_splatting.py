@@ -70,7 +70,7 @@ def render(
     settings,
     antialiasing: bool = False,
 ) -> dict[str, Tensor]:
-    """``color [C, H, W]``, ``depth``, ``inverse`` and ``alpha [H, W]``, and ``radii [N]``.
+    """``color [C, H, W]``, ``depth``, ``inverse`` and ``alpha [H, W]``; ``radii, touched [N]``.
 
     Args:
         means: ``[N, 3]``, float64 as all.
@@ -156,7 +156,18 @@ def render(
     with torch.no_grad():
         near = ((free / ALPHA_MIN - 1).abs() < 1e-4) | ((after / STOP - 1).abs() < 1e-3)
         close = (near & inside).any(1).view(height, width)
-    return dict(**shaped, radii=radii, close=close, exact=3 * most.sqrt())
+        touched = torch.zeros_like(radii)
+        touched[order] = ((alpha > 0) & (after > 0.5)).sum(0).double()
+    return dict(**shaped, radii=radii, touched=touched, close=close, exact=3 * most.sqrt())
+
+
+def perspective_of(tan, shift=(0.0, 0.0)):
+    """A projection as the 3DGS code makes it."""
+    perspective = torch.zeros(4, 4, dtype=torch.float64)
+    perspective[0, 0], perspective[1, 1] = 1 / tan[0], 1 / tan[1]
+    perspective[0, 2], perspective[1, 2] = shift
+    perspective[2, 2], perspective[2, 3], perspective[3, 2] = 1.0001, -0.01, 1
+    return perspective
 
 
 def settings_of(degree=0, shift=(0.0, 0.0), **changes):
@@ -166,17 +177,25 @@ def settings_of(degree=0, shift=(0.0, 0.0), **changes):
     view[:3, :3] *= torch.linalg.det(view[:3, :3]).sign()
     view[:3, 3] = torch.tensor([0.1, -0.2, 2.0])
     tan = math.tan(0.4), math.tan(0.5)
-    perspective = torch.zeros(4, 4, dtype=torch.float64)
-    perspective[0, 0], perspective[1, 1] = 1 / tan[0], 1 / tan[1]
-    perspective[0, 2], perspective[1, 2] = shift
-    perspective[2, 2], perspective[2, 3], perspective[3, 2] = 1.0001, -0.01, 1
     made = dict(
         image_height=HEIGHT, image_width=WIDTH, tanfovx=tan[0], tanfovy=tan[1],
         bg=torch.rand(3), scale_modifier=1.0, viewmatrix=view.T.float(),
-        projmatrix=(perspective @ view).T.float(), sh_degree=degree,
+        projmatrix=(perspective_of(tan, shift) @ view).T.float(), sh_degree=degree,
         campos=torch.linalg.inv(view)[:3, 3].float(), prefiltered=False, debug=False,
     )  # fmt: skip
     return GaussianRasterizationSettings(**{**made, **changes})
+
+
+def moved_by(settings, twist):
+    """The settings in float64 with the camera moved by exp(rho, theta), ``twist`` being both."""
+    x, y, z = twist[3:]
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y, twist[0]], [z, zero, -x, twist[1]], [-y, x, zero, twist[2]], [zero] * 4
+    generator = torch.stack([torch.stack(row) for row in rows])
+    view = torch.linalg.matrix_exp(generator) @ settings.viewmatrix.double().T
+    perspective = perspective_of((settings.tanfovx, settings.tanfovy))
+    center = torch.linalg.inv(view)[:3, 3]
+    return settings._replace(viewmatrix=view.T, projmatrix=(perspective @ view).T, campos=center)
 
 
 def scene_of(num=150, shs=None):

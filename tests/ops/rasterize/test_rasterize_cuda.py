@@ -10,11 +10,13 @@ from helpers import assert_rel_rms
 from helpers.raster import absolute_gradients, crowded, leaves, make
 
 from gamba_warp.kernels.rasterize import Skip, function, rasterization
-from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
+from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, T_MIN
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 from gamba_warp.kernels.rasterize.cuda import leaves as leaves_cuda
 from gamba_warp.kernels.rasterize.cuda.records import make_records
 from gamba_warp.kernels.rasterize.cuda.warp import LanePixels, touching
+from gamba_warp.kernels.rasterize.projection import Projected
+from gamba_warp.kernels.rasterize.quantile import counts_in_front
 from gamba_warp.kernels.rasterize.tiles import Drawn, Limits, Size, make_picture
 from gamba_warp.kernels.runtime.launch import cuda_launch
 
@@ -100,6 +102,17 @@ def test_absolute_gradients(monkeypatch, on_cuda, channels, parts, passes):
     assert_same(blocks, lanes)
     assert_rel_rms(found[-1], found[0], SAME, "absolute")
     assert (found[0] > 0).all(-1).float().mean() > 0.5
+
+
+def test_counts_in_front_of_the_median(on_cuda):
+    meta = rasterization(**crowded())[-1]
+    splats = Projected(*(meta[name] for name in ("means2d", "conics", "depths", "opacities")))
+    given = splats, meta.bins, meta.tiling, Limits(ALPHA_MIN, ALPHA_MAX, T_MIN)
+    lanes = counts_in_front(*given)
+    on_cuda()
+    blocks = counts_in_front(*given)
+    # T may lie on the threshold in a pixel
+    assert (blocks - lanes).abs().sum() <= 2 and lanes.sum() > 1000
 
 
 @pytest.mark.parametrize("parts", [1, 2])
