@@ -237,6 +237,7 @@ class GaussianRasterizer(torch.nn.Module):
         theta: Tensor | None = None,
         rho: Tensor | None = None,
         means2D_densify: Tensor | None = None,
+        **others: Any,
     ) -> tuple[Tensor, ...]:
         """Render N Gaussians, differentiable in all arguments.
 
@@ -256,6 +257,7 @@ class GaussianRasterizer(torch.nn.Module):
                 world-to-camera matrix would be multiplied by exp(rho, theta) from the left.
             means2D_densify: ``[N, 3]``, like ``means2D``; its gradient is the sum of the absolute
                 values of the pixels' gradients (Ye et al. 2024, "AbsGS").
+            **others: arguments of other forks, which are refused.
 
         Returns:
             The colour ``[C, H, W]`` and the radii ``[N]`` int32, pixels, 0 where culled, and what
@@ -264,10 +266,12 @@ class GaussianRasterizer(torch.nn.Module):
             transmittance is above 0.5 behind it.
 
         Raises:
-            TypeError: an argument is not a tensor, or of another dtype.
+            TypeError: an argument is not a tensor, or of another dtype, or of another fork.
             ValueError: a shape, device or setting is not as above, or not exactly one of two
                 alternatives is given.
         """
+        for name in others:
+            raise TypeError(f"{name} is an argument of another rasterizer and is not supported")
         return rasterize_gaussians(
             means3D, means2D, shs, colors_precomp, opacities, scales, rotations, cov3D_precomp,
             self.raster_settings, theta, rho, means2D_densify,

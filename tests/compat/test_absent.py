@@ -165,6 +165,9 @@ def test_names_of_later_gsplat():
     assert gsplat.has_3dgs() and not gsplat.has_2dgs() and not gsplat.has_losses()
     assert get_args(gsplat.RasterizeMode) == ("classic", "antialiased")
     assert get_args(gsplat.CameraModel) == ("pinhole",) and "ED" in get_args(gsplat.RenderMode)
+    from gamba_warp.compat.gsplat.cuda._wrapper import CameraModel  # as gsplat 1.6 has it
+
+    assert CameraModel is gsplat.CameraModel
 
 
 def test_losses_are_an_installed_gsplats(monkeypatch):

@@ -241,6 +241,9 @@ def test_options_of_other_rasterizers_are_refused():
     for name in ("kernel_size", "subpixel_offset"):
         with pytest.raises(TypeError, match=f"{name} is an option of another rasterizer"):
             GaussianRasterizationSettings(**given, **{name: 0.1})
+    for name in ("sh_objs", "features"):  # Gaussian grouping, feature splatting
+        with pytest.raises(TypeError, match=f"^{name} is an argument of another rasterizer and is"):
+            draw({**scene_of(9), name: torch.zeros(9, 16)}, settings_of())
     fields = inspect.signature(drop_in._Settings).parameters
     assert list(fields)[:12] == list(given)[:12] and settings_of()._replace(debug=True).debug
 

@@ -86,10 +86,10 @@ ABSENT = complete(
         "cuda._torch_impl_2dgs": "accumulate_2dgs",
         "cuda_legacy._torch_impl": "quat_to_rotmat",
         "cuda_legacy._wrapper": "num_sh_bases",
-        "cuda._wrapper": "FThetaCameraDistortionParameters FThetaPolynomialType RollingShutterType "
-        "UnscentedTransformParameters adam fully_fused_projection fully_fused_projection_2dgs "
-        "fully_fused_projection_with_ut isect_offset_encode isect_tiles persp_proj proj "
-        "quat_scale_to_covar_preci rasterize_to_indices_in_range "
+        "cuda._wrapper": "CameraModel FThetaCameraDistortionParameters FThetaPolynomialType "
+        "RollingShutterType UnscentedTransformParameters adam fully_fused_projection "
+        "fully_fused_projection_2dgs fully_fused_projection_with_ut isect_offset_encode "
+        "isect_tiles persp_proj proj quat_scale_to_covar_preci rasterize_to_indices_in_range "
         "rasterize_to_indices_in_range_2dgs rasterize_to_pixels rasterize_to_pixels_2dgs "
         "rasterize_to_pixels_eval3d spherical_harmonics world_to_cam",
         "distributed": "all_gather_int32 all_gather_tensor_list all_to_all_int32 "
