@@ -93,16 +93,19 @@ def test_the_default_is_what_the_picture_has_the_pixels_for():
 
 @pytest.mark.parametrize("size, changes", [(24, {}), (96, {}), (24, {"predict_rotation": True})])
 def test_a_plain_picture_has_no_gaps_when_it_is_drawn_large(size, changes):
-    """Four pixels a cell; the network's own Gaussians let the background through between them."""
+    """Four pixels a cell; the network's own Gaussians let the background through between them.
+
+    Along the view, where no gap can be, they stay as they are.
+    """
     model, rgba = fresh(**changes), box(size, size // 4, 3 * size // 4)
     model.decoder.scale_bias.data[0] = math.log(0.2)  # sides of a cell
     camera = reference_cameras(model.config, 1).resized(96, 96)
     inside = slice(32, 64)
-    found, raw = (
-        render(reconstruct(model, rgba, detail=k), camera).alpha[0, inside, inside].min()
-        for k in (None, 1)
-    )
+    after, before = (reconstruct(model, rgba, detail=k) for k in (None, 1))
+    found, raw = (render(g, camera).alpha[0, inside, inside].min() for g in (after, before))
     assert raw < 0.4 < 0.75 < found
+    grown = filled(model, rgba).scales > before.scales
+    assert (grown[::3].sum(-1) == 2).all()  # of the first layer
 
 
 def test_what_is_plain_does_not_split():

@@ -148,7 +148,10 @@ def test_an_invalid_compressed_ply(sound, old, new, word):
     [
         (BOUNDS[0], float("nan"), "not finite"),
         # the sizes of 256 Gaussians between -inf and a logarithm are unknown
-        ("min_scale_x", -np.inf, "256 of 300 Gaussians have scales that are not finite"),
+        *(
+            (f"{end}_scale_x", -np.inf, "256 of 300 Gaussians have scales that are not finite")
+            for end in ("min", "max")
+        ),
     ],
 )
 def test_a_compressed_ply_with_bounds_that_are_not_finite(sound, bound, value, reason):

@@ -1,5 +1,6 @@
 """Round trips of every format of Gaussians, with a line about its losses."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -108,26 +109,44 @@ def test_harmonics_show_the_same_colours_after_a_turn(tmp_path, kind):
     assert (want - got).abs().max() < 15 * 0.7 / 64
 
 
-@pytest.mark.parametrize("kind, most", [("spz", "±1"), ("compressed-ply", "±4")])
-def test_harmonics_out_of_range_are_clipped_and_that_is_said(tmp_path, kind, most):
+@pytest.mark.parametrize("kind, ends", [("spz", [-1, 127 / 128]), ("compressed-ply", [-4, 4])])
+def test_harmonics_out_of_range_are_clipped_and_that_is_said(tmp_path, kind, ends):
     gaussians = some(9, degree=1)
-    gaussians.harmonics[4, 1, 2] = 5.0
-    path, lost = written(tmp_path, gaussians, kind)
-    assert most in lost and "\n" not in lost
-    assert read_gaussians(path).harmonics.abs().max() < 4.02
+    for value, end in zip([-5.0, 5.0], ends):
+        gaussians.harmonics[4, 2, 1] = value  # of x, which .spz does not turn
+        path, lost = written(tmp_path, gaussians, kind)
+        assert f"±{-ends[0]}" in lost and "\n" not in lost
+        found = read_gaussians(path).harmonics.flatten()
+        assert found[found.abs().argmax()] == end
+
+
+def test_a_compressed_ply_without_bounds_of_colours(tmp_path):
+    """As early writers made it: colours are between 0 and 1, as those are that we write here."""
+    gaussians = some(200)
+    gaussians.colors[:2] = torch.tensor([[0.0], [1.0]])
+    path, _ = written(tmp_path, gaussians, "compressed-ply")
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    head = re.sub(b"property float (min|max)_[rgb]\n", b"", head)
+    path.write_bytes(head + end + body[:48] + body[72:])  # 12 of the chunk's 18 bounds
+    check("compressed-ply", gaussians, read_gaussians(path))
 
 
 def test_spz_far_and_wide(tmp_path):
     gaussians = some(50)
     gaussians.means *= 1e4
-    gaussians.scales[3] = 1e4
+    # of logarithms from -10 to 5.94, in steps of 1/16
+    gaussians.scales[:5] = torch.tensor([9.2, 6.1, 5.98, -10.05, -10.08]).exp()[:, None]
     path, lost = written(tmp_path, gaussians, "spz")
-    assert "scales of 1 Gaussians" in lost
+    assert "scales of 3 Gaussians" in lost
     found = differences(gaussians, read_gaussians(path))
     assert found["means"] <= 0.9 / 2**10  # 5,000 leaves ten bits behind the point
-    gaussians.means *= 1e4
-    before = path.read_bytes()
-    refused("an .spz holds", written, tmp_path, gaussians, "spz")
+    one = some(1)
+    for reach in (-128.0, 128.0, 2.0**23 - 1):  # the sign is one of 24 bits
+        one.means[:] = torch.tensor([0, reach, 0])
+        written(tmp_path, one, "spz")
+        assert read_gaussians(path).means[0, 1] == reach
+    one.means[0, 1], before = 2.0**23, path.read_bytes()
+    refused("an .spz holds", written, tmp_path, one, "spz")
     assert path.read_bytes() == before
 
 
