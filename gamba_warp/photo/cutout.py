@@ -318,8 +318,6 @@ def _at_own_pixels(
         return without_matte(part)[0]
     if found.method == "mask":
         return np.dstack([without_background(part[..., :3], part[..., 3]), part[..., 3]])
-    if found.method == "none":
-        return part
     alpha = resize_rgba(small, *part.shape[:2])[..., 3]
     same = copy.copy(options)  # with its opened networks
     same.cutout = "matte" if found.method == "sam" else found.method

@@ -467,6 +467,38 @@ def test_a_few_transparent_pixels_are_no_cut_out(tmp_path, kind):
     assert alone.method == "alpha"
 
 
+@pytest.mark.parametrize("spread", [0, 1], ids=["one colour", "noise"])
+def test_with_a_few_transparent_pixels_the_object_may_be_all(tmp_path, spread):
+    rgba = np.random.default_rng(0).random((40, 50, 4)) * spread
+    rgba[..., 3] = 1
+    rgba[0, :3, 3] = 0
+    save_image(tmp_path / "a.png", rgba)
+    found = cut_out(tmp_path / "a.png", CutoutOptions(fetch=False, notify=lambda line: None))
+    assert found.method == "alpha" and (found.mask == rgba[..., 3]).all()
+
+
+@pytest.mark.parametrize("second", [0.0, 1.0, "elsewhere"])
+def test_a_small_object_stays_the_one_that_was_found(tmp_path, monkeypatch, second):
+    """If a method finds nothing, or another thing, among the object's own pixels."""
+    monkeypatch.setattr(cutout, "WORKING_SIZE", 128)
+    save_image(tmp_path / "noise.png", np.random.default_rng(0).random((160, 160, 3)))
+
+    def segmenter(rgb):
+        alpha = np.zeros(rgb.shape[:2], np.float32)
+        if len(rgb) == 128:
+            alpha[40:56, 32:64] = 1
+        elif second == "elsewhere":
+            alpha[:, :20] = 1
+        else:
+            alpha[:] = second
+        return alpha
+
+    monkeypatch.setattr(cutout, "SamSegmenter", lambda *_: segmenter)
+    found = cut_out(tmp_path / "noise.png", CutoutOptions(sam="sam.pth"))
+    rows, columns = (np.ptp(np.nonzero(found.rgba[..., 3] > 0.5)[axis]) + 1 for axis in (0, 1))
+    assert found.method == "sam" and (rows, columns) == (20, 40)  # 1.25 as many
+
+
 @pytest.mark.parametrize("way", ["plain", "alpha", "mask", "matte"])
 def test_a_small_object_of_a_large_picture_keeps_its_pixels(tmp_path, network, way):
     """As sharp as in a part of the same picture."""

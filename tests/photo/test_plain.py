@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.cutouts import cases, doubted, iou, near_white
+from scipy.ndimage import gaussian_filter
 
 pytest.importorskip("skimage")
 from gamba_warp.photo.plain import plain_matte
@@ -37,6 +38,28 @@ def test_text_on_white_and_shading_save_an_area(scores):
     for case, score in scores:
         if case.name.split(",")[0] in kept:
             assert score > 0.98, case.name
+
+
+@pytest.mark.parametrize(
+    "darkness, blur, rows, columns, removed",
+    [
+        ((0.3, 0.3, 0.3), 8, (145, 165), (50, 150), True),
+        ((0.3, 0.3, 0.4), 8, (145, 165), (50, 150), False),
+        ((-0.1, -0.1, -0.1), 8, (145, 165), (50, 150), False),
+        ((0.3, 0.3, 0.3), 8, (95, 115), (50, 150), False),
+        ((0.25, 0.25, 0.25), 14, (145, 180), (20, 180), False),
+    ],
+    ids=["grey", "coloured", "light", "at half the height", "larger than a third of the object"],
+)
+def test_only_a_small_grey_shadow_at_the_foot_is_removed(darkness, blur, rows, columns, removed):
+    cast = np.zeros((200, 200))
+    cast[slice(*rows), slice(*columns)] = 1
+    cast = gaussian_filter(cast, blur)[..., None]
+    rgb = (0.9 * (1 - np.array(darkness) * cast)).astype(np.float32)
+    rgb[50:150, 60:140] = 0.2, 0.3, 0.7
+    alpha = plain_matte(rgb).rgba[..., 3]
+    alpha[50:152, 58:142] = 0  # the object and its rim
+    assert alpha.any() != removed
 
 
 def test_holes_may_be_kept(scores):
