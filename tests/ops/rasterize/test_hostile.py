@@ -122,7 +122,7 @@ def test_shapes_are_right(cuts, shape):
 
 
 def test_opacities_around_the_cut():
-    """Below alpha_min nothing is drawn; at it and above, a Gaussian on a pixel's centre is."""
+    """Below alpha_min nothing is drawn; above it, a Gaussian on a pixel's centre is."""
     around = [1 - 1e-6, 1 - 1e-7, 1.0, 1 + 1e-7, 1 + 1e-6, 1.01]
     values = torch.tensor([0.0, *(ALPHA_MIN * x for x in around), 0.5, 1.0])
     scene = base(len(values) * 5, size=0.02)
@@ -132,6 +132,43 @@ def test_opacities_around_the_cut():
     drawn = values >= torch.tensor(1.005 * ALPHA_MIN)
     assert (grads["colors"][0].view(5, len(values), 3)[:, drawn] != 0).any((0, 2)).all()
     assert (grads["colors"][0].view(5, len(values), 3)[:, values < ALPHA_MIN] == 0).all()
+
+
+@pytest.mark.parametrize("cuda", [False, True])
+def test_at_a_limit_exactly(on_cuda, cuda):
+    """A pixel of alpha_min itself is drawn, and so is a Gaussian on the near and the far plane."""
+    if cuda:
+        on_cuda()
+    scene = {
+        "means": torch.tensor([[[0.0, 0, 1]]]),
+        "quats": None,
+        "scales": torch.full((1, 1, 3), 0.3),
+    }
+    scene |= {"opacities": torch.tensor([[0.6]]), "viewmats": torch.eye(4)[None, None]}
+    scene |= {
+        "Ks": torch.tensor([[[[8.0, 0, 8.5], [0, 8, 8.5], [0, 0, 1]]]]),
+        "width": 17,
+        "height": 17,
+    }
+
+    def drawn(**changes):
+        colors = torch.ones(1, 1, 3, requires_grad=True)
+        renders, _, meta = rasterization(**(scene | changes), colors=colors)
+        renders[0, 0, 8, 2, 0].backward()
+        culled = [reason for reason, count in meta["culled"].items() if count]
+        return renders[0, 0, 8, 2, 0].item(), colors.grad[0, 0, 0].item(), culled
+
+    alpha, *_ = drawn()
+    pixel, gradient, _ = drawn(alpha_min=alpha)
+    assert pixel == alpha and gradient == pytest.approx(alpha)
+    assert drawn(alpha_min=alpha * (1 + 2**-22))[:2] == (0, 0)
+    for limits, culled in (
+        ({"near_plane": 1.0, "far_plane": 1.0}, []),
+        ({"near_plane": 1 + 2**-23}, ["near"]),
+        ({"far_plane": 1 - 2**-24}, ["far"]),
+        ({"opacities": torch.full((1, 1), ALPHA_MIN)}, ["small"]),  # its box is a point
+    ):
+        assert drawn(**limits)[2] == culled
 
 
 @pytest.mark.parametrize("opacity", [1.5, 1e30, 3e38])
