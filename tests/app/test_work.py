@@ -3,6 +3,7 @@
 import re
 import zipfile
 from dataclasses import replace
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from helpers.model import quick, run_reconstruct
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.app import cutting, work
+from gamba_warp.app import cutting, guard, work
 from gamba_warp.cameras import orbit
 from gamba_warp.files import STARTER
 from gamba_warp.formats.gaussians.files import read_gaussians
@@ -246,6 +247,30 @@ def test_haze_is_left_out(made, tmp_path, monkeypatch):
     again = work.trim(both, 0.0, work.FARTHEST)
     torch.testing.assert_close(again.gaussians.means, gaussians.means, rtol=0, atol=0)
     refused("no Gaussian would stay", work.trim, replace(made, gaussians=gaussians[:0]), 0.9, 10.0)
+
+
+def test_the_strip_keeps_the_last_results(made, tmp_path, monkeypatch):
+    """Computations and the server are stand-ins."""
+    gradio = pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
+    from gamba_warp.app import actions
+
+    said = []
+    monkeypatch.setattr(gradio, "Info", said.append)
+    monkeypatch.setattr(actions, "cut_picture", lambda path, name, _: Mock(title=name, warning=""))
+    monkeypatch.setattr(work, "run_model", lambda _, cut: replace(made, name=cut.title))
+    monkeypatch.setattr(work, "viewer", lambda made: made.name)
+    monkeypatch.setattr(work, "thumbnail", lambda *_: None)
+    thread = Mock(call=lambda function, *inputs, wanted: function(*inputs))
+    page = actions.Actions(None, None, Mock(new_folder=lambda _: tmp_path), "cpu", thread)
+    results, most = [], guard.MAX_PICTURES
+    for count in (most - 1, 1, 1):
+        names = [str(len(results) + number) for number in range(count)]
+        given = [{"path": "a", "orig_name": name} for name in names]
+        assert not said
+        results, strip, *_ = page.take_all(given, results, MagicMock(), lambda *_: None)
+    names = [str(number) for number in range(1, most + 1)]
+    assert [each.made.name for each in results] == [name for _, name in strip["value"]] == names
+    assert said == ["The strip keeps the last 12 results."]
 
 
 def test_the_viewer_has_the_input_and_the_last_mesh(made):
