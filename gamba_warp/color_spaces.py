@@ -150,10 +150,10 @@ def _code_points(image: Image.Image) -> tuple[int, int, bool] | None:
         _, box, numbers = file.read(_META).partition(b"colrnclx")
         file.seek(start)
         if box and len(numbers) >= 4:
-            found = *struct.unpack(">2H", numbers[:4]), True  # the decoder widens the range
+            primaries, transfer = struct.unpack(">2H", numbers[:4])
+            found = primaries, transfer, True  # the decoder widens the range
     elif numbers := image.info.get("nclx_profile"):
-        names = "color_primaries", "transfer_characteristics"
-        found = *(int(numbers[name]) for name in names), True
+        found = int(numbers["color_primaries"]), int(numbers["transfer_characteristics"]), True
     return found
 
 
