@@ -128,13 +128,14 @@ class Stages:
 
     Attributes:
         quiet: no bar is drawn.
+        verbose: details are printed.
         stdout: the standard output while ``sys.stdout`` drops all text, else None.
         show: shows a name; None without a bar.
         seconds: wall-clock and CPU seconds of each stage, over all items.
     """
 
     def __init__(self) -> None:
-        self.quiet = False
+        self.quiet = self.verbose = False
         self.stdout: TextIO | None = None
         self.show: Callable[[str], object] | None = None
         self.seconds: dict[str, list[float]] = {}

@@ -132,9 +132,12 @@ def run(name: str, arguments: list[str]) -> int:
             return 0
         require(*row.needs)
         arguments, quiet, verbose = _common(arguments)
-        arguments = _expanded(command, arguments)
+        call = _parsed(command, _expanded(command, arguments), f"gamba {name}")
+        vars(command).get("check", _nothing)(*call.args, **call.keywords)
         if name == "app" and not quiet:  # which takes long to start
             print("loading torch", flush=True)
+        elif "network" in row.uses and sys.stderr.isatty() and not quiet:
+            print("loading torch", file=sys.stderr, flush=True)
         if "cores" in row.uses:
             share_cores()
         if "network" in row.uses:
@@ -142,8 +145,9 @@ def run(name: str, arguments: list[str]) -> int:
             use_fastest_products()
         if "kernels" in row.uses and not verbose:
             quiet_warp()
+        STAGES.verbose = verbose
         with _quiet() if quiet else nullcontext():
-            code = _parsed(command, arguments, f"gamba {name}")() or 0
+            code = call() or 0
         if verbose:
             table = [STAGES.table()] if STAGES.seconds else []
             print("\n".join([*table, f"{time.process_time():.1f} s of CPU time"]), file=sys.stderr)
@@ -205,13 +209,17 @@ def help_text(name: str, command: Callable, arguments: list[str]) -> str:
     return "\n".join([*lines, f"every command: {common}", ""])
 
 
-def _parsed(command: Callable, arguments: list[str], program: str) -> Callable[[], int | None]:
+def _nothing(*_: Any, **__: Any) -> None:
+    """Check nothing."""
+
+
+def _parsed(command: Callable, arguments: list[str], program: str) -> partial[int | None]:
     """Return the command with its arguments.
 
     Raises:
         UserError: they are invalid; what tyro prints in a box, in one line.
     """
-    calls: list[Callable[[], int | None]] = []
+    calls: list[partial[int | None]] = []
 
     @wraps(command)
     def keep(*values: Any, **options: Any) -> None:

@@ -165,9 +165,11 @@ def _find_pictures(
     """Return picture files, and failures with reasons. Raises UserError without a file."""
     from ..images import find_pictures, left_out
 
+    example = next(iter(sorted((STARTER / "icons").glob("*.png"))), None)
     if not images:
-        example = next(iter(sorted((STARTER / "icons").glob("*.png"))), "photo.png")
-        raise UserError(f"give at least one picture or folder, such as {example}")
+        raise UserError(f"give at least one picture or folder, such as {example or 'photo.png'}")
+    if example and images == (Path("photo.png"),) and not images[0].exists():  # of the pages
+        raise UserError(f"photo.png: no such file; give a picture of yours, or {example}")
     given = [_standard_input() if str(path) == "-" else path for path in dict.fromkeys(images)]
     pictures, failures = find_pictures(given, recursive)
     if mask is not None and len(pictures) != 1:

@@ -67,6 +67,10 @@ def reported(command: Callable[..., Results]) -> Callable[..., int]:
         given.apply_defaults()
         values, files = given.arguments, given.arguments.get("files")
         piped = (files.out if files else values["out"]) == STREAM
+        inputs = next(iter(values.values()))
+        several = isinstance(inputs, tuple) and (len(inputs) > 1 or any(x.is_dir() for x in inputs))
+        if piped and several:
+            raise UserError("--out - writes one file; give one input, and no folder")
         as_json = files is not None and files.json
         if piped and as_json:
             raise UserError("--out - writes a file to the standard output; --json cannot, too")

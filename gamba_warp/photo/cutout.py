@@ -160,8 +160,9 @@ class CutOut:
         how: the method in a sentence.
         source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels per side.
         mask: alpha of the object in it, ``[H, W]`` float32 in [0, 1].
-        editable: ``[H, W, 4]`` float32: the whole picture, with colours in transparent parts too,
-            so that an editor can restore them in a PNG, which may be used as input again.
+        editable: ``[h, w, 4]`` float32: the whole picture, or a small object with what is around
+            it at its own pixels, with colours in transparent parts too, so that an editor can
+            restore them in a PNG, which may be used as input again.
         warning: reasons to doubt the cut-out, and a remedy; empty without a doubt.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour, kept or removed.
     """
@@ -182,8 +183,7 @@ class CutOut:
 
     def beside(self) -> np.ndarray:
         """Return the picture beside its cut-out on grey, ``[H, 2 W, 3]``."""
-        whole = np.ones_like(self.editable[..., :1])
-        both = np.dstack([self.source_rgb, whole]), self.editable
+        both = (np.dstack([self.source_rgb, x]) for x in (np.ones_like(self.mask), self.mask))
         small = np.hstack([shrink(half, _PREVIEW_SIDE) for half in both])
         return over_background(small, GREY)
 
@@ -248,7 +248,9 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     if found is None or few and not found.rgba[..., 3].any():
         found = _Found("alpha", rgba)  # the object may well fill the picture
     method, rgba = found.method, found.rgba
-    close = _at_own_pixels(path, whole, found, options) if options.recenter else rgba
+    close, around = rgba, source
+    if options.recenter:
+        close, around = _at_own_pixels(path, whole, source, found, options)
     try:
         centred = recenter(close, BORDER_RATIO if options.recenter else None)
     except ValueError as error:
@@ -279,33 +281,38 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
             best = models.PUBLISHED[0]
             about = f"{best.name}, {best.megabytes} MB, {best.licence}, fetched once"
             warning += f" Try a network: gamba reconstruct --cutout matte ({about})."
-    colors = np.where(rgba[..., 3:] > 0, rgba[..., :3], source)
-    editable = np.dstack([colors, rgba[..., 3]])
+    editable = np.dstack([np.where(close[..., 3:] > 0, close[..., :3], around), close[..., 3]])
     areas = np.zeros(rgba.shape[:2], bool) if found.areas is None else found.areas > 0
     return CutOut(centred, method, how, source, rgba[..., 3], editable, warning, areas)
 
 
 def _at_own_pixels(
-    path: str | Path, whole: np.ndarray, found: _Found, options: CutoutOptions
-) -> np.ndarray:
+    path: str | Path,
+    whole: np.ndarray,
+    source: np.ndarray,
+    found: _Found,
+    options: CutoutOptions,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return an object that is small in the reduced picture as it is in the whole one.
 
     Args:
         path: named in errors.
         whole: ``[H, W, 4]``, the picture with its alpha or the mask's.
+        source: ``[h, w, 3]``, the reduced picture.
         found: its cut-out in the reduced picture.
         options: options.
 
     Returns:
-        ``[h, w, 4]``, the object and what is around it; or the reduced picture's.
+        ``[h, w, 4]``, the object and what is around it, and ``[h, w, 3]``, the picture there; or
+        the reduced picture's.
     """
     rgba, scale = found.rgba, len(whole) / len(found.rgba)
     rows, columns = (np.flatnonzero((rgba[..., 3] > PRESENT).any(axis)) for axis in (1, 0))
     if scale < 1.1 or not len(rows):
-        return rgba
+        return rgba, source
     sides = [int(each[-1] - each[0]) + 1 for each in (rows, columns)]
     if max(sides) > _CLOSE:
-        return rgba
+        return rgba, source
     spare = max(8, max(sides) // 4)
     box = [
         (max(0, each[0] - spare), min(n, each[-1] + 1 + spare))
@@ -314,22 +321,23 @@ def _at_own_pixels(
     small = rgba[tuple(slice(*ends) for ends in box)]
     part = whole[tuple(slice(round(a * scale), round(b * scale)) for a, b in box)]
     part = shrink(part, WORKING_SIZE)
+    around = part[..., :3]
     if found.method == "alpha":
-        return without_matte(part)[0]
+        return without_matte(part)[0], around
     if found.method == "mask":
-        return np.dstack([without_background(part[..., :3], part[..., 3]), part[..., 3]])
+        return np.dstack([without_background(around, part[..., 3]), part[..., 3]]), around
     alpha = resize_rgba(small, *part.shape[:2])[..., 3]
     same = copy.copy(options)  # with its opened networks
     same.cutout = "matte" if found.method == "sam" else found.method
     try:
-        again = _cut_by_methods(path, part[..., :3], same).rgba
+        again = _cut_by_methods(path, around, same).rgba
     except UserError:  # it is all of the part
         again = rgba[:0]
     if again.shape == part.shape:
         one, other = again[..., 3] > 0.5, alpha > 0.5
         if (one & other).sum() >= _SAME * (one | other).sum():
-            return again
-    return _blended(part[..., :3], alpha)
+            return again, around
+    return _blended(around, alpha), around
 
 
 def _methods(options: CutoutOptions) -> list[Method]:

@@ -131,5 +131,5 @@ def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Pa
 
 
 def to_stderr(line: str) -> None:
-    """Print a line on stderr, like the commands."""
-    print(f"gamba: {line}", file=sys.stderr, flush=True)
+    """Print a line on stderr, which is no error."""
+    print(f"note: {line}", file=sys.stderr, flush=True)

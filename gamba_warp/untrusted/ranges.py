@@ -160,18 +160,23 @@ def check_options(group: Any) -> None:
 def ranged(command: Function) -> Function:
     """Decorate a command to check its arguments against their ranges before it starts.
 
-    Dataclass arguments are checked by the ranges of their fields.
+    Dataclass arguments are checked by the ranges of their fields. The attribute ``check`` is the
+    check alone.
     """
 
-    @functools.wraps(command)
-    def checked(*args: Any, **kwargs: Any) -> Any:
+    def check(*args: Any, **kwargs: Any) -> None:
         values = inspect.signature(command).bind(*args, **kwargs).arguments
         check_values(values, command, option)
         for value in values.values():
             if is_dataclass(value) and not isinstance(value, type):
                 check_options(value)
+
+    @functools.wraps(command)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        check(*args, **kwargs)
         return command(*args, **kwargs)
 
+    vars(checked)["check"] = check
     return typing.cast(Function, checked)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
+from ...batch import STAGES
 from ...errors import UserError
 from ...files import atomic_path
 from ...gaussians import Gaussians
@@ -108,7 +109,8 @@ def to_be_written(gaussians: Gaussians, least: float | None = None) -> tuple[Gau
         least: as for ``Gaussians.drawn``.
 
     Returns:
-        The Gaussians, and a sentence with their number and the number left out.
+        The Gaussians, and a sentence with their number and, if they could be seen or with
+        --verbose, the number left out.
 
     Raises:
         UserError: none is left.
@@ -119,7 +121,8 @@ def to_be_written(gaussians: Gaussians, least: float | None = None) -> tuple[Gau
         raise UserError(f"no Gaussian has an opacity of {limit} or more")
     lost = gaussians.num - kept.num
     why = f"opacity under {limit}" + (", never drawn" if least is None else "")
-    return kept, f"{kept.num:,} Gaussians" + (f", {lost:,} left out ({why})." if lost else ".")
+    said = f", {lost:,} left out ({why})" if lost and (least or STAGES.verbose) else ""
+    return kept, f"{kept.num:,} Gaussians{said}."
 
 
 def write_gaussians(

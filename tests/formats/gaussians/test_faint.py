@@ -34,7 +34,7 @@ def test_pictures_keep_every_bit(mode):
     gaussians = faint()
     kept, said = to_be_written(gaussians)
     assert kept.num == 2000
-    assert said == "2,000 Gaussians, 1,000 left out (opacity under 1/255, never drawn)."
+    assert said == "2,000 Gaussians."
     viewmats = orbit(torch.tensor([0.0, 70.0, 200.0]), elevation=20.0)
     cameras = Cameras(viewmats, intrinsics(64, 64).expand(3, 3, 3), 64, 64)
     want, got = (
@@ -82,7 +82,8 @@ def test_export_leaves_them_out_and_says_so(tmp_path, capsys):
     common = ["export", tmp_path / "a.ply", "--mesh", "--splats", *SPLAT_FORMATS]
     few, all_ = tmp_path / "few", tmp_path / "all"
     for out, options, count in (
-        (few, [], "2,000 Gaussians, 1,000 left out (opacity under 1/255, never drawn)."),
+        (few, [], "2,000 Gaussians."),
+        (few, ["-v"], "2,000 Gaussians, 1,000 left out (opacity under 1/255, never drawn)."),
         (all_, ["--min-opacity", 0], "3,000 Gaussians."),
     ):
         words = map(str, [*common[1:], "--out", out, *options])
