@@ -1,7 +1,7 @@
 """Mesh files as flat arrays: one list of triangles with their corners' normals, UVs and materials.
 
-The readers of the formats yield parts, which are joined without faces of no area, which would set
-the bounding box unseen, and without unused vertices; normals are computed when they are asked for.
+The readers of the formats yield parts, which are joined without unused vertices, and without faces
+of no area that would set the bounding box; normals are computed when they are asked for.
 The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up by convention and are turned by
 ``normalized`` (front +z becomes front -y, as in Blender).
 """
@@ -132,7 +132,7 @@ def load_mesh(
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
     texture without UV coordinates by its mean colour, and the alpha of a mesh that would be
-    invisible by 1; ``warnings`` names each. Faces of no area stay only if no face has one.
+    invisible by 1; ``warnings`` names each. Faces of no area do not set the box.
 
     Args:
         path: the file.
@@ -233,13 +233,18 @@ def _joined(parts: list[TexturedMesh], sides: SideFiles) -> TexturedMesh:
 
 
 def _without_flat(mesh: TexturedMesh) -> TexturedMesh:
-    """Return a mesh without the faces of no area, unless all are; then it is warned of."""
-    first, second, third = (mesh.vertices[corner] for corner in mesh.faces.T)
-    one, two = second - first, third - first
-    longest = np.maximum((one * one).sum(1), (two * two).sum(1))
-    solid = (np.cross(one, two) ** 2).sum(1) > (THIN * longest) ** 2
-    if solid.all():
+    """Return a mesh without its faces of no area, if one reaches the sides of the bounding box.
+
+    If all faces are such, they stay, with a warning.
+    """
+    vertices, faces = mesh.vertices, mesh.faces
+    outer = np.zeros(len(vertices), bool)
+    for axis in vertices.T:
+        outer |= (axis == axis.min()) | (axis == axis.max())
+    first, second, third = (outer[corner] for corner in faces.T)
+    if _have_area(vertices, faces[first | second | third]).all():
         return mesh
+    solid = _have_area(vertices, faces)
     if not solid.any():
         mesh.warnings.append("no face has an area")
         return mesh
@@ -255,6 +260,14 @@ def _without_flat(mesh: TexturedMesh) -> TexturedMesh:
         given_normals=None if normals is None else normals[solid],
         flat=int((~solid).sum()),
     )
+
+
+def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return ``[F]`` bool, True for the faces with an area."""
+    first, second, third = (vertices[corner] for corner in faces.T)
+    one, two = second - first, third - first
+    longest = np.maximum((one * one).sum(1), (two * two).sum(1))
+    return (np.cross(one, two) ** 2).sum(1) > (THIN * longest) ** 2
 
 
 def _is_visible(part: TexturedMesh) -> bool:
