@@ -17,6 +17,7 @@ import json
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,8 @@ def _views(model: Gamba, dataset: ViewDataset, objects: list[int]) -> dict[str, 
     """Return the figures of a validation of these objects."""
     failures: dict[str, str] = {}
     batches = fixed_batches(FixedObjects(dataset, objects), model.config, 128, failures)
-    found, _ = validate(model, batches, Objective({}, load_lpips("cpu")), torch.device("cpu"))
+    objective = Objective(defaultdict(float), load_lpips())  # no loss, only figures
+    found, _ = validate(model, batches, objective, torch.device("cpu"))
     if failures:
         raise UserError(f"unreadable: {failures}")
     return found
