@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..batch import STAGES
 from ..errors import UserError
 from ..gaussians import Gaussians
 from .density import level_set
@@ -65,14 +66,17 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
     options.check()
     gaussians = near_and_visible(gaussians.detach())
     views = None
+    STAGES.begin("mesh views")
     if options.method == "tsdf" or options.colors or texture:
         views = look_around(gaussians, options)
+    STAGES.begin("mesh surface")
     if options.method == "tsdf":
         assert views is not None
         support = max(1.0, options.min_support * options.views)
         mesh = fuse(views, options.voxels, options.truncation, support)
     else:
         mesh = level_set(gaussians, options.voxels, options.level)
+    STAGES.begin("mesh cleaning")
     vertices, faces = cleaned_mesh(
         *mesh,
         min_component=options.min_component,
@@ -84,17 +88,21 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
     )
     colors = picture = moved = None
     if options.watertight:
+        STAGES.begin("mesh closing")
         before = vertices
         voxels = min(options.voxels, _SOLID_VOXELS)
         vertices, faces = solid_of(vertices, faces, voxels, options.faces)
         distance = distances(before, vertices, faces)
         moved = float(distance.mean()), float(distance.max())
     if options.colors:
+        STAGES.begin("mesh colors")
         assert views is not None
         colors = vertex_colors(vertices, faces, views, options.voxels)
     if texture:
+        STAGES.begin("mesh texture")
         assert views is not None
         picture = bake_texture(vertices, faces, views, options.voxels, texture)
+    STAGES.begin("mesh")  # what follows, such as its file
     return Surface(vertices, faces, colors, picture, moved)
 
 
