@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import functools
+import contextvars
 import html
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gradio as gr
 
+from ..batch import STAGES
 from ..errors import UserError, first_line
 from ..images import save_image
 from ..versions import advice
@@ -26,7 +29,7 @@ from .cutting import (
     switch_areas,
 )
 from .guard import MAX_PICTURES, VISITOR
-from .main_thread import MainThread
+from .main_thread import Cancelled, MainThread
 from .visitor_files import VisitorFiles
 
 if TYPE_CHECKING:
@@ -37,7 +40,17 @@ _FRAME = (
     '<iframe class="stage" title="3D view of {name}" sandbox="allow-scripts allow-downloads" '
     'allow="fullscreen" srcdoc="{document}"></iframe>'
 )
-
+VIEWS = "Cut-out", "Object"  # what the stage shows
+# Share of a mesh's time before each of its stages.
+_DONE = {
+    "mesh views": 0.1,
+    "mesh surface": 0.3,
+    "mesh cleaning": 0.4,
+    "mesh closing": 0.5,
+    "mesh colors": 0.6,
+    "mesh texture": 0.7,
+    "mesh": 0.9,
+}
 
 State = tuple[work.Reconstruction, list[Path]]  # the shown result, and its files
 
@@ -49,26 +62,22 @@ class Result(NamedTuple):
     picture: Path
 
 
-def with_page_errors(function: Callable) -> Callable:
-    """Wrap a handler: bad input becomes one line in the page; any other error is a bug."""
-
-    @functools.wraps(function)
-    def wrapped(*args: Any) -> Any:
-        try:
-            return function(*args)
-        except (UserError, MemoryError) as error:
-            raise _error(error) from None
-        except ModuleNotFoundError as error:
-            reason = advice(error.name or "", "app", "app")
-            if reason is None:
-                raise
-            raise _error(UserError(reason)) from None
-        except RuntimeError as error:  # torch raises it when out of memory
-            if "memory" not in str(error):
-                raise
-            raise _error(MemoryError("there is not enough memory for this")) from None
-
-    return wrapped
+@contextmanager
+def page_errors() -> Iterator[None]:
+    """Turn bad input into one line in the page; any other error is a bug."""
+    try:
+        yield
+    except (UserError, MemoryError) as error:
+        raise _error(error) from None
+    except ModuleNotFoundError as error:
+        reason = advice(error.name or "", "app", "app")
+        if reason is None:
+            raise
+        raise _error(UserError(reason)) from None
+    except RuntimeError as error:  # torch raises it when out of memory
+        if "memory" not in str(error):
+            raise
+        raise _error(MemoryError("there is not enough memory for this")) from None
 
 
 def _error(error: Exception) -> gr.Error:
@@ -101,8 +110,9 @@ class Actions:
         self._options = options
         self._files = files
         self._device = device
+        self._cancels: Counter[str] = Counter()  # by page
 
-    @with_page_errors
+    @page_errors()
     def take(
         self,
         given: dict[str, Any] | None,
@@ -121,12 +131,19 @@ class Actions:
             return self.end_session()
         return *self._shown(cut, request), gr.skip()
 
-    @with_page_errors
+    @page_errors()
+    def cancel(self, request: gr.Request) -> None:
+        """Interrupt the page's running action."""
+        self._cancels[request.session_hash or ""] += 1
+
+    @page_errors()
     def end_session(self) -> tuple:
         """Clear the picture; its results stay."""
-        return None, gr.update(visible=False), None, "", gr.skip(), None
+        gone, empty = gr.update(visible=False), gr.update(value=None, visible=False)
+        view = gr.update(value=VIEWS[1], visible=False)
+        return None, gone, empty, "", gr.skip(), view, gr.skip(), None
 
-    @with_page_errors
+    @page_errors()
     def load_example(self, event: gr.EventData, request: gr.Request) -> tuple:
         """Take an example of the gallery."""
         found, index = examples(), event._data["index"]
@@ -136,7 +153,7 @@ class Actions:
         cut = self._call(request, cut_picture, path, title, self._options)
         return *self._shown(cut, request), str(path)
 
-    @with_page_errors
+    @page_errors()
     def apply_strokes(
         self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request
     ) -> tuple:
@@ -144,13 +161,13 @@ class Actions:
         cut = apply_strokes(_given(cut), _layers(painted))
         return self._edited(cut, request)
 
-    @with_page_errors
+    @page_errors()
     def restart(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Reset the mask, without strokes."""
         cut = reset_mask(_given(cut))
         return self._edited(cut, request)
 
-    @with_page_errors
+    @page_errors()
     def toggle_holes(self, cut: Cut | None, request: gr.Request) -> tuple:
         """Clear the enclosed areas of a plain background's colour, or fill them."""
         cut = _given(cut)
@@ -159,7 +176,7 @@ class Actions:
         cut = switch_areas(cut)
         return self._edited(cut, request)
 
-    @with_page_errors
+    @page_errors()
     def reconstruct(
         self,
         cut: Cut | None,
@@ -176,37 +193,41 @@ class Actions:
         made = self._call(request, work.run_model, self._model, after, elevation)
         progress(0.8, "Making the viewer")
         edited = (gr.skip(),) * 3 if after is before else self._edited(after, request)
-        return *edited, *self._added(results, [made], request)
+        return *edited, *self._added(results, made, request)
 
-    @with_page_errors
     def take_all(
         self,
         given: list[dict[str, Any]] | None,
         results: list[Result],
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
-    ) -> tuple:
-        """Reconstruct several pictures, each with the cut-out that is found."""
-        made, doubted = [], []
-        for number, file in enumerate(given or [], 1):
-            name = file.get("orig_name") or "picture"
-            progress((number - 1) / len(given or []), f"Picture {number} of {len(given or [])}")
-            try:
-                cut = self._call(request, cut_picture, Path(file["path"]), name, self._options)
-                made.append(self._call(request, work.run_model, self._model, cut))
+    ) -> Iterator[tuple]:
+        """Reconstruct several pictures, each with the cut-out that is found; yield each result."""
+        given, before, doubted = given or [], results, []
+        with page_errors():
+            for number, file in enumerate(given):
+                name = file.get("orig_name") or "picture"
+                progress(number / len(given), f"Picture {number + 1} of {len(given)}")
+                try:
+                    cut = self._call(request, cut_picture, Path(file["path"]), name, self._options)
+                    made = self._call(request, work.run_model, self._model, cut)
+                except Cancelled:
+                    raise
+                except UserError as error:
+                    text = f"{name}: {str(error).removeprefix(f'{name}: ')}"
+                    gr.Warning(html.escape(text), title="This picture cannot be used")
+                    continue
                 if cut.warning:
                     doubted.append(name)
-            except UserError as error:
-                text = f"{name}: {str(error).removeprefix(f'{name}: ')}"
-                gr.Warning(html.escape(text), title="This picture cannot be used")
-        if doubted:
-            text = f"{', '.join(doubted)}. Give such a picture alone to correct it."
-            gr.Warning(html.escape(text), title="These cut-outs may be wrong")
-        if not made:
-            raise UserError("none of these pictures can be used")
-        return self._added(results, made, request)
+                results, *shown = self._added(results, made, request)
+                yield gr.update(open=False), results, *shown
+            if doubted:
+                text = f"{', '.join(doubted)}. Give such a picture alone to correct it."
+                gr.Warning(html.escape(text), title="These cut-outs may be wrong")
+            if results is before:
+                raise UserError("none of these pictures can be used")
 
-    @with_page_errors
+    @page_errors()
     def choose(self, results: list[Result], event: gr.EventData) -> tuple:
         """Show an earlier result again."""
         index = event._data["index"]
@@ -215,7 +236,7 @@ class Actions:
         _forget_surfaces(results)
         return _presented(results[index].made)
 
-    @with_page_errors
+    @page_errors()
     def trim(
         self, state: State | None, opacity: float, distance: float, request: gr.Request
     ) -> tuple:
@@ -234,47 +255,70 @@ class Actions:
             request: gr.Request,
             progress: gr.Progress = gr.Progress(),  # noqa: B008
         ) -> tuple:
-            made, older = _state(state)
+            made, files = _state(state)
             before = made.surface
-            progress(0.2, f"Writing {work.KINDS[kind][1]}")
-            folder = self._new_folder(request)
+            progress(0.1, f"Writing {work.KINDS[kind][1]}")
             mesh = work.MeshChoice.of(faces, texture, watertight)
-            path, note = self._call(request, work.write, made, kind, folder, self._device, mesh)
+            inputs = made, kind, self._new_folder(request), self._device, mesh
+            if kind in work.UNRENDERED:
+                path, note = work.write(*inputs)
+            else:
+                path, note = self._call(request, work.write, *inputs, progress=progress)
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
-            files = [*(old for old in older if old.name != path.name and old.is_file()), path]
+            # In place: meanwhile the page may show another object, which stays.
+            files[:] = [*(old for old in files if old.name != path.name and old.is_file()), path]
             listed = gr.update(value=[str(file) for file in files], visible=True)
-            shown = gr.skip() if made.surface is before else _frame(made)
-            return (made, files), listed, shown
+            return listed, gr.skip() if made.surface is before else _frame(made)
 
-        return with_page_errors(write)
+        return page_errors()(write)
 
     def _added(
-        self, results: list[Result], made: list[work.Reconstruction], request: gr.Request
+        self, results: list[Result], made: work.Reconstruction, request: gr.Request
     ) -> tuple:
-        """Append results, and show the last one."""
-        new = []
-        for each in made:
-            path = self._new_folder(request) / "result.png"
-            self._call(request, work.thumbnail, each, path, self._device)
-            new.append(Result(each, path))
+        """Append a result, and show it."""
+        path = self._new_folder(request) / "result.png"
+        self._call(request, work.thumbnail, made, path, self._device)
         _forget_surfaces(results)
-        kept = [*results, *new][-MAX_PICTURES:]
-        if len(kept) < len(results) + len(new):
+        kept = [*results, Result(made, path)][-MAX_PICTURES:]
+        if len(kept) == len(results):
             gr.Info(f"The strip keeps the last {MAX_PICTURES} results.")
         strip = [(str(result.picture), result.made.name) for result in kept]
         shown = gr.update(value=strip, visible=len(kept) > 1, selected_index=None)
-        return kept, shown, *_presented(new[-1].made)
+        return kept, shown, *_presented(made)
 
-    def _call(self, request: gr.Request, function: Callable, *args: Any) -> Any:
-        """Call a function on the main thread, as long as the page is open."""
+    def _call(
+        self,
+        request: gr.Request,
+        function: Callable,
+        *args: Any,
+        progress: Callable[[float, str], Any] | None = None,
+    ) -> Any:
+        """Call a function on the main thread, as long as the page is open and nobody cancels.
+
+        The stages of a mesh are shown as progress.
+        """
         page = request.session_hash or ""
-        return self._main_thread.call(function, *args, wanted=lambda: self._files.is_active(page))
+        cancels = self._cancels[page]
+        context = contextvars.copy_context()  # gradio finds the event by it
+
+        def job() -> Any:
+            if progress is not None:
+                STAGES.show = lambda name: context.run(progress, _DONE.get(name, 0.1), name)
+            try:
+                return function(*args)
+            finally:
+                STAGES.show = None
+
+        return self._main_thread.call(
+            job, wanted=lambda: self._files.is_active(page) and self._cancels[page] == cancels
+        )
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
         elevation = self._call(request, work.estimated_elevation, self._model, cut)
         cut, *edited = self._edited(cut, request)
-        return cut, gr.update(visible=True), *edited, elevation
+        view = gr.update(value=VIEWS[0], visible=True)
+        return cut, gr.update(visible=True), *edited, elevation, view, gr.update(open=False)
 
     def _edited(self, cut: Cut, request: gr.Request) -> tuple:
         note = html.escape(self._call(request, note_of, cut))
@@ -292,7 +336,8 @@ class Actions:
         """
         path = self._new_folder(request) / "cut-out.png"
         save_image(path, editor_picture(cut) / 255.0)
-        return {"background": str(path), "layers": [], "composite": str(path)}
+        value = {"background": str(path), "layers": [], "composite": str(path)}
+        return gr.update(value=value, visible=True)
 
 
 def _forget_surfaces(results: list[Result]) -> None:
@@ -302,9 +347,9 @@ def _forget_surfaces(results: list[Result]) -> None:
 
 
 def _presented(made: work.Reconstruction) -> tuple:
-    """Return state, viewer, the buttons of files, no files, and sliders at their ends."""
-    files = gr.update(value=None, visible=False)
-    return (made, []), _frame(made), gr.update(visible=True), files, 0.0, work.FARTHEST
+    """Return state, viewer, the buttons of files, no files, sliders at their ends, and the view."""
+    files, on = gr.update(value=None, visible=False), gr.update(visible=True)
+    return (made, []), _frame(made), on, files, 0.0, work.FARTHEST, VIEWS[1]
 
 
 def _frame(made: work.Reconstruction) -> str:

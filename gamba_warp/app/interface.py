@@ -10,7 +10,7 @@ from gradio import themes
 from msgspec import Meta
 
 from . import work
-from .actions import Actions
+from .actions import VIEWS, Actions
 from .cutting import FOLDER, KEEP, REMOVE, SIDE, STROKE, examples
 from .guard import MAX_PICTURES, GivenFile, Painted
 from .visitor_files import KEEP_SECONDS
@@ -23,11 +23,6 @@ _EMPTY = """<div class="stage empty"><p>The object will appear here.<br>Give a p
 cut-out, and make it 3D.</p></div>"""
 _FILES = {"Gaussians": work.GAUSSIANS, "Mesh": work.MESHES, "To show": work.SHOWS}
 _BRUSHES = {"Paint what to keep": KEEP, "Paint what to remove": REMOVE}
-# On a phone the object is below the window.
-_SHOW = """() => {
-  const stage = document.querySelector("#stage").getBoundingClientRect();
-  if (stage.top < 0 || stage.top > innerHeight / 2) scrollBy({top: stage.top, behavior: "smooth"});
-}"""
 # Starts the download once the file exists.
 _FETCH = """(files) => {
   const file = Array.isArray(files) ? files.at(-1) : files;
@@ -49,11 +44,28 @@ def build(actions: Actions) -> gr.Blocks:
     page = gr.Blocks(title="Gamba", analytics_enabled=False, fill_width=True)
     with page:
         gr.HTML(_TITLE, elem_id="title")
+        with gr.Row(elem_id="now"):
+            status = gr.HTML(elem_id="status")
+            cancel = gr.Button("Cancel", size="sm", min_width=80, elem_id="cancel")
         cut, made, results = (
             gr.State(first, time_to_live=KEEP_SECONDS) for first in (None, None, [])
         )
+        small_pictures: dict[str, Any] = {
+            "height": "auto",
+            "allow_preview": False,
+            "object_fit": "contain",
+            "buttons": [],
+            "interactive": False,
+            "elem_classes": "strip",
+        }
+        plain: dict[str, Any] = {
+            "show_label": False,
+            "container": False,
+            "interactive": True,  # also if only its look depends on it
+            "elem_classes": "choice",
+        }
         with gr.Row(elem_id="bench"):
-            with gr.Column(scale=5, min_width=300):
+            with gr.Column(scale=5, min_width=300, elem_id="left"):
                 picture = gr.Image(
                     label="Picture",
                     sources=["upload", "clipboard"],
@@ -64,48 +76,24 @@ def build(actions: Actions) -> gr.Blocks:
                     placeholder="Drop a picture here\nor click to choose one",
                     elem_id="picture",
                 )
-                small_pictures: dict[str, Any] = {
-                    "height": "auto",
-                    "allow_preview": False,
-                    "object_fit": "contain",
-                    "buttons": [],
-                    "interactive": False,
-                    "elem_classes": "strip",
-                }
-                gallery = gr.Gallery(
-                    [(str(path), title) for path, title in examples()],
-                    label="Or take an example",
-                    columns=6,
-                    elem_id="examples",
-                    **small_pictures,
-                )
-                several = gr.UploadButton(
-                    f"Several pictures at once (up to {MAX_PICTURES})",
-                    file_count="multiple",
-                    file_types=["image"],
-                    size="sm",
-                    elem_id="several",
-                )
-                with gr.Column(visible=False, elem_id="cut") as cut_part:
-                    note = gr.HTML(elem_id="note")
-                    editor = gr.ImageEditor(
-                        label="Cut-out",
-                        type="numpy",
-                        image_mode="RGBA",
-                        format="png",
-                        sources=(),
-                        transforms=(),
-                        layers=False,
-                        brush=_brush(KEEP),
-                        eraser=gr.Eraser(default_size=SIDE // 24),
-                        canvas_size=(SIDE, SIDE),
-                        height=380,
-                        buttons=[],
-                        elem_id="editor",
+                with gr.Accordion("Examples, or several pictures", elem_id="more") as more:
+                    gallery = gr.Gallery(
+                        [(str(path), title) for path, title in examples()],
+                        show_label=False,
+                        columns=6,
+                        elem_id="examples",
+                        **small_pictures,
                     )
-                    choices, first = list(_BRUSHES), next(iter(_BRUSHES))
-                    plain: dict[str, Any] = {"show_label": False, "container": False}
-                    brush = gr.Radio(choices, value=first, elem_id="brush", **plain)
+                    several = gr.UploadButton(
+                        f"Several pictures at once (up to {MAX_PICTURES})",
+                        file_count="multiple",
+                        file_types=["image"],
+                        size="sm",
+                        elem_id="several",
+                    )
+                with gr.Column(visible=False, elem_id="cut") as cut_part:
+                    brush = gr.Radio([*_BRUSHES], value=[*_BRUSHES][0], elem_id="brush", **plain)
+                    note = gr.HTML(elem_id="note")
                     with gr.Row():
                         mend = gr.Button("Apply strokes", size="md", min_width=120)
                         restart = gr.Button("Start over", size="md", min_width=120)
@@ -123,7 +111,25 @@ def build(actions: Actions) -> gr.Blocks:
                     )
                     make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
             with gr.Column(scale=8, min_width=300, elem_id="right"):
-                stage = gr.HTML(_EMPTY, elem_id="stage")
+                view = gr.Radio([*VIEWS], value=VIEWS[1], visible=False, elem_id="view", **plain)
+                with gr.Column(elem_id="views"):
+                    editor = gr.ImageEditor(
+                        label="Cut-out",
+                        type="numpy",
+                        image_mode="RGBA",
+                        format="png",
+                        sources=(),
+                        transforms=(),
+                        layers=False,
+                        brush=_brush(KEEP),
+                        eraser=gr.Eraser(default_size=SIDE // 24),
+                        canvas_size=(SIDE, SIDE),
+                        height="var(--tall)",
+                        buttons=[],
+                        visible=False,
+                        elem_id="editor",
+                    )
+                    stage = gr.HTML(_EMPTY, elem_id="stage")
                 strip = gr.Gallery(
                     label="Results",
                     visible=False,
@@ -167,62 +173,41 @@ def build(actions: Actions) -> gr.Blocks:
                         visible=False,
                         elem_id="made",
                     )
-        one: dict[str, Any] = {
-            "concurrency_id": "gamba",
-            "concurrency_limit": 1,
-            "preprocess": False,
-            "api_visibility": "private",
-        }
-        # On the editor the progress sign would stay: gradio shows it again when the editor has
-        # loaded its new picture.
-        quick = {**one, "show_progress": "hidden"}
-        taking = {**one, "show_progress_on": picture}
-        shown = [cut, cut_part, editor, note, elevation, picture]
+        free: dict[str, Any] = {"preprocess": False, "api_visibility": "private"}
+        shared: dict[str, Any] = {**free, "show_progress_on": status}
+        one = {**shared, "concurrency_id": "gamba", "concurrency_limit": 1}
+        shown = [cut, cut_part, editor, note, elevation, view, more, picture]
         mask = [cut, editor, note]
         # (The event ``input`` sends the old picture when it is cleared.)
-        picture.upload(actions.take, picture, shown, **taking)
-        picture.clear(actions.end_session, None, shown, **quick)
-        gallery.select(actions.load_example, None, shown, **taking)
+        picture.upload(actions.take, picture, shown, **one)
+        picture.clear(actions.end_session, None, shown, **one)
+        gallery.select(actions.load_example, None, shown, **one)
         # Has its own queue, so that it waits for no other event.
-        brush.change(_painting, brush, editor, **{**quick, "concurrency_id": "brush"})
-        mend.click(actions.apply_strokes, mask[:2], mask, **quick)
-        restart.click(actions.restart, cut, mask, **quick)
-        seen = [made, stage, files_part, made_files, opacity, distance]
-        make.click(
-            actions.reconstruct,
-            [cut, editor, elevation, results],
-            [*mask, results, strip, *seen],
-            show_progress_on=stage,
-            **one,
-        )
-        several.upload(
-            actions.take_all,
-            [several, results],
-            [results, strip, *seen],
-            show_progress_on=stage,
-            **one,
-        )
-        strip.select(actions.choose, results, seen, **quick)
+        brush.change(_painting, brush, editor, show_progress="hidden", **free)
+        mend.click(actions.apply_strokes, mask[:2], mask, **one)
+        restart.click(actions.restart, cut, mask, **one)
+        seen = [made, stage, files_part, made_files, opacity, distance, view]
+        added = [results, strip, *seen]
+        make.click(actions.reconstruct, [cut, editor, elevation, results], [*mask, *added], **one)
+        several.upload(actions.take_all, [several, results], [more, *added], **one)
+        strip.select(actions.choose, results, seen, **one)
         gr.on(
             [opacity.input, distance.input],
             actions.trim,
             [made, opacity, distance],
             seen[:4],
             trigger_mode="always_last",
-            show_progress_on=stage,
             **one,
         )
-        make.click(None, js=_SHOW, api_visibility="private")
         for kind, button in buttons.items():
+            # A file that needs no rendering does not wait for the device.
+            queue = {**shared, "concurrency_id": "files"} if kind in work.UNRENDERED else one
             written = button.click(
-                actions.writer(kind),
-                [made, faces, texture, closed],
-                [made, made_files, stage],
-                show_progress_on=made_files,
-                **one,
+                actions.writer(kind), [made, faces, texture, closed], [made_files, stage], **queue
             )
             written.success(None, made_files, None, js=_FETCH, api_visibility="private")
-        areas.click(actions.toggle_holes, cut, mask, **quick)
+        areas.click(actions.toggle_holes, cut, mask, **one)
+        cancel.click(actions.cancel, None, None, show_progress="hidden", **free)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
 

@@ -14,9 +14,13 @@ from typing import Any, TypeVar
 from ..errors import UserError
 
 Result = TypeVar("Result")
-LOOK_SECONDS = 2.0  # between two looks whether the result of a job is still wanted
+LOOK_SECONDS = 0.5  # between two looks whether the result of a job is still wanted
 # In these functions, of imports and of compiled kernels, an error would last until the end.
 _WHOLE = ("_find_and_load", "load")
+
+
+class Cancelled(UserError):
+    """An end of a job whose result is not wanted."""
 
 
 class MainThread:
@@ -44,7 +48,7 @@ class MainThread:
             wanted: asked now and then; once it returns False, the function is interrupted.
 
         Raises:
-            UserError: the main thread has ended, or the result was no longer wanted.
+            UserError: the main thread has ended; ``Cancelled`` if the result was not wanted.
         """
         future: Future[Result] = Future()
         self._jobs.put((future, function, args))
@@ -93,4 +97,4 @@ class MainThread:
         while frame and frame.f_code.co_name not in _WHOLE:
             frame = frame.f_back
         if self._running and self._running is self._unwanted and not frame:
-            raise UserError("its page was closed")
+            raise Cancelled("it was cancelled, or its page was closed")

@@ -35,6 +35,7 @@ IN_ZIP = ("ply", "mesh-glb", "mesh-stl", "gif", "html")
 # Choices for the mesh, by label.
 FACES = {f"{count:,} faces": count for count in (2_000, 10_000, 50_000, 200_000)}
 TEXTURES = {"No texture": 0, **{f"Texture {side}": side for side in (512, 1024, 2048)}}
+UNRENDERED = {*GAUSSIANS, "html"}  # kinds whose writing renders nothing
 KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
 FARTHEST = 10.0  # percent of the longest side: Gaussians at any distance from the surface stay
 _PICTURE, _SMALL = 512, 128  # largest side of a kept input; side of a thumbnail, pixels

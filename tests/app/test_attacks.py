@@ -17,8 +17,8 @@ from gamba_warp.app.work import KINDS
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
 SEVERAL, CHOOSE, TRIM = 7, 8, 9
-ZIP = TRIM + 2 + 2 * list(KINDS).index("zip")
-AREAS = TRIM + 2 + 2 * len(KINDS)  # after the two functions of each kind of file
+ZIP = TRIM + 1 + 2 * list(KINDS).index("zip")
+AREAS = TRIM + 1 + 2 * len(KINDS)  # after the two functions of each kind of file
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
 
@@ -59,13 +59,13 @@ def test_a_program_that_does_as_the_page_does(program, private):
     output = program.result(TAKE, [given(path)])
     note = output["data"][3]
     assert "No object was found" in note
-    shown = output["data"][2]["background"]["path"]
+    shown = output["data"][2]["value"]["background"]["path"]
     assert program.ask(f"/gradio_api/file={shown}").status == 200
     layer = Image.new("RGBA", (720, 720), (0, 0, 255, 255))
     painted = {"layers": [given(program.upload(bytes_of(layer)))], "background": {"path": "/"}}
     _, editor, note = program.result(MEND, [None, painted])["data"]
     assert "edited" in note and "touches the picture" in note
-    after = editor["background"]["path"]
+    after = editor["value"]["background"]["path"]
     assert program.ask("/manifest.json").body == b"{}"  # the page links it
     assert Path(after).read_bytes() != Path(shown).read_bytes()
 
@@ -76,8 +76,10 @@ def test_enclosed_areas_are_filled_and_cleared(program):
     pixels[20:40, 20:40] = 255
     output = program.result(TAKE, [given(program.upload(bytes_of(Image.fromarray(pixels))))])
     assert "1 enclosed area" in output["data"][3]
-    shown = [output["data"][2]["background"]["path"]]
-    shown += [program.result(AREAS, [None])["data"][1]["background"]["path"] for _ in range(2)]
+    shown = [output["data"][2]["value"]["background"]["path"]]
+    shown += [
+        program.result(AREAS, [None])["data"][1]["value"]["background"]["path"] for _ in range(2)
+    ]
     first, filled, cleared = (np.asarray(Image.open(path))[360, 360] for path in shown)
     assert filled.min() == 255 > first.max() and (first == cleared).all()
 
@@ -297,7 +299,7 @@ def test_what_is_closed(served, program):
     assert program.ask("/?deep_link=../../../etc/passwd").status == 200
 
 
-@pytest.mark.parametrize("number", [-1, TRIM + 1, 99, 1 << 70, 1.5, "0", None, [0]])
+@pytest.mark.parametrize("number", [-1, TRIM + 2, 99, 1 << 70, 1.5, "0", None, [0]])
 def test_no_such_function_is_one_line(program, number):
     answer = program.join(number, [None])
     assert answer.status == 400 and answer.line

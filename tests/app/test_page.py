@@ -6,6 +6,7 @@ import re
 import signal
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -198,22 +199,39 @@ def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
     assert page.locator("iframe.stage").count() == 0
 
 
-def test_the_next_step_is_in_the_window(opened, tmp_path):
+# Whether an element is inside the window, and no other is over its middle and corners.
+CLEAR = """element => {
+  const { left, top, right, bottom } = element.getBoundingClientRect();
+  const points = [[left + 9, top + 9], [right - 9, top + 9], [left + 9, bottom - 9],
+    [right - 9, bottom - 9], [(left + right) / 2, (top + bottom) / 2]];
+  return top >= 0 && left >= 0 && bottom <= innerHeight && right <= innerWidth
+    && points.every((point) => element.contains(document.elementFromPoint(...point)));
+}"""
+SIZES = ((1280, 900), (390, 844))
+
+
+def assert_clear(page, *places):
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        for place in places:
+            clear = partial(page.locator(place).first.evaluate, CLEAR)
+            until(clear, f"{place} is seen at {width} x {height}")
+
+
+def test_the_cut_out_and_the_progress_are_in_the_window(opened, tmp_path):
     page = opened.page
     give(page, red_square(tmp_path))
     page.wait_for_selector("#editor canvas")
-    seen = """make => {
-      const { left, top, width, height } = make.getBoundingClientRect();
-      const over = [[0, 0], [1, 0], [0, 1], [1, 1]].map(([x, y]) =>
-        document.elementFromPoint(left + 9 + x * (width - 18), top + 9 + y * (height - 18)));
-      return over.every((element) => make.contains(element));
-    }"""
-    for width, height in ((1280, 900), (390, 844)):
-        page.set_viewport_size({"width": width, "height": height})
-        until(lambda: page.locator("#make").evaluate(seen), f"it is seen at {width} x {height}")
+    assert_clear(page, "#editor", "#editor .toolbar-wrap", "#brush", "#view", "#make")
     assert page.evaluate("scrollY") == 0
+    assert page.locator("#editor canvas").first.bounding_box()["height"] > 844 * 0.4
+    assert not page.locator("#examples, #several").filter(visible=True).count()
     page.locator("#make").click()
-    page.wait_for_selector("#mesh")
+    page.wait_for_selector("iframe.stage")
+    assert_clear(page, "iframe.stage")
+    page.locator("#view").get_by_text("Cut-out").click()
+    assert_clear(page, "#editor")
+    page.locator("#view").get_by_text("Object").click()
     choices = page.locator("#mesh > *").evaluate_all(
         "all => all.map(each => [each.getBoundingClientRect().right, each.scrollWidth"
         " - each.clientWidth, each.querySelector('input').clientWidth])"
@@ -222,6 +240,13 @@ def test_the_next_step_is_in_the_window(opened, tmp_path):
     assert all(width > 90 for _, _, width in choices[:2]), choices  # of "Texture 1024"
     page.get_by_text("Closed, for printing").click()
     assert page.locator("#mesh input[type=checkbox]").is_checked()
+
+    page.locator("#file-mesh-glb").click()
+    page.wait_for_selector("#now .progress-level-inner:has-text('mesh ')")
+    assert_clear(page, "#now", "#cancel")
+    page.locator("#cancel").click()
+    assert "it was cancelled" in toast(page)
+    page.wait_for_selector("#now", state="hidden")
 
 
 def test_no_picture_is_one_line(opened, tmp_path):

@@ -438,7 +438,7 @@ def test_a_job_that_nobody_wants_is_ended(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         jobs.work()
     thread.join(timeout=10)
-    assert found == ["its page was closed", 40, 40]
+    assert found == ["it was cancelled, or its page was closed", 40, 40]
 
 
 def test_who_waits_does_not_wait_for_ever():

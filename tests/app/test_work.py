@@ -13,7 +13,8 @@ from helpers.model import quick, run_reconstruct
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.app import cutting, guard, work
+from gamba_warp.app import cutting, guard, main_thread, work
+from gamba_warp.batch import STAGES
 from gamba_warp.cameras import orbit
 from gamba_warp.files import STARTER
 from gamba_warp.formats.gaussians.files import read_gaussians
@@ -249,28 +250,93 @@ def test_haze_is_left_out(made, tmp_path, monkeypatch):
     refused("no Gaussian would stay", work.trim, replace(made, gaussians=gaussians[:0]), 0.9, 10.0)
 
 
-def test_the_strip_keeps_the_last_results(made, tmp_path, monkeypatch):
-    """Computations and the server are stand-ins."""
-    gradio = pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
+@pytest.fixture
+def page(made, tmp_path, monkeypatch):
+    """Handlers of the page; computations and the server are stand-ins."""
+    pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
     from gamba_warp.app import actions
 
-    said = []
-    monkeypatch.setattr(gradio, "Info", said.append)
     monkeypatch.setattr(actions, "cut_picture", lambda path, name, _: Mock(title=name, warning=""))
     monkeypatch.setattr(work, "run_model", lambda _, cut: replace(made, name=cut.title))
     monkeypatch.setattr(work, "viewer", lambda made: made.name)
     monkeypatch.setattr(work, "thumbnail", lambda *_: None)
-    thread = Mock(call=lambda function, *inputs, wanted: function(*inputs))
-    page = actions.Actions(None, None, Mock(new_folder=lambda _: tmp_path), "cpu", thread)
+    thread = Mock(call=lambda function, wanted: function())
+    return actions.Actions(None, None, Mock(new_folder=lambda _: tmp_path), "cpu", thread)
+
+
+def results_of(page, names, results):
+    """Yield the results, and the strip, after each picture."""
+    given = [{"path": "a", "orig_name": name} for name in names]
+    for _, kept, strip, *_ in page.take_all(given, results, MagicMock(), lambda *_: None):
+        yield kept, strip["value"]
+
+
+def test_the_strip_keeps_the_last_results(page, monkeypatch):
+    said = []
+    monkeypatch.setattr("gradio.Info", said.append)
     results, most = [], guard.MAX_PICTURES
     for count in (most - 1, 1, 1):
-        names = [str(len(results) + number) for number in range(count)]
-        given = [{"path": "a", "orig_name": name} for name in names]
         assert not said
-        results, strip, *_ = page.take_all(given, results, MagicMock(), lambda *_: None)
+        *_, (results, strip) = results_of(
+            page, map(str, range(len(results), most + 1)[:count]), results
+        )
     names = [str(number) for number in range(1, most + 1)]
-    assert [each.made.name for each in results] == [name for _, name in strip["value"]] == names
+    assert [each.made.name for each in results] == [name for _, name in strip] == names
     assert said == ["The strip keeps the last 12 results."]
+
+
+def test_each_of_several_pictures_is_shown_once_it_is_done(page, made, monkeypatch):
+    run = []
+    monkeypatch.setattr(work, "run_model", lambda _, cut: run.append(cut.title) or made)
+    shown = results_of(page, "abc", [])
+    for count in (1, 2):
+        results, strip = next(shown)
+        assert len(results) == len(strip) == len(run) == count
+
+    def cancelled(*_):
+        run.append("cancelled")
+        raise main_thread.Cancelled("it was cancelled")
+
+    monkeypatch.setattr(work, "run_model", cancelled)
+    gradio = pytest.importorskip("gradio")
+    with pytest.raises(gradio.Error, match="it was cancelled"):
+        [*results_of(page, "de", [])]
+    assert run == ["a", "b", "cancelled"], "the next one is not begun"
+
+
+def test_what_waits_for_the_device(page, made, tmp_path):
+    """A haze slider may compute for minutes; files that render nothing are written meanwhile."""
+    from gamba_warp.app.interface import build
+
+    page._main_thread.call = Mock(side_effect=AssertionError("it waits"))
+    blocks = build(page)
+    events = {each.targets[0][0]: each for each in blocks.fns.values() if each.fn}
+    events = {blocks.blocks[number].elem_id: each for number, each in events.items()}
+    for kind in work.KINDS:
+        waits = events[f"file-{kind}"].concurrency_id == events["make"].concurrency_id
+        assert waits == (kind in {"gif", "zip", *work.MESHES})
+        if not waits:
+            state, inputs = (made, []), ("10,000 faces", "No texture", False, MagicMock(), Mock())
+            listed, _ = page.writer(kind)(state, *inputs)
+            assert listed["value"] == [str(path) for path in state[1]] and state[1][0].is_file()
+    assert events["cancel"].concurrency_id != events["make"].concurrency_id
+    for name in ("picture", "examples", "make", "several", "results", "file-ply", "file-gif"):
+        assert [each.elem_id for each in events[name].show_progress_on] == ["status"]
+
+
+def test_the_stages_of_a_mesh_are_shown(page, made, monkeypatch):
+    def surface_of(*_):
+        STAGES.begin("mesh texture")
+        raise main_thread.Cancelled("that is enough")
+
+    monkeypatch.setattr(extract, "surface_of", surface_of)
+    said, choices = [], ("10,000 faces", "No texture", False)
+    gradio = pytest.importorskip("gradio")
+    state = replace(made, surface=None), []
+    with pytest.raises(gradio.Error, match="that is enough"):
+        page.writer("mesh-stl")(state, *choices, MagicMock(), lambda *step: said.append(step))
+    assert said == [(0.1, "Writing -mesh.stl"), (0.7, "mesh texture")]
+    assert STAGES.show is None
 
 
 def test_the_viewer_has_the_input_and_the_last_mesh(made):
