@@ -236,14 +236,6 @@ class Actions:
         _forget_surfaces(results)
         return _presented(results[index].made)
 
-    @page_errors()
-    def trim(
-        self, state: State | None, opacity: float, distance: float, request: gr.Request
-    ) -> tuple:
-        """Leave out Gaussians; the viewer and all later files lack them."""
-        made = self._call(request, work.trim, _state(state)[0], opacity, distance, self._device)
-        return _presented(made)[:4]
-
     def writer(self, kind: str) -> Callable:
         """Return the handler that writes files of one kind, and adds them to the list."""
 
@@ -347,9 +339,9 @@ def _forget_surfaces(results: list[Result]) -> None:
 
 
 def _presented(made: work.Reconstruction) -> tuple:
-    """Return state, viewer, the buttons of files, no files, sliders at their ends, and the view."""
+    """Return state, viewer, the buttons of files, no files, and the view."""
     files, on = gr.update(value=None, visible=False), gr.update(visible=True)
-    return (made, []), _frame(made), on, files, 0.0, work.FARTHEST, VIEWS[1]
+    return (made, []), _frame(made), on, files, VIEWS[1]
 
 
 def _frame(made: work.Reconstruction) -> str:

@@ -139,21 +139,6 @@ def build(actions: Actions) -> gr.Blocks:
                 )
                 buttons: dict[str, gr.Button] = {}
                 with gr.Column(visible=False, elem_id="files") as files_part:
-                    with gr.Row(elem_id="trim"):
-                        opacity = gr.Slider(
-                            0,
-                            0.9,
-                            value=0,
-                            step=0.05,
-                            label="Haze: least opacity",
-                        )
-                        distance = gr.Slider(
-                            0.5,
-                            work.FARTHEST,
-                            value=work.FARTHEST,
-                            step=0.5,
-                            label="Haze: most distance from the surface, %",
-                        )
                     with gr.Row(elem_id="mesh"):
                         small: dict[str, Any] = {"container": False, "min_width": 120}
                         faces = gr.Dropdown([*work.FACES], value="10,000 faces", **small)
@@ -186,19 +171,11 @@ def build(actions: Actions) -> gr.Blocks:
         brush.change(_painting, brush, editor, show_progress="hidden", **free)
         mend.click(actions.apply_strokes, mask[:2], mask, **one)
         restart.click(actions.restart, cut, mask, **one)
-        seen = [made, stage, files_part, made_files, opacity, distance, view]
+        seen = [made, stage, files_part, made_files, view]
         added = [results, strip, *seen]
         make.click(actions.reconstruct, [cut, editor, elevation, results], [*mask, *added], **one)
         several.upload(actions.take_all, [several, results], [more, *added], **one)
         strip.select(actions.choose, results, seen, **one)
-        gr.on(
-            [opacity.input, distance.input],
-            actions.trim,
-            [made, opacity, distance],
-            seen[:4],
-            trigger_mode="always_last",
-            **one,
-        )
         for kind, button in buttons.items():
             # A file that needs no rendering does not wait for the device.
             queue = {**shared, "concurrency_id": "files"} if kind in work.UNRENDERED else one

@@ -37,7 +37,6 @@ FACES = {f"{count:,} faces": count for count in (2_000, 10_000, 50_000, 200_000)
 TEXTURES = {"No texture": 0, **{f"Texture {side}": side for side in (512, 1024, 2048)}}
 UNRENDERED = {*GAUSSIANS, "html"}  # kinds whose writing renders nothing
 KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
-FARTHEST = 10.0  # percent of the longest side: Gaussians at any distance from the surface stay
 _PICTURE, _SMALL = 512, 128  # largest side of a kept input; side of a thumbnail, pixels
 
 
@@ -73,7 +72,6 @@ class Reconstruction:
         camera: distance (object units), field of view and elevation (degrees) of the input's.
         seconds: run time of the model.
         picture: the model's input ``[S, S, 4]`` uint8, reduced.
-        whole: the reconstruction that was trimmed to this one, or None.
         surface: the last one that was extracted, or None.
         choice: its number of faces at most, and if it is closed.
     """
@@ -83,7 +81,6 @@ class Reconstruction:
     camera: tuple[float, float, float]
     seconds: float
     picture: np.ndarray
-    whole: Reconstruction | None = None
     surface: Surface | None = None
     choice: tuple[int, bool] | None = None
 
@@ -127,36 +124,6 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconst
     camera = model.config.distance, model.config.fov, elevation
     upright, picture = set_up(gaussians, elevation), to_uint8(shrink(rgba, _PICTURE))
     return Reconstruction(cut.name, upright, camera, seconds, picture)
-
-
-def trim(
-    made: Reconstruction, opacity: float, distance: float, device: str = "cpu"
-) -> Reconstruction:
-    """Leave out faint Gaussians, and those far from the surface.
-
-    Args:
-        made: the reconstruction, trimmed or not.
-        opacity: the least that stays, 0 to 1.
-        distance: the largest that stays, of the centre from the surface, percent of the object's
-            longest side; from ``FARTHEST`` on all stay.
-        device: device that renders.
-
-    Raises:
-        UserError: nothing stays, or the object has no surface.
-    """
-    whole = made.whole or made
-    gaussians = whole.gaussians
-    keep = gaussians.opacities >= opacity
-    if distance < FARTHEST:
-        from ..surfaces.solid import distances
-
-        surface = surface_of(whole, MESH, device)
-        side = float(np.ptp(surface.vertices, axis=0).max())
-        away = distances(gaussians.means.double().numpy(), surface.vertices, surface.faces)
-        keep &= torch.from_numpy(away <= distance / 100 * side)
-    if not keep.any():
-        raise UserError("no Gaussian would stay; choose less")
-    return replace(whole, gaussians=gaussians.select(keep), whole=whole, surface=None)
 
 
 def surface_of(

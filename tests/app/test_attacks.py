@@ -16,9 +16,9 @@ from gamba_warp.app.guard import MAX_PICTURES
 from gamba_warp.app.work import KINDS
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
-SEVERAL, CHOOSE, TRIM = 7, 8, 9
-ZIP = TRIM + 1 + 2 * list(KINDS).index("zip")
-AREAS = TRIM + 1 + 2 * len(KINDS)  # after the two functions of each kind of file
+SEVERAL, CHOOSE = 7, 8
+ZIP = CHOOSE + 1 + 2 * list(KINDS).index("zip")
+AREAS = CHOOSE + 1 + 2 * len(KINDS)  # after the two functions of each kind of file
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
 
@@ -299,7 +299,7 @@ def test_what_is_closed(served, program):
     assert program.ask("/?deep_link=../../../etc/passwd").status == 200
 
 
-@pytest.mark.parametrize("number", [-1, TRIM + 2, 99, 1 << 70, 1.5, "0", None, [0]])
+@pytest.mark.parametrize("number", [-1, CHOOSE + 2, 99, 1 << 70, 1.5, "0", None, [0]])
 def test_no_such_function_is_one_line(program, number):
     answer = program.join(number, [None])
     assert answer.status == 400 and answer.line
@@ -311,8 +311,6 @@ def test_no_such_function_is_one_line(program, number):
     [
         *[(TAKE, []), (TAKE, [None, None]), (BRUSH, ["Paint it black"]), (BRUSH, [0])],
         *[(MAKE, [None] * 3), *((MAKE, [None, None, value, None]) for value in (91, "up", None))],
-        *[(TRIM, [None, value, 10]) for value in (-1, 0.95, "x", None)],
-        *[(TRIM, [None, 0, value]) for value in (0, 11)],
         *[(SEVERAL, [[{"path": "x"}] * (MAX_PICTURES + 1), None]), (SEVERAL, ["x", None])],
     ],
 )

@@ -229,27 +229,6 @@ def test_a_mesh(made, tmp_path, monkeypatch):
     assert len(asked) == 1  # both of its meshes are of one surface
 
 
-def test_haze_is_left_out(made, tmp_path, monkeypatch):
-    made = replace(made, surface=None)
-    gaussians = made.gaussians
-    corners = gaussians.means.double().numpy().min(0) + [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    plane = extract.Surface(corners[:3], np.array([[0, 1, 2]]), np.full((3, 3), 0.5, np.float32))
-    monkeypatch.setattr(extract, "surface_of", lambda *_: plane)
-    half = float(gaussians.opacities.median())
-    opaque = work.trim(made, half, work.FARTHEST)
-    assert 0 < opaque.gaussians.num == (gaussians.opacities >= half).sum() < gaussians.num
-    near = work.trim(opaque, 0.0, 5.0)
-    inside = (gaussians.means[:, 2] - corners[0, 2]) <= 0.05 * 1.0  # its plane has a side of 1
-    assert near.gaussians.num <= int(inside.sum()) and near.gaussians.num > 0
-    both = work.trim(near, half, 5.0)
-    assert both.gaussians.num < min(near.gaussians.num, opaque.gaussians.num) and both.whole is made
-    path, note = work.write(near, "ply", tmp_path)
-    assert load_ply(path).num == near.gaussians.drawn().num
-    again = work.trim(both, 0.0, work.FARTHEST)
-    torch.testing.assert_close(again.gaussians.means, gaussians.means, rtol=0, atol=0)
-    refused("no Gaussian would stay", work.trim, replace(made, gaussians=gaussians[:0]), 0.9, 10.0)
-
-
 @pytest.fixture
 def page(made, tmp_path, monkeypatch):
     """Handlers of the page; computations and the server are stand-ins."""
@@ -305,7 +284,7 @@ def test_each_of_several_pictures_is_shown_once_it_is_done(page, made, monkeypat
 
 
 def test_what_waits_for_the_device(page, made, tmp_path):
-    """A haze slider may compute for minutes; files that render nothing are written meanwhile."""
+    """Files that render nothing are written while a mesh or a movie is made."""
     from gamba_warp.app.interface import build
 
     page._main_thread.call = Mock(side_effect=AssertionError("it waits"))
