@@ -294,9 +294,12 @@ class Actions:
         cancels = self._cancels[page]
         context = contextvars.copy_context()  # gradio finds the event by it
 
-        def job() -> Any:
+        def show(name: str) -> None:
             if progress is not None:
-                STAGES.show = lambda name: context.run(progress, _DONE.get(name, 0.1), name)
+                context.run(progress, _DONE.get(name, 0.1), name)
+
+        def job() -> Any:
+            STAGES.show = show
             try:
                 return function(*args)
             finally:
