@@ -32,7 +32,7 @@ def test_failures_are_noted_in_one_line_and_the_rest_go_on():
     assert done == [("first", "first"), ("last", "last")]
     assert failures is before and failures == [
         ("early", "no such file"),
-        *[("user", "bad more"), ("value", "wrong"), ("diverged", "not finite"), ("disk", "full")],
+        *[("user", "bad\\nmore"), ("value", "wrong"), ("diverged", "not finite"), ("disk", "full")],
         *[("cuda", "out of memory"), ("memory", "MemoryError")],
     ]
 
