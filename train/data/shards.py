@@ -145,8 +145,12 @@ def _read(dataset: Any) -> Iterator[dict[str, Any] | Unreachable]:
     try:
         yield from dataset
     except Exception as error:  # of webdataset, tarfile or a transfer; the last argument is the tar
-        words = ": ".join(word for word in reversed(error.args) if isinstance(word, str))
-        reason = first_line(error if isinstance(error, OSError) else words or error)
+        texts = (
+            text.partition(" @ <")[0] for text in reversed(error.args) if isinstance(text, str)
+        )
+        words = ": ".join(texts)
+        of_system = isinstance(error, OSError) and isinstance(error.errno, int)
+        reason = first_line(error if of_system else words or error)
         yield from repeat(Unreachable(f"the shards cannot be read: {reason}"))
 
 
