@@ -133,7 +133,8 @@ def run(name: str, arguments: list[str]) -> int:
         require(*row.needs)
         arguments, quiet, verbose = _common(arguments)
         call = _parsed(command, _expanded(command, arguments), f"gamba {name}")
-        vars(command).get("check", _nothing)(*call.args, **call.keywords)
+        if check := vars(command).get("check"):
+            check(*call.args, **call.keywords)
         if name == "app" and not quiet:  # which takes long to start
             print("loading torch", flush=True)
         elif "network" in row.uses and sys.stderr.isatty() and not quiet:
@@ -207,10 +208,6 @@ def help_text(name: str, command: Callable, arguments: list[str]) -> str:
     lines = [line.rstrip() for line in shown.getvalue().splitlines()]
     common = "-q, --quiet: errors and warnings only; -v, --verbose: times, and errors in full"
     return "\n".join([*lines, f"every command: {common}", ""])
-
-
-def _nothing(*_: Any, **__: Any) -> None:
-    """Check nothing."""
 
 
 def _parsed(command: Callable, arguments: list[str], program: str) -> partial[int | None]:

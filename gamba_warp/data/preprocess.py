@@ -33,8 +33,8 @@ _TRANSPARENT = 0.5  # a pixel of lower alpha is outside of a cut-out object
 _CUT_BORDER, _CUT_SHARE = 0.15, 0.05
 PRESENT = 0.05  # least alpha of a pixel within the object's bounds
 _MIN_OBJECT = 16  # least size of an object, pixels
-_COLORED = 0.1  # difference of channels from which a mask is of labels in colours,
-_LABELS = 64  # of 255: a mask with only darker greys is of labels by numbers
+# A mask holds labels if its channels differ by more than this, or if no grey is brighter.
+_COLORED, _DARK = 0.1, 0.25
 
 
 def has_alpha(rgba: np.ndarray, any_share: bool = False) -> bool:
@@ -67,13 +67,10 @@ def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
     inside = grey[alpha > PRESENT]
     if alpha.min() < 1 and not (len(inside) and np.ptp(inside) > 1 / 255):
         return alpha
-    levels = np.unique(to_uint8(grey))
-    if np.ptp(colors, axis=-1).max() > _COLORED:
-        levels = np.unique(to_uint8(colors).reshape(-1, 3), axis=0)
-    elif levels.max() >= _LABELS:
-        levels = levels[:2]  # grey levels of one object's edge
-    if len(levels) > 2:
-        raise UserError(f"{mask}: has {len(levels)} labels; a mask is bright on the object alone")
+    if grey.max() < _DARK or np.ptp(colors, axis=-1).max() > _COLORED:
+        count = len(np.unique(to_uint8(colors).reshape(-1, 3), axis=0))
+        if count > 2:
+            raise UserError(f"{mask}: has {count} labels; a mask is bright on the object alone")
     grey = grey * alpha
     low, high = grey.min(), grey.max()
     return (grey - low) / (high - low) if low < high else grey
