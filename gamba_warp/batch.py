@@ -50,8 +50,8 @@ def for_each(
             try:
                 function(name, item)
             except EXPECTED as error:
-                named_twice = f"{escaped(str(item))}: "
-                failures.append((item, first_line(error).removeprefix(named_twice)))
+                prefix = f"{escaped(str(item))}: "
+                failures.append((item, first_line(error).removeprefix(prefix)))
         STAGES.show = None
     return failures
 
@@ -105,7 +105,7 @@ def _terminal(stream: Any) -> Any:
 
 
 def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line on stdout, or on another stream, above the progress bars; ``escaped``."""
+    """Print a text as one line, ``escaped``, on stdout or a stream, above the progress bars."""
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=_terminal(sys.stderr)):

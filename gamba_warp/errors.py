@@ -42,9 +42,9 @@ def one_line(text: str, most: int = MOST_LETTERS) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return a text that is to be a line, with escapes for line ends and as ``printable``.
+    """Return the text in one line: ``printable``, with escapes for line ends and tabs.
 
-    So a name that holds a line end starts no line of its own in an output.
+    A name that holds a line end then starts no line of the output.
     """
     return printable(text).replace("\n", "\\n").replace("\t", "\\t")
 

@@ -19,7 +19,8 @@ _SHOWN = {
 # mean over at least MANY.
 FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
 AS_IS, MIRRORED = "as it is", "mirrored"  # key of the identity, first word of the mirrors'
-_MIRROR = 0.8  # share of the best rotation's distance: many shapes are their own mirror images
+# A mirror counts below this fraction of the best rotation's distance: many shapes are symmetric.
+_MIRROR = 0.8
 _NAMED = 3  # most objects named in a warning
 
 
@@ -85,10 +86,10 @@ def file_warnings(done: list[dict[str, Any]]) -> list[str]:
 
 
 def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
-    """Warn about rotations and mirrors of the predictions' files that would improve it a lot.
+    """Warn about rotations and mirrors of the predictions' files that improve the score a lot.
 
-    One that improves the mean of many objects gives one warning; else there is one for each that
-    improves single objects by ``FAR_BETTER``.
+    A transform that improves the mean of many objects gives one warning; else each transform that
+    improves single objects by ``FAR_BETTER`` gives one.
 
     Args:
         done: records of the evaluated objects.

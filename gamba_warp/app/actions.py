@@ -41,7 +41,7 @@ _FRAME = (
     'allow="fullscreen" srcdoc="{document}"></iframe>'
 )
 VIEWS = "Cut-out", "Object"  # what the stage shows
-# Share of a mesh's time before each of its stages.
+# Fraction of the progress bar before each stage of a mesh; not measured.
 _DONE = {
     "mesh views": 0.1,
     "mesh surface": 0.3,

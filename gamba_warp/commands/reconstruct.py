@@ -168,7 +168,7 @@ def _find_pictures(
     example = next(iter(sorted((STARTER / "icons").glob("*.png"))), None)
     if not images:
         raise UserError(f"give at least one picture or folder, such as {example or 'photo.png'}")
-    if example and images == (Path("photo.png"),) and not images[0].exists():  # of the pages
+    if example and images == (Path("photo.png"),) and not images[0].exists():  # the pages' example
         raise UserError(f"photo.png: no such file; give a picture of yours, or {example}")
     given = [_standard_input() if str(path) == "-" else path for path in dict.fromkeys(images)]
     pictures, failures = find_pictures(given, recursive)

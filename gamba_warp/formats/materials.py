@@ -139,7 +139,7 @@ def _shown(name: str) -> str:
 
 
 def _folded(name: str) -> str:
-    """Return a name as systems compare it that ignore case, or store umlauts as two characters."""
+    """Return a name in lower case and in Unicode's composed form, as file systems compare names."""
     return normalize("NFC", name).lower()
 
 
