@@ -51,7 +51,7 @@ def main(*data: Path) -> None:
         seen = Image.fromarray(to_uint8(over_background(rgba, GREY)))
         still = np.asarray(seen.resize((SIDE, SIDE), Image.Resampling.BICUBIC))
         gaussians = reconstruct(model, rgba)
-        upright = set_up(gaussians, estimate_elevation(gaussians))
+        upright = set_up(gaussians, estimate_elevation(gaussians).degrees)
         turn = turntable_frames(upright, size=SIDE, frames=FRAMES, elevation=10.0)
         pair = np.stack([np.broadcast_to(still, turn.shape), turn])[:, :, CROP:-CROP, CROP:-CROP]
         cells.append(np.concatenate([*pair], 2))

@@ -94,7 +94,7 @@ def estimated_elevation(model: Gamba, cut: Cut) -> int:
         rgba = model_picture(cut)
     except UserError:
         return 0
-    return estimate_elevation(reconstruct(model, rgba, detail=1))
+    return estimate_elevation(reconstruct(model, rgba, detail=1)).degrees
 
 
 def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconstruction:
@@ -120,7 +120,7 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconst
     gaussians = reconstruct(model, rgba).to("cpu")
     seconds = time.perf_counter() - started
     if elevation is None:
-        elevation = estimate_elevation(gaussians)
+        elevation = estimate_elevation(gaussians).degrees
     camera = model.config.distance, model.config.fov, elevation
     upright, picture = set_up(gaussians, elevation), to_uint8(shrink(rgba, _PICTURE))
     return Reconstruction(cut.name, upright, camera, seconds, picture)

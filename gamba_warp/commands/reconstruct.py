@@ -143,14 +143,15 @@ def reconstruct_command(
         made = reconstruct(model, cut.rgba, precision, detail)
         gaussians = made.to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
-        elevation = camera.elevation
+        elevation, between = camera.elevation, None
         if elevation is None:
-            elevation = estimate_elevation(gaussians)
-            say(f"{name}: the camera's elevation is about {elevation} degrees (--elevation).")
+            estimate = estimate_elevation(gaussians)
+            elevation, between = estimate.degrees, estimate[1:] if estimate.doubtful else None
+            say(f"{name}: the camera's elevation is about {estimate}; --elevation states it.")
         view = outputs.view(model.config, elevation)
         figures = write_outputs(name, cut, gaussians.to(chosen), outputs, view, seconds)
         source = {"input": str(path), "name": name, "cutout": cut.how, "warning": cut.warning}
-        results.made.append(source | {"elevation": elevation} | figures)
+        results.made.append(source | {"elevation": elevation, "elevation_doubt": between} | figures)
 
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:

@@ -75,9 +75,11 @@ def test_results_as_json(tmp_path, checkpoint, splats, capsys):
     assert made["failures"] == [{"input": str(missing), "reason": "no such file"}]
     (result,) = made["results"]
     assert sorted(result.pop("files")) == sorted(path.name for path in out.iterdir())
+    doubt = result.pop("elevation_doubt")
     assert (
         result.pop("cutout")
-        and -20 <= result.pop("elevation") <= 65
+        and -20 <= (elevation := result.pop("elevation")) <= 65
+        and (doubt is None or doubt[0] <= elevation <= doubt[1])
         and result
         == {
             "input": str(picture),
