@@ -1,8 +1,8 @@
 """Cut out the object of a photograph; tries mask, alpha, networks, plain background, GrabCut.
 
-Masks and transparency from the user are used unchanged. Results of the other methods are checked:
-the next method is tried if they cannot be an object, and reasons to doubt them are said. Colours
-along the object's edge lose those of its background (``edges.py``).
+Masks and transparency from the user are not doubted. Results of the other methods are checked: the
+next method is tried if they cannot be an object, and reasons to doubt them are said. Of all, the
+object's edge loses its background (``edges.py``).
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     if method == "alpha":
         rgba, fringe = without_matte(rgba)
     elif method == "mask":
-        rgba[..., :3] = without_background(source, rgba[..., 3])
+        rgba = without_background(source, rgba[..., 3])
     found = None if method is None else _Found(method, rgba)
     if found is None:
         try:
@@ -325,7 +325,7 @@ def _at_own_pixels(
     if found.method == "alpha":
         return without_matte(part)[0], around
     if found.method == "mask":
-        return np.dstack([without_background(around, part[..., 3]), part[..., 3]]), around
+        return without_background(around, part[..., 3]), around
     alpha = resize_rgba(small, *part.shape[:2])[..., 3]
     same = copy.copy(options)  # with its opened networks
     same.cutout = "matte" if found.method == "sam" else found.method
@@ -451,4 +451,4 @@ def _blended(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Return ``[H, W, 4]`` without specks, and without the background along the border."""
     alpha = np.where(alpha < _HAZE, 0, alpha)  # haze would enlarge the object's bounds
     alpha = without_specks(alpha) if find_spec("skimage") is not None else alpha
-    return np.dstack([without_background(rgb, alpha), alpha]).astype(np.float32)
+    return without_background(rgb, alpha.astype(np.float32))

@@ -1,7 +1,8 @@
 """Colours along an object's edge, without those of its background.
 
 A pixel of the edge mixes both: c = alpha · object + (1 - alpha) · background. If the background's
-share stays, it is visible as a fringe on any other background.
+share stays, it is visible as a fringe on any other background, and stretched over the object's
+sides. A mask that is too wide leaves a rim of such pixels, whose alpha is too large.
 """
 
 from __future__ import annotations
@@ -17,13 +18,17 @@ _REACH = 2  # pixels between these and solid ones
 _LEAST = 20  # number of these
 _FRINGE = 0.1  # least rms difference of their colours from the solid ones beside them
 _UNEXPLAINED = 0.2  # largest share of its square that white or black may leave
+_WIDTH = 128  # a rim is this part of the picture's longer side wide, at least two pixels
+# The same two bounds for a rim, and the least excess of its background over what alpha admits.
+_RIM_FRINGE, _RIM_UNEXPLAINED, _EXCESS = 0.08, 0.3, 0.17
 
 
 def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
     """Remove white or black that is mixed into the edge of a picture with transparency.
 
-    Icons and cut-outs often keep the colours that their edge had on white. The edge has such a
-    colour if it explains the difference to the mean of the solid pixels beside.
+    Icons and cut-outs often keep the colours that their edge had on white. A soft edge has such a
+    colour if it explains the difference to the mean of the solid pixels beside; a hard one has a
+    rim of white, see ``_narrowed``.
 
     Args:
         rgba: ``[H, W, 4]`` in [0, 1], straight alpha.
@@ -37,31 +42,85 @@ def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
     edge = (alpha > _EDGE[0]) & (alpha < _EDGE[1]) & (beside[0, 0].numpy() > 0)
     inner, share = near[0].permute(1, 2, 0).numpy()[edge], 1 - alpha[edge, None]
     added = rgba[edge, :3] - inner
-    if len(inner) < _LEAST or np.sqrt((added**2).mean()) < _FRINGE:
-        return rgba, None
-    for name, color in (("white", 1.0), ("black", 0.0)):
-        left = added - share * (color - inner)
-        if (left**2).sum() < _UNEXPLAINED * (added**2).sum():
-            colors = (rgba[..., :3] - (1 - rgba[..., 3:]) * color) / np.maximum(rgba[..., 3:], 1e-3)
-            return np.dstack([colors.clip(0, 1), alpha]).astype(np.float32), name
-    return rgba, None
+    if len(inner) >= _LEAST and np.sqrt((added**2).mean()) >= _FRINGE:
+        for name, color in (("white", 1.0), ("black", 0.0)):
+            left = added - share * (color - inner)
+            if (left**2).sum() < _UNEXPLAINED * (added**2).sum():
+                return _unmixed(rgba, alpha, color), name
+    narrow = _narrowed(rgba[..., :3], alpha, np.ones_like(rgba[..., :3]))
+    return (rgba, None) if narrow is alpha else (_unmixed(rgba, narrow, 1.0), "white")
+
+
+def _unmixed(rgba: np.ndarray, alpha: np.ndarray, color: float) -> np.ndarray:
+    """Return a picture of another alpha, without the grey value ``color`` that is mixed into it."""
+    share = alpha[..., None]
+    colors = (rgba[..., :3] - (1 - share) * color) / np.maximum(share, 1e-3)
+    return np.dstack([colors.clip(0, 1), alpha]).astype(np.float32)
 
 
 def without_background(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Return a photograph's colours ``[H, W, 3]`` without its background along the object's edge.
+    """Return a photograph's object ``[H, W, 4]`` without its background along the edge.
 
     Colours of object and of background are local means weighted by alpha (the fusion of blurs of
-    Forte 2021).
+    Forte 2021); alpha is that of ``_narrowed``.
 
     Args:
         rgb: ``[H, W, 3]`` in [0, 1].
         alpha: ``[H, W]`` in [0, 1].
     """
+    alpha = _narrowed(rgb, alpha)
     picture, share = _planes(rgb), _planes(alpha[..., None])
     ours, theirs = local_colors(rgb, alpha, max(2, max(rgb.shape[:2]) // 64))
     colors = ours + share * (picture - share * ours - (1 - share) * theirs)
     colors = torch.where(share > _SOLID, picture, colors).clamp(0, 1)
-    return colors[0].permute(1, 2, 0).numpy()
+    return np.dstack([colors[0].permute(1, 2, 0).numpy(), alpha])
+
+
+def _narrowed(
+    rgb: np.ndarray, alpha: np.ndarray, background: np.ndarray | None = None
+) -> np.ndarray:
+    """Return alpha, less along a rim that has more background than alpha admits.
+
+    Each pixel's share of the background is its colour's place between those of the object inside
+    and of the background.
+
+    Args:
+        rgb: ``[H, W, 3]`` in [0, 1].
+        alpha: ``[H, W]`` in [0, 1].
+        background: ``[H, W, 3]``; None for the local mean outside the rim.
+    """
+    width = max(2, max(rgb.shape[:2]) // _WIDTH)
+    picture, own = _planes(rgb), _planes(alpha[..., None])
+    solid = (own > 0.5).float()
+    near, known = _around(rgb, _eroded(solid, width + 1)[0, 0].numpy(), width + 3)
+    rim = (solid > _eroded(solid, width)) & (known > 0)
+    if background is None:
+        outside = _eroded(1 - solid, width + 1)[0, 0].numpy()
+        theirs, known = _around(rgb, outside, width + 3)
+        rim &= known > 0
+    else:
+        theirs = _planes(background)
+    added, way = picture - near, theirs - near
+    share = _dot(added, way) / _dot(way, way).clamp(min=1e-3)
+    excess = (share.clamp(0, 1) - (1 - own)).clamp(min=0)
+    left = added - share.clamp(0, 1) * way
+    whole, left = (_dot(x, x)[rim].double() for x in (added, left))
+    is_mixed = (
+        len(whole) >= _LEAST
+        and whole.mean() > 3 * _RIM_FRINGE**2
+        and left.sum() < _RIM_UNEXPLAINED * whole.sum()
+        and excess[rim].mean() > _EXCESS
+    )
+    return torch.where(rim, own - excess, own)[0, 0].numpy() if is_mixed else alpha
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(1, keepdim=True)
+
+
+def _eroded(mask: Tensor, width: int) -> Tensor:
+    """Return a mask ``[1, 1, H, W]`` without the pixels within ``width`` of others."""
+    return -F.max_pool2d(-mask, 2 * width + 1, 1, width)
 
 
 def local_colors(rgb: np.ndarray, alpha: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:

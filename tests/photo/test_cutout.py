@@ -204,7 +204,7 @@ def test_sam_comes_before_the_matte(network, busy, monkeypatch):
     square[40:100, 60:140] = 1
     monkeypatch.setattr(cutout, "SamSegmenter", lambda *_: lambda rgb: square)
     found = cut_out(path, options)
-    assert found.method == "sam" and iou(found.mask, square) == 1
+    assert found.method == "sam" and iou(found.mask, square) > 0.95  # less a rim of background
     square[:] = 0
     assert cut_out(path, options).method == "matte"
 

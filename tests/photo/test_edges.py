@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from gamba_warp.images import save_image
 from gamba_warp.photo.cutout import CutoutOptions, cut_out
@@ -74,7 +75,76 @@ def test_a_photograph_keeps_the_colours_of_solid_pixels():
     rgb = np.random.default_rng(1).random((*SIZE, 3)).astype(np.float32)
     alpha = disc((0, 0, 0))[..., 3]
     found = without_background(rgb, alpha)
-    assert (found[alpha == 1] == rgb[alpha == 1]).all()
+    assert (found[alpha == 1, :3] == rgb[alpha == 1]).all() and (found[..., 3] == alpha).all()
+
+
+GROUND = np.array([0.2, 0.5, 0.9])
+
+
+def rimmed(color, background, width=1.2):
+    """A disc before a background as a hard mask of some pixels more cuts it; and as it is."""
+    clean = disc(color)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    mask = np.hypot(x - 40, y - 29) < 24 + width
+    return np.dstack([mixed(clean, background)[..., :3], mask]).astype(np.float32), clean
+
+
+@pytest.mark.parametrize("color", [(0.7, 0.0, 0.1), (0.3, 0.5, 0.3)])
+def test_a_rim_of_white_goes(color):
+    given, clean = rimmed(color, 1.0)
+    found, which = without_matte(given)
+    assert which == "white"
+    assert (
+        abs(found[..., 3] - clean[..., 3]).mean() < 0.15 * abs(given[..., 3] - clean[..., 3]).mean()
+    )
+    seen = clean[..., 3] > 0.3
+    assert abs(found - clean)[seen].mean() < 0.5 * abs(given - clean)[seen].mean()
+
+
+def test_a_rim_of_a_photographs_background_goes():
+    given, clean = rimmed((0.7, 0.3, 0.1), GROUND)
+    found = without_background(given[..., :3], given[..., 3])
+    assert (
+        abs(found[..., 3] - clean[..., 3]).mean() < 0.15 * abs(given[..., 3] - clean[..., 3]).mean()
+    )
+    seen = clean[..., 3] > 0.3
+    assert abs(found - clean)[seen].mean() < 0.5 * abs(given - clean)[seen].mean()
+
+
+def shaded(color):
+    """A hard disc that becomes darker towards its edge, as a ball does."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    light = np.sqrt(np.clip(1 - (np.hypot(x - 40, y - 29) / 26) ** 2, 0, 1))
+    return np.dstack([light[..., None] * color, light > 0.3]).astype(np.float32)
+
+
+def outlined(color):
+    """A disc in a drawing, with an outline of two pixels."""
+    picture, _ = rimmed((0.7, 0.6, 0.2), np.array(color))
+    return picture
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        shaded((0.6, 0.7, 0.3)),
+        outlined((0, 0, 0)),
+        outlined((0.8, 0.1, 0.1)),
+        disc((0.9, 0.9, 0.85)),
+    ],
+    ids=["shaded", "black outline", "red outline", "nearly white"],
+)
+def test_an_edge_of_the_object_itself_stays(picture):
+    found, which = without_matte(picture)
+    assert which is None and found is picture
+
+
+@pytest.mark.parametrize("blur", [0, 1])
+def test_a_right_mask_stays(blur):
+    """Also one of a picture that is a little blurred, as photographs are."""
+    clean = disc((0.7, 0.3, 0.1))
+    photo = gaussian_filter(mixed(clean, GROUND)[..., :3], (0.6 * blur, 0.6 * blur, 0))
+    assert (without_background(photo, clean[..., 3])[..., 3] == clean[..., 3]).all()
 
 
 def test_a_picture_keeps_no_fringe_of_its_background(tmp_path):
