@@ -98,7 +98,8 @@ def causal_conv1d(
     if x.dim() != 3 or x.shape[2] == 0:
         raise ValueError(f"x has shape {tuple(x.shape)}, must be [B, L, D] with D >= 1")
     packed = sequences(x, cu_seqlens, seq_idx)
-    batch, channels = len(x if packed is None else packed), x.shape[2]
+    # not len(x), which would fix a traced batch
+    batch, channels = (x if packed is None else packed).shape[0], x.shape[2]
     if weight.dim() != 2 or weight.shape[0] != channels or not 2 <= weight.shape[1] <= TAPS:
         raise ValueError(f"weight has shape {tuple(weight.shape)}, must be ({channels}, 2 to 4)")
     if bias is not None and tuple(bias.shape) != (channels,):

@@ -71,7 +71,8 @@ class Scan(NamedTuple):
     @property
     def sequences(self) -> int:
         """Number of sequences: B, or S of packed rows."""
-        return len(self.inputs.u if self.options.packed is None else self.options.packed)
+        # not len(), which would fix a traced batch
+        return (self.inputs.u if self.options.packed is None else self.options.packed).shape[0]
 
 
 def like_inputs(gradients: Inputs, inputs: Inputs, needs: Inputs) -> Inputs:
