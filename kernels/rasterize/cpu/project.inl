@@ -3,16 +3,13 @@
 //     projection.py: VISIBLE, TRANSPARENT, FAR,
 //     NEAR, NOT_FINITE, OUTSIDE, SMALL
 // gives: the bodies of project and project_vjp
-// The projection on the CPU (README.md §1), and with GRADIENT its gradient (§4). A sum of products
-// in one expression becomes fused operations, as it does in Warp's own functions; other sums are
-// functions, so that they do not.
+// The projection on the CPU (README.md §1), and with GRADIENT its gradient (§4). Products and sums
+// are rounded one by one, as in the kernels of ../cuda/project.py: only fma_ is fused.
+#pragma clang fp contract(off)
 #include "sixteen.h"
 
 const int runs = (num + RUN - 1) / RUN, begin = task % runs * RUN;
 const int end = begin + RUN < num ? begin + RUN : num;
-auto add_ = [](F a, F b) -> F { return a + b; };
-auto minus_ = [](F a, F b) -> F { return a - b; };
-auto mul_ = [](F a, F b) -> F { return a * b; };
 auto greater_ = [](F a, F b) -> F { return __builtin_elementwise_max(a, b); };
 auto less_ = [](F a, F b) -> F { return __builtin_elementwise_min(a, b); };
 auto cross_ = [](F a, F b, F c, F d) -> F { return a * d - b * c; };
@@ -59,17 +56,17 @@ auto rotate_ = [&](F* q, F size, F (*R)[3]) {
     const I some = size > 0.0f;
     for (int k = 0; k < 4; ++k) q[k] = some ? q[k] / size : splat(k == 0);
     const F w = q[0], x = q[1], y = q[2], z = q[3], one = splat(1.0f), two = one + one;
-    auto plus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), mul_(c, d)); };
-    auto minus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), -mul_(c, d)); };
-    R[0][0] = add_(one, -mul_(two, plus(y, y, z, z)));
-    R[0][1] = mul_(two, minus(x, y, w, z));
-    R[0][2] = mul_(two, plus(x, z, w, y));
-    R[1][0] = mul_(two, plus(x, y, w, z));
-    R[1][1] = add_(one, -mul_(two, plus(x, x, z, z)));
-    R[1][2] = mul_(two, minus(y, z, w, x));
-    R[2][0] = mul_(two, minus(x, z, w, y));
-    R[2][1] = mul_(two, plus(y, z, w, x));
-    R[2][2] = add_(one, -mul_(two, plus(x, x, y, y)));
+    auto plus = [&](F a, F b, F c, F d) { return a * b + c * d; };
+    auto minus = [&](F a, F b, F c, F d) { return a * b - c * d; };
+    R[0][0] = one - two * plus(y, y, z, z);
+    R[0][1] = two * minus(x, y, w, z);
+    R[0][2] = two * plus(x, z, w, y);
+    R[1][0] = two * plus(x, y, w, z);
+    R[1][1] = one - two * plus(x, x, z, z);
+    R[1][2] = two * minus(y, z, w, x);
+    R[2][0] = two * minus(x, z, w, y);
+    R[2][1] = two * plus(y, z, w, x);
+    R[2][2] = one - two * plus(x, x, y, y);
 };
 // README eq. 15: the triangle whose square is the covariance; kept within what rounding leaves
 auto root_of_ = [&](const F* c, F (*L)[3]) {
@@ -79,15 +76,15 @@ auto root_of_ = [&](const F* c, F (*L)[3]) {
     const F a = root_(left_(c[0])), along = root_(left_(c[3]));
     const F b = within_(ratio_(c[1], a), along);
     const F d = within_(ratio_(c[2], a), root_(left_(c[5])));
-    const F e = root_(left_(minus_(c[3], mul_(b, b)))), rest = left_(minus_(c[5], mul_(d, d)));
-    const F f = within_(ratio_(minus_(c[4], mul_(b, d)), e), root_(rest));
+    const F e = root_(left_(c[3] - b * b)), rest = left_(c[5] - d * d);
+    const F f = within_(ratio_(c[4] - b * d, e), root_(rest));
     L[0][0] = a, L[0][1] = F{}, L[0][2] = F{};
     L[1][0] = b, L[1][1] = e, L[1][2] = F{};
-    L[2][0] = d, L[2][1] = f, L[2][2] = root_(left_(minus_(rest, mul_(f, f))));
+    L[2][0] = d, L[2][1] = f, L[2][2] = root_(left_(rest - f * f));
 };
 auto turned_ = [&](const F* row, const F (*R)[3], F* out) {
     for (int k = 0; k < 3; ++k)
-        out[k] = fma_(row[2], R[2][k], fma_(row[1], R[1][k], mul_(row[0], R[0][k])));
+        out[k] = fma_(row[2], R[2][k], fma_(row[1], R[1][k], row[0] * R[0][k]));
 };
 
 // A camera: its numbers, and README eq. 2's bounds of the slopes, the picture and a margin around.
@@ -108,10 +105,10 @@ auto camera_of = [&](size_t image) -> Camera {
 auto to_camera_ = [&](const Camera& camera, const F* mean, F* t) {
     for (int r = 0; r < 3; ++r) {
         const float* const row = camera.V + 4 * r;
-        F sum = mul_(mean[0], splat(row[0]));
-        sum = add_(sum, mul_(mean[1], splat(row[1])));
-        sum = add_(sum, mul_(mean[2], splat(row[2])));
-        t[r] = add_(sum, splat(row[3]));
+        F sum = mean[0] * row[0];
+        sum += mean[1] * row[1];
+        sum += mean[2] * row[2];
+        t[r] = sum + splat(row[3]);
     }
 };
 // (x, y)/z, clamped, and the rows of J W: J has the rows (fx, 0, -fx sx) and (0, fy, -fy sy)
@@ -123,8 +120,8 @@ auto jacobian_ = [&](const Camera& camera, const F* t, F* slopes, F (*rows)[3]) 
     const F sy = less_(greater_(splat(camera.top), slopes[1]), splat(camera.bottom));
     const F jx = -fx * sx, jy = -fy * sy;
     for (int k = 0; k < 3; ++k) {
-        rows[0][k] = fma_(jx, splat(V[8 + k]), mul_(fx, splat(V[k])));
-        rows[1][k] = fma_(jy, splat(V[8 + k]), mul_(fy, splat(V[4 + k])));
+        rows[0][k] = fma_(jx, splat(V[8 + k]), fx * V[k]);
+        rows[1][k] = fma_(jy, splat(V[8 + k]), fy * V[4 + k]);
     }
 };
 
@@ -135,10 +132,10 @@ auto jacobian_ = [&](const Camera& camera, const F* t, F* slopes, F (*rows)[3]) 
 // original slope z is one
 auto slope_ = [&](F p, F z, float low, float high, float focal, F v, F& vx, F& vz) {
     const F s = less_(greater_(splat(low), p), splat(high));
-    const F f = mul_(v, splat(focal)) / mul_(z, z);
+    const F f = v * focal / (z * z);
     const I free = p == s;
     vx = free ? -f : F{};
-    vz = free | (I{} - lens.original) ? mul_(mul_(splat(2.0f), f), s) : mul_(f, s);
+    vz = free | (I{} - lens.original) ? 2.0f * f * s : f * s;
 };
 const int object = task / runs;
 for (int i0 = begin; i0 < end; i0 += 16) {
@@ -187,8 +184,8 @@ for (int i0 = begin; i0 < end; i0 += 16) {
             else
                 for (int k = 0; k < 3; ++k) N[r][k] = P[r][k];
         for (int k = 0; k < 3; ++k) {
-            m0[k] = mul_(N[0][k], scale[k]);
-            m1[k] = mul_(N[1][k], scale[k]);
+            m0[k] = N[0][k] * scale[k];
+            m1[k] = N[1][k] * scale[k];
         }
 
         // README eq. 8: the conic's gradient to the covariance's
@@ -198,64 +195,58 @@ for (int i0 = begin; i0 < end; i0 += 16) {
             cross_(m0[0], m0[1], m1[0], m1[1])};
         const F d[3] = {cross_(m1[1], m1[2], c[1], c[2]), cross_(m1[2], m1[0], c[2], c[0]),
             cross_(m1[0], m1[1], c[0], c[1])};
-        const F v_across = mul_(mul_(mul_(-two, a), a), v_conic[0]);
-        const F shear = mul_(e, v_conic[1]);
-        const F along = minus_(mul_(v_across, k), shear);
-        const F whole = mul_(e, add_(mul_(v_conic[1], k), mul_(mul_(two, e), v_conic[2])));
+        const F v_across = -two * a * a * v_conic[0];
+        const F shear = e * v_conic[1];
+        const F along = v_across * k - shear;
+        const F whole = e * (v_conic[1] * k + two * e * v_conic[2]);
         F v_m[2][3], v_N[2][3], v_P[2][3];
         for (int j = 0; j < 3; ++j) {
-            const F across = mul_(e, add_(mul_(splat(lens.eps2d), m0[j]), d[j]));
-            v_m[0][j] = minus_(mul_(v_across, across), mul_(shear, m1[j]));
-            v_m[1][j] = minus_(mul_(along, across), mul_(whole, m1[j]));
+            const F across = e * (lens.eps2d * m0[j] + d[j]);
+            v_m[0][j] = v_across * across - shear * m1[j];
+            v_m[1][j] = along * across - whole * m1[j];
         }
-        auto gather_ = [&](F& to, F value) { to = seen ? add_(to, value) : to; };
+        auto gather_ = [&](F& to, F value) { to = seen ? to + value : to; };
         gather_(v_opacity, v_o);
         if (v_scene.covars.data) {  // README eq. 15
-            const F a2 = mul_(a, a), v_xx = minus_(F{}, mul_(a2, v_conic[0]));
-            const F v_xy =
-                minus_(F{}, add_(mul_(mul_(mul_(two, a2), k), v_conic[0]), mul_(e, v_conic[1])));
-            const F v_yy = minus_(F{},
-                add_(add_(mul_(mul_(mul_(a2, k), k), v_conic[0]), mul_(mul_(k, e), v_conic[1])),
-                    mul_(mul_(e, e), v_conic[2])));
+            const F a2 = a * a, v_xx = F{} - a2 * v_conic[0];
+            const F v_xy = F{} - (two * a2 * k * v_conic[0] + e * v_conic[1]);
+            const F v_yy =
+                F{} - (a2 * k * k * v_conic[0] + k * e * v_conic[1] + e * e * v_conic[2]);
             int at = 0;
             for (int r = 0; r < 3; ++r)
                 for (int j = r; j < 3; ++j) {
-                    const F across = mul_(mul_(splat(0.5f), v_xy),
-                        add_(mul_(P[0][r], P[1][j]), mul_(P[1][r], P[0][j])));
-                    const F entry = add_(add_(mul_(mul_(v_xx, P[0][r]), P[0][j]), across),
-                        mul_(mul_(v_yy, P[1][r]), P[1][j]));
-                    gather_(v_covar[at++], r == j ? entry : mul_(two, entry));
+                    const F across = 0.5f * v_xy * (P[0][r] * P[1][j] + P[1][r] * P[0][j]);
+                    const F entry = v_xx * P[0][r] * P[0][j] + across + v_yy * P[1][r] * P[1][j];
+                    gather_(v_covar[at++], r == j ? entry : two * entry);
                 }
         }
-        for (int j = 0; j < 3; ++j)
-            gather_(v_scale[j], add_(mul_(N[0][j], v_m[0][j]), mul_(N[1][j], v_m[1][j])));
+        for (int j = 0; j < 3; ++j) gather_(v_scale[j], N[0][j] * v_m[0][j] + N[1][j] * v_m[1][j]);
         for (int r = 0; r < 2; ++r)
-            for (int j = 0; j < 3; ++j) v_N[r][j] = mul_(v_m[r][j], scale[j]);
+            for (int j = 0; j < 3; ++j) v_N[r][j] = v_m[r][j] * scale[j];
         for (int r = 0; r < 3; ++r)
             for (int j = 0; j < 3; ++j)
-                gather_(v_R[r][j], fma_(P[1][r], v_N[1][j], mul_(P[0][r], v_N[0][j])));
+                gather_(v_R[r][j], fma_(P[1][r], v_N[1][j], P[0][r] * v_N[0][j]));
         for (int r = 0; r < 2; ++r)
             for (int j = 0; j < 3; ++j)
                 v_P[r][j] = turns
-                    ? fma_(v_N[r][2], R[j][2], fma_(v_N[r][1], R[j][1], mul_(v_N[r][0], R[j][0])))
+                    ? fma_(v_N[r][2], R[j][2], fma_(v_N[r][1], R[j][1], v_N[r][0] * R[j][0]))
                     : v_N[r][j];
         auto v_J = [&](int r, int j) -> F {  // times the transpose of W
             return fma_(v_P[r][2], splat(V[4 * j + 2]),
-                fma_(v_P[r][1], splat(V[4 * j + 1]), mul_(v_P[r][0], splat(V[4 * j]))));
+                fma_(v_P[r][1], splat(V[4 * j + 1]), v_P[r][0] * V[4 * j]));
         };
         const F z = t[2];
         F xx, xz, yy, yz;
         slope_(slopes[0], z, camera.left, camera.right, K[0], v_J(0, 2), xx, xz);
         slope_(slopes[1], z, camera.top, camera.bottom, K[4], v_J(1, 2), yy, yz);
-        const F zz = mul_(z, z), ux = mul_(v_u[0], splat(K[0])), uy = mul_(v_u[1], splat(K[4]));
-        const F focal = add_(mul_(v_J(0, 0), splat(K[0])), mul_(v_J(1, 1), splat(K[4])));
-        const F center = add_(mul_(ux, t[0]), mul_(uy, t[1]));
-        const F v_t[3] = {add_(xx, ux / z), add_(yy, uy / z),
-            minus_(minus_(add_(add_(xz, yz), v_z), focal / zz), center / zz)};
+        const F zz = z * z, ux = v_u[0] * K[0], uy = v_u[1] * K[4];
+        const F focal = v_J(0, 0) * K[0] + v_J(1, 1) * K[4];
+        const F center = ux * t[0] + uy * t[1];
+        const F v_t[3] = {xx + ux / z, yy + uy / z, xz + yz + v_z - focal / zz - center / zz};
         for (int j = 0; j < 3; ++j) {
-            F sum = mul_(splat(V[j]), v_t[0]);
-            sum = add_(sum, mul_(splat(V[4 + j]), v_t[1]));
-            gather_(v_mean[j], add_(sum, mul_(splat(V[8 + j]), v_t[2])));
+            F sum = V[j] * v_t[0];
+            sum += V[4 + j] * v_t[1];
+            gather_(v_mean[j], sum + V[8 + j] * v_t[2]);
         }
     }
     if (v_scene.means.data) write_(v_scene.means.data + g, 3, n, v_mean);
@@ -267,29 +258,23 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     if (any_(ever)) {
         const F w = q[0], x = q[1], y = q[2], u = q[3], two = splat(2.0f);
         const auto& v = v_R;
-        auto plus = [&](int r, int c) { return add_(v[r][c], v[c][r]); };
-        auto less = [&](int r, int c) { return minus_(v[r][c], v[c][r]); };
-        auto both = [&](int r, int c) { return add_(v[r][r], v[c][c]); };
+        auto plus = [&](int r, int c) { return v[r][c] + v[c][r]; };
+        auto less = [&](int r, int c) { return v[r][c] - v[c][r]; };
+        auto both = [&](int r, int c) { return v[r][r] + v[c][c]; };
         F s[4];
-        s[0] = add_(add_(mul_(x, less(2, 1)), mul_(y, less(0, 2))), mul_(u, less(1, 0)));
-        s[1] = add_(
-            add_(add_(mul_(mul_(-two, x), both(1, 2)), mul_(y, plus(0, 1))), mul_(u, plus(0, 2))),
-            mul_(w, less(2, 1)));
-        s[2] = add_(
-            add_(minus_(mul_(x, plus(0, 1)), mul_(mul_(two, y), both(0, 2))), mul_(u, plus(1, 2))),
-            mul_(w, less(0, 2)));
-        s[3] = add_(
-            minus_(add_(mul_(x, plus(0, 2)), mul_(y, plus(1, 2))), mul_(mul_(two, u), both(0, 1))),
-            mul_(w, less(1, 0)));
+        s[0] = x * less(2, 1) + y * less(0, 2) + u * less(1, 0);
+        s[1] = -two * x * both(1, 2) + y * plus(0, 1) + u * plus(0, 2) + w * less(2, 1);
+        s[2] = x * plus(0, 1) - two * y * both(0, 2) + u * plus(1, 2) + w * less(0, 2);
+        s[3] = x * plus(0, 2) + y * plus(1, 2) - two * u * both(0, 1) + w * less(1, 0);
         F dot = F{};
         for (int j = 0; j < 4; ++j) {
-            s[j] = mul_(two, s[j]);
+            s[j] *= two;
             dot += q[j] * s[j];
         }
         // the gradient of a shorter one leaves float32's range
         const I some = ever & (I)(size > 1e-30f);
         const F turn = lens.original ? F{} : dot;
-        for (int j = 0; j < 4; ++j) v_q[j] = some ? minus_(s[j], mul_(q[j], turn)) / size : F{};
+        for (int j = 0; j < 4; ++j) v_q[j] = some ? (s[j] - q[j] * turn) / size : F{};
     }
     write_(v_scene.quats.data + g, 4, n, v_q);
 }
@@ -301,7 +286,7 @@ const int image = task / runs, object = image / views, channels = colors.shape[1
 const Camera camera = camera_of(image);
 const float* const K = camera.K;
 auto finite_ = [&](F a) -> I { return abs_(a) <= 3.402823466e38f; };
-auto sum_ = [&](const F* v) -> F { return add_(add_(abs_(v[0]), abs_(v[1])), abs_(v[2])); };
+auto sum_ = [&](const F* v) -> F { return abs_(v[0]) + abs_(v[1]) + abs_(v[2]); };
 auto dot_ = [](const F* a, const F* b) -> F { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; };
 for (int i0 = begin; i0 < end; i0 += 16) {
     const int n = end - i0 < 16 ? end - i0 : 16;
@@ -355,36 +340,35 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         }
         F *const m0 = M[0], *const m1 = M[1];
         if (!scene.covars.data)
-            for (int k = 0; k < 3; ++k)
-                m0[k] = mul_(m0[k], scale[k]), m1[k] = mul_(m1[k], scale[k]);
+            for (int k = 0; k < 3; ++k) m0[k] *= scale[k], m1[k] *= scale[k];
         const F across[3] = {cross_(m0[1], m0[2], m1[1], m1[2]), cross_(m0[2], m0[0], m1[2], m1[0]),
             cross_(m0[0], m0[1], m1[0], m1[1])};
         const F det0 = dot_(across, across), d00 = dot_(m0, m0), d11 = dot_(m1, m1);
         const F eps = splat(lens.eps2d);
-        F det = add_(add_(det0, mul_(eps, add_(d00, d11))), mul_(eps, eps));
-        F syy = add_(d11, eps);
-        const F sxx = add_(d00, eps), sxy = dot_(m0, m1);
+        F det = det0 + eps * (d00 + d11) + eps * eps;
+        F syy = d11 + eps;
+        const F sxx = d00 + eps, sxy = dot_(m0, m1);
         const I solid = finite_(det) & (I)(det > 0.0f) & (I)(syy > 0.0f);
         det = solid ? det : splat(1.0f);
         syy = solid ? syy : splat(1.0f);
         const F a = syy / det, e = splat(1.0f) / syy;
-        const F x = add_(mul_(splat(K[0]), t[0]) / z, splat(K[2]));
-        const F y = add_(mul_(splat(K[4]), t[1]) / z, splat(K[5]));
+        const F x = K[0] * t[0] / z + splat(K[2]);
+        const F y = K[4] * t[1] / z + splat(K[5]);
         const I thick = (I)(a > 0.0f) & (I)(a <= CONIC_MAX) & (I)(e <= CONIC_MAX);
         const I sound = solid & thick & finite_(x) & finite_(y);
         shown = opacity;
         I faint = I{};
         if (lens.antialiased) {
-            shown = mul_(opacity, greater_(splat(COMPENSATION_MIN), root_(det0 / det)));
+            shown = opacity * greater_(splat(COMPENSATION_MIN), root_(det0 / det));
             faint = ~(I)(shown >= lens.alpha_min);
         }
         float cuts[16];
         const F over = shown / lens.alpha_min;
         // of all lanes: to ask each costs more than its logarithm
         for (int l = 0; l < 16; ++l) cuts[l] = wp::log(over[l]);
-        const F cut = root_(mul_(splat(2.0f), *(const F*)cuts));
-        extent[0] = mul_(cut, root_(sxx));
-        extent[1] = mul_(cut, root_(syy));
+        const F cut = root_(2.0f * (*(const F*)cuts));
+        extent[0] = cut * root_(sxx);
+        extent[1] = cut * root_(syy);
         F rx = extent[0], ry = extent[1];
         if (lens.rounded) rx = __builtin_elementwise_ceil(rx), ry = __builtin_elementwise_ceil(ry);
         const I small = (I)(rx <= lens.radius_clip) & (I)(ry <= lens.radius_clip);
@@ -395,10 +379,10 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         fate = faint ? I{} + TRANSPARENT : fate;
         if (lens.original) {
             // README eq. 16: the radius, and whether its square of tiles is empty
-            const F half = mul_(splat(0.5f), minus_(sxx, syy));
-            const F spread = root_(greater_(add_(mul_(half, half), mul_(sxy, sxy)), splat(0.1f)));
-            const F most = add_(mul_(splat(0.5f), add_(sxx, syy)), spread);
-            const F whole = __builtin_elementwise_ceil(mul_(splat(3.0f), root_(most)));
+            const F half = 0.5f * (sxx - syy);
+            const F spread = root_(greater_(half * half + sxy * sxy, splat(0.1f)));
+            const F most = 0.5f * (sxx + syy) + spread;
+            const F whole = __builtin_elementwise_ceil(3.0f * root_(most));
             const F radius = less_(whole, splat(RADIUS_MAX));
             const float right = ((int)lens.width + TILE - 1) / TILE * TILE + 0.5f;
             const float bottom = ((int)lens.height + TILE - 1) / TILE * TILE + 0.5f;
