@@ -1,19 +1,16 @@
 // needs: native.py: TABLE, DEGREE
-// gives: F, I, splat, fma_, max_abs_, in_range_, LOG2E, shifter, POWER_2, POWER_3, POWER_4,
+// gives: what sixteen.h gives, max_abs_, in_range_, LOG2E, shifter, POWER_2, POWER_3, POWER_4,
 //     POWER_5, POWER_6, horner_, exp2_clamped_, exp2_, decay_, exp2_parts_, exp2_fm1_,
 //     softplus_of_, softplus_, sigmoid_, rows_, H, S, Line, narrow_, read_, write_, put_,
-//     transpose_, tiles_, Lanes, gather_, scatter_
+//     tiles_, Lanes, gather_, scatter_
 // Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_fm1_; TABLE:
 // true to take a table instead where the processor has AVX-512.
-typedef float F __attribute__((vector_size(64), aligned(4)));
-typedef int I __attribute__((vector_size(64), aligned(4)));
-auto splat = [](float x) -> F { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; };
+#include "sixteen.h"
 #if TABLE && defined(__AVX512F__)
 #define TABLED true
 #else
 #define TABLED false
 #endif
-auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
 // max(most, |x|) by their bits, so that NaN is the greatest
 auto max_abs_ = [](F most, F x) -> F {
     I i = (I)x & 0x7fffffff;
@@ -206,38 +203,6 @@ auto put_ = [&](const auto& rows, int t, F v, bool stream) __attribute__((always
     else write_(rows, t, v);
 };
 
-// Transposes sixteen values of sixteen lanes: lane j of value i becomes lane i of value j. A round
-// exchanges a bit of i and one of j, of which the last two count within 128 bits, the first two
-// count these; so no instruction moves numbers across these 128 bits one by one, which is slow.
-auto transpose_ = [](F* v) __attribute__((always_inline)) {
-    auto place = [](int i) { return i % 4 * 4 + i / 4 % 2 * 2 + i / 8; };
-    F w[16];
-#pragma unroll
-    for (int i = 0; i < 16; ++i) w[place(i)] = v[i];
-#pragma unroll
-    for (int round = 0; round < 4; ++round) {
-        F x[16];
-#pragma unroll
-        for (int i = 0; i < 8; ++i) {
-            const F a = w[i], b = w[i + 8];
-            if (round < 2) {
-                x[2 * i] = __builtin_shufflevector(
-                    a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
-                x[2 * i + 1] = __builtin_shufflevector(
-                    a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
-            } else {
-                x[2 * i] = __builtin_shufflevector(
-                    a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
-                x[2 * i + 1] = __builtin_shufflevector(
-                    a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
-            }
-        }
-#pragma unroll
-        for (int i = 0; i < 16; ++i) w[i] = x[i];
-    }
-#pragma unroll
-    for (int i = 0; i < 16; ++i) v[i] = w[place(i)];
-};
 // Calls tile(t, width, end) for the tokens from begin to before ``end`` of turned rows, by sixteen
 // or fewer at the end; full tiles are compiled separately.
 auto tiles_ = [](const auto& rows, int begin, int end, auto tile) __attribute__((always_inline)) {

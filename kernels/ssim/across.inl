@@ -12,10 +12,10 @@ const F m = read(at(maps.shift, picture, 0));  // the same for each tap, which h
 for (int k = 0; k < 11; ++k) {
     F a = read(g + k * channels), c = read(w + k * channels);
     F s = a + c - m, q = a - c;
-    s0 = fma_(weights[k], s, s0);
-    s1 = fma_(weights[k], q, s1);
-    s2 = fma_(weights[k], s * s, s2);
-    s3 = fma_(weights[k], q * q, s3);
+    s0 = fma_(splat(weights[k]), s, s0);
+    s1 = fma_(splat(weights[k]), q, s1);
+    s2 = fma_(splat(weights[k]), s * s, s2);
+    s3 = fma_(splat(weights[k]), q * q, s3);
 }
 write(at(maps.hor, picture, 4 * y), s0);
 write(at(maps.hor, picture, 4 * y + 1), s1);

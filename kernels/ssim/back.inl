@@ -10,9 +10,9 @@ const float* c2 = at(maps.col, picture, 3 * y + 2);
 F b0 = F{}, b1 = F{}, b2 = F{};
 #pragma unroll
 for (int k = 0; k < 11; ++k) {
-    b0 = fma_(weights[k], read(c0 + k * channels), b0);
-    b1 = fma_(weights[k], read(c1 + k * channels), b1);
-    b2 = fma_(weights[k], read(c2 + k * channels), b2);
+    b0 = fma_(splat(weights[k]), read(c0 + k * channels), b0);
+    b1 = fma_(splat(weights[k]), read(c1 + k * channels), b1);
+    b2 = fma_(splat(weights[k]), read(c2 + k * channels), b2);
 }
 F a = read(at(maps.got, picture, y)), c = read(at(maps.want, picture, y));
 F s = a + c - read(at(maps.shift, picture, 0)), q = a - c;

@@ -11,10 +11,10 @@ for (int y = strip * STRIP; y < (strip + 1) * STRIP && y < rows; ++y) {
     F s0 = F{}, d0 = F{}, s2 = F{}, d2 = F{};
 #pragma unroll
     for (int k = 0; k < 11; ++k) {
-        s0 = fma_(weights[k], read(at(maps.hor, picture, 4 * (y + k))), s0);
-        d0 = fma_(weights[k], read(at(maps.hor, picture, 4 * (y + k) + 1)), d0);
-        s2 = fma_(weights[k], read(at(maps.hor, picture, 4 * (y + k) + 2)), s2);
-        d2 = fma_(weights[k], read(at(maps.hor, picture, 4 * (y + k) + 3)), d2);
+        s0 = fma_(splat(weights[k]), read(at(maps.hor, picture, 4 * (y + k))), s0);
+        d0 = fma_(splat(weights[k]), read(at(maps.hor, picture, 4 * (y + k) + 1)), d0);
+        s2 = fma_(splat(weights[k]), read(at(maps.hor, picture, 4 * (y + k) + 2)), s2);
+        d2 = fma_(splat(weights[k]), read(at(maps.hor, picture, 4 * (y + k) + 3)), d2);
     }
     F s = s0 + read(at(maps.shift, picture, 0));
     F bright = s * s + TWO_C1, dark = d0 * d0;

@@ -1,14 +1,12 @@
 // needs: lanes.py: WEIGHTS, maps, group, numbers
-// gives: F, weights, channels, d, width, splat, fma_, at, read, write
+// gives: weights, channels, d, width, at, read, write
 // Sixteen adjacent numbers of a picture's row, or fewer at its end, with WINDOW as weights.
 // Pictures are [P, H, E], E = W * C. Maps between two launches have their rows side by side: row 4
 // y + i is map i of row y, and 3 y + i where there are three. README.md has the formulas.
-typedef float F __attribute__((vector_size(64), aligned(4)));
+#include "../runtime/sixteen.h"
 const float weights[11] = WEIGHTS;
 const int channels = maps.channels, d = group * 16;
 const int width = numbers - d < 16 ? numbers - d : 16;
-auto splat = [](float x) -> F { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; };
-auto fma_ = [&](float a, F b, F c) -> F { return __builtin_elementwise_fma(splat(a), b, c); };
 // where row y of a picture has the first of the numbers
 auto at = [&](const auto& rows, int picture, int y) -> float* {
     return (float*)((char*)rows.data + (size_t)picture * rows.strides[0]

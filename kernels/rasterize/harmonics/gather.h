@@ -1,40 +1,13 @@
 // needs: cpu.py: DEGREE, D, arrays, SHORTEST, CLAMPED, CHUNK, task
-// gives: F, I, COUNT, FLOATS, PADDED, fma_, b, any_, not_finite_, transpose_, num, views, per_view,
-//     coefficients, centers, K_D, stop, load_rows_, direction_, basis_, shown_, passes_, chunks,
-//     begin, end, means_
+// gives: COUNT, FLOATS, PADDED, not_finite_, num, views, per_view, b, coefficients, centers, K_D,
+//     stop, load_rows_, direction_, basis_, shown_, passes_, chunks, begin, end, means_
 // Sixteen Gaussians as the lanes of one SIMD value. Coefficients are transposed, 16 x 16 floats
 // at a time, so that a lane holds one Gaussian's; the gradient is transposed back. A row is K_D
 // floats, of which FLOATS are used. Lanes beyond the last Gaussian hold the last one again.
-typedef float F __attribute__((vector_size(64), aligned(4)));
-typedef int I __attribute__((vector_size(64), aligned(4)));
+#include "../../runtime/sixteen.h"
 const int COUNT = (DEGREE + 1) * (DEGREE + 1), FLOATS = COUNT * D, PADDED = (FLOATS + 15) / 16 * 16;
-auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
-auto any_ = [](I mask) -> bool { return __builtin_reduce_or(mask) != 0; };
 // not finite, by the exponent's bits
 auto not_finite_ = [](F x) -> I { return ((I)x & 0x7fffffff) >= 0x7f800000; };
-// transposes 16 x 16 floats by exchanging ever smaller squares
-#define LOW(l, w) ((l) & (w) ? 16 + (l) - (w) : (l))
-#define HIGH(l, w) ((l) & (w) ? 16 + (l) : (l) + (w))
-#define LANES(f, w)                                                                                \
-    f(0, w), f(1, w), f(2, w), f(3, w), f(4, w), f(5, w), f(6, w), f(7, w), f(8, w), f(9, w),      \
-        f(10, w), f(11, w), f(12, w), f(13, w), f(14, w), f(15, w)
-#define EXCHANGE(w)                                                                                \
-    _Pragma("clang loop unroll(full)") for (int i = 0; i < 16; ++i) {                              \
-        if (i & (w)) continue;                                                                     \
-        const F a = r[i], b = r[i + (w)];                                                          \
-        r[i] = __builtin_shufflevector(a, b, LANES(LOW, w));                                       \
-        r[i + (w)] = __builtin_shufflevector(a, b, LANES(HIGH, w));                                \
-    }
-auto transpose_ = [](F* r) {
-    EXCHANGE(8)
-    EXCHANGE(4)
-    EXCHANGE(2)
-    EXCHANGE(1)
-};
-#undef EXCHANGE
-#undef LANES
-#undef HIGH
-#undef LOW
 const int num = size.num, views = size.views;
 const bool per_view = size.per_view;
 const wp::array_t<float>& coefficients = arrays.coefficients;
