@@ -50,7 +50,7 @@ def take_names(*packages: str) -> None:
     known = *VERSIONS, *EXTENSIONS
     for name in packages or known:
         if name not in known:
-            raise ValueError(f"the package {name!r} is not supported, allowed: {', '.join(known)}")
+            raise ValueError(f"package must be one of {', '.join(known)}, got {name!r}")
         if name in sys.modules:
             raise ImportError(f"{name} is already imported: call this before importing it")
     for name in packages or known:

@@ -431,7 +431,7 @@ def _camera(settings: GaussianRasterizationSettings, device: torch.device) -> tu
     )
     half = np.array([float(settings.tanfovx), float(settings.tanfovy)])
     if not (half > 0).all():
-        raise ValueError(f"tanfovx, tanfovy are {half[0]}, {half[1]}, allowed is > 0")
+        raise ValueError(f"tanfovx and tanfovy must be > 0, got {half[0]}, {half[1]}")
     # Clip coordinates x/tan + center z, and the same for y; w is the depth z.
     axis = view[:, 2]
     straight = view[:, :2] / half

@@ -41,13 +41,13 @@ def check_tensor(
     if optional and value is None:
         return
     if not isinstance(value, Tensor):
-        raise TypeError(f"{name} is {type(value).__name__}, allowed is a tensor")
+        raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
     if dtypes and value.dtype not in dtypes:
-        raise TypeError(f"{name} has dtype {value.dtype}, allowed: {', '.join(map(str, dtypes))}")
+        raise TypeError(f"{name} must have dtype {', '.join(map(str, dtypes))}, got {value.dtype}")
     size = tuple(value.shape)
     if shapes and size not in shapes and not any(_fits(size, shape) for shape in shapes):
         allowed = " or ".join(f"[{', '.join(map(str, shape))}]" for shape in shapes)
-        raise ValueError(f"{name} has shape {list(size)}, allowed is {allowed}")
+        raise ValueError(f"{name} must have shape {allowed}, got {list(size)}")
 
 
 def _fits(size: tuple[int, ...], shape: Shape) -> bool:
@@ -68,8 +68,8 @@ def one_of(name: str, value: Any, *allowed: Any) -> None:
     """
     if isinstance(value, Tensor) or value not in allowed:
         got = "a tensor" if isinstance(value, Tensor) else repr(value)
-        verdict = "which is not supported: allowed is" if len(allowed) == 1 else "allowed are"
-        raise ValueError(f"{name} is {got}, {verdict} {', '.join(map(repr, allowed))}")
+        verdict = "is supported only as" if len(allowed) == 1 else "must be one of"
+        raise ValueError(f"{name} {verdict} {', '.join(map(repr, allowed))}, got {got}")
 
 
 def positive(**numbers: float) -> None:
@@ -80,7 +80,7 @@ def positive(**numbers: float) -> None:
     """
     for name, value in numbers.items():
         if not value > 0:
-            raise ValueError(f"{name} is {value}, allowed is > 0")
+            raise ValueError(f"{name} must be > 0, got {value}")
 
 
 def at_least_0(**numbers: float) -> None:
@@ -91,7 +91,7 @@ def at_least_0(**numbers: float) -> None:
     """
     for name, value in numbers.items():
         if not value >= 0:
-            raise ValueError(f"{name} is {value}, allowed is >= 0")
+            raise ValueError(f"{name} must be >= 0, got {value}")
 
 
 def side(**pixels: Any) -> list[int]:
@@ -107,7 +107,7 @@ def side(**pixels: Any) -> list[int]:
         except TypeError:
             number = 0
         if not 1 <= number <= MAX_SIDE:
-            raise ValueError(f"{name} is {value!r}, allowed are integers from 1 to {MAX_SIDE}")
+            raise ValueError(f"{name} must be an integer from 1 to {MAX_SIDE}, got {value!r}")
         sizes.append(number)
     return sizes
 
@@ -121,7 +121,7 @@ def one_device(tensors: dict[str, Any]) -> None:
     devices = {x.device for x in tensors.values() if isinstance(x, Tensor)}
     if len(devices) > 1 or not {device.type for device in devices} <= {"cpu", "cuda"}:
         names = ", ".join(sorted(map(str, devices)))
-        raise ValueError(f"{', '.join(tensors)} are on {names}: allowed is one, cpu or cuda")
+        raise ValueError(f"{', '.join(tensors)} must be on one device, cpu or cuda, got {names}")
 
 
 def with_order(function: Callable[..., Any], names: str, **fixed: Any) -> Callable[..., Any]:

@@ -88,29 +88,29 @@ def causal_conv1d(
         if value is None and name in ("bias", "initial_state"):
             continue
         if not isinstance(value, Tensor):
-            raise TypeError(f"{name} is {type(value).__name__}, must be a tensor")
+            raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
         if value.dtype not in DTYPES:
-            raise TypeError(f"{name} has dtype {value.dtype}, allowed: {DTYPES}")
+            raise TypeError(f"{name} must have a dtype of {DTYPES}, got {value.dtype}")
         if value.device != x.device:
-            raise ValueError(f"{name} is on {value.device}, x is on {x.device}: allowed is one")
+            raise ValueError(f"{name} must be on {x.device}, as x, got {value.device}")
     if x.device.type not in ("cpu", "cuda"):
-        raise ValueError(f"x is on {x.device}, allowed are cpu and cuda")
+        raise ValueError(f"x must be on cpu or cuda, got {x.device}")
     if x.dim() != 3 or x.shape[2] == 0:
-        raise ValueError(f"x has shape {tuple(x.shape)}, must be [B, L, D] with D >= 1")
+        raise ValueError(f"x must have shape [B, L, D] with D >= 1, got {tuple(x.shape)}")
     packed = sequences(x, cu_seqlens, seq_idx)
     # not len(x), which would fix a traced batch
     batch, channels = (x if packed is None else packed).shape[0], x.shape[2]
     if weight.dim() != 2 or weight.shape[0] != channels or not 2 <= weight.shape[1] <= TAPS:
-        raise ValueError(f"weight has shape {tuple(weight.shape)}, must be ({channels}, 2 to 4)")
+        raise ValueError(f"weight must have shape ({channels}, 2 to 4), got {tuple(weight.shape)}")
     if bias is not None and tuple(bias.shape) != (channels,):
-        raise ValueError(f"bias has shape {tuple(bias.shape)}, must be ({channels},)")
+        raise ValueError(f"bias must have shape ({channels},), got {tuple(bias.shape)}")
     want = (batch, weight.shape[1] - 1, channels)
     if initial_state is not None and tuple(initial_state.shape) != want:
-        raise ValueError(f"initial_state has shape {tuple(initial_state.shape)}, must be {want}")
+        raise ValueError(f"initial_state must have shape {want}, got {tuple(initial_state.shape)}")
     if initial_state is not None and initial_state.dtype != x.dtype:
         raise TypeError(f"initial_state has dtype {initial_state.dtype}, x has {x.dtype}")
     if activation not in ACTIVATIONS:
-        raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")
+        raise ValueError(f"activation must be one of {ACTIVATIONS}, got {activation!r}")
     out = conv(x, weight, bias, initial_state, packed, activation is not None)
     if not return_final_state:
         return out

@@ -102,7 +102,7 @@ def depth_quantile(
         ValueError: the transmittance is out of range.
     """
     if not 0 < transmittance < 1:
-        raise ValueError(f"transmittance is {transmittance}, allowed is 0 < transmittance < 1")
+        raise ValueError(f"transmittance must be in (0, 1), got {transmittance}")
     splats = Projected(*(meta[name] for name in ("means2d", "conics", "depths", "opacities")))
     return _walk(splats, meta.bins, meta.tiling, transmittance, Limits(alpha_min, alpha_max, 0.0))
 

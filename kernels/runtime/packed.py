@@ -56,27 +56,27 @@ def sequences(
     if cu_seqlens is None and seq_idx is None:
         return None
     if cu_seqlens is not None and seq_idx is not None:
-        raise ValueError("cu_seqlens and seq_idx are given, allowed is one of them")
+        raise ValueError("pass either cu_seqlens or seq_idx, got both")
     batch, length = x.shape[:2]
     if isinstance(cu_seqlens, Packed) and seq_idx is None:
         return cu_seqlens.rows
     name, given = ("seq_idx", seq_idx) if cu_seqlens is None else ("cu_seqlens", cu_seqlens)
     if not isinstance(given, Tensor):
-        raise TypeError(f"{name} is {type(given).__name__}, must be a tensor")
+        raise TypeError(f"{name} must be a tensor, got {type(given).__name__}")
     if given.layout != torch.strided:
-        raise TypeError(f"{name} has layout {given.layout}, must be dense (torch.strided)")
+        raise TypeError(f"{name} must be dense (torch.strided), got {given.layout}")
     if given.dtype not in _DTYPES:
-        raise TypeError(f"{name} has dtype {given.dtype}, allowed: {', '.join(map(str, _DTYPES))}")
+        raise TypeError(f"{name} must have dtype {', '.join(map(str, _DTYPES))}, got {given.dtype}")
     if given.device != x.device:
         raise ValueError(f"{name} is on {given.device}, the tokens are on {x.device}")
     if cu_seqlens is None:
         if tuple(given.shape) != (batch, length):
-            raise ValueError(f"seq_idx has shape {tuple(given.shape)}, must be {(batch, length)}")
+            raise ValueError(f"seq_idx must have shape {(batch, length)}, got {tuple(given.shape)}")
         return _runs(given)
     if given.dim() != 1 or len(given) == 0 or batch != 1:
         raise ValueError(
-            f"cu_seqlens has shape {tuple(given.shape)}, must be [S + 1] with one row of tokens; "
-            f"there are {batch}"
+            "cu_seqlens must have shape [S + 1] with one row of tokens, "
+            f"got {tuple(given.shape)} with {batch}"
         )
     if given.device.type == "cpu" and not torch.compiler.is_compiling():
         first, last, fall = int(given[0]), int(given[-1]), (given.diff() < 0).nonzero()

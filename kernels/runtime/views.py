@@ -73,7 +73,7 @@ def _describe(tensor: Tensor, dtype, name: str) -> Any:
     if dtype is not None:
         scalar = wp.dtype_to_torch(getattr(dtype, "_wp_scalar_type_", dtype))
         if tensor.dtype != scalar:
-            raise TypeError(f"{name} has dtype {tensor.dtype}, allowed is {scalar}")
+            raise TypeError(f"{name} must have dtype {scalar}, got {tensor.dtype}")
     try:
         made: Any = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
     except RuntimeError as error:
@@ -201,5 +201,5 @@ def tokens_first(x: Tensor | None, name: str) -> Tensor | None:
         ValueError: the tensor, called ``name``, has not three dimensions.
     """
     if isinstance(x, Tensor) and x.dim() != 3:
-        raise ValueError(f"{name} has shape {tuple(x.shape)}, must be [B, D, L]")
+        raise ValueError(f"{name} must have shape [B, D, L], got {tuple(x.shape)}")
     return x.transpose(1, 2) if isinstance(x, Tensor) else x

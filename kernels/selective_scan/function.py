@@ -18,19 +18,19 @@ MAX_STATES = 256
 
 def _check(name: str, x: Tensor, shape: tuple[int, ...], dtypes: tuple, device) -> None:
     if not isinstance(x, Tensor):
-        raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
+        raise TypeError(f"{name} must be a tensor, got {type(x).__name__}")
     if tuple(x.shape) != shape:
-        raise ValueError(f"{name} has shape {tuple(x.shape)}, must be {shape}")
+        raise ValueError(f"{name} must have shape {shape}, got {tuple(x.shape)}")
     if x.dtype not in dtypes:
-        raise TypeError(f"{name} has dtype {x.dtype}, allowed: {', '.join(map(str, dtypes))}")
+        raise TypeError(f"{name} must have dtype {', '.join(map(str, dtypes))}, got {x.dtype}")
     if x.device != device:
-        raise ValueError(f"{name} is on {x.device}, u is on {device}")
+        raise ValueError(f"{name} must be on {device}, as u, got {x.device}")
 
 
 def _check_groups(name: str, x: Tensor, u: Tensor, states: int) -> Tensor:
     """Checks B or C and brings ``[B, L, N]`` to ``[B, L, G, N]``."""
     if not isinstance(x, Tensor):
-        raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
+        raise TypeError(f"{name} must be a tensor, got {type(x).__name__}")
     batch, length, channels = u.shape
     if x.dim() == 3:
         _check(name, x, (batch, length, states), DTYPES, u.device)
@@ -38,8 +38,8 @@ def _check_groups(name: str, x: Tensor, u: Tensor, states: int) -> Tensor:
     groups = x.shape[2] if x.dim() == 4 else 0
     if groups == 0 or channels % groups:
         raise ValueError(
-            f"{name} has shape {tuple(x.shape)}, must be {(batch, length, states)} or "
-            f"[{batch}, {length}, G, {states}] with G a divisor of {channels}"
+            f"{name} must have shape {(batch, length, states)} or [{batch}, {length}, G, {states}] "
+            f"with G a divisor of {channels}, got {tuple(x.shape)}"
         )
     _check(name, x, (batch, length, groups, states), DTYPES, u.device)
     return x
@@ -50,19 +50,21 @@ def _check_common(
 ) -> tuple[int, Tensor | None]:
     """Check the arguments of both functions, except B and C; returns N and the packed sequences."""
     if not isinstance(u, Tensor):
-        raise TypeError(f"u is {type(u).__name__}, must be a tensor")
+        raise TypeError(f"u must be a tensor, got {type(u).__name__}")
     if u.dim() != 3 or u.shape[2] == 0:
-        raise ValueError(f"u has shape {tuple(u.shape)}, must be [B, L, D] with D >= 1")
+        raise ValueError(f"u must have shape [B, L, D] with D >= 1, got {tuple(u.shape)}")
     _check("u", u, tuple(u.shape), DTYPES, u.device)
     if u.device.type not in ("cpu", "cuda"):
-        raise ValueError(f"u is on {u.device}, allowed are cpu and cuda")
+        raise ValueError(f"u must be on cpu or cuda, got {u.device}")
     if discretization not in DISCRETIZATIONS:
-        raise ValueError(f"discretization is {discretization!r}, allowed: {(*DISCRETIZATIONS,)}")
+        raise ValueError(
+            f"discretization must be one of {(*DISCRETIZATIONS,)}, got {discretization!r}"
+        )
     batch, _, channels = u.shape
     states = A.shape[1] if isinstance(A, Tensor) and A.dim() == 2 else 0
     _check("A", A, (channels, states), (torch.float32,), u.device)
     if not 1 <= states <= MAX_STATES:
-        raise ValueError(f"A has shape {tuple(A.shape)}, must be [D, N] with N from 1 to 256")
+        raise ValueError(f"A must have shape [D, N] with N from 1 to 256, got {tuple(A.shape)}")
     _check("delta", delta, tuple(u.shape), DTYPES, u.device)
     if delta_bias is not None:
         _check("delta_bias", delta_bias, (channels,), DTYPES, u.device)
@@ -248,7 +250,7 @@ def selective_scan_state(
 def input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
     """Brings (D, N), (B, N, L) or (B, G, N, L) to ``[B, L, G, N]``."""
     if not isinstance(x, Tensor):
-        raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
+        raise TypeError(f"{name} must be a tensor, got {type(x).__name__}")
     if x.is_complex():
         raise TypeError(f"{name} has dtype {x.dtype}; complex states are not supported")
     if x.dim() == 2:
@@ -309,7 +311,7 @@ def selective_scan_fn(
         raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
     u = tokens_first(u, "u")
     if not isinstance(u, Tensor):
-        raise TypeError(f"u is {type(u).__name__}, must be a tensor")
+        raise TypeError(f"u must be a tensor, got {type(u).__name__}")
     tokens = u.transpose(1, 2)
     B, C = input_matrix(B, tokens, "B"), input_matrix(C, tokens, "C")
     groups = max(B.shape[2], C.shape[2])

@@ -39,8 +39,8 @@ def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tenso
             )
         if x.ndim != 4 or x.shape != got.shape or min(x.shape[1:3]) < WINDOW:
             raise ValueError(
-                f"{name} has shape {tuple(x.shape)}, must be got's, [P, H, W, C] with H and "
-                f"W >= {WINDOW}"
+                f"{name} must have shape got's, [P, H, W, C] with H and W >= {WINDOW}, "
+                f"got {tuple(x.shape)}"
             )
     on_lanes = got.device.type == "cpu" and got.dtype == torch.float32
     compute = dissimilarity_on_lanes if on_lanes else dissimilarity_by_products

@@ -89,7 +89,7 @@ def test_complex_states_are_refused(scan, name):
 def test_float64_is_refused():
     tensors = inputs(VARYING, VARYING)
     tensors["u"] = tensors["u"].double()
-    with pytest.raises(TypeError, match="^u has dtype torch.float64, allowed: torch.float32"):
+    with pytest.raises(TypeError, match="^u must have dtype torch.float32.*, got torch.float64"):
         selective_scan_fn(**tensors)
 
 
@@ -136,9 +136,9 @@ def test_the_block_is_that_of_float64(constant_B, constant_C, norms, taps):
     "change, error, text",
     [
         ({"A": torch.ones(10, 3).cfloat()}, TypeError, "A has dtype torch.complex64"),
-        ({"checkpoint_lvl": 2}, ValueError, "checkpoint_lvl is 2, allowed"),
+        ({"checkpoint_lvl": 2}, ValueError, "checkpoint_lvl must be.*got 2"),
         ({"x_proj_weight": torch.ones(9, 10)}, ValueError, "x_proj_weight has 9 rows, must"),
-        ({"conv1d_weight": torch.ones(10, 4)}, ValueError, "conv1d_weight has shape .10, 4., al"),
+        ({"conv1d_weight": torch.ones(10, 4)}, ValueError, "conv1d_weight must have shape .*got .10, 4."),
         ({"B": torch.ones(10, 3)}, ValueError, "B_proj_bias is given, must be None"),
     ],
 )  # fmt: skip
@@ -281,10 +281,10 @@ def test_autocast():
 @pytest.mark.parametrize(
     "change, text",
     [
-        ({"d_conv": 5}, "d_conv is 5, allowed are 2, 3, 4"),
-        ({"d_state": 257}, "d_state is 257, allowed is 1 to 256"),
-        ({"dt_init": "zeros"}, "dt_init is 'zeros', allowed"),
-        ({"dt_rank": "full"}, "dt_rank is 'full', .* allowed is 'auto'"),
+        ({"d_conv": 5}, "d_conv must be one of 2, 3, 4, got 5"),
+        ({"d_state": 257}, "d_state must be 1 to 256.*, got 257"),
+        ({"dt_init": "zeros"}, "dt_init must be.*got 'zeros'"),
+        ({"dt_rank": "full"}, "dt_rank is supported only as 'auto', got 'full'"),
     ],
 )
 def test_refuses_sizes(change, text):
@@ -294,13 +294,13 @@ def test_refuses_sizes(change, text):
 
 def test_refuses_tokens():
     layer, tokens = Mamba(8), torch.randn(2, 3, 8)
-    with pytest.raises(TypeError, match="^hidden_states has dtype torch.float64, allowed"):
+    with pytest.raises(TypeError, match="^hidden_states must have dtype.*got torch.float64"):
         layer(tokens.double())
     with pytest.raises(
-        ValueError, match=r"^hidden_states has shape \[2, 3, 7\], allowed is \[B, L, 8"
+        ValueError, match=r"^hidden_states must have shape \[B, L, 8.*, got \[2, 3, 7\]"
     ):
         layer(tokens[..., :7])
-    with pytest.raises(ValueError, match="^hidden_states has shape .* allowed is .B, 1, 8."):
+    with pytest.raises(ValueError, match="^hidden_states must have shape .B, 1, 8."):
         layer.step(tokens, *layer.allocate_inference_cache(2, 0))
     with pytest.raises(ValueError, match="^layer_idx is None"):
         layer(tokens, InferenceParams(9, 2))
@@ -352,5 +352,5 @@ def test_float32_layers_where_the_default_is_float64():
         return [out, *layer.step(tokens[:, :1], *cache), *layer.parameters(), *gradients]
 
     assert_default_dtype_changes_nothing(run)
-    with pytest.raises(TypeError, match="hidden_states has dtype torch.float64, allowed: "):
+    with pytest.raises(TypeError, match="hidden_states must have dtype.*got torch.float64"):
         in_default_float64(lambda: Mamba(16)(torch.randn(2, 7, 16)))

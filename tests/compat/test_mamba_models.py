@@ -122,16 +122,16 @@ def test_a_block_with_an_mlp():
 @pytest.mark.parametrize(
     "call, error, text",
     [
-        (lambda: create_block(8, 16), ValueError, "d_intermediate is 16, which is not supported"),
+        (lambda: create_block(8, 16), ValueError, "d_intermediate is supported only as 0, got 16"),
         (
             lambda: create_block(8, attn_layer_idx=[1]),
             ValueError,
-            r"attn_layer_idx is \[1\], which",
+            r"attn_layer_idx is supported only as .*got \[1\]",
         ),
         (
             lambda: create_block(8, ssm_cfg={"layer": "Mamba2"}),
             ValueError,
-            "ssm_cfg.'layer'. is 'Mamba2', w",
+            "ssm_cfg.'layer'. is supported only as 'Mamba1'",
         ),
         (
             lambda: Mamba(8, bimamba_type="v2"),

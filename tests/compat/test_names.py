@@ -97,7 +97,7 @@ def test_names_are_refused(monkeypatch):
     for names, kind, text in (
         ((), ImportError, "causal_conv1d is already imported"),
         (("mamba_ssm", "causal_conv1d"), ImportError, "causal_conv1d is already imported"),
-        (("flash_attn",), ValueError, "allowed: mamba_ssm, causal_conv1d, gsplat"),
+        (("flash_attn",), ValueError, "must be one of mamba_ssm, causal_conv1d, gsplat"),
     ):
         with pytest.raises(kind, match=text):
             take_names(*names)

@@ -112,11 +112,11 @@ def test_no_gradient_flows():
 @pytest.mark.parametrize(
     "name, value, error, text",
     [
-        ("A", torch.ones(7, 5).cfloat(), TypeError, "A has dtype torch.complex64, al"),
-        ("dt", torch.ones(3, 7).double(), TypeError, "dt has dtype torch.float64, allowed"),
-        ("C", None, TypeError, "C is NoneType, allowed is a tensor"),
-        ("B", torch.ones(3, 2, 5), ValueError, r"B has shape \[3, 2, 5\], allowed is \[3, 5\] or"),
-        ("D", torch.ones(5), ValueError, r"D has shape \[5\], allowed is \[7\]$"),
+        ("A", torch.ones(7, 5).cfloat(), TypeError, "A must have dtype .*got torch.complex64"),
+        ("dt", torch.ones(3, 7).double(), TypeError, "dt must have dtype.*got torch.float64"),
+        ("C", None, TypeError, "C must be a tensor.*, got NoneType"),
+        ("B", torch.ones(3, 2, 5), ValueError, r"B must have shape \[3, 5\] or.*, got \[3, 2, 5\]"),
+        ("D", torch.ones(5), ValueError, r"D must have shape \[7\].*, got \[5\]$"),
     ],
 )
 def test_refuses(name, value, error, text):
@@ -127,6 +127,6 @@ def test_refuses(name, value, error, text):
 
 def test_refuses_groups_that_do_not_divide_the_heads():
     state, given = make(3, 5, 4, 3, torch.float32)
-    text = r"^B has shape \[3, 3, 5\], allowed is \[3, 5\] or .* \[3, 4, 5\]$"
+    text = r"^B must have shape \[3, 5\] or .* \[3, 4, 5\].*, got \[3, 3, 5\]$"
     with pytest.raises(ValueError, match=text):
         selective_state_update(state, **given)

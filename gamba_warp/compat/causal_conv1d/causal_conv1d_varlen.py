@@ -28,7 +28,7 @@ def causal_conv1d_varlen_states(x: Tensor, cu_seqlens: Tensor, state_len: int) -
         ValueError: ``x`` has another shape, or ``cu_seqlens`` is not as above.
     """
     if x.dim() != 2:
-        raise ValueError(f"x has shape {tuple(x.shape)}, must be [tokens, D] as of cu_seqlens")
+        raise ValueError(f"x must have shape [tokens, D] as of cu_seqlens, got {tuple(x.shape)}")
     packed = sequences(x[None], cu_seqlens, None)
     assert packed is not None
     return last_tokens(x[None], x.new_zeros(len(packed), state_len, x.shape[1]), packed).mT

@@ -38,7 +38,7 @@ def adam(
         ValueError: ``valid`` has another number of rows.
     """
     if valid is not None and valid.numel() != len(param):
-        raise ValueError(f"valid has {valid.numel()} rows, allowed is {len(param)}")
+        raise ValueError(f"valid must have {len(param)} rows, got {valid.numel()}")
     rows = slice(None) if valid is None else valid.flatten().nonzero()[:, 0]
     grad = param_grad[rows]
     exp_avg[rows] = mean = b1 * exp_avg[rows] + (1 - b1) * grad

@@ -58,6 +58,7 @@ def test_a_compiled_layer_with_gradients_takes_other_sizes():
     """One graph: a second one would mean that a size was fixed."""
     module, make, _ = CASES["Mamba"]
     torch.compiler.reset()
+    torch._dynamo.utils.counters.clear()
     compiled = torch.compile(module, backend="aot_eager", fullgraph=True)
     for sizes in ((3, 9), (5, 17)):
         (x,) = make(*sizes)

@@ -70,7 +70,7 @@ def test_the_limit_of_transmittance(t_min):
 
 @pytest.mark.parametrize("t_min", [0.0, 1.0, -1e-4, float("nan")])
 def test_limits_that_are_refused(t_min):
-    with pytest.raises(ValueError, match="t_min is"):
+    with pytest.raises(ValueError, match="t_min must be in"):
         rasterization(**scene(t_min=t_min).arguments())
 
 

@@ -66,9 +66,9 @@ def test_state_of_no_tokens_is_the_first():
 
 def test_state_refuses_bad_input():
     inputs = state_of(1, 4, 5, 3)
-    with pytest.raises(ValueError, match="initial_state has shape"):
+    with pytest.raises(ValueError, match="initial_state must have shape"):
         selective_scan_state(**inputs | {"initial_state": torch.zeros(1, 5, 2)})
-    with pytest.raises(TypeError, match="B is NoneType"):
+    with pytest.raises(TypeError, match="B must be a tensor, got NoneType"):
         selective_scan_state(**inputs | {"B": None})
 
 

@@ -71,7 +71,7 @@ class Mamba(nn.Module):
         for name, value in of_fork.items():
             raise TypeError(f"{name} is {value!r}, {_OF_FORK}")
         if not 1 <= d_state <= 256:
-            raise ValueError(f"d_state is {d_state}, allowed is 1 to 256")
+            raise ValueError(f"d_state must be 1 to 256, got {d_state}")
         one_of("d_conv", d_conv, 2, 3, 4)  # supported by the convolution's kernel
         one_of("dt_init", dt_init, "random", "constant")
         if isinstance(dt_rank, str):

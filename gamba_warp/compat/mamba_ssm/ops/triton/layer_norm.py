@@ -41,7 +41,7 @@ def layer_norm_fn(
         check_tensor(name, value, (x.shape[-1],), optional=name != "weight")
     check_tensor("rowscale", rowscale, tuple(x.shape[:-1]), optional=True)
     if rowscale is not None and x1 is not None:
-        raise ValueError("rowscale and x1 are given, allowed is one of them")
+        raise ValueError("pass either rowscale or x1, got both")
     wide = torch.promote_types(x.dtype, torch.float32)
     total: Any = x.to(wide) if rowscale is None else x.to(wide) * rowscale[..., None]
     masks = []
