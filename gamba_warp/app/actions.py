@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import contextvars
+import copy
 import html
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -236,6 +238,18 @@ class Actions:
         _forget_surfaces(results)
         return _presented(results[index].made)
 
+    @page_errors()
+    def edit(self, told: dict[str, Any], results: list[Result], state: State | None) -> Any:
+        """Edit one of the results; files of the shown one that were written before are dropped."""
+        made = next((each.made for each in results if each.made.key == told["key"]), None)
+        if made is None:
+            raise UserError("this result has expired")
+        work.edit(made, base64.b64decode(told["removed"]))
+        if state is None or state[0] is not made:
+            return gr.skip()
+        state[1].clear()
+        return gr.update(value=None, visible=False)
+
     def writer(self, kind: str) -> Callable:
         """Return the handler that writes files of one kind, and adds them to the list."""
 
@@ -248,10 +262,10 @@ class Actions:
             progress: gr.Progress = gr.Progress(),  # noqa: B008
         ) -> tuple:
             made, files = _state(state)
-            before = made.surface
+            one = copy.copy(made)  # the object may be edited meanwhile
             progress(0.1, f"Writing {work.KINDS[kind][1]}")
             mesh = work.MeshChoice.of(faces, texture, watertight)
-            inputs = made, kind, self._new_folder(request), self._device, mesh
+            inputs = one, kind, self._new_folder(request), self._device, mesh
             if kind in work.UNRENDERED:
                 path, note = work.write(*inputs)
             else:
@@ -261,7 +275,10 @@ class Actions:
             # In place: meanwhile the page may show another object, which stays.
             files[:] = [*(old for old in files if old.name != path.name and old.is_file()), path]
             listed = gr.update(value=[str(file) for file in files], visible=True)
-            return listed, gr.skip() if made.surface is before else _frame(made)
+            if made.removed is not one.removed or made.surface is one.surface:
+                return listed, gr.skip()
+            made.surface, made.choice = one.surface, one.choice
+            return listed, _frame(made)
 
         return page_errors()(write)
 

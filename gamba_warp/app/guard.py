@@ -122,6 +122,13 @@ class Painted(msgspec.Struct):
     composite: Any = None
 
 
+class Edit(msgspec.Struct):
+    """What the viewer tells of an object: its key, and a bit for each Gaussian, removed or not."""
+
+    key: Annotated[str, Meta(max_length=32)]
+    removed: Annotated[bytes, Meta(max_length=1 << 18)]  # base64 in the call
+
+
 class _Call(msgspec.Struct):
     """A call of one of the page's functions, reduced to the fields that the page uses."""
 

@@ -12,7 +12,7 @@ from msgspec import Meta
 from . import work
 from .actions import VIEWS, Actions
 from .cutting import FOLDER, KEEP, REMOVE, SIDE, STROKE, examples
-from .guard import MAX_PICTURES, GivenFile, Painted
+from .guard import MAX_PICTURES, Edit, GivenFile, Painted
 from .visitor_files import KEEP_SECONDS
 
 WAITING = 16  # queued requests; further ones are rejected
@@ -32,6 +32,13 @@ _FETCH = """(files) => {
   link.download = file.orig_name || "";
   link.click();
 }"""
+
+# Takes what the shown viewer tells, and no other frame.
+_LISTEN = """addEventListener("message", ({ data, source }) => {
+  if (!data?.edit || source !== document.querySelector("iframe.stage")?.contentWindow) return;
+  props.value = data.edit;
+  trigger("submit");
+});"""
 
 
 def build(actions: Actions) -> gr.Blocks:
@@ -130,6 +137,9 @@ def build(actions: Actions) -> gr.Blocks:
                         elem_id="editor",
                     )
                     stage = gr.HTML(_EMPTY, elem_id="stage")
+                edits = gr.HTML(
+                    None, html_template="", js_on_load=_LISTEN, visible="hidden", elem_id="edits"
+                )
                 strip = gr.Gallery(
                     label="Results",
                     visible=False,
@@ -185,6 +195,16 @@ def build(actions: Actions) -> gr.Blocks:
             written.success(None, made_files, None, js=_FETCH, api_visibility="private")
         areas.click(actions.toggle_holes, cut, mask, **one)
         cancel.click(actions.cancel, None, None, show_progress="hidden", **free)
+        # Like the files, so that a file that is asked for afterwards has the edit.
+        edits.submit(
+            actions.edit,
+            [edits, results, made],
+            made_files,
+            trigger_mode="always_last",
+            show_progress="hidden",
+            concurrency_id="files",
+            **free,
+        )
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
 
@@ -210,6 +230,7 @@ def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
     kinds: dict[type, Any] = {
         gr.State: None,
         gr.Image: GivenFile | None,
+        gr.HTML: Edit,
         gr.ImageEditor: Painted | None,
         gr.UploadButton: _Several | None,
         gr.Dropdown: Literal[(*work.FACES, *work.TEXTURES)],  # type: ignore[invalid-type-form]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import secrets
 import tempfile
 import time
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -68,21 +70,34 @@ class Reconstruction:
 
     Attributes:
         name: stem of its files.
-        gaussians: ``[N]`` on the CPU, upright, OpenCV's axes.
+        whole: ``[N]`` on the CPU, upright, OpenCV's axes.
         camera: distance (object units), field of view and elevation (degrees) of the input's.
         seconds: run time of the model.
         picture: the model's input ``[S, S, 4]`` uint8, reduced.
         surface: the last one that was extracted, or None.
         choice: its number of faces at most, and if it is closed.
+        removed: ``[N]`` bool, Gaussians that were removed by hand; every edit makes a new tensor.
+        key: unpredictable name.
     """
 
     name: str
-    gaussians: Gaussians
+    whole: Gaussians
     camera: tuple[float, float, float]
     seconds: float
     picture: np.ndarray
     surface: Surface | None = None
     choice: tuple[int, bool] | None = None
+    removed: torch.Tensor = field(init=False)
+    key: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.removed = torch.zeros(self.whole.num, dtype=torch.bool)
+        self.key = secrets.token_hex(8)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """What is left, ``[n]``."""
+        return self.whole.select(~self.removed)
 
 
 def estimated_elevation(model: Gamba, cut: Cut) -> int:
@@ -175,9 +190,36 @@ def viewer(made: Reconstruction) -> str:
     Raises:
         UserError: the object is invisible.
     """
+    from ..viewer.pack import visible_order
     from ..viewer.page import viewer_page
 
-    return viewer_page(made.name, made.gaussians, **_shown(made))
+    bits = made.removed[visible_order(made.whole, made.name)].numpy()
+    removed = base64.b64encode(np.packbits(bits, bitorder="little").tobytes()).decode()
+    edit = {"key": made.key, "removed": removed}
+    return viewer_page(made.name, made.whole, edit=edit, **_shown(made))
+
+
+def edit(made: Reconstruction, removed: bytes) -> None:
+    """Leave Gaussians out of a reconstruction, and forget its surface.
+
+    Args:
+        made: the reconstruction.
+        removed: a bit for each Gaussian, in the order of the viewer, the lowest bit first.
+
+    Raises:
+        UserError: the number of bits is wrong, or nothing would be left.
+    """
+    from ..viewer.pack import visible_order
+
+    order = visible_order(made.whole, made.name)
+    bits = np.unpackbits(np.frombuffer(removed, np.uint8), bitorder="little")
+    if len(removed) != -(-len(order) // 8) or bits[len(order) :].any():
+        raise UserError("the removed parts are not those of this object")
+    gone = torch.from_numpy(bits[: len(order)].astype(bool))
+    if gone.all():
+        raise UserError("nothing of the object would be left")
+    made.removed = torch.zeros_like(made.removed).index_fill(0, order[gone], True)
+    made.surface = None
 
 
 def _shown(made: Reconstruction) -> dict:

@@ -20,6 +20,7 @@ from ..errors import UserError
 from ..formats.meshes import TexturedMesh, load_mesh
 from ..gaussians import Gaussians
 from ..images import to_uint8
+from ..kernels.rasterize.constants import ALPHA_MIN
 
 _VISIBLE = 0.05  # opacity from which a Gaussian counts for the object's extent
 _MOST = 6e4  # float16 ends at 65504
@@ -66,6 +67,15 @@ def own_frame(gaussians: Gaussians, name: str) -> Frame:
 def visible(gaussians: Gaussians, name: str) -> Gaussians:
     """Return one object's visible Gaussians, sorted by covered area, on the CPU.
 
+    Arguments and errors are those of ``visible_order``.
+    """
+    order = visible_order(gaussians, name)
+    return gaussians.detach().to("cpu", torch.float32).select(order)
+
+
+def visible_order(gaussians: Gaussians, name: str) -> torch.Tensor:
+    """Return the numbers of one object's visible Gaussians, int64, sorted by covered area.
+
     Args:
         gaussians: ``[N]``.
         name: named in errors.
@@ -85,12 +95,12 @@ def visible(gaussians: Gaussians, name: str) -> Gaussians:
     if bad.any():
         count = int(bad.sum())
         raise UserError(f"{name}: {count} of {gaussians.num} Gaussians are not finite")
-    gaussians = gaussians.drawn()
-    if gaussians.num == 0:
+    seen = (gaussians.opacities >= ALPHA_MIN).nonzero()[:, 0]
+    if not len(seen):
         raise UserError(f"{name}: no Gaussian has an opacity of 1/255 or more")
-    widest = gaussians.scales.sort(-1).values
-    cover = gaussians.opacities * widest[:, 1] * widest[:, 2]
-    return gaussians.select(cover.argsort(descending=True, stable=True))
+    widest = gaussians.scales[seen].sort(-1).values
+    cover = gaussians.opacities[seen] * widest[:, 1] * widest[:, 2]
+    return seen[cover.argsort(descending=True, stable=True)]
 
 
 def pack_gaussians(gaussians: Gaussians, frame: Frame) -> tuple[bytes, bytes]:

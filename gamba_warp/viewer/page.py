@@ -22,7 +22,7 @@ from ..images import to_uint8
 from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
 
 # In order of their dependencies.
-_SCRIPTS = "shaders gl sorter camera controls packed meshes open ui main".split()
+_SCRIPTS = "shaders gl sorter camera controls packed meshes open edit ui main".split()
 _PICTURE = 512  # longest side of the input, pixels
 # The page may load only inlined content; the sorting worker is made from a text of the page.
 POLICY = (
@@ -89,6 +89,7 @@ def viewer_parts(
     view: tuple[float, float, float] | None = None,
     picture: np.ndarray | None = None,
     note: str = "",
+    edit: dict[str, str] | None = None,
 ) -> ViewerParts:
     """Return the texts for the slots of ``program_page``.
 
@@ -104,6 +105,9 @@ def viewer_parts(
             of the object's longest side.
         picture: the input from ``camera``, ``[S, S, 3|4]`` in [0, 1], which a slider shows.
         note: a few words below the title.
+        edit: lets the viewer remove Gaussians, and tell the page around its frame of it: ``key`` of
+            the object, and ``removed``, a base64 bit for each of its Gaussians in the order of
+            ``visible_order``.
 
     Raises:
         UserError: a value is not finite, nothing can be seen, or the object has no extent.
@@ -129,6 +133,7 @@ def viewer_parts(
         "input": None if camera is None else home,
         "picture": "" if picture is None else _data_url(picture),
         "frame": {"center": frame.center.tolist(), "size": frame.size},
+        "edit": edit,
     }
     packed = (base64.b64encode(part).decode() for part in (records, harmonics, surface))
     return ViewerParts(json_text(about), *packed)

@@ -1,5 +1,8 @@
 """Attacks on ``gamba app`` by local programs and foreign web pages, as raw requests."""
 
+import base64
+import html
+import re
 import signal
 import socket
 import time
@@ -19,6 +22,7 @@ TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of funct
 SEVERAL, CHOOSE = 7, 8
 ZIP = CHOOSE + 1 + 2 * list(KINDS).index("zip")
 AREAS = CHOOSE + 1 + 2 * len(KINDS)  # after the two functions of each kind of file
+EDIT = AREAS + 2
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
 
@@ -82,6 +86,60 @@ def test_enclosed_areas_are_filled_and_cleared(program):
     ]
     first, filled, cleared = (np.asarray(Image.open(path))[360, 360] for path in shown)
     assert filled.min() == 255 > first.max() and (first == cleared).all()
+
+
+def made_square(program):
+    """Make an object; return its key, and the number of Gaussians that the viewer has."""
+    picture = Image.new("RGB", (200, 200), "white")
+    picture.paste((200, 30, 20), (50, 50, 150, 150))
+    program.result(TAKE, [given(program.upload(bytes_of(picture)))])
+    page = str(program.result(MAKE, [None, None, 0, None])["data"])
+    edit = html.unescape(html.unescape(page[page.index("{&quot;title") :]))
+    key = re.search(r'"key": "(\w+)"', edit)[1]
+    return key, int(re.search(r'"count": (\d+)', edit)[1])
+
+
+def test_an_edit_that_is_none_is_one_line(served, program):
+    """It changes nothing, as the size of the next file shows."""
+    key, count = made_square(program)
+    size = -(-count // 8)
+    one, more = bytes([1]) + bytes(size - 1), bytes(size - 1) + b"\xff"
+    full = bytes([255]) * (count // 8) + (bytes([2 ** (count % 8) - 1]) if count % 8 else b"")
+
+    def written():
+        output = program.result(
+            EDIT - 2 - 2 * len(KINDS), [None, "10,000 faces", "No texture", False]
+        )
+        return Path(output["data"][0]["value"][0]["path"]).stat().st_size
+
+    def edit(removed, key=key, by=program):
+        text = base64.b64encode(removed).decode() if isinstance(removed, bytes) else removed
+        return by.join(EDIT, [{"key": key, "removed": text}, None, None])
+
+    before = written()
+    for text in ("%%%", "AAA", "A" * 400_000, 7, None, ["AA=="]):
+        answer = edit(text)
+        assert answer.status == 400 and answer.line.startswith("the call: "), text
+    for told in ({"key": key}, {"removed": ""}, "AA==", None, {"key": "x" * 33, "removed": ""}):
+        answer = program.join(EDIT, [told, None, None])
+        assert answer.status == 400 and answer.line.startswith("the call: "), told
+    told = {
+        "the removed parts are not those of this object": [b"", one[:-1], one + b"\0"],
+        "nothing of the object would be left": [full],
+    }
+    if count % 8:
+        told["the removed parts are not those of this object"].append(more)
+    for reason, all_removed in told.items():
+        for removed in all_removed:
+            data = [{"key": key, "removed": base64.b64encode(removed).decode()}, None, None]
+            assert program.result(EDIT, data)["error"] == reason
+    assert written() == before
+    other = Program(served.host).opened()
+    made_square(other)
+    data = [{"key": key, "removed": base64.b64encode(one).decode()}, None, None]
+    assert other.result(EDIT, data)["error"] == "this result has expired"
+    assert written() == before
+    assert "data" in program.result(EDIT, data) and written() < before
 
 
 @pytest.mark.parametrize("meta", [None, {"_type": "gradio.FileData"}])

@@ -178,6 +178,64 @@ def test_several_pictures_and_a_strip(opened, tmp_path):
     assert frame.locator("#wipe input").get_attribute("max") == "1"
 
 
+def downloaded(page, kind, path):
+    with page.expect_download() as download:
+        page.locator(f"#file-{kind}").click()
+    download.value.save_as(path)
+    return path
+
+
+def shown_viewer(page):
+    """The viewer of the shown object, once it is drawn."""
+    viewer = page.wait_for_selector("iframe.stage").content_frame()
+    viewer.wait_for_selector("#message", state="hidden")
+    viewer.wait_for_function("gambaViewer.editor.state")
+    return viewer
+
+
+def test_parts_are_erased(opened, tmp_path):
+    """Every download follows, and the view stays."""
+    page = opened.page
+    give(page, red_square(tmp_path))
+    page.wait_for_selector("#editor canvas")
+    page.locator("#make").click()
+    viewer = shown_viewer(page)
+    whole = read_gaussians(downloaded(page, "ply", tmp_path / "whole.ply"))
+    viewer.evaluate(
+        "gambaViewer.rest(), gambaViewer.setCamera({ azimuth: 0.5 }), (window.same = true)"
+    )
+    viewer.locator("#do-brush").click()
+    box = viewer.locator("#canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x - 60, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y, steps=3)
+    page.mouse.up()
+    marked = viewer.evaluate("gambaViewer.editor.state.filter((kind) => kind === 1).length")
+    assert marked > 20
+    page.keyboard.press("Delete")
+    page.wait_for_selector("#made", state="hidden")  # what was written before
+    left = read_gaussians(downloaded(page, "ply", tmp_path / "left.ply"))
+    assert left.num == whole.num - marked
+    document = downloaded(page, "html", tmp_path / "left.html").read_text(encoding="utf-8")
+    assert f'"count": {left.num},' in document and '"edit": null' in document
+    assert viewer.evaluate("window.same && gambaViewer.camera.azimuth") == 0.5
+    viewer.locator("#do-undo").click()
+    page.wait_for_selector("#made", state="hidden")
+    again = read_gaussians(downloaded(page, "ply", tmp_path / "again.ply"))
+    assert again.num == whole.num
+
+    viewer.locator("#do-remove").click()
+    page.wait_for_selector("#made", state="hidden")
+    assert_clear(page, "iframe.stage")
+    # Another frame cannot speak for the viewer.
+    key = viewer.evaluate("gambaViewer.about.edit.key")
+    page.evaluate("(key) => postMessage({ edit: { key, removed: '' } })", key)
+    viewer.evaluate("parent.postMessage({ edit: { key: 'other', removed: '' } }, '*')")
+    assert "this result has expired" in toast(page)
+    assert page.locator(".toast-body").count() == 1
+
+
 def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
     page = opened.page
     page.locator("#examples button").last.click()

@@ -1,5 +1,6 @@
 """From a picture to files, without the page."""
 
+import base64
 import re
 import zipfile
 from dataclasses import replace
@@ -21,8 +22,10 @@ from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import load_model
+from gamba_warp.pages import turntable
 from gamba_warp.photo.cutout import CutoutOptions
 from gamba_warp.surfaces import extract, files  # noqa: F401 (it must not find the stand-in)
+from gamba_warp.viewer.pack import visible
 
 RED, GREEN = (0.8, 0.1, 0.1), (0.1, 0.6, 0.2)
 
@@ -227,6 +230,55 @@ def test_a_mesh(made, tmp_path, monkeypatch):
         assert {*archive.namelist()} == names and archive.testzip() is None
     assert [p for p in tmp_path.iterdir() if p.is_dir()] == []
     assert len(asked) == 1  # both of its meshes are of one surface
+
+
+def test_what_is_removed_is_in_no_file(made, tmp_path, monkeypatch):
+    made = work.Reconstruction("thing", made.whole, made.camera, 0.0, made.picture)
+    seen = visible(made.whole, "thing")
+    bits = np.zeros(seen.num, bool)
+    bits[[0, 3, seen.num - 1]] = True
+    made.surface = Mock()
+    work.edit(made, np.packbits(bits, bitorder="little").tobytes())
+    assert made.surface is None and made.gaussians.num == made.whole.num - 3
+    left = visible(made.gaussians, "thing")
+    torch.testing.assert_close(left.means, seen.means[~torch.from_numpy(bits)])
+    for kind in ("ply", "splat"):
+        path, note = work.write(made, kind, tmp_path)
+        assert read_gaussians(path).num == made.gaussians.drawn().num == seen.num - 3
+    asked = []
+    monkeypatch.setattr(extract, "surface_of", lambda gaussians, *_: asked.append(gaussians.num))
+    monkeypatch.setattr(
+        turntable, "turntable_frames", lambda gaussians, **_: asked.append(gaussians.num)
+    )
+    monkeypatch.setattr(turntable, "save_turntable", lambda *_: None)
+    work.surface_of(made, work.MESH)
+    work.write(made, "gif", tmp_path)
+    assert asked == [made.gaussians.num] * 2
+    again = work.viewer(made)
+    removed = np.packbits(bits, bitorder="little").tobytes()
+    assert f'"count": {seen.num},' in again and base64.b64encode(removed).decode() in again
+    work.edit(made, bytes(-(-seen.num // 8)))
+    assert made.gaussians.num == made.whole.num
+
+
+def test_a_mesh_of_an_object_that_is_edited_meanwhile(page, made, monkeypatch):
+    """It is written, but not kept: it is not that of the object any more."""
+    made = work.Reconstruction("thing", made.whole, made.camera, 0.0, made.picture)
+    size = -(-visible(made.whole, "").num // 8)
+
+    def write(one, kind, folder, *_):
+        if kind == "mesh-stl":
+            work.edit(made, bytes([1]) + bytes(size - 1))
+        one.surface = surface
+        path = folder / "mesh"
+        path.touch()
+        return path, None
+
+    monkeypatch.setattr(work, "write", write)
+    for kind, kept in (("mesh-stl", False), ("mesh-glb", True)):
+        surface, choices = Mock(), ("10,000 faces", "No texture", False)
+        _, frame = page.writer(kind)((made, []), *choices, MagicMock(), lambda *_: None)
+        assert (made.surface is surface) == kept == isinstance(frame, str)
 
 
 @pytest.fixture

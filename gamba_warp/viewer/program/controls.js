@@ -2,7 +2,8 @@
 
 const TAP = { time: 300, reach: 8, between: 24 }; // milliseconds, and pixels
 
-// `act` has turn, pan, zoom (each redraws), focus(x, y) and keys: functions by the key's name.
+// `act` has turn, pan, zoom (each redraws), focus(x, y), keys: functions by the key's name, and perhaps
+// paint(x, y, dx, dy, clear), for which the left button and one finger are then.
 function takeHands(surface, act) {
   const down = new Map(); // positions of pointers by id
   let tap = null, moved = 0;
@@ -32,13 +33,15 @@ function takeHands(surface, act) {
     if (down.size > 1) {
       act.pan(dx, dy);
       if (before.spread > 1 && after.spread > 1) act.zoom(before.spread / after.spread);
-    } else if (event.buttons & 6 || event.shiftKey || event.ctrlKey || event.metaKey) act.pan(dx, dy);
+    } else if (act.paint && !(event.buttons & 6)) act.paint(after.x, after.y, dx, dy, event.shiftKey);
+    else if (event.buttons & (act.paint ? 4 : 6) || event.shiftKey || event.ctrlKey || event.metaKey) act.pan(dx, dy);
     else act.turn(dx, dy);
   });
 
   const leave = (event) => {
     if (!down.delete(event.pointerId) || event.type !== "pointerup" || moved > TAP.reach || event.button)
       return;
+    if (act.paint) return act.paint(event.offsetX, event.offsetY, 0, 0, event.shiftKey);
     const here = { x: event.offsetX, y: event.offsetY, time: event.timeStamp };
     const second = tap && here.time - tap.time < TAP.time
       && Math.hypot(here.x - tap.x, here.y - tap.y) < TAP.between;
@@ -55,9 +58,10 @@ function takeHands(surface, act) {
   }, { passive: false });
 
   window.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.altKey) return;
     const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    const key = act.keys[event.shiftKey ? `Shift+${name}` : name] || act.keys[name];
+    const key = event.ctrlKey || event.metaKey ? act.keys[`Ctrl+${name}`]
+      : act.keys[event.shiftKey ? `Shift+${name}` : name] || act.keys[name];
     const onButton = event.target.closest?.("button") && (name === "Enter" || name === " ");
     if (!key || onButton || event.target.closest?.("input")) return;
     event.preventDefault();

@@ -24,6 +24,7 @@ class Viewer {
     this.camera = new OrbitCamera(about.home, about.home.fov);
     this.choose = asked("controls") === "0" ? () => {} : takeFiles(this);
     this.act.keys = startButtons(this);
+    this.editor = new Editor(this);
     this.turning = !matchMedia("(prefers-reduced-motion: reduce)").matches && asked("turn") !== "0";
     for (const kind of ["pointerdown", "wheel", "keydown"])
       window.addEventListener(kind, () => { this.turning = false; }, { capture: true, passive: true });
@@ -88,6 +89,7 @@ class Viewer {
       parts.shift()();
       if (parts.length) return requestAnimationFrame(next);
       this.ready = true;
+      this.editor.load(records, this.about.edit);
       this.redraw();
     };
     next();

@@ -2,7 +2,7 @@
 // point. It runs in a worker made from this function's text, or, without workers, in
 // the page itself. So it uses no outer names.
 function sorterProgram(post) {
-  let words, means, count, mesh = null, depths, keys;
+  let words, means, count, mesh = null, depths, keys, states;
   const starts = new Uint32Array(65537);
   const halves = halfTable();
 
@@ -59,6 +59,7 @@ function sorterProgram(post) {
     }
     depths = new Float32Array(count);
     keys = new Uint16Array(count);
+    states = new Uint8Array(count); // of edit.js
     mesh = message.mesh ? meshOf(message.mesh, message.vertices, message.faces) : null;
     const harmonics = message.harmonics ? bytesOf(message.harmonics) : new ArrayBuffer(0);
     const sent = records.slice(0);
@@ -95,6 +96,7 @@ function sorterProgram(post) {
     for (let i = 0; i < count; i++) {
       const x = origin[0] - means[3 * i], y = origin[1] - means[3 * i + 1], z = origin[2] - means[3 * i + 2];
       const along = -(x * ray[0] + y * ray[1] + z * ray[2]);
+      if (states[i] === 2) continue;
       const sizes = words[8 * i + 5], last = words[8 * i + 6];
       const s = [halves[sizes & 65535], halves[sizes >>> 16], halves[last & 65535]];
       const reach = 3.4 * Math.max(s[0], s[1], s[2]);
@@ -141,7 +143,7 @@ function sorterProgram(post) {
       const along = o[0] * ray[0] + o[1] * ray[1] + o[2] * ray[2];
       const off = o[0] * o[0] + o[1] * o[1] + o[2] * o[2] - along * along;
       const limit = width * along;
-      if (along > 0.01 && off < limit * limit && (best === null || along < best)) best = along;
+      if (states[i / 3] !== 2 && along > 0.01 && off < limit * limit && (best === null || along < best)) best = along;
     }
     return best;
   }
@@ -175,7 +177,9 @@ function sorterProgram(post) {
     post({ kind: "meshed", mesh });
   }
 
-  const tasks = { load, addMesh, sort, pick };
+  const edit = (message) => { ({ states } = message); };
+
+  const tasks = { load, addMesh, sort, pick, edit };
   return (message) => tasks[message.kind](message);
 }
 
