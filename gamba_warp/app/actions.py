@@ -143,7 +143,7 @@ class Actions:
         """Clear the picture; its results stay."""
         gone, empty = gr.update(visible=False), gr.update(value=None, visible=False)
         view = gr.update(value=VIEWS[1], visible=False)
-        return None, gone, empty, "", gr.skip(), view, gr.skip(), None
+        return None, gone, empty, "", view, gr.skip(), None
 
     @page_errors()
     def load_example(self, event: gr.EventData, request: gr.Request) -> tuple:
@@ -183,16 +183,20 @@ class Actions:
         self,
         cut: Cut | None,
         painted: dict[str, Any] | None,
-        elevation: float,
         results: list[Result],
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """Reconstruct the object and show its viewer; pending strokes are applied first."""
+        """Reconstruct the object and show its viewer; pending strokes are applied first.
+
+        An elevation that was set by hand for this picture stays.
+        """
         before = _given(cut)
         after = apply_strokes(before, _layers(painted))
         progress(0.1, "Running the network")
-        made = self._call(request, work.run_model, self._model, after, elevation)
+        earlier = [each.made.chosen for each in results if each.made.given == after.key]
+        chosen = earlier[-1] if earlier else None
+        made = self._call(request, work.run_model, self._model, after, chosen)
         progress(0.8, "Making the viewer")
         edited = (gr.skip(),) * 3 if after is before else self._edited(after, request)
         return *edited, *self._added(results, made, request)
@@ -244,7 +248,7 @@ class Actions:
         made = next((each.made for each in results if each.made.key == told["key"]), None)
         if made is None:
             raise UserError("this result has expired")
-        work.edit(made, base64.b64decode(told["removed"]))
+        work.edit(made, told["elevation"], base64.b64decode(told["removed"]))
         if state is None or state[0] is not made:
             return gr.skip()
         state[1].clear()
@@ -327,10 +331,9 @@ class Actions:
         )
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
-        elevation = self._call(request, work.estimated_elevation, self._model, cut)
         cut, *edited = self._edited(cut, request)
         view = gr.update(value=VIEWS[0], visible=True)
-        return cut, gr.update(visible=True), *edited, elevation, view, gr.update(open=False)
+        return cut, gr.update(visible=True), *edited, view, gr.update(open=False)
 
     def _edited(self, cut: Cut, request: gr.Request) -> tuple:
         note = html.escape(self._call(request, note_of, cut))
@@ -359,9 +362,9 @@ def _forget_surfaces(results: list[Result]) -> None:
 
 
 def _presented(made: work.Reconstruction) -> tuple:
-    """Return state, viewer, the buttons of files, no files, and the view."""
+    """Return state, viewer, the buttons of files, no files, the view, and the elevation."""
     files, on = gr.update(value=None, visible=False), gr.update(visible=True)
-    return (made, []), _frame(made), on, files, VIEWS[1]
+    return (made, []), _frame(made), on, files, VIEWS[1], made.camera[2]
 
 
 def _frame(made: work.Reconstruction) -> str:

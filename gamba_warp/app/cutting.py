@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +45,7 @@ class Cut:
         note: method of the cut-out and doubts, for the page, before any stroke.
         warning: the doubts alone.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour.
+        key: unpredictable name of the picture.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Cut:
     note: str
     warning: str
     areas: np.ndarray
+    key: str = field(default_factory=lambda: secrets.token_hex(8))
 
 
 def cut_picture(path: Path, name: str, options: CutoutOptions) -> Cut:

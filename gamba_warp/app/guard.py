@@ -32,6 +32,7 @@ from ..untrusted.documents import parse_document
 from .connections import READ_SECONDS
 from .cutting import examples
 from .visitor_files import KEEP_SECONDS, VisitorFiles
+from .work import HIGHEST, LOWEST
 
 # The page has inline scripts, and its brush evaluates code for shaders; the viewer is an inline
 # frame with a worker from a blob.
@@ -123,9 +124,10 @@ class Painted(msgspec.Struct):
 
 
 class Edit(msgspec.Struct):
-    """What the viewer tells of an object: its key, and a bit for each Gaussian, removed or not."""
+    """What the viewer tells of an object; ``removed`` is a bit for each Gaussian."""
 
     key: Annotated[str, Meta(max_length=32)]
+    elevation: Annotated[float, Meta(ge=LOWEST, le=HIGHEST)]
     removed: Annotated[bytes, Meta(max_length=1 << 18)]  # base64 in the call
 
 

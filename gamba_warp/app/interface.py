@@ -33,6 +33,11 @@ _FETCH = """(files) => {
   link.click();
 }"""
 
+_STAND = f"""(degrees) => {{
+  const elevation = Math.max({work.LOWEST}, Math.min({work.HIGHEST}, Number(degrees)));
+  document.querySelector("iframe.stage")?.contentWindow.postMessage({{ elevation }}, "*");
+  return elevation;
+}}"""
 # Takes what the shown viewer tells, and no other frame.
 _LISTEN = """addEventListener("message", ({ data, source }) => {
   if (!data?.edit || source !== document.querySelector("iframe.stage")?.contentWindow) return;
@@ -107,15 +112,6 @@ def build(actions: Actions) -> gr.Blocks:
                         areas = gr.Button(
                             "Clear or fill holes", size="md", min_width=120, elem_id="areas"
                         )
-                    elevation = gr.Slider(
-                        -30,
-                        90,
-                        value=0,
-                        step=1,
-                        label="Camera above the object, degrees",
-                        info="An estimate, which sets the object upright; change it if it leans.",
-                        elem_id="elevation",
-                    )
                     make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
             with gr.Column(scale=8, min_width=300, elem_id="right"):
                 view = gr.Radio([*VIEWS], value=VIEWS[1], visible=False, elem_id="view", **plain)
@@ -149,6 +145,20 @@ def build(actions: Actions) -> gr.Blocks:
                 )
                 buttons: dict[str, gr.Button] = {}
                 with gr.Column(visible=False, elem_id="files") as files_part:
+                    with gr.Row(elem_id="elevation"):
+                        lower = gr.Button("−5°", size="md", min_width=56, scale=0)
+                        elevation = gr.Slider(
+                            work.LOWEST,
+                            work.HIGHEST,
+                            value=0,
+                            step=1,
+                            label="Camera above the object, degrees",
+                            info="An estimate, which sets the object upright; change it if it "
+                            "leans.",
+                            buttons=[],
+                            min_width=200,
+                        )
+                        raise_ = gr.Button("+5°", size="md", min_width=56, scale=0)
                     with gr.Row(elem_id="mesh"):
                         small: dict[str, Any] = {"container": False, "min_width": 120}
                         faces = gr.Dropdown([*work.FACES], value="10,000 faces", **small)
@@ -171,7 +181,7 @@ def build(actions: Actions) -> gr.Blocks:
         free: dict[str, Any] = {"preprocess": False, "api_visibility": "private"}
         shared: dict[str, Any] = {**free, "show_progress_on": status}
         one = {**shared, "concurrency_id": "gamba", "concurrency_limit": 1}
-        shown = [cut, cut_part, editor, note, elevation, view, more, picture]
+        shown = [cut, cut_part, editor, note, view, more, picture]
         mask = [cut, editor, note]
         # (The event ``input`` sends the old picture when it is cleared.)
         picture.upload(actions.take, picture, shown, **one)
@@ -181,9 +191,9 @@ def build(actions: Actions) -> gr.Blocks:
         brush.change(_painting, brush, editor, show_progress="hidden", **free)
         mend.click(actions.apply_strokes, mask[:2], mask, **one)
         restart.click(actions.restart, cut, mask, **one)
-        seen = [made, stage, files_part, made_files, view]
+        seen = [made, stage, files_part, made_files, view, elevation]
         added = [results, strip, *seen]
-        make.click(actions.reconstruct, [cut, editor, elevation, results], [*mask, *added], **one)
+        make.click(actions.reconstruct, [cut, editor, results], [*mask, *added], **one)
         several.upload(actions.take_all, [several, results], [more, *added], **one)
         strip.select(actions.choose, results, seen, **one)
         for kind, button in buttons.items():
@@ -205,6 +215,12 @@ def build(actions: Actions) -> gr.Blocks:
             concurrency_id="files",
             **free,
         )
+        # The viewer rotates the object at once, and then tells of it.
+        quick: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
+        elevation.input(None, elevation, None, js=_STAND, **quick)
+        for button, step in ((lower, -5), (raise_, 5)):
+            moved = f"(degrees) => ({_STAND})(Number(degrees) + {step})"
+            button.click(None, elevation, elevation, js=moved, **quick)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
 
@@ -239,12 +255,7 @@ def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
     }
     ours = {number: fn.inputs for number, fn in page.fns.items() if fn.fn is not None}
 
-    def kind(block: Any) -> Any:
-        if isinstance(block, gr.Slider):
-            return Annotated[float, Meta(ge=block.minimum, le=block.maximum)]
-        return kinds[type(block)]
-
-    return {number: [kind(block) for block in given] for number, given in ours.items()}
+    return {number: [kinds[type(block)] for block in given] for number, given in ours.items()}
 
 
 CSS = Path(__file__).parent / "look.css"

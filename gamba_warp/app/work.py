@@ -39,6 +39,7 @@ FACES = {f"{count:,} faces": count for count in (2_000, 10_000, 50_000, 200_000)
 TEXTURES = {"No texture": 0, **{f"Texture {side}": side for side in (512, 1024, 2048)}}
 UNRENDERED = {*GAUSSIANS, "html"}  # kinds whose writing renders nothing
 KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
+LOWEST, HIGHEST = -30, 90  # elevations that can be set by hand, degrees
 _PICTURE, _SMALL = 512, 128  # largest side of a kept input; side of a thumbnail, pixels
 
 
@@ -76,6 +77,8 @@ class Reconstruction:
         picture: the model's input ``[S, S, 4]`` uint8, reduced.
         surface: the last one that was extracted, or None.
         choice: its number of faces at most, and if it is closed.
+        given: key of the picture.
+        chosen: elevation that was set by hand, or None.
         removed: ``[N]`` bool, Gaussians that were removed by hand; every edit makes a new tensor.
         key: unpredictable name.
     """
@@ -87,6 +90,8 @@ class Reconstruction:
     picture: np.ndarray
     surface: Surface | None = None
     choice: tuple[int, bool] | None = None
+    given: str = ""
+    chosen: float | None = None
     removed: torch.Tensor = field(init=False)
     key: str = field(init=False)
 
@@ -100,26 +105,14 @@ class Reconstruction:
         return self.whole.select(~self.removed)
 
 
-def estimated_elevation(model: Gamba, cut: Cut) -> int:
-    """Return the estimate of the camera's elevation, whole degrees; 0 for an empty mask."""
-    from ..model.predict import reconstruct
-    from ..trajectories.elevation import estimate_elevation
-
-    try:
-        rgba = model_picture(cut)
-    except UserError:
-        return 0
-    return estimate_elevation(reconstruct(model, rgba, detail=1)).degrees
-
-
 def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconstruction:
     """Run one forward pass.
 
     Args:
         model: on any device.
         cut: the object.
-        elevation: of the picture's camera above the object, degrees; None for the estimate. The
-            result is upright.
+        elevation: of the picture's camera above the object, set by hand, degrees; None for the
+            estimate. The result is upright.
 
     Raises:
         UserError: the mask is empty.
@@ -134,11 +127,12 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconst
     started = time.perf_counter()
     gaussians = reconstruct(model, rgba).to("cpu")
     seconds = time.perf_counter() - started
-    if elevation is None:
-        elevation = estimate_elevation(gaussians).degrees
-    camera = model.config.distance, model.config.fov, elevation
-    upright, picture = set_up(gaussians, elevation), to_uint8(shrink(rgba, _PICTURE))
-    return Reconstruction(cut.name, upright, camera, seconds, picture)
+    angle = estimate_elevation(gaussians).degrees if elevation is None else elevation
+    camera = model.config.distance, model.config.fov, angle
+    upright, picture = set_up(gaussians, angle), to_uint8(shrink(rgba, _PICTURE))
+    return Reconstruction(
+        cut.name, upright, camera, seconds, picture, given=cut.key, chosen=elevation
+    )
 
 
 def surface_of(
@@ -195,20 +189,22 @@ def viewer(made: Reconstruction) -> str:
 
     bits = made.removed[visible_order(made.whole, made.name)].numpy()
     removed = base64.b64encode(np.packbits(bits, bitorder="little").tobytes()).decode()
-    edit = {"key": made.key, "removed": removed}
+    edit = {"key": made.key, "removed": removed, "elevation": made.camera[2]}
     return viewer_page(made.name, made.whole, edit=edit, **_shown(made))
 
 
-def edit(made: Reconstruction, removed: bytes) -> None:
-    """Leave Gaussians out of a reconstruction, and forget its surface.
+def edit(made: Reconstruction, elevation: float, removed: bytes) -> None:
+    """Rotate a reconstruction, and leave Gaussians out, which forgets its surface.
 
     Args:
         made: the reconstruction.
+        elevation: of the picture's camera above the object, degrees; the result is upright.
         removed: a bit for each Gaussian, in the order of the viewer, the lowest bit first.
 
     Raises:
         UserError: the number of bits is wrong, or nothing would be left.
     """
+    from ..trajectories.paths import set_up, upright
     from ..viewer.pack import visible_order
 
     order = visible_order(made.whole, made.name)
@@ -218,8 +214,17 @@ def edit(made: Reconstruction, removed: bytes) -> None:
     gone = torch.from_numpy(bits[: len(order)].astype(bool))
     if gone.all():
         raise UserError("nothing of the object would be left")
-    made.removed = torch.zeros_like(made.removed).index_fill(0, order[gone], True)
-    made.surface = None
+    before, surface, angle = made.removed, made.surface, elevation - made.camera[2]
+    made.removed = torch.zeros_like(before).index_fill(0, order[gone], True)
+    if not made.removed.equal(before):
+        made.surface = None
+    elif surface is not None:
+        vertices = surface.vertices @ upright(angle).double().numpy().T
+        made.surface = replace(surface, vertices=vertices)
+    if angle:
+        made.whole = set_up(made.whole, angle)
+        made.camera = (*made.camera[:2], elevation)
+        made.chosen = elevation
 
 
 def _shown(made: Reconstruction) -> dict:

@@ -89,7 +89,7 @@ def viewer_parts(
     view: tuple[float, float, float] | None = None,
     picture: np.ndarray | None = None,
     note: str = "",
-    edit: dict[str, str] | None = None,
+    edit: dict[str, Any] | None = None,
 ) -> ViewerParts:
     """Return the texts for the slots of ``program_page``.
 
@@ -105,9 +105,9 @@ def viewer_parts(
             of the object's longest side.
         picture: the input from ``camera``, ``[S, S, 3|4]`` in [0, 1], which a slider shows.
         note: a few words below the title.
-        edit: lets the viewer remove Gaussians, and tell the page around its frame of it: ``key`` of
-            the object, and ``removed``, a base64 bit for each of its Gaussians in the order of
-            ``visible_order``.
+        edit: lets the viewer edit the object, and tell the page around its frame: ``key`` of the
+            object, ``elevation`` of ``camera``, and ``removed``, in base64 a bit for each Gaussian
+            in the order of ``visible_order``.
 
     Raises:
         UserError: a value is not finite, nothing can be seen, or the object has no extent.

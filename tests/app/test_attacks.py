@@ -93,7 +93,7 @@ def made_square(program):
     picture = Image.new("RGB", (200, 200), "white")
     picture.paste((200, 30, 20), (50, 50, 150, 150))
     program.result(TAKE, [given(program.upload(bytes_of(picture)))])
-    page = str(program.result(MAKE, [None, None, 0, None])["data"])
+    page = str(program.result(MAKE, [None, None, None])["data"])
     edit = html.unescape(html.unescape(page[page.index("{&quot;title") :]))
     key = re.search(r'"key": "(\w+)"', edit)[1]
     return key, int(re.search(r'"count": (\d+)', edit)[1])
@@ -112,15 +112,14 @@ def test_an_edit_that_is_none_is_one_line(served, program):
         )
         return Path(output["data"][0]["value"][0]["path"]).stat().st_size
 
-    def edit(removed, key=key, by=program):
-        text = base64.b64encode(removed).decode() if isinstance(removed, bytes) else removed
-        return by.join(EDIT, [{"key": key, "removed": text}, None, None])
-
-    before = written()
+    before, good = written(), {"key": key, "elevation": 0, "removed": ""}
     for text in ("%%%", "AAA", "A" * 400_000, 7, None, ["AA=="]):
-        answer = edit(text)
+        answer = program.join(EDIT, [{**good, "removed": text}, None, None])
         assert answer.status == 400 and answer.line.startswith("the call: "), text
-    for told in ({"key": key}, {"removed": ""}, "AA==", None, {"key": "x" * 33, "removed": ""}):
+    for told in (
+        *({"key": key}, {"removed": ""}, "AA==", None),
+        *({**good, "key": "x" * 33}, {**good, "elevation": 91}, {**good, "elevation": "up"}),
+    ):
         answer = program.join(EDIT, [told, None, None])
         assert answer.status == 400 and answer.line.startswith("the call: "), told
     told = {
@@ -131,12 +130,12 @@ def test_an_edit_that_is_none_is_one_line(served, program):
         told["the removed parts are not those of this object"].append(more)
     for reason, all_removed in told.items():
         for removed in all_removed:
-            data = [{"key": key, "removed": base64.b64encode(removed).decode()}, None, None]
+            data = [{**good, "removed": base64.b64encode(removed).decode()}, None, None]
             assert program.result(EDIT, data)["error"] == reason
     assert written() == before
     other = Program(served.host).opened()
     made_square(other)
-    data = [{"key": key, "removed": base64.b64encode(one).decode()}, None, None]
+    data = [{**good, "removed": base64.b64encode(one).decode()}, None, None]
     assert other.result(EDIT, data)["error"] == "this result has expired"
     assert written() == before
     assert "data" in program.result(EDIT, data) and written() < before
@@ -299,7 +298,7 @@ def test_the_job_of_a_closed_page_ends(served, program, private):
     picture = Image.new("RGB", (200, 200), "white")
     picture.paste((200, 30, 20), (50, 50, 150, 150))
     program.result(TAKE, [given(program.upload(bytes_of(picture)))])
-    assert "data" in program.result(MAKE, [None, None, 0, None])
+    assert "data" in program.result(MAKE, [None, None, None])
     assert program.join(ZIP, [None, "200,000 faces", "Texture 2048", True]).status == 200
     cookie, host = f"Cookie: {program.headers['Cookie']}", f"Host: {served.host}"
     place = f"GET /gradio_api/queue/data?session_hash={program.session} HTTP/1.1"
@@ -368,7 +367,7 @@ def test_no_such_function_is_one_line(program, number):
     "number, data",
     [
         *[(TAKE, []), (TAKE, [None, None]), (BRUSH, ["Paint it black"]), (BRUSH, [0])],
-        *[(MAKE, [None] * 3), *((MAKE, [None, None, value, None]) for value in (91, "up", None))],
+        *[(MAKE, [None] * 2), (MAKE, [None, 0, None])],
         *[(SEVERAL, [[{"path": "x"}] * (MAX_PICTURES + 1), None]), (SEVERAL, ["x", None])],
     ],
 )

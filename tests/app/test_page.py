@@ -2,7 +2,6 @@
 
 import io
 import os
-import re
 import signal
 import time
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from PIL import Image
 
 from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.images import save_image
+from gamba_warp.trajectories.paths import set_up
 
 PATIENCE = 90  # seconds, on a machine that does much else
 RED = (0.8, 0.1, 0.1)
@@ -123,12 +123,10 @@ def test_the_whole_way(opened, served, tmp_path):
     page.get_by_role("button", name="Start over").click()
     until(lambda: middle(page)[1] < 60, "the middle is back")
 
-    page.locator("#elevation input[type=number]").fill("25")
     page.locator("#make").click()
     frame = page.wait_for_selector("iframe.stage")
     viewer = frame.content_frame()
     viewer.wait_for_selector("#message", state="hidden")
-    assert re.search(r'"elevation": 0\.436', viewer.content())  # radians
     assert viewer.locator("#name").inner_text() == "my-square"
 
     def drawn():
@@ -193,6 +191,50 @@ def shown_viewer(page):
     return viewer
 
 
+def test_the_object_is_rotated_at_once(opened, tmp_path):
+    """Files follow, the view stays, and another result keeps its own elevation."""
+    page = opened.page
+    blue = np.ones((200, 200, 3))
+    blue[50:150, 80:190] = 0.1, 0.2, 0.8
+    save_image(tmp_path / "blue.png", blue)
+    give(page, red_square(tmp_path))
+    page.wait_for_selector("#editor canvas")
+    page.locator("#make").click()
+    viewer = shown_viewer(page)
+    number = page.locator("#elevation input[type=number]")
+    estimate = int(number.input_value())
+    whole = read_gaussians(downloaded(page, "ply", tmp_path / "whole.ply"))
+    viewer.evaluate("gambaViewer.rest(), gambaViewer.setCamera({ azimuth: 0.5 })")
+    assert_clear(page, "#elevation")
+    page.set_viewport_size({"width": 390, "height": 844})
+    for button in page.locator("#elevation button").all():
+        box = button.bounding_box()
+        assert box["width"] >= 44 and box["height"] >= 44
+    page.locator("#elevation button").last.click()
+    page.locator("#elevation button").last.click()
+    viewer.wait_for_function("Math.abs(gambaViewer.camera.tilt - Math.PI / 18) < 1e-6")
+    page.wait_for_selector("#made", state="hidden")  # what was written before
+    number.fill("40")
+    viewer.wait_for_function("gambaViewer.about.edit.elevation === 40")
+    page.wait_for_timeout(1000)
+    assert viewer.evaluate("gambaViewer.camera.azimuth") == 0.5, "the frame is the same"
+    turned = read_gaussians(downloaded(page, "ply", tmp_path / "turned.ply"))
+    wanted = set_up(whole, 40 - estimate).means
+    np.testing.assert_allclose(turned.means, wanted, atol=1e-5)
+    assert np.abs(turned.means - whole.means).max() > 0.05
+
+    page.locator("#picture").get_by_label("Remove Image").click()
+    page.wait_for_selector("#cut", state="hidden")
+    give(page, tmp_path / "blue.png")
+    page.wait_for_selector("#cut", state="visible")
+    page.locator("#make").click()
+    page.wait_for_selector("#results button >> nth=1")
+    until(lambda: number.input_value() != "40", "its own estimate")
+    page.locator("#results button").first.click()
+    until(lambda: number.input_value() == "40", "the elevation of the first one")
+    assert shown_viewer(page).evaluate("gambaViewer.about.edit.elevation") == 40
+
+
 def test_parts_are_erased(opened, tmp_path):
     """Every download follows, and the view stays."""
     page = opened.page
@@ -227,11 +269,12 @@ def test_parts_are_erased(opened, tmp_path):
 
     viewer.locator("#do-remove").click()
     page.wait_for_selector("#made", state="hidden")
-    assert_clear(page, "iframe.stage")
     # Another frame cannot speak for the viewer.
     key = viewer.evaluate("gambaViewer.about.edit.key")
-    page.evaluate("(key) => postMessage({ edit: { key, removed: '' } })", key)
-    viewer.evaluate("parent.postMessage({ edit: { key: 'other', removed: '' } }, '*')")
+    page.evaluate("(key) => postMessage({ edit: { key, elevation: 0, removed: '' } })", key)
+    viewer.evaluate(
+        "parent.postMessage({ edit: { key: 'other', elevation: 0, removed: '' } }, '*')"
+    )
     assert "this result has expired" in toast(page)
     assert page.locator(".toast-body").count() == 1
 

@@ -56,6 +56,15 @@ def test_a_picture_from_above_stands_upright(tmp_path, made):
     turn = orbit(torch.zeros(1), 30.0)[0, :3, :3]
     torch.testing.assert_close(above.gaussians.means @ turn.T, made.gaussians.means)
     assert above.camera == (*made.camera[:2], 30.0) and made.camera[2] == 0
+    made = work.Reconstruction("thing", made.whole, made.camera, 0.0, made.picture)
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    made.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
+    nothing = bytes(-(-visible(made.whole, "").num // 8))
+    for elevation in (10.0, 30.0):  # rotations add up
+        work.edit(made, elevation, nothing)
+    torch.testing.assert_close(made.gaussians.means, above.gaussians.means, atol=1e-6, rtol=0)
+    np.testing.assert_allclose(made.surface.vertices, corners @ turn.double().numpy(), atol=1e-6)
+    assert made.camera == above.camera and made.chosen == above.chosen == 30
     path, _ = work.write(above, "ply", tmp_path)
     options = quick(STARTER / "tiny.safetensors", tmp_path / "out", 30)
     assert run_reconstruct(picture, *options) == 0
@@ -238,7 +247,7 @@ def test_what_is_removed_is_in_no_file(made, tmp_path, monkeypatch):
     bits = np.zeros(seen.num, bool)
     bits[[0, 3, seen.num - 1]] = True
     made.surface = Mock()
-    work.edit(made, np.packbits(bits, bitorder="little").tobytes())
+    work.edit(made, 0, np.packbits(bits, bitorder="little").tobytes())
     assert made.surface is None and made.gaussians.num == made.whole.num - 3
     left = visible(made.gaussians, "thing")
     torch.testing.assert_close(left.means, seen.means[~torch.from_numpy(bits)])
@@ -257,7 +266,7 @@ def test_what_is_removed_is_in_no_file(made, tmp_path, monkeypatch):
     again = work.viewer(made)
     removed = np.packbits(bits, bitorder="little").tobytes()
     assert f'"count": {seen.num},' in again and base64.b64encode(removed).decode() in again
-    work.edit(made, bytes(-(-seen.num // 8)))
+    work.edit(made, 0, bytes(-(-seen.num // 8)))
     assert made.gaussians.num == made.whole.num
 
 
@@ -268,7 +277,7 @@ def test_a_mesh_of_an_object_that_is_edited_meanwhile(page, made, monkeypatch):
 
     def write(one, kind, folder, *_):
         if kind == "mesh-stl":
-            work.edit(made, bytes([1]) + bytes(size - 1))
+            work.edit(made, 0, bytes([1]) + bytes(size - 1))
         one.surface = surface
         path = folder / "mesh"
         path.touch()
@@ -333,6 +342,26 @@ def test_each_of_several_pictures_is_shown_once_it_is_done(page, made, monkeypat
     with pytest.raises(gradio.Error, match="it was cancelled"):
         [*results_of(page, "de", [])]
     assert run == ["a", "b", "cancelled"], "the next one is not begun"
+
+
+def test_an_elevation_set_by_hand_stays_with_its_picture(page, made, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        work, "run_model", lambda _, cut, angle: asked.append(angle) or new(cut.key)
+    )
+
+    def new(key):
+        return work.Reconstruction("a", made.whole, made.camera, 0.0, made.picture, given=key)
+
+    one, other = (Mock(key=key) for key in "ab")
+    monkeypatch.setattr("gamba_warp.app.actions.apply_strokes", lambda cut, _: cut)
+    results = []
+    for cut in (one, one, other, one):
+        _, _, _, results, *_ = page.reconstruct(cut, None, results, MagicMock(), lambda *_: None)
+        if len(results) == 2:
+            work.edit(results[1].made, 35, bytes(-(-visible(made.whole, "").num // 8)))
+            results[1].made.chosen = 35
+    assert asked[:3] == [None, None, None] and asked[3] == 35
 
 
 def test_what_waits_for_the_device(page, made, tmp_path):

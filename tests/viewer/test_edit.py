@@ -1,12 +1,15 @@
 """The brush of the viewer that removes Gaussians, as the page of the app shows it."""
 
 import base64
+import io
 
 import numpy as np
 import pytest
 import torch
 from helpers.views import cloud_of
+from PIL import Image
 
+from gamba_warp.trajectories.paths import set_up
 from gamba_warp.viewer.page import write_viewer
 
 CAMERA = (1.5, 49.1, 0.0)
@@ -27,7 +30,7 @@ def edited(browser_page, tmp_path):
     """Opens the page of a row, whose frame is told of edits in ``told``."""
 
     def opened(removed=bytes(1), **options):
-        edit = {"key": "row", "removed": base64.b64encode(removed).decode()}
+        edit = {"key": "row", "elevation": 0.0, "removed": base64.b64encode(removed).decode()}
         path = tmp_path / "row.html"
         write_viewer(path, "Row", row(), camera=CAMERA, edit=edit)
         found = browser_page(path, SIDE, 600, reduced_motion="reduce", **options)
@@ -167,12 +170,50 @@ def test_what_was_removed_before_is_not_shown_and_can_be_undone(edited):
     assert not opened.messages
 
 
+def canvas(opened):
+    """The pixels at rest."""
+    text = opened.promised("gambaViewer.png()").partition(",")[2]
+    with Image.open(io.BytesIO(base64.b64decode(text))) as picture:
+        return np.asarray(picture.convert("RGB")).astype(float) / 255
+
+
+def test_the_object_is_rotated_at_once_for_another_elevation(edited, browser_page, tmp_path):
+    """The view stays; the first view is the input's; the picture is that of a rotated object."""
+    opened = edited()
+    page, camera = opened.page, "JSON.stringify(gambaViewer.camera.copyOf(gambaViewer.camera))"
+    first = canvas(opened)
+    page.evaluate("gambaViewer.setCamera({ azimuth: 0.7, elevation: 0.3 })")
+    before = page.evaluate(camera)
+    for degrees in (10, 40):
+        page.evaluate(f"postMessage({{ elevation: {degrees} }})")
+    opened.until("told.length === 1")  # once it stays
+    assert page.evaluate("gambaViewer.about.edit.elevation") == 40
+    assert page.evaluate(camera) == before
+    seen = canvas(opened)
+    path = tmp_path / "above.html"
+    write_viewer(path, "Row", set_up(row(), 40.0), camera=(*CAMERA[:2], 40.0))
+    other = browser_page(path, SIDE, 600, reduced_motion="reduce")
+    other.promised("gambaViewer.rest()")
+    other.page.evaluate("gambaViewer.setCamera({ azimuth: 0.7, elevation: 0.3 })")
+    # The brush's page has no slider of the input either, so both pictures have one size.
+    assert np.abs(canvas(other) - seen).max() < 3 / 255 < 0.3 < np.abs(first - seen).max()
+    page.keyboard.press("r")
+    assert np.abs(canvas(opened) - first).max() < 2 / 255, "the input's view"
+    page.keyboard.press("e")
+    stroke(page, -0.42, -0.15)
+    assert states(page)[:3] == [1, 1, 1] and states(page)[-1] == 0, "the brush sees it as it is"
+    page.evaluate("postMessage({ elevation: 'x' })")
+    assert page.evaluate("gambaViewer.about.edit.elevation") == 40 and not opened.messages
+
+
 def test_other_pages_have_no_brush(browser_page, tmp_path):
     write_viewer(tmp_path / "row.html", "Row", row(), camera=CAMERA)
     opened = browser_page(tmp_path / "row.html", SIDE, 600, reduced_motion="reduce")
     opened.promised("gambaViewer.rest()")
     opened.page.keyboard.press("e")
     stroke(opened.page, -0.42, 0.42)
+    opened.page.evaluate("postMessage({ elevation: 30 })")
+    assert opened.page.evaluate("gambaViewer.camera.tilt") == 0
     assert not opened.page.is_visible("#edit") and not opened.page.is_visible("#ring")
     assert opened.page.evaluate("gambaViewer.camera.azimuth") < 0
     opened.page.keyboard.press("h")

@@ -12,6 +12,7 @@ class OrbitCamera {
     this.home = home;
     this.half = Math.tan((fov * Math.PI) / 360);
     this.goal = null;
+    this.tilt = 0; // of the object about the x axis, radians
     Object.assign(this, this.copyOf(home));
   }
 
@@ -21,7 +22,8 @@ class OrbitCamera {
 
   // Rows: the camera's right, down and forward, in the object's frame.
   rotation() {
-    return axesOf(this.azimuth, this.elevation);
+    const c = Math.cos(this.tilt), s = Math.sin(this.tilt);
+    return axesOf(this.azimuth, this.elevation).map(([x, y, z]) => [x, c * y - s * z, s * y + c * z]);
   }
 
   // The focal length in pixels; the field of view is that of the shorter side.

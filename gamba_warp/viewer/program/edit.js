@@ -1,9 +1,10 @@
-// Parts that are removed by hand, in the page of the app, which gives `about.edit`: a brush marks the
-// Gaussians whose centres are below it, at any depth. The page around the frame is told of removals.
+// Edits in the page of the app, which gives `about.edit`. A brush marks Gaussians to remove, those whose
+// centres are below it, at any depth. The page around the frame sets the elevation, and is told of edits.
 
 const MARKED = 1, REMOVED = 2; // states of a Gaussian
 const MARK = [0x3b480000, 0x2a66359a]; // the records' colour of a marked one: red; green and blue
 const MOST_STEPS = 50; // that can be undone
+const PAUSE = 150; // milliseconds after the last change, before an elevation is told
 
 class Editor {
   constructor(viewer) {
@@ -15,6 +16,9 @@ class Editor {
     const keys = { e: "brush", Delete: "remove", Backspace: "remove", "Ctrl+z": "undo" };
     for (const [key, name] of Object.entries(keys)) act.keys[key] = () => byId(`do-${name}`).click();
     Object.assign(act.keys, { "[": resize(-4), "]": resize(4) });
+    window.addEventListener("message", ({ data, source }) => {
+      if (source === parent && this.edit && Number.isFinite(data?.elevation)) this.stand(data.elevation);
+    });
     canvas.addEventListener("pointerdown", () => { this.begun = false; });
     canvas.addEventListener("pointerleave", () => { ring.hidden = true; });
     canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
@@ -39,6 +43,17 @@ class Editor {
     this.total = this.viewer.about.total;
     this.count();
     this.show();
+  }
+
+  // Rotates the object for another elevation of the input's camera, in degrees; the view stays.
+  stand(degrees) {
+    const { viewer, edit } = this, { home, input } = viewer.about;
+    viewer.turning = false;
+    edit.elevation = degrees;
+    home.elevation = (degrees * Math.PI) / 180;
+    viewer.moving(() => { viewer.camera.tilt = home.elevation - input.elevation; });
+    clearTimeout(this.later);
+    this.later = setTimeout(() => parent.postMessage({ edit }, "*"), PAUSE);
   }
 
   // Takes the brush, or leaves it and what is marked.
@@ -133,6 +148,6 @@ class Editor {
     if (viewer.mode === "mesh") viewer.setMode("gaussians");
     if (viewer.wipe > 0) viewer.setWipe(0);
     this.count();
-    parent.postMessage({ edit: { key: edit.key, removed } }, "*");
+    parent.postMessage({ edit }, "*");
   }
 }
