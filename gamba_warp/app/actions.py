@@ -22,6 +22,7 @@ from . import work
 from .cutting import (
     Cut,
     apply_strokes,
+    cut_by_network,
     cut_picture,
     editor_picture,
     examples,
@@ -143,7 +144,7 @@ class Actions:
         """Clear the picture; its results stay."""
         gone, empty = gr.update(visible=False), gr.update(value=None, visible=False)
         view = gr.update(value=VIEWS[1], visible=False)
-        return None, gone, empty, "", view, gr.skip(), None
+        return None, gone, empty, "", gone, view, gr.skip(), None
 
     @page_errors()
     def load_example(self, event: gr.EventData, request: gr.Request) -> tuple:
@@ -179,6 +180,18 @@ class Actions:
         return self._edited(cut, request)
 
     @page_errors()
+    def cut_by_network(
+        self,
+        cut: Cut | None,
+        request: gr.Request,
+        progress: gr.Progress = gr.Progress(),  # noqa: B008
+    ) -> tuple:
+        """Cut the picture out again by a network."""
+        progress(0.2, "Cutting out with a network")
+        again = self._call(request, cut_by_network, _given(cut), self._options)
+        return self._edited(again, request)
+
+    @page_errors()
     def reconstruct(
         self,
         cut: Cut | None,
@@ -198,7 +211,7 @@ class Actions:
         chosen = earlier[-1] if earlier else None
         made = self._call(request, work.run_model, self._model, after, chosen)
         progress(0.8, "Making the viewer")
-        edited = (gr.skip(),) * 3 if after is before else self._edited(after, request)
+        edited = (gr.skip(),) * 4 if after is before else self._edited(after, request)
         return *edited, *self._added(results, made, request)
 
     def take_all(
@@ -337,7 +350,8 @@ class Actions:
 
     def _edited(self, cut: Cut, request: gr.Request) -> tuple:
         note = html.escape(self._call(request, note_of, cut))
-        return cut, self._editor(cut, request), f"<p>{note}</p>"
+        network = gr.update(value=cut.network, visible=bool(cut.network))
+        return cut, self._editor(cut, request), f"<p>{note}</p>", network
 
     def _new_folder(self, request: gr.Request) -> Path:
         inner = request.request

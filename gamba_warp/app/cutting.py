@@ -6,6 +6,7 @@ import re
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,8 @@ MAX_STROKES = 4 << 20  # pixels of a layer; the page sends SIDE x SIDE
 _TILE = 12  # side of the checkerboard's squares, pixels
 _LIGHT, _DARK = 0.97, 0.86
 _GHOST = 0.22  # opacity of the removed parts, so that they can be painted back
+# Options of the command line in the words of photo/cutout.py.
+_OPTIONS = re.compile(r" \(--keep-holes[^)]*\)|; give a picture with .*")
 _NAME = re.compile(r"[^\w-]+")
 FOLDER = STARTER / "icons"  # the examples
 
@@ -44,6 +47,8 @@ class Cut:
         ghost: True if the picture has colours where the mask is 0.
         note: method of the cut-out and doubts, for the page, before any stroke.
         warning: the doubts alone.
+        path: file of the picture.
+        network: label of a button that cuts the picture out again by a network; empty without one.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour.
         key: unpredictable name of the picture.
     """
@@ -57,6 +62,8 @@ class Cut:
     note: str
     warning: str
     areas: np.ndarray
+    path: Path
+    network: str = ""
     key: str = field(default_factory=lambda: secrets.token_hex(8))
 
 
@@ -83,15 +90,58 @@ def cut_picture(path: Path, name: str, options: CutoutOptions) -> Cut:
     try:
         cut = cut_out(path, options)
     except UserError as error:  # the picture is valid, so the object can be painted by hand
-        reason = str(error).removeprefix(f"{path}: ")
+        reason = _OPTIONS.sub("", str(error).removeprefix(f"{path}: "))
         mask = np.zeros(rgba.shape[:2], np.float32)
         note = f"No object was found ({reason}). Paint over the object with the blue brush."
         nothing = np.zeros(mask.shape, bool)
-        return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note, note, nothing)
+        label = _network(options)
+        return Cut(
+            stem(name), rgba[..., :3], mask, mask, None, True, note, note, nothing, path, label
+        )
     ghost = cut.method != "alpha"  # colours of transparent pixels are arbitrary
     rgb = _clean_edge(cut.source_rgb, cut.mask, cut.rgba)
-    note = f"{cut.how} {cut.warning}".strip()
-    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, note, cut.warning, cut.areas)
+    note, label = _OPTIONS.sub("", cut.how), ""
+    if cut.doubt:
+        label = _network(options) if cut.method in ("plain", "grabcut") else ""
+        note += f" {cut.doubt} Paint what to keep or remove{', or use a network' if label else ''}."
+    found = cut.rgba, ghost, note, cut.doubt, cut.areas, path, label
+    return Cut(stem(name), rgb, cut.mask, cut.mask, *found)
+
+
+def _network(options: CutoutOptions) -> str:
+    """Return the label of a button for the matting network; empty where it cannot help."""
+    from ..photo import models
+
+    if options.cutout != "auto" or options.matte_model is not None:
+        return ""  # it was used
+    if find_spec("onnxruntime") is None:
+        return ""
+    best = models.PUBLISHED[0]
+    if (here := models.cached()) is not None:
+        return f"Cut out with a network ({here.stem})"
+    if not (options.fetch and models.may_fetch() and find_spec("pooch")):
+        return ""
+    return f"Cut out with a network ({best.name}, {best.megabytes} MB, fetched once)"
+
+
+def cut_by_network(cut: Cut, options: CutoutOptions) -> Cut:
+    """Return the cut-out of the same picture by the matting network, which may be fetched.
+
+    Raises:
+        UserError: the network cannot be fetched or run, or finds no object.
+    """
+    from ..photo import models
+
+    best, options = models.PUBLISHED[0], replace(options, cutout="matte")
+    try:
+        if models.cached() is None:
+            models.fetch(best, best.address)
+    except models.NotFetched as error:
+        raise UserError(f"the network cannot be fetched: {error}") from None
+    again = cut_picture(cut.path, cut.name, options)
+    if again.found is None:
+        raise UserError(f"the network does not help: {again.note.partition('. Paint')[0]}")
+    return replace(again, key=cut.key)
 
 
 def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:

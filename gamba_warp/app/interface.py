@@ -106,6 +106,7 @@ def build(actions: Actions) -> gr.Blocks:
                 with gr.Column(visible=False, elem_id="cut") as cut_part:
                     brush = gr.Radio([*_BRUSHES], value=[*_BRUSHES][0], elem_id="brush", **plain)
                     note = gr.HTML(elem_id="note")
+                    network = gr.Button(visible=False, size="md", elem_id="network")
                     with gr.Row():
                         mend = gr.Button("Apply strokes", size="md", min_width=120)
                         restart = gr.Button("Start over", size="md", min_width=120)
@@ -152,9 +153,8 @@ def build(actions: Actions) -> gr.Blocks:
                             work.HIGHEST,
                             value=0,
                             step=1,
-                            label="Camera above the object, degrees",
-                            info="An estimate, which sets the object upright; change it if it "
-                            "leans.",
+                            label="Elevation of the camera, degrees",
+                            info="An estimate; change it if the object leans.",
                             buttons=[],
                             min_width=200,
                         )
@@ -181,8 +181,8 @@ def build(actions: Actions) -> gr.Blocks:
         free: dict[str, Any] = {"preprocess": False, "api_visibility": "private"}
         shared: dict[str, Any] = {**free, "show_progress_on": status}
         one = {**shared, "concurrency_id": "gamba", "concurrency_limit": 1}
-        shown = [cut, cut_part, editor, note, view, more, picture]
-        mask = [cut, editor, note]
+        shown = [cut, cut_part, editor, note, network, view, more, picture]
+        mask = [cut, editor, note, network]
         # (The event ``input`` sends the old picture when it is cleared.)
         picture.upload(actions.take, picture, shown, **one)
         picture.clear(actions.end_session, None, shown, **one)
@@ -215,6 +215,7 @@ def build(actions: Actions) -> gr.Blocks:
             concurrency_id="files",
             **free,
         )
+        network.click(actions.cut_by_network, cut, mask, **one)
         # The viewer rotates the object at once, and then tells of it.
         quick: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         elevation.input(None, elevation, None, js=_STAND, **quick)

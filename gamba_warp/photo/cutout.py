@@ -165,6 +165,7 @@ class CutOut:
             restore them in a PNG, which may be used as input again.
         warning: reasons to doubt the cut-out, and a remedy; empty without a doubt.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour, kept or removed.
+        doubt: the warning without the remedy, which is one of the command line.
     """
 
     rgba: np.ndarray
@@ -175,6 +176,7 @@ class CutOut:
     editable: np.ndarray
     warning: str
     areas: np.ndarray
+    doubt: str
 
     @property
     def note(self) -> str:
@@ -267,7 +269,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
         how += f" Its longer side has {pixels} pixels, so the result is blurred."
     if (most := rgba[..., 3].max()) < _OPAQUE:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
-    warning, own = "", method in ("mask", "alpha", "none")
+    doubt, advice, own = "", "", method in ("mask", "alpha", "none")
     doubts = [] if own else doubts_of(source, rgba[..., 3])
     if method == "mask" and (edge := _on_border(rgba[..., 3] > 0.5)) > _BORDER:
         inverted = " (is the mask inverted?)" if edge > _MOST_EDGE else ""
@@ -276,14 +278,16 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     if method == "grabcut":  # docs/reconstruct.md has the figure
         doubts.append("colours alone fail for more than half of photographs")
     if doubts:
-        warning = f"The cut-out may be wrong: {'; '.join(doubts)}."
+        doubt = f"The cut-out may be wrong: {'; '.join(doubts)}."
         if method in ("plain", "grabcut") and not options.without_network:
             best = models.PUBLISHED[0]
             about = f"{best.name}, {best.megabytes} MB, {best.licence}, fetched once"
-            warning += f" Try a network: gamba reconstruct --cutout matte ({about})."
+            advice = f" Try a network: gamba reconstruct --cutout matte ({about})."
     editable = np.dstack([np.where(close[..., 3:] > 0, close[..., :3], around), close[..., 3]])
     areas = np.zeros(rgba.shape[:2], bool) if found.areas is None else found.areas > 0
-    return CutOut(centred, method, how, source, rgba[..., 3], editable, warning, areas)
+    return CutOut(
+        centred, method, how, source, rgba[..., 3], editable, doubt + advice, areas, doubt
+    )
 
 
 def _at_own_pixels(

@@ -67,7 +67,7 @@ def test_a_program_that_does_as_the_page_does(program, private):
     assert program.ask(f"/gradio_api/file={shown}").status == 200
     layer = Image.new("RGBA", (720, 720), (0, 0, 255, 255))
     painted = {"layers": [given(program.upload(bytes_of(layer)))], "background": {"path": "/"}}
-    _, editor, note = program.result(MEND, [None, painted])["data"]
+    _, editor, note, _ = program.result(MEND, [None, painted])["data"]
     assert "edited" in note and "touches the picture" in note
     after = editor["value"]["background"]["path"]
     assert program.ask("/manifest.json").body == b"{}"  # the page links it

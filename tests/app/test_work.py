@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.images import bad_files, cut_out
+from helpers.matting import matting_network
 from helpers.model import quick, run_reconstruct
 from helpers.refusals import refused
 from PIL import Image
@@ -23,6 +24,7 @@ from gamba_warp.formats.ply import load_ply
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.pages import turntable
+from gamba_warp.photo import models
 from gamba_warp.photo.cutout import CutoutOptions
 from gamba_warp.surfaces import extract, files  # noqa: F401 (it must not find the stand-in)
 from gamba_warp.viewer.pack import visible
@@ -105,6 +107,63 @@ def test_strokes_keep_and_remove(two, size):
     np.testing.assert_array_equal(cutting.reset_mask(again).mask, cut.mask)
     assert cutting.note_of(cutting.reset_mask(again)) == cut.note
     assert cutting.apply_strokes(cut, [np.zeros((*size, 4), np.uint8)]) is cut
+
+
+def post(folder):
+    """A picture of a red post, which touches the border, so that its cut-out is doubted."""
+    rgb = np.ones((60, 80, 3))
+    rgb[20:, 30:50] = 0.8, 0.2, 0.1
+    save_image(folder / "post.png", rgb)
+    return folder / "post.png"
+
+
+def test_a_doubted_cut_out_has_no_command_but_a_network(tmp_path, monkeypatch):
+    pytest.importorskip("onnxruntime", reason="needs onnxruntime: pip install '.[photo]'")
+    options = CutoutOptions(notify=lambda line: None)
+    home = tmp_path / "models"
+    home.mkdir()
+    monkeypatch.setenv("U2NET_HOME", str(home))
+
+    def cut():
+        found = cutting.cut_picture(post(tmp_path), "post.png", options)
+        assert "may be wrong: it touches" in found.note and "Paint what to keep" in found.note
+        assert "gamba" not in found.note and "--" not in found.note
+        return found
+
+    assert cut().network == "" and "network" not in cut().note  # GAMBA_OFFLINE
+    monkeypatch.setenv("GAMBA_OFFLINE", "0")
+    first = cut()
+    assert first.network == "Cut out with a network (isnet-general-use, 179 MB, fetched once)"
+    assert "or use a network" in first.note
+
+    def fail(*_):
+        raise models.NotFetched("github.com cannot be reached")
+
+    monkeypatch.setattr(models, "fetch", fail)
+    refused("network cannot be fetched: github.com cannot", cutting.cut_by_network, first, options)
+    other, file = home / "silueta.onnx", home / "isnet-general-use.onnx"
+    other.write_bytes(matting_network(bias=-400.0))
+    said = refused("network does not help", cutting.cut_by_network, first, options)
+    assert "nothing stands out" in said and "--" not in said
+    other.unlink()
+    monkeypatch.setattr(models, "fetch", lambda *_: file.write_bytes(matting_network()))
+    again = cutting.cut_by_network(first, options)
+    assert "The matting model isnet-general-use.onnx" in again.note and again.key == first.key
+    assert again.network == "" and again.mask[50, 40] > 0.9 and again.mask[5, 5] < 0.1
+    mended = cutting.apply_strokes(first, [stroke((60, 80), (0, 0, 1, 1), cutting.REMOVE)])
+    assert cutting.cut_by_network(mended, options).mask[50, 40] > 0.9
+
+
+def test_words_of_the_command_line_are_not_for_the_page(tmp_path):
+    options = CutoutOptions(notify=lambda line: None)
+    save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
+    assert "--" not in cutting.cut_picture(tmp_path / "even.png", "even.png", options).note
+    rgb = np.ones((60, 80, 3))
+    rgb[10:50, 20:60] = 0.8, 0.2, 0.1
+    rgb[20:40, 30:50] = 1
+    save_image(tmp_path / "ring.png", rgb)
+    note = cutting.cut_picture(tmp_path / "ring.png", "ring.png", options).note
+    assert "with 1 enclosed area of it" in note and "--" not in note
 
 
 def test_enclosed_areas_are_cleared_and_filled(tmp_path):
@@ -357,7 +416,7 @@ def test_an_elevation_set_by_hand_stays_with_its_picture(page, made, monkeypatch
     monkeypatch.setattr("gamba_warp.app.actions.apply_strokes", lambda cut, _: cut)
     results = []
     for cut in (one, one, other, one):
-        _, _, _, results, *_ = page.reconstruct(cut, None, results, MagicMock(), lambda *_: None)
+        results = page.reconstruct(cut, None, results, MagicMock(), lambda *_: None)[4]
         if len(results) == 2:
             work.edit(results[1].made, 35, bytes(-(-visible(made.whole, "").num // 8)))
             results[1].made.chosen = 35
