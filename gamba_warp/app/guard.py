@@ -124,7 +124,7 @@ class Painted(msgspec.Struct):
 
 
 class Edit(msgspec.Struct):
-    """What the viewer tells of an object; ``removed`` is a bit for each Gaussian."""
+    """Message of the viewer about its object; ``removed`` has a bit for each Gaussian."""
 
     key: Annotated[str, Meta(max_length=32)]
     elevation: Annotated[float, Meta(ge=LOWEST, le=HIGHEST)]

@@ -101,7 +101,7 @@ class Reconstruction:
 
     @property
     def gaussians(self) -> Gaussians:
-        """What is left, ``[n]``."""
+        """The Gaussians that are left, ``[n]``."""
         return self.whole.select(~self.removed)
 
 

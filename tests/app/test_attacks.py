@@ -100,7 +100,7 @@ def made_square(program):
 
 
 def test_an_edit_that_is_none_is_one_line(served, program):
-    """It changes nothing, as the size of the next file shows."""
+    """Nothing changes, as the size of the next file shows."""
     key, count = made_square(program)
     size = -(-count // 8)
     one, more = bytes([1]) + bytes(size - 1), bytes(size - 1) + b"\xff"

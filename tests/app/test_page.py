@@ -278,8 +278,8 @@ def test_parts_are_erased(opened, tmp_path):
     viewer.evaluate(
         "parent.postMessage({ edit: { key: 'other', elevation: 0, removed: '' } }, '*')"
     )
-    assert "this result has expired" in toast(page)
-    assert page.locator(".toast-body").count() == 1
+    page.wait_for_selector(".toast-body:has-text('this result has expired')")
+    assert not page.locator(".toast-body", has_text="not those of this object").count()
 
 
 def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):

@@ -330,7 +330,7 @@ def test_what_is_removed_is_in_no_file(made, tmp_path, monkeypatch):
 
 
 def test_a_mesh_of_an_object_that_is_edited_meanwhile(page, made, monkeypatch):
-    """It is written, but not kept: it is not that of the object any more."""
+    """The file is written, but the surface, of the object before, is not kept."""
     made = work.Reconstruction("thing", made.whole, made.camera, 0.0, made.picture)
     size = -(-visible(made.whole, "").num // 8)
 
