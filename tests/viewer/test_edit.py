@@ -16,9 +16,9 @@ CAMERA = (1.5, 49.1, 0.0)
 SIDE = 400
 
 
-def row(n=8):
-    """Gaussians side by side, the largest last; the viewer has it first."""
-    means = torch.zeros(n, 3)
+def row(y=0.0, n=8):
+    """Gaussians side by side at a height, the largest last; the viewer has it first."""
+    means = torch.full((n, 1), y) * torch.tensor([0.0, 1.0, 0.0])
     means[:, 0] = torch.linspace(-0.4, 0.4, n)
     found = cloud_of(means, 0.02, 0.9, torch.tensor([0.1, 0.3, 0.9]).expand(n, 3))
     found.scales *= torch.linspace(1, 1.1, n)[:, None]
@@ -29,10 +29,10 @@ def row(n=8):
 def edited(browser_page, tmp_path):
     """Opens the page of a row, whose frame is told of edits in ``told``."""
 
-    def opened(removed=bytes(1), **options):
+    def opened(removed=bytes(1), y=0.0, **options):
         edit = {"key": "row", "elevation": 0.0, "removed": base64.b64encode(removed).decode()}
         path = tmp_path / "row.html"
-        write_viewer(path, "Row", row(), camera=CAMERA, edit=edit)
+        write_viewer(path, "Row", row(y), camera=CAMERA, edit=edit)
         found = browser_page(path, SIDE, 600, reduced_motion="reduce", **options)
         found.promised("gambaViewer.rest()")
         found.page.evaluate("""() => {
@@ -44,19 +44,19 @@ def edited(browser_page, tmp_path):
     return opened
 
 
-def place(page, x):
-    """The pixel of a point at that x, in the middle of the height."""
+def place(page, x, y=0.0):
+    """The pixel of a point with z = 0."""
     box = page.locator("#canvas").bounding_box()
     focal = min(box["width"], box["height"]) / 2 / np.tan(np.radians(CAMERA[1] / 2))
-    return box["width"] / 2 + focal * x / CAMERA[0], box["height"] / 2
+    return box["width"] / 2 + focal * x / CAMERA[0], box["height"] / 2 + focal * y / CAMERA[0]
 
 
-def stroke(page, start, end):
-    """Drag without pressing the mouse anywhere between."""
-    (x, y), (to, _) = place(page, start), place(page, end)
-    page.mouse.move(x, y)
+def stroke(page, start, end, y=0.0):
+    """Drag from one x to another."""
+    (x, height), (to, _) = place(page, start, y), place(page, end, y)
+    page.mouse.move(x, height)
     page.mouse.down()
-    page.mouse.move(to, y, steps=2)  # the brush paints what is between two events, too
+    page.mouse.move(to, height, steps=2)  # the brush paints what is between two events, too
     page.mouse.up()
 
 
@@ -179,7 +179,7 @@ def canvas(opened):
 
 def test_the_object_is_rotated_at_once_for_another_elevation(edited, browser_page, tmp_path):
     """The view stays; the first view is the input's; the picture is that of a rotated object."""
-    opened = edited()
+    opened = edited(y=0.3)
     page, camera = opened.page, "JSON.stringify(gambaViewer.camera.copyOf(gambaViewer.camera))"
     first = canvas(opened)
     page.evaluate("gambaViewer.setCamera({ azimuth: 0.7, elevation: 0.3 })")
@@ -191,7 +191,7 @@ def test_the_object_is_rotated_at_once_for_another_elevation(edited, browser_pag
     assert page.evaluate(camera) == before
     seen = canvas(opened)
     path = tmp_path / "above.html"
-    write_viewer(path, "Row", set_up(row(), 40.0), camera=(*CAMERA[:2], 40.0))
+    write_viewer(path, "Row", set_up(row(0.3), 40.0), camera=(*CAMERA[:2], 40.0))
     other = browser_page(path, SIDE, 600, reduced_motion="reduce")
     other.promised("gambaViewer.rest()")
     other.page.evaluate("gambaViewer.setCamera({ azimuth: 0.7, elevation: 0.3 })")
@@ -200,7 +200,7 @@ def test_the_object_is_rotated_at_once_for_another_elevation(edited, browser_pag
     page.keyboard.press("r")
     assert np.abs(canvas(opened) - first).max() < 2 / 255, "the input's view"
     page.keyboard.press("e")
-    stroke(page, -0.42, -0.15)
+    stroke(page, -0.42, -0.15, 0.3)
     assert states(page)[:3] == [1, 1, 1] and states(page)[-1] == 0, "the brush sees it as it is"
     page.evaluate("postMessage({ elevation: 'x' })")
     assert page.evaluate("gambaViewer.about.edit.elevation") == 40 and not opened.messages
