@@ -378,7 +378,9 @@ def _forget_surfaces(results: list[Result]) -> None:
 def _presented(made: work.Reconstruction) -> tuple:
     """Return state, viewer, the buttons of files, no files, the view, and the elevation."""
     files, on = gr.update(value=None, visible=False), gr.update(visible=True)
-    return (made, []), _frame(made), on, files, VIEWS[1], made.camera[2]
+    info = f"Estimate: {made.estimate}. Change it if the object leans."
+    elevation = gr.update(value=made.camera[2], info=info)
+    return (made, []), _frame(made), on, files, VIEWS[1], elevation
 
 
 def _frame(made: work.Reconstruction) -> str:

@@ -154,7 +154,6 @@ def build(actions: Actions) -> gr.Blocks:
                             value=0,
                             step=1,
                             label="Elevation of the camera, degrees",
-                            info="An estimate; change it if the object leans.",
                             buttons=[],
                             min_width=200,
                         )

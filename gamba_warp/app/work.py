@@ -78,6 +78,7 @@ class Reconstruction:
         surface: the last one that was extracted, or None.
         choice: its number of faces at most, and if it is closed.
         given: key of the picture.
+        estimate: of the elevation, in words.
         chosen: elevation that was set by hand, or None.
         removed: ``[N]`` bool, Gaussians that were removed by hand; every edit makes a new tensor.
         key: unpredictable name.
@@ -91,6 +92,7 @@ class Reconstruction:
     surface: Surface | None = None
     choice: tuple[int, bool] | None = None
     given: str = ""
+    estimate: str = ""
     chosen: float | None = None
     removed: torch.Tensor = field(init=False)
     key: str = field(init=False)
@@ -127,12 +129,12 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconst
     started = time.perf_counter()
     gaussians = reconstruct(model, rgba).to("cpu")
     seconds = time.perf_counter() - started
-    angle = estimate_elevation(gaussians).degrees if elevation is None else elevation
+    estimate = estimate_elevation(gaussians)
+    angle = estimate.degrees if elevation is None else elevation
     camera = model.config.distance, model.config.fov, angle
     upright, picture = set_up(gaussians, angle), to_uint8(shrink(rgba, _PICTURE))
-    return Reconstruction(
-        cut.name, upright, camera, seconds, picture, given=cut.key, chosen=elevation
-    )
+    words = {"given": cut.key, "estimate": str(estimate)}
+    return Reconstruction(cut.name, upright, camera, seconds, picture, **words, chosen=elevation)
 
 
 def surface_of(

@@ -204,6 +204,7 @@ def test_the_object_is_rotated_at_once(opened, tmp_path):
     viewer = shown_viewer(page)
     number = page.locator("#elevation input[type=number]")
     estimate = int(number.input_value())
+    assert f"Estimate: {estimate} degrees" in page.locator("#elevation").inner_text()
     whole = read_gaussians(downloaded(page, "ply", tmp_path / "whole.ply"))
     viewer.evaluate("gambaViewer.rest(), gambaViewer.setCamera({ azimuth: 0.5 })")
     assert_clear(page, "#elevation")

@@ -98,7 +98,7 @@ def run_json(capsys, *words) -> dict:
 def test_the_app_begins_with_the_estimate():
     cut = cutting.cut_picture(ICON, "thing.png", CutoutOptions())
     made = work.run_model(load_model(), cut)
-    assert made.camera[2] > 10
+    assert made.camera[2] > 10 and made.estimate == f"{made.camera[2]} degrees"
     assert work.run_model(load_model(), cut, 3.0).camera[2] == 3.0
 
 
