@@ -133,8 +133,9 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Reconst
     angle = estimate.degrees if elevation is None else elevation
     camera = model.config.distance, model.config.fov, angle
     upright, picture = set_up(gaussians, angle), to_uint8(shrink(rgba, _PICTURE))
-    words = {"given": cut.key, "estimate": str(estimate)}
-    return Reconstruction(cut.name, upright, camera, seconds, picture, **words, chosen=elevation)
+    made = Reconstruction(cut.name, upright, camera, seconds, picture)
+    made.given, made.estimate, made.chosen = cut.key, str(estimate), elevation
+    return made
 
 
 def surface_of(
