@@ -47,13 +47,13 @@ def operator(settings: Settings) -> list[Variant]:
     return pair(problem, "default", default=True) + pair(_turned(problem), "[B, D, L]")
 
 
-_TURNED = ("u", "delta", "B", "C", "z")
+_TRANSPOSED = ("u", "delta", "B", "C", "z")
 
 
 def _turned(problem: Operator) -> Operator:
     """Return the same operator in mamba-ssm's layout."""
     function = partial(selective_scan_fn, delta_softplus=True)
-    return replace(problem, function=function, turned=(*_TURNED, "out"))
+    return replace(problem, function=function, transposed=(*_TRANSPOSED, "out"))
 
 
 def _peer(problem: Operator, function: Callable, channels_first: bool = True) -> Operator:
@@ -62,7 +62,7 @@ def _peer(problem: Operator, function: Callable, channels_first: bool = True) ->
         problem,
         function=function,
         limits=dict.fromkeys(problem.limits, 1e-4),
-        turned=(*_TURNED, "out") if channels_first else (),
+        transposed=(*_TRANSPOSED, "out") if channels_first else (),
         compared=False,
     )
 
@@ -123,7 +123,9 @@ def layers(settings: Settings) -> list[Variant]:
             if settings.peers and settings.device.type == "cuda":
                 theirs, label = peers.mamba_ssm_scan, f"mamba-ssm, {name}"
                 made += pair(_peer(problem, theirs), label, peer=True)
-                last = _peer(problem, peers.channels_last(theirs, _TURNED), channels_first=False)
+                last = _peer(
+                    problem, peers.channels_last(theirs, _TRANSPOSED), channels_first=False
+                )
                 made += pair(last, f"{label}, channels last", peer=True)
             if length * width <= 2048 * 1536:  # others' code in torch takes seconds
                 loop, slow = _peer(problem, peers.scan_loop), {"peer": True, "rounds": 3}

@@ -33,7 +33,7 @@ def conv_problem(
     device: torch.device,
     sizes: tuple[int, int, int, int],
     function: Callable[..., Tensor] = silu,
-    turned: bool = False,
+    transposed: bool = False,
     state: bool = False,
 ) -> Operator:
     """Return ``function(x, weight, bias)``; the oracle sees all channels of the first tokens.
@@ -42,7 +42,7 @@ def conv_problem(
         device: of the operator.
         sizes: batch, tokens, channels and taps.
         function: the operator, or another package's.
-        turned: True if it takes ``x [B, D, L]``.
+        transposed: True if it takes ``x [B, D, L]``.
         state: True if ``initial_state`` is an input too.
     """
     batch, length, width, taps = sizes
@@ -68,7 +68,7 @@ def conv_problem(
         HALF_LIMITS,
         cast=("x", "out"),
         corner=dict.fromkeys(("x", "out"), (slice(None), slice(tokens))),
-        turned=("x", "out") if turned else (),
+        transposed=("x", "out") if transposed else (),
     )
 
 

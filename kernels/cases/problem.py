@@ -67,7 +67,7 @@ class Operator:
         half_limits: limits in half precision, explained by the rounding of inputs and output.
         cast: names of the inputs that a dtype holds for.
         corner: index of the corner by name of an input, or "out".
-        turned: inputs, and "out", whose last two dimensions are exchanged for ``function``.
+        transposed: inputs, and "out", whose last two dimensions are exchanged for ``function``.
         fixed: inputs without a gradient.
         compared: True to compare gradients too, not only the output.
     """
@@ -83,7 +83,7 @@ class Operator:
     half_limits: Mapping[torch.dtype, float] = field(default_factory=dict)
     cast: tuple[str, ...] = ()
     corner: Mapping[str, Any] = field(default_factory=dict)
-    turned: tuple[str, ...] = ()
+    transposed: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     compared: bool = True
     truths: dict = field(default_factory=dict)
@@ -107,7 +107,7 @@ class Operator:
         return {k: x for k, x in self._laid[dtype].items() if k != "out"}
 
     def _turn(self, name: str, x: Tensor) -> Tensor:
-        return x.mT.contiguous() if name in self.turned else x
+        return x.mT.contiguous() if name in self.transposed else x
 
     def call(self, inputs: dict[str, Tensor], **options: Any) -> Tensor:
         """Call the operator."""

@@ -4,7 +4,7 @@
 // runs three tokens behind.
 #include "window.h"
 const auto dout_rows = rows_(dout_in, b, 0, d, width);
-#if TURNED
+#if TRANSPOSED
 // Turned as they are read and written. Whole tiles are read before and behind for three tokens.
 F x_lanes[PIECE + 32], dout_lanes[PIECE + 16], dx_lanes[PIECE];
 const int first = t0 == begin ? t0 : t0 - 16, last = end + 16 < stop ? end + 16 : stop;
@@ -62,7 +62,7 @@ for (; t < end + 3; ++t) {
     step(t, x3, g3, t < stop, t < end);
 }
 complete();
-#if TURNED
+#if TRANSPOSED
 auto dx_of = [&](int t) { return dx_lanes[t - t0]; };
 if (dx_out.shape[1] > 0) scatter_(rows_(dx_out, b, 0, d, width), t0, end, dx_of, false);
 #endif

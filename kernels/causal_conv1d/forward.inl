@@ -1,9 +1,9 @@
-// needs: kernels.py: y_out, use_silu, stream, AHEAD, WIDTH, x_in, TURNED
+// needs: kernels.py: y_out, use_silu, stream, AHEAD, WIDTH, x_in, TRANSPOSED
 // gives: the body of conv_forward
 // Equation 1 for a strip of tokens.
 #include "window.h"
 const auto ys = rows_(y_out, b, 0, d, width);
-#if TURNED  // lanes are the tokens of a channel
+#if TRANSPOSED  // lanes are the tokens of a channel
 for (int i = 0; i < width; ++i) {
     auto tap = [&](const F* row) { return splat(((const float*)row)[i]); };
     const F w0 = tap(w), w1 = tap(w + taps), w2 = tap(w + 2 * taps), w3 = tap(w + 3 * taps);

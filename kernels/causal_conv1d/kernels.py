@@ -16,9 +16,9 @@ from ..runtime.scalars import BITS, EXP2, RECIPROCAL
 
 TAPS = 4
 # Tokens of a forward task; on a CPU few, because each row may be in another page, but many where x
-# is turned.
+# is transposed.
 STRIP = {"cpu": 16, "cuda": 128}
-TURNED_STRIP = 512
+TRANSPOSED_STRIP = 512
 # Tokens of a backward task, each with its own sum for the gradient of the weight.
 CHUNK = {"cpu": 64, "cuda": 128}
 # Tokens that a CPU adds one after the other: equal terms would round to the same side 64 times.
@@ -29,7 +29,7 @@ VALUES = {"cpu": (lanes, W), "cuda": (wp.vec4, 4)}  # type of a value, and its c
 _INDICES = {False: "task, k", True: "k, task"}  # of a launch: adjacent memory follows last
 
 
-def _text(file: str, device_type: str, io: torch.dtype, piece: int, turned: bool) -> str:
+def _text(file: str, device_type: str, io: torch.dtype, piece: int, transposed: bool) -> str:
     on_cpu = device_type == "cpu"
     head = PRELUDE if on_cpu else EXP2 + RECIPROCAL
     return head + native(
@@ -37,7 +37,7 @@ def _text(file: str, device_type: str, io: torch.dtype, piece: int, turned: bool
         ELEMENT=BITS[io]["ELEMENT"],
         WIDTH=VALUES[device_type][1],
         PIECE=piece,
-        TURNED=turned,
+        TRANSPOSED=transposed,
         RUN=RUN if on_cpu else 0,
         AHEAD=AHEAD,
     )
@@ -57,27 +57,27 @@ def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:
 
 
 @functools.cache
-def forward_kernel(device_type: str, io: torch.dtype, turned: bool) -> Any:
+def forward_kernel(device_type: str, io: torch.dtype, transposed: bool) -> Any:
     """The kernel for tensors of dtype ``io`` on a device of that type (README, equation 1).
 
-    If x is ``turned`` (``runtime.views.is_turned``), the launch's first dimension is channels.
+    If x is ``transposed`` (``runtime.views``), the launch's first dimension is channels.
     """
-    piece = TURNED_STRIP if turned else STRIP[device_type]
-    text = _text("forward.inl", device_type, io, piece, turned)
+    piece = TRANSPOSED_STRIP if transposed else STRIP[device_type]
+    text = _text("forward.inl", device_type, io, piece, transposed)
     inputs = {**_window(device_type, io), "stream": int}
     outputs = {"y_out": wp.array3d(dtype=WARP_DTYPES[io])}
-    return native_kernel("conv_forward", text, inputs, outputs, _INDICES[turned])
+    return native_kernel("conv_forward", text, inputs, outputs, _INDICES[transposed])
 
 
 @functools.cache
-def backward_kernel(device_type: str, io: torch.dtype, turned: bool) -> Any:
+def backward_kernel(device_type: str, io: torch.dtype, transposed: bool) -> Any:
     """The kernel of the gradients (README, equation 2); the weight's are one sum per chunk.
 
-    It is ``turned`` where x or the gradient of the output is.
+    It is ``transposed`` where x or the gradient of the output is.
     """
-    text = _text("backward.inl", device_type, io, CHUNK[device_type], turned)
+    text = _text("backward.inl", device_type, io, CHUNK[device_type], transposed)
     rows = wp.array3d(dtype=WARP_DTYPES[io])
     inputs = {**_window(device_type, io), "dout_in": rows}
     sums = wp.array3d(dtype=VALUES[device_type][0])
     outputs = {"dx_out": rows, "dstate_out": rows, "dweight_out": sums}
-    return native_kernel("conv_backward", text, inputs, outputs, _INDICES[turned])
+    return native_kernel("conv_backward", text, inputs, outputs, _INDICES[transposed])

@@ -9,8 +9,8 @@ from ..runtime.native import streams
 from ..runtime.operator import operator
 from ..runtime.packed import count_slots, pieces
 from ..runtime.stand_in import kind_of
-from ..runtime.views import dense, is_turned, laid_as, lane_contiguous, view
-from .kernels import CHUNK, STRIP, TAPS, TURNED_STRIP, VALUES, backward_kernel, forward_kernel
+from ..runtime.views import dense, is_transposed, laid_as, lane_contiguous, view
+from .kernels import CHUNK, STRIP, TAPS, TRANSPOSED_STRIP, VALUES, backward_kernel, forward_kernel
 
 _ARGUMENTS = "Tensor x, Tensor weight, Tensor? bias, Tensor? state, Tensor? packed, bool silu"
 _FEW = 1 << 15  # elements that one thread has done before it could wake another
@@ -69,14 +69,14 @@ def conv(x, weight, bias, state, packed, silu):
     """
     kind = kind_of(x.device)
     x = dense(x)
-    turned = is_turned(x)
-    strips, where = _pieces(x, packed, TURNED_STRIP if turned else STRIP[kind])
+    transposed = is_transposed(x)
+    strips, where = _pieces(x, packed, TRANSPOSED_STRIP if transposed else STRIP[kind])
     blocks, w, v, rows = _operands(x, weight, bias, state)
     out = _like(x)
-    kernel = forward_kernel(kind, x.dtype, turned)
-    stream = int(kind == "cpu" and streams([out]) and not (turned and packed is not None))
+    kernel = forward_kernel(kind, x.dtype, transposed)
+    stream = int(kind == "cpu" and streams([out]) and not (transposed and packed is not None))
     inputs = [int(silu), where, x, w, v, rows, stream]
-    _launch(x, kernel, (blocks, strips) if turned else (strips, blocks), inputs, [out])
+    _launch(x, kernel, (blocks, strips) if transposed else (strips, blocks), inputs, [out])
     return out
 
 
@@ -96,7 +96,7 @@ def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     kind = kind_of(x.device)
     chunks, where = _pieces(x, packed, CHUNK[kind])
     x, dout = dense(x), dense(dout)
-    turned = is_turned(x) or is_turned(dout)
+    transposed = is_transposed(x) or is_transposed(dout)
     value, width = VALUES[kind]
     blocks, w, v, rows = _operands(x, weight, bias, state)
     dx = _like(x) if need_x else x.new_empty(batch, 0, channels)
@@ -107,8 +107,8 @@ def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     shaped = dweight.view(*dweight.shape[:2], blocks, width) if width > 1 else dweight
     _launch(
         x,
-        backward_kernel(kind, x.dtype, turned),
-        (blocks, chunks) if turned else (chunks, blocks),
+        backward_kernel(kind, x.dtype, transposed),
+        (blocks, chunks) if transposed else (chunks, blocks),
         [int(silu), where, x, w, v, rows, dout],
         [dx, dstate, view(shaped, value)],
     )

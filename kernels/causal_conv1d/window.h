@@ -1,4 +1,5 @@
-// needs: kernels.py: WIDTH, TURNED, x_in, PIECE, pieces_in, task, k, state_in, weight_in, bias_in;
+// needs: kernels.py: WIDTH, TRANSPOSED, x_in, PIECE, pieces_in, task, k, state_in, weight_in,
+// bias_in;
 //     scalars.py: reciprocal_, exp2_, ELEMENT; lanes.h: rows_, read_, write_, put_, fma_, sigmoid_
 // gives: F, each_, fma_, sigmoid_, one, rows_, b, t0, d, width, read_, write_, put_, next_, pieces,
 //     begin, stop, own, end, rows, before, w, taps, w0, w1, w2, w3, bias, x0, x1, x2, start
@@ -94,10 +95,10 @@ if (pieces_in.shape[0] > 0) {
 } else b = own = task / pieces, t0 = task % pieces * PIECE;
 #if !defined(__CUDA_ARCH__)
 // Each row is in another page, so no processor prefetches what the next task reads: the next lanes,
-// or of turned rows the next tokens, whose lines these tokens share.
+// or of transposed rows the next tokens, whose lines these tokens share.
 auto next_ = [&](const auto& rows, int t) {
     const int own = t - t0, lines = PIECE * sizeof(*rows.first) / 64;
-    __builtin_prefetch(!TURNED
+    __builtin_prefetch(!TRANSPOSED
             ? (char*)(rows.row(t) + WIDTH)
             : (char*)rows.row(t0 + PIECE) + own / lines * rows.across + own % lines * 64 + 63);
 };

@@ -16,7 +16,7 @@ from .projection import LensOptions, Projected
 from .skip import Skip
 from .tiles import Limits, Size, Walk
 
-EVERYTHING = Skip()
+DEFAULT_SKIP = Skip()
 _WEIGHT_EPS = 1e-10  # a sum of weights below this has no expected depth
 
 
@@ -55,7 +55,7 @@ def rasterization(
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
     t_min: float = T_MIN,
-    skip: Skip = EVERYTHING,
+    skip: Skip = DEFAULT_SKIP,
 ) -> tuple[Tensor, Tensor, Meta]:
     """Renders N Gaussians of each object in each of its V views, all in single launches.
 

@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from ..runtime.memory import empty
-from ..runtime.views import Packed, as_struct, filled, struct
+from ..runtime.views import StructValue, as_struct, filled, struct
 
 # Status of a (view, Gaussian).
 VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
@@ -142,7 +142,7 @@ def project_forward(inputs: Sequence[Any], lens: Lens, run: Callable[..., None])
         status=empty_on(device, [*shape, num], torch.int32),
     )
     if projected.status.numel():
-        scene = Packed(Scene, *gaussians, viewmats, Ks)
+        scene = StructValue(Scene, *gaussians, viewmats, Ks)
         per_view = int(colors.dim() > gaussians[0].dim())
         arguments = [shape[-1], num, lens, scene, per_view, colors.flatten(0, -2)]
         run(shape.numel(), num, [*arguments, as_struct(projected)], device)
@@ -185,10 +185,10 @@ def project_backward(
     v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[5] else None
     if status.numel():
         arguments = [
-            *(views, num, lens, Packed(Scene, *gaussians, viewmats, Ks)),
+            *(views, num, lens, StructValue(Scene, *gaussians, viewmats, Ks)),
             as_struct(Projected(conics=conics, status=status)),
             as_struct(Projected(*cotangents)),
-            Packed(Scene, *grads, None, None),
+            StructValue(Scene, *grads, None, None),
         ]
         run(batch, num, arguments, v_viewmats)
     if v_viewmats is not None:

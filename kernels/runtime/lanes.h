@@ -124,8 +124,8 @@ auto sigmoid_ = [&](F v) -> F {
 };
 #undef TABLED
 
-// Rows of a tensor [B, L, D] as lanes. Its channels are dense, or its tokens are, and it is turned.
-// The other dimensions may be strided.
+// Rows of a tensor [B, L, D] as lanes. Its channels are dense, or its tokens are, and it is
+// transposed. The other dimensions may be strided.
 
 // The rows from batch element b, token t0 and channel d on: lanes past the width are read as 0 and
 // not written.
@@ -136,7 +136,7 @@ auto rows_ = [](auto& array, int b, int t0, int d, int width) __attribute__((alw
         size_t step, across;  // bytes between tokens, and between channels
         int width;
         decltype(at) row(int t) const { return (decltype(at))((char*)first + t * step); }
-        bool turned() const { return across != sizeof(*first) && step == sizeof(*first); }
+        bool transposed() const { return across != sizeof(*first) && step == sizeof(*first); }
         // rows of which each is a channel; their lanes are the tokens from t to before ``end``
         Rows channels(int t, int end) const { return {row(t), across, step, end - t}; }
     };
@@ -203,8 +203,8 @@ auto put_ = [&](const auto& rows, int t, F v, bool stream) __attribute__((always
     else write_(rows, t, v);
 };
 
-// Calls tile(t, width, end) for the tokens from begin to before ``end`` of turned rows, by sixteen
-// or fewer at the end; full tiles are compiled separately.
+// Calls tile(t, width, end) for the tokens from begin to before ``end`` of transposed rows, by
+// sixteen or fewer at the end; full tiles are compiled separately.
 auto tiles_ = [](const auto& rows, int begin, int end, auto tile) __attribute__((always_inline)) {
     for (int t = begin; t < end; t += 16)
         if (rows.width >= 16 && t + 16 <= end) tile(t, 16, t + 16);
@@ -221,7 +221,7 @@ struct Lanes {
 auto gather_ = [&](const auto& rows, int begin, int end, F* to, size_t step)
                    __attribute__((always_inline)) -> Lanes {
     const Lanes lanes = {(float*)to, step, begin, 16};
-    if (!rows.turned())
+    if (!rows.transposed())
         for (int t = begin; t < end; ++t) write_(lanes, t, read_(rows, t));
     else
         tiles_(rows, begin, end, [&](int t, int width, int stop) __attribute__((always_inline)) {
@@ -236,7 +236,7 @@ auto gather_ = [&](const auto& rows, int begin, int end, F* to, size_t step)
 // Writes ``value(t)`` of tokens t.
 auto scatter_ = [&](const auto& rows, int begin, int end, auto value,
                     bool stream) __attribute__((always_inline)) {
-    if (!rows.turned())
+    if (!rows.transposed())
         for (int t = begin; t < end; ++t) put_(rows, t, value(t), stream);
     else
         tiles_(rows, begin, end, [&](int t, int width, int stop) __attribute__((always_inline)) {

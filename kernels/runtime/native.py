@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from .views import is_turned
+from .views import is_transposed
 
 _INCLUDE = re.compile(r'^[ \t]*#include "(.+)"[ \t]*\n', re.MULTILINE)
 
@@ -120,7 +120,7 @@ def streams(results: Sequence[Tensor]) -> bool:
     written = [x for x in results if x.numel()]
     return bool(written) and all(
         x.dtype == torch.float32
-        and x.shape[1 if is_turned(x) else 2] % W == 0
+        and x.shape[1 if is_transposed(x) else 2] % W == 0
         and x.data_ptr() % 64 == 0
         and 4 * x.numel() >= _STREAMED
         for x in written

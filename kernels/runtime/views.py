@@ -81,7 +81,7 @@ def _describe(tensor: Tensor, dtype, name: str) -> Any:
     return type(made).from_buffer_copy(made)  # a copy that does not keep the tensor alive
 
 
-class Packed:
+class StructValue:
     """A Warp struct of tensors and numbers, as a launch takes it.
 
     An instance of the struct itself would take 10 µs for each array that it is given; this takes
@@ -158,9 +158,9 @@ def struct_of(record: type) -> Any:
     return wp.struct(type(record.__name__, (), {"__annotations__": fields, **names}))
 
 
-def as_struct(record: Any) -> Packed:
+def as_struct(record: Any) -> StructValue:
     """A record of tensors, or None, as a launch takes it; kernels call its type ``struct_of``."""
-    return Packed(struct_of(type(record)), *record)
+    return StructValue(struct_of(type(record)), *record)
 
 
 def lane_contiguous(tensor: Tensor) -> Tensor:
@@ -168,7 +168,7 @@ def lane_contiguous(tensor: Tensor) -> Tensor:
     return tensor if tensor.stride(-1) == 1 or tensor.shape[-1] == 1 else tensor.contiguous()
 
 
-def is_turned(x: Tensor) -> bool:
+def is_transposed(x: Tensor) -> bool:
     """True if a CPU's kernels read ``[B, L, D]`` along its tokens: these are dense, channels not.
 
     It is a view of mamba-ssm's ``[B, D, L]``. CUDA's kernels have none.
@@ -178,13 +178,13 @@ def is_turned(x: Tensor) -> bool:
 
 
 def dense(x: Tensor) -> Tensor:
-    """The tensor itself if it is turned or its channels are dense, else a dense copy."""
-    return x if is_turned(x) else lane_contiguous(x)
+    """The tensor itself if it is transposed or its channels are dense, else a dense copy."""
+    return x if is_transposed(x) else lane_contiguous(x)
 
 
 def laid_as(x: Tensor, make: Callable[[tuple[int, ...]], Tensor]) -> Tensor:
-    """Result of the shape ``[B, L, D]`` of x, turned if x is; ``make`` gives dense memory."""
-    if not is_turned(x):
+    """Result of the shape ``[B, L, D]`` of x, transposed if x is; ``make`` gives dense memory."""
+    if not is_transposed(x):
         return make(tuple(x.shape))
     batch, length, channels = x.shape
     return make((batch, channels, length)).transpose(1, 2)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..runtime.launch import parallel_launch
 from ..runtime.native import native, native_kernel
-from ..runtime.views import Packed, struct
+from ..runtime.views import StructValue, struct
 from .products import box_of_windows, groups
 from .reference import C1, C2, EDGE, SIGMA, WINDOW
 
@@ -111,7 +111,7 @@ def _compute(got: Tensor, want: Tensor, slope: Tensor | None, scratch: Tensor) -
     shift = (2 * want[:, :1, :1]).repeat(1, 1, width, 1).flatten(2)
     by, col, out = (None,) * 3 if slope is None else (*between, _rows(slope[:, box[0], box[1]]))
     a, b = _rows(got), _rows(want)
-    maps = Packed(Maps, channels, 1 / windows, a, b, shift, hor, values, by, col, out)
+    maps = StructValue(Maps, channels, 1 / windows, a, b, shift, hor, values, by, col, out)
     inner, outer = (-(-x.shape[2] // _LANES) for x in (hor, a))
     parallel_launch(_across, (count * height, inner), [maps])
     parallel_launch(_down, (count * values.shape[1], inner), [maps])

@@ -17,7 +17,7 @@ import warp as wp
 from warp._src import context as warp_context
 
 from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
-from gamba_warp.kernels.runtime.views import Packed
+from gamba_warp.kernels.runtime.views import StructValue
 
 from .contract import contracted
 from .machine import FAULTS, Array, Count, Finding, Launch, Missing, library
@@ -161,7 +161,7 @@ def _tensors(values) -> list[torch.Tensor]:
     """The tensors that a launch is given, those inside of structs too."""
     found = []
     for value in values:
-        if isinstance(value, Packed):
+        if isinstance(value, StructValue):
             found += _tensors(value.values)
         elif isinstance(owner := getattr(value, "owner", value), torch.Tensor):
             found.append(owner)

@@ -18,7 +18,7 @@ import warp as wp
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.native import native, native_kernel
-from ...runtime.views import Packed, as_struct, struct, struct_of
+from ...runtime.views import StructValue, as_struct, struct, struct_of
 from ..projection import Projected
 from ..skip import SQUARES, TILE_TEST
 from ..tiles import SLACK, SLACK_ABS, Bins, Grid
@@ -72,7 +72,9 @@ _scatter = native_kernel(
 )
 
 
-def _sort_lists(count: int, longest: int, splats: Packed, staged: Any, lists: Packed) -> None:
+def _sort_lists(
+    count: int, longest: int, splats: StructValue, staged: Any, lists: StructValue
+) -> None:
     workers = torch.get_num_threads()
     counter = torch.zeros(1, dtype=torch.int32)
     workspace = torch.empty(workers, 2 * max(longest, 1), dtype=torch.int64)
@@ -95,7 +97,7 @@ def bin_views(grid: Grid, projected: Projected, check: Callable[[int], None]) ->
     starts = order.new_empty(images * tiles + 1)
     count = torch.empty((), dtype=torch.int64)
     splats = as_struct(projected)
-    work = Packed(
+    work = StructValue(
         Work,
         empty([groups * 16], torch.int32),
         empty([groups * 16], torch.int16),

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.native import native, native_kernel
-from ...runtime.views import Packed, as_struct, struct, struct_of, view
+from ...runtime.views import StructValue, as_struct, struct, struct_of, view
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
 from ..tiles import SLACK, SLACK_ABS, Bins, Drawn, Picture, Pixels, Walk
@@ -79,10 +79,10 @@ _sum_rows = native_kernel(
 )
 
 
-def _workers(size: int) -> Packed:
+def _workers(size: int) -> StructValue:
     """Room for ``size`` lanes of each worker."""
     workspace = torch.empty(torch.get_num_threads() * size * 16, dtype=torch.float32)
-    return Packed(Workers, torch.zeros(1, dtype=torch.int32), workspace)
+    return StructValue(Workers, torch.zeros(1, dtype=torch.int32), workspace)
 
 
 def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tensor, Tensor, Walk]:
@@ -114,7 +114,7 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         as_struct(splats),
         as_struct(bins),
         as_struct(walk),
-        Packed(Pixels, renders, transmittances),
+        StructValue(Pixels, renders, transmittances),
         _workers(BLOCKS * channels),
     ]
     parallel_launch(_composite, torch.get_num_threads(), arguments)
@@ -155,9 +155,9 @@ def composite_backward(
         as_struct(splats),
         as_struct(bins),
         as_struct(walk),
-        Packed(Pixels, *v_pixels),
+        StructValue(Pixels, *v_pixels),
         _workers(channels + BLOCKS * (channels + 1)),
-        Packed(Rows, sums, written, skipped, int(geometry)),
+        StructValue(Rows, sums, written, skipped, int(geometry)),
     ]
     kernel = _composite_vjp[absolute is not None, passes]
     parallel_launch(kernel, torch.get_num_threads(), arguments)
@@ -191,7 +191,7 @@ def reduce_rows(
     arguments = [
         as_struct(Drawn(conics=conics, view_opacities=view_opacities)),
         as_struct(bins),
-        Packed(Rows, sums, written, None, int(geometry)),
+        StructValue(Rows, sums, written, None, int(geometry)),
         as_struct(v),
         None if absolute is None else view(absolute.view(-1, 2), wp.vec2),
     ]

@@ -82,7 +82,7 @@ auto root_of_ = [&](const F* c, F (*L)[3]) {
     L[1][0] = b, L[1][1] = e, L[1][2] = F{};
     L[2][0] = d, L[2][1] = f, L[2][2] = root_(left_(rest - f * f));
 };
-auto turned_ = [&](const F* row, const F (*R)[3], F* out) {
+auto rotated_ = [&](const F* row, const F (*R)[3], F* out) {
     for (int k = 0; k < 3; ++k)
         out[k] = fma_(row[2], R[2][k], fma_(row[1], R[1][k], row[0] * R[0][k]));
 };
@@ -143,7 +143,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     const size_t g = (size_t)object * num + i0;
     F v_mean[3] = {}, v_scale[3] = {}, v_opacity = F{}, v_R[3][3] = {}, v_covar[6] = {};
     F mean[3], scale[3], q[4], R[3][3] = {}, size = F{};
-    const bool turns = scene.quats.data || scene.covars.data;
+    const bool rotates = scene.quats.data || scene.covars.data;
     I ever = I{};
     for (int view = 0; view < views; ++view) {
         const size_t image = (size_t)object * views + view, i = image * num + i0;
@@ -180,7 +180,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         to_camera_(camera, mean, t);
         jacobian_(camera, t, slopes, P);
         for (int r = 0; r < 2; ++r)
-            if (turns) turned_(P[r], R, N[r]);
+            if (rotates) rotated_(P[r], R, N[r]);
             else
                 for (int k = 0; k < 3; ++k) N[r][k] = P[r][k];
         for (int k = 0; k < 3; ++k) {
@@ -228,7 +228,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
                 gather_(v_R[r][j], fma_(P[1][r], v_N[1][j], P[0][r] * v_N[0][j]));
         for (int r = 0; r < 2; ++r)
             for (int j = 0; j < 3; ++j)
-                v_P[r][j] = turns
+                v_P[r][j] = rotates
                     ? fma_(v_N[r][2], R[j][2], fma_(v_N[r][1], R[j][1], v_N[r][0] * R[j][0]))
                     : v_N[r][j];
         auto v_J = [&](int r, int j) -> F {  // times the transpose of W
@@ -273,8 +273,8 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         }
         // the gradient of a shorter one leaves float32's range
         const I some = ever & (I)(size > 1e-30f);
-        const F turn = lens.original ? F{} : dot;
-        for (int j = 0; j < 4; ++j) v_q[j] = some ? (s[j] - q[j] * turn) / size : F{};
+        const F along_q = lens.original ? F{} : dot;
+        for (int j = 0; j < 4; ++j) v_q[j] = some ? (s[j] - q[j] * along_q) / size : F{};
     }
     write_(v_scene.quats.data + g, 4, n, v_q);
 }
@@ -335,7 +335,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
             F R[3][3], N[2][3];
             if (scene.covars.data) root_of_(covar, R);
             else rotate_(q, length_(q), R);
-            for (int r = 0; r < 2; ++r) turned_(M[r], R, N[r]);
+            for (int r = 0; r < 2; ++r) rotated_(M[r], R, N[r]);
             for (int k = 0; k < 3; ++k) M[0][k] = N[0][k], M[1][k] = N[1][k];
         }
         F *const m0 = M[0], *const m1 = M[1];

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...runtime.launch import cuda_launch
 from ...runtime.stand_in import multiprocessors_of
-from ...runtime.views import Packed, as_struct
+from ...runtime.views import StructValue, as_struct
 from ..constants import BLOCKS
 from ..tiles import CHUNK, Bins, Drawn, Picture, Pixels, Walk
 from .backward import Rows, Sums, backward_kernels, row_sizes
@@ -48,7 +48,7 @@ def _launch(
 ) -> None:
     """Launches both ``kernels`` of each chunk of channels, with so many warps, some a block."""
     for first in range(0, channels if warps[0] else 0, chunk):
-        gaussians = Packed(Gaussians, records, channels, first)
+        gaussians = StructValue(Gaussians, records, channels, first)
         for kernel, count in zip(kernels(min(chunk, channels - first)), warps):
             arguments = [picture, gaussians, *inputs]
             threads = WARP * block
@@ -84,7 +84,7 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         walk.records,
         channels,
         [as_struct(bins)],
-        [as_struct(walk), Packed(Pixels, renders, transmittances)],
+        [as_struct(walk), StructValue(Pixels, renders, transmittances)],
     )
     return renders, transmittances, walk
 
@@ -108,7 +108,7 @@ def composite_backward(
     # a chunk without gradients does not write its part of a row that another chunk has written
     make = colors.new_empty if channels <= CHUNK else colors.new_zeros
     sums = [make(pairs, size) for size in row_sizes(channels, absolute is not None)]
-    rows = Packed(Rows, *sums, bins.pairs.new_zeros(-(-pairs // 32)), skipped)
+    rows = StructValue(Rows, *sums, bins.pairs.new_zeros(-(-pairs // 32)), skipped)
     # a pixel's absolute gradient is of all channels: several chunks leave it to another launch
     apart = absolute is not None and channels > CHUNK
     given = (
@@ -116,7 +116,7 @@ def composite_backward(
         picture,
         walk.records,
         channels,
-        [as_struct(bins), as_struct(walk), Packed(Pixels, *v_pixels)],
+        [as_struct(bins), as_struct(walk), StructValue(Pixels, *v_pixels)],
         [rows],
         parts,
     )

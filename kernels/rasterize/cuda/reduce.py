@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.views import Packed, as_struct, struct_of, view
+from ...runtime.views import StructValue, as_struct, struct_of, view
 from ..projection import Projected
 from ..tiles import CHUNK, Bins, Drawn
 from . import leaves as L
@@ -89,7 +89,7 @@ def _add_rows(
 
 
 def reduce_rows(
-    rows: Packed, splats: Drawn, bins: Bins, geometry: bool, absolute: Tensor | None
+    rows: StructValue, splats: Drawn, bins: Bins, geometry: bool, absolute: Tensor | None
 ) -> Drawn:
     """Sum rows by (view, Gaussian), as the CPU's; all rows are written.
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from ...runtime.launch import launch
 from ...runtime.operator import operator
 from ...runtime.stand_in import kind_of
-from ...runtime.views import Packed
+from ...runtime.views import StructValue
 from ..projection import empty_on
 from . import cpu, cuda
 from .formula import colors_by_formula, sums_by_formula
@@ -25,9 +25,9 @@ def _kernels(device: torch.device):
 def _launch(kernel, chunk: int, tensors: list, outputs: list) -> None:
     """Run a kernel on chunks of Gaussians; ``tensors`` are the fields of ``Arrays``."""
     coefficients, means, centers, _ = tensors
-    size = Packed(Size, means.shape[1], centers.shape[1], int(coefficients.dim() == 5))
+    size = StructValue(Size, means.shape[1], centers.shape[1], int(coefficients.dim() == 5))
     tasks = means.shape[0] * -(-means.shape[1] // chunk)
-    launch(kernel, tasks, [size, Packed(Arrays, *tensors)], outputs, means.device)
+    launch(kernel, tasks, [size, StructValue(Arrays, *tensors)], outputs, means.device)
 
 
 def _empty_colors(coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ def _harmonics_vjp(
     v_means = torch.zeros_like(means) if wanted[1] else None
     chunks = -(-num // kernels.CHUNK)
     v_centers = means.new_zeros(batch, views, chunks, 3) if wanted[2] else None
-    v_arrays = Packed(Arrays, v_coefficients, v_means, v_centers, v_colors)
+    v_arrays = StructValue(Arrays, v_coefficients, v_means, v_centers, v_colors)
     kernel = kernels.backward_kernel(degree, shape[-1], clamped)
     _launch(kernel, kernels.CHUNK, arrays, [v_arrays])
     grads = v_coefficients, v_means, None if v_centers is None else v_centers.sum(2)

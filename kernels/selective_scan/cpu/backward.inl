@@ -1,7 +1,8 @@
 // needs: lanes.h: F, fma_, splat, put_, scatter_; kernels.py: work_out, sums_out, sizes, rows_in,
 //     task, a_in, skip_in, bias_in, u_in, delta_in, z_in, dout_in, dlast_in, TOKENS, AT_ONCE,
-//     TURNED, starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB, NEED_DC, NEED_DZ,
-//     NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out; problem.py: WEIGHTED
+//     TRANSPOSED, starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB, NEED_DC,
+//     NEED_DZ, NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out; problem.py:
+//     WEIGHTED
 // gives: the body of scan_backward
 // Equation 1 again, keeping decay and state of every token, and the sums of equation 8; then
 // backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums restart in the first of the
@@ -152,11 +153,11 @@ auto walk = [&](const Position p) __attribute__((always_inline)) {
             dskip += skips, dbias += biases;
             skips = biases = F{};
         }
-        if constexpr (!TURNED)
+        if constexpr (!TRANSPOSED)
             write([&](const auto& rows, auto value)
                       __attribute__((always_inline)) { put_(rows, t, value(t), stream); });
     }
-    if constexpr (TURNED)
+    if constexpr (TRANSPOSED)
         write([&](const auto& rows, auto value)
                   __attribute__((always_inline)) { scatter_(rows, 0, count, value, stream); });
     *row_(dchannel_out, chunk, 0, p.k) = dskip;

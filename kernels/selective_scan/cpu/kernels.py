@@ -64,14 +64,14 @@ class Tuning(NamedTuple):
 class Kind(NamedTuple):
     """Key of a compiled kernel: the dtypes of u and delta, the rule, and the tuning.
 
-    ``turned``: u, delta, z, or the gradient of the output is (``runtime.views.is_turned``).
+    ``transposed``: u, delta, z, or the gradient of the output is (``runtime.views.is_transposed``).
     """
 
     io: torch.dtype
     delta_io: torch.dtype
     discretization: str
     tuning: Tuning
-    turned: bool
+    transposed: bool
 
     def text(self, file: str, gradient: bool, output: bool = True) -> str:
         """A leaf's C++."""
@@ -83,7 +83,7 @@ class Kind(NamedTuple):
         text = native(
             _HERE / file, **macros(self.discretization, True), **limits, **NEEDS, SCALE=rule.scale,
             GRADIENT=gradient, OUTPUT=output, TOKENS=tokens, CHUNK=tuning.chunk, AT_ONCE=at_once,
-            BLOCKS=BLOCKS, TURNED=self.turned,
+            BLOCKS=BLOCKS, TRANSPOSED=self.transposed,
         )  # fmt: skip
         return prelude(tuning.degree, tuning.table) + text
 

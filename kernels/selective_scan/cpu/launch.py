@@ -12,7 +12,7 @@ from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty, empty_like
 from ...runtime.native import W, lanes, streams
 from ...runtime.packed import count_slots, slots
-from ...runtime.views import dense, filled, is_turned, view
+from ...runtime.views import dense, filled, is_transposed, view
 from ..problem import DISCRETIZATIONS, Inputs, Scan, like_inputs, sum_parts
 from . import kernels
 from .kernels import BLOCKS, FEW, NEEDS, SPAN, Kind, Sizes, Tuning
@@ -158,19 +158,19 @@ class _Operands:
         tuning = TUNING._replace(walked=TUNING.walked or (2 if states <= FEW else 4))
         u, delta = dense(x.u), dense(x.delta)
         z = u if x.z is None else dense(x.z)
-        turned = is_turned(u) or is_turned(delta) or is_turned(z)
-        turned = turned or (dout is not None and is_turned(dout))
-        span = SPAN if not turned else 1 if dout is None else BLOCKS
+        transposed = is_transposed(u) or is_transposed(delta) or is_transposed(z)
+        transposed = transposed or (dout is not None and is_transposed(dout))
+        span = SPAN if not transposed else 1 if dout is None else BLOCKS
         make = _unpacked if options.packed is None else Layout
         self.layout = y = make(Extent.of(x), options.packed, tuning.chunk, span, split)
-        self.kind = Kind(x.u.dtype, x.delta.dtype, options.discretization, tuning, turned)
+        self.kind = Kind(x.u.dtype, x.delta.dtype, options.discretization, tuning, transposed)
         self.options = int(options.softplus), int(x.z is not None)
         skip, bias = (None if v is None else v.float().contiguous() for v in (x.D, x.delta_bias))
         self.inputs = [y.rows, u, delta, z, x.A.contiguous(), skip, bias]
         self.b = _entries(x.B)
         self.c = self.b if x.C is None else _entries(x.C)
-        # whole lines of turned results begin at a multiple of W tokens
-        self.whole = y.group_width % W == 0 and not (turned and options.packed is not None)
+        # whole lines of transposed results begin at a multiple of W tokens
+        self.whole = y.group_width % W == 0 and not (transposed and options.packed is not None)
 
     def run(self, kernel, inputs: list, outputs: list, needs=0, results=()) -> None:
         """Launches a kernel of ``kernels.py``; ``results`` may go past the caches."""

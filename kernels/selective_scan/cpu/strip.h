@@ -1,4 +1,5 @@
-// needs: kernels.py: GRADIENT, TOKENS, AT_ONCE, TURNED, SLOWEST, MODERATE; lanes.h: F, I, rows_,
+// needs: kernels.py: GRADIENT, TOKENS, AT_ONCE, TRANSPOSED, SLOWEST, MODERATE; lanes.h: F, I,
+// rows_,
 //     gather_, in_range_, max_abs_, splat; problem.py: WEIGHTED; task.h: Position, fill_
 // gives: Token, PerToken, Saved, Group, load_group_, here_, lanes_, Fetch, Fetches, lines_,
 //     read_soon_, write_soon_, Plain, Slow, worth_slow_, slow_lanes_, Column, column_, Several,
@@ -52,11 +53,11 @@ auto load_group_ = [&](const auto& rates, const auto& skips, const auto& biases,
 // The rows of a strip in their own layout.
 auto here_ = [&](auto& array, const Position& p, int width)
                  __attribute__((always_inline)) { return rows_(array, p.b, p.t0, p.d, width); };
-// The same to be read, a token's lanes together: turned rows are first copied to a field of the
+// The same to be read, a token's lanes together: transposed rows are first copied to a field of the
 // tokens, unless they are not ``used``.
 auto lanes_ = [&](auto& array, const Position& p, int width, F& field, bool used = true) {
     const auto rows = here_(array, p, width);
-    if constexpr (TURNED) return gather_(rows, 0, used ? p.count : 0, &field, sizeof(Token));
+    if constexpr (TRANSPOSED) return gather_(rows, 0, used ? p.count : 0, &field, sizeof(Token));
     else return rows;
 };
 
@@ -88,7 +89,7 @@ struct Fetches {
         }
     }
 };
-// In turned rows a channel's lines are adjacent. A strip may begin or end within one; the strip
+// In transposed rows a channel's lines are adjacent. A strip may begin or end within one; the strip
 // before has fetched that, so they are met at their ends, or in the gradient at their begins.
 auto lines_ = [](const auto& rows, int64_t ahead) -> Fetch {
     const int lines = TOKENS * sizeof(*rows.first) / 64;
@@ -101,7 +102,7 @@ auto read_soon_ = [&](Fetches& fetches, auto& array, const Position& p) {
     const auto rows = here_(array, p, 16);
     const int64_t step = rows.step, bytes = 16 * sizeof(*rows.first);
     Fetch& fetch = fetches.all[fetches.asked++];
-    if (TURNED && rows.turned()) {
+    if (TRANSPOSED && rows.transposed()) {
         fetch = lines_(rows, more ? next * step : 0);
         return;
     }
@@ -113,7 +114,7 @@ auto write_soon_ = [&](Fetches& fetches, auto& array, const Position& p, bool st
     if (array.shape[1] == 0 || stream) return;
     const auto rows = here_(array, p, 16);
     const int64_t step = rows.step;
-    fetches.all[fetches.asked++] = TURNED && rows.turned()
+    fetches.all[fetches.asked++] = TRANSPOSED && rows.transposed()
         ? lines_(rows, 0)
         : Fetch{(const char*)rows.first, step, step, 0, 1};
 };

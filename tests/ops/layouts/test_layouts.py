@@ -14,8 +14,8 @@ TOKENS = ("u", "delta", "B", "C", "z", "x", "out")  # tensors [B, L, ..]
 
 
 def lay(x, layout):
-    """The same values: "last" is dense, "turned" [B, D, L], "slice" a half of that along D, "cut"
-    a part of it along L, so that no row begins at a cache line."""
+    """The same values: "last" is dense, "transposed" [B, D, L], "slice" a half of that along D,
+    "cut" a part of it along L, so that no row begins at a cache line."""
     if layout == "last":
         return x.contiguous()
     x = x.transpose(1, -1).contiguous()
@@ -27,14 +27,14 @@ def lay(x, layout):
 
 
 MIXTURES = {
-    "turned": dict.fromkeys(TOKENS, "turned"),
+    "transposed": dict.fromkeys(TOKENS, "transposed"),
     "slices": dict.fromkeys(TOKENS, "slice") | {"B": "cut", "C": "cut"},
     "cuts": dict.fromkeys(TOKENS, "cut") | {"z": "slice"},
-    "u and x": {"u": "turned", "x": "slice"},
-    "delta": {"delta": "slice", "C": "turned"},
-    "z": {"z": "turned"},
+    "u and x": {"u": "transposed", "x": "slice"},
+    "delta": {"delta": "slice", "C": "transposed"},
+    "z": {"z": "transposed"},
     "the gradient of the output": {"out": "cut"},
-    "all but u and x": dict.fromkeys(TOKENS, "turned") | {"u": "last", "x": "last"},
+    "all but u and x": dict.fromkeys(TOKENS, "transposed") | {"u": "last", "x": "last"},
 }
 every_mixture = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
 
@@ -62,8 +62,8 @@ def assert_same(function, inputs, mixture, seed=0):
         if name not in (0, *TOKENS) or got.shape != mine[name].shape:
             continue
         if 1 not in (got.shape[1], got.shape[-1]):
-            turned = [x.stride(-1) != 1 and x.stride(1) == 1 for x in (got, mine[name])]
-            assert turned[0] == turned[1], name
+            transposed = [x.stride(-1) != 1 and x.stride(1) == 1 for x in (got, mine[name])]
+            assert transposed[0] == transposed[1], name
             assert got.is_contiguous() or got.transpose(1, -1).is_contiguous(), name
 
 
@@ -97,7 +97,7 @@ def test_bfloat16(mixture):
 
 
 @pytest.mark.parametrize("lengths", [[0, 1, 2, 17, 64, 65, 0, 130, 1], [700, 40]])
-@pytest.mark.parametrize("mixture", ["turned", "cuts", "u and x"])
+@pytest.mark.parametrize("mixture", ["transposed", "cuts", "u and x"])
 def test_packed_rows(lengths, mixture):
     cuts = torch.tensor([0, *lengths]).cumsum(0)
     inputs = make(1, sum(lengths), 37, 3)
@@ -108,7 +108,7 @@ def test_packed_rows(lengths, mixture):
     assert_same(lambda **x: conv(**x, cu_seqlens=cuts), inputs, MIXTURES[mixture])
 
 
-@pytest.mark.parametrize("mixture", ["turned", "all but u and x"])
+@pytest.mark.parametrize("mixture", ["transposed", "all but u and x"])
 def test_segments_groups_and_no_options(mixture):
     """Tokens that are cut for a second thread, groups of channels, another rule, no gate."""
     layouts = MIXTURES[mixture]
@@ -123,7 +123,9 @@ def test_segments_groups_and_no_options(mixture):
     assert_same(lambda **x: (selective_scan_state(**x, delta_softplus=True),), inputs, layouts)
 
 
-@pytest.mark.parametrize("length, mixture", [(8208, "turned"), (8200, "turned"), (8208, "delta")])
+@pytest.mark.parametrize(
+    "length, mixture", [(8208, "transposed"), (8200, "transposed"), (8208, "delta")]
+)
 def test_large_results(length, mixture):
     """From 32 MiB on they bypass the caches, if all cache lines are whole."""
     inputs = make(1, length, 1024, 1)

@@ -9,7 +9,7 @@ import warp as wp
 from gamba_warp.kernels.runtime import views
 from gamba_warp.kernels.runtime.launch import cuda_launch
 from gamba_warp.kernels.runtime.stand_in import StandIn, multiprocessors_of, standing_in
-from gamba_warp.kernels.runtime.views import Packed, struct, view
+from gamba_warp.kernels.runtime.views import StructValue, struct, view
 
 
 class _Cleared(dict):
@@ -47,13 +47,13 @@ def test_a_struct_of_arrays_for_a_launch():
     """Leading dimensions count as one, None is no array, and what does not fit is refused."""
     for number in (7, 7, 8):  # other memory of the same shapes, and then another number
         places, rows, out = torch.randn(2, 3, 3), torch.randn(2, 3, 4), torch.zeros(6)
-        points = Packed(_Points, places, rows, None, number)
+        points = StructValue(_Points, places, rows, None, number)
         wp.launch(_row_sums, 6, [points, view(out)], device="cpu")
         assert torch.equal(out, (places[..., 2] + rows[..., 1] + number).flatten())
     with pytest.raises(TypeError, match="int64"):
-        Packed(_Points, places.long(), rows, None, 7)
+        StructValue(_Points, places.long(), rows, None, 7)
     with pytest.raises(ValueError, match="longer"):
-        Packed(_Points, places, rows)
+        StructValue(_Points, places, rows)
 
 
 @wp.kernel(enable_backward=False, module="unique")
