@@ -120,7 +120,9 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 def _eroded(mask: Tensor, width: int) -> Tensor:
     """Return a mask ``[1, 1, H, W]`` without the pixels within ``width`` of others."""
-    return -F.max_pool2d(-mask, 2 * width + 1, 1, width)
+    size = 2 * width + 1
+    columns = F.max_pool2d(-mask, (size, 1), 1, (width, 0))
+    return -F.max_pool2d(columns, (1, size), 1, (0, width))
 
 
 def local_colors(rgb: np.ndarray, alpha: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
@@ -130,8 +132,10 @@ def local_colors(rgb: np.ndarray, alpha: np.ndarray, radius: int) -> tuple[Tenso
 
 def _around(rgb: np.ndarray, weight: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
     """Return weighted means ``[1, 3, H, W]`` around each pixel, and the mean weight there."""
-    share = _planes(weight[..., None])
-    mean = F.avg_pool2d(torch.cat([_planes(rgb) * share, share], 1), 2 * radius + 1, 1, radius)
+    share, size = _planes(weight[..., None]), 2 * radius + 1
+    mean = torch.cat([_planes(rgb) * share, share], 1)
+    for kernel, pad in (((size, 1), (radius, 0)), ((1, size), (0, radius))):  # first the columns
+        mean = F.avg_pool2d(mean, kernel, 1, pad)
     return mean[:, :3] / mean[:, 3:].clamp(min=1e-5), mean[:, 3:]
 
 
