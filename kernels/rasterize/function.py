@@ -14,7 +14,7 @@ from .meta import Call, Meta
 from .ops import composite, project
 from .projection import LensOptions, Projected
 from .skip import Skip
-from .tiles import Limits, Size, Walk
+from .tiles import Limits, Saved, Size
 
 DEFAULT_SKIP = Skip()
 _WEIGHT_EPS = 1e-10  # a sum of weights below this has no expected depth
@@ -131,9 +131,9 @@ def rasterization(
     skipped = None if compiling else bins.starts.new_zeros(tiles)
     drawn = projected.means2d, projected.conics, projected.view_opacities, channels
     lists = list(bins), list(size), list(limits)
-    renders, transmittances, *walk = composite(*drawn, *lists, skipped, None)
+    renders, transmittances, *saved = composite(*drawn, *lists, skipped, None)
     renders = _finish(render_mode, renders, transmittances, x.backgrounds)
-    meta = Meta(call, bins, Walk(*walk), skipped)
+    meta = Meta(call, bins, Saved(*saved), skipped)
     # under gsplat's names
     meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
     meta.update(opacities=projected.view_opacities, width=width, height=height, tile_size=TILE)

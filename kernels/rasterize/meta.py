@@ -9,7 +9,7 @@ from torch import Tensor
 from .constants import TILE
 from .ops import bin_op, composite
 from .projection import STATUS_NAMES, Projected
-from .tiles import Bins, Limits, Size, Tiling, Walk
+from .tiles import Bins, Limits, Saved, Size, Tiling
 
 
 class Call(NamedTuple):
@@ -36,13 +36,13 @@ class Call(NamedTuple):
         picture = size.width, size.height, self.limits.alpha_min, size.skip
         return Bins(*bin_op(*splats, *picture, exact))
 
-    def listed(self) -> tuple[Bins, Walk]:
-        """The lists with all pairs, and the compositor's walk; this waits for the device."""
+    def listed(self) -> tuple[Bins, Saved]:
+        """The lists with all pairs, and what the compositor saved; this waits for the device."""
         bins, s = self.bins(exact=True), self.splats
         size = self.size._replace(colors_per_view=1)
         drawn = s.means2d, s.conics, s.view_opacities, torch.ones_like(s.depths)[..., None]
-        _, _, *walk = composite(*drawn, list(bins), list(size), list(self.limits), None, None)
-        return bins, Walk(*walk)
+        _, _, *saved = composite(*drawn, list(bins), list(size), list(self.limits), None, None)
+        return bins, Saved(*saved)
 
 
 class Meta(dict):
@@ -65,10 +65,10 @@ class Meta(dict):
         bins: the lists themselves.
     """
 
-    def __init__(self, call: Call, bins: Bins, walk: Walk, skipped: Tensor | None):
+    def __init__(self, call: Call, bins: Bins, saved: Saved, skipped: Tensor | None):
         super().__init__()
         self.tiling, self.bins, self._call = call.tiling(), bins, call
-        self._walk, self._skipped = walk, skipped
+        self._saved, self._skipped = saved, skipped
 
     def __missing__(self, key: str):
         if key == "tiles_skipped":
@@ -81,18 +81,18 @@ class Meta(dict):
             raise KeyError(key)
         walks = key not in ("culled", "pairs_box", "pairs", "tiles")
         if walks and int(self.bins.count) > self.bins.pairs.numel():  # the lists were too short
-            self.bins, self._walk = self._call.listed()
-        self[key] = _COUNTS[key](self.bins, self._walk, self._call)
+            self.bins, self._saved = self._call.listed()
+        self[key] = _COUNTS[key](self.bins, self._saved, self._call)
         return self[key]
 
 
-def _culled(bins: Bins, walk: Walk, call: Call) -> dict[str, int]:
+def _culled(bins: Bins, saved: Saved, call: Call) -> dict[str, int]:
     status = call.splats.status.view(-1)
     counts = torch.bincount(status, minlength=len(STATUS_NAMES)).tolist()
     return dict(zip(STATUS_NAMES[1:], counts[1:]))
 
 
-def _pairs_of_boxes(bins: Bins, walk: Walk, call: Call) -> int:
+def _pairs_of_boxes(bins: Bins, saved: Saved, call: Call) -> int:
     # as the lists have them where tiles are not tested; rows have a pixel to spare
     means2d, extents = call.splats.means2d, call.splats.extents
     last = extents.new_tensor([call.size.width - 1, call.size.height - 1])
@@ -103,17 +103,17 @@ def _pairs_of_boxes(bins: Bins, walk: Walk, call: Call) -> int:
     return int((end - begin + 1)[seen].prod(-1).sum())
 
 
-_COUNTS: dict[str, Callable[[Bins, Walk, Call], Any]] = {
+_COUNTS: dict[str, Callable[[Bins, Saved, Call], Any]] = {
     "culled": _culled,
     "pairs_box": _pairs_of_boxes,
-    "pairs": lambda bins, walk, call: int(bins.count),
-    "pairs_walked": lambda bins, walk, call: int(walk.walked.sum(dtype=torch.int64)),
-    "blocks_walked": lambda bins, walk, call: int(walk.blocks_walked.sum()),
-    "blocks_used": lambda bins, walk, call: sum(
-        int((walk.blocks >> b & 1).sum()) for b in range(16)
+    "pairs": lambda bins, saved, call: int(bins.count),
+    "pairs_walked": lambda bins, saved, call: int(saved.walked.sum(dtype=torch.int64)),
+    "blocks_walked": lambda bins, saved, call: int(saved.blocks_walked.sum()),
+    "blocks_used": lambda bins, saved, call: sum(
+        int((saved.blocks >> b & 1).sum()) for b in range(16)
     ),
-    "pairs_used": lambda bins, walk, call: int((walk.blocks != 0).sum()),
-    "gaussians_used": lambda bins, walk, call: bins.pairs[walk.blocks != 0].unique().numel(),
-    "tiles": lambda bins, walk, call: bins.starts.numel() - 1,
-    "tiles_empty": lambda bins, walk, call: int((bins.starts.diff() == 0).sum()),
+    "pairs_used": lambda bins, saved, call: int((saved.blocks != 0).sum()),
+    "gaussians_used": lambda bins, saved, call: bins.pairs[saved.blocks != 0].unique().numel(),
+    "tiles": lambda bins, saved, call: bins.starts.numel() - 1,
+    "tiles_empty": lambda bins, saved, call: int((bins.starts.diff() == 0).sum()),
 }

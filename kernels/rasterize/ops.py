@@ -32,12 +32,12 @@ from .projection import (
 from .skip import UNASKED
 from .tiles import (
     Bins,
-    Drawn,
     Limits,
     Picture,
+    Saved,
     Size,
+    Splats2D,
     Tiling,
-    Walk,
     make_grid,
     make_picture,
     record_size,
@@ -220,7 +220,7 @@ def composite(
     skipped: Tensor | None,
     absolute: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blend the pairs: pictures, their final transmittances and the fields of a ``Walk``.
+    """Blend the pairs: pictures, their final transmittances and the fields of a ``Saved``.
 
     ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
     Gaussians or, shared by the views, one for each of an object's. The lists hold the values of
@@ -229,10 +229,10 @@ def composite(
     geometry, it sets ``absolute``, ``[.., N, 2]``, to the sums over pixels of the absolute values
     of their gradients of ``means2d``.
     """
-    splats = Drawn(means2d, conics, view_opacities, colors.flatten(0, -2))
+    splats = Splats2D(means2d, conics, view_opacities, colors.flatten(0, -2))
     given = splats, Bins(*bins), _picture(means2d, size, limits)
-    renders, transmittances, walk = _compositor(means2d.device).composite_forward(*given)
-    return renders, transmittances, *walk
+    renders, transmittances, saved = _compositor(means2d.device).composite_forward(*given)
+    return renders, transmittances, *saved
 
 
 def _picture(means2d: Tensor, size: list[int], limits: list[float]) -> Picture:
@@ -246,7 +246,7 @@ def _(means2d, conics, opacities, colors, bins, size, *rest):
     tiles = images.numel() * Tiling(width, height).count
     on_cpu = kind_of(colors.device) == "cpu"
     record_shape = (0, 0) if on_cpu else (opacities.numel(), record_size(colors.shape[-1]))
-    walk = Walk(
+    saved = Saved(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.empty_like(pairs),
@@ -255,7 +255,7 @@ def _(means2d, conics, opacities, colors, bins, size, *rest):
         records=colors.new_empty(*record_shape),
     )
     renders = colors.new_empty(*images, height, width, colors.shape[-1])
-    return renders, colors.new_empty(*images, height, width, 1), *walk
+    return renders, colors.new_empty(*images, height, width, 1), *saved
 
 
 # It changes ``skipped`` and ``absolute``, which is not declared: compilers, which would have to
@@ -266,17 +266,17 @@ def _composite_vjp(
     bins: List[Tensor],
     size: List[int],
     limits: List[float],
-    walk: List[Tensor],
+    saved: List[Tensor],
     v_pixels: List[Tensor],
     skipped: Tensor | None,
     geometry: bool,
     absolute: Tensor | None,
 ) -> List[Tensor]:
     if skipped is None:
-        skipped = torch.zeros_like(Walk(*walk).walked)
-    drawn = Drawn(*splats)
+        skipped = torch.zeros_like(Saved(*saved).walked)
+    drawn = Splats2D(*splats)
     drawn = drawn._replace(colors=drawn.colors.flatten(0, -2))
-    given = drawn, Bins(*bins), _picture(splats[0], size, limits), Walk(*walk)
+    given = drawn, Bins(*bins), _picture(splats[0], size, limits), Saved(*saved)
     backward = _compositor(splats[0].device).composite_backward
     passes, absolute = bool(Limits(*limits).passes), absolute if geometry else None
     grads = backward(*given, v_pixels, skipped, geometry, absolute, passes)
@@ -284,7 +284,7 @@ def _composite_vjp(
 
 
 @_composite_vjp.register_fake
-def _(splats, bins, size, limits, walk, v_pixels, skipped, geometry, absolute):
+def _(splats, bins, size, limits, saved, v_pixels, skipped, geometry, absolute):
     *geometries, colors = splats
     v_colors = colors.new_empty(*splats[2].shape, colors.shape[-1])
     return [*(map(torch.empty_like, geometries) if geometry else ()), v_colors]
@@ -292,23 +292,23 @@ def _(splats, bins, size, limits, walk, v_pixels, skipped, geometry, absolute):
 
 def _composite_setup(ctx, inputs, output):
     *splats, bins, ctx.size, ctx.limits, ctx.skipped, ctx.absolute = inputs
-    renders, transmittances, *walk = output
-    ctx.mark_non_differentiable(*walk)
+    renders, transmittances, *saved = output
+    ctx.mark_non_differentiable(*saved)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*splats, *bins, *walk)
+    ctx.save_for_backward(*splats, *bins, *saved)
     ctx.shapes = renders.shape, transmittances.shape
 
 
 def _composite_backward(ctx, *cotangents):
     splats, rest = list(ctx.saved_tensors[:4]), ctx.saved_tensors[4:]
-    bins, walk = list(rest[: len(Bins._fields)]), list(rest[len(Bins._fields) :])
+    bins, saved = list(rest[: len(Bins._fields)]), list(rest[len(Bins._fields) :])
     colors, needs, size = splats[3], ctx.needs_input_grad, Size(*ctx.size)
     v_pixels = [
         colors.new_zeros(shape) if v is None else v.contiguous()
         for v, shape in zip(cotangents, ctx.shapes)
     ]
     geometry = any(needs[:3]) or not size.skip & UNASKED
-    given = splats, bins, ctx.size, ctx.limits, walk, v_pixels, ctx.skipped, geometry
+    given = splats, bins, ctx.size, ctx.limits, saved, v_pixels, ctx.skipped, geometry
     *grads, v_colors = _composite_vjp(*given, ctx.absolute)
     if not size.colors_per_view and size.views > 1:
         *images, num, channels = v_colors.shape

@@ -104,7 +104,9 @@ def depth_quantile(
     if not 0 < transmittance < 1:
         raise ValueError(f"transmittance must be in (0, 1), got {transmittance}")
     splats = Projected(*(meta[name] for name in ("means2d", "conics", "depths", "opacities")))
-    return _walk(splats, meta.bins, meta.tiling, transmittance, Limits(alpha_min, alpha_max, 0.0))
+    return _traverse(
+        splats, meta.bins, meta.tiling, transmittance, Limits(alpha_min, alpha_max, 0.0)
+    )
 
 
 def counts_in_front(
@@ -125,11 +127,11 @@ def counts_in_front(
         ``[.., V, N]`` int32, without gradient.
     """
     counts = splats.depths.new_zeros(splats.depths.shape, dtype=torch.int32)
-    _walk(splats, bins, tiling, transmittance, limits, counts)
+    _traverse(splats, bins, tiling, transmittance, limits, counts)
     return counts
 
 
-def _walk(
+def _traverse(
     splats: Projected,
     bins: Bins,
     tiling: Tiling,

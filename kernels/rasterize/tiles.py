@@ -1,8 +1,8 @@
 """Tiles: how a picture is cut into them, their lists, and the scalars of launches.
 
-In this order: ``Tiling``, the cut; ``Bins`` and ``Walk``, the results of binning and compositing
-for later steps; ``Drawn``, the Gaussians to composite; ``Grid`` and ``Picture``, the scalars that
-the launches of these two steps take.
+In this order: ``Tiling``, the cut; ``Bins`` and ``Saved``, the results of binning and compositing
+for later steps; ``Splats2D``, the Gaussians to composite; ``Grid`` and ``Picture``, the scalars
+that the launches of these two steps take.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -70,7 +70,7 @@ class Bins(NamedTuple):
     count: Annotated[Any, wp.array[wp.int64]] = None
 
 
-class Walk(NamedTuple):
+class Saved(NamedTuple):
     """Values that the compositor saves for its gradient, by tiles and by blocks of 4 x 4 pixels.
 
     Attributes:
@@ -107,7 +107,7 @@ class Pixels:
     transmittances: wp.array2d[wp.float32]  # the final ones
 
 
-class Drawn(NamedTuple):
+class Splats2D(NamedTuple):
     """Gaussians to composite, or their gradients: of each (view, Gaussian), the sum over its pairs.
 
     Attributes:

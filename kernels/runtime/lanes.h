@@ -1,8 +1,7 @@
 // needs: native.py: TABLE, DEGREE
-// gives: what sixteen.h gives, max_abs_, in_range_, LOG2E, shifter, POWER_2, POWER_3, POWER_4,
-//     POWER_5, POWER_6, horner_, exp2_clamped_, exp2_, decay_, exp2_parts_, exp2_fm1_,
-//     softplus_of_, softplus_, sigmoid_, rows_, H, S, Line, narrow_, read_, write_, put_,
-//     tiles_, Lanes, gather_, scatter_
+// gives: max_abs_, in_range_, LOG2E, shifter, POWER_2, POWER_3, POWER_4, POWER_5, POWER_6, horner_,
+//     exp2_clamped_, exp2_, decay_, exp2_parts_, exp2_fm1_, softplus_of_, softplus_, sigmoid_,
+//     rows_, H, S, Line, narrow_, read_, write_, put_, tiles_, Lanes, gather_, scatter_
 // Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_fm1_; TABLE:
 // true to take a table instead where the processor has AVX-512.
 #include "sixteen.h"

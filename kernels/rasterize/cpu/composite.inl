@@ -1,5 +1,5 @@
 // needs: composite.py: SUM_ROWS, absolute, lists, rows, task, RUN, splats, TILE, workers, picture,
-//     GRADIENT, ABSOLUTE, PASSES, walk, pixels, ZERO_UPSTREAM, UNUSED, SLACK, SLACK_ABS,
+//     GRADIENT, ABSOLUTE, PASSES, saved, pixels, ZERO_UPSTREAM, UNUSED, SLACK, SLACK_ABS,
 //     EMPTY_TILES, BLOCK_TEST, STOPPED, v
 // gives: the bodies of composite, composite_vjp and sum_rows
 // Compositing on the CPU (README.md §3, §5), three kernels: the pictures, with GRADIENT the sums of
@@ -162,7 +162,7 @@ auto total_ = [](F x) -> float {
 
 for (int index = next_tile(); index < tiles; index = next_tile()) {
     const Tile tile = tile_at(index);
-    const int begin = lists.starts.data[index], end = begin + walk.walked.data[index];
+    const int begin = lists.starts.data[index], end = begin + saved.walked.data[index];
     const int every = begin < end ? tile.inside : 0;
     I nonzero = I{};
     for (int bits = every; bits; bits &= bits - 1) {
@@ -180,15 +180,15 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
     skipped = wanted ? 2 : skipped > 1 ? skipped : 1;
     if (!wanted) continue;
     F Ts[BLOCKS], Rs[BLOCKS];  // transmittance, and the blend behind
-    const I* const stops = (const I*)walk.stops.data + tile.first;
+    const I* const stops = (const I*)saved.stops.data + tile.first;
     for (int b = 0; b < BLOCKS; ++b) {
-        const F T = ((const F*)walk.transmittances.data)[tile.first + b];
+        const F T = ((const F*)saved.transmittances.data)[tile.first + b];
         Ts[b] = T < 0.0f ? -T : T;
         Rs[b] = F{};
     }
     for (int k = end - 1; k >= begin; --k) {
         const int later = k - AHEAD > begin ? k - AHEAD : begin;
-        if (walk.blocks.data[later]) {  // rows are in the order of the Gaussians
+        if (saved.blocks.data[later]) {  // rows are in the order of the Gaussians
             const int row = lists.rows.data[later];
             const char* const sums = (const char*)(rows.sums.data + (size_t)row * row_length);
             __builtin_prefetch(sums, 1);
@@ -196,7 +196,7 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
             __builtin_prefetch(rows.written.data + row, 1);
             fetch(lists.pairs.data[later]);
         }
-        int bits = picture.skip & UNUSED ? walk.blocks.data[k] : every;
+        int bits = picture.skip & UNUSED ? saved.blocks.data[k] : every;
         if (!bits) continue;
         const Splat s = splat_of(lists.pairs.data[k], tile);
         F h0 = {}, hu = {}, hy = {}, huu = {}, huy = {}, hyy = {}, across = {}, along = {};
@@ -286,14 +286,14 @@ auto touched = [&](const Tile& tile, int g) -> int {
 F* const sums = (F*)workers.workspace.data + (size_t)task * BLOCKS * channels;  // of colours
 for (int index = next_tile(); index < tiles; index = next_tile()) {
     const int begin = lists.starts.data[index], end = lists.starts.data[index + 1];
-    walk.walked.data[index] = 0;
-    walk.blocks_walked.data[index] = 0;
+    saved.walked.data[index] = 0;
+    saved.blocks_walked.data[index] = 0;
     if (begin == end && picture.skip & EMPTY_TILES) continue;
     const Tile tile = tile_at(index);
     // A pixel that has stopped keeps its transmittance, above t_min, with a minus sign. T itself is
     // not chosen by a mask: that would become a masked store, for which the next load had to wait.
-    F* const Ts = (F*)walk.transmittances.data + tile.first;
-    I* const stops = (I*)walk.stops.data + tile.first;
+    F* const Ts = (F*)saved.transmittances.data + tile.first;
+    I* const stops = (I*)saved.stops.data + tile.first;
     for (int b = 0; b < BLOCKS; ++b) {
         Ts[b] = splat(1.0f);
         stops[b] = I{} + 0x7fffffff;
@@ -332,10 +332,10 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
         }
         evaluated += __builtin_popcount(todo);
         if (picture.skip & STOPPED) alive &= ~dead;
-        walk.blocks.data[k] = used;
+        saved.blocks.data[k] = used;
     }
-    walk.walked.data[index] = k - begin;
-    walk.blocks_walked.data[index] = evaluated;
+    saved.walked.data[index] = k - begin;
+    saved.blocks_walked.data[index] = evaluated;
     for (int b = 0; b < BLOCKS; ++b)
         pixels_of(tile, b, [&](int l, size_t pixel) {
             const float T = Ts[b][l];

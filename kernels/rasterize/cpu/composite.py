@@ -18,7 +18,7 @@ from ...runtime.native import native, native_kernel
 from ...runtime.views import StructValue, as_struct, struct, struct_of, view
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
-from ..tiles import SLACK, SLACK_ABS, Bins, Drawn, Picture, Pixels, Walk
+from ..tiles import SLACK, SLACK_ABS, Bins, Picture, Pixels, Saved, Splats2D
 
 _HERE = Path(__file__).parent
 _RUN = 1024  # Gaussians of a task of the sums
@@ -48,14 +48,14 @@ class Rows:
     geometry: int  # 0 for the gradient of the colours alone
 
 
-_SPLATS = {"picture": Picture, "splats": struct_of(Drawn), "lists": struct_of(Bins)}
-_WALK = {"walk": struct_of(Walk), "pixels": Pixels}
+_SPLATS = {"picture": Picture, "splats": struct_of(Splats2D), "lists": struct_of(Bins)}
+_SAVED = {"saved": struct_of(Saved), "pixels": Pixels}
 
 _composite = native_kernel(
     "composite",
     native(_HERE / "composite.inl", **_DEFINES),
     inputs=_SPLATS,
-    outputs={**_WALK, "workers": Workers},
+    outputs={**_SAVED, "workers": Workers},
 )
 # with the sums of absolute values, and with a gradient that passes the clamp of alpha, which cost
 # nothing where they are not asked for
@@ -65,7 +65,7 @@ _composite_vjp = {
         native(
             _HERE / "composite.inl", GRADIENT=True, **_DEFINES, ABSOLUTE=absolute, PASSES=passes
         ),
-        inputs={**_SPLATS, **_WALK},
+        inputs={**_SPLATS, **_SAVED},
         outputs={"workers": Workers, "rows": Rows},
     )
     for absolute in (False, True)
@@ -74,8 +74,8 @@ _composite_vjp = {
 _sum_rows = native_kernel(
     "sum_rows",
     native(_HERE / "composite.inl", SUM_ROWS=True, RUN=_RUN),
-    inputs={"splats": struct_of(Drawn), "lists": struct_of(Bins), "rows": Rows},
-    outputs={"v": struct_of(Drawn), "absolute": wp.array[wp.vec2]},
+    inputs={"splats": struct_of(Splats2D), "lists": struct_of(Bins), "rows": Rows},
+    outputs={"v": struct_of(Splats2D), "absolute": wp.array[wp.vec2]},
 )
 
 
@@ -85,7 +85,9 @@ def _workers(size: int) -> StructValue:
     return StructValue(Workers, torch.zeros(1, dtype=torch.int32), workspace)
 
 
-def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tensor, Tensor, Walk]:
+def composite_forward(
+    splats: Splats2D, bins: Bins, picture: Picture
+) -> tuple[Tensor, Tensor, Saved]:
     """Blend I views; float32, contiguous tensors on the CPU.
 
     Args:
@@ -94,14 +96,14 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         picture: from ``make_picture``.
 
     Returns:
-        ``renders [.., H, W, C]``, transmittances ``[.., H, W, 1]`` and a ``Walk``.
+        ``renders [.., H, W, C]``, transmittances ``[.., H, W, 1]`` and a ``Saved``.
     """
     colors = splats.colors
     images, channels = splats.means2d.shape[:-2], colors.shape[1]
     tiles = images.numel() * picture.tiles_x * picture.tiles_y
     renders = colors.new_zeros(*images, picture.height, picture.width, channels)
     transmittances = colors.new_ones(*images, picture.height, picture.width, 1)
-    walk = Walk(
+    saved = Saved(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.zeros_like(bins.pairs),
@@ -113,32 +115,32 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         picture,
         as_struct(splats),
         as_struct(bins),
-        as_struct(walk),
+        as_struct(saved),
         StructValue(Pixels, renders, transmittances),
         _workers(BLOCKS * channels),
     ]
     parallel_launch(_composite, torch.get_num_threads(), arguments)
-    return renders, transmittances, walk
+    return renders, transmittances, saved
 
 
 def composite_backward(
-    splats: Drawn,
+    splats: Splats2D,
     bins: Bins,
     picture: Picture,
-    walk: Walk,
+    saved: Saved,
     v_pixels: list[Tensor],
     skipped: Tensor,
     geometry: bool,
     absolute: Tensor | None = None,
     passes: bool = False,
-) -> Drawn:
+) -> Splats2D:
     """Gradients of ``composite_forward`` by (view, Gaussian), from a row of sums for each pair.
 
     Args:
         splats: as forward.
         bins: as forward.
         picture: as forward.
-        walk: as returned forward.
+        saved: as returned forward.
         v_pixels: gradients of the renders and the transmittances.
         skipped: ``[tiles]`` int32, raised to 1 for a tile that is skipped and 2 for one walked.
         geometry: True to compute more than the gradient of the colours.
@@ -154,7 +156,7 @@ def composite_backward(
         picture,
         as_struct(splats),
         as_struct(bins),
-        as_struct(walk),
+        as_struct(saved),
         StructValue(Pixels, *v_pixels),
         _workers(channels + BLOCKS * (channels + 1)),
         StructValue(Rows, sums, written, skipped, int(geometry)),
@@ -167,11 +169,11 @@ def composite_backward(
 def reduce_rows(
     sums: Tensor,
     written: Tensor,
-    splats: Drawn,
+    splats: Splats2D,
     bins: Bins,
     geometry: bool,
     absolute: Tensor | None,
-) -> Drawn:
+) -> Splats2D:
     """Sum rows by (view, Gaussian), in the order in which intersections are numbered.
 
     Args:
@@ -187,9 +189,9 @@ def reduce_rows(
     v_means2d, v_conics, v_opacities = (
         empty([*lead, *size], torch.float32) if geometry else None for size in ((2,), (3,), ())
     )
-    v = Drawn(v_means2d, v_conics, v_opacities, empty([*lead, channels], torch.float32))
+    v = Splats2D(v_means2d, v_conics, v_opacities, empty([*lead, channels], torch.float32))
     arguments = [
-        as_struct(Drawn(conics=conics, view_opacities=view_opacities)),
+        as_struct(Splats2D(conics=conics, view_opacities=view_opacities)),
         as_struct(bins),
         StructValue(Rows, sums, written, None, int(geometry)),
         as_struct(v),

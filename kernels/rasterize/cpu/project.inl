@@ -1,7 +1,6 @@
 // needs: project.py: num, RUN, task, scene, MARGIN, lens, GRADIENT, views, v_splats, splats,
 //     v_scene, colors, colors_per_view, COMPENSATION_MIN, CONIC_MAX, RADIUS_MAX, TILE;
-//     projection.py: VISIBLE, TRANSPARENT, FAR,
-//     NEAR, NOT_FINITE, OUTSIDE, SMALL
+//     projection.py: VISIBLE, TRANSPARENT, FAR, NEAR, NOT_FINITE, OUTSIDE, SMALL
 // gives: the bodies of project and project_vjp
 // The projection on the CPU (README.md §1), and with GRADIENT its gradient (§4). Products and sums
 // are rounded one by one, as in the kernels of ../cuda/project.py: only fma_ is fused.

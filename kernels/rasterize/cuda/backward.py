@@ -12,7 +12,7 @@ import warp as wp
 
 from ...runtime.views import struct, struct_of
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import CHUNK, Bins, Picture, Pixels, Walk
+from ..tiles import CHUNK, Bins, Picture, Pixels, Saved
 from . import leaves as L
 from .records import Gaussians
 from .warp import (
@@ -176,7 +176,7 @@ def _completing(asked: Sums, parts: int):
 
 
 @functools.cache
-def _walking(asked: Sums, parts: int, listed: bool):
+def _traversal(asked: Sums, parts: int, listed: bool):
     """The function that walks a part of a tile.
 
     Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
@@ -230,7 +230,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
 
     @wp.func
     @no_type_check
-    def walk(
+    def traverse(
         picture: Picture,
         gaussians: Gaussians,
         lists: struct_of(Bins),
@@ -250,8 +250,8 @@ def _walking(asked: Sums, parts: int, listed: bool):
         else:
             begin = p.image * picture.num
             walked = -walked_in[p.tile]
-        # T is as forward left it, negative until the walk reaches where the pixel stopped; R is
-        # R of README eq. 10, plus the gradient of T_end, which is the same for all pairs
+        # T is as forward left it, negative until the traversal reaches where the pixel stopped;
+        # R is R of README eq. 10, plus the gradient of T_end, which is the same for all pairs
         T = pixels_type()
         R = pixels_type()
         upstream = upstream_type()
@@ -418,7 +418,7 @@ def _walking(asked: Sums, parts: int, listed: bool):
                 together()
             end -= WARP
 
-    return walk
+    return traverse
 
 
 @functools.cache
@@ -432,7 +432,7 @@ def backward_kernels(asked: Sums, parts: int):
     size, lane_pixels = parts * asked.shared(), pixels_of_lane(parts)
     warps = (24 if parts == 4 else 20) if asked.channels < 4 else 16  # as registers allow
     options = kernel_options(warps, parts)
-    walk, walk_unlisted = (_walking(asked, parts, listed) for listed in (True, False))
+    traverse, traverse_unlisted = (_traversal(asked, parts, listed) for listed in (True, False))
     store, vectors = _storing(asked, adding=False), asked.vectors()
 
     @wp.kernel(enable_backward=False, **options)
@@ -441,21 +441,21 @@ def backward_kernels(asked: Sums, parts: int):
         picture: Picture,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
-        walked_in: struct_of(Walk),
+        saved_in: struct_of(Saved),
         v_pixels_in: Pixels,
         rows_out: Rows,
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
         p = lane_pixels(picture, index, lane)
-        walk(
+        traverse(
             picture,
             gaussians_in,
             lists_in,
-            walked_in.transmittances,
-            walked_in.stops,
-            walked_in.blocks,
-            walked_in.walked,
+            saved_in.transmittances,
+            saved_in.stops,
+            saved_in.blocks,
+            saved_in.walked,
             v_pixels_in,
             rows_out,
             arena,
@@ -468,7 +468,7 @@ def backward_kernels(asked: Sums, parts: int):
         picture: Picture,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
-        walked_in: struct_of(Walk),
+        saved_in: struct_of(Saved),
         v_pixels_in: Pixels,
         rows_out: Rows,
     ):
@@ -487,14 +487,14 @@ def backward_kernels(asked: Sums, parts: int):
         for tile in range(tiles):
             tile += image * picture.tiles_x * picture.tiles_y
             p = lane_pixels(picture, tile * wp.static(parts) + worker % wp.static(parts), lane)
-            walk_unlisted(
+            traverse_unlisted(
                 picture,
                 gaussians_in,
                 lists_in,
-                walked_in.transmittances,
-                walked_in.stops,
-                walked_in.blocks,
-                walked_in.walked,
+                saved_in.transmittances,
+                saved_in.stops,
+                saved_in.blocks,
+                saved_in.walked,
                 v_pixels_in,
                 rows_out,
                 arena,

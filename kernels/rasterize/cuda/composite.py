@@ -16,7 +16,7 @@ from ...runtime.launch import cuda_launch
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import StructValue, as_struct
 from ..constants import BLOCKS
-from ..tiles import CHUNK, Bins, Drawn, Picture, Pixels, Walk
+from ..tiles import CHUNK, Bins, Picture, Pixels, Saved, Splats2D
 from .backward import Rows, Sums, backward_kernels, row_sizes
 from .forward import forward_kernels
 from .records import Gaussians, make_records
@@ -57,10 +57,12 @@ def _launch(
             )
 
 
-def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tensor, Tensor, Walk]:
+def composite_forward(
+    splats: Splats2D, bins: Bins, picture: Picture
+) -> tuple[Tensor, Tensor, Saved]:
     """Blend I views, like ``composite_forward`` on the CPU.
 
-    A ``Walk``'s pixels are in the order of the lanes, its ``stops`` are set where a pixel stopped
+    A ``Saved``'s pixels are in the order of the lanes, its ``stops`` are set where a pixel stopped
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
     """
     colors = splats.colors
@@ -69,7 +71,7 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
     renders = colors.new_empty(*images, picture.height, picture.width, channels)
     transmittances = colors.new_empty(*images, picture.height, picture.width, 1)
     parts = parts_of_tile(tiles, colors.device)
-    walk = Walk(
+    saved = Saved(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.zeros_like(bins.pairs),
@@ -81,28 +83,28 @@ def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tens
         lambda count: forward_kernels(count, parts),
         (tiles * parts, tiles * parts),
         picture,
-        walk.records,
+        saved.records,
         channels,
         [as_struct(bins)],
-        [as_struct(walk), StructValue(Pixels, renders, transmittances)],
+        [as_struct(saved), StructValue(Pixels, renders, transmittances)],
     )
-    return renders, transmittances, walk
+    return renders, transmittances, saved
 
 
 def composite_backward(
-    splats: Drawn,
+    splats: Splats2D,
     bins: Bins,
     picture: Picture,
-    walk: Walk,
+    saved: Saved,
     v_pixels: list[Tensor],
     skipped: Tensor,
     geometry: bool,
     absolute: Tensor | None = None,
     passes: bool = False,
-) -> Drawn:
+) -> Splats2D:
     """Gradients of ``composite_forward``, like ``composite_backward`` on the CPU."""
     colors = splats.colors
-    tiles, channels = walk.walked.numel(), colors.shape[1]
+    tiles, channels = saved.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
     pairs = bins.pairs.numel()
     # a chunk without gradients does not write its part of a row that another chunk has written
@@ -114,9 +116,9 @@ def composite_backward(
     given = (
         (tiles * parts, splats.means2d.shape[:-2].numel() * parts),
         picture,
-        walk.records,
+        saved.records,
         channels,
-        [as_struct(bins), as_struct(walk), StructValue(Pixels, *v_pixels)],
+        [as_struct(bins), as_struct(saved), StructValue(Pixels, *v_pixels)],
         [rows],
         parts,
     )

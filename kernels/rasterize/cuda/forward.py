@@ -11,7 +11,7 @@ import warp as wp
 
 from ...runtime.views import struct_of
 from ..skip import BLOCK_TEST, STOPPED
-from ..tiles import Bins, Picture, Pixels, Walk
+from ..tiles import Bins, Picture, Pixels, Saved
 from . import leaves as L
 from .records import Gaussians
 from .warp import (
@@ -40,7 +40,7 @@ _SIZE = _MASKS + WARP
 
 
 @functools.cache
-def _walking(channels: int, parts: int, listed: bool):
+def _traversal(channels: int, parts: int, listed: bool):
     """The function that walks the pairs of a tile's part.
 
     Unless ``listed``, the tiles of a view share one list of all its Gaussians, in which ``offsets``
@@ -69,11 +69,11 @@ def _walking(channels: int, parts: int, listed: bool):
 
     @wp.func
     @no_type_check
-    def walk(
+    def traverse(
         picture: Picture,
         gaussians: Gaussians,
         lists: struct_of(Bins),
-        walked_out: struct_of(Walk),
+        saved_out: struct_of(Saved),
         pixels_out: Pixels,
         arena: arena_type,
         p: LanePixels,
@@ -156,7 +156,7 @@ def _walking(channels: int, parts: int, listed: bool):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if (stopped[0] & wp.static(1 << (STOP + j))) != 0:
                                 T[j] = -T[j]
-                                L.store_word(walked_out.stops, p.walk_row, j * WARP, k)
+                                L.store_word(saved_out.stops, p.walk_row, j * WARP, k)
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1
@@ -177,21 +177,21 @@ def _walking(channels: int, parts: int, listed: bool):
             if slot >= 0 and slot < count:
                 mine = memory.get_int(arena, wp.static(_BITS) + slot)
             if mine != 0:
-                leave(walked_out.blocks, k0 + p.lane, p.part, mine)
+                leave(saved_out.blocks, k0 + p.lane, p.part, mine)
             k0 += WARP
 
-        # recomputed, so that no registers hold the lane's pixels during the walk
+        # recomputed, so that no registers hold the lane's pixels during the traversal
         p = lane_pixels(picture, L.opaque(p.index), p.lane)
         if p.lane == 0:
             if wp.static(listed):
-                wp.atomic_max(walked_out.walked, p.tile, end - lists.starts[p.tile])
+                wp.atomic_max(saved_out.walked, p.tile, end - lists.starts[p.tile])
             else:
-                wp.atomic_min(walked_out.walked, p.tile, p.image * picture.num - end)
+                wp.atomic_min(saved_out.walked, p.tile, p.image * picture.num - end)
         if evaluated != 0 and gaussians.first == 0:
-            wp.atomic_add(walked_out.blocks_walked, p.tile, wp.int64(evaluated))
+            wp.atomic_add(saved_out.blocks_walked, p.tile, wp.int64(evaluated))
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
-            L.store(walked_out.transmittances, p.walk_row, j * WARP, T[j])
+            L.store(saved_out.transmittances, p.walk_row, j * WARP, T[j])
             if T[j] != 0.0:
                 step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 L.store(pixels_out.transmittances, p.pixel, step, wp.abs(T[j]))
@@ -199,7 +199,7 @@ def _walking(channels: int, parts: int, listed: bool):
                 for c in range(wp.static(channels)):
                     L.store(pixels_out.renders, first, step + c, sums[j, c])
 
-    return walk
+    return traverse
 
 
 @functools.cache
@@ -211,7 +211,10 @@ def forward_kernels(channels: int, parts: int):
     """
     options = kernel_options(24 if channels < 4 else 20)  # as many warps as the registers allow
     lane_pixels = pixels_of_lane(parts)
-    walk, walk_unlisted = _walking(channels, parts, True), _walking(channels, parts, False)
+    traverse, traverse_unlisted = (
+        _traversal(channels, parts, True),
+        _traversal(channels, parts, False),
+    )
 
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
@@ -219,13 +222,13 @@ def forward_kernels(channels: int, parts: int):
         picture: Picture,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
-        walked_out: struct_of(Walk),
+        saved_out: struct_of(Saved),
         pixels_out: Pixels,
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         p = lane_pixels(picture, index, lane)
-        walk(picture, gaussians_in, lists_in, walked_out, pixels_out, arena, p)
+        traverse(picture, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
 
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
@@ -233,13 +236,13 @@ def forward_kernels(channels: int, parts: int):
         picture: Picture,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
-        walked_out: struct_of(Walk),
+        saved_out: struct_of(Saved),
         pixels_out: Pixels,
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         if lists_in.count[0] > wp.int64(lists_in.pairs.shape[0]):
             p = lane_pixels(picture, index, lane)
-            walk_unlisted(picture, gaussians_in, lists_in, walked_out, pixels_out, arena, p)
+            traverse_unlisted(picture, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
 
     return composite, composite_unlisted

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ...runtime.launch import launch
 from ...runtime.views import as_struct, struct, struct_of
-from ..tiles import CHUNK, Drawn, Picture, color_row, record_size
+from ..tiles import CHUNK, Picture, Splats2D, color_row, record_size
 from . import leaves as L
 from .ellipse import make_ellipse
 
@@ -35,7 +35,7 @@ class Gaussians:
 def _record(
     offset: wp.int32,
     picture: Picture,
-    splats_in: struct_of(Drawn),
+    splats_in: struct_of(Splats2D),
     records_out: wp.array2d[wp.float32],
 ):
     g = offset + wp.tid()
@@ -58,7 +58,7 @@ def _record(
         L.store4(records_out, at + wp.int64(8 + first), color)
 
 
-def make_records(splats: Drawn, picture: Picture) -> Tensor:
+def make_records(splats: Splats2D, picture: Picture) -> Tensor:
     """Records ``[I * N, record_size(C)]`` of all Gaussians."""
     opacities, colors = splats.view_opacities, splats.colors
     records = colors.new_empty(opacities.numel(), record_size(colors.shape[1]))

@@ -12,7 +12,7 @@ from torch import Tensor
 from ...runtime.launch import launch
 from ...runtime.views import StructValue, as_struct, struct_of, view
 from ..projection import Projected
-from ..tiles import CHUNK, Bins, Drawn
+from ..tiles import CHUNK, Bins, Splats2D
 from . import leaves as L
 from .backward import Rows
 from .records import LOG2_E_HALF
@@ -89,8 +89,8 @@ def _add_rows(
 
 
 def reduce_rows(
-    rows: StructValue, splats: Drawn, bins: Bins, geometry: bool, absolute: Tensor | None
-) -> Drawn:
+    rows: StructValue, splats: Splats2D, bins: Bins, geometry: bool, absolute: Tensor | None
+) -> Splats2D:
     """Sum rows by (view, Gaussian), as the CPU's; all rows are written.
 
     Args:
@@ -123,4 +123,4 @@ def reduce_rows(
         ],
         conics.device,
     )
-    return Drawn(v_means2d, v_conics, v_opacities, v_colors)
+    return Splats2D(v_means2d, v_conics, v_opacities, v_colors)

@@ -183,7 +183,7 @@ def touching(parts: int):
         limit, top = level[2], level[3]
         reach = L.root(limit * L.reciprocal(e))
         over_a = L.reciprocal(a)
-        # the centre of the part's first pixel, which no registers hold during the walk
+        # the centre of the part's first pixel, which no registers hold during the traversal
         lane = L.opaque(p.lane)
         x = p.x[0] - float(lane & wp.static(WIDTH - 1)) - shape[0]
         y = p.y[0] - float(lane >> wp.static(WIDTH.bit_length() - 1)) - shape[1]

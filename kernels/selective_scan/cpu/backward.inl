@@ -1,8 +1,8 @@
-// needs: lanes.h: F, fma_, splat, put_, scatter_; kernels.py: work_out, sums_out, sizes, rows_in,
-//     task, a_in, skip_in, bias_in, u_in, delta_in, z_in, dout_in, dlast_in, TOKENS, AT_ONCE,
-//     TRANSPOSED, starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB, NEED_DC,
-//     NEED_DZ, NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out; problem.py:
-//     WEIGHTED
+// needs: lanes.h: put_, scatter_; sixteen.h: F, fma_, splat; kernels.py: work_out, sums_out, sizes,
+//     rows_in, task, a_in, skip_in, bias_in, u_in, delta_in, z_in, dout_in, dlast_in, TOKENS,
+//     AT_ONCE, TRANSPOSED, starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB,
+//     NEED_DC, NEED_DZ, NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out;
+//     problem.py: WEIGHTED
 // gives: the body of scan_backward
 // Equation 1 again, keeping decay and state of every token, and the sums of equation 8; then
 // backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums restart in the first of the

@@ -1,6 +1,6 @@
-// needs: kernels.py: SCALE; lanes.h: F, read_, splat, decay_, fma_, softplus_of_, sigmoid_,
-//     softplus_, max_abs_; task.h: Position; strip.h: Token, PerToken, Group, Fetches, lanes_,
-//     read_soon_
+// needs: kernels.py: SCALE; lanes.h: read_, decay_, softplus_of_, sigmoid_, softplus_, max_abs_;
+//     sixteen.h: F, splat, fma_; task.h: Position; strip.h: Token, PerToken, Group, Fetches,
+//     lanes_, read_soon_
 // gives: prepare_
 // The part of the gradient that does not depend on the state n: as in forward.inl, with
 // dy = dout silu(z), and the slopes of the step and of the gate. Returns the largest |rate|.

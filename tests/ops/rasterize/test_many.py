@@ -15,7 +15,7 @@ from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.cuda.project import project_on_threads, vjp_on_threads
 from gamba_warp.kernels.rasterize.projection import LensOptions, Projected, make_lens
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
-from gamba_warp.kernels.rasterize.tiles import Drawn, Tiling, make_grid
+from gamba_warp.kernels.rasterize.tiles import Splats2D, Tiling, make_grid
 
 LISTS = ("pairs", "starts")
 
@@ -206,7 +206,7 @@ def sums_one_by_one(v_pairs, written, splats, bins, geometry, absolute):
     v_conics = torch.stack([-0.5 * huu, -a * huy, -0.5 * hyy], -1)
     v_opacities = torch.where(h != 0, h / view_opacities, 0.0)
     assert geometry and absolute is None
-    return Drawn(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
+    return Splats2D(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
 
 
 @pytest.mark.parametrize("channels", [1, 3, 10, 11, 20])
