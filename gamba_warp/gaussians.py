@@ -79,6 +79,10 @@ class Gaussians:
         """Return the Gaussians of one object (no batch dimension) that ``keep [N]`` selects."""
         return self.map(lambda value: value[keep])
 
+    def is_drawn(self, least: float | None = None) -> Tensor:
+        """Return a mask ``[N]`` of the Gaussians of one object that ``drawn`` keeps."""
+        return ~(self.opacities < (ALPHA_MIN if least is None else least))
+
     def drawn(self, least: float | None = None) -> Gaussians:
         """Return the Gaussians of one object that are drawn, and any with an opacity of NaN.
 
@@ -86,7 +90,7 @@ class Gaussians:
             least: opacity below which a Gaussian is left out. None: 1/255, below which the
                 rasterizer draws nothing, so that pictures stay bit-identical.
         """
-        return self.select(~(self.opacities < (ALPHA_MIN if least is None else least)))
+        return self.select(self.is_drawn(least))
 
     def to(self, *args, **kwargs) -> Gaussians:
         """Move or convert every tensor, with the arguments of ``torch.Tensor.to``."""

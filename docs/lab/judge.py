@@ -48,7 +48,7 @@ COLUMNS = (
     ("lpips_grey_far", "LPIPS > 60°", 3),
     ("lpips_black_far", "on black", 3),
     ("mask_iou_far", "mask IoU > 60°", 3),
-    ("translucency_far", "ghost > 60°", 3),
+    ("translucency_far", "translucency > 60°", 3),
     ("translucency_far_true", "true", 3),
     ("psnr_input", "input PSNR", 2),
     ("iou", "Volume IoU", 3),

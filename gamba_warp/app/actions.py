@@ -256,12 +256,12 @@ class Actions:
         return _presented(results[index].made)
 
     @page_errors()
-    def edit(self, told: dict[str, Any], results: list[Result], state: State | None) -> Any:
+    def edit(self, message: dict[str, Any], results: list[Result], state: State | None) -> Any:
         """Edit one of the results; files of the shown one that were written before are dropped."""
-        made = next((each.made for each in results if each.made.key == told["key"]), None)
+        made = next((each.made for each in results if each.made.key == message["key"]), None)
         if made is None:
             raise UserError("this result has expired")
-        work.edit(made, told["elevation"], base64.b64decode(told["removed"]))
+        work.edit(made, message["elevation"], base64.b64decode(message["removed"]))
         if state is None or state[0] is not made:
             return gr.skip()
         state[1].clear()

@@ -33,7 +33,7 @@ _FETCH = """(files) => {
   link.click();
 }"""
 
-_STAND = f"""(degrees) => {{
+_ROTATE = f"""(degrees) => {{
   const elevation = Math.max({work.LOWEST}, Math.min({work.HIGHEST}, Number(degrees)));
   document.querySelector("iframe.stage")?.contentWindow.postMessage({{ elevation }}, "*");
   return elevation;
@@ -217,9 +217,9 @@ def build(actions: Actions) -> gr.Blocks:
         network.click(actions.cut_by_network, cut, mask, **one)
         # The viewer rotates the object at once, and then tells of it.
         quick: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
-        elevation.input(None, elevation, None, js=_STAND, **quick)
+        elevation.input(None, elevation, None, js=_ROTATE, **quick)
         for button, step in ((lower, -5), (raise_, 5)):
-            moved = f"(degrees) => ({_STAND})(Number(degrees) + {step})"
+            moved = f"(degrees) => ({_ROTATE})(Number(degrees) + {step})"
             button.click(None, elevation, elevation, js=moved, **quick)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page

@@ -46,7 +46,7 @@ MEND = (
 )
 _HOW: dict[str, str] = {
     "alpha": "The picture's own transparency is the cut-out{fringe}.",
-    "mask": "The mask {mask} cut the object out.",
+    "mask": "The mask {mask} cut the object out{fringe}.",
     "plain": "The plain background was removed{holes}{why}.",
     "matte": "The matting model {model} cut the object out.",
     "sam": "Segment Anything cut the object out, expected in the middle.",
@@ -239,7 +239,8 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     if method == "alpha":
         rgba, fringe = without_matte(rgba)
     elif method == "mask":
-        rgba = without_background(source, rgba[..., 3])
+        given, rgba = rgba, without_background(source, rgba[..., 3])
+        fringe = "background" if (rgba[..., 3] < given[..., 3]).any() else None
     found = None if method is None else _Found(method, rgba)
     if found is None:
         try:

@@ -90,7 +90,7 @@ def _narrowed(
         background: ``[H, W, 3]``; None for the local mean outside the rim.
     """
     width = max(2, max(rgb.shape[:2]) // _WIDTH)
-    picture, own = _planes(rgb), _planes(alpha[..., None])
+    own = _planes(alpha[..., None])
     solid = (own > 0.5).float()
     near, known = _around(rgb, _eroded(solid, width + 1)[0, 0].numpy(), width + 3)
     rim = (solid > _eroded(solid, width)) & (known > 0)
@@ -100,11 +100,10 @@ def _narrowed(
         rim &= known > 0
     else:
         theirs = _planes(background)
-    added, way = picture - near, theirs - near
-    share = _dot(added, way) / _dot(way, way).clamp(min=1e-3)
-    excess = (share.clamp(0, 1) - (1 - own)).clamp(min=0)
-    left = added - share.clamp(0, 1) * way
-    whole, left = (_dot(x, x)[rim].double() for x in (added, left))
+    added, full = _planes(rgb) - near, theirs - near
+    share = (_dot(added, full) / _dot(full, full).clamp(min=1e-3)).clamp(0, 1)
+    excess = (share - (1 - own)).clamp(min=0)
+    whole, left = (_dot(x, x)[rim].double() for x in (added, added - share * full))
     is_mixed = (
         len(whole) >= _LEAST
         and whole.mean() > 3 * _RIM_FRINGE**2

@@ -20,7 +20,6 @@ from ..errors import UserError
 from ..formats.meshes import TexturedMesh, load_mesh
 from ..gaussians import Gaussians
 from ..images import to_uint8
-from ..kernels.rasterize.constants import ALPHA_MIN
 
 _VISIBLE = 0.05  # opacity from which a Gaussian counts for the object's extent
 _MOST = 6e4  # float16 ends at 65504
@@ -95,7 +94,7 @@ def visible_order(gaussians: Gaussians, name: str) -> torch.Tensor:
     if bad.any():
         count = int(bad.sum())
         raise UserError(f"{name}: {count} of {gaussians.num} Gaussians are not finite")
-    seen = (gaussians.opacities >= ALPHA_MIN).nonzero()[:, 0]
+    seen = gaussians.is_drawn().nonzero()[:, 0]
     if not len(seen):
         raise UserError(f"{name}: no Gaussian has an opacity of 1/255 or more")
     widest = gaussians.scales[seen].sort(-1).values

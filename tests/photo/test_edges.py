@@ -111,6 +111,16 @@ def test_a_rim_of_a_photographs_background_goes():
     assert abs(found - clean)[seen].mean() < 0.5 * abs(given - clean)[seen].mean()
 
 
+def test_a_rim_that_is_removed_is_said(tmp_path):
+    given, clean = rimmed((0.7, 0.3, 0.1), GROUND)
+    save_image(tmp_path / "photo.png", given[..., :3])
+    for mask, said in ((given, ", without the background mixed into its edge."), (clean, ".")):
+        save_image(tmp_path / "mask.png", mask[..., 3])
+        options = CutoutOptions(mask=tmp_path / "mask.png", recenter=False)
+        how = cut_out(tmp_path / "photo.png", options).how
+        assert how == f"The mask mask.png cut the object out{said}"
+
+
 def shaded(color):
     """A hard disc that becomes darker towards its edge, as a ball does."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]

@@ -17,7 +17,7 @@ class Editor {
     for (const [key, name] of Object.entries(keys)) act.keys[key] = () => byId(`do-${name}`).click();
     Object.assign(act.keys, { "[": resize(-4), "]": resize(4) });
     window.addEventListener("message", ({ data, source }) => {
-      if (source === parent && this.edit && Number.isFinite(data?.elevation)) this.stand(data.elevation);
+      if (source === parent && this.edit && Number.isFinite(data?.elevation)) this.rotate(data.elevation);
     });
     canvas.addEventListener("pointerdown", () => { this.begun = false; });
     canvas.addEventListener("pointerleave", () => { ring.hidden = true; });
@@ -46,7 +46,7 @@ class Editor {
   }
 
   // Rotates the object for another elevation of the input's camera, in degrees; the view stays.
-  stand(degrees) {
+  rotate(degrees) {
     const { viewer, edit } = this, { home, input } = viewer.about;
     viewer.turning = false;
     edit.elevation = degrees;
@@ -117,7 +117,7 @@ class Editor {
 
   // Writes the states into the records on the graphics card.
   show() {
-    const { words, looks, viewer: { renderer, send } } = this;
+    const { words, looks, viewer: { renderer } } = this;
     this.state.forEach((kind, i) => {
       const [look, paint] = looks.subarray(2 * i, 2 * i + 2);
       words[8 * i + 3] = kind === REMOVED ? 0 : kind ? (look & 65535) | MARK[0] : look;
