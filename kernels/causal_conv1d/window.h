@@ -1,6 +1,6 @@
 // needs: kernels.py: WIDTH, TRANSPOSED, x_in, PIECE, pieces_in, task, k, state_in, weight_in,
 //     bias_in; scalars.py: reciprocal_, exp2_, ELEMENT; lanes.h: rows_, read_, write_, put_,
-//     sigmoid_; sixteen.h: fma_
+//     sigmoid_; sixteen.inl: fma_
 // gives: F, each_, fma_, sigmoid_, one, rows_, b, t0, d, width, read_, write_, put_, next_, pieces,
 //     begin, stop, own, end, rows, before, w, taps, w0, w1, w2, w3, bias, x0, x1, x2, start
 // The beginning of both kernels. A value F is WIDTH channels, from the head of kernels.py: sixteen

@@ -4,7 +4,7 @@
 //     rows_, H, S, Line, narrow_, read_, write_, put_, tiles_, Lanes, gather_, scatter_
 // Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_fm1_; TABLE:
 // true to take a table instead where the processor has AVX-512.
-#include "sixteen.h"
+#include "sixteen.inl"
 #if TABLE && defined(__AVX512F__)
 #define TABLED true
 #else

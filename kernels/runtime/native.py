@@ -24,8 +24,9 @@ _INCLUDE = re.compile(r'^[ \t]*#include "(.+)"[ \t]*\n', re.MULTILINE)
 def native(path: Path, **defines: object) -> str:
     """The text of a C++ file whose parameters are macros, defined before it and undefined after it.
 
-    Files that it includes stand in their place, so that the text holds all that is compiled: the
-    hash of a Warp module, by which compiled kernels are saved, follows every file's contents.
+    Files that it includes stand in their place, each once, so that the text holds all that is
+    compiled: the hash of a Warp module, by which compiled kernels are saved, follows every file's
+    contents.
 
     Args:
         path: of the file; an ``#include "..."`` in it is relative to it.
@@ -34,20 +35,38 @@ def native(path: Path, **defines: object) -> str:
     Raises:
         OSError: a file cannot be read.
     """
-
-    def value(x: object) -> str:
-        if isinstance(x, bool):
-            return str(x).lower()
-        return f"{x!r}f" if isinstance(x, float) else str(x)
-
-    before = "".join(f"#define {name} {value(x)}\n" for name, x in defines.items())
+    before = "".join(f"#define {name} {_literal(x)}\n" for name, x in defines.items())
     after = "".join(f"#undef {name}\n" for name in defines)
-    return f"\n{before}{_read(path)}{after}"
+    return f"\n{before}{_read(path, set())}{after}"
 
 
-def _read(path: Path) -> str:
+def _literal(x: object) -> str:
+    if isinstance(x, bool):
+        return str(x).lower()
+    return f"{x!r}f" if isinstance(x, float) else str(x)
+
+
+def _read(path: Path, seen: set[Path]) -> str:
+    if path in seen:
+        return ""
+    seen.add(path)
     text = path.read_text(encoding="utf-8")
-    return _INCLUDE.sub(lambda found: _read(path.parent / found[1]), text)
+    return _INCLUDE.sub(lambda found: _read((path.parent / found[1]).resolve(), seen), text)
+
+
+def constants(name: str, **values: object) -> str:
+    """The text of a C++ struct of constants, a template argument of a kernel's functions.
+
+    Args:
+        name: of the struct.
+        **values: its members: numbers as for ``native``.
+    """
+
+    def member(key: str, x: object) -> str:
+        kind = {bool: "bool", int: "int", float: "float"}[type(x)]
+        return f"    static constexpr {kind} {key} = {_literal(x)};\n"
+
+    return f"\nstruct {name} {{\n{''.join(member(*item) for item in values.items())}}};\n"
 
 
 def native_kernel(
@@ -56,18 +75,23 @@ def native_kernel(
     inputs: Mapping[str, Any],
     outputs: Mapping[str, Any],
     indices: str = "task",
+    header: str = "",
 ) -> Any:
     """A CPU kernel for ``parallel_launch`` that is C++: the body of one task.
 
     Args:
         name: of the kernel.
-        text: from ``native``; the task's number and the arguments are known in it by their names.
+        text: the body; the task's number and the arguments are known in it by their names. Or a
+            function of ``header``, maybe with template arguments, which is called with them.
         inputs: Warp types by names, first those that are read.
         outputs: of those that are written.
         indices: names of the launch's dimensions, the first of which is the task's number.
+        header: from ``native``: types and functions, which the text uses.
     """
     arguments = {**inputs, **outputs}
     names = ", ".join(arguments)
+    if text.isidentifier() or re.fullmatch(r"[\w:]+(<[\w:, ]*>)?", text):
+        text = f"{text}({indices}, {names});"
     source = (
         f"def {name}_task({indices}, {names}): ...\n"
         f"def {name}(offset, {names}):\n"
@@ -83,7 +107,9 @@ def native_kernel(
     task.__annotations__ = {**dict.fromkeys(map(str.strip, indices.split(",")), int), **arguments}
     kernel.__annotations__ = {"offset": int, **arguments}
     made[f"{name}_task"] = wp.func_native(text)(task)
-    return wp.kernel(kernel, enable_backward=False, module="unique")
+    build = wp.ModuleBuildOptions(extra_cpu_preamble=header, extra_cuda_preamble=header)
+    options = {"extra_build_options": build}
+    return wp.kernel(kernel, enable_backward=False, module="unique", module_options=options)
 
 
 W = 16  # channels of a lane group: one cache line of float32

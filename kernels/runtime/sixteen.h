@@ -1,22 +1,23 @@
-// needs: nothing
-// gives: F, I, lane, splat, max_, min_, fma_, abs_, root_, any_, all_, transpose_
 // Sixteen numbers as one value, which becomes AVX-512, AVX2 or NEON instructions.
+#pragma clang diagnostic ignored "-Wpsabi"  // all functions of them are within one module
+namespace gamba {
+
 typedef float F __attribute__((vector_size(64), aligned(4)));
 typedef int I __attribute__((vector_size(64), aligned(4)));
-const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-auto splat = [](float x) -> F { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; };
-auto max_ = [](F a, F b) -> F { return a > b ? a : b; };
-auto min_ = [](F a, F b) -> F { return a < b ? a : b; };
-auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
-auto abs_ = [](F a) -> F { return __builtin_elementwise_abs(a); };
-auto root_ = [](F a) -> F { return __builtin_elementwise_sqrt(a); };
-auto any_ = [](I mask) -> bool { return __builtin_reduce_or(mask) != 0; };
-auto all_ = [](I mask) -> bool { return __builtin_reduce_and(mask) != 0; };
+static const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+static inline F splat(float x) { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+static inline F max(F a, F b) { return a > b ? a : b; }
+static inline F min(F a, F b) { return a < b ? a : b; }
+static inline F fma(F a, F b, F c) { return __builtin_elementwise_fma(a, b, c); }
+static inline F abs(F a) { return __builtin_elementwise_abs(a); }
+static inline F sqrt(F a) { return __builtin_elementwise_sqrt(a); }
+static inline bool any(I mask) { return __builtin_reduce_or(mask) != 0; }
+static inline bool all(I mask) { return __builtin_reduce_and(mask) != 0; }
 
 // Transposes sixteen values of sixteen lanes: lane j of value i becomes lane i of value j. A round
 // exchanges a bit of i and one of j, of which the last two count within 128 bits, the first two
 // count these; so no instruction moves numbers across these 128 bits one by one, which is slow.
-auto transpose_ = [](F* v) __attribute__((always_inline)) {
+static inline __attribute__((always_inline)) void transpose(F* v) {
     auto place = [](int i) { return i % 4 * 4 + i / 4 % 2 * 2 + i / 8; };
     F w[16];
 #pragma unroll
@@ -44,4 +45,6 @@ auto transpose_ = [](F* v) __attribute__((always_inline)) {
     }
 #pragma unroll
     for (int i = 0; i < 16; ++i) v[i] = w[place(i)];
-};
+}
+
+}  // namespace gamba

@@ -1,5 +1,5 @@
 // needs: problem.py: ON_CPU, MODE, MAMBA, BILINEAR; lanes.h: exp2_fm1_, exp2_, exp2_parts_, LOG2E;
-//     sixteen.h: F, splat, fma_, I; scalars.py: reciprocal_
+//     sixteen.inl: F, splat, fma_, I; scalars.py: reciprocal_
 // gives: InRange, AnyRange, LN2, within_, factors_, slopes_, PHI, exact_
 // A step's decay f and weight g of x = δA, and their slopes: equations 2 to 4 and 10. A holds
 // log2(e) as well if f is an exponential.

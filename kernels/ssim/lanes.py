@@ -1,7 +1,4 @@
-"""1 - SSIM of float32 pictures on a CPU: sixteen adjacent numbers of a row at a time.
-
-Four kernels, each a file of C++; they share ``rows.h``. README.md has the formulas.
-"""
+"""1 - SSIM of float32 pictures on a CPU: sizes and launches of the kernels of ``ssim_cpu.h``."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from ..runtime.launch import parallel_launch
 from ..runtime.native import native, native_kernel
 from ..runtime.views import StructValue, struct
 from .products import box_of_windows, groups
-from .reference import C1, C2, EDGE, SIGMA, WINDOW
+from .reference import EDGE
 
 _LANES = 16
 _STRIP = 8  # rows of windows of a task, whose values are summed before they are stored
@@ -42,23 +39,14 @@ class Maps:
     slope: wp.array3d[wp.float32]
 
 
-def _weights() -> str:
-    """The window's eleven weights of a row, as C++ text."""
-    offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    line = torch.exp(-offsets.square() / (2 * SIGMA**2))
-    return f"{{{', '.join(f'{float(w)!r}f' for w in line / line.sum())}}}"
+def _kernel(function: str) -> Any:
+    """The kernel of a function: a task per row, or strip of rows, and sixteen numbers of it."""
+    header = native(Path(__file__).with_name("ssim_cpu.h"))
+    name, call = f"ssim_{function.partition('<')[0]}", f"gamba::ssim::{function}"
+    return native_kernel(name, call, {}, {"maps": Maps}, "task, group", header)
 
 
-_DEFINES = {"WEIGHTS": _weights(), "STRIP": _STRIP, "TWO_C1": 2 * C1, "TWO_C2": 2 * C2}
-
-
-def _kernel(name: str) -> Any:
-    """The kernel of a file: a task for each row, or strip of rows, and sixteen numbers of it."""
-    text = native(Path(__file__).with_name(f"{name}.inl"), **_DEFINES)
-    return native_kernel(f"ssim_{name}", text, {}, {"maps": Maps}, indices="task, group")
-
-
-_across, _down, _up, _back = map(_kernel, ("across", "down", "up", "back"))
+_across, _down, _up, _back = map(_kernel, ("across", f"down<{_STRIP}>", "up", "back"))
 
 
 def dissimilarity_on_lanes(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tensor | None]:

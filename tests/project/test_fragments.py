@@ -6,7 +6,12 @@ from pathlib import Path
 import pytest
 
 KERNELS = Path(__file__).resolve().parents[2] / "kernels"
-FRAGMENTS = sorted(path for end in ("h", "inl") for path in KERNELS.rglob(f"*.{end}"))
+FRAGMENTS = sorted(
+    path
+    for end in ("h", "inl")
+    for path in KERNELS.rglob(f"*.{end}")
+    if "namespace gamba" not in path.read_text()  # headers, whose functions have parameters
+)
 HEAD = re.compile(r"// needs: (.*?)\n// gives: (.*?)\n(?!//     )", re.DOTALL)
 
 

@@ -3,7 +3,7 @@
 // gives: the bodies of sort, count, offsets and scatter
 // The tile lists of the CPU (README.md §2), four kernels, of which a macro of its name chooses one:
 // COUNT the tiles of each Gaussian, OFFSETS of the lists, SCATTER the intersections, SORT a list.
-#include "../../runtime/sixteen.h"
+#include "../../runtime/sixteen.inl"
 typedef unsigned long long Word;
 struct Staged {
     int key, gaussian, number;

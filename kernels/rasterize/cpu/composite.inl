@@ -4,7 +4,7 @@
 // gives: the bodies of composite, composite_vjp and sum_rows
 // Compositing on the CPU (README.md §3, §5), three kernels: the pictures, with GRADIENT the sums of
 // each intersection, with SUM_ROWS the sums of each Gaussian.
-#include "../../runtime/sixteen.h"
+#include "../../runtime/sixteen.inl"
 
 #if SUM_ROWS
 // Sums the rows of the Gaussians [begin, end) of the order: a row as lanes where it has at most 16

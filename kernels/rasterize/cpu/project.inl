@@ -5,7 +5,7 @@
 // The projection on the CPU (README.md §1), and with GRADIENT its gradient (§4). Products and sums
 // are rounded one by one, as in the kernels of ../cuda/project.py: only fma_ is fused.
 #pragma clang fp contract(off)
-#include "../../runtime/sixteen.h"
+#include "../../runtime/sixteen.inl"
 
 const int runs = (num + RUN - 1) / RUN, begin = task % runs * RUN;
 const int end = begin + RUN < num ? begin + RUN : num;

@@ -4,7 +4,7 @@
 // Sixteen Gaussians as the lanes of one SIMD value. Coefficients are transposed, 16 x 16 floats
 // at a time, so that a lane holds one Gaussian's; the gradient is transposed back. A row is K_D
 // floats, of which FLOATS are used. Lanes beyond the last Gaussian hold the last one again.
-#include "../../runtime/sixteen.h"
+#include "../../runtime/sixteen.inl"
 const int COUNT = (DEGREE + 1) * (DEGREE + 1), FLOATS = COUNT * D, PADDED = (FLOATS + 15) / 16 * 16;
 // not finite, by the exponent's bits
 auto not_finite_ = [](F x) -> I { return ((I)x & 0x7fffffff) >= 0x7f800000; };

@@ -1,4 +1,4 @@
-// needs: lanes.h: put_, scatter_; sixteen.h: F, fma_, splat; kernels.py: work_out, sums_out, sizes,
+// needs: lanes.h: put_, scatter_; sixteen.inl: F, fma_, splat; kernels.py: work_out, sums_out, sizes,
 //     rows_in, task, a_in, skip_in, bias_in, u_in, delta_in, z_in, dout_in, dlast_in, TOKENS,
 //     AT_ONCE, TRANSPOSED, starts_in, du_out, ddelta_out, dz_out, BLOCKS, b_in, c_in, NEED_DB,
 //     NEED_DC, NEED_DZ, NEED_DH, SCALE, dchannel_out, db_out, dc_out, dfirst_out, da_out;

@@ -1,4 +1,4 @@
-// needs: lanes.h: read_, softplus_, sigmoid_, max_abs_, scatter_; sixteen.h: F, splat, fma_;
+// needs: lanes.h: read_, softplus_, sigmoid_, max_abs_, scatter_; sixteen.inl: F, splat, fma_;
 //     kernels.py: work_out, OUTPUT, sizes, rows_in, task, a_in, skip_in, bias_in, TOKENS, first_in,
 //     starts_out, CHUNK, delta_in, u_in, z_in, y_out, SCALE, b_in, c_in, last_out, product_out
 // gives: the body of scan_forward

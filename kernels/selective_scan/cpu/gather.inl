@@ -1,4 +1,4 @@
-// needs: sixteen.h: F; kernels.py: work_out, sizes, rows_in, task, a_in, skip_in, bias_in, TOKENS,
+// needs: sixteen.inl: F; kernels.py: work_out, sizes, rows_in, task, a_in, skip_in, bias_in, TOKENS,
 //     u_in, delta_in, z_in, c_in, dout_in, dh_out, product_out
 // gives: the body of scan_gradient_states
 // The gradient of the outputs by the state before the first token, and the product of the decays.

@@ -1,5 +1,5 @@
 // needs: kernels.py: SCALE; lanes.h: read_, decay_, softplus_of_, sigmoid_, softplus_, max_abs_;
-//     sixteen.h: F, splat, fma_; task.h: Position; strip.h: Token, PerToken, Group, Fetches,
+//     sixteen.inl: F, splat, fma_; task.h: Position; strip.h: Token, PerToken, Group, Fetches,
 //     lanes_, read_soon_
 // gives: prepare_
 // The part of the gradient that does not depend on the state n: as in forward.inl, with

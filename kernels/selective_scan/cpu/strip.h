@@ -1,5 +1,5 @@
 // needs: kernels.py: GRADIENT, TOKENS, AT_ONCE, TRANSPOSED, SLOWEST, MODERATE; lanes.h: rows_,
-//     gather_, in_range_, max_abs_; sixteen.h: F, I, splat; problem.py: WEIGHTED; task.h: Position,
+//     gather_, in_range_, max_abs_; sixteen.inl: F, I, splat; problem.py: WEIGHTED; task.h: Position,
 //     fill_
 // gives: Token, PerToken, Saved, Group, load_group_, here_, lanes_, Fetch, Fetches, lines_,
 //     read_soon_, write_soon_, Plain, Slow, worth_slow_, slow_lanes_, Column, column_, Several,

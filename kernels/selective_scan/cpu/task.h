@@ -1,4 +1,4 @@
-// needs: kernels.py: BLOCKS, CHUNK, TOKENS; sixteen.h: F, splat
+// needs: kernels.py: BLOCKS, CHUNK, TOKENS; sixteen.inl: F, splat
 // gives: Position, position_, row_, states_, fill_, pairs_, load_, store_, piece_, each_
 // A task: a segment of the tokens of one sequence, and lane groups of one channel group. Tasks that
 // follow one another have the same lane groups and adjacent tokens, also in the backward order: the
