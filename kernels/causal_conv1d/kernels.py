@@ -1,7 +1,6 @@
 """Causal depthwise convolution of at most four taps, with SiLU: the step before the scan.
 
-One C++ body serves both devices: its values are lanes of sixteen channels on a CPU and a few of
-them, one thread each, on CUDA. Equations 1 and 2 of README.md.
+``conv.h`` serves both devices: its values are sixteen channels on a CPU and four on CUDA.
 """
 
 import functools
@@ -11,8 +10,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from ..runtime.native import PRELUDE, WARP_DTYPES, W, lanes, native, native_kernel
-from ..runtime.scalars import BITS, EXP2, RECIPROCAL
+from ..runtime.native import WARP_DTYPES, W, constants, lanes, native, native_kernel
 
 TAPS = 4
 # Tokens of a forward task; on a CPU few, because each row may be in another page, but many where x
@@ -26,21 +24,27 @@ CHUNK = {"cpu": 64, "cuda": 128}
 RUN = 16
 AHEAD = 8  # tokens whose loads a CUDA thread has under way
 VALUES = {"cpu": (lanes, W), "cuda": (wp.vec4, 4)}  # type of a value, and its channels
-_INDICES = {False: "task, k", True: "k, task"}  # of a launch: adjacent memory follows last
 
 
-def _text(file: str, device_type: str, io: torch.dtype, piece: int, transposed: bool) -> str:
+def _kernel(
+    direction: str,
+    device_type: str,
+    tokens: int,
+    transposed: bool,
+    inputs: dict[str, Any],
+    outputs: dict[str, Any],
+) -> Any:
+    """Return the kernel of a function of ``conv.h``, or where it is ``transposed`` of its twin."""
     on_cpu = device_type == "cpu"
-    head = PRELUDE if on_cpu else EXP2 + RECIPROCAL
-    return head + native(
-        Path(__file__).with_name(file),
-        ELEMENT=BITS[io]["ELEMENT"],
-        WIDTH=VALUES[device_type][1],
-        PIECE=piece,
-        TRANSPOSED=transposed,
-        RUN=RUN if on_cpu else 0,
-        AHEAD=AHEAD,
+    header = native(Path(__file__).with_name(f"conv_{device_type}.h"))
+    config = constants(
+        "Config", TOKENS=tokens, RUN=RUN if on_cpu else 0, AHEAD=0 if on_cpu else AHEAD
     )
+    twin = "_transposed" if transposed else ""
+    call = f"gamba::conv::{direction}{twin}<Config>(task, k, in, out);"
+    # adjacent memory follows the last dimension
+    indices = "k, task" if transposed else "task, k"
+    return native_kernel(f"conv_{direction}", call, inputs, outputs, indices, header + config)
 
 
 def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:
@@ -63,10 +67,9 @@ def forward_kernel(device_type: str, io: torch.dtype, transposed: bool) -> Any:
     If x is ``transposed`` (``runtime.views``), the launch's first dimension is channels.
     """
     piece = TRANSPOSED_STRIP if transposed else STRIP[device_type]
-    text = _text("forward.inl", device_type, io, piece, transposed)
     inputs = {**_window(device_type, io), "stream": int}
     outputs = {"y_out": wp.array3d(dtype=WARP_DTYPES[io])}
-    return native_kernel("conv_forward", text, inputs, outputs, _INDICES[transposed])
+    return _kernel("forward", device_type, piece, transposed, inputs, outputs)
 
 
 @functools.cache
@@ -75,9 +78,8 @@ def backward_kernel(device_type: str, io: torch.dtype, transposed: bool) -> Any:
 
     It is ``transposed`` where x or the gradient of the output is.
     """
-    text = _text("backward.inl", device_type, io, CHUNK[device_type], transposed)
     rows = wp.array3d(dtype=WARP_DTYPES[io])
     inputs = {**_window(device_type, io), "dout_in": rows}
     sums = wp.array3d(dtype=VALUES[device_type][0])
     outputs = {"dx_out": rows, "dstate_out": rows, "dweight_out": sums}
-    return native_kernel("conv_backward", text, inputs, outputs, _INDICES[transposed])
+    return _kernel("backward", device_type, CHUNK[device_type], transposed, inputs, outputs)

@@ -69,6 +69,12 @@ def constants(name: str, **values: object) -> str:
     return f"\nstruct {name} {{\n{''.join(member(*item) for item in values.items())}}};\n"
 
 
+def _group(name: str, arguments: Mapping[str, Any]) -> str:
+    """C++ text of a local struct of references to arguments, without the ending of their names."""
+    members = "".join(f"const decltype({x})& {x.removesuffix(f'_{name}')}; " for x in arguments)
+    return f"const struct {{ {members}}} {name} = {{{', '.join(arguments)}}};\n"
+
+
 def native_kernel(
     name: str,
     text: str,
@@ -77,12 +83,13 @@ def native_kernel(
     indices: str = "task",
     header: str = "",
 ) -> Any:
-    """A CPU kernel for ``parallel_launch`` that is C++: the body of one task.
+    """A kernel for ``launch`` that is C++: the body of one task.
 
     Args:
         name: of the kernel.
-        text: the body; the task's number and the arguments are known in it by their names. Or a
-            function of ``header``, maybe with template arguments, which is called with them.
+        text: the body, as a rule the call of a function of ``header``. It knows the task's number
+            and the arguments by their names, and as ``in.u`` and ``out.y`` those that are named
+            ``u_in`` and ``y_out``.
         inputs: Warp types by names, first those that are read.
         outputs: of those that are written.
         indices: names of the launch's dimensions, the first of which is the task's number.
@@ -90,8 +97,10 @@ def native_kernel(
     """
     arguments = {**inputs, **outputs}
     names = ", ".join(arguments)
-    if text.isidentifier() or re.fullmatch(r"[\w:]+(<[\w:, ]*>)?", text):
+    if re.fullmatch(r"[\w:]+(<[\w:, ]*>)?", text):
         text = f"{text}({indices}, {names});"
+    if re.search(r"\bin\b", text):
+        text = f"{_group('in', inputs)}{_group('out', outputs)}{text}"
     source = (
         f"def {name}_task({indices}, {names}): ...\n"
         f"def {name}(offset, {names}):\n"
@@ -119,21 +128,6 @@ WARP_DTYPES = {
     torch.float16: wp.float16,
     torch.bfloat16: wp.bfloat16,
 }
-
-_HERE = Path(__file__).parent
-
-
-def prelude(degree: int, table: bool = False) -> str:
-    """C++ text of ``lanes.h``: arithmetic on lanes, and rows of tensors as lanes.
-
-    Args:
-        degree: of the polynomial in ``exp2_parts_`` and ``exp2_fm1_``, 2 to 6.
-        table: True to use a table instead where the processor has AVX-512.
-    """
-    return native(_HERE / "lanes.h", DEGREE=degree, TABLE=table)
-
-
-PRELUDE = prelude(5)
 
 _STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
 

@@ -1,5 +1,6 @@
 // Sixteen numbers as one value, which becomes AVX-512, AVX2 or NEON instructions.
 #pragma clang diagnostic ignored "-Wpsabi"  // all functions of them are within one module
+#define INLINE static inline __attribute__((always_inline))
 namespace gamba {
 
 typedef float F __attribute__((vector_size(64), aligned(4)));
@@ -17,7 +18,7 @@ static inline bool all(I mask) { return __builtin_reduce_and(mask) != 0; }
 // Transposes sixteen values of sixteen lanes: lane j of value i becomes lane i of value j. A round
 // exchanges a bit of i and one of j, of which the last two count within 128 bits, the first two
 // count these; so no instruction moves numbers across these 128 bits one by one, which is slow.
-static inline __attribute__((always_inline)) void transpose(F* v) {
+INLINE void transpose(F* v) {
     auto place = [](int i) { return i % 4 * 4 + i / 4 % 2 * 2 + i / 8; };
     F w[16];
 #pragma unroll

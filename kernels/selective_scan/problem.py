@@ -1,7 +1,7 @@
 """Arguments of a scan, and the rules that discretize a step of the state to f and g.
 
-A rule (equations 2 to 4 of README.md) is an entry here, a branch on both devices in
-``discretize.h``, and the oracle's formula in ``reference.py``.
+A rule (equations 2 to 4 of README.md) is an entry here, a branch in the C++ of each device
+(``discretize.h``), and the oracle's formula in ``reference.py``.
 """
 
 from __future__ import annotations
@@ -130,8 +130,7 @@ def sum_parts(parts: Tensor) -> Tensor:
     return first
 
 
-def macros(name: str, on_cpu: bool) -> dict[str, object]:
-    """Macros of the kernels' C++: MODE is one of the numbers MAMBA, BILINEAR, ZOH."""
+def macros(name: str) -> dict[str, object]:
+    """Macros of CUDA's C++: MODE is one of the numbers MAMBA, BILINEAR, ZOH."""
     numbers: dict[str, object] = {key.upper(): i for i, key in enumerate(DISCRETIZATIONS)}
-    numbers |= {"MODE": name.upper(), "WEIGHTED": DISCRETIZATIONS[name].weighted}
-    return numbers | {"ON_CPU": on_cpu}
+    return numbers | {"MODE": name.upper(), "WEIGHTED": DISCRETIZATIONS[name].weighted}

@@ -1,9 +1,9 @@
 """The CPU kernels: lanes are adjacent channels, tokens run in strips, states a few at a time.
 
 A task is one batch element, a segment of its tokens, and lane groups of one channel group. In a
-strip it holds values that do not depend on the state n, and walks the tokens once per few n and
-lane group: their h_n are in registers and N is free. The loops are C++ in the files next to this
-one. Equations are numbered as in README.md.
+strip it holds values that do not depend on the state n, and traverses the tokens once per few n and
+lane group: their h_n are in registers and N is free. The loops are C++, ``forward.h`` and
+``backward.h``. Equations are numbered as in README.md.
 """
 
 import functools
@@ -13,17 +13,17 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from ...runtime.native import WARP_DTYPES, lanes, native, native_kernel, prelude
+from ...runtime.native import WARP_DTYPES, constants, lanes, native, native_kernel
 from ...runtime.views import struct
-from ..problem import DISCRETIZATIONS, macros
+from ..problem import DISCRETIZATIONS
 
-# Lane groups of a task at most: rows are read in long parts that fit a core's cache. Turned ones
-# are read along the tokens, and a task has the fewest that it can.
+# Lane groups of a task at most: rows are read in long parts that fit a core's cache. Transposed
+# ones are read along the tokens, and a task has the fewest that it can.
 SPAN = 32
 BLOCKS = 4  # lane groups whose dB and dC are one partial sum, whatever the number of threads
 FEW = 8  # states up to which the memory, and not the arithmetic, sets the time
 
-# A chunk is walked with care for slow decays where |x| <= 1/128 in one channel of the sixteen at
+# A chunk is traversed with care for slow decays where |x| <= 1/128 in one channel of the sixteen at
 # least, or 1/32 in all. Then all channels with |x| <= 1/32 count as slow. Chunks of more than 64
 # tokens take smaller limits, by their length, so that a state does not leave its base far behind.
 SLOWEST, MODERATE = 1 / 128, 1 / 32
@@ -41,24 +41,24 @@ class Tuning(NamedTuple):
     """Constants of a compiled kernel; the scan's README has the cost of the choices.
 
     Attributes:
-        chunk: tokens between saved states, which the gradient walks at once; a multiple of
+        chunk: tokens between saved states, which the gradient traverses at once; a multiple of
             8 and of ``strip``.
-        strip: tokens that the forward walks at once for one state.
+        strip: tokens that the forward traverses at once for one state.
         degree: of the polynomial for the decays' 2^x, 2 to 6; the relative error of a decay is
             at most 2e-3, 1e-4, 3e-6, 3e-7 and 7.5e-9.
         table: True to compute 2^x by a table of 16 and a cubic, not the polynomial, where the
             processor has AVX-512; the relative error of a decay is then at most 6e-8.
-        walked: states that the forward walks at once; 0 for 2 where there are FEW, else 4. A walk
-            fetches one tensor's rows of the next strip, so few states need shorter walks.
-        walked_back: states that the gradient walks at once.
+        at_once: states that the forward computes together; 0 for 2 where there are FEW, else 4. A
+            traversal fetches one tensor's rows of the next strip, so few states need shorter ones.
+        back_at_once: states that the gradient computes together.
     """
 
     chunk: int = 64
     strip: int = 32
     degree: int = 5
     table: bool = True
-    walked: int = 0
-    walked_back: int = 4
+    at_once: int = 0
+    back_at_once: int = 4
 
 
 class Kind(NamedTuple):
@@ -73,19 +73,34 @@ class Kind(NamedTuple):
     tuning: Tuning
     transposed: bool
 
-    def text(self, file: str, gradient: bool, output: bool = True) -> str:
-        """A leaf's C++."""
+    def header(self, gradient: bool, output: bool = True) -> str:
+        """C++ of the kernels, ``forward.h`` or ``backward.h``, and their constants, ``Config``."""
         tuning, rule = self.tuning, DISCRETIZATIONS[self.discretization]
-        tokens = tuning.chunk if gradient else tuning.strip
-        at_once = tuning.walked_back if gradient else tuning.walked
         share = min(1.0, 64 / tuning.chunk)
-        limits = {"SLOWEST": SLOWEST * share, "MODERATE": MODERATE * share}
-        text = native(
-            _HERE / file, **macros(self.discretization, True), **limits, **NEEDS, SCALE=rule.scale,
-            GRADIENT=gradient, OUTPUT=output, TOKENS=tokens, CHUNK=tuning.chunk, AT_ONCE=at_once,
-            BLOCKS=BLOCKS, TRANSPOSED=self.transposed,
-        )  # fmt: skip
-        return prelude(tuning.degree, tuning.table) + text
+        config = constants(
+            "Config",
+            MODE=[*DISCRETIZATIONS].index(self.discretization),
+            WEIGHTED=rule.weighted,
+            SCALE=rule.scale,
+            DEGREE=tuning.degree,
+            TABLE=tuning.table,
+            SLOWEST=SLOWEST * share,
+            MODERATE=MODERATE * share,
+            GRADIENT=gradient,
+            OUTPUT=output,
+            TRANSPOSED=self.transposed,
+            TOKENS=tuning.chunk if gradient else tuning.strip,
+            CHUNK=tuning.chunk,
+            AT_ONCE=tuning.back_at_once if gradient else tuning.at_once,
+            BLOCKS=BLOCKS,
+        )
+        return config + native(_HERE / ("backward.h" if gradient else "forward.h"))
+
+    def kernel(self, function: str, inputs: dict[str, Any], outputs: dict[str, Any], header: str):
+        """Return the kernel of a function of the header."""
+        call = f"gamba::scan::{function}<Config>(task, in, out);"
+        inputs = {**_channels(self), **inputs}
+        return native_kernel(f"scan_{function}", call, inputs, outputs, header=header)
 
 
 @struct
@@ -114,7 +129,7 @@ def forward_kernel(kind: Kind, output: bool) -> Any:
     ``task.h`` has the layout of states. With ``output`` it computes y; else the products of the
     decays, and z, C and D are not used.
     """
-    inputs = {**_channels(kind), "b_in": _MATRIX, "c_in": _MATRIX, "first_in": _STATES}
+    inputs = {"B_in": _MATRIX, "C_in": _MATRIX, "first_in": _STATES}
     outputs = {
         "work_out": _WORK,
         "last_out": _STATES,
@@ -122,16 +137,16 @@ def forward_kernel(kind: Kind, output: bool) -> Any:
         "starts_out": wp.array3d(dtype=lanes),
         "y_out": wp.array3d(dtype=WARP_DTYPES[kind.io]),
     }
-    return native_kernel("scan_forward", kind.text("forward.inl", False, output), inputs, outputs)
+    return kind.kernel("forward", inputs, outputs, kind.header(False, output))
 
 
 @functools.cache
 def gradient_states_kernel(kind: Kind) -> Any:
     """Kernel of a segment's gradient by the state before it, and of the products of the decays."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
-    inputs = {**_channels(kind), "c_in": _MATRIX, "dout_in": rows}
+    inputs = {"C_in": _MATRIX, "dout_in": rows}
     outputs = {"work_out": _WORK, "dh_out": _STATES, "product_out": _STATES}
-    return native_kernel("scan_gradient_states", kind.text("gather.inl", True), inputs, outputs)
+    return kind.kernel("gradient_states", inputs, outputs, kind.header(True))
 
 
 @functools.cache
@@ -139,9 +154,8 @@ def backward_kernel(kind: Kind) -> Any:
     """Computes all gradients from the gradients of the states after each segment, ``dlast_in``."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     inputs = {
-        **_channels(kind),
-        "b_in": _MATRIX,
-        "c_in": _MATRIX,
+        "B_in": _MATRIX,
+        "C_in": _MATRIX,
         "starts_in": wp.array3d(dtype=lanes),
         "dout_in": rows,
         "dlast_in": _STATES,
@@ -153,25 +167,25 @@ def backward_kernel(kind: Kind) -> Any:
         "du_out": rows,
         "ddelta_out": wp.array3d(dtype=WARP_DTYPES[kind.delta_io]),
         "dz_out": rows,
-        "da_out": _STATES,
-        "db_out": wp.array2d(dtype=wp.float32),
-        "dc_out": wp.array2d(dtype=wp.float32),
+        "dA_out": _STATES,
+        "dB_out": wp.array2d(dtype=wp.float32),
+        "dC_out": wp.array2d(dtype=wp.float32),
         "dchannel_out": wp.array3d(dtype=lanes),
     }
-    return native_kernel("scan_backward", kind.text("backward.inl", True), inputs, outputs)
+    return kind.kernel("backward", inputs, outputs, kind.header(True))
 
 
 def _channels(kind: Kind) -> dict[str, Any]:
-    """Return the text that all three begin with."""
+    """Return the inputs that all three begin with."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     deltas = wp.array3d(dtype=WARP_DTYPES[kind.delta_io])
     return {
         "sizes": Sizes,
-        "rows_in": wp.array2d(dtype=wp.int32),  # of packed rows: b, begin, end, chunk; or none
+        "ranges_in": wp.array2d(dtype=wp.int32),  # of packed rows: b, begin, end, chunk; or none
         "u_in": rows,
         "delta_in": deltas,
         "z_in": rows,
-        "a_in": wp.array2d(dtype=wp.float32),
-        "skip_in": wp.array(dtype=wp.float32),
-        "bias_in": wp.array(dtype=wp.float32),
+        "A_in": wp.array2d(dtype=wp.float32),
+        "D_in": wp.array(dtype=wp.float32),
+        "delta_bias_in": wp.array(dtype=wp.float32),
     }

@@ -49,8 +49,8 @@ class Layout:
     """Map of channels to lanes: D = groups × group_width, each group in blocks of W, padded.
 
     A task is a segment of one sequence's tokens and a span of blocks of one group. The blocks
-    of a span are walked side by side, so that rows are read in long parts. Segments are for inputs
-    with too few channels for torch's threads; finding their first states costs a second walk.
+    of a span are traversed side by side, so that rows are read in long parts. Segments are for
+    inputs with too few channels for torch's threads; their first states cost a second traversal.
     Packed sequences are each cut as if alone, so that their bits are the same; those with
     fewer segments than others have empty ones behind.
     """
@@ -155,7 +155,7 @@ class _Operands:
     def __init__(self, scan: Scan, dout: Tensor | None = None, split: bool = True):
         x, options = scan
         states = x.A.shape[1]
-        tuning = TUNING._replace(walked=TUNING.walked or (2 if states <= FEW else 4))
+        tuning = TUNING._replace(at_once=TUNING.at_once or (2 if states <= FEW else 4))
         u, delta = dense(x.u), dense(x.delta)
         z = u if x.z is None else dense(x.z)
         transposed = is_transposed(u) or is_transposed(delta) or is_transposed(z)
@@ -198,7 +198,7 @@ class _Operands:
         return torch.empty(y.segments, y.sequences, y.channels, y.states, dtype=torch.float32)
 
     def advance(self, first: Tensor | None, last: Tensor, product: Tensor | None, starts: Tensor):
-        """Walks without outputs: states after each segment, and the products of the decays."""
+        """Runs without outputs: states after each segment, and the products of the decays."""
         kernel = kernels.forward_kernel(self.kind, output=False)
         outputs = [_rows(last), _rows(product), view(starts, lanes), None]
         work = self.work(4)

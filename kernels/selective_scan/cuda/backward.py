@@ -106,7 +106,7 @@ def backward_kernel(
     taken = max([v for v in (1, 2, 4) if f.width % v == 0 and every // v >= f.block] or [1])
     constants = {"MARK": MARK, "SUB": SUB, "TAKEN": taken, "READ": read, "THROUGH": through}
     constants |= {"NEED_DB": "dB" in flags, "NEED_DC": "dC" in flags, "NEED_Y": "y" in flags}
-    constants |= macros(mode, False)
+    constants |= macros(mode)
     back = constants | {f"AT_{name}": start for name, start in offset.items()}
     marking = constants | {f"AT_{name}": start for name, start in mark_offset.items()}
 

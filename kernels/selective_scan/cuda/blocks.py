@@ -350,7 +350,7 @@ def recurrence(
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     offset = {"AT_C": 0, "AT_Y": 0} | {f"AT_{name}": start for name, start in parts}
-    text = functools.partial(f.text, TOKENS=tokens, **macros(mode, False), **offset)
+    text = functools.partial(f.text, TOKENS=tokens, **macros(mode), **offset)
 
     @wp.func_native(text("recurrence.inl", UNROLL=UNROLL, READ=read, REVERSE=reverse))
     def advance(arena: arena_type, base: int, p: Position, a: vec, h: vec) -> vec: ...

@@ -280,11 +280,11 @@ def test_a_compiled_scan_is_the_scan():
     assert torch.equal(grad, *torch.autograd.grad(want.square().sum(), v))
 
 
-@pytest.mark.parametrize("walked, walked_back", [(1, 1), (2, 5)])
-def test_states_walked_at_once_change_no_bit(walked, walked_back, monkeypatch):
-    """Five states are a walk of four and one left over, or five, or two, two and one."""
+@pytest.mark.parametrize("at_once, back_at_once", [(1, 1), (2, 5)])
+def test_states_computed_together_change_no_bit(at_once, back_at_once, monkeypatch):
+    """Five states are four together and one left over, or five, or two, two and one."""
     inputs, results = make(2, 173, 24, 5), []
-    for tuning in (cpu.TUNING, cpu.Tuning(walked=walked, walked_back=walked_back)):
+    for tuning in (cpu.TUNING, cpu.Tuning(at_once=at_once, back_at_once=back_at_once)):
         monkeypatch.setattr(cpu, "TUNING", tuning)
         mine = leaves(inputs)
         out = selective_scan(**mine, delta_softplus=True)
