@@ -15,6 +15,13 @@ static inline F sqrt(F a) { return __builtin_elementwise_sqrt(a); }
 static inline bool any(I mask) { return __builtin_reduce_or(mask) != 0; }
 static inline bool all(I mask) { return __builtin_reduce_and(mask) != 0; }
 
+// The sum of the lanes, pairwise, in a fixed order.
+static inline float total(F x) {
+    for (int w = 8; w > 0; w >>= 1)
+        for (int l = 0; l < w; ++l) x[l] += x[l + w];
+    return x[0];
+}
+
 // Transposes sixteen values of sixteen lanes: lane j of value i becomes lane i of value j. A round
 // exchanges a bit of i and one of j, of which the last two count within 128 bits, the first two
 // count these; so no instruction moves numbers across these 128 bits one by one, which is slow.

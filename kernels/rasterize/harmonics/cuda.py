@@ -19,7 +19,9 @@ CHUNK = 1  # Gaussians of a task
 HELD = 48  # coefficients of a row that a thread holds at most: three channels of degree 3
 _HERE = Path(__file__).parent
 # Loops over a column of coefficients are written out, so that it stays in registers.
-_OPTIONS = {"max_unroll": 25}
+_BASIS = native(_HERE / "basis.h")
+_BUILD = wp.ModuleBuildOptions(extra_cpu_preamble=_BASIS, extra_cuda_preamble=_BASIS)
+_OPTIONS = {"max_unroll": 25, "extra_build_options": _BUILD}
 
 
 @wp.func
@@ -48,16 +50,16 @@ def _leaves(degree: int, channels: int) -> SimpleNamespace:
     group = channels if count * channels <= HELD else 1
     column = wp.types.vector(count, wp.float32)
     part = wp.types.vector(count * group, wp.float32)
-    packed = f"typedef float F; wp::vec_t<{count}, float> Y;"
     sizes = dict(COUNT=count, CHANNELS=group, WHOLE=group == channels)
 
-    @wp.func_native(packed + native(_HERE / "basis.h", DEGREE=degree) + "return Y;")
+    @wp.func_native(
+        f"wp::vec_t<{count}, float> Y; gamba::harmonics::basis<{degree}>(x, y, z, Y.c); return Y;"
+    )
     def basis(x: wp.float32, y: wp.float32, z: wp.float32) -> column: ...
 
     @wp.func_native(
-        "typedef float F; F v_x = 0.0f, v_y = 0.0f, v_z = 0.0f;"
-        + native(_HERE / "slopes.h", DEGREE=degree)
-        + "return wp::vec_t<3, float>(v_x, v_y, v_z);"
+        "wp::vec3 v(0.0f);"
+        f"gamba::harmonics::slopes<{degree}>(x, y, z, s.c, v.c[0], v.c[1], v.c[2]); return v;"
     )
     def slopes(x: wp.float32, y: wp.float32, z: wp.float32, s: column) -> wp.vec3: ...
 
