@@ -1,12 +1,11 @@
 """Compositing on the CPU: threads take tile after tile, 16 lanes = the pixels of a 4 x 4 block.
 
-A tile of 16 x 16 pixels is 16 such blocks. The gradient walks back to front and writes one row per
+A tile of 16 x 16 pixels is 16 such blocks. The gradient goes back to front and writes one row per
 (tile, Gaussian) intersection; rows are summed by Gaussian afterwards, by one thread and without
-atomics: the same bits every time. README.md §3 and §5 hold the maths.
+atomics: the same bits every time. README.md §3 and §5 hold the maths, ``composite.h`` the code.
 """
 
 from pathlib import Path
-from typing import Any
 
 import torch
 import warp as wp
@@ -14,20 +13,19 @@ from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from ...runtime.native import native, native_kernel
+from ...runtime.native import constants, native, native_kernel
 from ...runtime.views import StructValue, as_struct, struct, struct_of, view
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
 from ..tiles import SLACK, SLACK_ABS, Bins, Picture, Pixels, Saved, Splats2D
 
-_HERE = Path(__file__).parent
 _RUN = 1024  # Gaussians of a task of the sums
 _PIECES_PER_THREAD = 8
-_DEFINES: dict[str, Any] = {
-    **{"TILE": TILE, "SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "BLOCK_TEST": BLOCK_TEST},
-    **{"STOPPED": STOPPED, "EMPTY_TILES": EMPTY_TILES, "ZERO_UPSTREAM": ZERO_UPSTREAM},
-    "UNUSED": UNUSED,
-}
+_CONFIG = constants(
+    "Config", TILE=TILE, SLACK=SLACK, SLACK_ABS=SLACK_ABS, BLOCK_TEST=BLOCK_TEST, STOPPED=STOPPED,
+    EMPTY_TILES=EMPTY_TILES, ZERO_UPSTREAM=ZERO_UPSTREAM, UNUSED=UNUSED,
+)  # fmt: skip
+_HEADER = _CONFIG + native(Path(__file__).with_name("composite.h"))
 
 
 @struct
@@ -53,29 +51,30 @@ _SAVED = {"saved": struct_of(Saved), "pixels": Pixels}
 
 _composite = native_kernel(
     "composite",
-    native(_HERE / "composite.inl", **_DEFINES),
+    "gamba::raster::composite<Config>",
     inputs=_SPLATS,
     outputs={**_SAVED, "workers": Workers},
+    header=_HEADER,
 )
 # with the sums of absolute values, and with a gradient that passes the clamp of alpha, which cost
 # nothing where they are not asked for
 _composite_vjp = {
     (absolute, passes): native_kernel(
         "composite_vjp" + "_absolute" * absolute + "_passing" * passes,
-        native(
-            _HERE / "composite.inl", GRADIENT=True, **_DEFINES, ABSOLUTE=absolute, PASSES=passes
-        ),
+        f"gamba::raster::composite_vjp<Config, {absolute:d}, {passes:d}>",
         inputs={**_SPLATS, **_SAVED},
         outputs={"workers": Workers, "rows": Rows},
+        header=_HEADER,
     )
     for absolute in (False, True)
     for passes in (False, True)
 }
 _sum_rows = native_kernel(
     "sum_rows",
-    native(_HERE / "composite.inl", SUM_ROWS=True, RUN=_RUN),
+    f"gamba::raster::sum_rows<{_RUN}>",
     inputs={"splats": struct_of(Splats2D), "lists": struct_of(Bins), "rows": Rows},
     outputs={"v": struct_of(Splats2D), "absolute": wp.array[wp.vec2]},
+    header=_HEADER,
 )
 
 
