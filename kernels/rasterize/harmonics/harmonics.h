@@ -1,9 +1,11 @@
 // Colours from spherical harmonics on a CPU, and their gradient (README.md §6): sixteen
 // Gaussians as lanes. Coefficients are transposed, 16 x 16 floats at a time, so that a lane holds
-// one Gaussian's; the gradient is transposed back. Lanes beyond the last Gaussian hold it again.
-#include "../../runtime/sixteen.h"
+// one Gaussian's; the gradient is transposed back. Lanes beyond the last Gaussian hold its row
+// again, and 0.
+#include "../rows.h"
 #include "basis.h"
 namespace gamba::harmonics {
+using namespace raster;
 
 typedef wp::array_t<float> Coefficients;           // [rows, K, D]
 typedef float A __attribute__((vector_size(64)));  // F as templates know it: not aligned to 4
@@ -15,30 +17,6 @@ struct Sizes : Config {
     static constexpr int FLOATS = COUNT * Config::D, PADDED = (FLOATS + 15) / 16 * 16;
     static constexpr int UNROLL = FLOATS <= 96 ? FLOATS : 1;  // longer code is no quicker
 };
-
-// A task's Gaussians [begin, end) of an object, which has ``count`` such chunks.
-struct Chunk {
-    int object, index, count, begin, end;
-};
-template<class Config>
-static Chunk chunk_of(int task, int num) {
-    const int chunks = (num + Config::CHUNK - 1) / Config::CHUNK;
-    const int begin = task % chunks * Config::CHUNK;
-    const int end = begin + Config::CHUNK < num ? begin + Config::CHUNK : num;
-    return {task / chunks, task % chunks, chunks, begin, end};
-}
-
-static inline I not_finite(F x) { return ((I)x & 0x7fffffff) >= 0x7f800000; }
-
-// Results that pass a gradient on: colours above 0, and sums that are neither NaN, which says that
-// something was not finite, nor -inf.
-static inline I passes(F shown, bool clamped) { return shown > (clamped ? 0.0f : -3.4e38f); }
-
-static inline __attribute__((always_inline)) void load_means(
-    const float* means, size_t first, int live, F* mean) {
-    for (int j = 0; j < 16; ++j)
-        for (int i = 0; i < 3; ++i) mean[i][j] = means[(first + (j < live ? j : live - 1)) * 3 + i];
-}
 
 // Transposes the rows of ``live`` Gaussians: the i-th float of each becomes into[i].
 template<int FLOATS>
@@ -111,15 +89,15 @@ template<class Config, class Size, class Arrays>
 static void forward(int task, const Size& size, const Arrays& arrays) {
     typedef Sizes<Config> S;
     constexpr int D = S::D;
-    const Chunk chunk = chunk_of<Config>(task, size.num);
+    const Run chunk(task, size.num, S::CHUNK);
     const float* const centers = (const float*)arrays.centers.data;
     for (int first = chunk.begin; first < chunk.end; first += 16) {
         const int live = chunk.end - first < 16 ? chunk.end - first : 16;
         const size_t gaussian = (size_t)chunk.object * size.num + first;
         F mean[3], T[S::PADDED];
-        load_means((const float*)arrays.means.data, gaussian, live, mean);
+        load<3>(arrays.means.data + gaussian, live, mean);
         I lost = {};
-        for (int i = 0; i < 3; ++i) lost |= not_finite(mean[i]);
+        for (int i = 0; i < 3; ++i) lost |= ~finite(mean[i]);
         for (int view = 0; view < size.views; ++view) {
             const size_t image = (size_t)chunk.object * size.views + view;
             const size_t at = image * size.num + first, row = size.per_view ? at : gaussian;
@@ -135,38 +113,30 @@ static void forward(int task, const Size& size, const Arrays& arrays) {
                 for (int d = 0; d < D; ++d) sum[d] = fma(Y[k], T[k * D + d], sum[d]);
             // a coefficient that is not finite leaves a sum that is not; the reverse need not hold
             I bad = lost;
-            for (int d = 0; d < D; ++d) bad |= not_finite(sum[d]);
+            for (int d = 0; d < D; ++d) bad |= ~finite(sum[d]);
             if (any(bad)) bad = lost | broken<S::FLOATS>(arrays.coefficients, row, live);
-            float values[16 * D];
             for (int d = 0; d < D; ++d) {
-                F shown = sum[d];
                 if (S::CLAMPED) {
-                    shown = sum[d] + 0.5f;
-                    shown = shown < 0.0f ? F{} : shown;
+                    sum[d] += 0.5f;
+                    sum[d] = sum[d] < 0.0f ? F{} : sum[d];
                 }
-                shown = bad ? splat(__builtin_nanf("")) : shown;
-                for (int j = 0; j < 16; ++j) values[j * D + d] = shown[j];
+                sum[d] = bad ? splat(__builtin_nanf("")) : sum[d];
             }
-            __builtin_memcpy(arrays.colors.data + at * D, values, (size_t)live * D * 4);
+            store<D>(arrays.colors.data + at * D, live, sum);
         }
     }
 }
 
-// Fills v with the gradient of ``live`` Gaussians' colours, 0 where none passes; the result says
-// which have one.
-template<int D>
-static inline __attribute__((always_inline)) I load_gradient(
-    const float* colors, const float* v_colors, int live, bool clamped, F* v) {
+// Makes v, the gradient of results, 0 where these pass none on: colours that are 0, and sums that
+// are NaN, which says that something was not finite, or -inf. The result says which Gaussians have
+// one.
+template<class S>
+static inline I masked(const F* shown, F* v) {
     I alive = {};
-    for (int d = 0; d < D; ++d) {
-        F value = {}, shown = {};
-        for (int j = 0; j < live; ++j) {
-            value[j] = v_colors[j * D + d];
-            shown[j] = colors[j * D + d];
-        }
-        const I passed = passes(shown, clamped);
-        v[d] = passed ? value : F{};
-        alive |= passed;
+    for (int d = 0; d < S::D; ++d) {
+        const I passes = shown[d] > (S::CLAMPED ? 0.0f : -3.4e38f);
+        v[d] = passes ? v[d] : F{};
+        alive |= passes;
     }
     return alive;
 }
@@ -196,26 +166,26 @@ template<class Config, class Size, class Arrays>
 static void backward(int task, const Size& size, const Arrays& arrays, const Arrays& v_arrays) {
     typedef Sizes<Config> S;
     constexpr int D = S::D;
-    const Chunk chunk = chunk_of<Config>(task, size.num);
+    const Run chunk(task, size.num, S::CHUNK);
     const float* const centers = (const float*)arrays.centers.data;
-    float* const v_means = (float*)v_arrays.means.data;
     float* const v_centers = (float*)v_arrays.centers.data;
-    const bool geometry = S::DEGREE > 0 && (v_means || v_centers);
+    const bool geometry = S::DEGREE > 0 && (v_arrays.means.data || v_centers);
     for (int first = chunk.begin; first < chunk.end; first += 16) {
         const int live = chunk.end - first < 16 ? chunk.end - first : 16;
         const size_t gaussian = (size_t)chunk.object * size.num + first;
         F mean[3], T[S::PADDED], v_T[S::PADDED], v_mean[3] = {};
-        load_means((const float*)arrays.means.data, gaussian, live, mean);
+        load<3>(arrays.means.data + gaussian, live, mean);
         for (int view = 0; view < size.views; ++view) {
             const size_t image = (size_t)chunk.object * size.views + view;
             const size_t at = image * size.num + first, row = size.per_view ? at : gaussian;
             const bool starts = size.per_view || view == 0;
             const bool ends = size.per_view || view == size.views - 1;
             if (geometry && starts) load_rows<S::FLOATS>(arrays.coefficients, row, live, T);
-            F v[D], t[3];
+            F shown[D], v[D], t[3];
             A Y[S::COUNT];
-            const I alive = load_gradient<D>(
-                arrays.colors.data + at * D, v_arrays.colors.data + at * D, live, S::CLAMPED, v);
+            load<D>(arrays.colors.data + at * D, live, shown);
+            load<D>(v_arrays.colors.data + at * D, live, v);
+            const I alive = masked<S>(shown, v) & (lane < live);
             const F length = direction(mean, centers + image * 3, S::SHORTEST, t);
             // channels that pass no gradient on may hold NaN, which must not meet a zero
             for (int i = 0; i < 3; ++i) t[i] = alive ? t[i] : F{};
@@ -237,9 +207,7 @@ static void backward(int task, const Size& size, const Arrays& arrays, const Arr
             for (int i = 0; i < 3; ++i)
                 out[i] = (first == chunk.begin ? 0.0f : out[i]) - total(v_t[i]);
         }
-        if (v_means)
-            for (int j = 0; j < live; ++j)
-                for (int i = 0; i < 3; ++i) v_means[(gaussian + j) * 3 + i] = v_mean[i][j];
+        if (v_arrays.means.data) store<3>(v_arrays.means.data + gaussian, live, v_mean);
     }
 }
 

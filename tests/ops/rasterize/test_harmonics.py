@@ -200,6 +200,15 @@ def test_a_centre_that_is_not_finite(device):
     assert not grads["centers"][0, 1].any()
 
 
+@pytest.mark.parametrize("name", ["means", "centers"])
+def test_bare_sums_of_the_last_that_is_not_finite(device, name):
+    """Nor do lanes without a Gaussian pass a gradient on."""
+    inputs = make(1, 2)
+    inputs[name][0, -1, 0] = math.nan
+    got, grads = run(sums_seen_from, 3, inputs, torch.randn(1, 2, 37, 3))
+    assert got.isnan().any() and all(g.isfinite().all() for g in grads.values())
+
+
 @pytest.mark.parametrize("distance", [0.0, 1e-13, 1e-25])
 def test_no_direction(device, distance):
     """A mean in the centre, or nearer than 1e-12, which then divides in place of the length."""
