@@ -1,5 +1,5 @@
 """The projection and its gradient on the CPU: sixteen Gaussians as lanes. README.md §1 and §4 have
-the maths; the results equal ``../cuda/project.py``'s to the last bit.
+the maths, ``project.h`` the code; the results equal ``../cuda/project.py``'s to the last bit.
 """
 
 from pathlib import Path
@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from ...runtime.launch import parallel_launch
-from ...runtime.native import native, native_kernel
+from ...runtime.native import constants, native, native_kernel
 from ...runtime.views import struct_of
 from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN, RADIUS_MAX, TILE
 from ..projection import STATUS_NAMES, Lens, Projected, Scene
@@ -17,27 +17,28 @@ from ..projection import STATUS_NAMES, Lens, Projected, Scene
 _RUN = 512  # Gaussians of a task, a multiple of 16
 _PIECES_PER_THREAD = 8  # those that are culled cost less
 
-_HERE = Path(__file__).parent
-_DEFINES = {
+_CONFIG = constants(
+    "Config",
     **{name.upper(): number for number, name in enumerate(STATUS_NAMES)},
     **{"RUN": _RUN, "MARGIN": FRUSTUM_MARGIN, "COMPENSATION_MIN": COMPENSATION_MIN},
     **{"CONIC_MAX": CONIC_MAX, "RADIUS_MAX": RADIUS_MAX, "TILE": TILE},
-}
-
-
-_SCENE = {"views": int, "num": int, "lens": Lens, "scene": Scene}
+)
+_HEADER = _CONFIG + native(Path(__file__).with_name("project.h"))
+_SCENE = {"views": int, "num": int, "options": Lens, "scene": Scene}
 
 _project = native_kernel(
     "project",
-    native(_HERE / "project.inl", **_DEFINES),
+    "gamba::raster::project<Config>",
     inputs={**_SCENE, "colors_per_view": int, "colors": wp.array2d[wp.float32]},
     outputs={"splats": struct_of(Projected)},
+    header=_HEADER,
 )
 _project_vjp = native_kernel(
     "project_vjp",
-    native(_HERE / "project.inl", GRADIENT=True, **_DEFINES),
+    "gamba::raster::project_vjp<Config>",
     inputs={**_SCENE, "splats": struct_of(Projected), "v_splats": struct_of(Projected)},
     outputs={"v_scene": Scene},
+    header=_HEADER,
 )
 
 
