@@ -5,7 +5,7 @@ Gaussian, leaves them as a window of 4 x 4 tiles, and finds how many intersectio
 has; their running sum is where ``scatter`` writes. Views of few Gaussians are sorted by depth
 before that. A sort of a million Gaussians, and every later step in that random order, would wait
 for memory: large views keep their order, and each list, which fits a cache, is sorted last.
-README.md §2 holds the maths.
+README.md §2 holds the maths, ``bin.h`` the code.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ import warp as wp
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from ...runtime.native import native, native_kernel
+from ...runtime.native import constants, native, native_kernel
 from ...runtime.views import StructValue, as_struct, struct, struct_of
 from ..projection import Projected
 from ..skip import SQUARES, TILE_TEST
@@ -26,8 +26,10 @@ from ..tiles import SLACK, SLACK_ABS, Bins, Grid
 MANY = 1 << 15  # Gaussians of a view from which sorting each list is quicker
 _PARTS_PER_THREAD = 4  # more than 1, since Gaussians differ in size, and so do parts
 
-_HERE = Path(__file__).parent
-_DEFINES = {"SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "TILE_TEST": TILE_TEST, "SQUARES": SQUARES}
+_CONFIG = constants(
+    "Config", SLACK=SLACK, SLACK_ABS=SLACK_ABS, TILE_TEST=TILE_TEST, SQUARES=SQUARES
+)
+_HEADER = _CONFIG + native(Path(__file__).with_name("bin.h"))
 
 
 @struct
@@ -44,31 +46,35 @@ class Work:
 # a task is a worker; ``counter`` is the next list, ``workspace`` holds two of a worker
 _sort = native_kernel(
     "sort",
-    native(_HERE / "bin.inl", SORT=True),
+    "gamba::raster::sort",
     inputs={"count": int, "splats": struct_of(Projected), "staged": wp.array2d[wp.int32]},
     outputs={
         "counter": wp.array[wp.int32],
         "workspace": wp.array2d[wp.int64],
         "lists": struct_of(Bins),
     },
+    header=_HEADER,
 )
 _count = native_kernel(
     "count",
-    native(_HERE / "bin.inl", COUNT=True, **_DEFINES),
+    "gamba::raster::count<Config>",
     inputs={"parts": int, "grid": Grid, "splats": struct_of(Projected), "lists": struct_of(Bins)},
     outputs={"work": Work},
+    header=_HEADER,
 )
 _offsets = native_kernel(
     "offsets",
-    native(_HERE / "bin.inl", OFFSETS=True),
+    "gamba::raster::offsets",
     inputs={"parts": int},
     outputs={"work": Work, "lists": struct_of(Bins)},
+    header=_HEADER,
 )
 _scatter = native_kernel(
     "scatter",
-    native(_HERE / "bin.inl", SCATTER=True, **_DEFINES),
+    "gamba::raster::scatter<Config>",
     inputs={"parts": int, "grid": Grid, "splats": struct_of(Projected)},
     outputs={"work": Work, "lists": struct_of(Bins), "staged": wp.array2d[wp.int32]},
+    header=_HEADER,
 )
 
 
