@@ -213,6 +213,7 @@ inline f32 of_f16(u16 bits) {
     MOVES("s32", u32) MOVES("f32", u32) MOVES("b64", u64) MOVES("u64", u64) MOVES("s64", u64) \
     OP1(move, "mov.pred", u32, u32, a != 0) OP1(integer, "not.pred", u32, u32, !a) \
     OP1(move, "cvta.to.global.u64", u64, u64, a) OP1(move, "cvta.to.shared.u64", u64, u64, a & ~SHARED) \
+    OP1(move, "cvta.to.local.u64", u64, u64, a) \
     OP1(move, "cvta.shared.u64", u64, u64, a | SHARED) OP1(move, "cvta.local.u64", u64, u64, a) \
     OP1(integer, "cvt.s64.s32", s64, s32, a) OP1(move, "cvt.u64.u32", u64, u32, a) OP1(move, "cvt.u32.u64", u32, u64, a) \
     OP1(move, "cvt.s64.s32 of 64", s64, u64, (s32)a) OP1(move, "cvt.u64.u32 of 64", u64, u64, (u32)a) \
