@@ -102,23 +102,75 @@ def native_kernel(
     if re.search(r"\bin\b", text):
         text = f"{_group('in', inputs)}{_group('out', outputs)}{text}"
     source = (
-        f"def {name}_task({indices}, {names}): ...\n"
+        f"def {name}_native({indices}, {names}): ...\n"
         f"def {name}(offset, {names}):\n"
         f"    {indices} = wp.tid()\n"
-        f"    {name}_task(offset + {indices}, {names})\n"
+        f"    {name}_native(offset + {indices}, {names})\n"
     )
+    own = dict.fromkeys(map(str.strip, indices.split(",")), int)
+    return _kernel(name, source, text, own | arguments, {"offset": int, **arguments}, header)
+
+
+def cuda_kernel(
+    name: str,
+    function: str,
+    inputs: Mapping[str, Any],
+    outputs: Mapping[str, Any],
+    header: str,
+    shared: int,
+    bounds: int | tuple[int, int],
+) -> Any:
+    """A CUDA kernel that is C++: a function of ``header``, maybe with template arguments.
+
+    It is called with the number of the block and that of the thread in it, the block's shared
+    memory, and the arguments. Launches have two dimensions, blocks and their threads.
+
+    Args:
+        name: as those below, of ``native_kernel``.
+        function: of the header.
+        inputs: Warp types by names.
+        outputs: the same.
+        header: only for CUDA.
+        shared: floats of shared memory.
+        bounds: threads of a block, and maybe the least number of blocks on a multiprocessor.
+    """
+    arguments = {**inputs, **outputs}
+    names = ", ".join(arguments)
+    source = (
+        f"def {name}_native(index, lane, shared, {names}): ...\n"
+        f"def {name}({names}):\n"
+        f"    index, lane = wp.tid()\n"
+        f'    shared = wp.tile_empty(shape=({shared},), dtype=float, storage="shared")\n'
+        f"    {name}_native(index, lane, shared, {names})\n"
+    )
+    memory: Any = wp.tile[float, shared]  # pyright: ignore[reportIndexIssue] (in its stub a function)
+    own = {"index": int, "lane": int, "shared": memory, **arguments}
+    text = f"{function}(index, lane, shared.data.ptr, {names});"
+    options = {"launch_bounds": bounds, "grid_stride": False}
+    return _kernel(name, source, text, own, arguments, header, **options)
+
+
+def _kernel(
+    name: str, source: str, text: str, own: dict, arguments: dict, header: str, **options: Any
+) -> Any:
+    """The kernel of a source, which calls the C++ ``text`` as ``{name}_native``.
+
+    Args:
+        own: types of the arguments of the C++.
+        arguments: of those of the kernel.
+        options: of ``wp.kernel``.
+    """
     # Warp reads the source of a kernel, and finds it there, as debuggers do.
-    file = f"<{name}({names})>"
+    file = f"<{name}({', '.join(arguments)})>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file
     made: dict[str, Any] = {"__name__": __name__, "wp": wp}
     exec(compile(source, file, "exec"), made)
-    task, kernel = made[f"{name}_task"], made[name]
-    task.__annotations__ = {**dict.fromkeys(map(str.strip, indices.split(",")), int), **arguments}
-    kernel.__annotations__ = {"offset": int, **arguments}
-    made[f"{name}_task"] = wp.func_native(text)(task)
+    native, kernel = made[f"{name}_native"], made[name]
+    native.__annotations__, kernel.__annotations__ = own, arguments
+    made[f"{name}_native"] = wp.func_native(text)(native)
     build = wp.ModuleBuildOptions(extra_cpu_preamble=header, extra_cuda_preamble=header)
-    options = {"extra_build_options": build}
-    return wp.kernel(kernel, enable_backward=False, module="unique", module_options=options)
+    options["module_options"] = {"extra_build_options": build}
+    return wp.kernel(kernel, enable_backward=False, module="unique", **options)
 
 
 W = 16  # channels of a lane group: one cache line of float32

@@ -1,4 +1,4 @@
-"""The arithmetic of ``lanes.h`` for one channel per thread, for CUDA kernels."""
+"""Arithmetic and types of one number per thread, for CUDA kernels that Warp makes of Python."""
 
 import torch
 import warp as wp
@@ -46,16 +46,6 @@ auto reciprocal_ = [](float v) -> float {
 """
 
 
-# The product of two int32 in one instruction, as addresses need it.
-WIDE = """
-auto wide_ = [](int a, int b) -> long long {
-    long long r;
-    asm("mul.wide.s32 %0, %1, %2;" : "=l"(r) : "r"(a), "r"(b));
-    return r;
-};
-"""
-
-
 @wp.func_native(EXP2 + "return exp2_(x);")
 def exp2(x: float) -> float: ...
 
@@ -68,25 +58,3 @@ def reciprocal(x: float) -> float: ...
 def opaque(x: int) -> int:
     """Return x, so that values computed from it before need not stay in registers."""
     ...
-
-
-@wp.func
-def sigmoid(x: float) -> float:
-    return reciprocal(1.0 + exp2(-wp.static(LOG2E) * x))  # 0 where the power is infinite
-
-
-# It has no branch and is relatively accurate for x << 0, as the one in lanes.h; 2 atanh(s) in one.
-@wp.func
-def softplus(x: float) -> float:
-    e = exp2(-wp.static(LOG2E) * wp.abs(x))
-    s = e * reciprocal(e + 2.0)
-    w = s * s
-    p = 0.40021699188717086 + w * (0.27999139406777306 + w * 0.2802446564849388)
-    return wp.max(x, 0.0) + s * (2.0 + w * (0.6666641312961027 + w * p))
-
-
-# This is the sigmoid, from the exponential that ``softplus`` uses as well.
-@wp.func
-def softplus_slope(x: float) -> float:
-    e = exp2(-wp.static(LOG2E) * wp.abs(x))
-    return wp.where(x < 0.0, e, 1.0) * reciprocal(1.0 + e)

@@ -1,7 +1,7 @@
 """Arguments of a scan, and the rules that discretize a step of the state to f and g.
 
 A rule (equations 2 to 4 of README.md) is an entry here, a branch in the C++ of each device
-(``discretize.h``), and the oracle's formula in ``reference.py``.
+(``cpu/discretize.h``, ``cuda/discretize.cuh``), and the oracle's formula in ``reference.py``.
 """
 
 from __future__ import annotations
@@ -128,9 +128,3 @@ def sum_parts(parts: Tensor) -> Tensor:
     for part in rest:
         first += part
     return first
-
-
-def macros(name: str) -> dict[str, object]:
-    """Macros of CUDA's C++: MODE is one of the numbers MAMBA, BILINEAR, ZOH."""
-    numbers: dict[str, object] = {key.upper(): i for i, key in enumerate(DISCRETIZATIONS)}
-    return numbers | {"MODE": name.upper(), "WEIGHTED": DISCRETIZATIONS[name].weighted}

@@ -13,9 +13,9 @@
   from ``data``, are not looked at; ``make ptx`` runs the scan with strides near 2^31.
 - ``backward``: ``enable_backward=False``, for the kernel or the module.
 
-A kernel from ``native_kernel`` is C++ and two mappings, of inputs and of outputs: so these need no
-endings, and their order, types and options are right by themselves. What its file writes is checked
-where the inputs are written out in the call.
+A kernel from ``native_kernel`` or ``cuda_kernel`` is C++ and two mappings, of inputs and of
+outputs: so these need no endings, and their order, types and options are right by themselves. What
+its file writes is checked where the inputs are written out in the call of ``native_kernel``.
 """
 
 import ast
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 _NUMBER = re.compile(r"int|float|bool|wp\.(u?int|float)\d+|wp\.bool")
 _WRITING = re.compile(r"(tile_)?(atomic|store|write|put)")
 _WIDENED = ("wp.int64", "wp.uint64", "wp.static", "float", "wp.float32")
-_WIDE = r"\(size_t\)|\(long long\)|\bwide_\("
+_WIDE = r"\(size_t\)|\(long long\)|\bwide_?\("
 
 Found = Iterator[tuple[int, str, str]]  # line, rule, what
 
@@ -178,7 +178,7 @@ def _cpp(text: str, inputs: set[str]) -> Found:
     for m in re.finditer(r"\((?:size_t|long long)\)\([^()]* \* [^()]*\)", text):
         yield line(m.start()), "32 bits", f"widened too late: {m[0]}"
     array = r"[\w.]+\.strides\[\d\]"
-    allowed = rf"wide_\([^;]*?{array}\)|\(size_t\)(?:[\w.]+\s*\* \(?)?{array}"
+    allowed = rf"wide_?\([^;]*?{array}\)|\(size_t\)(?:[\w.]+\s*\* \(?)?{array}"
     rest = re.sub(allowed, lambda m: re.sub(r"\S", " ", m[0]), text)
     for m in re.finditer(r"\S+\bstrides\b\S*", rest):
         yield line(m.start()), "32 bits", f"not widened: {m[0]}"
@@ -207,6 +207,7 @@ def _terms(text: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    files = [x for x in sorted((ROOT / "kernels").rglob("*")) if x.suffix in (".py", ".h", ".inl")]
+    ends = (".py", ".h", ".cuh", ".inl")
+    files = [x for x in sorted((ROOT / "kernels").rglob("*")) if x.suffix in ends]
     faults = findings({str(x.relative_to(ROOT)): x.read_text() for x in files})
     sys.exit("\n".join(faults) or None)

@@ -28,7 +28,7 @@ def test_known_counts():
     )
     # a state's decay; softplus and gate are of 16 states
     assert forward["special"] == 1 + 4 / 16
-    # marks but before the last of 16 groups of tokens, and the walk; softplus, its slope, the gate
+    # states recomputed but for the last 4 of 64 tokens, and the gradient; softplus, its slope, gate
     assert back["special"] == 1 + 15 / 16 + 6 / 16
     # u, delta, z, out and 1/64 of the states, in sectors: a warp has 32 channels of 2 bytes
     tensors = 4 * 2 / 32 + 16 * 4 / 64 / 32

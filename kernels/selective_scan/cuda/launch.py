@@ -2,8 +2,8 @@
 
 All runs on torch's current stream, without synchronisation, in memory from torch's allocator. One
 pass over the whole sequence computes each exponential once, but gives the machine only batch x
-channels to do at once. Cut into segments, all run at once, and each but the last is walked twice:
-first from zero, then from its first state.
+channels to do at once. Cut into segments, all run at once, and each but the last is computed
+twice: first from zero, then from its first state.
 """
 
 from __future__ import annotations
@@ -22,10 +22,16 @@ from ...runtime.scalars import LOG2E, exp2
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
 from ..problem import DISCRETIZATIONS, Inputs, Scan, like_inputs
-from .backward import backward_kernel
-from .blocks import MARK, RUN, Sizes, block_shape
-from .forward import forward_kernel
-from .summary import summary_kernel
+from .kernels import (
+    CHUNK,
+    RUN,
+    Rules,
+    Sizes,
+    backward_kernel,
+    block_shape,
+    forward_kernel,
+    summary_kernel,
+)
 
 MOST_SEGMENTS = 256  # the carry between them is serial
 RESIDENT = (3, 2)  # blocks of a multiprocessor, by their registers: forward, gradient
@@ -64,25 +70,25 @@ def choose(
     """The tuning for a shape on a device with that many multiprocessors.
 
     The model: a multiprocessor holds ``RESIDENT`` blocks at a time, and k blocks at once take
-    k + 1/2 times as long as one would take at its full rate. P segments are walked (2 - 1/P) times
-    in the forward; the gradient's walks are longer, so that they cost (4 - 1/P) / 3. Beginning
+    k + 1/2 times as long as one would take at its full rate. P segments take (2 - 1/P) times the
+    work in the forward; the gradient's own kernel is longer, so that it is (4 - 1/P) / 3. Beginning
     and ending a segment costs as much as ``OVERHEAD`` tokens. In one pass the forward has twice
     the threads, of half as many states: docs/gpu.md has the times.
     """
     tuning = Tuning()
     if not batch or not length:
         return tuning
-    units = -(-length // MARK)
+    units = -(-length // CHUNK)
 
-    def segments(per_thread: tuple[int, int], resident: int, walks: float) -> int:
+    def segments(per_thread: tuple[int, int], resident: int, work: float) -> int:
         shape = block_shape(tuning.block, *per_thread, states)
         blocks = batch * groups * -(-(channels // groups) // shape.span)
 
         def cost(count: int) -> float:
             load = -(-blocks * count // multiprocessors)
             rounds = -(-load // resident)
-            work = (walks + 1 - 1 / count) / walks / count
-            return work * (load + 0.5 * rounds) * (1 + OVERHEAD * count / length)
+            each = (work + 1 - 1 / count) / work / count
+            return each * (load + 0.5 * rounds) * (1 + OVERHEAD * count / length)
 
         return min(range(1, min(units, MOST_SEGMENTS) + 1), key=cost)
 
@@ -116,7 +122,7 @@ def _carry_kernel(exponential: bool, reverse: bool):
         # in
         segments: int,
         states: int,
-        a_in: wp.array2d(dtype=float),
+        A_in: wp.array2d(dtype=float),
         decay_in: wp.array3d(dtype=float),
         # in and out
         local_out: wp.array2d(dtype=float),
@@ -138,7 +144,7 @@ def _carry_kernel(exponential: bool, reverse: bool):
                 total = wp.float32(0.0)
                 for row in range(decay_in.shape[1]):
                     total += decay_in[at, row, d]
-                decay = exp2(wp.static(LOG2E) * a_in[d, n] * total)
+                decay = exp2(wp.static(LOG2E) * A_in[d, n] * total)
             else:
                 decay = decay_in[at, d, n]
             h = decay * h + own
@@ -170,12 +176,12 @@ class _Operands:
     """Tensors of one scan as the kernels take them, and its segments.
 
     ``state`` is new and dense, ``[B, D, N]`` or of packed rows ``[S, D, N]``: the first state, or
-    the gradient of the last. ``shape`` is the block shape; ``back`` says that the gradient runs.
-    Packed sequences, whose lengths are on the device, are cut as if these were equal: each into at
-    most ``segments``, a short one into fewer.
+    the gradient of the last. ``output`` says that there are outputs, ``back`` that the gradient
+    runs. Packed sequences, whose lengths are on the device, are cut as if these were equal: each
+    into at most ``segments``, a short one into fewer.
     """
 
-    def __init__(self, scan: Scan, state: Tensor | None, back: bool):
+    def __init__(self, scan: Scan, state: Tensor | None, output: bool, back: bool):
         x, options = scan
         self.batch, self.length, self.channels = x.u.shape
         self.states, self.groups, self.device = x.A.shape[1], x.B.shape[2], x.u.device
@@ -188,9 +194,9 @@ class _Operands:
             per_thread = (tuning.back_channels, tuning.back_states)
             segments = tuning.back_segments
         self.shape = block_shape(tuning.block, *per_thread, self.states)
-        self.marks = -(-self.length // MARK)
-        self.segment = -(-max(self.marks, 1) // segments) * MARK
-        self.segments = min(segments, self.marks)
+        self.chunks = -(-self.length // CHUNK)
+        self.segment = -(-max(self.chunks, 1) // segments) * CHUNK
+        self.segments = min(segments, self.chunks)
         self.parts = -(-(self.channels // self.groups) // self.shape.span)
         if self.packed is None:
             self.segments = -(-self.length // self.segment)
@@ -198,16 +204,21 @@ class _Operands:
 
         C = x.B if x.C is None else x.C
         matrix = x.B.dtype if x.B.dtype == C.dtype else torch.float32
-        self.mode, self.softplus = options.discretization, options.softplus
-        self.use_z = x.z is not None
-        self.exponential = DISCRETIZATIONS[self.mode].exponential
-        self.dtypes = (x.u.dtype, x.delta.dtype, matrix)
+        self.rules = Rules(
+            (x.u.dtype, x.delta.dtype, matrix),
+            self.shape,
+            options.discretization,
+            options.softplus,
+            x.z is not None,
+            output,
+        )
+        self.exponential = DISCRETIZATIONS[options.discretization].exponential
         self.u, self.delta = lane_contiguous(x.u), lane_contiguous(x.delta)
         self.z = self.u if x.z is None else lane_contiguous(x.z)
         self.A = x.A.float().contiguous()
         self.B, self.C = x.B.to(matrix), C.to(matrix)
         zero = torch.zeros(self.channels, dtype=torch.float32, device=self.device)
-        self.skip, self.bias = (
+        self.D, self.bias = (
             zero if v is None else v.float().contiguous() for v in (x.D, x.delta_bias)
         )
         if state is None:
@@ -229,7 +240,7 @@ class _Operands:
 
     def inputs(self, save: bool = False) -> list:
         """Return the arguments that the forward and the gradient begin with."""
-        tensors = self.u, self.delta, self.z, self.A[None], self.B, self.C, self.skip, self.bias
+        tensors = self.u, self.delta, self.z, self.A[None], self.B, self.C, self.D, self.bias
         return [self.sizes(save), self.packed, *tensors]
 
     def launch(self, kernel: Any, inputs: list, outputs: list) -> None:
@@ -259,31 +270,29 @@ class _Operands:
 def saved_shape(x: Scan) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns, whatever the tuning."""
     (batch, length, _), packed = x.inputs.u.shape, x.options.packed
-    rows = batch * -(-length // MARK)
+    rows = batch * -(-length // CHUNK)
     if packed is not None:
-        rows = count_slots(packed, batch, length, MARK)
+        rows = count_slots(packed, batch, length, CHUNK)
     return (rows if x.options.save else 0, *x.inputs.A.shape)
 
 
 def forward(scan: Scan) -> tuple[Tensor, Tensor, Tensor]:
     """Runs the scan on CUDA; results as on the CPU."""
     x, options = scan
-    read = x.C is not None
-    o = _Operands(scan, x.initial_state, back=False)
-    shape = (o.batch, o.length if read else 0, o.channels)
+    o = _Operands(scan, x.initial_state, x.C is not None, back=False)
+    shape = (o.batch, o.length if o.rules.output else 0, o.channels)
     out = torch.empty(shape, dtype=o.u.dtype, device=o.device)
     saved = o.empty(*saved_shape(scan))
     if not o.u.numel():
         return out, o.state, saved
     first, none = o.state, o.empty(0, 0, 0)
-    kernel = functools.partial(forward_kernel, o.dtypes, o.mode, o.shape)
     if o.segments > 1:
-        inputs = [*o.inputs(), o.state]
-        first = o.carried(kernel(False, True, o.softplus, False), inputs, [saved, out], False)
+        kernel = forward_kernel(o.rules._replace(gate=False, output=False), summary=True)
+        first = o.carried(kernel, [*o.inputs(), o.state], [saved, out], False)
     last = torch.empty_like(o.state)
     outputs = [last, none, saved, out]
-    chosen = kernel(read, False, o.softplus, o.use_z and read)
-    o.launch(chosen, [*o.inputs(options.save), first], outputs)
+    kernel = forward_kernel(o.rules, summary=False)
+    o.launch(kernel, [*o.inputs(options.save), first], outputs)
     return out, last, saved
 
 
@@ -292,25 +301,23 @@ def backward(
 ) -> Inputs:
     """Gradients of ``forward``; arguments and results as on the CPU."""
     x, options = scan
-    o = _Operands(scan, dlast, back=True)
-    read = dout is not None
+    o = _Operands(scan, dlast, dout is not None, back=True)
     wanted = {
-        "read": read,
         "du": needs.u,
         "ddelta": needs.delta,
-        "dz": needs.z,
-        "y": needs.z and o.use_z and read,
+        "dz": needs.z and o.rules.gate and o.rules.output,
         "dB": needs.B,
-        "dC": needs.C and read,
-        "through": any(needs._replace(C=False, D=False, z=False)),  # anything that needs dh
+        "dC": needs.C and o.rules.output,
+        "dh": any(needs._replace(C=False, D=False, z=False)),
     }
-    flags = frozenset(name for name, on in wanted.items() if on)
+    computed = frozenset(name for name, on in wanted.items() if on)
 
-    def like(x: Tensor, flag: str) -> Tensor:
-        return torch.empty(x.shape if flag in flags else (0, 0, 0), dtype=x.dtype, device=o.device)
+    def like(x: Tensor, name: str) -> Tensor:
+        shape = x.shape if name in computed else (0, 0, 0)
+        return torch.empty(shape, dtype=x.dtype, device=o.device)
 
-    def sums(flag: str) -> Tensor:
-        rows = o.batch * o.groups * o.parts if flag in flags else 0
+    def sums(name: str) -> Tensor:
+        rows = o.batch * o.groups * o.parts if name in computed else 0
         return o.empty(rows, o.length, o.states)
 
     def total(parts: Tensor) -> Tensor:
@@ -321,36 +328,33 @@ def backward(
             cuda_launch(_sum_parts, dim, inputs, [total], device=o.device)
         return total
 
-    du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
-    db, dc = sums("dB"), sums("dC")
-    runs = o.batch * o.segments * -(-o.segment // (RUN * MARK))
+    du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "dz")
+    dB, dC = sums("dB"), sums("dC")
+    runs = o.batch * o.segments * -(-o.segment // (RUN * CHUNK))
     if options.packed is not None:
-        runs = o.batch * o.length // (RUN * MARK) + o.sequences * o.segments
+        runs = o.batch * o.length // (RUN * CHUNK) + o.sequences * o.segments
     dfirst = torch.empty_like(o.state)
-    da = o.state.new_zeros(runs, o.channels, o.states)
-    dskip, dbias = o.state.new_zeros(2, runs, o.shape.rows, o.channels)
+    dA = o.state.new_zeros(runs, o.channels, o.states)
+    dD, dbias = o.state.new_zeros(2, runs, o.shape.rows, o.channels)
     if o.u.numel():
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state
         if o.segments > 1:  # the gradient of the state after each segment
-            kernel = summary_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, read)
+            kernel = summary_kernel(o.rules)
             inputs = [o.sizes(), o.packed, o.delta, o.z, o.A[None], o.C, o.bias, dout]
             last = o.carried(kernel, inputs, [], True)
-        kernel = backward_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, flags)
-        o.launch(
-            kernel,
-            [*o.inputs(), dout, saved, last],
-            [dfirst, du, ddelta, dz, da, db, dc, dskip, dbias],
-        )
+        kernel = backward_kernel(o.rules, computed)
+        outputs = [dfirst, du, ddelta, dz, dA, dB, dC, dD, dbias]
+        o.launch(kernel, [*o.inputs(), dout, saved, last], outputs)
     else:
         dfirst = o.state
     gradients = Inputs(
         u=du,
         delta=ddelta,
-        A=da.sum(0) if needs.A else None,
-        B=total(db) if needs.B else None,
-        C=total(dc) if needs.C else None,
-        D=dskip.sum((0, 1)) if needs.D else None,
+        A=dA.sum(0) if needs.A else None,
+        B=total(dB) if needs.B else None,
+        C=total(dC) if needs.C else None,
+        D=dD.sum((0, 1)) if needs.D else None,
         z=dz,
         delta_bias=dbias.sum((0, 1)) if needs.delta_bias else None,
         initial_state=dfirst,
