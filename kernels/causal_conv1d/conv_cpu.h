@@ -29,7 +29,7 @@ INLINE void prefetch_down(const Rows<T>& rows, int t0, int t) {
 
 // Equation 1 where lanes are the tokens of a channel.
 template<class Config, class In, class Out>
-static void forward_transposed(int task, int k, const In& in, const Out& out) {
+static void forward_transposed(int k, int task, const In& in, const Out& out) {
     const Piece p = piece_of<Config::TOKENS>(task, in.pieces, in.x.shape[1]);
     if (p.sequence < 0) return;
     const int d = k * WIDTH, width = in.x.shape[2] - d < WIDTH ? in.x.shape[2] - d : WIDTH;
@@ -67,7 +67,7 @@ static void forward_transposed(int task, int k, const In& in, const Out& out) {
 // Equation 2 of transposed rows, which are transposed again as they are read and written. Whole
 // tiles are read before and behind for three tokens.
 template<class Config, class In, class Out>
-static void backward_transposed(int task, int k, const In& in, const Out& out) {
+static void backward_transposed(int k, int task, const In& in, const Out& out) {
     constexpr int TOKENS = Config::TOKENS;
     const Piece p = piece_of<TOKENS>(task, in.pieces, in.x.shape[1]);
     if (p.sequence < 0) return;

@@ -41,10 +41,11 @@ def _kernel(
         "Config", TOKENS=tokens, RUN=RUN if on_cpu else 0, AHEAD=0 if on_cpu else AHEAD
     )
     twin = "_transposed" if transposed else ""
-    call = f"gamba::conv::{direction}{twin}<Config>(task, k, in, out);"
+    call = f"gamba::conv::{direction}{twin}<Config>"
     # adjacent memory follows the last dimension
     indices = "k, task" if transposed else "task, k"
-    return native_kernel(f"conv_{direction}", call, inputs, outputs, indices, header + config)
+    name, header = f"conv_{direction}", header + config
+    return native_kernel(name, call, inputs, outputs, header, indices, grouped=True)
 
 
 def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:

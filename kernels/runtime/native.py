@@ -77,30 +77,30 @@ def _group(name: str, arguments: Mapping[str, Any]) -> str:
 
 def native_kernel(
     name: str,
-    text: str,
+    function: str,
     inputs: Mapping[str, Any],
     outputs: Mapping[str, Any],
+    header: str,
     indices: str = "task",
-    header: str = "",
+    grouped: bool = False,
 ) -> Any:
-    """A kernel for ``launch`` that is C++: the body of one task.
+    """A kernel for ``launch`` that is C++: a function of ``header``, called for each task.
 
     Args:
         name: of the kernel.
-        text: the body, as a rule the call of a function of ``header``. It knows the task's number
-            and the arguments by their names, and as ``in.u`` and ``out.y`` those that are named
-            ``u_in`` and ``y_out``.
+        function: of the header, maybe with template arguments. It is called with the indices and
+            the arguments, in the order that they have here.
         inputs: Warp types by names, first those that are read.
         outputs: of those that are written.
-        indices: names of the launch's dimensions, the first of which is the task's number.
-        header: from ``native``: types and functions, which the text uses.
+        header: from ``native``.
+        indices: names of the launch's dimensions, the first of which is cut for the threads.
+        grouped: True to give the function two structs in place of the arguments: ``in.u`` and
+            ``out.y`` are those that are named ``u_in`` and ``y_out``.
     """
     arguments = {**inputs, **outputs}
-    names = ", ".join(arguments)
-    if re.fullmatch(r"[\w:]+(<[\w:, ]*>)?", text):
-        text = f"{text}({indices}, {names});"
-    if re.search(r"\bin\b", text):
-        text = f"{_group('in', inputs)}{_group('out', outputs)}{text}"
+    names, text = ", ".join(arguments), f"{function}({indices}, {', '.join(arguments)});"
+    if grouped:
+        text = f"{_group('in', inputs)}{_group('out', outputs)}{function}({indices}, in, out);"
     source = (
         f"def {name}_native({indices}, {names}): ...\n"
         f"def {name}(offset, {names}):\n"

@@ -43,7 +43,7 @@ def _kernel(function: str) -> Any:
     """The kernel of a function: a task per row, or strip of rows, and sixteen numbers of it."""
     header = native(Path(__file__).with_name("ssim_cpu.h"))
     name, call = f"ssim_{function.partition('<')[0]}", f"gamba::ssim::{function}"
-    return native_kernel(name, call, {}, {"maps": Maps}, "task, group", header)
+    return native_kernel(name, call, {}, {"maps": Maps}, header, "task, group")
 
 
 _across, _down, _up, _back = map(_kernel, ("across", f"down<{_STRIP}>", "up", "back"))

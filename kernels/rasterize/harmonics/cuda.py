@@ -19,8 +19,8 @@ CHUNK = 1  # Gaussians of a task
 HELD = 48  # coefficients of a row that a thread holds at most: three channels of degree 3
 _HERE = Path(__file__).parent
 # Loops over a column of coefficients are written out, so that it stays in registers.
-_BASIS = native(_HERE / "basis.h")
-_BUILD = wp.ModuleBuildOptions(extra_cpu_preamble=_BASIS, extra_cuda_preamble=_BASIS)
+_HEADER = native(_HERE / "basis.h") + native(_HERE / "part.h")
+_BUILD = wp.ModuleBuildOptions(extra_cpu_preamble=_HEADER, extra_cuda_preamble=_HEADER)
 _OPTIONS = {"max_unroll": 25, "extra_build_options": _BUILD}
 
 
@@ -50,7 +50,7 @@ def _leaves(degree: int, channels: int) -> SimpleNamespace:
     group = channels if count * channels <= HELD else 1
     column = wp.types.vector(count, wp.float32)
     part = wp.types.vector(count * group, wp.float32)
-    sizes = dict(COUNT=count, CHANNELS=group, WHOLE=group == channels)
+    sizes = f"{count}, {group}, {str(group == channels).lower()}"
 
     @wp.func_native(
         f"wp::vec_t<{count}, float> Y; gamba::harmonics::basis<{degree}>(x, y, z, Y.c); return Y;"
@@ -63,10 +63,13 @@ def _leaves(degree: int, channels: int) -> SimpleNamespace:
     )
     def slopes(x: wp.float32, y: wp.float32, z: wp.float32, s: column) -> wp.vec3: ...
 
-    @wp.func_native(native(_HERE / "part.inl", **sizes, LOAD=True))
+    @wp.func_native(
+        f"wp::vec_t<{count * group}, float> part;"
+        f"gamba::harmonics::load<{sizes}>(coefficients, row, first, part.c); return part;"
+    )
     def load(coefficients: wp.array3d[wp.float32], row: wp.int32, first: wp.int32) -> part: ...
 
-    @wp.func_native(native(_HERE / "part.inl", **sizes, LOAD=False))
+    @wp.func_native(f"gamba::harmonics::store<{sizes}>(coefficients, row, first, part.c);")
     def store(coefficients: wp.array3d[wp.float32], row: wp.int32, first: wp.int32, part: part): ...
 
     @wp.func

@@ -98,9 +98,9 @@ class Kind(NamedTuple):
 
     def kernel(self, function: str, inputs: dict[str, Any], outputs: dict[str, Any], header: str):
         """Return the kernel of a function of the header."""
-        call = f"gamba::scan::{function}<Config>(task, in, out);"
+        call = f"gamba::scan::{function}<Config>"
         inputs = {**_channels(self), **inputs}
-        return native_kernel(f"scan_{function}", call, inputs, outputs, header=header)
+        return native_kernel(f"scan_{function}", call, inputs, outputs, header, grouped=True)
 
 
 @struct

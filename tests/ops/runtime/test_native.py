@@ -57,8 +57,9 @@ def test_a_function_of_a_header_is_a_kernel_and_its_text_decides_the_module(tmp_
     def kernel():
         header = native(path) + constants("Config", TERM=2, HALF=0.5, ODD=True)
         inputs = {"x_in": wp.array(dtype=float), "shift": float}
-        call = "scale<Config>(task, in, out);"
-        return native_kernel("scale", call, inputs, {"y_out": wp.array(dtype=float)}, header=header)
+        call = "scale<Config>"
+        outputs = {"y_out": wp.array(dtype=float)}
+        return native_kernel("scale", call, inputs, outputs, header, grouped=True)
 
     first, x, y = kernel(), torch.tensor([1.0, 2.0, 4.0]), torch.zeros(3)
     parallel_launch(first, 3, [x, 0.25], [y], threads=2)
