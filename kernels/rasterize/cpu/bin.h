@@ -11,7 +11,8 @@ struct Staged {
 };
 
 // Sorts words, whose upper halves are keys up to ``most`` and whose lower ones rise, stably by key.
-// Returns where they are, of two places: digits have 8 or 11 bits, of those in which keys differ.
+// Returns where they are, of two places. Digits have at most 8 or 11 bits, of those in which keys
+// differ.
 static Word* sort_words(Word* now, Word* then, int n, unsigned most) {
     if (n <= 24) {
         for (int j = 1; j < n; ++j) {
@@ -24,14 +25,14 @@ static Word* sort_words(Word* now, Word* then, int n, unsigned most) {
     }
     if (!most) return now;
     const int bits = 32 - __builtin_clz(most), longest = n < 6000 ? 8 : 11;
-    const int turns = (bits + longest - 1) / longest, digit = (bits + turns - 1) / turns;
+    const int rounds = (bits + longest - 1) / longest, digit = (bits + rounds - 1) / rounds;
     const unsigned mask = (1u << digit) - 1;
     int places[4][2048];
-    for (int t = 0; t < turns; ++t)
+    for (int t = 0; t < rounds; ++t)
         for (unsigned d = 0; d <= mask; ++d) places[t][d] = 0;
     for (int j = 0; j < n; ++j)
-        for (int t = 0; t < turns; ++t) ++places[t][(now[j] >> 32) >> t * digit & mask];
-    for (int t = 0; t < turns; ++t) {
+        for (int t = 0; t < rounds; ++t) ++places[t][(now[j] >> 32) >> t * digit & mask];
+    for (int t = 0; t < rounds; ++t) {
         int place = 0;
         for (unsigned d = 0; d <= mask; ++d) {
             const int many = places[t][d];

@@ -1,21 +1,21 @@
 // Colours from spherical harmonics on a CPU, and their gradient (README.md §6): sixteen
 // Gaussians as lanes. Coefficients are transposed, 16 x 16 floats at a time, so that a lane holds
-// one Gaussian's; the gradient is transposed back. Lanes beyond the last Gaussian hold its row
-// again, and 0.
+// one Gaussian's; the gradient is transposed back. Lanes beyond the last Gaussian hold its
+// coefficients again, and else zeros.
 #include "../rows.h"
 #include "basis.h"
 namespace gamba::harmonics {
 using namespace raster;
 
 typedef wp::array_t<float> Coefficients;           // [rows, K, D]
-typedef float A __attribute__((vector_size(64)));  // F as templates know it: not aligned to 4
+typedef float A __attribute__((vector_size(64)));  // F as a template argument: not aligned to 4
 
 // What follows from a kernel's constants: of a row's K D floats the first FLOATS are used.
 template<class Config>
 struct Sizes : Config {
     static constexpr int COUNT = (Config::DEGREE + 1) * (Config::DEGREE + 1);
     static constexpr int FLOATS = COUNT * Config::D, PADDED = (FLOATS + 15) / 16 * 16;
-    static constexpr int UNROLL = FLOATS <= 96 ? FLOATS : 1;  // longer code is no quicker
+    static constexpr int UNROLL = FLOATS <= 96 ? FLOATS : 1;  // of loops over a row that is short
 };
 
 // Transposes the rows of ``live`` Gaussians: the i-th float of each becomes into[i].
