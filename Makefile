@@ -106,7 +106,7 @@ lint: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/python tests/project/kernel_lint.py
 	$(BIN)/python tests/project/docstring_lint.py
-	git ls-files -z '*.h' '*.cuh' '*.inl' '*.cpp' | xargs -0r $(BIN)/clang-format --dry-run --Werror
+	git ls-files -z '*.h' '*.cuh' '*.cpp' | xargs -0r $(BIN)/clang-format --dry-run --Werror
 	@rm -rf build
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build .
 	$(BIN)/python -m zipfile --extract build/*.whl $(WHEEL)
@@ -116,7 +116,7 @@ lint: $(TOOLS)
 format: $(TOOLS)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	git ls-files -z '*.h' '*.cuh' '*.inl' '*.cpp' | xargs -0r $(BIN)/clang-format -i
+	git ls-files -z '*.h' '*.cuh' '*.cpp' | xargs -0r $(BIN)/clang-format -i
 
 # Tables and pictures of the pages from results that are kept; REPORTS="--views out/eval/report.json"
 # puts an evaluation of the shipped model into its card first.

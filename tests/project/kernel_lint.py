@@ -3,8 +3,7 @@
 - ``arguments``: inputs come first, then outputs. An array, or a struct of arrays, is ``…_in``, or
   ``…_out`` if it is written; that may be read, too. Numbers have plain names.
 - ``types``: each argument says its type, itself: an array, a struct or a number.
-- ``inputs``: nothing is written to what is named ``…_in``, in kernels and in functions of Warp's.
-  What a function knows by a plain name is not followed.
+- ``inputs``: nothing is written to what is named ``…_in``, or in C++ ``in.…``. What a function knows by a plain name is not followed.
 - ``32 bits``: the number of a row fits in 32 bits, because views.py refuses longer arrays, and
   Warp's own indexing multiplies it by the stride in 64. What is counted in elements or bytes does
   not fit: so a stride or a length is widened before it is multiplied, and so is, in C++, a factor
@@ -14,8 +13,7 @@
 - ``backward``: ``enable_backward=False``, for the kernel or the module.
 
 A kernel from ``native_kernel`` or ``cuda_kernel`` is C++ and two mappings, of inputs and of
-outputs: so these need no endings, and their order, types and options are right by themselves. What
-its file writes is checked where the inputs are written out in the call of ``native_kernel``.
+outputs: so these need no endings, and their order, types and options are right by themselves.
 """
 
 import ast
@@ -41,17 +39,9 @@ def findings(sources: dict[str, str]) -> list[str]:
         if isinstance(node, ast.ClassDef):
             fields = [ast.unparse(x.annotation) for x in node.body if isinstance(x, ast.AnnAssign)]
             structs[node.name] = structs.get(node.name, False) or "array" in " ".join(fields)
-    kernels: dict[str, list] = {}  # of a C++ file: macros that choose its parts, and its inputs
-    for name, tree in trees.items():
-        for file, *kernel in _native(tree):
-            kernels.setdefault(str(Path(name).parent / file), []).append(kernel)
     found = []
     for name, text in sources.items():
-        if name in trees:
-            of_file = [*_python(trees[name], structs)]
-        else:
-            of_kernels = ((_chosen(text, m), names) for m, names in kernels.get(name, []))
-            of_file = {x for part in ((text, set()), *of_kernels) for x in _cpp(*part)}
+        of_file = {*(_python(trees[name], structs) if name in trees else _cpp(text))}
         found += [f"{name}:{line}: {rule}: {what}" for line, rule, what in sorted(of_file)]
     return found
 
@@ -65,7 +55,7 @@ def _python(tree: ast.Module, structs: dict[str, bool]) -> Found:
             if said.get("enable_backward", str(not off or "module" in said)) != "False":
                 yield node.lineno, "backward", "the kernel has no enable_backward=False"
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            for line, rule, what in _cpp(node.value, set()):
+            for line, rule, what in _cpp(node.value):
                 yield node.lineno + line - 1, rule, what
         if not isinstance(node, ast.FunctionDef):
             continue
@@ -127,52 +117,13 @@ def _narrow(node: ast.AST) -> Iterator[ast.AST]:
             yield from _narrow(child)
 
 
-def _chosen(text: str, macros: set[str]) -> str:
-    """A C++ text without the lines that a kernel with these macros leaves out.
-
-    Only conditions on one name are decided, as ``native_kernel`` gives them; of others all stays.
-    """
-    lines, open_parts = [], []  # of each open #if: whether its part stays, and may another
-    for text_line in text.split("\n"):
-        if m := re.match(r"#(if|elif|else|endif)\b *(\w*) *(//.*)?$", text_line):
-            word, name = m[1], m[2]
-            if word == "endif":
-                open_parts.pop()
-            else:
-                others = word == "if" or open_parts.pop()[1]
-                stays = others and (word == "else" or name in macros)
-                open_parts.append((stays, others and not stays))
-        elif re.match(r"#if", text_line):
-            open_parts.append((True, True))
-        stays = all(part for part, _ in open_parts)
-        lines.append(text_line if stays else "")
-    return "\n".join(lines)
-
-
-def _native(tree: ast.Module) -> Iterator[tuple[str, set[str], set[str]]]:
-    """The file of each native kernel, its macros that are True, and inputs that are written out."""
-    known = {ast.unparse(x.targets[0]): x.value for x in tree.body if isinstance(x, ast.Assign)}
-
-    def keys(node: ast.AST) -> set[str]:
-        node = known.get(ast.unparse(node), node)
-        pairs = zip(node.keys, node.values) if isinstance(node, ast.Dict) else ()
-        return {y for k, v in pairs for y in (keys(v) if k is None else {ast.literal_eval(k)})}
-
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "native_kernel":
-            names = {y for k in node.keywords if k.arg == "inputs" for y in keys(k.value)}
-            for file in re.findall(r"'([\w/]+\.inl)'", ast.unparse(node)):
-                yield file, set(re.findall(r"(\w+)=True", ast.unparse(node))), names
-
-
-def _cpp(text: str, inputs: set[str]) -> Found:
+def _cpp(text: str) -> Found:
     text = re.sub(r"//.*", "", text)
 
     def line(at: int) -> int:
         return text.count("\n", 0, at) + 1
 
-    name = "|".join([r"\w+_in", *sorted(inputs)])
-    target = rf"\b({name})(?:\.\w+)*\.data"
+    target = r"\b(\w+_in|in\.\w+)(?:\.\w+)*\.data"
     for m in re.finditer(rf"{target}\[[^;=]*\]\s*[-+*/|&^]?=(?!=)|__atomic_\w+\(&?{target}", text):
         yield line(m.start()), "inputs", f"writes to {m[1] or m[2]}"
     for m in re.finditer(r"\((?:size_t|long long)\)\([^()]* \* [^()]*\)", text):
@@ -207,7 +158,7 @@ def _terms(text: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    ends = (".py", ".h", ".cuh", ".inl")
+    ends = (".py", ".h", ".cuh")
     files = [x for x in sorted((ROOT / "kernels").rglob("*")) if x.suffix in ends]
     faults = findings({str(x.relative_to(ROOT)): x.read_text() for x in files})
     sys.exit("\n".join(faults) or None)

@@ -127,7 +127,7 @@ def test_the_wheel_holds_the_model_its_card_two_pictures_and_whose_they_are(whee
     assert all(f"`{Path(icon).stem}`" in text for icon in icons)
     sources = {
         str(p.relative_to(ROOT))
-        for end in ("h", "cuh", "inl")
+        for end in ("h", "cuh")
         for p in ROOT.glob(f"kernels/**/*.{end}")
     }
     assert {f"gamba_warp/{name}" for name in sources} <= names
