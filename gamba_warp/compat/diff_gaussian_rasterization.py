@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from gamba_warp.kernels.rasterize import Skip
+from gamba_warp.kernels.rasterize.autograd import bin_op, composite, project
 from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
-from gamba_warp.kernels.rasterize.ops import bin_op, composite, project
 from gamba_warp.kernels.rasterize.projection import LensOptions, Projected
 from gamba_warp.kernels.rasterize.quantile import counts_in_front
 from gamba_warp.kernels.rasterize.skip import SQUARES

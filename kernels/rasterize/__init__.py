@@ -1,7 +1,7 @@
 """The differentiable Gaussian rasterizer."""
 
+from .api import rasterization
 from .cuda.capacity import forget_graphs, lists_outgrown
-from .function import rasterization
 from .quantile import depth_quantile
 from .skip import Skip
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .autograd import bin_op, composite
 from .constants import TILE
-from .ops import bin_op, composite
 from .projection import STATUS_NAMES, Projected
 from .tiles import Bins, Limits, Saved, Size, Tiling
 

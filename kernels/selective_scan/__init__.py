@@ -1,5 +1,5 @@
 """Mamba's selective scan, on CUDA and on the CPU."""
 
-from .function import selective_scan, selective_scan_fn, selective_scan_state
+from .api import selective_scan, selective_scan_fn, selective_scan_state
 
 __all__ = ["selective_scan", "selective_scan_fn", "selective_scan_state"]

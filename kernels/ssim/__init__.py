@@ -1,5 +1,5 @@
 """1 - SSIM of pictures with its gradient."""
 
-from .function import dissimilarity
+from .api import dissimilarity
 
 __all__ = ["dissimilarity"]

@@ -3,7 +3,8 @@
 - ``arguments``: inputs come first, then outputs. An array, or a struct of arrays, is ``…_in``, or
   ``…_out`` if it is written; that may be read, too. Numbers have plain names.
 - ``types``: each argument says its type, itself: an array, a struct or a number.
-- ``inputs``: nothing is written to what is named ``…_in``, or in C++ ``in.…``. What a function knows by a plain name is not followed.
+- ``inputs``: nothing is written to what is named ``…_in``, or in C++ ``in.…``. What a function
+  knows by a plain name is not followed.
 - ``32 bits``: the number of a row fits in 32 bits, because views.py refuses longer arrays, and
   Warp's own indexing multiplies it by the stride in 64. What is counted in elements or bytes does
   not fit: so a stride or a length is widened before it is multiplied, and so is, in C++, a factor

@@ -20,7 +20,7 @@ from gamba_warp.render import render
 ROOT = Path(__file__).resolve().parents[2]
 # Modules and packages that have the name of a function beside them.
 BESIDE = ("gamba_warp.render", "gamba_warp.kernels.selective_scan.reference",
-          "gamba_warp.kernels.causal_conv1d.ops", "gamba_warp.kernels.rasterize")  # fmt: skip
+          "gamba_warp.kernels.causal_conv1d.autograd", "gamba_warp.kernels.rasterize")  # fmt: skip
 
 
 def run(code: str, program: str = sys.executable) -> str:
@@ -57,8 +57,9 @@ for name in ("selective_scan", "causal_conv1d", "rasterization", "render"):
 assert render is gamba_warp.render and selective_scan is kernels.selective_scan
 from gamba_warp.render import Rendering
 from gamba_warp.kernels.selective_scan import reference
-from gamba_warp.kernels.causal_conv1d import ops
-assert reference.selective_scan_reference and ops.__name__.endswith("causal_conv1d.ops")
+from gamba_warp.kernels.causal_conv1d import autograd
+assert reference.selective_scan_reference
+assert autograd.__name__.endswith("causal_conv1d.autograd")
 """
     orders = []
     for module in BESIDE:

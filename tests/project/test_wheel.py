@@ -126,9 +126,7 @@ def test_the_wheel_holds_the_model_its_card_two_pictures_and_whose_they_are(whee
     assert card["steps"] > 0 and len(icons) == 2
     assert all(f"`{Path(icon).stem}`" in text for icon in icons)
     sources = {
-        str(p.relative_to(ROOT))
-        for end in ("h", "cuh")
-        for p in ROOT.glob(f"kernels/**/*.{end}")
+        str(p.relative_to(ROOT)) for end in ("h", "cuh") for p in ROOT.glob(f"kernels/**/*.{end}")
     }
     assert {f"gamba_warp/{name}" for name in sources} <= names
     assert wheel.stat().st_size < 12e6

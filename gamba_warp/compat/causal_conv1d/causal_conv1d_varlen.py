@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...kernels.causal_conv1d.function import last_tokens
+from ...kernels.causal_conv1d.api import last_tokens
 from ...kernels.runtime.packed import sequences
 
 __all__ = ["causal_conv1d_varlen_states", "causal_conv1d_varlen_states_ref"]

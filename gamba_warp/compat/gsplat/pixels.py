@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gamba_warp.kernels.rasterize import Skip
+from gamba_warp.kernels.rasterize.autograd import composite
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, T_MIN, TILE
-from gamba_warp.kernels.rasterize.ops import composite
 from gamba_warp.kernels.rasterize.tiles import Bins, Limits, Size, Tiling
 
 from ..shared import check_tensor, one_device, side

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gamba_warp.kernels.rasterize.autograd import project
 from gamba_warp.kernels.rasterize.constants import (
     ALPHA_MIN,
     COMPENSATION_MIN,
@@ -16,7 +17,6 @@ from gamba_warp.kernels.rasterize.constants import (
     FRUSTUM_MARGIN,
 )
 from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
-from gamba_warp.kernels.rasterize.ops import project
 from gamba_warp.kernels.rasterize.projection import LensOptions
 
 from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side

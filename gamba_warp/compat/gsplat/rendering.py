@@ -9,9 +9,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from gamba_warp.kernels.rasterize.autograd import bin_op
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, TILE
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
-from gamba_warp.kernels.rasterize.ops import bin_op
 from gamba_warp.kernels.rasterize.projection import LensOptions
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 

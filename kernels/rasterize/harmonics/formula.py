@@ -1,6 +1,6 @@
 """Real spherical harmonics up to degree 4, in torch (autograd gives the gradients).
 
-The operator of ``ops.py`` takes this where it has no kernel: for other dtypes than float32,
+The operator of ``autograd.py`` takes this where it has no kernel: for other dtypes than float32,
 other devices, very many channels. In float64 it is the oracle of the kernels.
 """
 

@@ -7,7 +7,7 @@ import torch
 from helpers import assert_rel_rms
 from helpers.raster import NAMES, leaves, make, mapped
 
-from gamba_warp.kernels.rasterize import ops, rasterization
+from gamba_warp.kernels.rasterize import autograd, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 
 
@@ -197,6 +197,6 @@ def test_bad_input(change, error, words):
 @pytest.mark.parametrize("many", [0, 1 << 30])
 def test_too_many_pairs(monkeypatch, many):
     monkeypatch.setattr(bin_cpu, "MANY", many)
-    monkeypatch.setattr(ops, "MAX_PAIRS", 5000)
+    monkeypatch.setattr(autograd, "MAX_PAIRS", 5000)
     with pytest.raises(ValueError, match="pairs of tiles and Gaussians"):
         rasterization(**make(num=400, size=1.0))

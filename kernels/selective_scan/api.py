@@ -1,4 +1,4 @@
-"""The public scan, and mamba-ssm's own: checks of their arguments, and a call of ``ops.py``."""
+"""The public scan, and mamba-ssm's own: checks of their arguments, and ``autograd.py``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..runtime.packed import Packed, sequences
 from ..runtime.views import tokens_first
-from . import ops
+from .autograd import scan
 from .problem import DISCRETIZATIONS, Inputs, Options
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
@@ -78,7 +78,7 @@ def _check_common(
 def _run(x: Inputs, options: Options) -> tuple[Tensor, Tensor]:
     """Output and last state; saves the states between them if a gradient may follow."""
     save = torch.is_grad_enabled() and any(v is not None and v.requires_grad for v in x)
-    out, last, _ = ops.scan(*x, *options._replace(save=save))
+    out, last, _ = scan(*x, *options._replace(save=save))
     return out, last
 
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .autograd import composite, project
 from .checks import check_inputs
 from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN, TILE
 from .harmonics import colors_from_harmonics
 from .meta import Call, Meta
-from .ops import composite, project
 from .projection import LensOptions, Projected
 from .skip import Skip
 from .tiles import Limits, Saved, Size

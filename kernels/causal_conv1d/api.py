@@ -1,4 +1,4 @@
-"""The public convolution, and causal-conv1d's own: checks of arguments, and ``ops.py``."""
+"""The public convolution, and causal-conv1d's own: checks of arguments, and ``autograd.py``."""
 
 from typing import Literal, overload
 
@@ -7,8 +7,8 @@ from torch import Tensor
 
 from ..runtime.packed import Packed, sequences
 from ..runtime.views import tokens_first
+from .autograd import conv
 from .kernels import TAPS
-from .ops import conv
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 ACTIVATIONS = (None, "silu", "swish")

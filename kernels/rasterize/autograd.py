@@ -1,6 +1,6 @@
 """The three registered operators and their gradients: project, bin, composite.
 
-They hold no arithmetic: each calls the launchers of its file. ``function.py`` joins them. An
+They hold no arithmetic: each calls the launchers of its file. ``api.py`` joins them. An
 operator takes tensors and plain numbers only, so each named tuple comes as a list of its values.
 """
 
