@@ -15,7 +15,7 @@ from gamba_warp.kernels.rasterize import Skip
 from gamba_warp.kernels.rasterize.autograd import bin_op, composite, project
 from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
-from gamba_warp.kernels.rasterize.projection import LensOptions, Projected
+from gamba_warp.kernels.rasterize.projection import Projected, ProjectionOptions
 from gamba_warp.kernels.rasterize.quantile import counts_in_front
 from gamba_warp.kernels.rasterize.skip import SQUARES
 from gamba_warp.kernels.rasterize.tiles import Bins, Limits, Size, Tiling
@@ -361,13 +361,13 @@ def _project(
     scales = x.get("scales")
     if scales is not None and settings.scale_modifier != 1:
         scales = _Scaled.apply(scales, settings.scale_modifier)
-    lens = LensOptions(
+    options = ProjectionOptions(
         settings.image_width, settings.image_height, NEAR, float("inf"), 0.0, EPS2D, ALPHA_MIN,
         bool(settings.antialiasing), skip_unused=True, original=True,
     ).numbers()  # fmt: skip
     shapes = x.get("rotations"), scales, x.get("cov3D_precomp")
     gaussians = x["means3D"], *shapes, x["opacities"].flatten()
-    return Projected(*project(*gaussians, colors.detach(), viewmat, K, lens))
+    return Projected(*project(*gaussians, colors.detach(), viewmat, K, options))
 
 
 def _plain(settings: GaussianRasterizationSettings) -> GaussianRasterizationSettings:

@@ -26,7 +26,7 @@ from .case import (
     mostly,
 )
 from .problem import BOTH, Error, compare
-from .raster_oracle import Lens, View, render_view
+from .raster_oracle import View, ViewOptions, render_view
 from .rounding import SAMPLES, Rounding, samples_of
 
 LEAVES = ("means", "quats", "scales", "opacities", "colors")
@@ -453,9 +453,9 @@ def _view(o: dict, x: dict[str, Tensor], v: int, K: Tensor, r: Rounding) -> View
     if o["colors_per_view"]:
         gaussians["colors"] = gaussians["colors"][:, v]
     names = ("width", "height", "alpha_min", "alpha_max", "eps2d", "radius_clip", "antialiased")
-    lens = Lens(**{k: o[k] for k in names}, sh_degree=_degree(o))
+    options = ViewOptions(**{k: o[k] for k in names}, sh_degree=_degree(o))
     W, w = x["viewmats"][:, v, :3, :3], x["viewmats"][:, v, :3, 3]
-    view = render_view(gaussians, W, w, K, lens, r)
+    view = render_view(gaussians, W, w, K, options, r)
     parts = [view.blended.shape[-1] - 3, 1, 1, 1]
     color, depth, weight, alpha = view.blended.split(parts, dim=-1)
     more, more_depth, more_weight, more_alpha = view.allowance.split(parts, dim=-1)

@@ -20,7 +20,7 @@ from .scan_oracle import EXP_ULPS
 _RANGE = 3.4e38  # largest float32
 
 
-class Lens(NamedTuple):
+class ViewOptions(NamedTuple):
     """Arguments of ``rasterization`` besides tensors and modes, under the same names."""
 
     width: int
@@ -87,10 +87,10 @@ def _rotation(q: Tensor, r: Rounding) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def _jacobian(t: Tensor, K: Tensor, lens: Lens, r: Rounding) -> tuple[Tensor, Tensor]:
+def _jacobian(t: Tensor, K: Tensor, options: ViewOptions, r: Rounding) -> tuple[Tensor, Tensor]:
     """``[S, n, 2, 3]``, and which Gaussians are at the clamp of a slope ``[n]``."""
     rows, at_clamp = [], torch.zeros(t.shape[1], dtype=torch.bool)
-    for axis, size in ((0, lens.width), (1, lens.height)):
+    for axis, size in ((0, options.width), (1, options.height)):
         focal, center = K[axis, axis].item(), K[axis, 2].item()
         margin = FRUSTUM_MARGIN * 0.5 * size / focal
         slope = r(t[..., axis] / t[..., 2])
@@ -121,17 +121,25 @@ class _Splats(NamedTuple):
     index: Tensor
 
 
-def _splats(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -> _Splats:
+def _splats(x: dict, W: Tensor, w: Tensor, K: Tensor, options: ViewOptions, r: Rounding) -> _Splats:
     """Project Gaussians that may be visible: ``[SAMPLES, N, ..]`` of one object, of one view."""
     t = r(_product(W[:, None], x["means"][..., None], r)[..., 0] + w[:, None])
     z, opacity = t[..., 2], x["opacities"]
-    unsure = _near(z, lens.near_plane) | _near(z, lens.far_plane) | _near(opacity, lens.alpha_min)
-    seen = (z[0] >= lens.near_plane) & (z[0] <= lens.far_plane) & (opacity[0] >= lens.alpha_min)
+    unsure = (
+        _near(z, options.near_plane)
+        | _near(z, options.far_plane)
+        | _near(opacity, options.alpha_min)
+    )
+    seen = (
+        (z[0] >= options.near_plane)
+        & (z[0] <= options.far_plane)
+        & (opacity[0] >= options.alpha_min)
+    )
     index = (seen | unsure).nonzero()[:, 0]
     index = index[torch.argsort(z[0, index].detach(), stable=True)]
     t, opacity, channels = t[:, index], opacity[:, index], x["colors"][:, index]
     seen, unsure = seen[index], unsure[index]
-    J, loose = _jacobian(t, K, lens, r)
+    J, loose = _jacobian(t, K, options, r)
     M = _product(J, W[:, None], r)
     if x["quats"] is not None:
         M = _product(M, _rotation(x["quats"][:, index], r), r)
@@ -139,21 +147,21 @@ def _splats(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -
     m0, m1 = M[..., 0, :], M[..., 1, :]
     n = r(torch.linalg.cross(m0, m1))
     det0, s0, s1 = _dot(n, n, r), _dot(m0, m0, r), _dot(m1, m1, r)
-    eps2d = r.constant(lens.eps2d)
+    eps2d = r.constant(options.eps2d)
     det = r(det0 + r(eps2d * r(s0 + s1)) + r(eps2d * eps2d))
     fits = det[0] < _RANGE
     unsure = unsure | ((det[0] > 1e-2 * _RANGE) & (det[0] < 1e2 * _RANGE))
     sxx, syy = r(s0 + eps2d), r(s1 + eps2d)
     conic = r(syy / det), r(-_dot(m0, m1, r) / syy), r(1 / syy)
-    if lens.antialiased:
+    if options.antialiased:
         ratio = r(det0 / det)
         loose = loose | _near(ratio, COMPENSATION_MIN**2)
         opacity = r(opacity * r(ratio.clamp_min(COMPENSATION_MIN**2).sqrt()))
-    if lens.radius_clip > 0:
-        cut = r((2 * torch.log((opacity / lens.alpha_min).clamp_min(1 + 1e-9))).sqrt())
+    if options.radius_clip > 0:
+        cut = r((2 * torch.log((opacity / options.alpha_min).clamp_min(1 + 1e-9))).sqrt())
         extent = r(cut * r(torch.maximum(sxx, syy).sqrt()))
-        unsure = unsure | _near(extent, lens.radius_clip)
-        seen = seen & (extent[0] > lens.radius_clip)
+        unsure = unsure | _near(extent, options.radius_clip)
+        seen = seen & (extent[0] > options.radius_clip)
     scaled = [r(r(K[i, i] * t[..., i]) / t[..., 2]) for i in (0, 1)]
     center = torch.stack([r(scaled[i] + r.constant(K[i, 2])) for i in (0, 1)], -1)
     depth = t[..., 2]
@@ -177,7 +185,7 @@ def _order_swaps(s: _Splats, weight: Tensor, active: Tensor) -> tuple[Tensor, Te
     return change, touched
 
 
-def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
+def _blend(s: _Splats, pixels: Tensor, options: ViewOptions, r: Rounding) -> View:
     offset = r(pixels[None, :, None] - s.center[:, None])
     a, k, e = (c[:, None] for c in s.conic)
     dx, dy = offset.unbind(-1)
@@ -186,9 +194,9 @@ def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
     raw = r(s.opacity[:, None] * r.exp(-0.5 * q, EXP_ULPS))
     with torch.no_grad():
         value, band = raw[0], _band(raw) + FACTOR * EXP_ULPS * UNIT * raw[0]
-        on = (value >= lens.alpha_min) & s.seen
-        clamped = value > lens.alpha_max
-    alpha = torch.where(clamped, r.constant(lens.alpha_max)[..., None], raw)
+        on = (value >= options.alpha_min) & s.seen
+        clamped = value > options.alpha_max
+    alpha = torch.where(clamped, r.constant(options.alpha_max)[..., None], raw)
     alpha = torch.where(on, alpha, 0.0)
     after = torch.cumprod(torch.where(on, r(1 - alpha), 1.0), -1)
     with torch.no_grad():
@@ -212,8 +220,8 @@ def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
     with torch.no_grad():  # decisions that depend on rounding, and their effect
         stops = (on & ~going).any(-1)
         reached = before[0] > T_MIN * (1 - FACTOR * len(s.seen) * UNIT) - _band(after).amax()
-        cut = (value - lens.alpha_min).abs() <= band
-        cut |= s.unsure & (value >= lens.alpha_min - band)
+        cut = (value - options.alpha_min).abs() <= band
+        cut |= s.unsure & (value >= options.alpha_min - band)
         cut &= reached & (s.seen | s.unsure)
         stop = on & reached & ((after[0] - T_MIN).abs() <= _band(after))
         # a Gaussian that appears or vanishes changes its pixels by its share, and shows or hides
@@ -221,19 +229,23 @@ def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
         share = (before[0] * value * cut).sum(-1) + (before[0] * stop).amax(-1)
         top = torch.cat([s.channels[0].abs().amax(0), torch.ones(1, dtype=share.dtype)])
         allowance = 2 * share[:, None] * top
-        swap, swapped = _order_swaps(s, before[0] * value.clamp_max(lens.alpha_max), on & reached)
+        swap, swapped = _order_swaps(
+            s, before[0] * value.clamp_max(options.alpha_max), on & reached
+        )
         allowance[:, :-1] += 2 * swap
         undecided = cut.any(-1) | stop.any(-1) | swapped
         # undecided Gaussians before a stop may move the stop: this light at most is then left
         elsewhere = undecided & (stops | stop.any(-1))
-        allowance[elsewhere] += 2 * T_MIN / (1 - lens.alpha_max) * top
-        bend = on & ((value - lens.alpha_max).abs() <= band) | (on & s.loose)
+        allowance[elsewhere] += 2 * T_MIN / (1 - options.alpha_max) * top
+        bend = on & ((value - options.alpha_max).abs() <= band) | (on & s.loose)
         allowance += FACTOR * UNIT * top
         loose = undecided | (bend & reached).any(-1)
         return View(blended, allowance, undecided[:, None], loose[:, None])
 
 
-def render_view(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -> View:
+def render_view(
+    x: dict, W: Tensor, w: Tensor, K: Tensor, options: ViewOptions, r: Rounding
+) -> View:
     """One object in one view.
 
     Args:
@@ -242,26 +254,28 @@ def render_view(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Roundin
         W: rotation ``[SAMPLES, 3, 3]`` of the view.
         w: translation ``[SAMPLES, 3]``.
         K: ``[3, 3]`` float64.
-        lens: the rest.
+        options: the rest.
         r: rounds.
     """
     x = {name: None if t is None else r(t) for name, t in x.items()}
     bent = None
-    if lens.sh_degree is not None:
+    if options.sh_degree is not None:
         centers = -(r(W).mT @ r(w)[..., None])[..., 0]
-        colors = colors_by_formula(lens.sh_degree, x["colors"], x["means"], centers[:, None])[:, 0]
+        colors = colors_by_formula(options.sh_degree, x["colors"], x["means"], centers[:, None])[
+            :, 0
+        ]
         x["colors"] = r(colors, EXP_ULPS)
         with torch.no_grad():  # the clamp at 0
             bent = (colors[0] <= _band(colors) + 1e-6).any(-1) & (colors[0] >= 0).any(-1)
-    s = _splats(x, r(W), r(w), K, lens, r)
+    s = _splats(x, r(W), r(w), K, options, r)
     if bent is not None:
         s = s._replace(loose=s.loose | bent[s.index])
     rows, columns = torch.meshgrid(
-        torch.arange(lens.height), torch.arange(lens.width), indexing="ij"
+        torch.arange(options.height), torch.arange(options.width), indexing="ij"
     )
     pixels = torch.stack([columns, rows], -1).reshape(-1, 2).double() + 0.5
     if len(s.seen):
-        return _blend(s, pixels, lens, r)
+        return _blend(s, pixels, options, r)
     blank = x["means"].new_zeros(len(W), len(pixels), x["colors"].shape[-1] + 3)
     allowance = blank[0].clone()
     allowance[:, -1] = FACTOR * UNIT

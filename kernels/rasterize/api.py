@@ -12,7 +12,7 @@ from .checks import check_inputs
 from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN, TILE
 from .harmonics import colors_from_harmonics
 from .meta import Call, Meta
-from .projection import LensOptions, Projected
+from .projection import Projected, ProjectionOptions
 from .skip import Skip
 from .tiles import Limits, Saved, Size
 
@@ -113,14 +113,14 @@ def rasterization(
     colors = x.colors
     if sh_degree is not None:
         colors = colors_from_harmonics(sh_degree, colors, x.means, x.viewmats).contiguous()
-    lens = LensOptions(
+    projection = ProjectionOptions(
         width=width, height=height, near_plane=near_plane, far_plane=far_plane,
         radius_clip=radius_clip, eps2d=eps2d, alpha_min=alpha_min,
         antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
     ).numbers()  # fmt: skip
     # colours only cull here, so their gradient does not require the geometry's
     gaussians = x.means, x.quats, x.scales, None, x.opacities
-    projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, lens))
+    projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, projection))
     channels = _channels(render_mode, colors, projected.depths)
     colors_per_view = int(channels.dim() > x.means.dim())
     size = Size(width, height, x.viewmats.shape[-3], colors_per_view, skip.bits())

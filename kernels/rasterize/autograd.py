@@ -23,11 +23,11 @@ from .cuda import composite as composite_cuda
 from .cuda.project import project_on_threads, vjp_on_threads
 from .projection import (
     PROJECTED_SIZES,
-    LensOptions,
     Projected,
-    make_lens,
+    ProjectionOptions,
     project_backward,
     project_forward,
+    projection_params,
 )
 from .skip import UNASKED
 from .tiles import (
@@ -65,16 +65,18 @@ def project(
     colors: Tensor,
     viewmats: Tensor,
     Ks: Tensor,
-    lens: List[float],
+    options: List[float],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """``project_forward`` as an operator, with the numbers of ``LensOptions``."""
+    """``project_forward`` as an operator, with the numbers of ``ProjectionOptions``."""
     inputs = means, quats, scales, covars, opacities, colors, viewmats, Ks
-    p = project_forward(inputs, make_lens(LensOptions(*lens)), _projector(means.device))
+    p = project_forward(
+        inputs, projection_params(ProjectionOptions(*options)), _projector(means.device)
+    )
     return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
 @project.register_fake
-def _(means, quats, scales, covars, opacities, colors, viewmats, Ks, lens):
+def _(means, quats, scales, covars, opacities, colors, viewmats, Ks, options):
     shape = (*viewmats.shape[:-2], means.shape[-2])
     floats = tuple(means.new_empty(*shape, *size) for size in PROJECTED_SIZES)
     return *floats, means.new_empty(shape, dtype=torch.int32)
@@ -83,26 +85,27 @@ def _(means, quats, scales, covars, opacities, colors, viewmats, Ks, lens):
 @torch.library.custom_op(_OP + "project_vjp", mutates_args=())
 def _project_vjp(
     inputs: List[Tensor | None],
-    lens: List[float],
+    options: List[float],
     conics: Tensor,
     status: Tensor,
     cotangents: List[Tensor],
     wanted: List[bool],
 ) -> List[Tensor]:
-    options, viewmats = LensOptions(*lens), wanted[5]
-    on_lanes = kind_of(conics.device) == "cpu" and not (viewmats or options.antialiased)
+    projection, viewmats = ProjectionOptions(*options), wanted[5]
+    on_lanes = kind_of(conics.device) == "cpu" and not (viewmats or projection.antialiased)
     run = vjp_on_lanes if on_lanes else vjp_on_threads
-    grads = project_backward(inputs, make_lens(options), conics, status, cotangents, wanted, run)
+    params = projection_params(projection)
+    grads = project_backward(inputs, params, conics, status, cotangents, wanted, run)
     return [g for g in grads if g is not None]
 
 
 @_project_vjp.register_fake
-def _(inputs, lens, conics, status, cotangents, wanted):
+def _(inputs, options, conics, status, cotangents, wanted):
     return [torch.empty_like(x) for x, want in zip(inputs[:6], wanted) if want]
 
 
 def _project_setup(ctx, inputs, output):
-    *gaussians, _, viewmats, Ks, ctx.lens = inputs
+    *gaussians, _, viewmats, Ks, ctx.options = inputs
     projected = Projected(*output)
     ctx.mark_non_differentiable(projected.extents, projected.status)
     ctx.set_materialize_grads(False)
@@ -117,7 +120,7 @@ def _project_backward(ctx, *cotangents):
         conics.new_zeros(*status.shape, *size) if v is None else v.contiguous()
         for v, size in zip(cotangents, PROJECTED_SIZES[:4])
     ]
-    grads = iter(_project_vjp(inputs, ctx.lens, conics, status, given, wanted))
+    grads = iter(_project_vjp(inputs, ctx.options, conics, status, given, wanted))
     *v_gaussians, v_viewmats = (next(grads) if want else None for want in wanted)
     return *v_gaussians, None, v_viewmats, None, None
 

@@ -19,8 +19,8 @@ VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
 STATUS_NAMES = ("visible", "near", "far", "not_finite", "transparent", "outside", "small")
 
 
-class LensOptions(NamedTuple):
-    """Arguments of a ``Lens``, as numbers that fit in a list of floats.
+class ProjectionOptions(NamedTuple):
+    """Arguments of a ``ProjectionParams``, as numbers that fit in a list of floats.
 
     Attributes:
         width: of the picture, pixels.
@@ -50,7 +50,7 @@ class LensOptions(NamedTuple):
     original: float = 0.0
 
     def numbers(self) -> list[float]:
-        """The attributes in their order; ``LensOptions(*numbers)`` is the inverse."""
+        """The attributes in their order; ``ProjectionOptions(*numbers)`` is the inverse."""
         return [float(x) for x in self]
 
 
@@ -79,7 +79,7 @@ PROJECTED_SIZES = ((2,), (3,), (), (), (2,))  # of ``Projected``'s floats, after
 
 
 @struct
-class Lens:
+class ProjectionParams:
     """The scalars of a projection's launch: picture size and thresholds."""
 
     width: float
@@ -111,9 +111,9 @@ class Scene:
     Ks: wp.array[wp.mat33]
 
 
-def make_lens(options: LensOptions) -> Lens:
+def projection_params(options: ProjectionOptions) -> ProjectionParams:
     """The scalars of a projection as one kernel argument, which is shared: do not modify it."""
-    return filled(Lens, *options[:7], *map(int, options[7:]))
+    return filled(ProjectionParams, *options[:7], *map(int, options[7:]))
 
 
 def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
@@ -123,7 +123,9 @@ def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> 
     return torch.empty(*shape, dtype=dtype, device=device)
 
 
-def project_forward(inputs: Sequence[Any], lens: Lens, run: Callable[..., None]) -> Projected:
+def project_forward(
+    inputs: Sequence[Any], params: ProjectionParams, run: Callable[..., None]
+) -> Projected:
     """Project objects of N Gaussians into V views each; float32, contiguous tensors.
 
     Args:
@@ -132,7 +134,7 @@ def project_forward(inputs: Sequence[Any], lens: Lens, run: Callable[..., None])
             semidefinite), opacities ``[.., N]``; colors ``[.., N, C]`` or ``[.., V, N, C]``, only
             to cull values that are not finite; viewmats ``[.., V, 4, 4]`` and Ks
             ``[.., V, 3, 3]``.
-        lens: from ``make_lens``.
+        params: from ``projection_params``.
         run: launches the device's kernel.
     """
     *gaussians, colors, viewmats, Ks = inputs
@@ -144,14 +146,14 @@ def project_forward(inputs: Sequence[Any], lens: Lens, run: Callable[..., None])
     if projected.status.numel():
         scene = StructValue(Scene, *gaussians, viewmats, Ks)
         per_view = int(colors.dim() > gaussians[0].dim())
-        arguments = [shape[-1], num, lens, scene, per_view, colors.flatten(0, -2)]
+        arguments = [shape[-1], num, params, scene, per_view, colors.flatten(0, -2)]
         run(shape.numel(), num, [*arguments, as_struct(projected)], device)
     return projected
 
 
 def project_backward(
     inputs: Sequence[Any],
-    lens: Lens,
+    params: ProjectionParams,
     conics: Tensor,
     status: Tensor,
     cotangents: Sequence[Tensor],
@@ -162,7 +164,7 @@ def project_backward(
 
     Args:
         inputs: as given forward, without the colors.
-        lens: as given forward.
+        params: as given forward.
         conics: as returned forward.
         status: as returned forward.
         cotangents: of means2d, conics, depths and view_opacities; contiguous.
@@ -185,7 +187,7 @@ def project_backward(
     v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[5] else None
     if status.numel():
         arguments = [
-            *(views, num, lens, StructValue(Scene, *gaussians, viewmats, Ks)),
+            *(views, num, params, StructValue(Scene, *gaussians, viewmats, Ks)),
             as_struct(Projected(conics=conics, status=status)),
             as_struct(Projected(*cotangents)),
             StructValue(Scene, *grads, None, None),

@@ -17,7 +17,7 @@ from gamba_warp.kernels.rasterize.constants import (
     FRUSTUM_MARGIN,
 )
 from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
-from gamba_warp.kernels.rasterize.projection import LensOptions
+from gamba_warp.kernels.rasterize.projection import ProjectionOptions
 
 from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side
 from .relocation import quat_scale_to_covar_preci
@@ -175,7 +175,7 @@ def proj(
     return focal * slopes + center, jacobian @ covars @ jacobian.mT
 
 
-def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -> Splats:
+def project_views(scene: dict[str, Tensor], colors: Tensor, options: ProjectionOptions) -> Splats:
     """Project each object into each of its views; all float32, contiguous.
 
     The rasterizer's factor of antialiasing is at least 0.005, while gsplat's goes down to 0. The
@@ -187,20 +187,20 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -
             ``Ks [B, C, 3, 3]``, and ``quats [B, N, 4]`` and ``scales [B, N, 3]``, or
             ``covars [B, N, 6]``.
         colors: ``[B, N, D]`` or ``[B, C, N, D]``, only to cull what is not finite.
-        lens: options.
+        options: of the projection.
     """
     means, opacities, viewmats, Ks = (scene[k] for k in ("means", "opacities", "viewmats", "Ks"))
     quats, scales, covars = (scene.get(name) for name in ("quats", "scales", "covars"))
-    if covars is not None and lens.antialiased:
+    if covars is not None and options.antialiased:
         finite = colors.isfinite().all(-1).view(len(colors), -1, means.shape[1])
         finite = finite & opacities.isfinite()[:, None]
         shown = torch.where(finite, opacities[:, None], 0.0)
         whole: Any = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
-        return _project_covariances(means, whole, shown, viewmats, Ks, lens)
+        return _project_covariances(means, whole, shown, viewmats, Ks, options)
     given = means, quats, scales, covars, opacities, colors.detach(), viewmats, Ks
-    splats = Splats(*project(*given, lens.numbers())[:5])
+    splats = Splats(*project(*given, options.numbers())[:5])
     splats = splats._replace(extents=splats.extents.detach())
-    if not lens.antialiased or quats is None or scales is None:
+    if not options.antialiased or quats is None or scales is None:
         return splats
     with torch.no_grad():
         faint = splats.opacities <= opacities[:, None] * (COMPENSATION_MIN * _NEARLY)
@@ -211,7 +211,7 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -
     wide = quats[b, g].double(), scales[b, g].double()
     whole = quat_scale_to_covar_preci(*wide, True, False)[0]
     given = means[b, g], whole, opacities[b, g, None], viewmats[b, c], Ks[b, c]
-    exact = _project_covariances(*(x[:, None] for x in given), lens=lens)
+    exact = _project_covariances(*(x[:, None] for x in given), options=options)
     return Splats(*(x.index_put(at, one[:, 0, 0]) for x, one in zip(splats, exact)))
 
 
@@ -221,7 +221,7 @@ def _project_covariances(
     opacities: Tensor,
     viewmats: Tensor,
     Ks: Tensor,
-    lens: LensOptions,
+    options: ProjectionOptions,
 ) -> Splats:
     """Project like the operator, from covariances, in float64 torch; opacities ``[B, (C), N]``."""
     finite = means.isfinite().all(-1) & covars.isfinite().flatten(-2).all(-1)
@@ -230,19 +230,19 @@ def _project_covariances(
     covars = torch.where(finite[..., None, None], covars, 0.0)
     turned, covars = world_to_cam(means.double(), covars.double(), viewmats.double())
     depths = turned[..., 2]
-    seen = finite[:, None] & (depths >= lens.near_plane) & (depths <= lens.far_plane)
+    seen = finite[:, None] & (depths >= options.near_plane) & (depths <= options.far_plane)
     # and here before the division by z.
     turned = torch.where(seen[..., None], turned, turned.new_tensor([0.0, 0.0, 1.0]))
     covars = torch.where(seen[..., None, None], covars, torch.eye(3).to(covars))
-    centers, plane = proj(turned, covars, Ks.double(), int(lens.width), int(lens.height))
+    centers, plane = proj(turned, covars, Ks.double(), int(options.width), int(options.height))
     xx, xy, yy = plane[..., 0, 0], plane[..., 0, 1], plane[..., 1, 1]
     before = xx * yy - xy * xy
-    xx, yy = xx + lens.eps2d, yy + lens.eps2d
+    xx, yy = xx + options.eps2d, yy + options.eps2d
     det = xx * yy - xy * xy
     solid = (det > 0) & (yy <= CONIC_MAX * det) & (yy * CONIC_MAX >= 1)
     xx, yy, det = (torch.where(solid, x, 1.0) for x in (xx, yy, det))
     shown = opacities.double().expand_as(depths)
-    if lens.antialiased:
+    if options.antialiased:
         some = before > 0
         # Replaced before the root, whose infinite slope at 0 would turn a gradient of 0 into NaN.
         factor = torch.where(some, before / det, 1.0).sqrt()
@@ -252,8 +252,8 @@ def _project_covariances(
         cut = (2 * (shown / ALPHA_MIN).clamp_min(1).log()).sqrt()
         extents = cut[..., None] * torch.stack([xx, yy], -1).clamp_min(0).sqrt()
         reach = extents.ceil()
-        inside = (centers + reach >= 0) & (centers - reach <= plane.new_tensor(lens[:2]))
-        seen = seen & inside.all(-1) & (reach > lens.radius_clip).any(-1)
+        inside = (centers + reach >= 0) & (centers - reach <= plane.new_tensor(options[:2]))
+        seen = seen & inside.all(-1) & (reach > options.radius_clip).any(-1)
     conics = torch.stack([yy / det, -xy / yy, 1 / yy], -1)
     box, blank = seen[..., None], conics.new_tensor([1.0, 0.0, 1.0])
     kept = (
@@ -328,11 +328,11 @@ def fully_fused_projection(
 
     def projected(opacity: Tensor, antialiased: bool) -> Splats:
         scene = {**given, "opacities": opacity}
-        lens = LensOptions(
+        options = ProjectionOptions(
             width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN, antialiased,
             skip_unused=True, rounded=True,
         )  # fmt: skip
-        return project_views(scene, opacity[..., None], lens)
+        return project_views(scene, opacity[..., None], options)
 
     compensations = None
     if opacities is not None:

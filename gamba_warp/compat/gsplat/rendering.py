@@ -12,7 +12,7 @@ from torch import Tensor
 from gamba_warp.kernels.rasterize.autograd import bin_op
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, TILE
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
-from gamba_warp.kernels.rasterize.projection import LensOptions
+from gamba_warp.kernels.rasterize.projection import ProjectionOptions
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 
 from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side
@@ -165,11 +165,11 @@ def rasterization(
         centers = torch.linalg.inv(given["viewmats"])[..., :3, 3]
         colors = flat(colors, lead)
         blended = colors_seen_from(sh_degree, colors, given["means"], centers).contiguous()
-    lens = LensOptions(
+    options = ProjectionOptions(
         width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN,
         rasterize_mode == "antialiased", skip_unused=True, rounded=True,
     )  # fmt: skip
-    splats = project_views(given, blended, lens)
+    splats = project_views(given, blended, options)
     radii = splats.extents.ceil().int()
     seen = (radii > 0).all(-1)
     at = seen.nonzero(as_tuple=True) if packed else None

@@ -12,7 +12,7 @@ from ...runtime.launch import parallel_launch
 from ...runtime.native import constants, native, native_kernel
 from ...runtime.views import struct_of
 from ..constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN, RADIUS_MAX, TILE
-from ..projection import STATUS_NAMES, Lens, Projected, Scene
+from ..projection import STATUS_NAMES, Projected, ProjectionParams, Scene
 
 _RUN = 512  # Gaussians of a task, a multiple of 16
 _PIECES_PER_THREAD = 8  # those that are culled cost less
@@ -24,7 +24,7 @@ _CONFIG = constants(
     **{"CONIC_MAX": CONIC_MAX, "RADIUS_MAX": RADIUS_MAX, "TILE": TILE},
 )
 _HEADER = _CONFIG + native(Path(__file__).with_name("project.h"))
-_SCENE = {"views": int, "num": int, "options": Lens, "scene": Scene}
+_SCENE = {"views": int, "num": int, "options": ProjectionParams, "scene": Scene}
 
 _project = native_kernel(
     "project",

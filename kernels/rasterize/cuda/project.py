@@ -23,8 +23,8 @@ from ..projection import (
     SMALL,
     TRANSPARENT,
     VISIBLE,
-    Lens,
     Projected,
+    ProjectionParams,
     Scene,
     vec6,
 )
@@ -76,8 +76,8 @@ def rotation(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 @no_type_check
-def unit(q: wp.vec4, lens: Lens) -> wp.vec4:
-    if lens.original != 0:
+def unit(q: wp.vec4, options: ProjectionParams) -> wp.vec4:
+    if options.original != 0:
         return q
     size = quat_size(q)
     if size > 0.0:
@@ -111,20 +111,24 @@ def root_of(c: vec6) -> wp.mat33:
 @wp.func
 @no_type_check
 def slope(
-    p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32, lens: Lens
+    p: wp.float32,
+    center: wp.float32,
+    size: wp.float32,
+    focal: wp.float32,
+    options: ProjectionParams,
 ) -> wp.float32:
     # x/z kept within README eq. 2's bounds: the picture and a margin around it
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    if lens.original != 0:
+    if options.original != 0:
         center = 0.5 * size
     return wp.clamp(p, -(center / focal + margin), (size - center) / focal + margin)
 
 
 @wp.func
 @no_type_check
-def jacobian(t: wp.vec3, K: wp.mat33, lens: Lens) -> mat23:
-    sx = slope(t[0] / t[2], K[0, 2], lens.width, K[0, 0], lens)
-    sy = slope(t[1] / t[2], K[1, 2], lens.height, K[1, 1], lens)
+def jacobian(t: wp.vec3, K: wp.mat33, options: ProjectionParams) -> mat23:
+    sx = slope(t[0] / t[2], K[0, 2], options.width, K[0, 0], options)
+    sy = slope(t[1] / t[2], K[1, 2], options.height, K[1, 1], options)
     fx = K[0, 0] / t[2]
     fy = K[1, 1] / t[2]
     return mat23(fx, 0.0, -fx * sx, 0.0, fy, -fy * sy)
@@ -160,7 +164,7 @@ def _splat(
     g: wp.int32,
     image: wp.int32,
     color_row: wp.int32,
-    lens: Lens,
+    options: ProjectionParams,
     scene_in: Scene,
     colors_in: wp.array2d[wp.float32],
 ) -> _Splat:
@@ -186,32 +190,32 @@ def _splat(
     if not finite:
         splat.status = NOT_FINITE
         return splat
-    if not (t[2] >= lens.near_plane):
+    if not (t[2] >= options.near_plane):
         splat.status = NEAR
         return splat
-    if not (t[2] <= lens.far_plane):
+    if not (t[2] <= options.far_plane):
         splat.status = FAR
         return splat
-    if not (opacity >= lens.alpha_min) and lens.original == 0:
+    if not (opacity >= options.alpha_min) and options.original == 0:
         splat.status = TRANSPARENT
         return splat
 
     K = scene_in.Ks[image]
-    M = jacobian(t, K, lens) * rotation_of(viewmat)
+    M = jacobian(t, K, options) * rotation_of(viewmat)
     if scene_in.covars:
         M = M * root_of(scene_in.covars[g])
     else:
         if scene_in.quats:
-            M = M * rotation(unit(scene_in.quats[g], lens))
+            M = M * rotation(unit(scene_in.quats[g], options))
         M = M * wp.diag(scene_in.scales[g])
     m0 = row_of(M, 0)
     m1 = row_of(M, 1)
     n = wp.cross(m0, m1)
     det0 = wp.dot(n, n)
-    det = det0 + lens.eps2d * (wp.dot(m0, m0) + wp.dot(m1, m1)) + lens.eps2d * lens.eps2d
-    sxx = wp.dot(m0, m0) + lens.eps2d
+    det = det0 + options.eps2d * (wp.dot(m0, m0) + wp.dot(m1, m1)) + options.eps2d * options.eps2d
+    sxx = wp.dot(m0, m0) + options.eps2d
     sxy = wp.dot(m0, m1)
-    syy = wp.dot(m1, m1) + lens.eps2d
+    syy = wp.dot(m1, m1) + options.eps2d
     if not (wp.isfinite(det) and det > 0.0 and syy > 0.0):
         splat.status = NOT_FINITE
         return splat
@@ -222,38 +226,38 @@ def _splat(
     if not (sound and wp.isfinite(center[0]) and wp.isfinite(center[1])):
         splat.status = NOT_FINITE
         return splat
-    if lens.antialiased != 0:
+    if options.antialiased != 0:
         opacity *= wp.max(COMPENSATION_MIN, wp.sqrt(det0 / det))
-        if not (opacity >= lens.alpha_min) and lens.original == 0:
+        if not (opacity >= options.alpha_min) and options.original == 0:
             splat.status = TRANSPARENT
             return splat
-    if lens.original != 0:
+    if options.original != 0:
         # README eq. 16: the radius, and whether its square of tiles is empty
         half = 0.5 * (sxx - syy)
         spread = wp.sqrt(wp.max(half * half + sxy * sxy, 0.1))
         radius = wp.min(wp.ceil(3.0 * wp.sqrt(0.5 * (sxx + syy) + spread)), RADIUS_MAX)
-        right = wp.ceil(lens.width / float(TILE)) * float(TILE)
-        bottom = wp.ceil(lens.height / float(TILE)) * float(TILE)
+        right = wp.ceil(options.width / float(TILE)) * float(TILE)
+        bottom = wp.ceil(options.height / float(TILE)) * float(TILE)
         inside_x = center[0] + radius >= 1.5 and center[0] - radius < right + 0.5
         inside_y = center[1] + radius >= 1.5 and center[1] - radius < bottom + 0.5
         if not (inside_x and inside_y):
             splat.status = OUTSIDE
             return splat
         splat.extent = wp.vec2(radius, radius)
-        if not (opacity >= lens.alpha_min):
+        if not (opacity >= options.alpha_min):
             splat.status = TRANSPARENT
             return splat
-    cut = wp.sqrt(2.0 * wp.log(opacity / lens.alpha_min))
+    cut = wp.sqrt(2.0 * wp.log(opacity / options.alpha_min))
     extent = wp.vec2(cut * wp.sqrt(sxx), cut * wp.sqrt(syy))
     reach = extent
-    if lens.rounded != 0:
+    if options.rounded != 0:
         reach = wp.vec2(wp.ceil(extent[0]), wp.ceil(extent[1]))
-    if reach[0] <= lens.radius_clip and reach[1] <= lens.radius_clip:
+    if reach[0] <= options.radius_clip and reach[1] <= options.radius_clip:
         splat.status = SMALL
         return splat
-    inside_x = center[0] + reach[0] >= 0.0 and center[0] - reach[0] <= lens.width
-    inside_y = center[1] + reach[1] >= 0.0 and center[1] - reach[1] <= lens.height
-    if not (inside_x and inside_y) and lens.original == 0:
+    inside_x = center[0] + reach[0] >= 0.0 and center[0] - reach[0] <= options.width
+    inside_y = center[1] + reach[1] >= 0.0 and center[1] - reach[1] <= options.height
+    if not (inside_x and inside_y) and options.original == 0:
         splat.status = OUTSIDE
         return splat
     splat.status = VISIBLE
@@ -261,7 +265,7 @@ def _splat(
     splat.conic = wp.vec3(a, -sxy / syy, e)
     splat.depth = t[2]
     splat.opacity = opacity
-    if lens.original == 0:
+    if options.original == 0:
         splat.extent = extent
     return splat
 
@@ -272,7 +276,7 @@ def _project(
     offset: wp.int32,
     views: wp.int32,
     num: wp.int32,
-    lens: Lens,
+    options: ProjectionParams,
     scene_in: Scene,
     colors_per_view: wp.int32,
     colors_in: wp.array2d[wp.float32],
@@ -284,7 +288,7 @@ def _project(
     row = g
     if colors_per_view != 0:
         row = i
-    splat = _splat(g, image, row, lens, scene_in, colors_in)
+    splat = _splat(g, image, row, options, scene_in, colors_in)
     splats_out.means2d[i] = splat.mean
     splats_out.conics[i] = splat.conic
     splats_out.depths[i] = splat.depth
@@ -302,22 +306,22 @@ def _slope_vjp(
     size: wp.float32,
     focal: wp.float32,
     v: wp.float32,
-    lens: Lens,
+    options: ProjectionParams,
 ) -> wp.vec2:
     # gradient of j = -focal·slope(x/z)/z to (x, z), p = x/z; a clamped slope is a constant, and
     # in the original slope·z is one
-    s = slope(p, center, size, focal, lens)
+    s = slope(p, center, size, focal, options)
     f = v * focal / (z * z)
     if p == s:
         return wp.vec2(-f, 2.0 * f * s)
-    if lens.original != 0:
+    if options.original != 0:
         return wp.vec2(0.0, 2.0 * f * s)
     return wp.vec2(0.0, f * s)
 
 
 @wp.func
 @no_type_check
-def _rotation_vjp(q: wp.vec4, v: wp.mat33, lens: Lens) -> wp.vec4:
+def _rotation_vjp(q: wp.vec4, v: wp.mat33, options: ProjectionParams) -> wp.vec4:
     # through the matrix of a unit quaternion, then through the normalisation, less its 1/|q|
     w, x, y, z = q[0], q[1], q[2], q[3]
     vq = 2.0 * wp.vec4(
@@ -335,7 +339,7 @@ def _rotation_vjp(q: wp.vec4, v: wp.mat33, lens: Lens) -> wp.vec4:
         - 2.0 * z * (v[0, 0] + v[1, 1])
         + w * (v[1, 0] - v[0, 1]),
     )
-    if lens.original != 0:
+    if options.original != 0:
         return vq
     return vq - q * wp.dot(q, vq)
 
@@ -378,7 +382,7 @@ def _vjp_kernel(covars: bool, original: bool):
         offset: wp.int32,
         views: wp.int32,
         num: wp.int32,
-        lens: Lens,
+        options: ProjectionParams,
         scene_in: Scene,
         splats_in: struct_of(Projected),
         v_splats_in: struct_of(Projected),
@@ -395,7 +399,7 @@ def _vjp_kernel(covars: bool, original: bool):
         else:
             scale = scene_in.scales[g]
             if scene_in.quats:
-                q = unit(scene_in.quats[g], lens)
+                q = unit(scene_in.quats[g], options)
                 R = rotation(q)
         v_covar = vec6()  # of these
         v_mean = wp.vec3(0.0, 0.0, 0.0)
@@ -405,13 +409,13 @@ def _vjp_kernel(covars: bool, original: bool):
         for view_index in range(views):
             image = b * views + view_index
             i = image * num + g % num
-            unused = lens.skip_unused != 0 and _all_zero(v_splats_in, i)
+            unused = options.skip_unused != 0 and _all_zero(v_splats_in, i)
             if splats_in.status[i] == VISIBLE and not unused:
                 viewmat = scene_in.viewmats[image]
                 W = rotation_of(viewmat)
                 t = W * scene_in.means[g] + translation_of(viewmat)
                 K = scene_in.Ks[image]
-                J = jacobian(t, K, lens)
+                J = jacobian(t, K, options)
                 P = J * W
                 N = P * R
                 M = N * wp.diag(scale)
@@ -423,7 +427,7 @@ def _vjp_kernel(covars: bool, original: bool):
                 a, k, e = conic[0], conic[1], conic[2]
                 v = v_splats_in.conics[i]
                 n = wp.cross(m0, m1)
-                across = e * (lens.eps2d * m0 + wp.cross(m1, n))
+                across = e * (options.eps2d * m0 + wp.cross(m1, n))
                 v_across = -2.0 * a * a * v[0]
                 v_m0 = v_across * across - e * v[1] * m1
                 v_m1 = (v_across * k - e * v[1]) * across - e * (v[1] * k + 2.0 * e * v[2]) * m1
@@ -432,11 +436,11 @@ def _vjp_kernel(covars: bool, original: bool):
                 v_xx = wp.float32(0.0)
                 v_xy = wp.float32(0.0)
                 v_yy = wp.float32(0.0)
-                if lens.antialiased != 0:
+                if options.antialiased != 0:
                     # README eq. 9: the factor sqrt(det0 / det), det0 = |m0 × m1|²
                     det0 = wp.dot(n, n)
                     trace = wp.dot(m0, m0) + wp.dot(m1, m1)
-                    det = det0 + lens.eps2d * trace + lens.eps2d * lens.eps2d
+                    det = det0 + options.eps2d * trace + options.eps2d * options.eps2d
                     factor = wp.sqrt(det0 / det)
                     if factor > COMPENSATION_MIN:
                         v_factor = v_o * scene_in.opacities[g]
@@ -445,12 +449,12 @@ def _vjp_kernel(covars: bool, original: bool):
                         xx = wp.dot(m0, m0)
                         xy = wp.dot(m0, m1)
                         yy = wp.dot(m1, m1)
-                        v_xx = v_det0 * yy + v_det * (yy + lens.eps2d)
+                        v_xx = v_det0 * yy + v_det * (yy + options.eps2d)
                         v_xy = -2.0 * (v_det0 + v_det) * xy
-                        v_yy = v_det0 * xx + v_det * (xx + lens.eps2d)
+                        v_yy = v_det0 * xx + v_det * (xx + options.eps2d)
                         if wp.static(original):
                             # README eq. 17: the slope of the factor where eps2d is added once more
-                            eps = lens.eps2d
+                            eps = options.eps2d
                             xx += eps
                             yy += eps
                             whole = det + eps * (xx + yy) + eps * eps
@@ -462,8 +466,8 @@ def _vjp_kernel(covars: bool, original: bool):
                             v_m1 += 2.0 * v_yy * m1 + v_xy * m0
                         else:
                             v_n = 2.0 * (v_det0 + v_det) * n
-                            v_m0 += wp.cross(m1, v_n) + 2.0 * v_det * lens.eps2d * m0
-                            v_m1 += wp.cross(v_n, m0) + 2.0 * v_det * lens.eps2d * m1
+                            v_m0 += wp.cross(m1, v_n) + 2.0 * v_det * options.eps2d * m0
+                            v_m1 += wp.cross(v_n, m0) + 2.0 * v_det * options.eps2d * m1
                     v_o *= wp.max(COMPENSATION_MIN, factor)
                 v_opacity += v_o
                 if wp.static(covars):
@@ -491,8 +495,8 @@ def _vjp_kernel(covars: bool, original: bool):
                 v_J = v_P * wp.transpose(W)
                 z = t[2]
                 v_u = v_splats_in.means2d[i]
-                v_x = _slope_vjp(t[0] / z, z, K[0, 2], lens.width, K[0, 0], v_J[0, 2], lens)
-                v_y = _slope_vjp(t[1] / z, z, K[1, 2], lens.height, K[1, 1], v_J[1, 2], lens)
+                v_x = _slope_vjp(t[0] / z, z, K[0, 2], options.width, K[0, 0], v_J[0, 2], options)
+                v_y = _slope_vjp(t[1] / z, z, K[1, 2], options.height, K[1, 1], v_J[1, 2], options)
                 v_t = wp.vec3(
                     v_x[0] + v_u[0] * K[0, 0] / z,
                     v_y[0] + v_u[1] * K[1, 1] / z,
@@ -520,11 +524,11 @@ def _vjp_kernel(covars: bool, original: bool):
             v_scene_out.opacities[g] = v_opacity
         if v_scene_out.quats:
             size = wp.float32(1.0)
-            if lens.original == 0:
+            if options.original == 0:
                 size = quat_size(scene_in.quats[g])
             v_scene_out.quats[g] = wp.vec4(0.0, 0.0, 0.0, 0.0)
             if size > _SHORTEST:
-                v_scene_out.quats[g] = _rotation_vjp(q, v_R, lens) / size
+                v_scene_out.quats[g] = _rotation_vjp(q, v_R, options) / size
 
     return project_vjp
 
@@ -536,8 +540,12 @@ def project_on_threads(images: int, num: int, arguments: list, device: torch.dev
 
 def vjp_on_threads(batch: int, num: int, arguments: list, v_viewmats: Tensor | None) -> None:
     """Run the gradient for B objects; see ``projection.project_backward``."""
-    lens, scene = arguments[2:4]
+    options, scene = arguments[2:4]
     device, covars = scene.values[0].device, scene.values[3] is not None
     launch(
-        _vjp_kernel(covars, bool(lens.original)), batch * num, [*arguments, v_viewmats], [], device
+        _vjp_kernel(covars, bool(options.original)),
+        batch * num,
+        [*arguments, v_viewmats],
+        [],
+        device,
     )

@@ -13,7 +13,7 @@ from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes, vjp_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.cuda.project import project_on_threads, vjp_on_threads
-from gamba_warp.kernels.rasterize.projection import LensOptions, Projected, make_lens
+from gamba_warp.kernels.rasterize.projection import Projected, ProjectionOptions, projection_params
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
 from gamba_warp.kernels.rasterize.tiles import Splats2D, Tiling, make_grid
 
@@ -129,20 +129,21 @@ def test_repeatable_with_any_number_of_threads(monkeypatch, many):
 
 
 def projected(gaussians, colors, **changes):
-    """The inputs, lens and projection on lanes, which is that on threads to the bit."""
+    """The inputs, parameters and projection on lanes, which is that on threads to the bit."""
     viewmats = torch.eye(4).repeat(2, 3, 1, 1)
     viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
     viewmats[..., 2, 3] = 2.0
     Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
     options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=0.0)
     options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=0, skip_unused=1)
-    lens, inputs = make_lens(LensOptions(**options | changes)), [*gaussians, colors, viewmats, Ks]
-    got = projection.project_forward(inputs, lens, project_on_lanes)
-    want = projection.project_forward(inputs, lens, project_on_threads)
+    params = projection_params(ProjectionOptions(**options | changes))
+    inputs = [*gaussians, colors, viewmats, Ks]
+    got = projection.project_forward(inputs, params, project_on_lanes)
+    want = projection.project_forward(inputs, params, project_on_threads)
     for name, value in want._asdict().items():
         assert torch.equal(getattr(got, name), value), name
     assert len(got.status.unique()) >= (5 if gaussians[0].shape[1] > 300 else 3)
-    return inputs, lens, got
+    return inputs, params, got
 
 
 @pytest.mark.parametrize(
@@ -176,10 +177,10 @@ def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original)
     covars[:, 30:35], covars[0, 35, 2] = 0.0, torch.nan
     given = {"covars": (None, None, covars), "quats": (quats, scales, None)}
     gaussians = means, *given.get(shape, (None, scales, None)), opacities
-    inputs, lens, got = projected(gaussians, torch.rand(2, num, 3), original=original)
+    inputs, params, got = projected(gaussians, torch.rand(2, num, 3), original=original)
     v = [torch.randn_like(x) for x in got[:4]]
     wanted = [x is not None for x in gaussians] + [False]
-    kept = [*gaussians, *inputs[-2:]], lens, got.conics, got.status, v, wanted
+    kept = [*gaussians, *inputs[-2:]], params, got.conics, got.status, v, wanted
     of_lanes, of_threads = (
         projection.project_backward(*kept, run) for run in (vjp_on_lanes, vjp_on_threads)
     )
