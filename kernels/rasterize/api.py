@@ -89,7 +89,7 @@ def rasterization(
         alpha_min: fainter contributions are skipped; > 0.
         alpha_max: alpha is clamped here, and has zero gradient then; < 1.
         t_min: a pixel stops before its transmittance would fall to this; 1e-30 to < 1.
-        skip: work to leave out; changes neither picture nor gradients.
+        skip: work to leave out; changes neither image nor gradients.
 
     Returns:
         ``renders [.., V, H, W, C]``, ``alphas [.., V, H, W, 1]`` and ``meta``, a dict with

@@ -33,13 +33,13 @@ from .skip import UNASKED
 from .tiles import (
     Bins,
     Limits,
-    Picture,
+    RasterParams,
     Saved,
     Size,
     Splats2D,
     Tiling,
     make_grid,
-    make_picture,
+    raster_params,
     record_size,
 )
 
@@ -138,7 +138,7 @@ def _refuse_too_many(pairs: int) -> None:
     if pairs > MAX_PAIRS:
         raise ValueError(
             f"{pairs} pairs of tiles and Gaussians; at most 2^31 - 1 fit: fewer views, a smaller "
-            "picture or smaller scales are needed"
+            "image or smaller scales are needed"
         )
 
 
@@ -174,7 +174,7 @@ def bin_op(
 
     Raises:
         ValueError: there are more than 2^31 - 1 pairs, or more tiles. On CUDA a number of pairs
-            that is not read back is not refused: the pictures are then made without lists.
+            that is not read back is not refused: the images are then made without lists.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
     """
     given = means2d, conics, depths, view_opacities, extents
@@ -223,7 +223,7 @@ def composite(
     skipped: Tensor | None,
     absolute: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blend the pairs: pictures, their final transmittances and the fields of a ``Saved``.
+    """Blend the pairs: images, their final transmittances and the fields of a ``Saved``.
 
     ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
     Gaussians or, shared by the views, one for each of an object's. The lists hold the values of
@@ -233,13 +233,13 @@ def composite(
     of their gradients of ``means2d``.
     """
     splats = Splats2D(means2d, conics, view_opacities, colors.flatten(0, -2))
-    given = splats, Bins(*bins), _picture(means2d, size, limits)
+    given = splats, Bins(*bins), _raster_params(means2d, size, limits)
     renders, transmittances, saved = _compositor(means2d.device).composite_forward(*given)
     return renders, transmittances, *saved
 
 
-def _picture(means2d: Tensor, size: list[int], limits: list[float]) -> Picture:
-    return make_picture(Size(*size), Limits(*limits), num=means2d.shape[-2])
+def _raster_params(means2d: Tensor, size: list[int], limits: list[float]) -> RasterParams:
+    return raster_params(Size(*size), Limits(*limits), num=means2d.shape[-2])
 
 
 @composite.register_fake
@@ -279,7 +279,7 @@ def _composite_vjp(
         skipped = torch.zeros_like(Saved(*saved).walked)
     drawn = Splats2D(*splats)
     drawn = drawn._replace(colors=drawn.colors.flatten(0, -2))
-    given = drawn, Bins(*bins), _picture(splats[0], size, limits), Saved(*saved)
+    given = drawn, Bins(*bins), _raster_params(splats[0], size, limits), Saved(*saved)
     backward = _compositor(splats[0].device).composite_backward
     passes, absolute = bool(Limits(*limits).passes), absolute if geometry else None
     grads = backward(*given, v_pixels, skipped, geometry, absolute, passes)

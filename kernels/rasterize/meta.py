@@ -33,8 +33,8 @@ class Call(NamedTuple):
         """The lists; ``exact`` sizes them to the pair count, which waits for the device."""
         s, size = self.splats, self.size
         splats = s.means2d, s.conics, s.depths, s.view_opacities, s.extents
-        picture = size.width, size.height, self.limits.alpha_min, size.skip
-        return Bins(*bin_op(*splats, *picture, exact))
+        numbers = size.width, size.height, self.limits.alpha_min, size.skip
+        return Bins(*bin_op(*splats, *numbers, exact))
 
     def listed(self) -> tuple[Bins, Saved]:
         """The lists with all pairs, and what the compositor saved; this waits for the device."""

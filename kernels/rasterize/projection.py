@@ -23,8 +23,8 @@ class ProjectionOptions(NamedTuple):
     """Arguments of a ``ProjectionParams``, as numbers that fit in a list of floats.
 
     Attributes:
-        width: of the picture, pixels.
-        height: of the picture, pixels.
+        width: of the image, pixels.
+        height: of the image, pixels.
         near_plane: as ``rasterization``, like the following three.
         far_plane: as ``rasterization``.
         radius_clip: as ``rasterization``.
@@ -33,7 +33,7 @@ class ProjectionOptions(NamedTuple):
         antialiased: not 0 for ``rasterize_mode="antialiased"``.
         skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
         rounded: not 0 to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
-            does; a Gaussian that this keeps outside the picture has no pair.
+            does; a Gaussian that this keeps outside the image has no pair.
         original: not 0 for the conventions of the first 3D Gaussian splatting code (README.md §7).
     """
 
@@ -80,7 +80,7 @@ PROJECTED_SIZES = ((2,), (3,), (), (), (2,))  # of ``Projected``'s floats, after
 
 @struct
 class ProjectionParams:
-    """The scalars of a projection's launch: picture size and thresholds."""
+    """The scalars of a projection's launch: image size and thresholds."""
 
     width: float
     height: float

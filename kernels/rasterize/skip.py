@@ -1,4 +1,4 @@
-"""Work that the rasterizer skips without changing picture or gradients, each with its switch."""
+"""Work that the rasterizer skips without changing image or gradients, each with its switch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True)
 class Skip:
-    """Work to be left out. Every choice gives the same picture and gradients; all are on.
+    """Work to be left out. Every choice gives the same image and gradients; all are on.
 
     README.md, "Skipped work", has the proofs; the counts are keys of ``meta``.
 

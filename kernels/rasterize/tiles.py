@@ -1,7 +1,7 @@
-"""Tiles: how a picture is cut into them, their lists, and the scalars of launches.
+"""Tiles: how an image is cut into them, their lists, and the scalars of launches.
 
 In this order: ``Tiling``, the cut; ``Bins`` and ``Saved``, the results of binning and compositing
-for later steps; ``Splats2D``, the Gaussians to composite; ``Grid`` and ``Picture``, the scalars
+for later steps; ``Splats2D``, the Gaussians to composite; ``Grid`` and ``Image``, the scalars
 that the launches of these two steps take.
 """
 
@@ -19,11 +19,11 @@ SLACK, SLACK_ABS = 1.0 + 1e-4, 1e-4
 
 
 class Tiling(NamedTuple):
-    """Grid of square tiles over a picture, ``TILE`` pixels a side.
+    """Grid of square tiles over an image, ``TILE`` pixels a side.
 
     Attributes:
-        width: of the picture, pixels.
-        height: of the picture, pixels.
+        width: of the image, pixels.
+        height: of the image, pixels.
     """
 
     width: int
@@ -31,7 +31,7 @@ class Tiling(NamedTuple):
 
     @property
     def tiles_x(self) -> int:
-        """Tiles in a row; the last one may reach beyond the picture."""
+        """Tiles in a row; the last one may reach beyond the image."""
         return -(-self.width // TILE)
 
     @property
@@ -41,7 +41,7 @@ class Tiling(NamedTuple):
 
     @property
     def count(self) -> int:
-        """Tiles of one picture."""
+        """Tiles of one image."""
         return self.tiles_x * self.tiles_y
 
 
@@ -49,7 +49,7 @@ class Bins(NamedTuple):
     """The lists of tiles: P pairs of (tile, Gaussian) in I views; int32 unless stated.
 
     On CUDA the lists may be longer: ``count`` says how many pairs there are, and entries behind
-    them belong to no tile. If they are more than P, all lists are empty, and pictures use
+    them belong to no tile. If they are more than P, all lists are empty, and images use
     ``order``, restricted to Gaussians that have pairs by ``offsets``. Then P >= I * N.
 
     Attributes:
@@ -101,7 +101,7 @@ def record_size(channels: int) -> int:
 
 @struct
 class Pixels:
-    """The pictures, or the gradient that comes from them; by pixels of all of them."""
+    """The images, or the gradient that comes from them; by pixels of all of them."""
 
     renders: wp.array2d[wp.float32]
     transmittances: wp.array2d[wp.float32]  # the final ones
@@ -126,7 +126,7 @@ class Splats2D(NamedTuple):
 
 @struct
 class Grid:
-    """The scalars of a binning launch: the picture and its tiles."""
+    """The scalars of a binning launch: the image and its tiles."""
 
     num: int
     width: int
@@ -142,7 +142,7 @@ def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
     """The scalars of a binning launch as one kernel argument, which is shared: do not modify it.
 
     Args:
-        tiling: the cut of each view's picture.
+        tiling: the cut of each view's image.
         num: Gaussians of a view.
         alpha_min: fainter contributions are not drawn.
         skip: from ``Skip.bits``.
@@ -155,8 +155,8 @@ class Size(NamedTuple):
     """The integers that a call of the compositor is given.
 
     Attributes:
-        width: of a picture, pixels.
-        height: of a picture, pixels.
+        width: of an image, pixels.
+        height: of an image, pixels.
         views: of an object.
         colors_per_view: 1 if each view has its own colours, 0 if an object's views share them.
         skip: from ``Skip.bits``.
@@ -186,7 +186,7 @@ class Limits(NamedTuple):
 
 
 @struct
-class Picture:
+class RasterParams:
     """The scalars of a compositing launch: sizes, thresholds and switches."""
 
     width: int
@@ -202,7 +202,7 @@ class Picture:
     skip: int
 
 
-def make_picture(size: Size, limits: Limits, *, num: int) -> Picture:
+def raster_params(size: Size, limits: Limits, *, num: int) -> RasterParams:
     """The scalars of a compositing launch as one kernel argument; do not modify it either.
 
     Args:
@@ -212,13 +212,13 @@ def make_picture(size: Size, limits: Limits, *, num: int) -> Picture:
     """
     tiling = Tiling(size.width, size.height)
     sizes = *tiling, tiling.tiles_x, tiling.tiles_y, size.views, num, size.colors_per_view
-    return filled(Picture, *sizes, *limits[:3], size.skip)
+    return filled(RasterParams, *sizes, *limits[:3], size.skip)
 
 
 @wp.func
-def color_row(picture: Picture, g: int) -> int:
+def color_row(params: RasterParams, g: int) -> int:
     # the row of view-major Gaussian g; shared colours have one row for each object's Gaussian
     row = g
-    if picture.colors_per_view == 0:
-        row = g // (picture.views * picture.num) * picture.num + g % picture.num
+    if params.colors_per_view == 0:
+        row = g // (params.views * params.num) * params.num + g % params.num
     return row

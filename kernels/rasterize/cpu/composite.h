@@ -16,14 +16,14 @@ struct Tile {
     int inside;       // a bit for each block that has a pixel in the image
 };
 
-template<class Picture>
-static Tile tile_at(const Picture& picture, int index) {
-    const int per_image = picture.tiles_x * picture.tiles_y;
-    Tile tile = {index / per_image, index % picture.tiles_x * Tile::SIDE,
-        index / picture.tiles_x % picture.tiles_y * Tile::SIDE, index * Tile::BLOCKS, 0};
+template<class RasterParams>
+static Tile tile_at(const RasterParams& params, int index) {
+    const int per_image = params.tiles_x * params.tiles_y;
+    Tile tile = {index / per_image, index % params.tiles_x * Tile::SIDE,
+        index / params.tiles_x % params.tiles_y * Tile::SIDE, index * Tile::BLOCKS, 0};
     for (int b = 0; b < Tile::BLOCKS; ++b) {
         const int x = tile.x + b % Tile::COLUMNS * 4, y = tile.y + b / Tile::COLUMNS * 4;
-        if (x < picture.width && y < picture.height) tile.inside |= 1 << b;
+        if (x < params.width && y < params.height) tile.inside |= 1 << b;
     }
     return tile;
 }
@@ -34,30 +34,30 @@ static inline int next_tile(const Workers& workers) {
 }
 
 // visit(l, pixel) for each pixel of a block inside the image.
-template<class Picture, class Visit>
-static inline void pixels_of(const Picture& picture, const Tile& tile, int b, Visit visit) {
+template<class RasterParams, class Visit>
+static inline void pixels_of(const RasterParams& params, const Tile& tile, int b, Visit visit) {
     const int x = tile.x + b % Tile::COLUMNS * 4, y = tile.y + b / Tile::COLUMNS * 4;
-    const int nx = picture.width - x < 4 ? picture.width - x : 4;
-    const int ny = picture.height - y < 4 ? picture.height - y : 4;
+    const int nx = params.width - x < 4 ? params.width - x : 4;
+    const int ny = params.height - y < 4 ? params.height - y : 4;
     for (int j = 0; j < ny; ++j)
         for (int i = 0; i < nx; ++i)
-            visit(4 * j + i, ((size_t)tile.image * picture.height + y + j) * picture.width + x + i);
+            visit(4 * j + i, ((size_t)tile.image * params.height + y + j) * params.width + x + i);
 }
 
 // Shared colours have one row for each object's Gaussian.
-template<class Picture, class Splats>
-static inline const float* color_of(const Picture& picture, const Splats& splats, int g) {
-    const int object = g / (picture.views * picture.num);
-    const int row = picture.colors_per_view ? g : object * picture.num + g % picture.num;
+template<class RasterParams, class Splats>
+static inline const float* color_of(const RasterParams& params, const Splats& splats, int g) {
+    const int object = g / (params.views * params.num);
+    const int row = params.colors_per_view ? g : object * params.num + g % params.num;
     return splats.colors.data + (size_t)row * splats.colors.shape[1];
 }
 
-template<class Picture, class Splats>
-static inline void prefetch(const Picture& picture, const Splats& splats, int g) {
+template<class RasterParams, class Splats>
+static inline void prefetch(const RasterParams& params, const Splats& splats, int g) {
     __builtin_prefetch(splats.means2d.data + g);
     __builtin_prefetch(splats.conics.data + g);
     __builtin_prefetch(splats.view_opacities.data + g);
-    __builtin_prefetch(color_of(picture, splats, g));
+    __builtin_prefetch(color_of(params, splats, g));
 }
 
 // A Gaussian as a tile sees it: from its centre to the tile's first pixel, its conic with
@@ -92,14 +92,14 @@ struct Splat {
     }
 };
 
-template<class Picture, class Splats>
+template<class RasterParams, class Splats>
 static inline Splat splat_of(
-    const Picture& picture, const Splats& splats, int g, const Tile& tile) {
+    const RasterParams& params, const Splats& splats, int g, const Tile& tile) {
     const float* const mean = (const float*)(splats.means2d.data + g);
     const float* const conic = (const float*)(splats.conics.data + g);
     return {(float)tile.x + 0.5f - mean[0], (float)tile.y + 0.5f - mean[1],
         -0.72134752044f * conic[0], conic[1], -0.72134752044f * conic[2],
-        splats.view_opacities.data[g], color_of(picture, splats, g)};
+        splats.view_opacities.data[g], color_of(params, splats, g)};
 }
 
 // The blocks (lanes) in which some pixel centre may have q <= limit: the least q on the rectangle
@@ -128,10 +128,10 @@ static inline int touched(const Splats& splats, int g, const Tile& tile, float a
 
 // A worker blends tile after tile, front to back. Of each Gaussian the blocks are tested at once
 // (lanes = blocks), and those that its ellipse touches are evaluated (lanes = pixels).
-template<class Config, class Picture, class Splats, class Lists, class Saved, class Pixels,
+template<class Config, class RasterParams, class Splats, class Lists, class Saved, class Pixels,
     class Workers>
-static void composite(int task, const Picture& picture, const Splats& splats, const Lists& lists,
-    const Saved& saved, const Pixels& pixels, const Workers& workers) {
+static void composite(int task, const RasterParams& params, const Splats& splats,
+    const Lists& lists, const Saved& saved, const Pixels& pixels, const Workers& workers) {
     static_assert(Config::TILE == Tile::SIDE, "lanes are the 16 blocks of a tile");
     constexpr int BLOCKS = Tile::BLOCKS;
     const int channels = splats.colors.shape[1], tiles = lists.starts.shape[0] - 1;
@@ -140,8 +140,8 @@ static void composite(int task, const Picture& picture, const Splats& splats, co
         const int begin = lists.starts.data[index], end = lists.starts.data[index + 1];
         saved.walked.data[index] = 0;
         saved.blocks_walked.data[index] = 0;
-        if (begin == end && picture.skip & Config::EMPTY_TILES) continue;
-        const Tile tile = tile_at(picture, index);
+        if (begin == end && params.skip & Config::EMPTY_TILES) continue;
+        const Tile tile = tile_at(params, index);
         // A pixel that has stopped keeps its transmittance, above t_min, with a minus sign. T is
         // not chosen by a mask: that would become a masked store, for which the next load waits.
         F* const Ts = (F*)saved.transmittances.data + tile.first;
@@ -155,21 +155,21 @@ static void composite(int task, const Picture& picture, const Splats& splats, co
         long long evaluated = 0;
         for (; k < end && alive; ++k) {
             const int g = lists.pairs.data[k];
-            prefetch(picture, splats, lists.pairs.data[k + AHEAD < end ? k + AHEAD : end - 1]);
-            const int todo = picture.skip & Config::BLOCK_TEST
-                ? alive & touched<Config>(splats, g, tile, picture.alpha_min)
+            prefetch(params, splats, lists.pairs.data[k + AHEAD < end ? k + AHEAD : end - 1]);
+            const int todo = params.skip & Config::BLOCK_TEST
+                ? alive & touched<Config>(splats, g, tile, params.alpha_min)
                 : alive;
-            const Splat s = splat_of(picture, splats, g, tile);
+            const Splat s = splat_of(params, splats, g, tile);
             int used = 0, dead = 0;
             for (int bits = todo; bits; bits &= bits - 1) {
                 const int b = __builtin_ctz(bits);
                 const F T = Ts[b];
                 F alpha = s.alpha_of(s.u_of(b), s.dy_of(b));
-                alpha = ((alpha >= picture.alpha_min) & (T > 0.0f))
-                    ? min(alpha, splat(picture.alpha_max))
+                alpha = ((alpha >= params.alpha_min) & (T > 0.0f))
+                    ? min(alpha, splat(params.alpha_max))
                     : F{};
                 const F next = T - T * alpha;
-                const I stays = max(next, -next) > picture.t_min;
+                const I stays = max(next, -next) > params.t_min;
                 const F weight = stays ? T * alpha : F{};
                 Ts[b] = stays ? next : -T;
                 // no branch on a weight above 0: the processor would often predict it wrongly
@@ -186,13 +186,13 @@ static void composite(int task, const Picture& picture, const Splats& splats, co
                 }
             }
             evaluated += __builtin_popcount(todo);
-            if (picture.skip & Config::STOPPED) alive &= ~dead;
+            if (params.skip & Config::STOPPED) alive &= ~dead;
             saved.blocks.data[k] = used;
         }
         saved.walked.data[index] = k - begin;
         saved.blocks_walked.data[index] = evaluated;
         for (int b = 0; b < BLOCKS; ++b)
-            pixels_of(picture, tile, b, [&](int l, size_t pixel) {
+            pixels_of(params, tile, b, [&](int l, size_t pixel) {
                 const float T = Ts[b][l];
                 pixels.transmittances.data[pixel] = T < 0.0f ? -T : T;
                 for (int c = 0; c < channels; ++c)
@@ -202,16 +202,16 @@ static void composite(int task, const Picture& picture, const Splats& splats, co
 }
 
 // Fills v, of each block the gradient of its channels and of alpha; true if some is not zero.
-template<class Picture, class Pixels>
+template<class RasterParams, class Pixels>
 static bool load_gradient(
-    const Picture& picture, const Pixels& pixels, const Tile& tile, int blocks, F* v_pixels) {
+    const RasterParams& params, const Pixels& pixels, const Tile& tile, int blocks, F* v_pixels) {
     const int channels = pixels.renders.shape[1];
     I nonzero = I{};
     for (int bits = blocks; bits; bits &= bits - 1) {
         const int b = __builtin_ctz(bits);
         F* const v = v_pixels + b * (channels + 1);
         for (int c = 0; c <= channels; ++c) v[c] = F{};
-        pixels_of(picture, tile, b, [&](int l, size_t pixel) {
+        pixels_of(params, tile, b, [&](int l, size_t pixel) {
             for (int c = 0; c < channels; ++c) v[c][l] = pixels.renders.data[pixel * channels + c];
             v[channels][l] = -pixels.transmittances.data[pixel];
         });
@@ -243,9 +243,9 @@ struct Moments {
 
 // The gradient of the blending: a worker traverses the lists of tile after tile back to front, and
 // writes a row for each intersection: its moments, then the sums of its colours.
-template<class Config, bool ABSOLUTE, bool PASSES, class Picture, class Splats, class Lists,
+template<class Config, bool ABSOLUTE, bool PASSES, class RasterParams, class Splats, class Lists,
     class Saved, class Pixels, class Workers, class Rows>
-static void composite_vjp(int task, const Picture& picture, const Splats& splats,
+static void composite_vjp(int task, const RasterParams& params, const Splats& splats,
     const Lists& lists, const Saved& saved, const Pixels& pixels, const Workers& workers,
     const Rows& rows) {
     constexpr int BLOCKS = Tile::BLOCKS, COUNT = Moments<ABSOLUTE>::COUNT;
@@ -255,11 +255,11 @@ static void composite_vjp(int task, const Picture& picture, const Splats& splats
         (F*)workers.workspace.data + (size_t)task * (channels + BLOCKS * (channels + 1));
     F* const v_pixels = v_colors + channels;
     for (int index = next_tile(workers); index < tiles; index = next_tile(workers)) {
-        const Tile tile = tile_at(picture, index);
+        const Tile tile = tile_at(params, index);
         const int begin = lists.starts.data[index], end = begin + saved.walked.data[index];
         const int every = begin < end ? tile.inside : 0;
-        const bool nonzero = load_gradient(picture, pixels, tile, every, v_pixels);
-        const bool wanted = nonzero || (every && !(picture.skip & Config::ZERO_UPSTREAM));
+        const bool nonzero = load_gradient(params, pixels, tile, every, v_pixels);
+        const bool wanted = nonzero || (every && !(params.skip & Config::ZERO_UPSTREAM));
         int& skipped = rows.skipped.data[index];
         skipped = wanted ? 2 : skipped > 1 ? skipped : 1;
         if (!wanted) continue;
@@ -278,11 +278,11 @@ static void composite_vjp(int task, const Picture& picture, const Splats& splats
                 __builtin_prefetch(sums, 1);
                 __builtin_prefetch(sums + row_length * 4 - 1, 1);
                 __builtin_prefetch(rows.written.data + row, 1);
-                prefetch(picture, splats, lists.pairs.data[later]);
+                prefetch(params, splats, lists.pairs.data[later]);
             }
-            int bits = picture.skip & Config::UNUSED ? saved.blocks.data[k] : every;
+            int bits = params.skip & Config::UNUSED ? saved.blocks.data[k] : every;
             if (!bits) continue;
-            const Splat s = splat_of(picture, splats, lists.pairs.data[k], tile);
+            const Splat s = splat_of(params, splats, lists.pairs.data[k], tile);
             const float* const conic = (const float*)(splats.conics.data + lists.pairs.data[k]);
             const float ak = conic[0] * conic[1], e = conic[2];
             Moments<ABSOLUTE> moments;
@@ -291,8 +291,8 @@ static void composite_vjp(int task, const Picture& picture, const Splats& splats
                 const int b = __builtin_ctz(bits);
                 const F u = s.u_of(b), dy = s.dy_of(b);
                 const F free = s.alpha_of(u, dy);
-                const F alpha = ((free >= picture.alpha_min) & (stops[b] > k))
-                    ? min(free, splat(picture.alpha_max))
+                const F alpha = ((free >= params.alpha_min) & (stops[b] > k))
+                    ? min(free, splat(params.alpha_max))
                     : F{};
                 const F T = Ts[b] / (1.0f - alpha);
                 Ts[b] = T;
@@ -308,7 +308,7 @@ static void composite_vjp(int task, const Picture& picture, const Splats& splats
                 Rs[b] = fma(alpha, diff, Rs[b]);
                 // past the clamp it is the gradient of the unclamped alpha
                 const F over = PASSES ? T * free * diff : F{};
-                moments.add(alpha < picture.alpha_max ? weight * diff : over, u, dy, ak, e);
+                moments.add(alpha < params.alpha_max ? weight * diff : over, u, dy, ak, e);
             }
             const int row = lists.rows.data[k];
             float* const out = rows.sums.data + (size_t)row * row_length;

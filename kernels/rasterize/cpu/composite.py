@@ -17,7 +17,7 @@ from ...runtime.native import constants, native, native_kernel
 from ...runtime.views import StructValue, as_struct, struct, struct_of, view
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
-from ..tiles import SLACK, SLACK_ABS, Bins, Picture, Pixels, Saved, Splats2D
+from ..tiles import SLACK, SLACK_ABS, Bins, Pixels, RasterParams, Saved, Splats2D
 
 _RUN = 1024  # Gaussians of a task of the sums
 _PIECES_PER_THREAD = 8
@@ -46,7 +46,7 @@ class Rows:
     geometry: int  # 0 for the gradient of the colours alone
 
 
-_SPLATS = {"picture": Picture, "splats": struct_of(Splats2D), "lists": struct_of(Bins)}
+_SPLATS = {"params": RasterParams, "splats": struct_of(Splats2D), "lists": struct_of(Bins)}
 _SAVED = {"saved": struct_of(Saved), "pixels": Pixels}
 
 _composite = native_kernel(
@@ -85,23 +85,23 @@ def _workers(size: int) -> StructValue:
 
 
 def composite_forward(
-    splats: Splats2D, bins: Bins, picture: Picture
+    splats: Splats2D, bins: Bins, params: RasterParams
 ) -> tuple[Tensor, Tensor, Saved]:
     """Blend I views; float32, contiguous tensors on the CPU.
 
     Args:
         splats: Gaussians to draw.
         bins: from ``bin_views``.
-        picture: from ``make_picture``.
+        params: from ``raster_params``.
 
     Returns:
         ``renders [.., H, W, C]``, transmittances ``[.., H, W, 1]`` and a ``Saved``.
     """
     colors = splats.colors
     images, channels = splats.means2d.shape[:-2], colors.shape[1]
-    tiles = images.numel() * picture.tiles_x * picture.tiles_y
-    renders = colors.new_zeros(*images, picture.height, picture.width, channels)
-    transmittances = colors.new_ones(*images, picture.height, picture.width, 1)
+    tiles = images.numel() * params.tiles_x * params.tiles_y
+    renders = colors.new_zeros(*images, params.height, params.width, channels)
+    transmittances = colors.new_ones(*images, params.height, params.width, 1)
     saved = Saved(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
@@ -111,7 +111,7 @@ def composite_forward(
         records=colors.new_empty(0, 0),
     )
     arguments = [
-        picture,
+        params,
         as_struct(splats),
         as_struct(bins),
         as_struct(saved),
@@ -125,7 +125,7 @@ def composite_forward(
 def composite_backward(
     splats: Splats2D,
     bins: Bins,
-    picture: Picture,
+    params: RasterParams,
     saved: Saved,
     v_pixels: list[Tensor],
     skipped: Tensor,
@@ -138,7 +138,7 @@ def composite_backward(
     Args:
         splats: as forward.
         bins: as forward.
-        picture: as forward.
+        params: as forward.
         saved: as returned forward.
         v_pixels: gradients of the renders and the transmittances.
         skipped: ``[tiles]`` int32, raised to 1 for a tile that is skipped and 2 for one walked.
@@ -152,7 +152,7 @@ def composite_backward(
     sums = empty([bins.pairs.numel(), moments + channels], torch.float32)
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     arguments = [
-        picture,
+        params,
         as_struct(splats),
         as_struct(bins),
         as_struct(saved),

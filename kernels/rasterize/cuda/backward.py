@@ -12,7 +12,7 @@ import warp as wp
 
 from ...runtime.views import struct, struct_of
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import CHUNK, Bins, Picture, Pixels, Saved
+from ..tiles import CHUNK, Bins, Pixels, RasterParams, Saved
 from . import leaves as L
 from .records import Gaussians
 from .warp import (
@@ -209,7 +209,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
     @wp.func
     @no_type_check
     def of_tile(
-        picture: Picture,
+        params: RasterParams,
         gaussians: Gaussians,
         lists: struct_of(Bins),
         p: LanePixels,
@@ -231,7 +231,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
     @wp.func
     @no_type_check
     def traverse(
-        picture: Picture,
+        params: RasterParams,
         gaussians: Gaussians,
         lists: struct_of(Bins),
         transmittances: wp.array2d[wp.float32],  # in one struct, these four would spill registers
@@ -248,7 +248,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
             begin = lists.starts[p.tile]
             walked = walked_in[p.tile]
         else:
-            begin = p.image * picture.num
+            begin = p.image * params.num
             walked = -walked_in[p.tile]
         # T is as forward left it, negative until the traversal reaches where the pixel stopped;
         # R is R of README eq. 10, plus the gradient of T_end, which is the same for all pairs
@@ -257,13 +257,13 @@ def _traversal(asked: Sums, parts: int, listed: bool):
         upstream = upstream_type()
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         # no Gaussian reached a pixel whose T is 1, unless fainter ones than float32 resolves count
-        untouched = wp.where(picture.alpha_min > 1e-6, 1.0, 0.0)
+        untouched = wp.where(params.alpha_min > 1e-6, 1.0, 0.0)
         some = wp.int32(0)  # bits of the blocks whose upstream gradient is not 0
         for j in range(wp.static(pixels)):
             if walked > 0:
                 T[j] = L.load(transmittances, p.walk_row, j * WARP)
             if T[j] != 0.0 and T[j] != untouched:
-                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
+                step = j // 2 * HEIGHT * params.width + j % 2 * WIDTH
                 largest = wp.float32(0.0)
                 if gaussians.first == 0:
                     R[j] = L.load(v_pixels_in.transmittances, p.pixel, step)
@@ -278,7 +278,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                 # NaN does not count as zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
-        if (picture.skip & ZERO_UPSTREAM) == 0:
+        if (params.skip & ZERO_UPSTREAM) == 0:
             some = wp.static(part_blocks)
         wanted = any_of(some)
         of_all = wanted  # the whole tile's bits; each part has its own
@@ -300,11 +300,11 @@ def _traversal(asked: Sums, parts: int, listed: bool):
             bits = wp.int32(0)
             if k >= begin:
                 bits = L.load_int(blocks, k)
-                if (picture.skip & UNUSED) == 0:
+                if (params.skip & UNUSED) == 0:
                     bits |= of_all
                 bits = of_part(bits, p.part, wanted)
                 if wp.static(not listed):
-                    bits = of_tile(picture, gaussians, lists, p, k, bits)
+                    bits = of_tile(params, gaussians, lists, p, k, bits)
                 if bits != 0:
                     if wp.static(listed):
                         g = L.load_int(lists.pairs, k)
@@ -339,8 +339,8 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                         dy = p.y[j // 2] - shape[1]
                         u = L.sheared(shape[3], p.x[j % 2] - shape[0], dy)
                         alpha = L.exp2(L.exponent(shape[2], level[0], level[1], u, dy))
-                        clamped = wp.min(alpha, picture.alpha_max)
-                        if alpha >= picture.alpha_min and T[j] > 0.0:
+                        clamped = wp.min(alpha, params.alpha_max)
+                        if alpha >= params.alpha_min and T[j] > 0.0:
                             T[j] = T[j] * L.reciprocal(1.0 - clamped)
                             weight = T[j] * clamped
                             for c in range(wp.static(channels)):
@@ -350,7 +350,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                                 for c in range(wp.static(channels)):
                                     diff += color[c] * upstream[j, c]
                                 if wp.static(every):
-                                    step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
+                                    step = j // 2 * HEIGHT * params.width + j % 2 * WIDTH
                                     step *= gaussians.channels
                                     g = wp.cast(color[0], wp.int32)
                                     source = wp.int64(g) * wp.int64(gaussians.records.shape[1])
@@ -358,7 +358,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                                         v = L.load(v_pixels_in.renders, first, step + c)
                                         diff += L.load(gaussians.records, source, 8 + c) * v
                                 R[j] = R[j] + clamped * diff
-                                if wp.static(passes) or alpha < picture.alpha_max:
+                                if wp.static(passes) or alpha < params.alpha_max:
                                     h = weight * diff
                                     if wp.static(passes):
                                         h = T[j] * alpha * diff
@@ -438,7 +438,7 @@ def backward_kernels(asked: Sums, parts: int):
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite_vjp(
-        picture: Picture,
+        params: RasterParams,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
         saved_in: struct_of(Saved),
@@ -447,9 +447,9 @@ def backward_kernels(asked: Sums, parts: int):
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
-        p = lane_pixels(picture, index, lane)
+        p = lane_pixels(params, index, lane)
         traverse(
-            picture,
+            params,
             gaussians_in,
             lists_in,
             saved_in.transmittances,
@@ -465,7 +465,7 @@ def backward_kernels(asked: Sums, parts: int):
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite_vjp_unlisted(
-        picture: Picture,
+        params: RasterParams,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
         saved_in: struct_of(Saved),
@@ -475,20 +475,20 @@ def backward_kernels(asked: Sums, parts: int):
         worker, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
         image = worker // wp.static(parts)
-        tiles = picture.tiles_x * picture.tiles_y
+        tiles = params.tiles_x * params.tiles_y
         if lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0]):
             tiles = 0
         elif worker % wp.static(parts) == 0:
             # the tiles' sums are added to the rows
-            for g in range(lane, picture.num, WARP):
-                row = image * picture.num + g
+            for g in range(lane, params.num, WARP):
+                row = image * params.num + g
                 for n in range(wp.static(len(vectors))):
                     store(rows_out, row, gaussians_in.first, wp.static(vectors[n]), wp.vec4())
         for tile in range(tiles):
-            tile += image * picture.tiles_x * picture.tiles_y
-            p = lane_pixels(picture, tile * wp.static(parts) + worker % wp.static(parts), lane)
+            tile += image * params.tiles_x * params.tiles_y
+            p = lane_pixels(params, tile * wp.static(parts) + worker % wp.static(parts), lane)
             traverse_unlisted(
-                picture,
+                params,
                 gaussians_in,
                 lists_in,
                 saved_in.transmittances,

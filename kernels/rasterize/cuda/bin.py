@@ -2,7 +2,7 @@
 
 The lists have a capacity above the number of pairs, so that nothing waits for the count; unused
 entries sort behind the last tile. If the capacity is too small, no pair is written and all lists
-are empty: then ``composite_unlisted`` makes the pictures.
+are empty: then ``composite_unlisted`` makes the images.
 """
 
 import functools

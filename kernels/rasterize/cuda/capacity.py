@@ -2,7 +2,7 @@
 
 The first call of a shape reads its number of pairs back. Later calls allocate the capacity that
 earlier ones needed; the device copies their counts into pinned memory, which the host reads without
-waiting. A count over the capacity is allowed: see ``composite_unlisted``. Pictures and gradients
+waiting. A count over the capacity is allowed: see ``composite_unlisted``. Images and gradients
 have the same bits for any capacity, so it does not matter when a count arrives.
 """
 
@@ -144,7 +144,7 @@ def add_count(capacity: Capacity, count: Tensor) -> None:
 def lists_outgrown() -> bool:
     """Return True if a captured CUDA graph has a capacity below its recent counts.
 
-    Its pictures and gradients are still right, but slow. A new capture of the same shapes has the
+    Its images and gradients are still right, but slow. A new capture of the same shapes has the
     capacity. This does not wait for the device, whose counts may be some replays older or newer.
     """
     shapes = [(counts, shape) for counts in _counts.values() for shape in counts.shapes.values()]

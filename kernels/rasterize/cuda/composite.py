@@ -16,7 +16,7 @@ from ...runtime.launch import cuda_launch
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import StructValue, as_struct
 from ..constants import BLOCKS
-from ..tiles import CHUNK, Bins, Picture, Pixels, Saved, Splats2D
+from ..tiles import CHUNK, Bins, Pixels, RasterParams, Saved, Splats2D
 from .backward import Rows, Sums, backward_kernels, row_sizes
 from .forward import forward_kernels
 from .records import Gaussians, make_records
@@ -38,7 +38,7 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
 def _launch(
     kernels: Callable[[int], tuple[Any, Any]],
     warps: tuple[int, int],
-    picture: Picture,
+    params: RasterParams,
     records: Tensor,
     channels: int,
     inputs: list,
@@ -50,7 +50,7 @@ def _launch(
     for first in range(0, channels if warps[0] else 0, chunk):
         gaussians = StructValue(Gaussians, records, channels, first)
         for kernel, count in zip(kernels(min(chunk, channels - first)), warps):
-            arguments = [picture, gaussians, *inputs]
+            arguments = [params, gaussians, *inputs]
             threads = WARP * block
             cuda_launch(
                 kernel, (count, WARP), arguments, outputs, device=records.device, block_dim=threads
@@ -58,7 +58,7 @@ def _launch(
 
 
 def composite_forward(
-    splats: Splats2D, bins: Bins, picture: Picture
+    splats: Splats2D, bins: Bins, params: RasterParams
 ) -> tuple[Tensor, Tensor, Saved]:
     """Blend I views, like ``composite_forward`` on the CPU.
 
@@ -67,9 +67,9 @@ def composite_forward(
     """
     colors = splats.colors
     images, channels = splats.means2d.shape[:-2], colors.shape[1]
-    tiles = images.numel() * picture.tiles_x * picture.tiles_y
-    renders = colors.new_empty(*images, picture.height, picture.width, channels)
-    transmittances = colors.new_empty(*images, picture.height, picture.width, 1)
+    tiles = images.numel() * params.tiles_x * params.tiles_y
+    renders = colors.new_empty(*images, params.height, params.width, channels)
+    transmittances = colors.new_empty(*images, params.height, params.width, 1)
     parts = parts_of_tile(tiles, colors.device)
     saved = Saved(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
@@ -77,12 +77,12 @@ def composite_forward(
         blocks=torch.zeros_like(bins.pairs),
         walked=bins.pairs.new_zeros(tiles),
         blocks_walked=bins.pairs.new_zeros(tiles, dtype=torch.int64),
-        records=make_records(splats, picture),
+        records=make_records(splats, params),
     )
     _launch(
         lambda count: forward_kernels(count, parts),
         (tiles * parts, tiles * parts),
-        picture,
+        params,
         saved.records,
         channels,
         [as_struct(bins)],
@@ -94,7 +94,7 @@ def composite_forward(
 def composite_backward(
     splats: Splats2D,
     bins: Bins,
-    picture: Picture,
+    params: RasterParams,
     saved: Saved,
     v_pixels: list[Tensor],
     skipped: Tensor,
@@ -115,7 +115,7 @@ def composite_backward(
     apart = absolute is not None and channels > CHUNK
     given = (
         (tiles * parts, splats.means2d.shape[:-2].numel() * parts),
-        picture,
+        params,
         saved.records,
         channels,
         [as_struct(bins), as_struct(saved), StructValue(Pixels, *v_pixels)],

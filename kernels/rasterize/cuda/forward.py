@@ -11,7 +11,7 @@ import warp as wp
 
 from ...runtime.views import struct_of
 from ..skip import BLOCK_TEST, STOPPED
-from ..tiles import Bins, Picture, Pixels, Saved
+from ..tiles import Bins, Pixels, RasterParams, Saved
 from . import leaves as L
 from .records import Gaussians
 from .warp import (
@@ -70,7 +70,7 @@ def _traversal(channels: int, parts: int, listed: bool):
     @wp.func
     @no_type_check
     def traverse(
-        picture: Picture,
+        params: RasterParams,
         gaussians: Gaussians,
         lists: struct_of(Bins),
         saved_out: struct_of(Saved),
@@ -82,14 +82,14 @@ def _traversal(channels: int, parts: int, listed: bool):
             k0 = lists.starts[p.tile]
             end = lists.starts[p.tile + 1]
         else:
-            k0 = p.image * picture.num
-            end = k0 + picture.num
+            k0 = p.image * params.num
+            end = k0 + params.num
         half = p.lane // 4 % 2  # which of a sub-tile's two blocks of 4 x 4 pixels
-        # T is positive where a pixel continues, negative where it stopped, 0 outside of the picture
+        # T is positive where a pixel continues, negative where it stopped, 0 outside of the image
         T = pixels_type()
         inside = wp.int32(0)
         for j in range(wp.static(pixels)):
-            if p.px + j % 2 * WIDTH < picture.width and p.py + j // 2 * HEIGHT < picture.height:
+            if p.px + j % 2 * WIDTH < params.width and p.py + j // 2 * HEIGHT < params.height:
                 T[j] = 1.0
                 inside |= 1 << j
         sums = sums_type()
@@ -111,7 +111,7 @@ def _traversal(channels: int, parts: int, listed: bool):
             shape = L.load4(gaussians.records, at)
             level = L.load4(gaussians.records, at + wp.int64(4))
             lane_mask = live
-            if (picture.skip & BLOCK_TEST) != 0:
+            if (params.skip & BLOCK_TEST) != 0:
                 lane_mask &= touched(p, shape, level)
             if not seen:
                 lane_mask = 0
@@ -138,10 +138,10 @@ def _traversal(channels: int, parts: int, listed: bool):
                         dy = p.y[j // 2] - shape[1]
                         u = L.sheared(shape[3], p.x[j % 2] - shape[0], dy)
                         alpha = L.exp2(L.exponent(shape[2], level[0], level[1], u, dy))
-                        weight = T[j] * wp.min(alpha, picture.alpha_max)
+                        weight = T[j] * wp.min(alpha, params.alpha_max)
                         after = T[j] - weight
-                        if alpha >= picture.alpha_min and T[j] > 0.0:
-                            if after > picture.t_min:
+                        if alpha >= params.alpha_min and T[j] > 0.0:
+                            if after > params.t_min:
                                 used[0] += wp.static(1 << first_block(j))
                                 T[j] = after
                                 for c in range(wp.static(channels)):
@@ -161,7 +161,7 @@ def _traversal(channels: int, parts: int, listed: bool):
                             if T[j] > 0.0:
                                 going = 1
                             over = ballot(going) == 0
-                            if over and (picture.skip & STOPPED) != 0:
+                            if over and (params.skip & STOPPED) != 0:
                                 live &= wp.static(~(1 << j))
                     if slot > i:
                         lane_mask = live & memory.get_int(arena, wp.static(_MASKS) + p.lane)
@@ -181,19 +181,19 @@ def _traversal(channels: int, parts: int, listed: bool):
             k0 += WARP
 
         # recomputed, so that no registers hold the lane's pixels during the traversal
-        p = lane_pixels(picture, L.opaque(p.index), p.lane)
+        p = lane_pixels(params, L.opaque(p.index), p.lane)
         if p.lane == 0:
             if wp.static(listed):
                 wp.atomic_max(saved_out.walked, p.tile, end - lists.starts[p.tile])
             else:
-                wp.atomic_min(saved_out.walked, p.tile, p.image * picture.num - end)
+                wp.atomic_min(saved_out.walked, p.tile, p.image * params.num - end)
         if evaluated != 0 and gaussians.first == 0:
             wp.atomic_add(saved_out.blocks_walked, p.tile, wp.int64(evaluated))
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
             L.store(saved_out.transmittances, p.walk_row, j * WARP, T[j])
             if T[j] != 0.0:
-                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
+                step = j // 2 * HEIGHT * params.width + j % 2 * WIDTH
                 L.store(pixels_out.transmittances, p.pixel, step, wp.abs(T[j]))
                 step *= gaussians.channels
                 for c in range(wp.static(channels)):
@@ -206,7 +206,7 @@ def _traversal(channels: int, parts: int, listed: bool):
 def forward_kernels(channels: int, parts: int):
     """The kernels for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
 
-    ``composite`` walks the lists of tiles; ``composite_unlisted`` makes the pictures where the
+    ``composite`` walks the lists of tiles; ``composite_unlisted`` makes the images where the
     lists are too short.
     """
     options = kernel_options(24 if channels < 4 else 20)  # as many warps as the registers allow
@@ -219,7 +219,7 @@ def forward_kernels(channels: int, parts: int):
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite(
-        picture: Picture,
+        params: RasterParams,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
         saved_out: struct_of(Saved),
@@ -227,13 +227,13 @@ def forward_kernels(channels: int, parts: int):
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
-        p = lane_pixels(picture, index, lane)
-        traverse(picture, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
+        p = lane_pixels(params, index, lane)
+        traverse(params, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
 
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite_unlisted(
-        picture: Picture,
+        params: RasterParams,
         gaussians_in: Gaussians,
         lists_in: struct_of(Bins),
         saved_out: struct_of(Saved),
@@ -242,7 +242,7 @@ def forward_kernels(channels: int, parts: int):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         if lists_in.count[0] > wp.int64(lists_in.pairs.shape[0]):
-            p = lane_pixels(picture, index, lane)
-            traverse_unlisted(picture, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
+            p = lane_pixels(params, index, lane)
+            traverse_unlisted(params, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
 
     return composite, composite_unlisted

@@ -117,7 +117,7 @@ def slope(
     focal: wp.float32,
     options: ProjectionParams,
 ) -> wp.float32:
-    # x/z kept within README eq. 2's bounds: the picture and a margin around it
+    # x/z kept within README eq. 2's bounds: the image and a margin around it
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     if options.original != 0:
         center = 0.5 * size

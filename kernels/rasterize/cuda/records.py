@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ...runtime.launch import launch
 from ...runtime.views import as_struct, struct, struct_of
-from ..tiles import CHUNK, Picture, Splats2D, color_row, record_size
+from ..tiles import CHUNK, RasterParams, Splats2D, color_row, record_size
 from . import leaves as L
 from .ellipse import make_ellipse
 
@@ -34,7 +34,7 @@ class Gaussians:
 @no_type_check
 def _record(
     offset: wp.int32,
-    picture: Picture,
+    params: RasterParams,
     splats_in: struct_of(Splats2D),
     records_out: wp.array2d[wp.float32],
 ):
@@ -43,12 +43,12 @@ def _record(
     conic = splats_in.conics[g]
     opacity = splats_in.view_opacities[g]
     a, k, e = conic[0], conic[1], conic[2]
-    ellipse = make_ellipse(mean, conic, opacity, picture.alpha_min)
+    ellipse = make_ellipse(mean, conic, opacity, params.alpha_min)
     at = wp.int64(g) * wp.int64(records_out.shape[1])
     L.store4(records_out, at, wp.vec4(mean[0], mean[1], -LOG2_E_HALF * a, k))
     level = wp.vec4(-LOG2_E_HALF * e, wp.log2(opacity), LOG2_E_HALF * ellipse.limit, ellipse.top)
     L.store4(records_out, at + wp.int64(4), level)
-    row = color_row(picture, g)
+    row = color_row(params, g)
     channels = splats_in.colors.shape[1]
     for first in range(0, channels, CHUNK):
         color = wp.vec4()
@@ -58,9 +58,9 @@ def _record(
         L.store4(records_out, at + wp.int64(8 + first), color)
 
 
-def make_records(splats: Splats2D, picture: Picture) -> Tensor:
+def make_records(splats: Splats2D, params: RasterParams) -> Tensor:
     """Records ``[I * N, record_size(C)]`` of all Gaussians."""
     opacities, colors = splats.view_opacities, splats.colors
     records = colors.new_empty(opacities.numel(), record_size(colors.shape[1]))
-    launch(_record, len(records), [picture, as_struct(splats)], [records], colors.device)
+    launch(_record, len(records), [params, as_struct(splats)], [records], colors.device)
     return records

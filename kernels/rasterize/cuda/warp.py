@@ -13,7 +13,7 @@ import warp as wp
 
 from ...runtime.views import struct
 from ..constants import TILE
-from ..tiles import Picture
+from ..tiles import RasterParams
 from . import leaves as L
 
 wp.set_module_options({"enable_backward": False})
@@ -132,7 +132,7 @@ class LanePixels:
     part: wp.int32  # which part of the tile
     px: wp.int32  # the lane's pixel in the first sub-tile
     py: wp.int32
-    pixel: wp.int64  # its number in all pictures
+    pixel: wp.int64  # its number in all images
     walk_row: wp.int64  # its number by tiles and sub-tiles; the next sub-tiles' are WARP apart
     x: wp.vec2  # centres of the lane's pixels, by columns of sub-tiles
     y: wp.vec4  # by rows of sub-tiles
@@ -145,19 +145,19 @@ def pixels_of_lane(parts: int):
 
     @wp.func
     @no_type_check
-    def lane_pixels(picture: Picture, index: wp.int32, lane: wp.int32) -> LanePixels:
+    def lane_pixels(params: RasterParams, index: wp.int32, lane: wp.int32) -> LanePixels:
         p = LanePixels()
         p.index = index
         p.lane = lane
         p.tile = index // wp.static(parts)
         p.part = index % wp.static(parts)
-        p.image = p.tile // (picture.tiles_x * picture.tiles_y)
-        x = p.tile % picture.tiles_x * TILE
-        y = p.tile // picture.tiles_x % picture.tiles_y * TILE + p.part * wp.static(TILE // parts)
+        p.image = p.tile // (params.tiles_x * params.tiles_y)
+        x = p.tile % params.tiles_x * TILE
+        y = p.tile // params.tiles_x % params.tiles_y * TILE + p.part * wp.static(TILE // parts)
         p.px = x + lane % WIDTH
         p.py = y + lane // WIDTH
-        line = p.image * picture.height + p.py  # row among all pictures
-        p.pixel = wp.int64(line) * wp.int64(picture.width) + wp.int64(p.px)
+        line = p.image * params.height + p.py  # row among all images
+        p.pixel = wp.int64(line) * wp.int64(params.width) + wp.int64(p.px)
         p.walk_row = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
         for i in range(2):
             p.x[i] = float(p.px + i * WIDTH) + 0.5

@@ -1,6 +1,6 @@
 """The rasterizer at realistic size against the float64 oracle: row by row, and pixels at the cuts.
 
-Picture and gradient are compared pixel by pixel and Gaussian by Gaussian, with both cuts on. Where
+Image and gradient are compared pixel by pixel and Gaussian by Gaussian, with both cuts on. Where
 float32 decides a cut otherwise than float64 the picture jumps: such pixels are counted, bounded,
 and each must lie within rounding of a cut.
 """

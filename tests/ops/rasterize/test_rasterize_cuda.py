@@ -17,7 +17,7 @@ from gamba_warp.kernels.rasterize.cuda.records import make_records
 from gamba_warp.kernels.rasterize.cuda.warp import LanePixels, touching
 from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.quantile import counts_in_front
-from gamba_warp.kernels.rasterize.tiles import Limits, Size, Splats2D, make_picture
+from gamba_warp.kernels.rasterize.tiles import Limits, Size, Splats2D, raster_params
 from gamba_warp.kernels.runtime.launch import cuda_launch
 
 SAME = 2e-6  # the two sum in another order
@@ -243,9 +243,9 @@ def test_no_sub_tile_is_missed(from_ptx, longest):
     opacities = 0.01 + 0.98 * torch.rand(count)
     bits = torch.zeros(count, dtype=torch.int32)
     splats = Splats2D(means, conics, opacities, torch.rand(count, 3))
-    picture = make_picture(Size(16, 16, 1, 1, 0), Limits(ALPHA_MIN, 1.0, 0.0), num=count)
+    params = raster_params(Size(16, 16, 1, 1, 0), Limits(ALPHA_MIN, 1.0, 0.0), num=count)
     from_ptx()
-    records = make_records(splats, picture)
+    records = make_records(splats, params)
     cuda_launch(_test_sub_tiles, count, [records], [bits], device=bits.device)
     centre = torch.arange(16).double() + 0.5
     a, k, e = conics.double()[:, :, None, None].unbind(1)
