@@ -15,7 +15,7 @@ _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "CPU, ms", "fi
 _WORK = {
     "pairs_box": "pairs of boxes",
     "pairs": "of ellipses",
-    "pairs_walked": "walked",
+    "pairs_traversed": "traversed",
     "skipped": "skipped",
     "state_history_bytes": "history",
     "saved_bytes": "saved",

@@ -30,7 +30,7 @@ from .raster_oracle import View, ViewOptions, render_view
 from .rounding import SAMPLES, Rounding, samples_of
 
 LEAVES = ("means", "quats", "scales", "opacities", "colors")
-WORK = ("pairs_box", "pairs", "pairs_walked", "blocks_walked", "blocks_used")
+WORK = ("pairs_box", "pairs", "pairs_traversed", "blocks_traversed", "blocks_used")
 WORK += ("tiles", "tiles_empty")
 _HALF_FOV = math.radians(49.1) / 2
 _FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # width and height, pixels

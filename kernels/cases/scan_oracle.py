@@ -29,10 +29,10 @@ def factors(x: Tensor, discretization: str, r: Rounding) -> tuple[Tensor, Tensor
     return f, r(torch.where(small, series, torch.expm1(safe) / safe), EXP_ULPS)
 
 
-def _walk(f: Tensor, w: Tensor, first: Tensor) -> Tensor:
+def _recur(f: Tensor, w: Tensor, first: Tensor) -> Tensor:
     """All states h ← f h + w, ``[S, B, L, D, N]``, from ``first [S, B, D, N]``, in float64.
 
-    Pieces of tokens are walked side by side, each from 0, and joined: as many steps as √L.
+    Pieces of tokens are traversed side by side, each from 0, and joined: as many steps as √L.
     """
     length = f.shape[2]
     piece = max(1, math.isqrt(length))
@@ -55,19 +55,19 @@ def _walk(f: Tensor, w: Tensor, first: Tensor) -> Tensor:
 
 
 def _walk_rounded(f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> tuple[Tensor, Tensor]:
-    """The states of ``_walk`` with product and sum rounded at each token, and those before them.
+    """The states of ``_recur`` with product and sum rounded at each token, and those before them.
 
     The rounding of a token enters the next with the state, as another input does. So it is found
-    for all tokens of the exact walk at once, and a second walk takes it along.
+    for all tokens of the exact recurrence at once, and a second one takes it along.
     """
 
     def before(h: Tensor) -> Tensor:
         return torch.cat([first[:, :, None], h[:, :, :-1]], 2)
 
-    h = _walk(f, w, first)
+    h = _recur(f, w, first)
     products = f * before(h)
     rounded = r.rounded(products, 1.0) - products + (r.rounded(h, 1.0) - h)
-    h = _walk(f, w + rounded, first)
+    h = _recur(f, w + rounded, first)
     return h, before(h)
 
 

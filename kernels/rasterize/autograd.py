@@ -228,9 +228,9 @@ def composite(
     ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
     Gaussians or, shared by the views, one for each of an object's. The lists hold the values of
     ``Bins``, ``Size`` and ``Limits``. Backward raises the numbers of tiles in ``skipped``, ``[I *
-    tiles]`` int32, to 1 if it skips a tile and to 2 if it walks it. Where it has a gradient of the
-    geometry, it sets ``absolute``, ``[.., N, 2]``, to the sums over pixels of the absolute values
-    of their gradients of ``means2d``.
+    tiles]`` int32, to 1 if it skips a tile and to 2 if it traverses it. Where it has a gradient of
+    the geometry, it sets ``absolute``, ``[.., N, 2]``, to the sums over pixels of the absolute
+    values of their gradients of ``means2d``.
     """
     splats = Splats2D(means2d, conics, view_opacities, colors.flatten(0, -2))
     given = splats, Bins(*bins), _raster_params(means2d, size, limits)
@@ -253,8 +253,8 @@ def _(means2d, conics, opacities, colors, bins, size, *rest):
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.empty_like(pairs),
-        walked=pairs.new_empty(tiles),
-        blocks_walked=pairs.new_empty(tiles, dtype=torch.int64),
+        traversed=pairs.new_empty(tiles),
+        blocks_traversed=pairs.new_empty(tiles, dtype=torch.int64),
         records=colors.new_empty(*record_shape),
     )
     renders = colors.new_empty(*images, height, width, colors.shape[-1])
@@ -276,7 +276,7 @@ def _composite_vjp(
     absolute: Tensor | None,
 ) -> List[Tensor]:
     if skipped is None:
-        skipped = torch.zeros_like(Saved(*saved).walked)
+        skipped = torch.zeros_like(Saved(*saved).traversed)
     drawn = Splats2D(*splats)
     drawn = drawn._replace(colors=drawn.colors.flatten(0, -2))
     given = drawn, Bins(*bins), _raster_params(splats[0], size, limits), Saved(*saved)

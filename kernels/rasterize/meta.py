@@ -49,11 +49,12 @@ class Meta(dict):
     """A dict; these keys are computed at the first look, as ints (which synchronises on CUDA).
 
     ``culled``: dict of counts of (view, Gaussian) by reason; ``pairs_box`` and ``pairs``: (tile,
-    Gaussian) pairs without and with the exact test; ``pairs_walked``: until every pixel of the tile
-    had stopped; ``blocks_walked``: 4 x 4 blocks of pixels evaluated for them; ``pairs_used``,
-    ``blocks_used``, ``gaussians_used``: pairs, blocks, (view, Gaussian) that contributed;
-    ``tiles`` and ``tiles_empty``; ``tiles_skipped``: walked by no backward so far, being empty or
-    without upstream gradient. The last one is None before a backward and under torch.compile.
+    Gaussian) pairs without and with the exact test; ``pairs_traversed``: until every pixel of the
+    tile had stopped; ``blocks_traversed``: 4 x 4 blocks of pixels evaluated for them;
+    ``pairs_used``, ``blocks_used``, ``gaussians_used``: pairs, blocks, (view, Gaussian) that
+    contributed; ``tiles`` and ``tiles_empty``; ``tiles_skipped``: traversed by no backward so far,
+    being empty or without upstream gradient. The last one is None before a backward and under
+    torch.compile.
     ``radii``, a tensor, is computed at the first look too.
 
     On CUDA, where the lists of a call could not hold its pairs, they are made once more for these
@@ -79,8 +80,8 @@ class Meta(dict):
             return self[key]
         if key not in _COUNTS:
             raise KeyError(key)
-        walks = key not in ("culled", "pairs_box", "pairs", "tiles")
-        if walks and int(self.bins.count) > self.bins.pairs.numel():  # the lists were too short
+        of_pairs = key not in ("culled", "pairs_box", "pairs", "tiles")
+        if of_pairs and int(self.bins.count) > self.bins.pairs.numel():  # the lists were too short
             self.bins, self._saved = self._call.listed()
         self[key] = _COUNTS[key](self.bins, self._saved, self._call)
         return self[key]
@@ -107,8 +108,8 @@ _COUNTS: dict[str, Callable[[Bins, Saved, Call], Any]] = {
     "culled": _culled,
     "pairs_box": _pairs_of_boxes,
     "pairs": lambda bins, saved, call: int(bins.count),
-    "pairs_walked": lambda bins, saved, call: int(saved.walked.sum(dtype=torch.int64)),
-    "blocks_walked": lambda bins, saved, call: int(saved.blocks_walked.sum()),
+    "pairs_traversed": lambda bins, saved, call: int(saved.traversed.sum(dtype=torch.int64)),
+    "blocks_traversed": lambda bins, saved, call: int(saved.blocks_traversed.sum()),
     "blocks_used": lambda bins, saved, call: sum(
         int((saved.blocks >> b & 1).sum()) for b in range(16)
     ),

@@ -15,9 +15,9 @@ class Skip:
         tile_test: tiles that the box of a Gaussian meets and its ellipse does not (``pairs_box``
             without, ``pairs`` with the test).
         block_test: of a tile, the parts that the ellipse misses: 4 x 4 pixels on the CPU, 8 x 4 on
-            CUDA (``blocks_walked``; without the test, all of ``pairs_walked``).
+            CUDA (``blocks_traversed``; without the test, all of ``pairs_traversed``).
         stopped: Gaussians behind a tile or part whose pixels have all stopped (``pairs`` without,
-            ``pairs_walked`` with it).
+            ``pairs_traversed`` with it).
         empty_tiles: setting up tiles that no Gaussian touches (``tiles_empty``).
         zero_upstream: in backward, tiles whose upstream gradient is all zero (``tiles_skipped``).
         unused: in backward, pairs and parts that forward found without effect (``pairs_used``,

@@ -77,17 +77,17 @@ class Saved(NamedTuple):
         transmittances: ``[blocks, 16]`` final T; negative where the pixel stopped early.
         stops: ``[blocks, 16]`` int32, the pair at which the pixel stopped.
         blocks: ``[P]`` int32, one bit for each block of the tile to which the pair contributed.
-        walked: ``[tiles]`` int32, pairs walked until every pixel had stopped; on CUDA, where the
+        traversed: ``[tiles]`` int32, pairs until every pixel had stopped; on CUDA, where the
             lists were too short, with a minus, and of all Gaussians of the view.
-        blocks_walked: ``[tiles]`` int64, blocks evaluated for these pairs.
+        blocks_traversed: ``[tiles]`` int64, blocks evaluated for these pairs.
         records: ``[I * N, record_size(C)]``, what CUDA reads of a Gaussian; empty on a CPU.
     """
 
     transmittances: Annotated[Any, wp.array2d[wp.float32]]
     stops: Annotated[Any, wp.array2d[wp.int32]]
     blocks: Annotated[Any, wp.array[wp.int32]]
-    walked: Annotated[Any, wp.array[wp.int32]]
-    blocks_walked: Annotated[Any, wp.array[wp.int64]]
+    traversed: Annotated[Any, wp.array[wp.int32]]
+    blocks_traversed: Annotated[Any, wp.array[wp.int64]]
     records: Annotated[Any, wp.array2d[wp.float32]]
 
 

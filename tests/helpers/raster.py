@@ -10,7 +10,7 @@ import types
 import torch
 
 from gamba_warp.cameras import orbit
-from gamba_warp.kernels.rasterize import function, rasterization
+from gamba_warp.kernels.rasterize import api, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from helpers import assert_rel_rms
@@ -114,13 +114,13 @@ def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
 
 def absolute_gradients(monkeypatch):
     """A list to which calls from there on add their absolute gradients of means2d."""
-    found, composite = [], function.composite
+    found, composite = [], api.composite
 
     def with_sums(means2d, *rest):
         found.append(torch.zeros_like(means2d))
         return composite(means2d, *rest[:-1], found[-1])
 
-    monkeypatch.setattr(function, "composite", with_sums)
+    monkeypatch.setattr(api, "composite", with_sums)
     return found
 
 

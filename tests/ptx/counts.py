@@ -58,11 +58,11 @@ def _raster(multiprocessors: int) -> tuple[Counts, Units]:
 
     def run():
         *pictures, found = rasterization(**leaves, **cameras)
-        meta.update(pairs_walked=found["pairs_walked"])
+        meta.update(pairs_traversed=found["pairs_traversed"])
         return pictures
 
     counted = counting.count(run, [leaves[name] for name in LEAVES], multiprocessors)
-    each = [("pair, of a warp", float(meta["pairs_walked"]))]
+    each = [("pair, of a warp", float(meta["pairs_traversed"]))]
     each += [("pixel, of a thread", SIDE * SIDE / LANES)]
     return counted, PER_GAUSSIAN | {"composite": each, "composite_vjp": each}
 

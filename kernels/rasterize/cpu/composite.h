@@ -138,8 +138,8 @@ static void composite(int task, const RasterParams& params, const Splats& splats
     F* const sums = (F*)workers.workspace.data + (size_t)task * BLOCKS * channels;  // of colours
     for (int index = next_tile(workers); index < tiles; index = next_tile(workers)) {
         const int begin = lists.starts.data[index], end = lists.starts.data[index + 1];
-        saved.walked.data[index] = 0;
-        saved.blocks_walked.data[index] = 0;
+        saved.traversed.data[index] = 0;
+        saved.blocks_traversed.data[index] = 0;
         if (begin == end && params.skip & Config::EMPTY_TILES) continue;
         const Tile tile = tile_at(params, index);
         // A pixel that has stopped keeps its transmittance, above t_min, with a minus sign. T is
@@ -189,8 +189,8 @@ static void composite(int task, const RasterParams& params, const Splats& splats
             if (params.skip & Config::STOPPED) alive &= ~dead;
             saved.blocks.data[k] = used;
         }
-        saved.walked.data[index] = k - begin;
-        saved.blocks_walked.data[index] = evaluated;
+        saved.traversed.data[index] = k - begin;
+        saved.blocks_traversed.data[index] = evaluated;
         for (int b = 0; b < BLOCKS; ++b)
             pixels_of(params, tile, b, [&](int l, size_t pixel) {
                 const float T = Ts[b][l];
@@ -256,7 +256,7 @@ static void composite_vjp(int task, const RasterParams& params, const Splats& sp
     F* const v_pixels = v_colors + channels;
     for (int index = next_tile(workers); index < tiles; index = next_tile(workers)) {
         const Tile tile = tile_at(params, index);
-        const int begin = lists.starts.data[index], end = begin + saved.walked.data[index];
+        const int begin = lists.starts.data[index], end = begin + saved.traversed.data[index];
         const int every = begin < end ? tile.inside : 0;
         const bool nonzero = load_gradient(params, pixels, tile, every, v_pixels);
         const bool wanted = nonzero || (every && !(params.skip & Config::ZERO_UPSTREAM));

@@ -42,7 +42,7 @@ class Rows:
 
     sums: wp.array2d[wp.float32]  # [P, 6 + C], or with the absolute ones [P, 8 + C]
     written: wp.array[wp.uint8]  # [P], 0 where a row was not written and is not read
-    skipped: wp.array[wp.int32]  # [tiles], raised to 1 where a tile is skipped, to 2 where walked
+    skipped: wp.array[wp.int32]  # [tiles], raised to 1 where a tile is skipped, 2 where traversed
     geometry: int  # 0 for the gradient of the colours alone
 
 
@@ -106,8 +106,8 @@ def composite_forward(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.zeros_like(bins.pairs),
-        walked=bins.pairs.new_empty(tiles),
-        blocks_walked=bins.pairs.new_empty(tiles, dtype=torch.int64),
+        traversed=bins.pairs.new_empty(tiles),
+        blocks_traversed=bins.pairs.new_empty(tiles, dtype=torch.int64),
         records=colors.new_empty(0, 0),
     )
     arguments = [
@@ -141,7 +141,7 @@ def composite_backward(
         params: as forward.
         saved: as returned forward.
         v_pixels: gradients of the renders and the transmittances.
-        skipped: ``[tiles]`` int32, raised to 1 for a tile that is skipped and 2 for one walked.
+        skipped: ``[tiles]`` int32, raised to 1 for a tile that is skipped and 2 for one traversed.
         geometry: True to compute more than the gradient of the colours.
         absolute: ``[.., N, 2]``, set to the pixels' absolute gradients of means2d, summed; or None.
             With it ``geometry`` is True.

@@ -1,7 +1,7 @@
 """The CUDA compositor's gradient kernels: back to front over the pairs of a tile (README §5).
 
 ``composite_vjp`` leaves a row of sums for each pair. ``composite_vjp_unlisted`` does nothing unless
-the lists could not hold all pairs; then a warp walks all tiles of its view, one after the other,
+the lists could not hold all pairs; then a warp traverses all tiles of its view, one after another,
 and adds their sums in rows of Gaussians: in the order in which ``reduce.py`` adds up rows of pairs.
 """
 
@@ -177,7 +177,7 @@ def _completing(asked: Sums, parts: int):
 
 @functools.cache
 def _traversal(asked: Sums, parts: int, listed: bool):
-    """The function that walks a part of a tile.
+    """The function that traverses a part of a tile.
 
     Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
     its pairs; pairs that a tile's own test excludes are removed from these.
@@ -237,7 +237,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
         transmittances: wp.array2d[wp.float32],  # in one struct, these four would spill registers
         stops: wp.array2d[wp.int32],
         blocks: wp.array[wp.int32],
-        walked_in: wp.array[wp.int32],
+        traversed_in: wp.array[wp.int32],
         v_pixels_in: Pixels,
         rows_out: Rows,
         arena: arena_type,
@@ -246,10 +246,10 @@ def _traversal(asked: Sums, parts: int, listed: bool):
         base = p.part * wp.static(size)
         if wp.static(listed):
             begin = lists.starts[p.tile]
-            walked = walked_in[p.tile]
+            traversed = traversed_in[p.tile]
         else:
             begin = p.image * params.num
-            walked = -walked_in[p.tile]
+            traversed = -traversed_in[p.tile]
         # T is as forward left it, negative until the traversal reaches where the pixel stopped;
         # R is R of README eq. 10, plus the gradient of T_end, which is the same for all pairs
         T = pixels_type()
@@ -260,7 +260,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
         untouched = wp.where(params.alpha_min > 1e-6, 1.0, 0.0)
         some = wp.int32(0)  # bits of the blocks whose upstream gradient is not 0
         for j in range(wp.static(pixels)):
-            if walked > 0:
+            if traversed > 0:
                 T[j] = L.load(transmittances, p.walk_row, j * WARP)
             if T[j] != 0.0 and T[j] != untouched:
                 step = j // 2 * HEIGHT * params.width + j % 2 * WIDTH
@@ -290,11 +290,11 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                 of_all |= memory.get_int(arena, wp.static(part * size))
             together()
         if of_all == 0:
-            walked = 0
+            traversed = 0
         if p.lane == 0:
-            wp.atomic_max(rows_out.skipped, p.tile, wp.where(walked > 0, 2, 1))
+            wp.atomic_max(rows_out.skipped, p.tile, wp.where(traversed > 0, 2, 1))
 
-        end = begin + walked
+        end = begin + traversed
         while end > begin:
             k = end - WARP + p.lane
             bits = wp.int32(0)
@@ -455,7 +455,7 @@ def backward_kernels(asked: Sums, parts: int):
             saved_in.transmittances,
             saved_in.stops,
             saved_in.blocks,
-            saved_in.walked,
+            saved_in.traversed,
             v_pixels_in,
             rows_out,
             arena,
@@ -494,7 +494,7 @@ def backward_kernels(asked: Sums, parts: int):
                 saved_in.transmittances,
                 saved_in.stops,
                 saved_in.blocks,
-                saved_in.walked,
+                saved_in.traversed,
                 v_pixels_in,
                 rows_out,
                 arena,

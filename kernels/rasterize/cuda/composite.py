@@ -75,8 +75,8 @@ def composite_forward(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
         stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.zeros_like(bins.pairs),
-        walked=bins.pairs.new_zeros(tiles),
-        blocks_walked=bins.pairs.new_zeros(tiles, dtype=torch.int64),
+        traversed=bins.pairs.new_zeros(tiles),
+        blocks_traversed=bins.pairs.new_zeros(tiles, dtype=torch.int64),
         records=make_records(splats, params),
     )
     _launch(
@@ -104,7 +104,7 @@ def composite_backward(
 ) -> Splats2D:
     """Gradients of ``composite_forward``, like ``composite_backward`` on the CPU."""
     colors = splats.colors
-    tiles, channels = saved.walked.numel(), colors.shape[1]
+    tiles, channels = saved.traversed.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
     pairs = bins.pairs.numel()
     # a chunk without gradients does not write its part of a row that another chunk has written

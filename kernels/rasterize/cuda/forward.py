@@ -1,7 +1,7 @@
 """The CUDA compositor's forward kernels: front to back over the pairs of a tile (README §3).
 
-``composite`` walks the lists of the tiles. ``composite_unlisted`` does nothing unless these could
-not hold all pairs; then it walks all Gaussians of the view for each tile, in the same order.
+``composite`` traverses the lists of the tiles. ``composite_unlisted`` does nothing unless these
+could not hold all pairs; then it traverses all Gaussians of the view for each tile, in that order.
 """
 
 import functools
@@ -41,11 +41,11 @@ _SIZE = _MASKS + WARP
 
 @functools.cache
 def _traversal(channels: int, parts: int, listed: bool):
-    """The function that walks the pairs of a tile's part.
+    """The function that traverses the pairs of a tile's part.
 
     Unless ``listed``, the tiles of a view share one list of all its Gaussians, in which ``offsets``
     says where the pairs of each would begin, if the lists held them. Bits of tiles are then joined,
-    and numbers of walked pairs are stored negated, which marks them for the gradient.
+    and numbers of traversed pairs are stored negated, which marks them for the gradient.
     """
     memory = shared_memory(_SIZE)
     arena_type = memory.arena
@@ -184,11 +184,11 @@ def _traversal(channels: int, parts: int, listed: bool):
         p = lane_pixels(params, L.opaque(p.index), p.lane)
         if p.lane == 0:
             if wp.static(listed):
-                wp.atomic_max(saved_out.walked, p.tile, end - lists.starts[p.tile])
+                wp.atomic_max(saved_out.traversed, p.tile, end - lists.starts[p.tile])
             else:
-                wp.atomic_min(saved_out.walked, p.tile, p.image * params.num - end)
+                wp.atomic_min(saved_out.traversed, p.tile, p.image * params.num - end)
         if evaluated != 0 and gaussians.first == 0:
-            wp.atomic_add(saved_out.blocks_walked, p.tile, wp.int64(evaluated))
+            wp.atomic_add(saved_out.blocks_traversed, p.tile, wp.int64(evaluated))
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
             L.store(saved_out.transmittances, p.walk_row, j * WARP, T[j])
@@ -206,7 +206,7 @@ def _traversal(channels: int, parts: int, listed: bool):
 def forward_kernels(channels: int, parts: int):
     """The kernels for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
 
-    ``composite`` walks the lists of tiles; ``composite_unlisted`` makes the images where the
+    ``composite`` traverses the lists of tiles; ``composite_unlisted`` makes the images where the
     lists are too short.
     """
     options = kernel_options(24 if channels < 4 else 20)  # as many warps as the registers allow

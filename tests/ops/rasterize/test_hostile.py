@@ -349,7 +349,7 @@ def test_nothing_in_sight():
     scene = base()
     scene["means"] = scene["means"] + 50.0
     renders, alphas, grads, meta = survives(scene)
-    assert meta["pairs"] == meta["pairs_walked"] == 0 and meta["tiles_empty"] == meta["tiles"]
+    assert meta["pairs"] == meta["pairs_traversed"] == 0 and meta["tiles_empty"] == meta["tiles"]
     assert sum(meta["culled"].values()) == 120 and (alphas == 0).all()
     background = scene["backgrounds"][:, :, None, None].expand(-1, -1, 53, 37, -1)
     assert torch.equal(renders[..., :3], background)

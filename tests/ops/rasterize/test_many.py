@@ -7,7 +7,7 @@ import torch
 from helpers import on_threads
 from helpers.raster import NAMES, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, ops, projection, rasterization
+from gamba_warp.kernels.rasterize import Skip, autograd, projection, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes, vjp_on_lanes
@@ -43,7 +43,7 @@ def assert_lists(monkeypatch, scene, **options):
     """Lists sorted before they are written or after are those of CUDA's scalar kernels."""
     with monkeypatch.context() as patch:
         scalar = partial(bin_cuda.bin_views, exact=True)
-        patch.setattr(ops, "_bin_views", lambda device, exact: scalar)
+        patch.setattr(autograd, "_bin_views", lambda device, exact: scalar)
         want = call(scene, **options)
     for many in (1 << 30, 0):
         monkeypatch.setattr(bin_cpu, "MANY", many)

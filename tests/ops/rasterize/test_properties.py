@@ -154,9 +154,9 @@ def test_half_precision_inputs():
 
 def test_meta_counts():
     _, _, meta = rasterization(**make(num=300, size=0.1, width=100, height=70))
-    assert 0 < meta["pairs_walked"] <= meta["pairs"] < meta["pairs_box"]
+    assert 0 < meta["pairs_traversed"] <= meta["pairs"] < meta["pairs_box"]
     assert meta["tiles"] == 2 * 3 * 7 * 5 and meta["tiles_skipped"] is None
-    assert 0 < meta["blocks_used"] <= 16 * meta["pairs_walked"]
+    assert 0 < meta["blocks_used"] <= 16 * meta["pairs_traversed"]
     assert meta["width"] == 100 and meta["tile_size"] == 16
     with pytest.raises(KeyError):
         meta["nothing"]

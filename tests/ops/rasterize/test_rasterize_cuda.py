@@ -9,7 +9,7 @@ import warp as wp
 from helpers import assert_rel_rms
 from helpers.raster import absolute_gradients, crowded, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, function, rasterization
+from gamba_warp.kernels.rasterize import Skip, api, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, T_MIN
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 from gamba_warp.kernels.rasterize.cuda import leaves as leaves_cuda
@@ -44,7 +44,9 @@ def run(scene, v_renders, v_alphas, mode="RGB", needs=None, **options):
     renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)
     ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
     grads = {k: v.grad for k, v in tensors.items() if getattr(v, "grad", None) is not None}
-    counts = {k: meta[k] for k in ("pairs_walked", "blocks_walked", "blocks_used", "tiles_skipped")}
+    counts = {
+        k: meta[k] for k in ("pairs_traversed", "blocks_traversed", "blocks_used", "tiles_skipped")
+    }
     return {"renders": renders, "alphas": alphas, **grads}, counts
 
 
@@ -57,9 +59,9 @@ def test_skips_change_nothing(on_cuda):
     off = dict.fromkeys([field.name for field in fields(Skip)], False)
     got, all_counts = run(scene, v_renders, v_alphas, skip=Skip(**off))
     assert_same(got, want)
-    assert all_counts["pairs_walked"] > counts["pairs_walked"]
+    assert all_counts["pairs_traversed"] > counts["pairs_traversed"]
     assert all_counts["tiles_skipped"] < counts["tiles_skipped"]
-    assert all_counts["blocks_walked"] > counts["blocks_walked"] > 0
+    assert all_counts["blocks_traversed"] > counts["blocks_traversed"] > 0
 
 
 @pytest.mark.parametrize(
@@ -81,7 +83,7 @@ def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
     used, lanes_used = block_counts.pop("blocks_used"), lane_counts.pop("blocks_used")
     assert 0.99 * lanes_used <= used <= lanes_used
     # a sub-tile is two blocks
-    assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
+    assert 0 < block_counts.pop("blocks_traversed") <= lane_counts.pop("blocks_traversed")
     assert block_counts == lane_counts and lane_counts["tiles_skipped"] >= 2
 
 
@@ -89,7 +91,7 @@ def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
 @pytest.mark.parametrize("channels, parts", [(3, 1), (4, 2), (1, 4), (5, 1), (11, 2)])
 def test_absolute_gradients(monkeypatch, on_cuda, channels, parts, passes):
     """Also with more channels than one launch has, and of a gradient that passes the clamp."""
-    monkeypatch.setattr(function, "Limits", partial(Limits, passes=float(passes)))
+    monkeypatch.setattr(api, "Limits", partial(Limits, passes=float(passes)))
     scene = crowded(channels)
     given = scene, *upstream(channels)
     plain, _ = run(*given)
@@ -162,9 +164,9 @@ def test_without_dilation(on_cuda):
     blocks, block_counts = run(scene, *v, eps2d=0.0)
     assert all(x.isfinite().all() for x in blocks.values())
     assert all((blocks[name][:, k::6] == 0).all() for name in ("means", "scales") for k in (0, 1))
-    assert blocks["alphas"].mean() > 0.3 and block_counts["pairs_walked"] > 0
+    assert blocks["alphas"].mean() > 0.3 and block_counts["pairs_traversed"] > 0
     assert_same(blocks, lanes)
-    assert block_counts["pairs_walked"] == lane_counts["pairs_walked"]
+    assert block_counts["pairs_traversed"] == lane_counts["pairs_traversed"]
 
 
 def test_a_first_gaussian_may_stop_a_pixel(on_cuda):
@@ -177,7 +179,7 @@ def test_a_first_gaussian_may_stop_a_pixel(on_cuda):
     on_cuda()
     blocks, block_counts = run(scene, v_renders, v_alphas, **options)
     # a sub-tile is two blocks
-    assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
+    assert 0 < block_counts.pop("blocks_traversed") <= lane_counts.pop("blocks_traversed")
     assert (lanes["alphas"] == 0).any() and block_counts == lane_counts
     assert_same(blocks, lanes)
 

@@ -12,7 +12,7 @@ from gamba_warp.kernels.rasterize.cuda import capacity
 CPU = torch.device("cpu")
 READ_BACK = {"aten::item", "aten::_local_scalar_dense"}
 COUNTS = (
-    *("pairs", "pairs_box", "pairs_walked", "pairs_used", "blocks_walked", "blocks_used"),
+    *("pairs", "pairs_box", "pairs_traversed", "pairs_used", "blocks_traversed", "blocks_used"),
     *("gaussians_used", "tiles", "tiles_empty", "tiles_skipped"),
 )
 

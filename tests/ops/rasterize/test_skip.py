@@ -67,11 +67,11 @@ def test_counts_tell_what_each_leaves_out():
     tiles = on["tiles"] - on["tiles_empty"]
     metas = {name: render(replace(Skip(), **{name: False}))[1] for name in NAMES}
     assert metas["tile_test"]["pairs"] == on["pairs_box"] > on["pairs"]
-    assert metas["block_test"]["blocks_walked"] > 1.5 * on["blocks_walked"]
-    assert metas["stopped"]["pairs_walked"] == on["pairs"] > on["pairs_walked"]
+    assert metas["block_test"]["blocks_traversed"] > 1.5 * on["blocks_traversed"]
+    assert metas["stopped"]["pairs_traversed"] == on["pairs"] > on["pairs_traversed"]
     assert metas["zero_upstream"]["tiles_skipped"] == on["tiles_empty"]
     assert on["tiles_empty"] + tiles / 5 < on["tiles_skipped"] < on["tiles"]
-    assert on["blocks_walked"] > on["blocks_used"] > on["pairs_used"] > on["gaussians_used"] > 0
+    assert on["blocks_traversed"] > on["blocks_used"] > on["pairs_used"] > on["gaussians_used"] > 0
     assert on["gaussians_used"] < VIEWS * 6000
     for name in NAMES:  # what had an effect does not depend on what was looked at
         assert metas[name]["blocks_used"] == on["blocks_used"]

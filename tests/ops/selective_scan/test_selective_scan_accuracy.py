@@ -162,7 +162,7 @@ def test_a_constant_input_beside_a_fast_channel(discretization, length, threads)
 
 @every_discretization
 def test_a_fast_channel_has_the_same_bits_beside_slow_ones(discretization):
-    """The walk of slow decays leaves the arithmetic of the channels in it that are not slow."""
+    """The recurrence of slow decays leaves the arithmetic of channels that are not slow."""
     results = []
     for slowest in (0.3, 1e-3):
         inputs = constant(333)
