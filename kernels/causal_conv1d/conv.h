@@ -67,7 +67,7 @@ static void forward(int task, int k, const In& in, const Out& out) {
     const auto state = rows_from(in.state, p.sequence, 0, d, width);
     const Filter filter = filter_of(k, in.weight, in.bias);
     Window last = window_before(p, x, state, in.state.shape[1] > 0);
-    auto step = [&](int t, F x3) {
+    auto step = [&](int t, F x3, const auto& y) {
         F v = filter(last.x0, last.x1, last.x2, x3);
         if (in.use_silu) v = v * sigmoid(v);
         put(y, t, v, in.stream);
@@ -75,19 +75,22 @@ static void forward(int task, int k, const In& in, const Out& out) {
     };
     int t = p.t0;
     if constexpr (Config::AHEAD > 0)
-        // No load can pass a store, which might write its address: so some tokens' loads come
-        // first.
-        for (; x.whole && y.whole && t + Config::AHEAD <= p.end; t += Config::AHEAD) {
-            F ahead[Config::AHEAD];
+        if (x.whole && y.whole) {
+            auto x_whole = x, y_whole = y;  // so that the compiler knows
+            x_whole.whole = y_whole.whole = true;
+            // No load can pass a store, which might write its address: so some tokens' come first.
+            for (; t + Config::AHEAD <= p.end; t += Config::AHEAD) {
+                F ahead[Config::AHEAD];
 #pragma unroll
-            for (int i = 0; i < Config::AHEAD; ++i) ahead[i] = read(x, t + i);
+                for (int i = 0; i < Config::AHEAD; ++i) ahead[i] = read(x_whole, t + i);
 #pragma unroll
-            for (int i = 0; i < Config::AHEAD; ++i) step(t + i, ahead[i]);
+                for (int i = 0; i < Config::AHEAD; ++i) step(t + i, ahead[i], y_whole);
+            }
         }
     for (; t < p.end; ++t) {
         const F x3 = read(x, t);
         prefetch_right(x, t);
-        step(t, x3);
+        step(t, x3, y);
     }
     if (in.stream && d + WIDTH >= in.x.shape[2]) finish_stores();  // the last of a row of tasks
 }
@@ -104,7 +107,7 @@ static inline void gradient(const Piece& p, const Filter& filter, Window last, b
     auto complete = [&] {
         for (int i = 0; i < 5; ++i) sums[i] = sums[i] + run[i], run[i] = F{};
     };
-    auto step = [&](int t, F x3, F g3, bool inside, bool own) {
+    auto step = [&](int t, F x3, F g3, bool inside, bool own, const G& dx) {
         if (inside) {
             if (use_silu) {
                 const F y = filter(last.x0, last.x1, last.x2, x3), s = sigmoid(y);
@@ -125,15 +128,20 @@ static inline void gradient(const Piece& p, const Filter& filter, Window last, b
         if (Config::RUN > 0 && (t - p.t0) % Config::RUN == Config::RUN - 1) complete();
     };
     int t = p.t0;
-    if constexpr (Config::AHEAD > 0)  // as in the forward
-        for (; x.whole && dout.whole && dx.whole && t + Config::AHEAD <= p.end;
-            t += Config::AHEAD) {
-            F xs[Config::AHEAD], gs[Config::AHEAD];
+    if constexpr (Config::AHEAD > 0)
+        if (x.whole && dout.whole && dx.whole) {  // as in the forward; and the compiler is told
+            X x_whole = x;
+            G dout_whole = dout, dx_whole = dx;
+            x_whole.whole = dout_whole.whole = dx_whole.whole = true;
+            for (; t + Config::AHEAD <= p.end; t += Config::AHEAD) {
+                F xs[Config::AHEAD], gs[Config::AHEAD];
 #pragma unroll
-            for (int i = 0; i < Config::AHEAD; ++i)
-                xs[i] = read(x, t + i), gs[i] = read(dout, t + i);
+                for (int i = 0; i < Config::AHEAD; ++i)
+                    xs[i] = read(x_whole, t + i), gs[i] = read(dout_whole, t + i);
 #pragma unroll
-            for (int i = 0; i < Config::AHEAD; ++i) step(t + i, xs[i], gs[i], true, true);
+                for (int i = 0; i < Config::AHEAD; ++i)
+                    step(t + i, xs[i], gs[i], true, true, dx_whole);
+            }
         }
     for (; t < p.end + 3; ++t) {
         F x3 = last.x2, g3 = F{};
@@ -141,7 +149,7 @@ static inline void gradient(const Piece& p, const Filter& filter, Window last, b
             x3 = read(x, t), g3 = read(dout, t);
             prefetch(t);
         }
-        step(t, x3, g3, t < p.stop, t < p.end);
+        step(t, x3, g3, t < p.stop, t < p.end, dx);
     }
     complete();
 }
