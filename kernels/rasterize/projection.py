@@ -1,10 +1,12 @@
 """3D Gaussians to 2D: culling, the EWA projection, and its gradient (README.md §1 and §4).
 
-The arguments, and the launches on both devices: the kernels are in ``cpu/`` and ``cuda/``.
+The arguments and kernels of both devices, which ``cpu/`` and ``cuda/`` launch.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -12,7 +14,9 @@ import warp as wp
 from torch import Tensor
 
 from ..runtime.memory import empty
-from ..runtime.views import StructValue, as_struct, filled, struct
+from ..runtime.native import constants, native, native_kernel
+from ..runtime.views import StructValue, as_struct, filled, struct, struct_of
+from .constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN, RADIUS_MAX, TILE
 
 # Status of a (view, Gaussian).
 VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
@@ -109,6 +113,51 @@ class Scene:
     opacities: wp.array[wp.float32]
     viewmats: wp.array[wp.mat44]
     Ks: wp.array[wp.mat33]
+
+
+@functools.cache
+def _kernels(header: Path, run: int, covars: bool, original: bool) -> tuple[Any, Any]:
+    config = constants(
+        "Config",
+        **{name.upper(): number for number, name in enumerate(STATUS_NAMES)},
+        **{"RUN": run, "COVARS": covars, "ORIGINAL": original, "MARGIN": FRUSTUM_MARGIN},
+        **{"COMPENSATION_MIN": COMPENSATION_MIN, "CONIC_MAX": CONIC_MAX},
+        **{"RADIUS_MAX": RADIUS_MAX, "TILE": TILE},
+    )
+    text, splats = config + native(header), struct_of(Projected)
+    scene = {"views": int, "num": int, "options": ProjectionParams, "scene": Scene}
+    colors = {"colors_per_view": int, "colors": wp.array2d[wp.float32]}
+    project = native_kernel(
+        "project",
+        "gamba::raster::project<Config>",
+        inputs={**scene, **colors},
+        outputs={"splats": splats},
+        header=text,
+    )
+    project_vjp = native_kernel(
+        "project_vjp",
+        "gamba::raster::project_vjp<Config>",
+        inputs={**scene, "splats": splats, "v_splats": splats},
+        outputs={"v_scene": Scene, "v_viewmats": wp.array3d[wp.float32]},
+        header=text,
+    )
+    return project, project_vjp
+
+
+def projection_kernels(
+    header: Path, run: int, params: ProjectionParams, scene: StructValue
+) -> tuple[Any, Any]:
+    """The kernels of the projection and of its gradient, of the kind that a launch needs.
+
+    Covariances and the original have theirs, for fewer registers.
+
+    Args:
+        header: a device's ``project.h``.
+        run: Gaussians of a task.
+        params: of the launch.
+        scene: the Gaussians and cameras, a ``Scene``.
+    """
+    return _kernels(header, run, scene.values[3] is not None, bool(params.original))
 
 
 def projection_params(options: ProjectionOptions) -> ProjectionParams:
