@@ -23,29 +23,18 @@ CHUNK = {"cpu": 64, "cuda": 128}
 # CUDA has none: a second level of sums costs registers there.
 RUN = 16
 AHEAD = 8  # tokens whose loads a CUDA thread has under way
+_INDICES = {False: "task, k", True: "k, task"}  # of a launch: adjacent memory follows last
 VALUES = {"cpu": (lanes, W), "cuda": (wp.vec4, 4)}  # type of a value, and its channels
 
 
-def _kernel(
-    direction: str,
-    device_type: str,
-    tokens: int,
-    transposed: bool,
-    inputs: dict[str, Any],
-    outputs: dict[str, Any],
-) -> Any:
-    """Return the kernel of a function of ``conv.h``, or where it is ``transposed`` of its twin."""
+def _source(direction: str, device_type: str, tokens: int, transposed: bool) -> tuple[str, str]:
+    """Return a function of ``conv.h``, or where it is ``transposed`` its twin, and the header."""
     on_cpu = device_type == "cpu"
-    header = native(Path(__file__).with_name(f"conv_{device_type}.h"))
     config = constants(
         "Config", TOKENS=tokens, RUN=RUN if on_cpu else 0, AHEAD=0 if on_cpu else AHEAD
     )
-    twin = "_transposed" if transposed else ""
-    call = f"gamba::conv::{direction}{twin}<Config>"
-    # adjacent memory follows the last dimension
-    indices = "k, task" if transposed else "task, k"
-    name, header = f"conv_{direction}", header + config
-    return native_kernel(name, call, inputs, outputs, header, indices, grouped=True)
+    header = native(Path(__file__).with_name(f"conv_{device_type}.h")) + config
+    return f"gamba::conv::{direction}{'_transposed' if transposed else ''}<Config>", header
 
 
 def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:
@@ -70,7 +59,9 @@ def forward_kernel(device_type: str, io: torch.dtype, transposed: bool) -> Any:
     piece = TRANSPOSED_STRIP if transposed else STRIP[device_type]
     inputs = {**_window(device_type, io), "stream": int}
     outputs = {"y_out": wp.array3d(dtype=WARP_DTYPES[io])}
-    return _kernel("forward", device_type, piece, transposed, inputs, outputs)
+    function, header = _source("forward", device_type, piece, transposed)
+    indices = _INDICES[transposed]
+    return native_kernel("conv_forward", function, inputs, outputs, header, indices, grouped=True)
 
 
 @functools.cache
@@ -83,4 +74,6 @@ def backward_kernel(device_type: str, io: torch.dtype, transposed: bool) -> Any:
     inputs = {**_window(device_type, io), "dout_in": rows}
     sums = wp.array3d(dtype=VALUES[device_type][0])
     outputs = {"dx_out": rows, "dstate_out": rows, "dweight_out": sums}
-    return _kernel("backward", device_type, CHUNK[device_type], transposed, inputs, outputs)
+    function, header = _source("backward", device_type, CHUNK[device_type], transposed)
+    indices = _INDICES[transposed]
+    return native_kernel("conv_backward", function, inputs, outputs, header, indices, grouped=True)

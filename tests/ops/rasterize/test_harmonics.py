@@ -7,11 +7,11 @@ import torch
 from helpers import assert_rel_rms, assert_same_on_threads
 
 from gamba_warp.kernels.rasterize.harmonics import (
+    autograd,
     colors_from_harmonics,
     colors_seen_from,
     cpu,
     cuda,
-    ops,
     sums_seen_from,
 )
 from gamba_warp.kernels.rasterize.harmonics.formula import (
@@ -28,7 +28,9 @@ FORWARD, GRADIENT = 3e-7, 1e-6
 @pytest.fixture(params=["cpu", "cuda"])
 def device(request, monkeypatch):
     """The kernels of both devices; those of CUDA have no blocks, so a CPU runs them as they are."""
-    monkeypatch.setattr(ops, "_kernels", lambda device: {"cpu": cpu, "cuda": cuda}[request.param])
+    monkeypatch.setattr(
+        autograd, "_kernels", lambda device: {"cpu": cpu, "cuda": cuda}[request.param]
+    )
     return request.param
 
 
