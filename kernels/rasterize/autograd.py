@@ -91,10 +91,8 @@ def _project_vjp(
     cotangents: List[Tensor],
     wanted: List[bool],
 ) -> List[Tensor]:
-    projection, viewmats = ProjectionOptions(*options), wanted[5]
-    on_lanes = kind_of(conics.device) == "cpu" and not (viewmats or projection.antialiased)
-    run = vjp_on_lanes if on_lanes else vjp_on_threads
-    params = projection_params(projection)
+    run = vjp_on_lanes if kind_of(conics.device) == "cpu" else vjp_on_threads
+    params = projection_params(ProjectionOptions(*options))
     grads = project_backward(inputs, params, conics, status, cotangents, wanted, run)
     return [g for g in grads if g is not None]
 

@@ -352,7 +352,7 @@ static inline void factor_gradient(
 // Gradients of Gaussians, summed over views.
 struct Gradients {
     F means[3] = {}, scales[3] = {}, covars[6] = {}, R[3][3] = {}, opacities = F{};
-    Mask ever = first(WIDTH == 1);  // those that have some; a thread's counts as such
+    Mask ever = Mask{};  // those that have some
 
     static void gather(F& to, F value, Mask seen) { to = seen ? to + value : to; }
 
@@ -409,11 +409,10 @@ struct Gradients {
             s[j] *= two;
             along += q[j] * s[j];
         }
-        if (Config::ORIGINAL) along = F{};
         // the gradient of a shorter one leaves float32's range
         const Mask some = ever & (Mask)(gaussians.length > 1e-30f);
         for (int j = 0; j < 4; ++j) {
-            if (!Config::ORIGINAL || WIDTH > 1) s[j] -= q[j] * along;  // 0 keeps a thread's -0
+            if (!Config::ORIGINAL) s[j] -= q[j] * along;
             v_quats[j] = some ? s[j] / gaussians.length : F{};
         }
     }
@@ -475,13 +474,14 @@ static void project_vjp(int task, int views, int num, const Options& options, co
         const size_t g = (size_t)run.object * num + i0;
         Gradients sums;
         Gaussians<Config> gaussians;
-        auto read = [&] { gaussians.read(scene, g, n), gaussians.rotate(); };
-        if (WIDTH == 1) read();
         for (int view = 0; view < views; ++view) {
             const size_t image = (size_t)run.object * views + view, i = image * num + i0;
             Upstream v(v_splats, splats.status.data, i, n, options.skip_unused);
             if (!any(v.seen)) continue;
-            if (!any(sums.ever)) read();
+            if (!any(sums.ever)) {
+                gaussians.read(scene, g, n);
+                gaussians.rotate();
+            }
             sums.ever |= v.seen;
             const Camera<Config> camera(scene, options, image);
             F t[3], slopes[2], J[2][2], P[2][3], N[2][3], M[2][3], conics[3];

@@ -2,8 +2,7 @@
 ``../project.h`` the code.
 
 Forward has a thread for each (view, Gaussian). The gradient has one for each Gaussian, which loops
-over its views: sums over views are then in a fixed order. A CPU runs the gradient here as well
-where that of viewmats or of antialiasing is needed.
+over its views: sums over views are then in a fixed order.
 """
 
 from pathlib import Path

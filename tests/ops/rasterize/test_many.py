@@ -163,9 +163,9 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     projected(gaussians, colors, radius_clip=1.5, antialiased=antialiased, rounded=rounded)
 
 
-@pytest.mark.parametrize("original", [0, 1])
+@pytest.mark.parametrize("original, antialiased", [(0, 0), (0, 1), (1, 0), (1, 1)])
 @pytest.mark.parametrize("shape", ["covars", "quats", "scales"])
-def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original):
+def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original, antialiased):
     """Also backward, and of covariances that rounding has made indefinite."""
     num = 331
     means, scales = torch.randn(2, num, 3), torch.exp(2 * torch.randn(2, num, 3) - 3.5)
@@ -177,14 +177,16 @@ def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original)
     covars[:, 30:35], covars[0, 35, 2] = 0.0, torch.nan
     given = {"covars": (None, None, covars), "quats": (quats, scales, None)}
     gaussians = means, *given.get(shape, (None, scales, None)), opacities
-    inputs, params, got = projected(gaussians, torch.rand(2, num, 3), original=original)
+    options = {"original": original, "antialiased": antialiased}
+    inputs, params, got = projected(gaussians, torch.rand(2, num, 3), **options)
     v = [torch.randn_like(x) for x in got[:4]]
-    wanted = [x is not None for x in gaussians] + [False]
+    wanted = [x is not None for x in gaussians] + [True]
     kept = [*gaussians, *inputs[-2:]], params, got.conics, got.status, v, wanted
     of_lanes, of_threads = (
         projection.project_backward(*kept, run) for run in (vjp_on_lanes, vjp_on_threads)
     )
-    for name, a, b in zip("means quats scales covars opacities".split(), of_lanes, of_threads):
+    names = "means quats scales covars opacities viewmats".split()
+    for name, a, b in zip(names, of_lanes, of_threads):
         assert (a is None and b is None) or (torch.equal(a, b) and (a != 0).any()), name
     alone = [True, *[False] * 5]
     for run in (vjp_on_lanes, vjp_on_threads):
@@ -219,9 +221,10 @@ def test_sums_of_rows(monkeypatch, channels):
     assert_same(call(scene), got)
 
 
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("rotated, unused", [(True, True), (False, True), (True, False)])
-def test_gradient_of_the_projection_on_lanes(rotated, unused):
-    """To the bit: with a gradient of viewmats the scalar kernel runs, without it the lanes."""
+def test_gradient_of_the_projection_on_lanes(monkeypatch, rotated, unused, mode):
+    """To the bit that on threads, also by viewmats."""
     scene = make(2, 3, 331, 45, 60, size=0.03)
     scene["means"][0, :40] *= 6  # beside the picture, where the slopes are clamped, or behind
     scene["means"][1, :9, 0] = torch.nan
@@ -232,13 +235,15 @@ def test_gradient_of_the_projection_on_lanes(rotated, unused):
     scene["skip"] = Skip(unused=unused)
     upstream = torch.randn(2, 3, 60, 45, 4)
     made = []
-    for with_viewmats in (True, False):
+    for run in (vjp_on_lanes, vjp_on_threads):
+        monkeypatch.setattr(autograd, "vjp_on_lanes", run)
         tensors = leaves(scene, torch.float32)
-        tensors["viewmats"].requires_grad_(with_viewmats)
-        renders = rasterization(**tensors, render_mode="RGB+ED")[0]
+        tensors["viewmats"].requires_grad_()
+        renders = rasterization(**tensors, render_mode="RGB+ED", rasterize_mode=mode)[0]
         renders.backward(upstream)
         made.append({k: tensors[k].grad for k in NAMES if isinstance(tensors[k], torch.Tensor)})
-    assert (made[0]["viewmats"] != 0).any() and made[1]["viewmats"] is None
+    assert torch.equal(made[1]["viewmats"], made[0]["viewmats"])
+    assert (made[0]["viewmats"] != 0).any()
     for name in ("means", "scales", "opacities", *(["quats"] if rotated else [])):
         assert torch.equal(made[1][name], made[0][name]), name
         assert (made[0][name] != 0).any(-1).float().mean() > 0.2, name
