@@ -136,7 +136,7 @@ struct Camera {
     }
 };
 
-// What Gaussians are in an image.
+// Gaussians in an image.
 struct Projected {
     F means2d[2] = {}, conics[3] = {splat(1.0f), F{}, splat(1.0f)}, extents[2] = {};
     F depths = F{}, opacities = F{};
@@ -205,18 +205,18 @@ static inline void project_covariance(const Options& options, const float* K, co
     if (options.antialiased)
         shown = opacities * larger(splat(Config::COMPENSATION_MIN), sqrt(det0 / det));
     const Mask bright = shown >= options.alpha_min;
-    I fate;
+    I culled;
     if (Config::ORIGINAL) {
         const Mask touches = square<Config>(options, x, y, sxx, sxy, syy, extents[0]);
-        fate = touches ? (bright ? I{} : I{} + Config::TRANSPARENT) : I{} + Config::OUTSIDE;
+        culled = touches ? (bright ? I{} : I{} + Config::TRANSPARENT) : I{} + Config::OUTSIDE;
         const Mask reaches = there & (Mask)(out.status == 0) & sound & touches;
         extents[0] = extents[1] = reaches ? extents[0] : F{};
     } else {
-        fate = box<Config>(options, x, y, sxx, syy, shown, extents);
-        if (options.antialiased) fate = bright ? fate : I{} + Config::TRANSPARENT;
+        culled = box<Config>(options, x, y, sxx, syy, shown, extents);
+        if (options.antialiased) culled = bright ? culled : I{} + Config::TRANSPARENT;
     }
-    fate = sound ? fate : I{} + Config::NOT_FINITE;
-    out.status = out.status == 0 ? fate : out.status;
+    culled = sound ? culled : I{} + Config::NOT_FINITE;
+    out.status = out.status == 0 ? culled : out.status;
     const Mask seen = there & (Mask)(out.status == 0);
     auto keep = [&](F v, float other) -> F { return seen ? v : splat(other); };
     out.means2d[0] = keep(x, 0.0f);

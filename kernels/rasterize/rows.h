@@ -7,7 +7,7 @@ static inline I finite(F a) { return abs(a) <= 3.402823466e38f; }
 // Rows of SIZE numbers as lanes, of which n <= 16 are read and written, and others are 0; loops of
 // constant length become loads and shuffles.
 template<int SIZE>
-static inline __attribute__((always_inline)) void load(const void* from, int n, F* v) {
+INLINE void load(const void* from, int n, F* v) {
     const float* const p = (const float*)from;
     float part[SIZE][16] = {};
     auto fill = [&](int count) {
@@ -19,7 +19,7 @@ static inline __attribute__((always_inline)) void load(const void* from, int n, 
     for (int k = 0; k < SIZE; ++k) v[k] = *(const F*)part[k];
 }
 template<int SIZE>
-static inline __attribute__((always_inline)) void store(void* to, int n, const F* v) {
+INLINE void store(void* to, int n, const F* v) {
     float* const p = (float*)to;
     float part[SIZE][16];
     for (int k = 0; k < SIZE; ++k) *(F*)part[k] = v[k];

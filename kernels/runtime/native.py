@@ -1,4 +1,4 @@
-"""C++ of the kernels: an operator's files as the text of native functions and CPU kernels.
+"""C++ of the kernels: headers as text, and kernels that are functions of them.
 
 The kernels of ``[B, L, D]`` hold sixteen adjacent channels as one SIMD value, in the compiler's
 vector types, which become AVX-512, AVX2 or NEON instructions (``lanes.h``).
@@ -21,29 +21,19 @@ from .views import is_transposed
 _INCLUDE = re.compile(r'^[ \t]*#include "(.+)"[ \t]*\n', re.MULTILINE)
 
 
-def native(path: Path, **defines: object) -> str:
-    """The text of a C++ file whose parameters are macros, defined before it and undefined after it.
+def native(path: Path) -> str:
+    """The text of a C++ header, with those that it includes in their place, each once.
 
-    Files that it includes stand in their place, each once, so that the text holds all that is
-    compiled: the hash of a Warp module, by which compiled kernels are saved, follows every file's
-    contents.
+    So the text holds all that is compiled: the hash of a Warp module, by which compiled kernels are
+    saved, follows every file's contents.
 
     Args:
         path: of the file; an ``#include "..."`` in it is relative to it.
-        **defines: macros; a bool is ``true`` or ``false``, a float has all its digits and an f.
 
     Raises:
         OSError: a file cannot be read.
     """
-    before = "".join(f"#define {name} {_literal(x)}\n" for name, x in defines.items())
-    after = "".join(f"#undef {name}\n" for name in defines)
-    return f"\n{before}{_read(path, set())}{after}"
-
-
-def _literal(x: object) -> str:
-    if isinstance(x, bool):
-        return str(x).lower()
-    return f"{x!r}f" if isinstance(x, float) else str(x)
+    return f"\n{_read(path, set())}"
 
 
 def _read(path: Path, seen: set[Path]) -> str:
@@ -59,12 +49,13 @@ def constants(name: str, **values: object) -> str:
 
     Args:
         name: of the struct.
-        **values: its members: numbers as for ``native``.
+        **values: its members, numbers or bools; a float keeps all its digits.
     """
 
     def member(key: str, x: object) -> str:
         kind = {bool: "bool", int: "int", float: "float"}[type(x)]
-        return f"    static constexpr {kind} {key} = {_literal(x)};\n"
+        literal = f"{x!r}f" if kind == "float" else str(x).lower()
+        return f"    static constexpr {kind} {key} = {literal};\n"
 
     return f"\nstruct {name} {{\n{''.join(member(*item) for item in values.items())}}};\n"
 

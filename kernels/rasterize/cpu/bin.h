@@ -129,10 +129,9 @@ static inline F log(F x) {
     return fma(floats(n), splat(0.69314718f), p * s);
 }
 
-// What the lists need of Gaussian i, each number ``stride`` after the one before.
+// The numbers of Gaussian i that the lists need, each number ``stride`` after the one before.
 template<class Splats>
-static inline __attribute__((always_inline)) void read(
-    const Splats& splats, int i, float* to, int stride) {
+INLINE void read(const Splats& splats, int i, float* to, int stride) {
     const float* const mean = (const float*)splats.means2d.data + (size_t)i * 2;
     const float* const conic = (const float*)splats.conics.data + (size_t)i * 3;
     const float* const extent = (const float*)splats.extents.data + (size_t)i * 2;

@@ -10,7 +10,7 @@ using namespace raster;
 typedef wp::array_t<float> Coefficients;           // [rows, K, D]
 typedef float A __attribute__((vector_size(64)));  // F as a template argument: not aligned to 4
 
-// What follows from a kernel's constants: of a row's K D floats the first FLOATS are used.
+// Constants that follow from Config's: of a row's K D floats the first FLOATS are used.
 template<class Config>
 struct Sizes : Config {
     static constexpr int COUNT = (Config::DEGREE + 1) * (Config::DEGREE + 1);
@@ -20,8 +20,7 @@ struct Sizes : Config {
 
 // Transposes the rows of ``live`` Gaussians: the i-th float of each becomes into[i].
 template<int FLOATS>
-static inline __attribute__((always_inline)) void load_rows(
-    const Coefficients& coefficients, size_t first, int live, F* into) {
+INLINE void load_rows(const Coefficients& coefficients, size_t first, int live, F* into) {
     const size_t length = coefficients.shape[1] * coefficients.shape[2];
     const float* const row = coefficients.data + first * length;
     const float* const stop = coefficients.data + (size_t)coefficients.shape[0] * length;
@@ -45,8 +44,7 @@ static inline __attribute__((always_inline)) void load_rows(
 
 // The inverse of load_rows, with zeros for unused coefficients.
 template<int FLOATS>
-static inline __attribute__((always_inline)) void store_rows(
-    const Coefficients& coefficients, size_t first, int live, const F* from) {
+INLINE void store_rows(const Coefficients& coefficients, size_t first, int live, const F* from) {
     const size_t length = coefficients.shape[1] * coefficients.shape[2];
     float* const row = coefficients.data + first * length;
     for (int o = 0; o < FLOATS; o += 16) {
@@ -63,8 +61,7 @@ static inline __attribute__((always_inline)) void store_rows(
 
 // From a centre to the means of the lanes: the length, and as t the direction, for which a length
 // below ``shortest`` is that.
-static inline __attribute__((always_inline)) F direction(
-    const F* mean, const float* center, float shortest, F* t) {
+INLINE F direction(const F* mean, const float* center, float shortest, F* t) {
     for (int i = 0; i < 3; ++i) t[i] = mean[i] - center[i];
     const F square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2];
     const F size = sqrt(square);
@@ -143,8 +140,7 @@ static inline I masked(const F* shown, F* v) {
 
 // README eq. 13: the gradient v_t from v, through the sums and the direction t of a length.
 template<class S>
-static inline __attribute__((always_inline)) void geometry_gradient(
-    const F* T, const F* v, const F* t, F length, I alive, A* v_t) {
+INLINE void geometry_gradient(const F* T, const F* v, const F* t, F length, I alive, A* v_t) {
     A s[S::COUNT];
 #pragma unroll(S::UNROLL)
     for (int k = 0; k < S::COUNT; ++k) {

@@ -22,9 +22,6 @@ struct Saved<false> {
     F m, h;
 };
 
-// As ``needs``, gradients that cost work inside the loops.
-enum { NEED_DZ = 1, NEED_DC = 2, NEED_DB = 4, NEED_DH = 8 };
-
 // The part of a strip that does not depend on the state n: as in the forward, with
 // dy = dout silu(z), and the slopes of the step and of the gate. Returns the largest |rate|.
 template<class Config, class In>
@@ -158,8 +155,8 @@ INLINE void recompute(Kind, const States& at, const Position& p, int needs, cons
     F *const dB = chunk.dB + n * TOKENS, *const dC = chunk.dC + n * TOKENS;
     if (p.j % Config::BLOCKS == 0)
         for (int t = 0; t < K * TOKENS; ++t) {
-            if (needs & NEED_DB) dB[t] = F{};
-            if (needs & NEED_DC) dC[t] = F{};
+            if (needs & Config::NEED_DB) dB[t] = F{};
+            if (needs & Config::NEED_DC) dC[t] = F{};
         }
     State hs[K];
 #pragma unroll
@@ -179,8 +176,9 @@ INLINE void recompute(Kind, const States& at, const Position& p, int needs, cons
             saved.m = State::saved_of(f, fm1, at.slow[k]), saved.h = h.value();
             if constexpr (Config::WEIGHTED) saved.g = g;
             h.step(f, fm1, g * (du * B_t[k]));
-            if (needs & NEED_DZ) y = fma(h.value(), splat(C_t[k]), y);
-            if (needs & NEED_DC) dC[k * TOKENS + t] = fma(dy, h.value(), dC[k * TOKENS + t]);
+            if (needs & Config::NEED_DZ) y = fma(h.value(), splat(C_t[k]), y);
+            if (needs & Config::NEED_DC)
+                dC[k * TOKENS + t] = fma(dy, h.value(), dC[k * TOKENS + t]);
         }
         token.y = y;
     }
@@ -214,7 +212,7 @@ INLINE void reverse(Kind, const States& at, const Position& p, int needs, int st
             const F v = dh.value();
             F gv = v;
             if constexpr (Config::WEIGHTED) gv = saved.g * v;
-            if (needs & NEED_DB) dB[k * TOKENS + t] = fma(gv, du, dB[k * TOKENS + t]);
+            if (needs & Config::NEED_DB) dB[k * TOKENS + t] = fma(gv, du, dB[k * TOKENS + t]);
             s = fma(gv, splat(b), s);
             F q;
             if constexpr (Config::WEIGHTED) {
@@ -335,12 +333,12 @@ static void backward(int task, const In& in, const Out& out) {
         F* const dh = work_of(p);
         const Chunk<Config> chunk = {token, saved, at(in.starts, row, p.k), dh, dh + 2 * states,
             sums, sums + states * TOKENS};
-        const int all = NEED_DZ | NEED_DC | NEED_DB | NEED_DH;
+        const int all = Config::NEED_DZ | Config::NEED_DC | Config::NEED_DB | Config::NEED_DH;
         auto visit = [&](auto kind, const auto& at) __attribute__((always_inline)) {
             const int needs = sizeof(at.A) == sizeof(F) ? in.sizes.needs : all;
             const Column B = column_of(in.B, p, at.n), C = column_of(in.C, p, at.n);
             recompute<Config>(kind, at, p, needs, B, C, chunk, fetches.next());
-            if (needs & NEED_DH)
+            if (needs & Config::NEED_DH)
                 reverse<Config>(kind, at, p, needs, states, B, C, chunk, fetches.next());
         };
         each_state<Config>(group, max_rate, in.sizes.needs == all, visit);
@@ -349,9 +347,9 @@ static void backward(int task, const In& in, const Out& out) {
             *at(out.dchannel, row, 0, p.k), *at(out.dchannel, row, 1, p.k));
         if (p.j % BLOCKS == BLOCKS - 1 || p.j == p.blocks - 1) {
             const size_t part = p.part + p.j / BLOCKS, size = (size_t)states * in.sizes.length;
-            if (in.sizes.needs & NEED_DB)
+            if (in.sizes.needs & Config::NEED_DB)
                 sum_lanes<Config>(p, states, in.sizes.length, chunk.dB, out.dB.data + part * size);
-            if (in.sizes.needs & NEED_DC)
+            if (in.sizes.needs & Config::NEED_DC)
                 sum_lanes<Config>(p, states, in.sizes.length, chunk.dC, out.dC.data + part * size);
         }
     };

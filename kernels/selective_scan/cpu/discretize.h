@@ -3,7 +3,7 @@
 #include "../../runtime/lanes.h"
 namespace gamba::scan {
 
-enum Discretization { MAMBA, BILINEAR, ZOH };
+enum Discretization { MAMBA, BILINEAR, ZOH };  // in the order of problem.DISCRETIZATIONS
 
 static inline I within(F x, float most) { return (x <= most) & (x >= -most); }
 

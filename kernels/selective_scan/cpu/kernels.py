@@ -93,6 +93,7 @@ class Kind(NamedTuple):
             CHUNK=tuning.chunk,
             AT_ONCE=tuning.back_at_once if gradient else tuning.at_once,
             BLOCKS=BLOCKS,
+            **NEEDS,
         )
         return config + native(_HERE / ("backward.h" if gradient else "forward.h"))
 

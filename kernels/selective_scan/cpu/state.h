@@ -60,7 +60,7 @@ struct States {
     F A[COUNT];
     I slow[COUNT];
 };
-// How they are computed: with ``State``, and as |x| <= 125 in all lanes or not.
+// The kind of their computation: with ``State``, and for |x| <= 125 in all lanes or for any x.
 template<class StateOf, bool RANGE>
 struct Kind {
     typedef StateOf State;

@@ -3,7 +3,7 @@
 // STATES of them (an outer product, so that values from shared memory are used more than once), and
 // LANES threads share a channel; for loads, stores and values of a channel, a thread has one
 // channel and every ROWS-th token, so that a warp touches adjacent addresses.
-// K is the struct of a kernel's constants: launch.py, ``BlockShape`` and where it makes the kernel.
+// K is the struct of a kernel's constants (kernels.py).
 #include "../../runtime/scalars.cuh"
 #include "discretize.cuh"
 namespace gamba::scan {

@@ -26,7 +26,7 @@ struct BackTile : Operands<K, K::TOKENS> {
     static constexpr int FLOATS = DC + K::NEED_DC * PRODUCTS;
     static constexpr int RECOMPUTING = 2 * Operands<K, RECOMPUTED>::SIZE;
     static_assert((FLOATS > RECOMPUTING ? FLOATS : RECOMPUTING) == K::SHARED,
-        "launch.py computes the size of shared memory");
+        "kernels.py computes the size of shared memory");
     // sums for dB and dC that a thread takes at a time
     static constexpr int EVERY = (K::NEED_DB + K::NEED_DC) * K::TOKENS * K::WIDTH;
     static constexpr int TAKEN = K::WIDTH % 4 == 0 && EVERY / 4 >= K::BLOCK ? 4
@@ -115,7 +115,7 @@ struct Matrix {
     }
 };
 
-// What a thread reads and writes of the tensors.
+// The tensors as a thread reads and writes them.
 template<class Number, class Delta, class Of>
 struct Tensors {
     Channel<Number> u, z, dout, du, dz;

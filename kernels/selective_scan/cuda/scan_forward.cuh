@@ -49,7 +49,7 @@ struct Tile : Operands<K, K::TOKENS> {
     static constexpr int LANE = K::TOKENS * K::SPAN + K::PAD;  // of Y
     static constexpr bool SUMS = K::OUTPUT && !K::SUMMARY;
     static constexpr int FLOATS = SUMS ? Y + K::LANES * LANE : C;
-    static_assert(2 * FLOATS == K::SHARED, "launch.py computes the size of shared memory");
+    static_assert(2 * FLOATS == K::SHARED, "kernels.py computes the size of shared memory");
 };
 
 // Equation 1 over a tile, and with outputs the sums of equation 5 for each lane. In REVERSE it is
