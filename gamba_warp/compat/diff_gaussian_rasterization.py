@@ -325,7 +325,7 @@ def rasterize_gaussians(
     shown = projected.view_opacities
     listed = torch.where(shown[..., None] > 0, projected.extents, 0.0)  # not the transparent ones
     splats = projected.means2d, projected.conics, projected.depths, shown, listed
-    bins = bin_op(*(s.detach() for s in splats), width, height, ALPHA_MIN, SKIP, True)
+    bins = bin_op(*(s.detach() for s in splats), width, height, ALPHA_MIN, SKIP)
     size = Size(width, height, 1, int(channels.dim() == 3), SKIP)
     drawn = centers, projected.conics, shown, channels
     given = list(bins), list(size), list(LIMITS), None, absolute

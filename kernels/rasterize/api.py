@@ -126,7 +126,7 @@ def rasterization(
     size = Size(width, height, x.viewmats.shape[-3], colors_per_view, skip.bits())
     limits = Limits(alpha_min, alpha_max, t_min)
     call = Call(Projected(*(x.detach() for x in projected)), size, limits)
-    bins = call.bins(exact=False)
+    bins = call.bins()
     tiles, compiling = bins.starts.numel() - 1, torch.compiler.is_compiling()
     skipped = None if compiling else bins.starts.new_zeros(tiles)
     drawn = projected.means2d, projected.conics, projected.view_opacities, channels

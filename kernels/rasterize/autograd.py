@@ -6,7 +6,6 @@ operator takes tensors and plain numbers only, so each named tuple comes as a li
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import List
 
 import torch
@@ -20,6 +19,7 @@ from .cpu import composite as composite_cpu
 from .cpu.project import project_on_lanes, vjp_on_lanes
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
+from .cuda.capacity import MAX_PAIRS
 from .cuda.project import project_on_threads, vjp_on_threads
 from .projection import (
     PROJECTED_SIZES,
@@ -44,7 +44,6 @@ from .tiles import (
 )
 
 _OP = "gamba_warp::rasterize_"
-MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 
 
 def _compositor(device: torch.device):
@@ -127,9 +126,8 @@ project = operator(project, "rasterization", _project_setup, _project_backward)
 _project_vjp = operator(_project_vjp, "rasterization")
 
 
-def _bin_views(device: torch.device, exact: bool) -> Callable[..., Bins]:
-    on_cpu = kind_of(device) == "cpu"
-    return bin_cpu.bin_views if on_cpu else partial(bin_cuda.bin_views, exact=exact)
+def _bin_views(device: torch.device) -> Callable[..., Bins]:
+    return bin_cpu.bin_views if kind_of(device) == "cpu" else bin_cuda.bin_views
 
 
 def _refuse_too_many(pairs: int) -> None:
@@ -151,12 +149,11 @@ def bin_op(
     height: int,
     alpha_min: float,
     skip: int,
-    exact: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Make the tile lists of all views, ``Bins``; on CUDA without waiting for the number of pairs.
+    """Make the tile lists of all views, ``Bins``; on CUDA the host waits for the number of pairs.
 
-    There the first call of a shape reads that number back, and later ones take the capacity that
-    was needed before: ``cuda/capacity.py``. The length of the lists is known only at run time.
+    A CUDA graph takes a capacity instead: ``cuda/capacity.py``. The length of the lists is known
+    only at run time.
 
     Args:
         means2d: ``[.., N, 2]``, and so on as ``project_forward`` returns them, of I views.
@@ -168,11 +165,9 @@ def bin_op(
         height: pixels.
         alpha_min: fainter contributions are not drawn.
         skip: from ``Skip.bits``.
-        exact: lists as long as there are pairs; on CUDA the number is read back for that.
 
     Raises:
-        ValueError: there are more than 2^31 - 1 pairs, or more tiles. On CUDA a number of pairs
-            that is not read back is not refused: the images are then made without lists.
+        ValueError: there are more than 2^31 - 1 pairs, or more tiles.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
     """
     given = means2d, conics, depths, view_opacities, extents
@@ -182,7 +177,7 @@ def bin_op(
     if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
         raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
     grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
-    b = _bin_views(depths.device, exact)(grid, splats, _refuse_too_many)
+    b = _bin_views(depths.device)(grid, splats, _refuse_too_many)
     return b.order, b.offsets, b.pairs, b.rows, b.starts, b.count
 
 

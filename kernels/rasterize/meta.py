@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .autograd import bin_op, composite
+from .autograd import bin_op
 from .constants import TILE
 from .projection import STATUS_NAMES, Projected
 from .tiles import Bins, Limits, Saved, Size, Tiling
@@ -29,20 +29,12 @@ class Call(NamedTuple):
         """The cut into tiles."""
         return Tiling(self.size.width, self.size.height)
 
-    def bins(self, exact: bool) -> Bins:
-        """The lists; ``exact`` sizes them to the pair count, which waits for the device."""
+    def bins(self) -> Bins:
+        """The lists."""
         s, size = self.splats, self.size
         splats = s.means2d, s.conics, s.depths, s.view_opacities, s.extents
         numbers = size.width, size.height, self.limits.alpha_min, size.skip
-        return Bins(*bin_op(*splats, *numbers, exact))
-
-    def listed(self) -> tuple[Bins, Saved]:
-        """The lists with all pairs, and what the compositor saved; this waits for the device."""
-        bins, s = self.bins(exact=True), self.splats
-        size = self.size._replace(colors_per_view=1)
-        drawn = s.means2d, s.conics, s.view_opacities, torch.ones_like(s.depths)[..., None]
-        _, _, *saved = composite(*drawn, list(bins), list(size), list(self.limits), None, None)
-        return bins, Saved(*saved)
+        return Bins(*bin_op(*splats, *numbers))
 
 
 class Meta(dict):
@@ -57,9 +49,8 @@ class Meta(dict):
     torch.compile.
     ``radii``, a tensor, is computed at the first look too.
 
-    On CUDA, where the lists of a call could not hold its pairs, they are made once more for these
-    counts, with enough capacity. A key keeps its first value; after the replay of a CUDA graph
-    ``bins.count``, a tensor, has the graph's number of pairs.
+    A key keeps its first value; after the replay of a CUDA graph ``bins.count``, a tensor, has the
+    graph's number of pairs.
 
     Attributes:
         tiling: the cut into tiles with which the lists were made.
@@ -80,9 +71,6 @@ class Meta(dict):
             return self[key]
         if key not in _COUNTS:
             raise KeyError(key)
-        of_pairs = key not in ("culled", "pairs_box", "pairs", "tiles")
-        if of_pairs and int(self.bins.count) > self.bins.pairs.numel():  # the lists were too short
-            self.bins, self._saved = self._call.listed()
         self[key] = _COUNTS[key](self.bins, self._saved, self._call)
         return self[key]
 

@@ -45,20 +45,8 @@ def _quantile(
     depth = wp.float32(0.0)
     k = lists_in.starts[tile]
     end = lists_in.starts[tile + 1]
-    # where the lists were too short, the list has all Gaussians of the view
-    listed = lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0])
-    if not listed:
-        k = image * grid.num
-        end = k + grid.num
     while k < end:
-        g = wp.int32(-1)
-        if listed:
-            g = lists_in.pairs[k]
-        elif lists_in.offsets[k] != lists_in.offsets[k + 1]:
-            g = lists_in.order[k]
-        if g < 0:
-            k += 1
-            continue
+        g = lists_in.pairs[k]
         conic = splats_in.conics[g]
         dy = float(y) + 0.5 - splats_in.means2d[g][1]
         dx = float(x) + 0.5 - splats_in.means2d[g][0] + conic[1] * dy

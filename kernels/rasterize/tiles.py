@@ -48,9 +48,8 @@ class Tiling(NamedTuple):
 class Bins(NamedTuple):
     """The lists of tiles: P pairs of (tile, Gaussian) in I views; int32 unless stated.
 
-    On CUDA the lists may be longer: ``count`` says how many pairs there are, and entries behind
-    them belong to no tile. If they are more than P, all lists are empty, and images use
-    ``order``, restricted to Gaussians that have pairs by ``offsets``. Then P >= I * N.
+    In a CUDA graph the lists may be longer: ``count`` says how many pairs there are, and entries
+    behind them belong to no tile. If they are more than P, all lists are empty and images NaN.
 
     Attributes:
         order: ``[I * N]`` view-major Gaussian indices in the order in which pairs are numbered:
@@ -77,8 +76,7 @@ class Saved(NamedTuple):
         transmittances: ``[blocks, 16]`` final T; negative where the pixel stopped early.
         stops: ``[blocks, 16]`` int32, the pair at which the pixel stopped.
         blocks: ``[P]`` int32, one bit for each block of the tile to which the pair contributed.
-        traversed: ``[tiles]`` int32, pairs until every pixel had stopped; on CUDA, where the
-            lists were too short, with a minus, and of all Gaussians of the view.
+        traversed: ``[tiles]`` int32, pairs until every pixel had stopped.
         blocks_traversed: ``[tiles]`` int64, blocks evaluated for these pairs.
         records: ``[I * N, record_size(C)]``, what CUDA reads of a Gaussian; empty on a CPU.
     """

@@ -176,18 +176,6 @@ def render_all(scene: Scene) -> dict[str, Tensor]:
     return made | dict(zip(leaves, grads))
 
 
-def check_no_wait(device: torch.device) -> None:
-    """Check that torch synchronises with the device in no rendering after the first."""
-    waits_for_nothing(partial(render_all, scene_of(700, 75, 3, {"render_mode": "RGB+D"}, device)))
-
-
-def check_step(device: torch.device) -> None:
-    """Check the same of a step of ``gamba train``."""
-    from gamba_warp.train.timing import Step  # it needs more packages than the other checks
-
-    waits_for_nothing(Step("rays", 2, device).run)
-
-
 def check_step_graph(device: torch.device) -> None:
     """Check a step that is repeated by a CUDA graph bit by bit against steps one by one."""
     from gamba_warp.train.timing import Step
@@ -202,19 +190,8 @@ def check_step_graph(device: torch.device) -> None:
         assert_same((ours,), (theirs,))
 
 
-def waits_for_nothing(run: Callable[[], Any]) -> None:
-    """Run a function twice, the second time with every synchronisation an error."""
-    run()
-    before = torch.cuda.get_sync_debug_mode()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        run()
-    finally:
-        torch.cuda.set_sync_debug_mode(before)
-
-
 def check_raster_graph(device: torch.device) -> list[int]:
-    """Check replays bit by bit, with changed sizes and with more pairs than the capacity.
+    """Check replays bit by bit with changed sizes; with more pairs than the capacity they are NaN.
 
     Returns the numbers of pairs.
     """
@@ -230,6 +207,8 @@ def check_raster_graph(device: torch.device) -> list[int]:
         replayed = {name: value.clone() for name, value in made.items()}
         found.append(int(replayed["pairs"]))
         if factor == 6.0:
-            assert lists_outgrown(), f"the lists have room for {found[-1]} pairs after {found[0]}"
-        assert_same(tuple(replayed.values()), tuple(render_all(scene).values()))
+            assert lists_outgrown(), f"the lists hold {found[-1]} pairs after {found[0]}"
+            assert replayed["renders"].isnan().all() and replayed["alphas"].isnan().all()
+        else:
+            assert_same(tuple(replayed.values()), tuple(render_all(scene).values()))
     return found

@@ -4,8 +4,6 @@ import pytest
 import torch
 from gpu import checks
 
-from gamba_warp.train import timing
-
 CPU = torch.device("cpu")
 
 
@@ -43,11 +41,19 @@ def graph(monkeypatch):
 
 
 def test_rendering(graph, monkeypatch):
-    graph()
+    counts = []
+
+    def spoil(made):  # as where the lists are too short
+        counts.append(int(made["pairs"]))
+        if counts[-1] > 1.5 * counts[0]:
+            made["renders"].fill_(torch.nan)
+            made["alphas"].fill_(torch.nan)
+
+    graph(spoil)
     pairs = checks.check_raster_graph(CPU)
-    assert pairs[2] > 1.5 * pairs[0] and pairs[2] > 1.5 * pairs[1]  # more than there is room for
+    assert pairs[2] > 1.5 * pairs[0] and pairs[2] > 1.5 * pairs[1]
     monkeypatch.setattr(checks, "lists_outgrown", lambda: False)
-    with pytest.raises(AssertionError, match="have room"):
+    with pytest.raises(AssertionError, match="the lists hold"):
         checks.check_raster_graph(CPU)
     graph(lambda made: made["quats"].mul_(1 + 1e-6))
     with pytest.raises(AssertionError, match="result 4 differs"):
@@ -60,25 +66,6 @@ def test_layer(graph):
     graph(lambda out: out[0, 0, 0].add_(1e-6))
     with pytest.raises(AssertionError, match="result 0 differs"):
         checks.check_layer_graph(CPU)
-
-
-@pytest.mark.parametrize("check", ["check_no_wait", "check_step"])
-def test_no_wait(monkeypatch, check):
-    """The first call may wait, the second one runs under torch's own watch, which is put back."""
-    modes, ran = ["default"], []
-
-    def run(*_):
-        ran.append(modes[-1])
-        if modes[-1] == "error":
-            raise RuntimeError("called a synchronizing CUDA operation")
-
-    monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
-    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", modes.append)
-    monkeypatch.setattr(checks, "render_all", run)
-    monkeypatch.setattr(timing.Step, "run", run)
-    with pytest.raises(RuntimeError, match="synchronizing"):
-        getattr(checks, check)(CPU)
-    assert ran == ["default", "error"] and modes[-1] == "default"
 
 
 def test_compiled():

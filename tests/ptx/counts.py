@@ -30,8 +30,6 @@ PAGE = Path(__file__).parents[2] / "docs" / "lab" / "benchmarks" / "counts.md"
 LENGTH, LANES = 16961, 32  # of the scan in the paper's model; of a warp
 # The executed part of it: whole chunks, two blocks of channels; one segment, or two for several.
 TOKENS, WIDTH, SEGMENTS = 1024, 128, 2
-# One ends at once where the lists have room, the other is a single thread.
-_LEFT_OUT = ("composite_unlisted", "composite_vjp_unlisted", "note")
 # By kernel, or for all (""), the unit of the counts: a text, and the number of units in warps.
 Units = dict[str, list[tuple[str, float]]]
 PER_GAUSSIAN: Units = {"": [("Gaussian, of a thread", GAUSSIANS / LANES)]}
@@ -93,7 +91,7 @@ def rows_of(op: str, case: str, seen: set[str]) -> Iterator[dict]:
     counted, found = CASES[op, case]()
     for direction, kernels in counted.items():
         for entry, ran in kernels.items():
-            if entry in seen or ran.name in _LEFT_OUT:
+            if entry in seen:
                 continue
             seen.add(entry)
             for unit, number in found.get(ran.name, found[""]):

@@ -194,8 +194,8 @@ STAGES = {
     ("projection", "forward"): ("project",),
     ("tile lists", "forward"): ("count", "emit", "in_tile_order"),
     ("projection", "gradient"): ("project_vjp",),
-    ("drawing", "forward"): ("record", "composite", "composite_unlisted"),
-    ("drawing", "gradient"): ("composite_vjp", "composite_vjp_unlisted", "add_rows"),
+    ("drawing", "forward"): ("record", "composite"),
+    ("drawing", "gradient"): ("composite_vjp", "add_rows"),
 }
 
 

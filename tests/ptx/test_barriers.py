@@ -6,7 +6,6 @@ from helpers import raster as rasters
 from helpers import scan as scans
 
 from gamba_warp.kernels.rasterize import rasterization
-from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
@@ -22,26 +21,18 @@ def scan(states):
     torch.autograd.grad(out.sum() + last.sum(), [*mine.values()])
 
 
-def picture(listed):
-    """Both directions; lists have room for what there is, or none at all."""
-    capacity._counts.clear()
+def picture():
+    """Both directions."""
     mine = rasters.leaves(rasters.crowded(), torch.float32)
-    if not listed:
-        rasterization(**mine)
-        for counts in capacity._counts.values():
-            for room in counts.shapes.values():
-                counts.on_host.numpy()[room.slot] = room.pairs = 0
     renders, alphas, _ = rasterization(**mine)
     (renders.square().sum() + alphas.sum()).backward()
-    capacity._counts.clear()
 
 
 CASES = {
     "scan": (lambda: scan(16), 132),
     "scan of many states": (lambda: scan(70), 132),
-    "picture": (lambda: picture(True), 0),
-    "picture of tiles in quarters": (lambda: picture(True), 132),
-    "picture without lists": (lambda: picture(False), 0),
+    "picture": (picture, 0),
+    "picture of tiles in quarters": (picture, 132),
 }
 
 

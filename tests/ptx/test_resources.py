@@ -45,7 +45,6 @@ BOUNDS = {
     ("raster", "record", "32 views"): (48, 0, 2000, 40),
     ("raster", "count", "32 views"): (64, 0, 2000, 32),
     ("raster", "emit", "32 views"): (64, 0, 2000, 32),
-    ("raster", "note", "32 views"): (32, 0, 2000, 48),
     ("raster", "add_rows", "32 views"): (72, 0, 2000, 28),
     ("raster", "quantile", "depth of a transmittance"): (64, 0, 2000, 32),
     # a row of up to 75 coefficients is on its way at once
@@ -56,8 +55,6 @@ BOUNDS = {
     ("raster", "composite", "32 views"): (80, 40, 3200, 24),
     ("raster", "composite", "1 view, a tile in quarters"): (80, 0, 3200, 24),
     ("raster", "composite", "32 views with depth"): (96, 8, 3200, 20),
-    ("raster", "composite_unlisted", "32 views"): (88, 48, 3200, 20),
-    ("raster", "composite_vjp_unlisted", "32 views"): (104, 32, 7600, 16),
     ("raster", "composite_vjp", "32 views"): (96, 8, 7600, 20),
     ("raster", "composite_vjp", "1 view, a tile in quarters"): (80, 0, 25000, 24),
     ("raster", "composite_vjp", "32 views with depth"): (128, 0, 7600, 16),
@@ -146,7 +143,7 @@ def test_the_choice_of_kernels_is_the_operators(entries):
     assert {e.launch.block for e in composites} == {32}
     directions = {e.name: e.direction for e in entries if e.op != "scan"}
     assert {n for n, d in directions.items() if d == "gradient"} == {
-        *("conv_backward", "composite_vjp", "composite_vjp_unlisted", "project_vjp"),
+        *("conv_backward", "composite_vjp", "project_vjp"),
         *("add_rows", "harmonics_vjp"),
     }
 

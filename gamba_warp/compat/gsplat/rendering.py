@@ -196,9 +196,7 @@ def rasterization(
         blended = torch.cat(parts, -1)
     tiling = Tiling(width, height)
     per_view = [x.flatten(0, 1).contiguous() for x in splats]
-    # Of exact length, because they are in meta.
-    numbers = width, height, ALPHA_MIN, SKIP, True
-    bins = Bins(*bin_op(*(x.detach() for x in per_view), *numbers))
+    bins = Bins(*bin_op(*(x.detach() for x in per_view), width, height, ALPHA_MIN, SKIP))
     layers = *per_view[:2], per_view[3], blended.flatten(0, -2).contiguous()
 
     def keep(values: Tensor) -> None:

@@ -1,8 +1,6 @@
-"""The CUDA compositor's gradient kernels: back to front over the pairs of a tile (README §5).
+"""The CUDA compositor's gradient kernel: back to front over the pairs of a tile (README §5).
 
-``composite_vjp`` leaves a row of sums for each pair. ``composite_vjp_unlisted`` does nothing unless
-the lists could not hold all pairs; then a warp traverses all tiles of its view, one after another,
-and adds their sums in rows of Gaussians: in the order in which ``reduce.py`` adds up rows of pairs.
+It leaves a row of sums for each pair.
 """
 
 import functools
@@ -33,7 +31,6 @@ from .warp import (
     staging,
     sync,
     sync_block,
-    touching,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -41,7 +38,7 @@ wp.set_module_options({"enable_backward": False})
 
 @struct
 class Rows:
-    """Outputs of a gradient's launch: rows of pairs or Gaussians, and marks of skipped tiles.
+    """Outputs of a gradient's launch: rows of pairs, and marks of skipped tiles.
 
     A row has for each chunk of channels the six moments, the two sums of absolute values if they
     are asked for, and the colours: the first eight of these numbers, a sector of memory, in
@@ -102,27 +99,21 @@ class Sums(NamedTuple):
 
 
 @functools.cache
-def _storing(asked: Sums, adding: bool):
-    """The function that stores a vector of a chunk of a row, or adds it to the stored values."""
+def _storing(asked: Sums):
+    """The function that stores a vector of a chunk of a row."""
     pitch = Sums(CHUNK, False, asked.absolute).tail()
 
     @wp.func
     @no_type_check
     def store(rows: Rows, row: wp.int32, first: wp.int32, vector: wp.int32, sums: wp.vec4):
-        total = wp.vec4(sums)
         if vector < wp.static(HEAD // 4):
             at = wp.int64(row) * wp.int64(rows.heads.shape[1])
             at += wp.int64(first) * wp.int64(HEAD // CHUNK) + wp.int64(vector) * wp.int64(4)
-            if wp.static(adding):
-                total += L.load4(rows.heads, at)
-            L.store4(rows.heads, at, total)
+            L.store4(rows.heads, at, sums)
         else:
             at = wp.int64(row) * wp.int64(rows.tails.shape[1])
             for c in range(wp.static(asked.tail())):
-                column = first / CHUNK * pitch + c
-                if wp.static(adding):
-                    total[c] += L.load(rows.tails, at, column)
-                L.store(rows.tails, at, column, total[c])
+                L.store(rows.tails, at, first / CHUNK * pitch + c, sums[c])
 
     return store
 
@@ -176,12 +167,8 @@ def _completing(asked: Sums, parts: int):
 
 
 @functools.cache
-def _traversal(asked: Sums, parts: int, listed: bool):
-    """The function that traverses a part of a tile.
-
-    Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
-    its pairs; pairs that a tile's own test excludes are removed from these.
-    """
+def _traversal(asked: Sums, parts: int):
+    """The function that traverses a part of a tile."""
     (channels, geometry, absolute, passes), moments = asked, asked.moments()
     size = asked.shared()
     memory = shared_memory(parts * size)
@@ -189,10 +176,10 @@ def _traversal(asked: Sums, parts: int, listed: bool):
     slots, leave, complete = _completing(asked, parts)
     together = sync if parts == 1 else sync_block
     vectors = asked.vectors()
-    store = _storing(asked, adding=not listed)
+    store = _storing(asked)
     every = channels == 0  # channels are read one by one, from the tensors
     absolute = absolute and geometry
-    touched, stage = touching(parts), staging(parts * size)
+    stage = staging(parts * size)
     pixels = SUB_TILES // parts  # how many a lane has
     part_blocks = (1 << 16 // parts) - 1
     part_stops = (1 << pixels) - 1
@@ -205,28 +192,6 @@ def _traversal(asked: Sums, parts: int, listed: bool):
         # the bits of a pair that belong to a part of the tile; for blocks only the wanted ones
         stops = bits >> (part * wp.static(pixels)) & wp.static(part_stops << STOP)
         return bits >> (part * wp.static(16 // parts)) & wanted | stops
-
-    @wp.func
-    @no_type_check
-    def of_tile(
-        params: RasterParams,
-        gaussians: Gaussians,
-        lists: struct_of(Bins),
-        p: LanePixels,
-        k: wp.int32,
-        bits: wp.int32,
-    ):
-        # of a pair's bits, which combine all tiles, only the ones within this tile's test
-        left = wp.int32(0)
-        if L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1):
-            g = L.load_int(lists.order, k)
-            at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
-            level = L.load4(gaussians.records, at + wp.int64(4))
-            mask = touched(p, L.load4(gaussians.records, at), level)
-            for j in range(wp.static(pixels)):
-                if (mask & wp.static(1 << j)) != 0:
-                    left |= bits & wp.static(3 << first_block(j) | 1 << (STOP + j))
-        return left
 
     @wp.func
     @no_type_check
@@ -244,12 +209,8 @@ def _traversal(asked: Sums, parts: int, listed: bool):
         p: LanePixels,
     ):
         base = p.part * wp.static(size)
-        if wp.static(listed):
-            begin = lists.starts[p.tile]
-            traversed = traversed_in[p.tile]
-        else:
-            begin = p.image * params.num
-            traversed = -traversed_in[p.tile]
+        begin = lists.starts[p.tile]
+        traversed = traversed_in[p.tile]
         # T is as forward left it, negative until the traversal reaches where the pixel stopped;
         # R is R of README eq. 10, plus the gradient of T_end, which is the same for all pairs
         T = pixels_type()
@@ -303,13 +264,8 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                 if (params.skip & UNUSED) == 0:
                     bits |= of_all
                 bits = of_part(bits, p.part, wanted)
-                if wp.static(not listed):
-                    bits = of_tile(params, gaussians, lists, p, k, bits)
                 if bits != 0:
-                    if wp.static(listed):
-                        g = L.load_int(lists.pairs, k)
-                    else:
-                        g = L.load_int(lists.order, k)
+                    g = L.load_int(lists.pairs, k)
                     at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
                     shape = L.load4(gaussians.records, at)
                     level = L.load4(gaussians.records, at + wp.int64(4))
@@ -319,7 +275,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                     else:
                         color = L.load4(gaussians.records, at + wp.int64(8 + gaussians.first))
                     stage(arena, base + p.lane * RECORD, shape, level, color, bits)
-                elif wp.static(parts > 1 or not listed):  # no sums, but some of another part's
+                elif wp.static(parts > 1):  # no sums, but some of another part's
                     for vector in range(3):
                         memory.put4(arena, base + p.lane * RECORD + 4 * vector, wp.vec4())
             waiting = wp.int32(0)
@@ -399,9 +355,7 @@ def _traversal(asked: Sums, parts: int, listed: bool):
             if k >= begin:
                 used = of_all & L.load_int(blocks, k)
             if used != 0:
-                row = k
-                if wp.static(listed):
-                    row = L.load_int(lists.rows, k)
+                row = L.load_int(lists.rows, k)
                 record = p.lane * RECORD
                 channel = L.opaque(gaussians.first)  # no registers hold what follows from it
                 for n in range(wp.static(len(vectors))):
@@ -411,9 +365,8 @@ def _traversal(asked: Sums, parts: int, listed: bool):
                             more = wp.static(part * size + 4 * vectors[n])
                             total += memory.get4(arena, record + more)
                         store(rows_out, row, channel, wp.static(vectors[n]), total)
-                if wp.static(listed):
-                    if p.part == 0:
-                        wp.atomic_or(rows_out.written, row >> 5, 1 << (row & 31))
+                if p.part == 0:
+                    wp.atomic_or(rows_out.written, row >> 5, 1 << (row & 31))
             if wp.static(parts > 1):
                 together()
             end -= WARP
@@ -422,18 +375,12 @@ def _traversal(asked: Sums, parts: int, listed: bool):
 
 
 @functools.cache
-def backward_kernels(asked: Sums, parts: int):
-    """The kernels for these sums and parts of a tile: 1, 2 or 4.
-
-    ``composite_vjp`` has a block for each tile, a warp for each part, and rows of pairs;
-    ``composite_vjp_unlisted`` a block for all tiles of a view, and rows of Gaussians, numbered as
-    ``lists_in.order``.
-    """
+def backward_kernel(asked: Sums, parts: int):
+    """The kernel for these sums: a block for each tile, a warp for each of its 1, 2 or 4 parts."""
     size, lane_pixels = parts * asked.shared(), pixels_of_lane(parts)
     warps = (24 if parts == 4 else 20) if asked.channels < 4 else 16  # as registers allow
     options = kernel_options(warps, parts)
-    traverse, traverse_unlisted = (_traversal(asked, parts, listed) for listed in (True, False))
-    store, vectors = _storing(asked, adding=False), asked.vectors()
+    traverse = _traversal(asked, parts)
 
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
@@ -462,43 +409,4 @@ def backward_kernels(asked: Sums, parts: int):
             p,
         )
 
-    @wp.kernel(enable_backward=False, **options)
-    @no_type_check
-    def composite_vjp_unlisted(
-        params: RasterParams,
-        gaussians_in: Gaussians,
-        lists_in: struct_of(Bins),
-        saved_in: struct_of(Saved),
-        v_pixels_in: Pixels,
-        rows_out: Rows,
-    ):
-        worker, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
-        image = worker // wp.static(parts)
-        tiles = params.tiles_x * params.tiles_y
-        if lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0]):
-            tiles = 0
-        elif worker % wp.static(parts) == 0:
-            # the tiles' sums are added to the rows
-            for g in range(lane, params.num, WARP):
-                row = image * params.num + g
-                for n in range(wp.static(len(vectors))):
-                    store(rows_out, row, gaussians_in.first, wp.static(vectors[n]), wp.vec4())
-        for tile in range(tiles):
-            tile += image * params.tiles_x * params.tiles_y
-            p = lane_pixels(params, tile * wp.static(parts) + worker % wp.static(parts), lane)
-            traverse_unlisted(
-                params,
-                gaussians_in,
-                lists_in,
-                saved_in.transmittances,
-                saved_in.stops,
-                saved_in.blocks,
-                saved_in.traversed,
-                v_pixels_in,
-                rows_out,
-                arena,
-                p,
-            )
-
-    return composite_vjp, composite_vjp_unlisted
+    return composite_vjp

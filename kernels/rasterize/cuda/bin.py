@@ -1,8 +1,7 @@
 """Tile lists on CUDA: a sort by depth, then counting, writing, and a stable sort by tile.
 
-The lists have a capacity above the number of pairs, so that nothing waits for the count; unused
-entries sort behind the last tile. If the capacity is too small, no pair is written and all lists
-are empty: then ``composite_unlisted`` makes the images.
+The lists are as long as there are pairs, but for a CUDA graph, whose lists have a capacity: unused
+entries sort behind the last tile. If it is too small, no pair is written and all lists are empty.
 """
 
 import functools
@@ -214,16 +213,13 @@ def _tile_kernels(number: Any):
     return emit, in_tile_order
 
 
-def bin_views(
-    grid: Grid, projected: Projected, check: Callable[[int], None], exact: bool = False
-) -> Bins:
-    """Make the lists as on the CPU; their capacity may exceed the number of pairs.
+def bin_views(grid: Grid, projected: Projected, check: Callable[[int], None]) -> Bins:
+    """Make the lists as on the CPU; in a CUDA graph they may be longer or too short.
 
     Args:
         grid: from ``make_grid``.
         projected: as the CPU's.
-        check: raises if there are too many; it is called only where the number is read back.
-        exact: True to read the number of pairs back and to make the lists as long.
+        check: raises if there are too many pairs.
     """
     depths = projected.depths
     device, images = depths.device, len(depths)
@@ -239,7 +235,7 @@ def bin_views(
     inputs = [grid, splats, nearest.view(-1)]
     launch(_count, num, inputs, [order, spans, counts], device)
     sums = counts.cumsum(0)
-    size = _list_capacity(grid, depths, sums[-1:], check, exact)
+    size = _list_size(grid, depths, sums[-1:], check)
     tiles = images * grid.tiles_x * grid.tiles_y
     # a sort of 16 bits takes half as long as one of 32
     short = tiles < 1 << 16
@@ -259,29 +255,12 @@ def bin_views(
     return Bins(order, offsets, pairs, rows, starts, count.view(()))
 
 
-def _list_capacity(
-    grid: Grid, depths: Tensor, count: Tensor, check: Callable[[int], None], exact: bool
-) -> int:
-    """Return the lists' capacity; waits for the device if ``exact`` or if the shape is new."""
-    device, (images, num) = depths.device, depths.shape
-    # similar numbers of Gaussians share a capacity: some models change theirs in each call
-    shape = images, capacity.rounded_up(num), grid.width, grid.height, grid.shift
-    key = (*shape, grid.skip & TILE_TEST)
-    known = None if exact else capacity.find(key, device)
-    capturing = capacity.is_capturing(device)
-    if known is None:
-        if capturing:
-            raise RuntimeError(
-                "a CUDA graph cannot capture shapes that were never rendered: run the same "
-                "call once before the capture, as torch requires of all captured work"
-            )
-        total = int(count)
-        check(total)
-        if exact:
-            return total
-        known = capacity.add_shape(key, device, total)
-    pairs = max(known.pairs, depths.numel())
-    if capturing:
-        capacity.add_graph(known, pairs)
-    capacity.add_count(known, count)
-    return pairs
+def _list_size(grid: Grid, depths: Tensor, count: Tensor, check: Callable[[int], None]) -> int:
+    """Return the length of the lists: the number of pairs, for which this waits, or a capacity."""
+    key = *depths.shape, grid.width, grid.height, grid.skip & (TILE_TEST | SQUARES)
+    if capacity.is_capturing(depths.device):
+        return capacity.graph_capacity(key, count)
+    total = int(count)
+    check(total)
+    capacity.note_count(key, depths.device, total)
+    return total

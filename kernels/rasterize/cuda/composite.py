@@ -1,11 +1,11 @@
 """Compositing on CUDA: launches of one warp per tile of 16 x 16 pixels, or per part of one.
 
 Channels go in chunks of at most four: a chunk is a launch, and has its own sums for the geometry's
-gradient. Sums are written per pair and reduced by Gaussian afterwards: no atomics. A second launch
-of each replaces lists that were too short, and else ends at once. README.md §3 and §5 hold the
-maths, CUDA.md the design.
+gradient. Sums are written per pair and reduced by Gaussian afterwards: no atomics. README.md §3 and
+§5 hold the maths, CUDA.md the design.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,8 +17,9 @@ from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import StructValue, as_struct
 from ..constants import BLOCKS
 from ..tiles import CHUNK, Bins, Pixels, RasterParams, Saved, Splats2D
-from .backward import Rows, Sums, backward_kernels, row_sizes
-from .forward import forward_kernels
+from . import capacity
+from .backward import Rows, Sums, backward_kernel, row_sizes
+from .forward import forward_kernel
 from .records import Gaussians, make_records
 from .reduce import reduce_rows
 from .warp import WARP
@@ -36,8 +37,8 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
 
 
 def _launch(
-    kernels: Callable[[int], tuple[Any, Any]],
-    warps: tuple[int, int],
+    kernel: Callable[[int], Any],
+    warps: int,
     params: RasterParams,
     records: Tensor,
     channels: int,
@@ -46,15 +47,14 @@ def _launch(
     block: int = 1,
     chunk: int = CHUNK,
 ) -> None:
-    """Launches both ``kernels`` of each chunk of channels, with so many warps, some a block."""
-    for first in range(0, channels if warps[0] else 0, chunk):
+    """Launches the ``kernel`` of each chunk of channels, with so many warps, some a block."""
+    for first in range(0, channels if warps else 0, chunk):
         gaussians = StructValue(Gaussians, records, channels, first)
-        for kernel, count in zip(kernels(min(chunk, channels - first)), warps):
-            arguments = [params, gaussians, *inputs]
-            threads = WARP * block
-            cuda_launch(
-                kernel, (count, WARP), arguments, outputs, device=records.device, block_dim=threads
-            )
+        arguments = [params, gaussians, *inputs]
+        made, threads = kernel(min(chunk, channels - first)), WARP * block
+        cuda_launch(
+            made, (warps, WARP), arguments, outputs, device=records.device, block_dim=threads
+        )
 
 
 def composite_forward(
@@ -80,14 +80,18 @@ def composite_forward(
         records=make_records(splats, params),
     )
     _launch(
-        lambda count: forward_kernels(count, parts),
-        (tiles * parts, tiles * parts),
+        lambda count: forward_kernel(count, parts),
+        tiles * parts,
         params,
         saved.records,
         channels,
         [as_struct(bins)],
         [as_struct(saved), StructValue(Pixels, renders, transmittances)],
     )
+    if capacity.is_capturing(colors.device):  # a replay with too many pairs must not pass for right
+        short = bins.count > bins.pairs.numel()
+        renders.masked_fill_(short, math.nan)
+        transmittances.masked_fill_(short, math.nan)
     return renders, transmittances, saved
 
 
@@ -114,7 +118,7 @@ def composite_backward(
     # a pixel's absolute gradient is of all channels: several chunks leave it to another launch
     apart = absolute is not None and channels > CHUNK
     given = (
-        (tiles * parts, splats.means2d.shape[:-2].numel() * parts),
+        tiles * parts,
         params,
         saved.records,
         channels,
@@ -123,7 +127,7 @@ def composite_backward(
         parts,
     )
     flags = geometry and not apart, absolute is not None, passes
-    _launch(lambda count: backward_kernels(Sums(count, *flags), parts), *given)
+    _launch(lambda count: backward_kernel(Sums(count, *flags), parts), *given)
     if apart:
-        _launch(lambda _: backward_kernels(Sums(0, True, True, passes), parts), *given, channels)
+        _launch(lambda _: backward_kernel(Sums(0, True, True, passes), parts), *given, channels)
     return reduce_rows(rows, splats, bins, geometry, absolute)

@@ -1,8 +1,4 @@
-"""The CUDA compositor's forward kernels: front to back over the pairs of a tile (README §3).
-
-``composite`` traverses the lists of the tiles. ``composite_unlisted`` does nothing unless these
-could not hold all pairs; then it traverses all Gaussians of the view for each tile, in that order.
-"""
+"""The CUDA compositor's forward kernel: front to back over the pairs of a tile (README §3)."""
 
 import functools
 from typing import no_type_check
@@ -40,13 +36,8 @@ _SIZE = _MASKS + WARP
 
 
 @functools.cache
-def _traversal(channels: int, parts: int, listed: bool):
-    """The function that traverses the pairs of a tile's part.
-
-    Unless ``listed``, the tiles of a view share one list of all its Gaussians, in which ``offsets``
-    says where the pairs of each would begin, if the lists held them. Bits of tiles are then joined,
-    and numbers of traversed pairs are stored negated, which marks them for the gradient.
-    """
+def _traversal(channels: int, parts: int):
+    """The function that traverses the pairs of a tile's part."""
     memory = shared_memory(_SIZE)
     arena_type = memory.arena
     lane_pixels, touched, stage = pixels_of_lane(parts), touching(parts), staging(_SIZE)
@@ -57,8 +48,8 @@ def _traversal(channels: int, parts: int, listed: bool):
     @wp.func
     @no_type_check
     def leave(blocks: wp.array[wp.int32], k: wp.int32, part: wp.int32, mine: wp.int32):
-        # stores the bits of a pair, or combines them over the parts or tiles that share it
-        if wp.static(parts == 1 and listed):
+        # stores the bits of a pair, or combines them over the parts that share it
+        if wp.static(parts == 1):
             L.store_int(blocks, k, mine)
         else:
             shift_used = part * wp.static(16 // parts)
@@ -78,12 +69,8 @@ def _traversal(channels: int, parts: int, listed: bool):
         arena: arena_type,
         p: LanePixels,
     ):
-        if wp.static(listed):
-            k0 = lists.starts[p.tile]
-            end = lists.starts[p.tile + 1]
-        else:
-            k0 = p.image * params.num
-            end = k0 + params.num
+        k0 = lists.starts[p.tile]
+        end = lists.starts[p.tile + 1]
         half = p.lane // 4 % 2  # which of a sub-tile's two blocks of 4 x 4 pixels
         # T is positive where a pixel continues, negative where it stopped, 0 outside of the image
         T = pixels_type()
@@ -102,11 +89,7 @@ def _traversal(channels: int, parts: int, listed: bool):
             # each lane tests one of the next 32 Gaussians; past the end, the last one
             k = wp.min(k0 + p.lane, end - 1)
             seen = k == k0 + p.lane
-            if wp.static(listed):
-                g = L.load_int(lists.pairs, k)
-            else:
-                g = L.load_int(lists.order, k)
-                seen = seen and L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1)
+            g = L.load_int(lists.pairs, k)
             at = wp.int64(g) * wp.int64(gaussians.records.shape[1])
             shape = L.load4(gaussians.records, at)
             level = L.load4(gaussians.records, at + wp.int64(4))
@@ -183,10 +166,7 @@ def _traversal(channels: int, parts: int, listed: bool):
         # recomputed, so that no registers hold the lane's pixels during the traversal
         p = lane_pixels(params, L.opaque(p.index), p.lane)
         if p.lane == 0:
-            if wp.static(listed):
-                wp.atomic_max(saved_out.traversed, p.tile, end - lists.starts[p.tile])
-            else:
-                wp.atomic_min(saved_out.traversed, p.tile, p.image * params.num - end)
+            wp.atomic_max(saved_out.traversed, p.tile, end - lists.starts[p.tile])
         if evaluated != 0 and gaussians.first == 0:
             wp.atomic_add(saved_out.blocks_traversed, p.tile, wp.int64(evaluated))
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
@@ -203,18 +183,10 @@ def _traversal(channels: int, parts: int, listed: bool):
 
 
 @functools.cache
-def forward_kernels(channels: int, parts: int):
-    """The kernels for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
-
-    ``composite`` traverses the lists of tiles; ``composite_unlisted`` makes the images where the
-    lists are too short.
-    """
+def forward_kernel(channels: int, parts: int):
+    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4."""
     options = kernel_options(24 if channels < 4 else 20)  # as many warps as the registers allow
-    lane_pixels = pixels_of_lane(parts)
-    traverse, traverse_unlisted = (
-        _traversal(channels, parts, True),
-        _traversal(channels, parts, False),
-    )
+    lane_pixels, traverse = pixels_of_lane(parts), _traversal(channels, parts)
 
     @wp.kernel(enable_backward=False, **options)
     @no_type_check
@@ -230,19 +202,4 @@ def forward_kernels(channels: int, parts: int):
         p = lane_pixels(params, index, lane)
         traverse(params, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
 
-    @wp.kernel(enable_backward=False, **options)
-    @no_type_check
-    def composite_unlisted(
-        params: RasterParams,
-        gaussians_in: Gaussians,
-        lists_in: struct_of(Bins),
-        saved_out: struct_of(Saved),
-        pixels_out: Pixels,
-    ):
-        index, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
-        if lists_in.count[0] > wp.int64(lists_in.pairs.shape[0]):
-            p = lane_pixels(params, index, lane)
-            traverse_unlisted(params, gaussians_in, lists_in, saved_out, pixels_out, arena, p)
-
-    return composite, composite_unlisted
+    return composite

@@ -1,8 +1,4 @@
-"""Sums of rows by Gaussian on CUDA: bitwise repeatable, no atomics, the same without lists.
-
-Rows are added up first, then the chunks of channels: so the bits are the same for rows written pair
-by pair and for rows that the compositor has added.
-"""
+"""Sums of rows by Gaussian on CUDA: bitwise repeatable, no atomics."""
 
 from typing import no_type_check
 
@@ -26,7 +22,6 @@ def _add_rows(
     offset: wp.int32,
     order_in: wp.array[wp.int32],
     offsets_in: wp.array[wp.int32],
-    count_in: wp.array[wp.int64],
     rows_in: Rows,
     splats_in: struct_of(Projected),
     v_splats_out: struct_of(Projected),
@@ -38,11 +33,6 @@ def _add_rows(
     begin = offsets_in[j]
     end = offsets_in[j + 1]
     drawn = begin != end
-    listed = count_in[0] <= wp.int64(rows_in.heads.shape[0])
-    if not listed:
-        # rows of Gaussians, written where they have pairs
-        end = j + wp.where(drawn, 1, 0)
-        begin = j
     low = wp.vec4()  # h, hu, hy, huu
     high = wp.vec4()  # huy, hyy, and the sums of absolute values or colours
     tail_at = wp.int32(0)
@@ -55,7 +45,7 @@ def _add_rows(
         if not absolute_out:
             tails -= 2  # as the head has two colours, in place of the sums of absolute values
         for p in range(begin, end):
-            if listed and (L.load_int(rows_in.written, p >> 5) >> (p & 31) & 1) == 0:
+            if (L.load_int(rows_in.written, p >> 5) >> (p & 31) & 1) == 0:
                 continue
             at = wp.int64(p) * wp.int64(rows_in.heads.shape[1]) + head_at
             low_of += L.load4(rows_in.heads, at)
@@ -94,8 +84,7 @@ def reduce_rows(
     """Sum rows by (view, Gaussian), as the CPU's; all rows are written.
 
     Args:
-        rows: ``Rows`` of pairs, or where the lists were too short, of Gaussians in the order of
-            ``bins.order``.
+        rows: ``Rows`` of pairs.
         splats: as forward, like the lists.
         bins: of the pairs.
         geometry: True to compute more than the gradient of the colours.
@@ -113,7 +102,7 @@ def reduce_rows(
         _add_rows,
         bins.order.numel(),
         [
-            *(bins.order, bins.offsets, bins.count.view(1), rows),
+            *(bins.order, bins.offsets, rows),
             as_struct(Projected(conics=conics, view_opacities=view_opacities)),
         ],
         [

@@ -1,7 +1,5 @@
 """The CPU's tile lists, sorted by view or tile by tile, and the kernels that go with them."""
 
-from functools import partial
-
 import pytest
 import torch
 from helpers import on_threads
@@ -42,8 +40,7 @@ def assert_same(want, got):
 def assert_lists(monkeypatch, scene, **options):
     """Lists sorted before they are written or after are those of CUDA's scalar kernels."""
     with monkeypatch.context() as patch:
-        scalar = partial(bin_cuda.bin_views, exact=True)
-        patch.setattr(autograd, "_bin_views", lambda device, exact: scalar)
+        patch.setattr(autograd, "_bin_views", lambda device: bin_cuda.bin_views)
         want = call(scene, **options)
     for many in (1 << 30, 0):
         monkeypatch.setattr(bin_cpu, "MANY", many)
@@ -80,7 +77,7 @@ def test_lists_of_a_wide_picture():
     )
     grid = make_grid(Tiling(width, height), num=num, alpha_min=1 / 255, skip=TILE_TEST)
     want = bin_cpu.bin_views(grid, splats, lambda count: None)
-    got = bin_cuda.bin_views(grid, splats, lambda count: None, exact=True)
+    got = bin_cuda.bin_views(grid, splats, lambda count: None)
     assert want.count == got.count > 32768
     for name in LISTS:
         assert torch.equal(getattr(got, name), getattr(want, name)), name
