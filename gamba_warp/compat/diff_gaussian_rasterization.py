@@ -326,9 +326,9 @@ def rasterize_gaussians(
     listed = torch.where(shown[..., None] > 0, projected.extents, 0.0)  # not the transparent ones
     splats = projected.means2d, projected.conics, projected.depths, shown, listed
     bins = bin_op(*(s.detach() for s in splats), width, height, ALPHA_MIN, SKIP)
-    size = Size(width, height, 1, int(channels.dim() == 3), SKIP)
+    size = Size(width, height, 1, channels.dim() == 3, SKIP)
     drawn = centers, projected.conics, shown, channels
-    given = list(bins), list(size), list(LIMITS), None, absolute
+    given = list(bins), None, absolute, *size, *LIMITS
     renders, transmittances, *_ = composite(*drawn, *given)
     layers = renders[0].permute(2, 0, 1)
     clear = transmittances[0].permute(2, 0, 1)
@@ -364,10 +364,10 @@ def _project(
     options = ProjectionOptions(
         settings.image_width, settings.image_height, NEAR, float("inf"), 0.0, EPS2D, ALPHA_MIN,
         bool(settings.antialiasing), skip_unused=True, original=True,
-    ).numbers()  # fmt: skip
+    )  # fmt: skip
     shapes = x.get("rotations"), scales, x.get("cov3D_precomp")
     gaussians = x["means3D"], *shapes, x["opacities"].flatten()
-    return Projected(*project(*gaussians, colors.detach(), viewmat, K, options))
+    return Projected(*project(*gaussians, colors.detach(), viewmat, K, *options))
 
 
 def _plain(settings: GaussianRasterizationSettings) -> GaussianRasterizationSettings:

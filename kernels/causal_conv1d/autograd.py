@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
+from ..runtime import gpu
 from ..runtime.launch import launch
 from ..runtime.memory import empty_like
 from ..runtime.native import streams
 from ..runtime.operator import operator
 from ..runtime.packed import count_slots, pieces
-from ..runtime.stand_in import kind_of
 from ..runtime.views import dense, is_transposed, laid_as, lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, TRANSPOSED_STRIP, VALUES, backward_kernel, forward_kernel
 
@@ -35,7 +35,7 @@ def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
 
 def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None):
     """Channels padded to whole values, views of the parameters, and the state's three rows."""
-    value, width = VALUES[kind_of(x.device)]
+    value, width = VALUES[gpu.kind_of(x.device)]
     blocks = -(-x.shape[2] // width)
     shape = (width,) if width > 1 else ()
     w = _pack(weight, TAPS, blocks * width, x).view(TAPS, blocks, *shape)
@@ -67,7 +67,7 @@ def conv(x, weight, bias, state, packed, silu):
 
     ``packed`` are the sequences (``runtime.packed``), or None.
     """
-    kind = kind_of(x.device)
+    kind = gpu.kind_of(x.device)
     x = dense(x)
     transposed = is_transposed(x)
     strips, where = _pieces(x, packed, TRANSPOSED_STRIP if transposed else STRIP[kind])
@@ -93,7 +93,7 @@ def _(x, weight, bias, state, packed, silu):
 def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     need_x, need_weight, need_bias, need_state = needs
     batch, length, channels = x.shape
-    kind = kind_of(x.device)
+    kind = gpu.kind_of(x.device)
     chunks, where = _pieces(x, packed, CHUNK[kind])
     x, dout = dense(x), dense(dout)
     transposed = is_transposed(x) or is_transposed(dout)

@@ -117,12 +117,12 @@ def rasterization(
         width=width, height=height, near_plane=near_plane, far_plane=far_plane,
         radius_clip=radius_clip, eps2d=eps2d, alpha_min=alpha_min,
         antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
-    ).numbers()  # fmt: skip
+    )  # fmt: skip
     # colours only cull here, so their gradient does not require the geometry's
     gaussians = x.means, x.quats, x.scales, None, x.opacities
-    projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, projection))
+    projected = Projected(*project(*gaussians, colors.detach(), x.viewmats, x.Ks, *projection))
     channels = _channels(render_mode, colors, projected.depths)
-    colors_per_view = int(channels.dim() > x.means.dim())
+    colors_per_view = channels.dim() > x.means.dim()
     size = Size(width, height, x.viewmats.shape[-3], colors_per_view, skip.bits())
     limits = Limits(alpha_min, alpha_max, t_min)
     call = Call(Projected(*(x.detach() for x in projected)), size, limits)
@@ -130,8 +130,8 @@ def rasterization(
     tiles, compiling = bins.starts.numel() - 1, torch.compiler.is_compiling()
     skipped = None if compiling else bins.starts.new_zeros(tiles)
     drawn = projected.means2d, projected.conics, projected.view_opacities, channels
-    lists = list(bins), list(size), list(limits)
-    renders, transmittances, *saved = composite(*drawn, *lists, skipped, None)
+    given = list(bins), skipped, None, *size, *limits
+    renders, transmittances, *saved = composite(*drawn, *given)
     renders = _finish(render_mode, renders, transmittances, x.backgrounds)
     meta = Meta(call, bins, Saved(*saved), skipped)
     # under gsplat's names

@@ -1,18 +1,18 @@
 """The three registered operators and their gradients: project, bin, composite.
 
 They hold no arithmetic: each calls the launchers of its file. ``api.py`` joins them. An
-operator takes tensors and plain numbers only, so each named tuple comes as a list of its values.
+operator takes tensors and plain numbers only, so a named tuple comes as its values.
 """
 
 import math
-from collections.abc import Callable
-from typing import List
+from collections.abc import Callable, Sequence
+from typing import get_type_hints
 
 import torch
 from torch import Tensor
 
+from ..runtime import gpu
 from ..runtime.operator import operator
-from ..runtime.stand_in import kind_of
 from .constants import BLOCKS
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
@@ -33,7 +33,6 @@ from .skip import UNASKED
 from .tiles import (
     Bins,
     Limits,
-    RasterParams,
     Saved,
     Size,
     Splats2D,
@@ -47,79 +46,78 @@ _OP = "gamba_warp::rasterize_"
 
 
 def _compositor(device: torch.device):
-    return composite_cpu if kind_of(device) == "cpu" else composite_cuda
+    return composite_cpu if gpu.kind_of(device) == "cpu" else composite_cuda
 
 
 def _projector(device: torch.device) -> Callable[..., None]:
-    return project_on_lanes if kind_of(device) == "cpu" else project_on_threads
+    return project_on_lanes if gpu.kind_of(device) == "cpu" else project_on_threads
 
 
-@torch.library.custom_op(_OP + "project", mutates_args=())
-def project(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    options: List[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """``project_forward`` as an operator, with the numbers of ``ProjectionOptions``."""
+def _schema(record: type) -> str:
+    """The fields of a named tuple of numbers, as arguments of an operator."""
+    return ", ".join(f"{kind.__name__} {name}" for name, kind in get_type_hints(record).items())
+
+
+@torch.library.custom_op(
+    _OP + "project",
+    mutates_args=(),
+    schema="(Tensor means, Tensor? quats, Tensor? scales, Tensor? covars, Tensor opacities, "
+    f"Tensor colors, Tensor viewmats, Tensor Ks, {_schema(ProjectionOptions)})"
+    " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
+)
+def project(means, quats, scales, covars, opacities, colors, viewmats, Ks, *options):
+    """``project_forward`` as an operator; the options are those of ``ProjectionOptions``."""
     inputs = means, quats, scales, covars, opacities, colors, viewmats, Ks
-    p = project_forward(
-        inputs, projection_params(ProjectionOptions(*options)), _projector(means.device)
-    )
+    params = projection_params(ProjectionOptions(*options))
+    p = project_forward(inputs, params, _projector(means.device))
     return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
 @project.register_fake
-def _(means, quats, scales, covars, opacities, colors, viewmats, Ks, options):
+def _(means, quats, scales, covars, opacities, colors, viewmats, Ks, *options):
     shape = (*viewmats.shape[:-2], means.shape[-2])
     floats = tuple(means.new_empty(*shape, *size) for size in PROJECTED_SIZES)
     return *floats, means.new_empty(shape, dtype=torch.int32)
 
 
-@torch.library.custom_op(_OP + "project_vjp", mutates_args=())
-def _project_vjp(
-    inputs: List[Tensor | None],
-    options: List[float],
-    conics: Tensor,
-    status: Tensor,
-    cotangents: List[Tensor],
-    wanted: List[bool],
-) -> List[Tensor]:
-    run = vjp_on_lanes if kind_of(conics.device) == "cpu" else vjp_on_threads
+@torch.library.custom_op(
+    _OP + "project_vjp",
+    mutates_args=(),
+    schema="(Tensor?[] inputs, Tensor conics, Tensor status, Tensor[] cotangents, bool[] wanted, "
+    f"{_schema(ProjectionOptions)}) -> Tensor[]",
+)
+def _project_vjp(inputs, conics, status, cotangents, wanted, *options):
+    run = vjp_on_lanes if gpu.kind_of(conics.device) == "cpu" else vjp_on_threads
     params = projection_params(ProjectionOptions(*options))
     grads = project_backward(inputs, params, conics, status, cotangents, wanted, run)
     return [g for g in grads if g is not None]
 
 
 @_project_vjp.register_fake
-def _(inputs, options, conics, status, cotangents, wanted):
+def _(inputs, conics, status, cotangents, wanted, *options):
     return [torch.empty_like(x) for x, want in zip(inputs[:6], wanted) if want]
 
 
 def _project_setup(ctx, inputs, output):
-    *gaussians, _, viewmats, Ks, ctx.options = inputs
+    means, quats, scales, covars, opacities, _, viewmats, Ks, *ctx.options = inputs
     projected = Projected(*output)
     ctx.mark_non_differentiable(projected.extents, projected.status)
     ctx.set_materialize_grads(False)
+    gaussians = means, quats, scales, covars, opacities
     ctx.save_for_backward(*gaussians, viewmats, Ks, projected.conics, projected.status)
 
 
 def _project_backward(ctx, *cotangents):
     *inputs, conics, status = ctx.saved_tensors
-    *of_gaussians, _, viewmats, _, _ = ctx.needs_input_grad
-    wanted = [*of_gaussians, viewmats]
+    needs = ctx.needs_input_grad
+    wanted = [*needs[:5], needs[6]]  # all but the colors and Ks
     given = [
         conics.new_zeros(*status.shape, *size) if v is None else v.contiguous()
         for v, size in zip(cotangents, PROJECTED_SIZES[:4])
     ]
-    grads = iter(_project_vjp(inputs, ctx.options, conics, status, given, wanted))
+    grads = iter(_project_vjp(inputs, conics, status, given, wanted, *ctx.options))
     *v_gaussians, v_viewmats = (next(grads) if want else None for want in wanted)
-    return *v_gaussians, None, v_viewmats, None, None
+    return *v_gaussians, None, v_viewmats, None, *[None] * len(ctx.options)
 
 
 project = operator(project, "rasterization", _project_setup, _project_backward)
@@ -127,7 +125,7 @@ _project_vjp = operator(_project_vjp, "rasterization")
 
 
 def _bin_views(device: torch.device) -> Callable[..., Bins]:
-    return bin_cpu.bin_views if kind_of(device) == "cpu" else bin_cuda.bin_views
+    return bin_cpu.bin_views if gpu.kind_of(device) == "cpu" else bin_cuda.bin_views
 
 
 def _refuse_too_many(pairs: int) -> None:
@@ -204,43 +202,41 @@ def _(means2d, conics, depths, *rest):
 bin_op = operator(bin_op, "rasterization")
 
 
-@torch.library.custom_op(_OP + "composite", mutates_args=())
-def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    view_opacities: Tensor,
-    colors: Tensor,
-    bins: List[Tensor],
-    size: List[int],
-    limits: List[float],
-    skipped: Tensor | None,
-    absolute: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+@torch.library.custom_op(
+    _OP + "composite",
+    mutates_args=(),
+    schema="(Tensor means2d, Tensor conics, Tensor view_opacities, Tensor colors, Tensor[] bins, "
+    f"Tensor? skipped, Tensor? absolute, {_schema(Size)}, {_schema(Limits)})"
+    " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
+)
+def composite(means2d, conics, view_opacities, colors, bins, skipped, absolute, *options):
     """Blend the pairs: images, their final transmittances and the fields of a ``Saved``.
 
     ``means2d`` is ``[.., N, 2]``, of I views, and so on. ``colors`` has a row for each of these
-    Gaussians or, shared by the views, one for each of an object's. The lists hold the values of
-    ``Bins``, ``Size`` and ``Limits``. Backward raises the numbers of tiles in ``skipped``, ``[I *
-    tiles]`` int32, to 1 if it skips a tile and to 2 if it traverses it. Where it has a gradient of
-    the geometry, it sets ``absolute``, ``[.., N, 2]``, to the sums over pixels of the absolute
-    values of their gradients of ``means2d``.
+    Gaussians or, shared by the views, one for each of an object's. ``bins`` has the tensors of
+    ``Bins``; the options are those of ``Size``, then of ``Limits``. Backward raises the numbers of
+    tiles in ``skipped``, ``[I * tiles]`` int32, to 1 if it skips a tile and to 2 if it traverses
+    it. Where it has a gradient of the geometry, it sets ``absolute``, ``[.., N, 2]``, to the sums
+    over pixels of the absolute values of their gradients of ``means2d``.
     """
     splats = Splats2D(means2d, conics, view_opacities, colors.flatten(0, -2))
-    given = splats, Bins(*bins), _raster_params(means2d, size, limits)
-    renders, transmittances, saved = _compositor(means2d.device).composite_forward(*given)
+    params = raster_params(*_records(options), num=means2d.shape[-2])
+    forward = _compositor(means2d.device).composite_forward
+    renders, transmittances, saved = forward(splats, Bins(*bins), params)
     return renders, transmittances, *saved
 
 
-def _raster_params(means2d: Tensor, size: list[int], limits: list[float]) -> RasterParams:
-    return raster_params(Size(*size), Limits(*limits), num=means2d.shape[-2])
+def _records(options: Sequence) -> tuple[Size, Limits]:
+    """The options of an operator as records."""
+    count = len(Size._fields)
+    return Size(*options[:count]), Limits(*options[count:])
 
 
 @composite.register_fake
-def _(means2d, conics, opacities, colors, bins, size, *rest):
-    width, height = Size(*size).width, Size(*size).height
+def _(means2d, conics, opacities, colors, bins, skipped, absolute, width, height, *rest):
     images, pairs = means2d.shape[:-2], Bins(*bins).pairs
     tiles = images.numel() * Tiling(width, height).count
-    on_cpu = kind_of(colors.device) == "cpu"
+    on_cpu = gpu.kind_of(colors.device) == "cpu"
     record_shape = (0, 0) if on_cpu else (opacities.numel(), record_size(colors.shape[-1]))
     saved = Saved(
         transmittances=colors.new_empty(tiles * BLOCKS, 16),
@@ -256,38 +252,35 @@ def _(means2d, conics, opacities, colors, bins, size, *rest):
 
 # It changes ``skipped`` and ``absolute``, which is not declared: compilers, which would have to
 # know, pass None.
-@torch.library.custom_op(_OP + "composite_vjp", mutates_args=())
-def _composite_vjp(
-    splats: List[Tensor],
-    bins: List[Tensor],
-    size: List[int],
-    limits: List[float],
-    saved: List[Tensor],
-    v_pixels: List[Tensor],
-    skipped: Tensor | None,
-    geometry: bool,
-    absolute: Tensor | None,
-) -> List[Tensor]:
+@torch.library.custom_op(
+    _OP + "composite_vjp",
+    mutates_args=(),
+    schema="(Tensor[] splats, Tensor[] bins, Tensor[] saved, Tensor[] v_pixels, Tensor? skipped, "
+    f"bool geometry, Tensor? absolute, {_schema(Size)}, {_schema(Limits)}) -> Tensor[]",
+)
+def _composite_vjp(splats, bins, saved, v_pixels, skipped, geometry, absolute, *options):
     if skipped is None:
         skipped = torch.zeros_like(Saved(*saved).traversed)
+    size, limits = _records(options)
     drawn = Splats2D(*splats)
     drawn = drawn._replace(colors=drawn.colors.flatten(0, -2))
-    given = drawn, Bins(*bins), _raster_params(splats[0], size, limits), Saved(*saved)
+    params = raster_params(size, limits, num=splats[0].shape[-2])
     backward = _compositor(splats[0].device).composite_backward
-    passes, absolute = bool(Limits(*limits).passes), absolute if geometry else None
-    grads = backward(*given, v_pixels, skipped, geometry, absolute, passes)
-    return [g for g in grads if g is not None]
+    sums = absolute if geometry else None
+    given = drawn, Bins(*bins), params, Saved(*saved), v_pixels, skipped, geometry, sums
+    return [g for g in backward(*given, limits.straight_through) if g is not None]
 
 
 @_composite_vjp.register_fake
-def _(splats, bins, size, limits, saved, v_pixels, skipped, geometry, absolute):
+def _(splats, bins, saved, v_pixels, skipped, geometry, *rest):
     *geometries, colors = splats
     v_colors = colors.new_empty(*splats[2].shape, colors.shape[-1])
     return [*(map(torch.empty_like, geometries) if geometry else ()), v_colors]
 
 
 def _composite_setup(ctx, inputs, output):
-    *splats, bins, ctx.size, ctx.limits, ctx.skipped, ctx.absolute = inputs
+    *splats, bins, ctx.skipped, ctx.absolute = inputs[:7]
+    ctx.options = inputs[7:]
     renders, transmittances, *saved = output
     ctx.mark_non_differentiable(*saved)
     ctx.set_materialize_grads(False)
@@ -298,14 +291,14 @@ def _composite_setup(ctx, inputs, output):
 def _composite_backward(ctx, *cotangents):
     splats, rest = list(ctx.saved_tensors[:4]), ctx.saved_tensors[4:]
     bins, saved = list(rest[: len(Bins._fields)]), list(rest[len(Bins._fields) :])
-    colors, needs, size = splats[3], ctx.needs_input_grad, Size(*ctx.size)
+    colors, needs, (size, _) = splats[3], ctx.needs_input_grad, _records(ctx.options)
     v_pixels = [
         colors.new_zeros(shape) if v is None else v.contiguous()
         for v, shape in zip(cotangents, ctx.shapes)
     ]
     geometry = any(needs[:3]) or not size.skip & UNASKED
-    given = splats, bins, ctx.size, ctx.limits, saved, v_pixels, ctx.skipped, geometry
-    *grads, v_colors = _composite_vjp(*given, ctx.absolute)
+    given = splats, bins, saved, v_pixels, ctx.skipped, geometry, ctx.absolute
+    *grads, v_colors = _composite_vjp(*given, *ctx.options)
     if not size.colors_per_view and size.views > 1:
         *images, num, channels = v_colors.shape
         objects = math.prod(images) // size.views
@@ -314,7 +307,7 @@ def _composite_backward(ctx, *cotangents):
     v_colors = v_colors.reshape(colors.shape) if v_colors.numel() else torch.zeros_like(colors)
     grads = [*(grads or [None] * 3), v_colors]
     grads = (x if need else None for x, need in zip(grads, needs))
-    return *grads, [None] * len(bins), None, None, None, None
+    return *grads, [None] * len(bins), None, None, *[None] * len(ctx.options)
 
 
 composite = operator(composite, "rasterization", _composite_setup, _composite_backward)

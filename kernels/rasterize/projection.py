@@ -24,7 +24,7 @@ STATUS_NAMES = ("visible", "near", "far", "not_finite", "transparent", "outside"
 
 
 class ProjectionOptions(NamedTuple):
-    """Arguments of a ``ProjectionParams``, as numbers that fit in a list of floats.
+    """Arguments of a projection without a gradient.
 
     Attributes:
         width: of the image, pixels.
@@ -34,28 +34,24 @@ class ProjectionOptions(NamedTuple):
         radius_clip: as ``rasterization``.
         eps2d: as ``rasterization``.
         alpha_min: as ``rasterization``.
-        antialiased: not 0 for ``rasterize_mode="antialiased"``.
-        skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
-        rounded: not 0 to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
+        antialiased: True for ``rasterize_mode="antialiased"``.
+        skip_unused: True to leave out gradients that are zero, as ``Skip.unused``.
+        rounded: True to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
             does; a Gaussian that this keeps outside the image has no pair.
-        original: not 0 for the conventions of the first 3D Gaussian splatting code (README.md §7).
+        original: True for the conventions of the first 3D Gaussian splatting code (README.md §7).
     """
 
-    width: float
-    height: float
+    width: int
+    height: int
     near_plane: float
     far_plane: float
     radius_clip: float
     eps2d: float
     alpha_min: float
-    antialiased: float
-    skip_unused: float
-    rounded: float = 0.0
-    original: float = 0.0
-
-    def numbers(self) -> list[float]:
-        """The attributes in their order; ``ProjectionOptions(*numbers)`` is the inverse."""
-        return [float(x) for x in self]
+    antialiased: bool
+    skip_unused: bool
+    rounded: bool = False
+    original: bool = False
 
 
 class Projected(NamedTuple):

@@ -150,20 +150,20 @@ def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
 
 
 class Size(NamedTuple):
-    """The integers that a call of the compositor is given.
+    """Sizes that a call of the compositor is given.
 
     Attributes:
         width: of an image, pixels.
         height: of an image, pixels.
         views: of an object.
-        colors_per_view: 1 if each view has its own colours, 0 if an object's views share them.
+        colors_per_view: True if each view has its own colours, not those of its object.
         skip: from ``Skip.bits``.
     """
 
     width: int
     height: int
     views: int
-    colors_per_view: int
+    colors_per_view: bool
     skip: int
 
 
@@ -174,13 +174,13 @@ class Limits(NamedTuple):
         alpha_min: as ``rasterization``.
         alpha_max: as ``rasterization``.
         t_min: as ``rasterization``.
-        passes: not 0 for a gradient that passes the clamp at ``alpha_max`` (README.md §7).
+        straight_through: True for a gradient that passes the clamp at ``alpha_max`` (README.md §7).
     """
 
     alpha_min: float
     alpha_max: float
     t_min: float
-    passes: float = 0.0
+    straight_through: bool = False
 
 
 @struct
@@ -204,7 +204,7 @@ def raster_params(size: Size, limits: Limits, *, num: int) -> RasterParams:
     """The scalars of a compositing launch as one kernel argument; do not modify it either.
 
     Args:
-        size: the integers.
+        size: the sizes.
         limits: the thresholds.
         num: Gaussians of a view.
     """

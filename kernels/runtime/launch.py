@@ -26,7 +26,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from .stand_in import kind_of, stand_in
+from . import gpu
 from .views import cache_error, view
 
 wp.set_module_options({"enable_backward": False})
@@ -332,7 +332,7 @@ def cuda_launch(
     device: torch.device,
     block_dim: int = 128,
 ) -> None:
-    """Launches on torch's current stream of ``device``, or on a GPU's stand-in.
+    """Launches on torch's current stream of ``device``.
 
     Args:
         kernel: a ``wp.Kernel``, not generic.
@@ -343,10 +343,15 @@ def cuda_launch(
         block_dim: threads of a block.
     """
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
-    dim = (dim,) if isinstance(dim, int) else tuple(dim)
-    if (other := stand_in()) is not None:
-        other.launch(kernel, dim, arguments, block_dim)
-        return
+    launch_on_stream(
+        kernel, (dim,) if isinstance(dim, int) else tuple(dim), arguments, block_dim, device
+    )
+
+
+def launch_on_stream(
+    kernel: Any, dim: tuple[int, ...], arguments: list, block_dim: int, device: torch.device
+) -> None:
+    """Launches with arguments as Warp takes them; see ``cuda_launch``."""
     key = kernel, device, block_dim
     stream = _stream(device)
     if (entry := _entries.get(key)) is not None:
@@ -405,7 +410,7 @@ def launch(
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
-    if kind_of(device) == "cpu":
+    if gpu.kind_of(device) == "cpu":
         parallel_launch(kernel, dim, inputs, outputs, threads)
     else:
         cuda_launch(kernel, dim, [0, *inputs], outputs, device=device, block_dim=block_dim)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast, get_type_hints, overload
 import warp as wp
 from torch import Tensor
 
-from .stand_in import is_dry, kind_of
+from . import gpu
 
 _Class = TypeVar("_Class")
 _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
@@ -17,8 +17,6 @@ _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
 
 def view(tensor: Tensor, dtype=None, name: str = "tensor"):
     """A Warp array descriptor on the memory and strides of a tensor, which it keeps alive.
-
-    In a dry run (``stand_in.py``) it is None: the tensor may have no memory.
 
     Args:
         tensor: float32, float64, bfloat16, float16 or integer, at most 4 dimensions.
@@ -30,8 +28,6 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
         ValueError: too many dimensions, a broken vector dimension, or over 2^31 bytes per stride.
         OSError: Warp's folder of compiled kernels cannot be made.
     """
-    if is_dry():
-        return None
     key = (tensor.dtype, tensor.shape, tensor.stride(), dtype)
     known = _descriptors.get(key)  # looked up once: another thread may clear them at any time
     if known is None:
@@ -94,9 +90,7 @@ class StructValue:
     """
 
     def __init__(self, cls: Any, *values: Any) -> None:
-        self.values, self._made = values, cls.ctype()
-        if is_dry():  # the tensors may have no memory
-            return
+        self.values = values
         of = [(x.dtype, x.shape, x.stride()) if isinstance(x, Tensor) else x for x in values]
         key = (cls, *of)
         known = _structs.get(key)
@@ -174,7 +168,7 @@ def is_transposed(x: Tensor) -> bool:
     It is a view of mamba-ssm's ``[B, D, L]``. CUDA's kernels have none.
     """
     _, tokens, channels = x.stride()
-    return tokens == 1 and channels != 1 and x.shape[2] != 1 and kind_of(x.device) == "cpu"
+    return tokens == 1 and channels != 1 and x.shape[2] != 1 and gpu.kind_of(x.device) == "cpu"
 
 
 def dense(x: Tensor) -> Tensor:

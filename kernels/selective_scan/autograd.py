@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..runtime import gpu
 from ..runtime.operator import operator
-from ..runtime.stand_in import kind_of
 from ..runtime.views import laid_as
 from .cpu import launch as cpu
 from .problem import Inputs, Options, Scan
@@ -20,7 +20,7 @@ _SCAN = (
 
 
 def _implementation(u: Tensor):
-    if kind_of(u.device) == "cpu":
+    if gpu.kind_of(u.device) == "cpu":
         return cpu
     from .cuda import launch as cuda
 

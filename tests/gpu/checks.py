@@ -18,7 +18,7 @@ from gamba_warp.kernels.cases.raster import Scene, orbit_cameras, shell
 from gamba_warp.kernels.cases.scan import make_inputs, scan_problem
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import lists_outgrown, rasterization
-from gamba_warp.kernels.runtime.stand_in import kind_of
+from gamba_warp.kernels.runtime import gpu
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 from gamba_warp.measure.models import captured
 
@@ -76,7 +76,7 @@ def check_scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> float:
         return assert_within(problem.check(BOTH, dtype), HALF_LIMIT)
     got, truth = problem.results(True), problem.truth(True)
     limits = dict.fromkeys(truth, LIMIT)
-    if kind_of(device) == "cuda":
+    if gpu.kind_of(device) == "cuda":
         more = allowances(lambda off: problem.truth(True, off=off))
         limits = {name: LIMIT + more[name] for name in truth}
     errors = {name: compare({name: got[name]}, {name: truth[name]}) for name in truth}

@@ -23,9 +23,9 @@ def on_paper(monkeypatch):
     """Fake tensors on a missing GPU, in a capture with a capacity for the rasterizer."""
     if not dry_run.can_dry_run():
         pytest.skip(f"torch {torch.__version__} needs a GPU for it")
-    monkeypatch.setattr(capacity, "is_capturing", lambda device: True)
-    monkeypatch.setattr(capacity, "graph_capacity", lambda key, count: 1 << 20)
-    with dry_run.dry_run() as launches:
+    with dry_run.dry_run() as launches, monkeypatch.context() as patched:
+        patched.setattr(capacity, "is_capturing", lambda device: True)
+        patched.setattr(capacity, "graph_capacity", lambda key, count: 1 << 20)
         yield launches
 
 

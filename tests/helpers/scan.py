@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gamba_warp.kernels.cases import problem
-from gamba_warp.kernels.runtime.stand_in import kind_of
+from gamba_warp.kernels.runtime import gpu
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.problem import DISCRETIZATIONS
 from gamba_warp.kernels.selective_scan.reference import EXACT, Off, selective_scan_reference
@@ -118,7 +118,7 @@ def device_errors(exact, inputs, heads=(), decays=0.0, names=("out", "last"), **
         Additions >= 0 by name: of each result, and of each of ``inputs`` for its gradient.
     """
     error = max(decays, approximate["decay"])
-    if not error or kind_of(torch.device("cpu")) != "cuda":
+    if not error or gpu.kind_of(torch.device("cpu")) != "cuda":
         return dict.fromkeys((*names, *inputs), 0.0)
 
     def results(off):

@@ -1,7 +1,7 @@
 """Lists of the kernels that operators launch on CUDA, found without a GPU.
 
 The operators run on tensors that have a shape, a dtype and the device cuda, but no memory. Their
-launches are recorded (``kernels/runtime/stand_in.py``), so their own code chooses the kernels.
+launches are recorded (``simulated.py``), so their own code chooses the kernels.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
+from unittest.mock import patch
 
 import torch
 import warp as wp
@@ -17,7 +18,9 @@ from torch._library.custom_ops import OPDEFS
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
+from gamba_warp.kernels.rasterize.cuda import capacity
+
+from .simulated import simulated
 
 _READ_BACK = (torch.ops.aten.item.default, torch.ops.aten._local_scalar_dense.default)
 # The number of pairs, which the rasterizer reads back from the device, is taken to be this.
@@ -64,11 +67,17 @@ def dry_run() -> Iterator[list[Launch]]:
     """
     launches: list[Launch] = []
 
-    def note(kernel: wp.Kernel, dim: tuple[int, ...], arguments: list, block_dim: int) -> None:
+    def note(kernel, dim, arguments, block_dim: int, device) -> None:
         launches.append(Launch(kernel, block_dim))
 
-    stand_in = StandIn(note, MULTIPROCESSORS, dry=True)
-    with standing_in(stand_in), FakeTensorMode(), _Inside():
+    with (
+        simulated(note, MULTIPROCESSORS),
+        patch.object(Tensor, "data_ptr", lambda x: 0),
+        patch.object(capacity, "is_capturing", lambda device: False),
+        patch.object(capacity, "note_count", lambda key, device, count: None),
+        FakeTensorMode(),
+        _Inside(),
+    ):
         yield launches
 
 

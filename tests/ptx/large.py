@@ -3,6 +3,8 @@
 Run by ``-p ptx.plugin``, which executes all of it from PTX and reports what is found.
 """
 
+import contextlib
+
 import pytest
 import torch
 from gpu import checks
@@ -13,10 +15,11 @@ from helpers.kernels import conv_inputs
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.rasterize import rasterization
-from gamba_warp.kernels.runtime.stand_in import stand_in, standing_in
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
+
+from .simulated import not_simulated
 
 HALF = 4e-3  # of numbers of 8 bits
 CPU = torch.device("cpu")
@@ -29,15 +32,15 @@ def test_an_operator(check):
 
 @pytest.mark.parametrize("tuning", checks.TUNINGS)
 def test_tunings(monkeypatch, tuning):
-    monkeypatch.setattr(scan_cuda, "FORCED", tuning)
+    monkeypatch.setattr(scan_cuda, "choose", lambda *_: tuning)
     checks.check_scan(checks.SCANS[3], torch.float32, CPU)
 
 
 def on_both(function, inputs, cotangents):
     """Results of the inputs and all gradients, by name, from PTX and by the CPU's kernels."""
-    for other in (stand_in(), None):
+    for device in (contextlib.nullcontext, not_simulated):
         mine = scans.leaves(inputs)
-        with standing_in(other):
+        with device():
             outs = function(**mine)
             grads = torch.autograd.grad(outs, [*mine.values()], cotangents)
         yield dict(enumerate(outs)) | dict(zip(mine, grads))
@@ -75,7 +78,7 @@ def test_the_papers_picture():
     def picture(**x):
         return rasterization(**x, **rest)[:2]
 
-    with standing_in(None):
+    with not_simulated():
         renders, alphas = picture(**scene)
     # where a Gaussian is at its faintest to within rounding, a pixel may have it or not
     alike = (picture(**scene)[0] - renders).abs().amax(-1, keepdim=True) < rasters.PICTURE
@@ -105,7 +108,9 @@ def far(x, dim, path):
 @pytest.mark.parametrize(("dim", "shape"), [(0, (4, 70, 37)), (1, (1, 6, 37))])
 def test_strides_near_the_limit(monkeypatch, tmp_path, dim, shape, dtype, segments):
     """The bits are those of dense tensors, and nothing beside the tensors is touched."""
-    monkeypatch.setattr(scan_cuda, "FORCED", Tuning(segments=segments, back_segments=segments))
+    monkeypatch.setattr(
+        scan_cuda, "choose", lambda *_: Tuning(segments=segments, back_segments=segments)
+    )
     cotangent = torch.randn(shape).to(dtype)
     cases = (
         (lambda x: selective_scan(**x, delta_softplus=True), scans.make(*shape, 3, dtype=dtype)),

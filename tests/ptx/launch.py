@@ -16,12 +16,12 @@ import torch
 import warp as wp
 from warp._src import context as warp_context
 
-from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
 from gamba_warp.kernels.runtime.views import StructValue
 
 from .contract import contracted
 from .machine import FAULTS, Array, Count, Finding, Launch, Missing, library
 from .parse import Program, read
+from .simulated import simulated
 
 ARCHITECTURE = 80  # the PTX of the kernels for sm_90 is the same
 MOST_STEPS = 20_000_000  # instructions of a warp; those of a test's kernels take under a million
@@ -80,8 +80,8 @@ class Interpreter:
     trace: list[int] = field(default_factory=list)
     steps: int = 0
 
-    def launch(self, kernel, dim, arguments, block_dim: int) -> None:
-        """As a ``StandIn``."""
+    def launch(self, kernel, dim, arguments, block_dim: int, device) -> None:
+        """As ``launch_on_stream``."""
         of_module, notes = programs(kernel.module, block_dim)
         pattern = re.compile(re.escape(kernel.key) + "_[0-9a-f]{8}_cuda_kernel_forward")
         (name,) = filter(pattern.fullmatch, of_module)
@@ -204,7 +204,7 @@ def interpreted(multiprocessors: int = 132, **options):
     for (owner, name), make in before.items():
         setattr(owner, name, _poisoned(make))
     try:
-        with standing_in(StandIn(made.launch, multiprocessors)):
+        with simulated(made.launch, multiprocessors):
             yield made
     finally:
         for (owner, name), make in before.items():

@@ -38,7 +38,7 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_barrier_is_needed(monkeypatch, name):
-    monkeypatch.setattr(scan_cuda, "FORCED", Tuning(segments=3, back_segments=2))
+    monkeypatch.setattr(scan_cuda, "choose", lambda *_: Tuning(segments=3, back_segments=2))
     function, multiprocessors = CASES[name]
 
     def findings(seed=0):

@@ -20,7 +20,6 @@ from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
 from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
 from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
-from gamba_warp.kernels.runtime.stand_in import standing_in
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 from gamba_warp.model.gamba import Gamba
@@ -28,6 +27,7 @@ from gamba_warp.train.data.samples import Batch
 from gamba_warp.train.step import Objective, forward
 
 from .launch import interpreted
+from .simulated import not_simulated
 
 HALF = 4e-3  # of numbers of 8 bits, rounded in the inputs' gradients and in the output
 # Multiprocessors for which the tiles of two pictures, 24 or 12, are cut into so many parts.
@@ -63,7 +63,7 @@ SEGMENTS = Tuning(segments=3, back_segments=2)
     ],
 )
 def test_scan(monkeypatch, shape, options, tuning):
-    monkeypatch.setattr(scan_cuda, "FORCED", tuning)
+    monkeypatch.setattr(scan_cuda, "choose", lambda *_: tuning)
     options = dict(options)
     dtype = options.pop("dtype", torch.float32)
     forward = scans.FORWARD if dtype == torch.float32 else HALF
@@ -89,7 +89,7 @@ def pictures(scene, mode):
     """A comparison of pictures, and of the depth at which half of the light is gone."""
     meta = rasters.compare(scene, mode)
     got = depth_quantile(meta)
-    with standing_in(None):
+    with not_simulated():
         want = depth_quantile(meta)
     # a ray that is half clear to within rounding may take either of two depths
     assert (got - want).abs().gt(1e-6).float().mean() <= 1e-3 and (got > 0).any()

@@ -159,13 +159,13 @@ def blend(
         keep: called in backward with the absolute gradients ``[I * R, 2]`` of the centres, summed
             over the pixels (Ye et al. 2024, "AbsGS"), if these need a gradient; or None.
     """
-    size = Size(tiling.width, tiling.height, views, int(views == 1), SKIP)
+    size = Size(tiling.width, tiling.height, views, views == 1, SKIP)
     means2d, sums = layers[0], None
     if keep is not None and means2d.requires_grad:
         sums = torch.zeros_like(means2d)
         means2d = means2d.view_as(means2d)  # it has no other gradient than the compositor's
         means2d.register_hook(lambda _: keep(sums.flatten(0, 1).clone()))
-    given = list(bins), list(size), list(LIMITS), None, sums
+    given = list(bins), None, sums, *size, *LIMITS
     renders, transmittances, *_ = composite(means2d, *layers[1:], *given)
     return renders, transmittances
 

@@ -198,7 +198,7 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, options: ProjectionO
         whole: Any = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
         return _project_covariances(means, whole, shown, viewmats, Ks, options)
     given = means, quats, scales, covars, opacities, colors.detach(), viewmats, Ks
-    splats = Splats(*project(*given, options.numbers())[:5])
+    splats = Splats(*project(*given, *options)[:5])
     splats = splats._replace(extents=splats.extents.detach())
     if not options.antialiased or quats is None or scales is None:
         return splats
@@ -234,7 +234,7 @@ def _project_covariances(
     # and here before the division by z.
     turned = torch.where(seen[..., None], turned, turned.new_tensor([0.0, 0.0, 1.0]))
     covars = torch.where(seen[..., None, None], covars, torch.eye(3).to(covars))
-    centers, plane = proj(turned, covars, Ks.double(), int(options.width), int(options.height))
+    centers, plane = proj(turned, covars, Ks.double(), options.width, options.height)
     xx, xy, yy = plane[..., 0, 0], plane[..., 0, 1], plane[..., 1, 1]
     before = xx * yy - xy * xy
     xx, yy = xx + options.eps2d, yy + options.eps2d

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...runtime.stand_in import is_dry
-
 MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 _SLOTS = 4096  # shapes remembered; beyond these, the oldest are dropped
 
@@ -32,7 +30,7 @@ class _Counts:
     """Last counts of a device, ``[slots]`` int64 of the host, and the shapes, the oldest first."""
 
     def __init__(self, device: torch.device):
-        pinned = device.type == "cuda" and not is_dry()
+        pinned = device.type == "cuda"
         self.tensor = torch.zeros(_SLOTS, dtype=torch.int64, pin_memory=pinned)
         self.on_host = self.tensor.numpy()  # torch might wait for the device
         self.shapes: dict[Hashable, _Shape] = {}
@@ -48,13 +46,11 @@ _lock = threading.Lock()
 
 def is_capturing(device: torch.device) -> bool:
     """Return True if torch's current stream is being captured into a CUDA graph."""
-    return device.type == "cuda" and not is_dry() and torch.cuda.is_current_stream_capturing()
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
 def note_count(key: Hashable, device: torch.device, count: int) -> None:
     """Remember the count of a call, for a graph of its shape."""
-    if is_dry():  # a dry run leaves nothing behind
-        return
     with _lock:
         if device not in _counts:
             _counts[device] = _Counts(device)

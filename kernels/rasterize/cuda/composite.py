@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...runtime import gpu
 from ...runtime.launch import cuda_launch
-from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import StructValue, as_struct
 from ..constants import BLOCKS
 from ..tiles import CHUNK, Bins, Pixels, RasterParams, Saved, Splats2D
@@ -32,7 +32,7 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
     run side by side. With more views, parts would only repeat the work of a Gaussian for each warp.
     CUDA.md has the estimate behind the limits.
     """
-    few = 10 * multiprocessors_of(device)
+    few = 10 * gpu.multiprocessors_of(device)
     return 4 if tiles <= few else 2 if tiles <= 2 * few else 1
 
 

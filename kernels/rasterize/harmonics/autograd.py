@@ -5,9 +5,9 @@ from typing import List
 import torch
 from torch import Tensor
 
+from ...runtime import gpu
 from ...runtime.launch import launch
 from ...runtime.operator import operator
-from ...runtime.stand_in import kind_of
 from ...runtime.views import StructValue
 from ..projection import empty_on
 from . import cpu, cuda
@@ -19,7 +19,7 @@ MOST_CHANNELS = 64  # of the kernels: on a CPU the rows of coefficients are on a
 
 
 def _kernels(device: torch.device):
-    return cpu if kind_of(device) == "cpu" else cuda
+    return cpu if gpu.kind_of(device) == "cpu" else cuda
 
 
 def _launch(kernel, chunk: int, tensors: list, outputs: list) -> None:

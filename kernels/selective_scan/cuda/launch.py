@@ -9,17 +9,16 @@ twice: first from zero, then from its first state.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any, NamedTuple, no_type_check
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from ...runtime import gpu
 from ...runtime.launch import cuda_launch
 from ...runtime.packed import count_slots
 from ...runtime.scalars import LOG2E, exp2
-from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
 from ..problem import DISCRETIZATIONS, Inputs, Scan, like_inputs
 from .kernels import (
@@ -60,9 +59,6 @@ class Tuning(NamedTuple):
     block: int = 128
 
 
-FORCED: Tuning | None = None  # overrides the choice, for tests and studies
-
-
 @functools.cache
 def choose(
     batch: int, length: int, channels: int, states: int, groups: int, multiprocessors: int
@@ -98,20 +94,6 @@ def choose(
         states=2 if forward == 1 else tuning.states,
         back_segments=segments((tuning.back_channels, tuning.back_states), RESIDENT[1], 3.0),
     )
-
-
-def scan_tuning(shape: Sequence[int], states: int, groups: int, device: torch.device) -> Tuning:
-    """The tuning that a scan runs on.
-
-    Args:
-        shape: of u, ``[B, L, D]``.
-        states: N.
-        groups: G.
-        device: of the tensors.
-    """
-    if FORCED is not None:
-        return FORCED
-    return choose(*shape, states, groups, multiprocessors_of(device))
 
 
 @functools.cache
@@ -187,8 +169,8 @@ class _Operands:
         self.states, self.groups, self.device = x.A.shape[1], x.B.shape[2], x.u.device
         self.sequences, self.packed = scan.sequences, options.packed
         tokens = -(-self.batch * self.length // max(self.sequences, 1))
-        shape = self.sequences, tokens, self.channels
-        tuning = scan_tuning(shape, self.states, self.groups, self.device)
+        shape = self.sequences, tokens, self.channels, self.states, self.groups
+        tuning = choose(*shape, gpu.multiprocessors_of(self.device))
         per_thread, segments = (tuning.channels, tuning.states), tuning.segments
         if back:
             per_thread = (tuning.back_channels, tuning.back_states)

@@ -8,8 +8,8 @@ from helpers.scan import assert_gradient_alone, assert_gradients, leaves
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
+from gamba_warp.kernels.runtime import gpu
 from gamba_warp.kernels.runtime.native import streams
-from gamba_warp.kernels.runtime.stand_in import kind_of
 
 FORWARD = 2e-7  # float32 rounding of four products and a SiLU
 GRADIENT = 2e-6  # float32 sums over up to 2 * 577 tokens
@@ -56,7 +56,7 @@ def test_equal_terms_of_a_sum():
     mine = leaves(inputs)
     (got,) = torch.autograd.grad(causal_conv1d(**mine).sum(), [mine["weight"]])
     want = 640 * inputs["x"][0, 0].double()[:, None].expand_as(got)
-    limit = {"cpu": 3e-7, "cuda": 3 / 8 * 64 * 2**-24}[kind_of(got.device)]
+    limit = {"cpu": 3e-7, "cuda": 3 / 8 * 64 * 2**-24}[gpu.kind_of(got.device)]
     assert_rel_rms(got, want, limit, "gradient of weight")
 
 

@@ -81,7 +81,7 @@ def test_scan(lengths, channels, states, groups, rule, dtype, device, from_ptx):
     inputs = scan_inputs(lengths, channels, states, groups, dtype)
     # On CUDA a sequence alone has the same bits if it is cut in as many segments.
     tuning = cuda.Tuning() if device == "ptx" else cuda.Tuning(segments=3, back_segments=2)
-    with patch.object(cuda, "FORCED", tuning):
+    with patch.object(cuda, "choose", lambda *_: tuning):
         if device != "cpu":
             from_ptx()
         assert_as_alone(partial(scan, discretization=rule), inputs, lengths, 1e-5)
@@ -92,7 +92,7 @@ def test_scan_on_cuda_of_long_sequences(from_ptx):
     lengths = [1300, 0, 70, 1]
     from_ptx()
     for tuning in (cuda.Tuning(5, back_segments=30), cuda.Tuning(2, back_segments=1)):
-        with patch.object(cuda, "FORCED", tuning):
+        with patch.object(cuda, "choose", lambda *_, tuning=tuning: tuning):
             assert_as_alone(scan, scan_inputs(lengths, 5, 3), lengths, 1e-5)
 
 

@@ -181,10 +181,10 @@ def test_fake_results_have_the_real_shapes():
     bins = (means2d, conics, depths, opacities, extents, width, height, 1 / 255, 127)
     checks = ("test_schema", "test_faketensor")
     torch.library.opcheck(torch.ops.gamba_warp.rasterize_bin.default, bins, test_utils=checks)
-    size = Size(width=width, height=height, views=views, colors_per_view=0, skip=127)
+    size = Size(width=width, height=height, views=views, colors_per_view=False, skip=127)
     limits = Limits(alpha_min=1 / 255, alpha_max=0.99, t_min=1e-4)
-    lists = list(meta.bins), list(size), list(limits)
-    arguments = (means2d, conics, opacities, torch.rand(num, 3), *lists, None, None)
+    given = list(meta.bins), None, None, *size, *limits
+    arguments = (means2d, conics, opacities, torch.rand(num, 3), *given)
     torch.library.opcheck(
         torch.ops.gamba_warp.rasterize_composite.default, arguments, test_utils=checks
     )

@@ -18,6 +18,7 @@ from gamba_warp.kernels.rasterize.cuda.warp import LanePixels, touching
 from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.quantile import counts_in_front
 from gamba_warp.kernels.rasterize.tiles import Limits, Size, Splats2D, raster_params
+from gamba_warp.kernels.runtime import gpu
 from gamba_warp.kernels.runtime.launch import cuda_launch
 
 SAME = 2e-6  # the two sum in another order
@@ -91,7 +92,7 @@ def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
 @pytest.mark.parametrize("channels, parts", [(3, 1), (4, 2), (1, 4), (5, 1), (11, 2)])
 def test_absolute_gradients(monkeypatch, on_cuda, channels, parts, passes):
     """Also with more channels than one launch has, and of a gradient that passes the clamp."""
-    monkeypatch.setattr(api, "Limits", partial(Limits, passes=float(passes)))
+    monkeypatch.setattr(api, "Limits", partial(Limits, straight_through=passes))
     scene = crowded(channels)
     given = scene, *upstream(channels)
     plain, _ = run(*given)
@@ -210,7 +211,7 @@ def test_two_runs_and_any_parts(on_cuda):
 
 
 def test_many_tiles_are_not_cut(monkeypatch):
-    monkeypatch.setattr(composite_cuda, "multiprocessors_of", lambda device: 132)
+    monkeypatch.setattr(gpu, "multiprocessors_of", lambda device: 132)
     device = torch.device("cuda", 0)
     views = [1, 2, 3, 32]
     assert [composite_cuda.parts_of_tile(1024 * n, device) for n in views] == [4, 2, 1, 1]
@@ -245,7 +246,7 @@ def test_no_sub_tile_is_missed(from_ptx, longest):
     opacities = 0.01 + 0.98 * torch.rand(count)
     bits = torch.zeros(count, dtype=torch.int32)
     splats = Splats2D(means, conics, opacities, torch.rand(count, 3))
-    params = raster_params(Size(16, 16, 1, 1, 0), Limits(ALPHA_MIN, 1.0, 0.0), num=count)
+    params = raster_params(Size(16, 16, 1, True, 0), Limits(ALPHA_MIN, 1.0, 0.0), num=count)
     from_ptx()
     records = make_records(splats, params)
     cuda_launch(_test_sub_tiles, count, [records], [bits], device=bits.device)

@@ -1,14 +1,12 @@
-"""Views of tensors: their cache of descriptors, several threads, dry runs."""
-
-from concurrent.futures import ThreadPoolExecutor
+"""Views of tensors: their cache of descriptors, several threads; launches on a simulated GPU."""
 
 import pytest
 import torch
 import warp as wp
+from ptx.simulated import is_simulated, simulated
 
-from gamba_warp.kernels.runtime import views
-from gamba_warp.kernels.runtime.launch import cuda_launch
-from gamba_warp.kernels.runtime.stand_in import StandIn, multiprocessors_of, standing_in
+from gamba_warp.kernels.runtime import gpu, views
+from gamba_warp.kernels.runtime.launch import cuda_launch, launch
 from gamba_warp.kernels.runtime.views import StructValue, struct, view
 
 
@@ -61,23 +59,15 @@ def _never(x_out: wp.array[float]):
     x_out[wp.tid()] = 1.0
 
 
-def test_a_dry_run_tells_and_does_nothing(monkeypatch):
-    """No view, no launch, no look at a device, and only in the thread that asked for it."""
-    monkeypatch.setattr(views, "_descriptors", {})
+def test_a_simulated_gpu_gets_launches_and_ends_with_its_block():
     told, device, x = [], torch.device("cuda"), torch.zeros(6)
-    with standing_in(StandIn(lambda *launch: told.append(launch), 77, dry=True)):
-        assert multiprocessors_of(device) == multiprocessors_of(torch.device("cuda:3")) == 77
-        assert view(x) is None
+    with pytest.raises(KeyError), simulated(lambda *launch: told.append(launch), 77):
+        assert gpu.multiprocessors_of(device) == gpu.multiprocessors_of(x.device) == 77
+        assert is_simulated() and gpu.kind_of(x.device) == "cuda"
         cuda_launch(_never, 6, [], [x], device=device, block_dim=32)
-        cuda_launch(_never, (2, 3), [], [x], device=x.device)
-        with ThreadPoolExecutor(1) as pool:
-            assert pool.submit(view, x).result().data == x.data_ptr()
-    assert told == [(_never, (6,), [None], 32), (_never, (2, 3), [None], 128)]
-    assert not x.any() and len(views._descriptors) == 1
-    assert view(x).data == x.data_ptr()
-
-
-def test_a_dry_run_ends_with_its_block():
-    with pytest.raises(RuntimeError), standing_in(StandIn(print, 1, dry=True)):
-        raise RuntimeError
-    assert view(torch.zeros(2)) is not None
+        launch(_never, (2, 3), [], [x], x.device)
+        raise KeyError
+    (one, *_, block, _), (_, dim, arguments, _, _) = told
+    assert one is _never and block == 32 and dim == (2, 3) and arguments[0] == 0
+    assert arguments[1].data == x.data_ptr() and not x.any()
+    assert not is_simulated() and gpu.kind_of(x.device) == "cpu"
