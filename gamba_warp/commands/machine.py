@@ -65,7 +65,7 @@ def bench_command(
     """Measure run time and error, also of other installed packages.
 
     Every variant is compared with float64 before it is timed; a failed one is not timed. Writes
-    bench.json, bench.md and the chart bench.svg. Ctrl-C keeps the results so far.
+    bench.json, bench.md and bench-OP.svg, a chart of time over error. Ctrl-C keeps the results.
 
     Args:
         what: scan, conv, raster, model, step (of a training), or all.
@@ -81,7 +81,7 @@ def bench_command(
 
     from ..kernels.bench.measure import Settings, measure
     from ..kernels.bench.peers import versions
-    from ..kernels.bench.report import busy_line, chart, markdown
+    from ..kernels.bench.report import busy_line, charts, markdown
 
     if quick and full:
         raise UserError("--quick and --full: choose one")
@@ -105,12 +105,13 @@ def bench_command(
     document["machine"]["peers"] = versions() if peers else {}
     write_json(folder / "bench.json", document)
     write_text(folder / "bench.md", markdown(document))
-    write_text(folder / "bench.svg", chart(document))
+    for op, chart in charts(document).items():
+        write_text(folder / f"bench-{op}.svg", chart)
     failed = [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
     for r in failed:
         print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
     measured = sum(r["status"] == "ok" for r in document["records"])
-    print(f"{measured} measured; wrote {folder / 'bench.json'}, bench.md and bench.svg")
+    print(f"{measured} measured; wrote {folder / 'bench.json'}, bench.md and charts")
     if line := busy_line(document):
         print(line, file=sys.stderr)
     if document["interrupted"]:

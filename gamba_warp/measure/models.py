@@ -12,15 +12,28 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import UserError
+from ..files import STARTER
 from ..gaussians import Gaussians
-from ..kernels.bench.measure import Case, Settings, Variant, synchronize, variant
-from ..kernels.cases.problem import BOTH, Error, compare
+from ..kernels.bench import raster
+from ..kernels.bench.measure import (
+    Case,
+    Settings,
+    Variant,
+    saved_bytes,
+    synchronize,
+    variant,
+)
+from ..kernels.cases.problem import BOTH, DIRECTIONS, Error, compare
+from ..kernels.cases.raster import LEAVES, Scene, orbit_cameras
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
+from ..model.checkpoint import load_model
 from ..model.config import PRESETS, GambaConfig
 from ..model.gamba import Gamba
+from ..model.parts.attention import AttentionBlock
 from ..model.parts.block import GambaBlock, prefix_states, run_blocks
 from ..model.posing import reference_cameras
+from ..model.predict import reconstruct
 
 Result = TypeVar("Result")
 LIMITS = {"forward": 1e-5, BOTH: 1e-4}  # allowed relative rms error of blocks to float64
@@ -34,7 +47,9 @@ TOKENS = 128  # number of first tokens compared with the oracle
 
 def cases(settings: Settings) -> list[Case]:
     """Return the cases of models."""
-    made = [Case("model", "backbone", backbone), Case("model", "one picture", pictures)]
+    builders = {"backbone": backbone, "mixers": mixers}
+    builders |= {"one picture": pictures, "skipping": skipping}
+    made = [Case("model", name, build) for name, build in builders.items()]
     graphs = [Case("model", "CUDA graph", cuda_graphs)]
     return made + graphs * (settings.device.type == "cuda")
 
@@ -172,6 +187,64 @@ def backbone(settings: Settings) -> list[Variant]:
     return made
 
 
+def mixers(settings: Settings) -> list[Variant]:
+    """The paper's question Q2: a Mamba block and a transformer block with torch's fused attention,
+    of the same width, over the number of tokens. Saved: tensors that a forward pass keeps for its
+    gradient. The check is a second run.
+    """
+    lengths = {"quick": (256, 512), "normal": (1024, 4096), "full": (4096, 16384, 65536)}
+    config, made = replace(PRESETS["tiny"], width=256), []
+    for length in lengths[settings.level]:
+        for name, kind in (("Mamba", GambaBlock), ("transformer", AttentionBlock)):
+            torch.manual_seed(0)
+            block = _Mixer(kind(config, 0, 0).to(settings.device), length)
+            for direction in DIRECTIONS:
+                made.append(variant(block, f"{name}, {length} tokens", direction, rounds=3))
+                made[-1].peer = name == "transformer"
+            made[-1].work = block.work
+    return made
+
+
+class _Mixer:
+    """A block on the tokens of one sequence."""
+
+    def __init__(self, block: GambaBlock | AttentionBlock, length: int) -> None:
+        self.block = block
+        width, device = block.norm.weight.numel(), block.norm.weight.device
+        self.tokens = torch.randn(1, length, width, device=device)
+        self.sizes = {"L": length, "D": width}
+
+    @torch.no_grad()
+    def forward(self) -> Tensor:
+        """Run the block without gradients (timed)."""
+        return self.block(self.tokens, None)[0]
+
+    def backward(self) -> tuple[Tensor, ...]:
+        """Compute the gradients of tokens and weights, with the tokens as cotangent (timed)."""
+        tokens = self.tokens.detach().requires_grad_()
+        out, _ = self.block(tokens, None)
+        return torch.autograd.grad(out, [tokens, *self.block.parameters()], self.tokens)
+
+    def oracle(self, direction: str) -> str:
+        """Return a description of the check's reference."""
+        return "a second run (0: the same bits)"
+
+    def limit(self, direction: str) -> float:
+        """Return the largest allowed error: torch's products may be added in another order."""
+        return LIMITS[direction]
+
+    def check(self, direction: str) -> Error:
+        """Measure the difference of two runs."""
+        run = self.backward if direction == BOTH else lambda: [self.forward()]
+        first, second = ({str(i): x for i, x in enumerate(run())} for _ in range(2))
+        return compare(first, second)
+
+    def work(self) -> dict[str, int]:
+        """Return the bytes that a forward pass keeps for its gradient."""
+        inputs = [self.tokens.detach().requires_grad_(), *self.block.parameters()]
+        return {"saved_bytes": saved_bytes(lambda: self.block(inputs[0], None), inputs)}
+
+
 def without_encoder(config: GambaConfig) -> GambaConfig:
     """Return the configuration without an image encoder and its prepended tokens."""
     return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
@@ -245,6 +318,18 @@ def pictures(settings: Settings) -> list[Variant]:
         made.append(Variant(name, model.eager, check, 0.0, oracle, default=True, rounds=10))
         made[-1].parameters = model.sizes
     return made
+
+
+def skipping(settings: Settings) -> list[Variant]:
+    """Work left out in one view of the Gaussians that the shipped model predicts from a picture:
+    each switch of ``Skip`` off alone, and all off.
+    """
+    picture = STARTER / "icons" / "blendswap-cc-0-teddybear.png"
+    predicted = reconstruct(load_model(), picture).map(torch.clone)  # no tensors of inference
+    gaussians = {name: getattr(predicted, name) for name in LEAVES}
+    size = 256 if settings.level == "quick" else 512
+    scene = Scene(gaussians, *orbit_cameras(1, size), size, settings.device)
+    return [v for x in DIRECTIONS for v in raster.switches(scene, "the model's output", x)]
 
 
 def cuda_graphs(settings: Settings) -> list[Variant]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import torch
+from torch import Tensor
 
 from ..cases.problem import BOTH, DIRECTIONS, Error, Operator, compare
 from ..cases.raster import LEAVES, TRADE_LIMIT, Scene, orbit_cameras, shell
+from ..rasterize import Skip
 from ..rasterize.harmonics import colors_seen_from
 from ..rasterize.harmonics.formula import colors_by_formula
 from . import measure, peers
@@ -56,8 +58,8 @@ def _pair(scene: Scene, name: str, **changes) -> list[Variant]:
 
 
 def scenes(settings: Settings) -> list[Variant]:
-    """The probe scene: 16,384 Gaussians on a shell, one view of 512², whole operator (project,
-    sort, bin, blend), with standard deviations of 0.01, 0.02 and 0.04 of the object's size.
+    """The probe scene: Gaussians on a shell in one view, whole operator (project, sort, bin,
+    blend), with standard deviations of 0.01, 0.02 and 0.04 of the object's size.
     """
     made = []
     for scale in (1, 2, 4):
@@ -123,37 +125,66 @@ def knobs(settings: Settings) -> list[Variant]:
         rounded = {k: x.to(dtype) for k, x in scene.gaussians.items()}
         rounded = scene.changed(gaussians=rounded, truth=scene.gaussians)
         made += _pair(rounded, f"{name} inputs", limit=TRADE_LIMIT, dtype=name)
+    for v in made:
+        v.parameters["scale"] = 2
     return made
 
 
 def skipping(settings: Settings) -> list[Variant]:
-    """Work left out because no result needs it, at scale 2, against the same call that needs
-    all. Skipped: share of the pairs of Gaussians and tiles, or of the gradients.
+    """Work left out because no result needs it: each switch of ``Skip`` off alone, and all off.
+    One view; a few large Gaussians, and many small ones.
     """
-    scene = make_scene(settings, 2)
-    made = [_variant(scene, "all gradients, whole picture", BOTH, default=True)]
-    for name in ("colors", "means"):
-        made.append(_variant(scene.changed(wanted=(name,)), f"gradient of {name} alone", BOTH))
-        made[-1].work = lambda: scene.work(True) | {"skipped": 1 - 1 / len(LEAVES)}
-    half = scene.size // 2
-    for name, rows in (("half", scene.size), ("a quarter", half)):
-        part = torch.zeros_like(scene.upstream)
-        part[:, :rows, :half] = scene.upstream[:, :rows, :half]
-        part = scene.changed(cotangent=part)
-        made.append(_variant(part, f"upstream gradient on {name} of the picture", BOTH))
-        made[-1].work = partial(_tiles_skipped, part)
+    quick = settings.level == "quick"
+    scenes = {"few large": (512, 8.0), "many small": (4096 if quick else 65536, 0.5)}
+    made = []
+    for name, (count, scale) in scenes.items():
+        scene = make_scene(settings, scale, count)
+        made += [v for direction in DIRECTIONS for v in switches(scene, name, direction)]
+    return made + needed(make_scene(settings, 2))
+
+
+_FORWARD = ("tile_test", "block_test", "stopped", "empty_tiles")  # the others are of the gradient
+_SAME = "the call with all on (0: the same bits)"
+
+
+def switches(scene: Scene, name: str, direction: str) -> list[Variant]:
+    """Return the variants with each switch off alone, and all off; their bits are compared."""
+    names = [x.name for x in fields(Skip) if direction == BOTH or x.name in _FORWARD]
+    off = {"all on": (), **{f"{x} off": (x,) for x in names}, "all off": names}
+    made = []
+    for label, those in off.items():
+        other = scene.changed(options=scene.options | {"skip": Skip(**dict.fromkeys(those, False))})
+        check = partial(_difference, other, scene, direction)
+        changes = {"check": check, "limit": 0.0, "oracle": _SAME, "default": not those}
+        made.append(_variant(other, f"{name}: {label}", direction, **changes))
     return made
 
 
-def _tiles_skipped(scene: Scene) -> dict[str, float]:
-    counts = scene.work(True)
-    occupied = counts["tiles"] - counts["tiles_empty"]
-    skipped = counts["tiles_skipped"] - counts["tiles_empty"]
-    return counts | {"skipped": skipped / max(occupied, 1)}
+def _difference(scene: Scene, other: Scene, direction: str) -> Error:
+    run = "backward" if direction == BOTH else "forward"
+    got, want = (getattr(x, run)() for x in (scene, other))
+    return compare(
+        *({str(i): x for i, x in enumerate(r) if isinstance(x, Tensor)} for r in (got, want))
+    )
+
+
+def needed(scene: Scene) -> list[Variant]:
+    """Return calls that need a part of the gradients, with the switch for it on and off."""
+    half = scene.size // 2
+    part = torch.zeros_like(scene.upstream)
+    part[:, :half, :half] = scene.upstream[:, :half, :half]
+    cases = {
+        "gradient of colors alone": (scene.changed(wanted=("colors",)), "unasked"),
+        "upstream gradient on a quarter": (scene.changed(cotangent=part), "zero_upstream"),
+    }
+    made = []
+    for name, (changed, switch) in cases.items():
+        made += [v for v in switches(changed, name, BOTH) if v.default or f": {switch} " in v.name]
+    return made
 
 
 def one_call(settings: Settings) -> list[Variant]:
-    """8 objects of 4,096 Gaussians in 4 views of 128² each: in one call, and in 32."""
+    """Several objects in a few views each: in one call, and in as many as pictures."""
     objects, views, size = (2, 2, 64) if settings.level == "quick" else (8, 4, 128)
     shells = [shell(4096, 2, seed) for seed in range(objects)]
     viewmats, Ks = orbit_cameras(views, size)
@@ -180,7 +211,7 @@ def _call_all(runs: list) -> None:
 
 
 def many_views(settings: Settings) -> list[Variant]:
-    """32 views of 512² in one launch, compared with gsplat."""
+    """Many views in one launch, compared with gsplat."""
     scene = make_scene(settings, views=32)
     return _pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
 

@@ -1,11 +1,11 @@
-"""Report of measurements: Markdown tables, and a chart of run time over error."""
+"""Report of measurements: Markdown tables, and charts of run time over error."""
 
 from __future__ import annotations
 
 import html
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
 from ..runtime import tables
@@ -16,6 +16,7 @@ _WORK = {
     "pairs_box": "pairs of boxes",
     "pairs": "of ellipses",
     "pairs_traversed": "traversed",
+    "blocks_traversed": "blocks",
     "skipped": "skipped",
     "state_history_bytes": "history",
     "saved_bytes": "saved",
@@ -24,6 +25,7 @@ _WORK = {
     "share of convolution": "convolution",
     "share of rasterizer": "rasterizer",
     "share of products": "products",
+    "share of pictures' convolutions": "pictures' convolutions",
 }
 _UNSTEADY = 1.3  # ratio of the 80 % and 20 % quantiles from which a time is marked
 _BUSY = 1.2  # wall time over CPU time from which a machine is busy
@@ -59,7 +61,9 @@ def _work_text(r: dict) -> str:
             if name == "skipped" or name.startswith("share"):
                 text = f"{value:.0%}"
             elif name == "samples":
-                text = f"{1e3 * value / r['ms_p50']:.3g} samples/s"
+                on_cpu = r["device"] == "cpu"
+                rate = 1e3 * value / r["cpu_ms" if on_cpu else "ms_p50"]
+                text = f"{rate:.3g} samples per {'CPU second' if on_cpu else 'second'}"
             else:
                 text = f"{value / 2**20:,.1f} MiB" if name.endswith("_bytes") else f"{value:,}"
             yield f"{label} {text}".strip()
@@ -81,8 +85,13 @@ def _row(r: dict) -> list[str]:
     return [name, r["direction"], r["dtype"], *times, error or "none", peer, _work_text(r)]
 
 
+def _sizes(r: dict) -> str:
+    return ", ".join(f"{name} {value}" for name, value in r["parameters"].items())
+
+
 def _table(records: Sequence[dict]) -> str:
-    columns = zip((*_HEADER, "peer's time / ours", "work"), *map(_row, records))
+    columns = [*zip((*_HEADER, "peer's time / ours", "work"), *map(_row, records))]
+    columns.insert(1, ("sizes", *map(_sizes, records)))
     shown = [c for c in columns if c[0] in _HEADER or any(c[1:])]
     header, *rows = zip(*shown)
     return tables.markdown(header, rows)
@@ -106,7 +115,9 @@ def busy_line(document: dict) -> str:
 
 def markdown(document: dict) -> str:
     """Return a page with a table for each case."""
-    lines = ["# Benchmarks", "Written by `gamba bench`.", _EXPLANATION, machine_line(document)]
+    level = document["settings"]["level"]
+    title = "# Benchmarks" + ("" if level == "normal" else f", {level} sizes")
+    lines = [title, "Written by `gamba bench`.", _EXPLANATION, machine_line(document)]
     lines += ["The run was interrupted; these are its measurements."] * document["interrupted"]
     lines += filter(None, [busy_line(document)])
     for (op, case), group in groupby(document["records"], lambda r: (r["op"], r["case"])):
@@ -118,62 +129,93 @@ def markdown(document: dict) -> str:
     return "\n\n".join(lines) + "\n"
 
 
-_WIDTH, _HEIGHT, _MARGIN = 640, 300, 50  # of a panel, pixels
+# A panel, its margin, and a line of the legend, pixels.
+_WIDTH, _HEIGHT, _MARGIN, _LINE = 440, 280, 46, 15
 
 
-def chart(document: dict) -> str:
-    """Return an SVG with a panel of run time over error for each operator and direction.
+def charts(document: dict) -> dict[str, str]:
+    """Return an SVG of run time over error for each operator, a panel a direction.
 
-    Axes are logarithmic, an error of 0 is drawn at the bottom. A ring is a default, a square a
-    peer; titles of the marks name case, variant, time and error.
+    They have all variants of the sizes of its case "knobs", by the numbers of a legend; axes are
+    logarithmic. A ring is a default, a square a peer. What has no error, or has the same bits as
+    another variant, is left out.
     """
-    done = [r for r in document["records"] if r["ms_p50"] and r["rel_rms_error"] is not None]
-    panels: dict[tuple[str, str], list[dict]] = {}
-    for r in done:
-        panels.setdefault((r["op"], r["direction"]), []).append(r)
+    made = {}
+    for op, group in groupby(document["records"], lambda r: r["op"]):
+        records = [r for r in group if r["ms_p50"] and r["rel_rms_error"]]
+        sizes = next((r["parameters"] for r in records if r["case"] == "knobs"), None)
+        if sizes is not None:
+            same = [r for r in records if sizes.items() <= r["parameters"].items()]
+            made[op] = _chart(f"{op}: {_sizes(same[0])}", same)
+    return made
+
+
+def _chart(title: str, records: Sequence[dict]) -> str:
+    names = [*dict.fromkeys(_label(r) for r in records)]
+    numbers = {name: i + 1 for i, name in enumerate(names)}
+    panels: dict[str, list[dict]] = {}
+    for r in records:
+        panels.setdefault(r["direction"], []).append(r)
     body = [
-        f'<g transform="translate(0 {i * _HEIGHT})">{_panel(" ".join(name), records)}</g>'
-        for i, (name, records) in enumerate(panels.items())
+        f'<g transform="translate({_WIDTH * i} 24)">{_panel(name, group, numbers)}</g>'
+        for i, (name, group) in enumerate(panels.items())
     ]
-    size = f'width="{_WIDTH}" height="{max(1, len(panels)) * _HEIGHT}"'
+    width, rows = _WIDTH * len(panels), -(-len(names) // 3)
+    for i, name in enumerate(names):
+        at = _MARGIN + i // rows * (width - _MARGIN) / 3, _HEIGHT + 40 + i % rows * _LINE
+        body.append(_text(at, f"{i + 1}  {name}", "start"))
+    height = _HEIGHT + 40 + rows * _LINE
+    size = f'width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
     style = 'font-family="sans-serif" font-size="11" fill="none" stroke="none"'
+    ground = f'<rect width="{width}" height="{height}" fill="white"/>'
+    head = _text((width / 2, 16), f"{title}; relative rms error over milliseconds")
     return "\n".join(
-        [f'<svg xmlns="http://www.w3.org/2000/svg" {size} {style}>', *body, "</svg>\n"]
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" {size} {style}>',
+            ground,
+            head,
+            *body,
+            "</svg>\n",
+        ]
     )
 
 
-def _panel(title: str, records: Sequence[dict]) -> str:
-    times = [math.log10(r["ms_p50"]) for r in records]
-    least = min((r["rel_rms_error"] for r in records if r["rel_rms_error"]), default=1e-8) / 3
-    errors = [math.log10(max(r["rel_rms_error"], least)) for r in records]
-    left, right = math.floor(min(times)), math.floor(max(times)) + 1
+def _label(r: dict) -> str:
+    return f"{r['variant']}, {r['dtype']}" if r["dtype"] not in r["variant"] else r["variant"]
+
+
+def _text(at: tuple[float, float], words: str, anchor: str = "middle") -> str:
+    place = f'x="{at[0]:.1f}" y="{at[1]:.1f}" text-anchor="{anchor}"'
+    return f'<text {place} fill="black">{html.escape(words)}</text>'
+
+
+def _panel(title: str, records: Sequence[dict], numbers: Mapping[str, int]) -> str:
+    points = [(math.log10(r["ms_p50"]), math.log10(r["rel_rms_error"])) for r in records]
+    times, errors = zip(*points)  # whole powers of ten up, half ones across
+    left, right = math.floor(2 * min(times)) / 2, math.floor(2 * max(times) + 1) / 2
     low, high = math.floor(min(errors)), math.floor(max(errors)) + 1
 
-    def x(value: float) -> float:
-        return _MARGIN + (value - left) / (right - left) * (_WIDTH - 2 * _MARGIN)
+    def place(point: tuple[float, float]) -> tuple[float, float]:
+        x, y = ((v - a) / (b - a) for v, a, b in zip(point, (left, low), (right, high)))
+        across, up = _WIDTH - 2 * _MARGIN, _HEIGHT - 2 * _MARGIN
+        return _MARGIN + x * across, _HEIGHT - _MARGIN - y * up
 
-    def y(value: float) -> float:
-        return _HEIGHT - _MARGIN + (low - value) / (high - low) * (_HEIGHT - 2 * _MARGIN)
-
-    def text(at: tuple[float, float], words: str, anchor: str = "middle") -> str:
-        place = f'x="{at[0]:.1f}" y="{at[1]:.1f}" text-anchor="{anchor}"'
-        return f'<text {place} fill="black">{html.escape(words)}</text>'
-
-    parts = [text((_WIDTH / 2, 20), f"{title}: milliseconds over relative rms error")]
-    for power in range(left, right + 1):
-        parts.append(f'<path d="M{x(power):.1f} {y(low):.1f}V{y(high):.1f}" stroke="#ddd"/>')
-        parts.append(text((x(power), _HEIGHT - _MARGIN + 16), f"{10.0**power:g} ms"))
+    (x0, y0), (x1, y1) = place((left, low)), place((right, high))
+    parts = [_text(((x0 + x1) / 2, y1 - 8), title)]
+    for step in range(round(2 * (right - left)) + 1):
+        x, _ = place((left + step / 2, low))
+        parts.append(f'<path d="M{x:.1f} {y0:.1f}V{y1:.1f}" stroke="#ddd"/>')
+        parts.append(_text((x, y0 + 16), f"{10 ** (left + step / 2):.3g} ms"))
     for power in range(low, high + 1):
-        parts.append(f'<path d="M{x(left):.1f} {y(power):.1f}H{x(right):.1f}" stroke="#ddd"/>')
-        parts.append(text((_MARGIN - 6, y(power) + 4), f"1e{power}", "end"))
-    for r, time, error in zip(records, times, errors):
-        a, b = x(time), y(error)
-        mark = f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.5" fill="teal"'
+        _, y = place((left, power))
+        parts.append(f'<path d="M{x0:.1f} {y:.1f}H{x1:.1f}" stroke="#ddd"/>')
+        parts.append(_text((x0 - 6, y + 4), f"1e{power}", "end"))
+    for r, point in zip(records, points):
+        x, y = place(point)
+        mark = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="teal"/>'
         if r["is_peer"]:
-            mark = f'<path d="M{a - 3:.1f} {b - 3:.1f}h6v6h-6z" fill="orange"'
+            mark = f'<path d="M{x - 3:.1f} {y - 3:.1f}h6v6h-6z" fill="orange"/>'
         elif r["is_default"]:
-            mark = f'<circle cx="{a:.1f}" cy="{b:.1f}" r="5" stroke="teal" stroke-width="2"'
-        element = "path" if r["is_peer"] else "circle"
-        words = f"{r['case']}, {r['variant']}: {r['ms_p50']:.3g} ms, {r['rel_rms_error']:.2g}"
-        parts.append(f"{mark}><title>{html.escape(words)}</title></{element}>")
+            mark = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" stroke="teal" stroke-width="2"/>'
+        parts += [mark, _text((x + 8, y - 3), str(numbers[_label(r)]), "start")]
     return "".join(parts)

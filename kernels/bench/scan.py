@@ -137,8 +137,8 @@ def layers(settings: Settings) -> list[Variant]:
 
 
 def packed(settings: Settings) -> list[Variant]:
-    """Sequences of many lengths in one packed row, and one sequence as long. The oracle sees the
-    first of them.
+    """Sequences of many lengths in one packed row, one sequence as long, and a few of the sequences
+    in rows that are padded to the longest. The oracle sees the first of them.
     """
     length, width, _ = SIZES[settings.level]
     first = length // 8
@@ -151,6 +151,9 @@ def packed(settings: Settings) -> list[Variant]:
         cuts = torch.tensor([0, *cuts.tolist(), length], dtype=torch.int32, device=settings.device)
         cut = replace(problem, function=partial(problem.function, cu_seqlens=cuts))
         made += pair(cut, f"{count} sequences")
+        if count == 8:
+            rows = make_inputs(count, int(cuts.diff().max()), width)
+            made += pair(scan_problem(rows, settings.device, first), f"{count} sequences, padded")
     return made
 
 
