@@ -30,8 +30,8 @@ class ViewsOptions:
             prediction | truth); without it only the table is printed.
         protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, with the
             first view as the input; the report lists missing objects. It fixes --size, --reference,
-            --views, --split and --limit. splatter-image, gamba: these papers' values, as far as
-            published (gamba eval-geometry --protocol NAME --explain); these options change them,
+            --views, --split and --limit. splatter-image, leangaussian, gamba: these papers' values, as far
+            as published (gamba eval-geometry --protocol NAME --explain); these options change them,
             and the report notes that.
         split: Split of the dataset.
         reference: Index of the input view; 0 by default.
@@ -70,7 +70,7 @@ class ViewsOptions:
     checkpoint: Annotated[Path, tyro.conf.arg(aliases=["--predictions"])]
     data: Path
     out: Path | None = None
-    protocol: Literal["default", "gso", "splatter-image", "gamba"] = "default"
+    protocol: Literal["default", "gso", "splatter-image", "leangaussian", "gamba"] = "default"
     split: Literal["all", "train", "val", "test"] = "test"
     reference: Annotated[int, Meta(ge=0, le=100_000)] | None = None
     views: Annotated[int, Meta(ge=1, le=100_000)] | None = None
