@@ -129,6 +129,7 @@ def _kernels(header: Path, run: int, covars: bool, original: bool) -> tuple[Any,
         inputs={**scene, **colors},
         outputs={"splats": splats},
         header=text,
+        grid_stride=False,
     )
     project_vjp = native_kernel(
         "project_vjp",

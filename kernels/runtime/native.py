@@ -74,6 +74,7 @@ def native_kernel(
     header: str,
     indices: str = "task",
     grouped: bool = False,
+    **options: Any,
 ) -> Any:
     """A kernel for ``launch`` that is C++: a function of ``header``, called for each task.
 
@@ -87,6 +88,7 @@ def native_kernel(
         indices: names of the launch's dimensions, the first of which is cut for the threads.
         grouped: True to give the function two structs in place of the arguments: ``in.u`` and
             ``out.y`` are those that are named ``u_in`` and ``y_out``.
+        **options: of ``wp.kernel``.
     """
     arguments = {**inputs, **outputs}
     names, text = ", ".join(arguments), f"{function}({indices}, {', '.join(arguments)});"
@@ -99,7 +101,8 @@ def native_kernel(
         f"    {name}_native(offset + {indices}, {names})\n"
     )
     own = dict.fromkeys(map(str.strip, indices.split(",")), int)
-    return _kernel(name, source, text, own | arguments, {"offset": int, **arguments}, header)
+    every = {"offset": int, **arguments}
+    return _kernel(name, source, text, own | arguments, every, header, **options)
 
 
 def cuda_kernel(

@@ -157,7 +157,7 @@ def test_only_one_kernel_contracts():
         heights.expand(1, num, 2) * 4,
     )
     bins = []
-    for contract in ("", "_count", "emit"):
+    for contract in ("", "count", "emit"):
         with interpreted(contract=contract) as machine:
             bins.append(bin_views(grid, splats, lambda count: None))
         assert not machine.findings, "\n".join(machine.findings)

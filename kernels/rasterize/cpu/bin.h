@@ -1,6 +1,6 @@
 // The tile lists of a CPU (README.md §2), four kernels: count the tiles of each Gaussian, offsets
 // of the lists, scatter the intersections, sort a list.
-#include "../../runtime/sixteen.h"
+#include "ellipse.h"
 namespace gamba::raster {
 
 typedef unsigned long long Word;
@@ -112,23 +112,6 @@ static void offsets(int, int parts, const Work& work, const Lists& lists) {
     *start = (int)place;
 }
 
-static inline I ints(F x) { return __builtin_convertvector(x, I); }
-static inline F floats(I x) { return __builtin_convertvector(x, F); }
-
-// log(x) for x >= 1 to 2e-7 of itself or 1e-7: the limit has a slack of 1e-4. The polynomial is the
-// series of 2 atanh(s) = log m to s^9, for m from sqrt(½) to sqrt(2).
-static inline F log(F x) {
-    const I bits = (I)x;
-    const I n = (bits - 0x3f3504f3) >> 23;
-    const F m = (F)(bits - (n << 23));
-    const F s = (m - 1.0f) / (m + 1.0f), w = s * s;
-    F p = fma(w, splat(0.2222222f), splat(0.2857143f));
-    p = fma(p, w, splat(0.4f));
-    p = fma(p, w, splat(0.6666667f));
-    p = fma(p, w, splat(2.0f));
-    return fma(floats(n), splat(0.69314718f), p * s);
-}
-
 // The numbers of Gaussian i that the lists need, each number ``stride`` after the one before.
 template<class Splats>
 INLINE void read(const Splats& splats, int i, float* to, int stride) {
@@ -141,101 +124,49 @@ INLINE void read(const Splats& splats, int i, float* to, int stride) {
     for (int k = 0; k < 2; ++k) to[(6 + k) * stride] = extent[k];
 }
 
-// Ellipses, and the tiles that they touch: lanes are Gaussians, or rows of tiles of one Gaussian.
+// Windows of 4 x 4 tiles of the ellipses ``seen``: a bit for each tile that is touched, as
+// ``corner`` the first tile, or -1 where the window is too small.
 template<class Config, class Grid>
-struct Ellipse {
-    const Grid& grid;
-    const F x, y, rx, ry, k, e;
-    F limit, over_a, reach, top;
-
-    // from the numbers of ``read``
-    Ellipse(const Grid& grid, const F* v)
-        : grid(grid), x(v[0]), y(v[1]), rx(v[6]), ry(v[7]), k(v[3]), e(v[4]) {
-        const F a = v[2];
-        limit = log(v[5] / grid.alpha_min) * (2.0f * Config::SLACK) + Config::SLACK_ABS;
-        top = -k * a * sqrt(limit / (a * (a * k * k + e) * e));
-        over_a = splat(1.0f) / a, reach = sqrt(limit / e);
+static inline I windows_of(const Grid& grid, const Ellipse& ellipse, I seen, I& corner) {
+    const Interval rows = rows_of<Config>(grid, ellipse);
+    const I count = rows.last - rows.first + 1;
+    I few = seen & (count <= 4);
+    const int most = __builtin_reduce_max(few ? count : I{});
+    Interval columns[4];
+    I left = I{} + grid.tiles_x, right = I{} - 1;
+    for (int t = 0; t < most; ++t) {
+        auto& [first, last] = columns[t] = columns_of<Config>(grid, ellipse, rows.first + t);
+        const I some = few & (t < count) & (first <= last);
+        first = some ? first : I{} + grid.tiles_x;
+        last = some ? last : I{} - 1;
+        left = first < left ? first : left;
+        right = last > right ? last : right;
     }
-    // The tile of a pixel, clamped before the cast: a footprint may be larger than an int32.
-    I tile(F pixel, int size) const {
-        return ints(min(max(pixel, F{}), splat((float)(size - 1)))) >> grid.shift;
+    few &= right - left < 4;
+    I bits = I{};
+    for (int t = 0; t < most; ++t) {
+        const auto [first, last] = columns[t];
+        const I some = few & (first <= last), one = I{} + 1;
+        const I from = some ? first - left : I{}, to = some ? last - left : I{};
+        bits |= some ? ((one << (to + 1)) - (one << from)) << (4 * t) : I{};
     }
-    // First and last row with a pixel centre (at +0.5) in reach, with a pixel to spare; or of
-    // README eq. 16's square, whose half side is the reach.
-    I first_row() const {
-        return tile(y - ry - (grid.skip & Config::SQUARES ? 0.5f : 1.0f), grid.height);
-    }
-    I last_row() const {
-        return tile(y + ry + (grid.skip & Config::SQUARES ? -1.5f : 1.0f), grid.height);
-    }
-    // README eq. 6: first and last column of rows ``ty``; first > last: none.
-    void columns(I ty, I& first, I& last) const {
-        const int width = grid.width, height = grid.height;
-        if (!(grid.skip & Config::TILE_TEST)) {
-            first = tile(x - rx, width);
-            last = tile(x + rx, width);
-            return;
-        }
-        // exact numbers first, the mean once: rounding must not turn one row of pixels into none
-        const F y0 = max(floats(ty << grid.shift) + 0.5f - y, -reach);
-        const I below = (ty + 1) << grid.shift;
-        const F bound = floats(below < height ? below : I{} + height) - 0.5f;
-        const F y1 = min(bound - y, reach);
-        // convex, so clamping finds the extremes
-        const F right = min(max(top, y0), y1), left = min(max(-top, y0), y1);
-        F x1 = sqrt(max(limit - e * right * right, F{}) * over_a);
-        F x0 = sqrt(max(limit - e * left * left, F{}) * over_a);
-        x1 = x - k * right + x1;
-        x0 = x - k * left - x0;
-        const I none = (y0 > y1) | (x1 < 0.5f) | (x0 > (float)width - 0.5f);
-        // a tile spans pixel centres 0.5 to 15.5; a gap between two tiles belongs to neither
-        first = none ? I{} : tile(x0 + 0.5f, width);
-        last = none ? I{} - 1 : tile(x1 - 0.5f, width);
-        if (!(grid.skip & Config::SQUARES)) return;
-        const I begin = tile(x - rx - 0.5f, width), end = tile(x + rx - 1.5f, width);
-        first = first > begin ? first : begin;
-        last = last < end ? last : end;
-    }
-    // Windows of 4 x 4 tiles of those ``seen``: a bit for each tile that is touched, as ``corner``
-    // the first tile, or -1 where the window is too small.
-    I windows(I seen, I& corner) const {
-        const I top = first_row(), count = last_row() - top + 1;
-        I few = seen & (count <= 4);
-        const int most = __builtin_reduce_max(few ? count : I{});
-        I firsts[4], lasts[4], left = I{} + grid.tiles_x, right = I{} - 1;
-        for (int t = 0; t < most; ++t) {
-            columns(top + t, firsts[t], lasts[t]);
-            const I some = few & (t < count) & (firsts[t] <= lasts[t]);
-            firsts[t] = some ? firsts[t] : I{} + grid.tiles_x;
-            lasts[t] = some ? lasts[t] : I{} - 1;
-            left = firsts[t] < left ? firsts[t] : left;
-            right = lasts[t] > right ? lasts[t] : right;
-        }
-        few &= right - left < 4;
-        I bits = I{};
-        for (int t = 0; t < most; ++t) {
-            const I some = few & (firsts[t] <= lasts[t]), one = I{} + 1;
-            const I from = some ? firsts[t] - left : I{}, to = some ? lasts[t] - left : I{};
-            bits |= some ? ((one << (to + 1)) - (one << from)) << (4 * t) : I{};
-        }
-        const I large = seen & ~few;
-        corner = large ? I{} - 1 : (bits != 0 ? top * grid.tiles_x + left : I{});
-        return bits;
-    }
-};
+    const I large = seen & ~few;
+    corner = large ? I{} - 1 : (bits != 0 ? rows.first * grid.tiles_x + left : I{});
+    return bits;
+}
 
 // visit(row, first, last) for each row of tiles that Gaussian i touches.
 template<class Config, class Grid, class Splats, class Visit>
-static inline void rows_of(const Grid& grid, const Splats& splats, int i, Visit visit) {
+static inline void visit_rows(const Grid& grid, const Splats& splats, int i, Visit visit) {
     float numbers[8];
     F v[8];
     read(splats, i, numbers, 1);
     for (int k = 0; k < 8; ++k) v[k] = splat(numbers[k]);
-    const Ellipse<Config, Grid> ellipse(grid, v);
-    const int top = ellipse.first_row()[0], bottom = ellipse.last_row()[0];
+    const Ellipse ellipse = ellipse_of<Config>(v, grid.alpha_min);
+    const Interval rows = rows_of<Config>(grid, ellipse);
+    const int top = rows.first[0], bottom = rows.last[0];
     for (int t = top; t <= bottom; t += 16) {
-        I first, last;
-        ellipse.columns(lane + t, first, last);
+        const auto [first, last] = columns_of<Config>(grid, ellipse, lane + t);
         for (int k = 0; k < 16 && t + k <= bottom; ++k)
             if (first[k] <= last[k]) visit(t + k, first[k], last[k]);
     }
@@ -282,7 +213,10 @@ static void count(int task, int parts, const Grid& grid, const Splats& splats, c
         Word* const words = (Word*)(work.windows.data + (size_t)g * 16);
         const I seen = v[6] > 0.0f;
         I corners = I{}, bits = I{};
-        if (any(seen)) bits = Ellipse<Config, Grid>(grid, v).windows(seen, corners);
+        if (any(seen)) {
+            const Ellipse ellipse = ellipse_of<Config>(v, grid.alpha_min);
+            bits = windows_of<Config>(grid, ellipse, seen, corners);
+        }
         *(I*)corner = corners;
         typedef unsigned short Short __attribute__((vector_size(32), aligned(2)));
         *(Short*)words = __builtin_convertvector(bits, Short);
@@ -297,7 +231,7 @@ static void count(int task, int parts, const Grid& grid, const Splats& splats, c
         if (any(corners < 0))
             for (int l = 0; l < n; ++l)
                 if (corners[l] < 0)
-                    rows_of<Config>(
+                    visit_rows<Config>(
                         grid, splats, part.gaussian(j + l), [&](int ty, int first, int last) {
                             int* const row = counts + (size_t)ty * grid.tiles_x;
                             for (int tx = first; tx <= last; ++tx) ++row[tx];
@@ -335,7 +269,7 @@ static void scatter(int task, int parts, const Grid& grid, const Splats& splats,
                 const int i = part.gaussian(j + l);
                 lists.offsets.data[j + l] = p;
                 if (corner[l] < 0)
-                    rows_of<Config>(grid, splats, i, [&](int ty, int first, int last) {
+                    visit_rows<Config>(grid, splats, i, [&](int ty, int first, int last) {
                         int* const row = cursors + (size_t)ty * grid.tiles_x;
                         for (int tx = first; tx <= last; ++tx) emit(row[tx], i);
                     });

@@ -2,214 +2,74 @@
 
 The lists are as long as there are pairs, but for a CUDA graph, whose lists have a capacity: unused
 entries sort behind the last tile. If it is too small, no pair is written and all lists are empty.
+README.md §2 holds the maths, ``bin.h`` the code.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, no_type_check
+from pathlib import Path
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
+from ...runtime.native import constants, native, native_kernel
 from ...runtime.views import as_struct, struct_of
 from ..projection import Projected
 from ..skip import SQUARES, TILE_TEST
-from ..tiles import Bins, Grid
+from ..tiles import SLACK, SLACK_ABS, Bins, Grid
 from . import capacity
-from . import leaves as L
-from .ellipse import Ellipse, make_ellipse, tile_columns, tile_rows
-
-wp.set_module_options({"enable_backward": False})
-
 
 _KEPT = 7  # rows of tiles of a Gaussian whose columns are kept between counting and writing
 _EACH = 4  # pairs of a thread of ``in_tile_order``
 
+_CONFIG = constants(
+    "Config",
+    **{"SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "TILE_TEST": TILE_TEST, "SQUARES": SQUARES},
+    **{"KEPT": _KEPT, "EACH": _EACH},
+)
+_HEADER = _CONFIG + native(Path(__file__).with_name("bin.h"))
+_OPTIONS: dict[str, Any] = {"header": _HEADER, "grouped": True, "grid_stride": False}
+_INTS, _LONGS = wp.array[wp.int32], wp.array[wp.int64]
 
-@wp.func
-@no_type_check
-def _ellipse(grid: Grid, splats_in: struct_of(Projected), i: wp.int32) -> Ellipse:
-    mean = L.load_vec2(splats_in.means2d, i)
-    opacity = L.load_float(splats_in.view_opacities, i)
-    ellipse = make_ellipse(mean, L.load_vec3(splats_in.conics, i), opacity, grid.alpha_min)
-    if (grid.skip & (TILE_TEST | SQUARES)) != TILE_TEST:
-        ellipse.box = L.load_vec2(splats_in.extents, i)
-    return ellipse
-
-
-@wp.func
-@no_type_check
-def _are_kept(grid: Grid, rows: wp.vec2i) -> bool:
-    # few rows, and tiles whose numbers a word has room for
-    return rows[1] - rows[0] < _KEPT and wp.max(grid.tiles_x, grid.tiles_y) < 1 << 15
-
-
-@wp.func
-@no_type_check
-def _span(tiles: wp.vec2i) -> wp.int32:
-    # first and number in a word, from first and last, which is first - 1 at the least
-    return tiles[0] | tiles[1] - tiles[0] + 1 << 16
-
-
-@wp.kernel(grid_stride=False)
-@no_type_check
-def _count(
-    offset: wp.int32,
-    grid: Grid,
-    splats_in: struct_of(Projected),
-    nearest_in: wp.array[wp.int64],
-    order_out: wp.array[wp.int32],
-    spans_out: wp.array2d[wp.int32],
-    counts_out: wp.array[wp.int64],
-):
-    j = offset + wp.tid()
-    num = order_out.shape[0]
-    i = j / grid.num * grid.num + wp.int32(L.load_long(nearest_in, j))
-    L.store_int(order_out, j, i)
-    extent = L.load_vec2(splats_in.extents, i)
-    count = wp.int32(0)
-    if extent[0] > 0.0:
-        ellipse = _ellipse(grid, splats_in, i)
-        rows = tile_rows(grid, ellipse)
-        kept = _are_kept(grid, rows)
-        at = wp.int64(j)
-        L.store_word(spans_out, at, 0, wp.where(kept, _span(rows), 0))
-        ty = rows[0]
-        while ty <= rows[1]:
-            columns = tile_columns(grid, ellipse, ty)
-            count += columns[1] - columns[0] + 1
-            at += wp.int64(num)
-            if kept:
-                L.store_word(spans_out, at, 0, _span(columns))
-            ty = L.opaque(ty + 1)  # keeps the loop from being unrolled, which splits warps more
-    if j == 0:
-        L.store_long(counts_out, 0, wp.int64(0))  # their running sum is where each begins
-    L.store_long(counts_out, j + 1, wp.int64(count))
+_count = native_kernel(
+    "count",
+    "gamba::raster::count<Config>",
+    inputs={"grid": Grid, "splats_in": struct_of(Projected), "nearest_in": _LONGS},
+    outputs={"order_out": _INTS, "spans_out": wp.array2d[wp.int32], "counts_out": _LONGS},
+    **_OPTIONS,
+)
 
 
 @functools.cache
-def _tile_kernels(number: Any):
+def _tile_kernels(number: Any) -> tuple[Any, Any]:
     """The kernels that write and read the numbers of tiles, of this type, between the sort."""
-
-    @wp.func_native("values.data[i] = v;")
-    def store_tile(values: wp.array(dtype=number), i: wp.int32, v: number): ...
-
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    @no_type_check
-    def emit(
-        offset: wp.int32,
-        grid: Grid,
-        splats_in: struct_of(Projected),
-        order_in: wp.array[wp.int32],
-        spans_in: wp.array2d[wp.int32],
-        sums_in: wp.array[wp.int64],
-        first: wp.int32,
-        behind: wp.int32,
-        tiles_out: wp.array(dtype=number),
-        gaussians_out: wp.array[wp.int32],
-        offsets_out: wp.array[wp.int32],
-        count_out: wp.array[wp.int64],
-    ):
-        j = offset + wp.tid()
-        num = order_in.shape[0]
-        size = tiles_out.shape[0]
-        total = L.load_long(sums_in, num)
-        p = wp.int32(L.load_long(sums_in, j))
-        end = wp.int32(L.load_long(sums_in, j + 1))
-        if j == 0:
-            count_out[0] = total
-            L.store_int(offsets_out, 0, 0)
-        L.store_int(offsets_out, j + 1, end)
-        count = wp.int32(0)
-        if total <= wp.int64(size):
-            count = wp.int32(total)
-            if p < end:
-                i = L.load_int(order_in, j)
-                at = wp.int64(j)
-                span = L.load_word(spans_in, at, 0)
-                kept = span != 0
-                row = span & 0xFFFF
-                rows = span >> 16
-                ellipse = Ellipse()
-                if not kept:
-                    ellipse = _ellipse(grid, splats_in, i)
-                    ends = tile_rows(grid, ellipse)
-                    row = ends[0]
-                    rows = ends[1] - row + 1
-                tile = first + (i / grid.num * grid.tiles_y + row) * grid.tiles_x
-                for r in range(rows):
-                    at += wp.int64(num)
-                    if kept:
-                        span = L.load_word(spans_in, at, 0)
-                        tx = tile + (span & 0xFFFF)
-                        last = p + (span >> 16)
-                    else:
-                        ends = tile_columns(grid, ellipse, row + r)
-                        tx = tile + ends[0]
-                        last = p + ends[1] - ends[0] + 1
-                    # no more than were counted: a compiler may round otherwise here than there
-                    last = wp.min(last, end)
-                    while p < last:
-                        store_tile(tiles_out, p, number(tx))
-                        L.store_int(gaussians_out, p, i)
-                        tx += 1
-                        p += 1
-                    tile += grid.tiles_x
-                for free in range(p, end):  # where rounding found fewer
-                    store_tile(tiles_out, free, number(behind))
-                    L.store_int(gaussians_out, free, i)
-        place = wp.int64(count) + wp.int64(j)  # of 64 bits, as the last step may pass 2^31
-        while place < wp.int64(size):
-            store_tile(tiles_out, wp.int32(place), number(behind))
-            place += wp.int64(num)
-
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    @no_type_check
-    def in_tile_order(
-        offset: wp.int32,
-        threads: wp.int32,
-        tiles_in: wp.array(dtype=number),
-        emitted_in: wp.array[wp.int64],
-        gaussians_in: wp.array[wp.int32],
-        count_in: wp.array[wp.int64],
-        first: wp.int32,
-        pairs_out: wp.array[wp.int32],
-        rows_out: wp.array[wp.int32],
-        starts_out: wp.array[wp.int32],
-    ):
-        k = offset + wp.tid()
-        size = tiles_in.shape[0]
-        count = wp.int32(0)
-        if count_in[0] <= wp.int64(size):
-            count = wp.int32(count_in[0])
-        # all loads before the stores, so that they are in flight together
-        left = count - k
-        row = wp.vec4i()
-        g = wp.vec4i()
-        for n in range(_EACH):
-            if n * threads < left:
-                row[n] = wp.int32(L.load_long(emitted_in, k + n * threads))
-        for n in range(_EACH):
-            if n * threads < left:
-                g[n] = L.load_int(gaussians_in, row[n])
-        for n in range(_EACH):
-            if n * threads < left:
-                L.store_int(rows_out, k + n * threads, row[n])
-                L.store_int(pairs_out, k + n * threads, g[n])
-        if k < starts_out.shape[0]:
-            # the first pair whose tile is k or later
-            low = wp.int32(0)
-            high = size
-            while low < high:
-                middle = low + (high - low) / 2
-                if wp.int32(tiles_in[middle]) < first + k:
-                    low = middle + 1
-                else:
-                    high = middle
-            starts_out[k] = low
-
+    tiles = wp.array(dtype=number)
+    emit = native_kernel(
+        "emit",
+        "gamba::raster::emit<Config>",
+        inputs={
+            **{"grid": Grid, "splats_in": struct_of(Projected), "order_in": _INTS},
+            **{"spans_in": wp.array2d[wp.int32], "sums_in": _LONGS, "first": int, "behind": int},
+        },
+        outputs={
+            **{"tiles_out": tiles, "gaussians_out": _INTS},
+            **{"offsets_out": _INTS, "count_out": _LONGS},
+        },
+        **_OPTIONS,
+    )
+    in_tile_order = native_kernel(
+        "in_tile_order",
+        "gamba::raster::in_tile_order<Config>",
+        inputs={
+            **{"threads": int, "tiles_in": tiles, "emitted_in": _LONGS, "gaussians_in": _INTS},
+            **{"count_in": _LONGS, "first": int},
+        },
+        outputs={"pairs_out": _INTS, "rows_out": _INTS, "starts_out": _INTS},
+        **_OPTIONS,
+    )
     return emit, in_tile_order
 
 
