@@ -12,8 +12,6 @@ import warp as wp
 from ..runtime.views import filled, struct
 from .constants import TILE
 
-wp.set_module_options({"enable_backward": False})
-
 # Rounding of q, relative and absolute; the test may keep too much, never too little.
 SLACK, SLACK_ABS = 1.0 + 1e-4, 1e-4
 
@@ -211,12 +209,3 @@ def raster_params(size: Size, limits: Limits, *, num: int) -> RasterParams:
     tiling = Tiling(size.width, size.height)
     sizes = *tiling, tiling.tiles_x, tiling.tiles_y, size.views, num, size.colors_per_view
     return filled(RasterParams, *sizes, *limits[:3], size.skip)
-
-
-@wp.func
-def color_row(params: RasterParams, g: int) -> int:
-    # the row of view-major Gaussian g; shared colours have one row for each object's Gaussian
-    row = g
-    if params.colors_per_view == 0:
-        row = g // (params.views * params.num) * params.num + g % params.num
-    return row
