@@ -9,26 +9,9 @@ from ...runtime.scalars import reciprocal as reciprocal
 wp.set_module_options({"enable_backward": False})
 
 
-def _approximate(instruction: str, on_cpu: str) -> str:
-    # the tests run kernels for tile lists on a CPU too
-    return f"""
-#ifdef __CUDA_ARCH__
-    float y; asm("{instruction}.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x)); return y;
-#else
-    return {on_cpu};
-#endif
-"""
-
-
-@wp.func_native(_approximate("sqrt", "sqrtf(x)"))
+@wp.func_native('float y; asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x)); return y;')
 def root(x: wp.float32) -> wp.float32:
     """The square root, to 2 units in the last place."""
-    ...
-
-
-@wp.func_native(_approximate("lg2", "log2f(x)"))
-def log2(x: wp.float32) -> wp.float32:
-    """The logarithm to base 2, with an absolute error of 2^-22."""
     ...
 
 
@@ -36,32 +19,6 @@ def log2(x: wp.float32) -> wp.float32:
 # costs instructions and, in loops, registers.
 @wp.func_native("return values.data[i];")
 def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
-
-
-@wp.func_native("return values.data[i];")
-def load_float(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
-
-
-@wp.func_native("return values.data[i];")
-def load_long(values: wp.array[wp.int64], i: wp.int32) -> wp.int64: ...
-
-
-@wp.func_native("""
-    const float* at = values.data[i].c;
-    if (((size_t)at & 7) != 0) return wp::vec_t<2, float>(at[0], at[1]);
-    struct alignas(8) Two { float x, y; };
-    const Two two = *(const Two*)at;
-    return wp::vec_t<2, float>(two.x, two.y);
-""")
-def load_vec2(values: wp.array[wp.vec2], i: wp.int32) -> wp.vec2: ...
-
-
-@wp.func_native("return values.data[i];")
-def load_vec3(values: wp.array[wp.vec3], i: wp.int32) -> wp.vec3: ...
-
-
-@wp.func_native("values.data[i] = v;")
-def store_long(values: wp.array[wp.int64], i: wp.int32, v: wp.int64): ...
 
 
 @wp.func_native("values.data[i] = v;")
@@ -74,15 +31,6 @@ def store_int(values: wp.array[wp.int32], i: wp.int32, v: wp.int32): ...
     " return wp::vec_t<4, float>(r.x, r.y, r.z, r.w);"
 )
 def load4(values: wp.array2d[wp.float32], i: wp.int64) -> wp.vec4: ...
-
-
-@wp.func_native(
-    "wp::vec_t<4, float> v; for (int c = 0; c < 4; c++) v.c[c] = c < n ? values.data[i + c] : 0.f;"
-    " return v;"
-)
-def load_some(values: wp.array2d[wp.float32], i: wp.int64, n: wp.int32) -> wp.vec4:
-    """The first n of four numbers, one by one; the others are 0."""
-    ...
 
 
 @wp.func_native("*(float4*)(values.data + i) = make_float4(v[0], v[1], v[2], v[3]);")
