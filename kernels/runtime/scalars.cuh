@@ -15,6 +15,17 @@ static inline float reciprocal(float x) {
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
     return r;
 }
+// The square root, to 2 units in the last place.
+static inline float root(float x) {
+    float r;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return r;
+}
+// x itself, so that values computed from it before need not stay in registers.
+static inline int opaque(int x) {
+    asm volatile("" : "+r"(x));
+    return x;
+}
 
 // The product of two int32 in one instruction, as addresses need it.
 static inline long long wide(int a, int b) {

@@ -19,7 +19,7 @@ from ..constants import BLOCKS
 from ..tiles import CHUNK, Bins, Pixels, RasterParams, Saved, Splats2D
 from . import capacity
 from .backward import Rows, Sums, backward_kernel, row_sizes
-from .forward import forward_kernel
+from .kernels import forward_kernel
 from .records import Gaussians, make_records
 from .reduce import reduce_rows
 from .warp import WARP

@@ -1,4 +1,4 @@
-"""Common parts of the CUDA compositor's kernels: a warp, its pixels, shared memory, and the test.
+"""Common parts of the CUDA compositor's gradient: a warp, its pixels, and shared memory.
 
 A tile of 16 x 16 pixels is eight sub-tiles of 8 x 4. A block is one warp and works on a tile, or on
 a half or a quarter of it: on 8, 4 or 2 sub-tiles, in each of which a lane owns one pixel. CUDA.md
@@ -14,7 +14,6 @@ import warp as wp
 from ...runtime.views import struct
 from ..constants import TILE
 from ..tiles import RasterParams
-from . import leaves as L
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,9 +26,6 @@ PITCH = WARP + 4  # floats of a row of partial sums: aligned, and without bank c
 
 # An integer that branches change in place; Warp would keep a copy of a plain one for each branch.
 word = wp.types.vector(1, wp.int32)
-
-# The rounding of a position: the test of a sub-tile may keep too much, never too little.
-_SLACK_PIXELS = 0.01
 
 
 def first_block(j: int) -> int:
@@ -166,44 +162,6 @@ def pixels_of_lane(parts: int):
         return p
 
     return lane_pixels
-
-
-@functools.cache
-def touching(parts: int):
-    """The test of a Gaussian against the sub-tiles of a part of a tile (README eq. 6).
-
-    Takes the first two vectors of its record (``records.py``).
-    """
-
-    @wp.func
-    @no_type_check
-    def touched(p: LanePixels, shape: wp.vec4, level: wp.vec4) -> wp.int32:
-        # bit j: the ellipse alpha >= alpha_min touches sub-tile j
-        a, k, e = -shape[2], shape[3], -level[0]
-        limit, top = level[2], level[3]
-        reach = L.root(limit * L.reciprocal(e))
-        over_a = L.reciprocal(a)
-        # the centre of the part's first pixel, which no registers hold during the traversal
-        lane = L.opaque(p.lane)
-        x = p.x[0] - float(lane & wp.static(WIDTH - 1)) - shape[0]
-        y = p.y[0] - float(lane >> wp.static(WIDTH.bit_length() - 1)) - shape[1]
-        bits = word()
-        for row in range(wp.static(SUB_TILES // parts // 2)):
-            y0 = wp.max(y + float(row * HEIGHT), -reach)
-            y1 = wp.min(y + float(row * HEIGHT + HEIGHT - 1), reach)
-            if y0 <= y1:
-                right = wp.clamp(top, y0, y1)
-                left = wp.clamp(-top, y0, y1)
-                x1 = L.root(wp.max(limit - e * right * right, 0.0) * over_a) - k * right
-                x0 = -L.root(wp.max(limit - e * left * left, 0.0) * over_a) - k * left
-                x1 += _SLACK_PIXELS - x
-                x0 -= _SLACK_PIXELS + x
-                for column in range(2):
-                    if x1 >= float(column * WIDTH) and x0 <= float(column * WIDTH + WIDTH - 1):
-                        bits[0] += wp.static(1) << (row * 2 + column)
-        return bits[0]
-
-    return touched
 
 
 @functools.cache

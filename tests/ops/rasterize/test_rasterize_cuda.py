@@ -2,6 +2,7 @@
 
 from dataclasses import fields
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,14 +13,13 @@ from helpers.raster import absolute_gradients, crowded, leaves, make
 from gamba_warp.kernels.rasterize import Skip, api, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, T_MIN
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
-from gamba_warp.kernels.rasterize.cuda import leaves as leaves_cuda
 from gamba_warp.kernels.rasterize.cuda.records import make_records
-from gamba_warp.kernels.rasterize.cuda.warp import LanePixels, touching
 from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.quantile import counts_in_front
-from gamba_warp.kernels.rasterize.tiles import Limits, Size, Splats2D, raster_params
+from gamba_warp.kernels.rasterize.tiles import Limits, RasterParams, Size, Splats2D, raster_params
 from gamba_warp.kernels.runtime import gpu
-from gamba_warp.kernels.runtime.launch import cuda_launch
+from gamba_warp.kernels.runtime.launch import launch
+from gamba_warp.kernels.runtime.native import constants, native, native_kernel
 
 SAME = 2e-6  # the two sum in another order
 
@@ -217,19 +217,25 @@ def test_many_tiles_are_not_cut(monkeypatch):
     assert [composite_cuda.parts_of_tile(1024 * n, device) for n in views] == [4, 2, 1, 1]
 
 
-_touched = touching(1)
-
-
-@wp.kernel(enable_backward=False)
-def _test_sub_tiles(records_in: wp.array2d[float], bits_out: wp.array[int]):
-    i = wp.tid()
-    at = wp.int64(i) * wp.int64(records_in.shape[1])
-    shape = leaves_cuda.load4(records_in, at)
-    level = leaves_cuda.load4(records_in, at + wp.int64(4))
-    place = LanePixels()  # that of the first lane, in a tile at the picture's corner
-    place.x[0] = 0.5
-    place.y[0] = 0.5
-    bits_out[i] = _touched(place, shape, level)
+_HEADER = Path(composite_cuda.__file__).with_name("tile.cuh")
+_SUB_TILES = """
+namespace gamba::raster {
+template<class K, class Params>
+static void test_sub_tiles(
+    int i, const Params& params, const wp::array_t<float>& records, const wp::array_t<int>& bits) {
+    const Record record = ((const Record*)records.data)[i];
+    const Place<K> first_lane(params, 0, 0);
+    bits.data[i] = touched(first_lane, record.shape, record.level);
+}
+}
+"""
+_test_sub_tiles = native_kernel(
+    "test_sub_tiles",
+    "gamba::raster::test_sub_tiles<Config>",
+    {"params": RasterParams, "records": wp.array2d[wp.float32]},
+    {"bits": wp.array[wp.int32]},
+    constants("Config", PARTS=1) + native(_HEADER) + _SUB_TILES,
+)
 
 
 @pytest.mark.parametrize("longest", [3.0, 2000.0])
@@ -249,7 +255,7 @@ def test_no_sub_tile_is_missed(from_ptx, longest):
     params = raster_params(Size(16, 16, 1, True, 0), Limits(ALPHA_MIN, 1.0, 0.0), num=count)
     from_ptx()
     records = make_records(splats, params)
-    cuda_launch(_test_sub_tiles, count, [records], [bits], device=bits.device)
+    launch(_test_sub_tiles, count, [params, records], [bits], bits.device)
     centre = torch.arange(16).double() + 0.5
     a, k, e = conics.double()[:, :, None, None].unbind(1)
     dy = centre[:, None] - means.double()[:, 1, None, None]
