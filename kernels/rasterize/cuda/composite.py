@@ -18,11 +18,9 @@ from ...runtime.views import StructValue, as_struct
 from ..constants import BLOCKS
 from ..tiles import CHUNK, Bins, Pixels, RasterParams, Saved, Splats2D
 from . import capacity
-from .backward import Rows, Sums, backward_kernel, row_sizes
-from .kernels import forward_kernel
+from .kernels import WARP, Rows, backward_kernel, forward_kernel, row_sizes
 from .records import Gaussians, make_records
 from .reduce import reduce_rows
-from .warp import WARP
 
 
 def parts_of_tile(tiles: int, device: torch.device) -> int:
@@ -127,7 +125,7 @@ def composite_backward(
         parts,
     )
     flags = geometry and not apart, absolute is not None, passes
-    _launch(lambda count: backward_kernel(Sums(count, *flags), parts), *given)
+    _launch(lambda count: backward_kernel(count, parts, *flags), *given)
     if apart:
-        _launch(lambda _: backward_kernel(Sums(0, True, True, passes), parts), *given, channels)
+        _launch(lambda _: backward_kernel(0, parts, True, True, passes), *given, channels)
     return reduce_rows(rows, splats, bins, geometry, absolute)

@@ -49,7 +49,7 @@ static int load_batch(Batch& batch, const Place<K>& p, const Params& params,
     if (mask == 0) return -1;
     const int slot = __popc(some & ((1 << p.lane) - 1));
     level.limit = __int_as_float(mask);
-    batch.records[slot] = {shape, level, *(const Color*)(from + 8 + gaussians.first)};
+    batch.records[slot] = {shape, level, *(const Four*)(from + 8 + gaussians.first)};
     return slot;
 }
 
@@ -59,23 +59,20 @@ static int load_batch(Batch& batch, const Place<K>& p, const Params& params,
 template<class K, class Params>
 static int blend_pair(
     Blend<K>& blend, const Place<K>& p, const Params& params, const Record& record, int& stopped) {
-    const Shape shape = record.shape;
-    const Level level = record.level;
-    const Color color = record.color;
-    const int mask = blend.live & level.bits();
+    const int mask = blend.live & record.level.bits();
     int used = 0;
     stopped = 0;
     WP_PRAGMA_UNROLL
     for (int j = 0; j < PIXELS<K>; ++j) {
         if (!(mask & 1 << j)) continue;
-        const Sample s(shape, level, p.x[j % 2], p.y[j / 2]);
+        const Sample s(record, p.x[j % 2], p.y[j / 2]);
         float& T = blend.T[j];
         const float weight = T * fminf(s.alpha, params.alpha_max), after = T - weight;
         if (!(s.alpha >= params.alpha_min && T > 0.0f)) continue;
         if (after > params.t_min) {
             used += 1 << first_block(j);
             T = after;
-            for (int c = 0; c < K::CHANNELS; ++c) blend.sums[j][c] += weight * color.of[c];
+            for (int c = 0; c < K::CHANNELS; ++c) blend.sums[j][c] += weight * record.color.of[c];
         } else {
             stopped += 1 << (STOP + j);
         }
@@ -115,16 +112,14 @@ static void save_bits(int* at, int bits, int part) {
 template<class K, class Params, class Gaussians, class Saved, class Pixels>
 static void store_pixels(const Blend<K>& blend, const Place<K>& p, const Params& params,
     const Gaussians& gaussians, const Saved& saved, const Pixels& pixels) {
-    const long long first = p.pixel * gaussians.channels + gaussians.first;
     float* const transmittances = saved.transmittances.data + p.saved;
     WP_PRAGMA_UNROLL
     for (int j = 0; j < PIXELS<K>; ++j) {
         const float T = blend.T[j];
         transmittances[j * WARP] = T;
         if (T == 0.0f) continue;
-        const int step = p.step(j, params.width);
-        pixels.transmittances.data[p.pixel + step] = fabsf(T);
-        float* const render = pixels.renders.data + first + wide(step, gaussians.channels);
+        pixels.transmittances.data[p.pixel + p.step(j, params.width)] = fabsf(T);
+        float* const render = channels_of(pixels.renders, p, j, params, gaussians);
         for (int c = 0; c < K::CHANNELS; ++c) render[c] = blend.sums[j][c];
     }
 }
@@ -145,7 +140,8 @@ static void composite(int index, int lane, float* shared, const Params& params,
         __syncwarp();
         for (int i = 0; i < count; ++i) {
             int stopped;
-            const int bits = blend_pair(blend, p, params, batch.records[i], stopped);
+            const Record record = batch.records[i];
+            const int bits = blend_pair(blend, p, params, record, stopped);
             batch.bits[i] = bits;
             if (bits >> STOP == 0) continue;
             const int k = k0 + highest_bit(__ballot_sync(ALL, slot == i));
@@ -158,13 +154,10 @@ static void composite(int index, int lane, float* shared, const Params& params,
         const int bits = slot >= 0 && slot < count ? batch.bits[slot] : 0;
         if (bits) save_bits<K>(saved.blocks.data + k0 + lane, bits, p.part);
     }
-    // once more, so that no registers hold the lane's pixels during the traversal
-    const Place<K> again(params, opaque(index), lane);
-    if (lane == 0)
-        atomicMax(&saved.traversed.data[again.tile], end - lists.starts.data[again.tile]);
+    if (lane == 0) atomicMax(&saved.traversed.data[p.tile], end - lists.starts.data[p.tile]);
     if (evaluated != 0 && gaussians.first == 0)
-        wp::atomic_add(&saved.blocks_traversed.data[again.tile], (wp::int64)evaluated);
-    store_pixels(blend, again, params, gaussians, saved, pixels);
+        wp::atomic_add(&saved.blocks_traversed.data[p.tile], (wp::int64)evaluated);
+    store_pixels(blend, p, params, gaussians, saved, pixels);
 }
 
 }  // namespace gamba::raster

@@ -10,7 +10,7 @@ from ...runtime.native import native, native_kernel
 from ...runtime.views import StructValue, as_struct, struct_of, view
 from ..projection import Projected
 from ..tiles import Bins, Splats2D
-from .backward import Rows
+from .kernels import Rows
 
 _INTS, _SPLATS = wp.array[wp.int32], struct_of(Projected)
 _add_rows = native_kernel(

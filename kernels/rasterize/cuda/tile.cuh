@@ -1,7 +1,7 @@
-// A warp of the compositor: its part of a tile, the pixels of a lane, records of Gaussians, and the
-// test of a Gaussian against sub-tiles. A tile of 16 x 16 pixels is eight sub-tiles of 8 x 4. A
-// warp works on a tile, or on a half or a quarter of it: on 8, 4 or 2 sub-tiles, in each of which a
-// lane owns one pixel. CUDA.md has the design. K is the struct of a kernel's constants
+// Common parts of the CUDA compositor: a warp and the pixels of its lanes, records of Gaussians,
+// and the test of a Gaussian against sub-tiles. A tile of 16 x 16 pixels is eight sub-tiles of 8
+// x 4. A warp works on a tile, or on a half or a quarter of it: on 8, 4 or 2 sub-tiles, in each of
+// which a lane owns one pixel. CUDA.md has the design. K is the struct of a kernel's constants
 // (kernels.py): PARTS of a tile, CHANNELS of a launch, and bits of ``skip``.
 #include "../../runtime/scalars.cuh"
 namespace gamba::raster {
@@ -30,13 +30,16 @@ struct alignas(16) Level {
     float e, log2_opacity, limit, top;
     int bits() const { return __float_as_int(limit); }
 };
-struct alignas(16) Color {
+struct alignas(16) Four {
     float of[4];
+    void operator+=(const Four& other) {
+        for (int i = 0; i < 4; ++i) of[i] += other.of[i];
+    }
 };
 struct Record {
     Shape shape;
     Level level;
-    Color color;
+    Four color;
 };
 static_assert(sizeof(Record) == 48, "kernels.py computes the size of shared memory");
 
@@ -59,18 +62,17 @@ static inline int highest_bit(int x) {
 // Tile and pixels of a warp and a lane.
 template<class K>
 struct Place {
-    int index;  // of the warp's part among all tiles' parts
-    int lane, tile;
-    int part;         // of the tile
+    int lane, tile, part;
     int px, py;       // the lane's pixel in the first sub-tile
     long long pixel;  // its number in all images
     long long saved;  // its number by tiles and sub-tiles; the next sub-tiles' are WARP apart
     float x[2];       // centres of the lane's pixels, by columns of sub-tiles
     float y[PIXELS<K> / 2];  // by rows of sub-tiles
 
+    // ``index`` is that of the warp's part among all tiles' parts
     template<class Params>
     Place(const Params& params, int index, int lane)
-        : index(index), lane(lane), tile(index / K::PARTS), part(index % K::PARTS) {
+        : lane(lane), tile(index / K::PARTS), part(index % K::PARTS) {
         const int row = tile / params.tiles_x;  // of tiles, among all images
         px = tile % params.tiles_x * TILE + lane % WIDTH;
         py = row % params.tiles_y * TILE + part * (TILE / K::PARTS) + lane / WIDTH;
@@ -85,13 +87,22 @@ struct Place {
     static int step(int j, int width) { return j / 2 * HEIGHT * width + j % 2 * WIDTH; }
 };
 
+// The channels of a launch, of the lane's pixel in sub-tile j.
+template<class K, class Params, class Gaussians>
+static float* channels_of(const wp::array_t<float>& renders, const Place<K>& p, int j,
+    const Params& params, const Gaussians& gaussians) {
+    const long long first = p.pixel * gaussians.channels + gaussians.first;
+    return renders.data + first + wide(p.step(j, params.width), gaussians.channels);
+}
+
 // README §5's u and dy of a pixel's centre, and its alpha before the clamp.
 struct Sample {
     float u, dy, alpha;
     // fmaf is named, since forward and backward must see the same alpha: the compiler has no choice
-    Sample(const Shape& shape, const Level& level, float x, float y)
-        : u(fmaf(shape.k, y - shape.y, x - shape.x)), dy(y - shape.y),
-          alpha(exp2(fmaf(shape.a * u, u, fmaf(level.e * dy, dy, level.log2_opacity)))) {}
+    Sample(const Record& g, float x, float y) : dy(y - g.shape.y) {
+        u = fmaf(g.shape.k, dy, x - g.shape.x);
+        alpha = exp2(fmaf(g.shape.a * u, u, fmaf(g.level.e * dy, dy, g.level.log2_opacity)));
+    }
 };
 
 // Bit j: the ellipse alpha >= alpha_min touches sub-tile j of the warp's part (README eq. 6).
@@ -99,10 +110,9 @@ template<class K>
 static int touched(const Place<K>& p, const Shape& shape, const Level& level) {
     const float a = -shape.a, k = shape.k, e = -level.e, limit = level.limit;
     const float reach = root(limit * reciprocal(e)), over_a = reciprocal(a);
-    // the centre of the part's first pixel, which no registers hold during the traversal
-    const int lane = opaque(p.lane);
-    const float x = p.x[0] - float(lane % WIDTH) - shape.x;
-    const float y = p.y[0] - float(lane / WIDTH) - shape.y;
+    // the centre of the part's first pixel
+    const float x = p.x[0] - float(p.lane % WIDTH) - shape.x;
+    const float y = p.y[0] - float(p.lane / WIDTH) - shape.y;
     int bits = 0;
     WP_PRAGMA_UNROLL
     for (int row = 0; row < PIXELS<K> / 2; ++row) {
