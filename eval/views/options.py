@@ -30,9 +30,9 @@ class ViewsOptions:
             prediction | truth); without it only the table is printed.
         protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, with the
             first view as the input; the report lists missing objects. It fixes --size, --reference,
-            --views, --split and --limit. splatter-image, leangaussian, gamba: these papers' values, as far
-            as published (gamba eval-geometry --protocol NAME --explain); these options change them,
-            and the report notes that.
+            --views, --split and --limit. splatter-image, leangaussian, gamba: these papers' values,
+            as far as published (gamba eval-geometry --protocol NAME --explain); these options
+            change them, and the report notes that.
         split: Split of the dataset.
         reference: Index of the input view; 0 by default.
         views: Number of views of an object, input included, evenly spaced; all by default.
