@@ -19,16 +19,6 @@ static inline bool are_kept(const Grid& grid, Interval rows) {
     return rows.last - rows.first < Config::KEPT && most < 1 << 15;
 }
 
-// The ellipse of Gaussian i, with its box where tiles are tested against that.
-template<class Config, class Grid, class Splats>
-static inline Ellipse boxed_ellipse(const Grid& grid, const Splats& splats, int i) {
-    Ellipse ellipse = ellipse_of<Config>(splats, i, grid.alpha_min);
-    if ((grid.skip & (Config::TILE_TEST | Config::SQUARES)) == Config::TILE_TEST) return ellipse;
-    const wp::vec2 extent = load(splats.extents, i);
-    ellipse.rx = extent[0], ellipse.ry = extent[1];
-    return ellipse;
-}
-
 // The j-th Gaussian of all views, front to back in each: its number of pairs, and words of its rows
 // and of each row's columns if they are kept, else 0.
 template<class Config, class In, class Out>
@@ -37,8 +27,9 @@ static void count(int j, const In& in, const Out& out) {
     const int num = out.order.shape[0], i = j / grid.num * grid.num + (int)in.nearest.data[j];
     out.order.data[j] = i;
     int pairs = 0;
-    if (load(in.splats.extents, i)[0] > 0.0f) {
-        const Ellipse ellipse = boxed_ellipse<Config>(grid, in.splats, i);
+    const wp::vec2 box = load(in.splats.extents, i);
+    if (box[0] > 0.0f) {
+        const Ellipse ellipse = ellipse_of<Config>(in.splats, i, grid.alpha_min, box);
         const Interval rows = rows_of<Config>(grid, ellipse);
         const bool kept = are_kept<Config>(grid, rows);
         int* span = out.spans.data + j;
@@ -76,7 +67,8 @@ static inline void write_pairs(int j, int p, int end, const In& in, const Out& o
     const int* span = in.spans.data + j;
     if (*span) write_rows(unpacked(*span), [&](int) { return unpacked(*(span += num)); });
     else {
-        const Ellipse ellipse = boxed_ellipse<Config>(grid, in.splats, i);
+        const wp::vec2 box = load(in.splats.extents, i);
+        const Ellipse ellipse = ellipse_of<Config>(in.splats, i, grid.alpha_min, box);
         write_rows(rows_of<Config>(grid, ellipse),
             [&](int ty) { return columns_of<Config>(grid, ellipse, ty); });
     }

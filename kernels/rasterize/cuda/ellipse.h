@@ -44,9 +44,9 @@ static inline wp::vec2 load(const wp::array_t<wp::vec2>& values, int i) {
 #include "../ellipse.h"
 namespace gamba::raster {
 
-// The ellipse of Gaussian i, without its box.
+// The ellipse of Gaussian i with that box, which matters where tiles are tested against it.
 template<class Config, class Splats>
-static inline Ellipse ellipse_of(const Splats& splats, int i, float alpha_min) {
+static inline Ellipse ellipse_of(const Splats& splats, int i, float alpha_min, wp::vec2 box) {
     constexpr float TWICE_LN2 = 1.3862943611198906f;
     const wp::vec2 mean = load(splats.means2d, i);
     const wp::vec3 conic = splats.conics.data[i];
@@ -55,7 +55,7 @@ static inline Ellipse ellipse_of(const Splats& splats, int i, float alpha_min) {
     const float limit = TWICE_LN2 * level * Config::SLACK + Config::SLACK_ABS;
     const float over_a = reciprocal(a), reach = sqrt(limit * reciprocal(e));
     const float top = -k * a * reach * sqrt(over_a * reciprocal(a * k * k + e));
-    return {mean[0], mean[1], k, e, limit, over_a, reach, top};
+    return {mean[0], mean[1], k, e, limit, over_a, reach, top, box[0], box[1]};
 }
 
 }  // namespace gamba::raster

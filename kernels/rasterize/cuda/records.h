@@ -8,7 +8,7 @@ namespace gamba::raster {
 template<class Config, class Params, class Splats>
 static void record(
     int g, const Params& params, const Splats& splats, const wp::array_t<float>& records) {
-    const Ellipse ellipse = ellipse_of<Config>(splats, g, params.alpha_min);
+    const Ellipse ellipse = ellipse_of<Config>(splats, g, params.alpha_min, {});
     const float a = splats.conics.data[g][0], opacity = splats.view_opacities.data[g];
     float* const to = records.data + (size_t)g * records.shape[1];
     *(Shape*)to = {ellipse.x, ellipse.y, -LOG2_E_HALF * a, ellipse.k};
