@@ -13,7 +13,8 @@ struct alignas(16) Shape {
 struct alignas(16) Level {
     float e, log2_opacity, limit, top;
 };
-struct alignas(16) Color {
+// A chunk of colours, or four numbers of a row of sums.
+struct alignas(16) Four {
     float of[CHUNK];
 };
 

@@ -20,10 +20,10 @@ static void record(
     const int channels = splats.colors.shape[1];
     const float* const colors = splats.colors.data + (size_t)row * channels;
     for (int first = 0; first < channels; first += CHUNK) {
-        Color color = {};
+        Four color = {};
         for (int c = 0; c < CHUNK; ++c)
             if (first + c < channels) color.of[c] = colors[first + c];
-        *(Color*)(to + 8 + first) = color;
+        *(Four*)(to + 8 + first) = color;
     }
 }
 

@@ -2,11 +2,6 @@
 #include "record.h"
 namespace gamba::raster {
 
-// Four numbers of a row, which are read at once.
-struct alignas(16) Four {
-    float of[4];
-};
-
 // The sums of the rows of pairs [begin, end), of the columns of a chunk: eight of heads, and of
 // tails as many as there are.
 template<class Rows>
