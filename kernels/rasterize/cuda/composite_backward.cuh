@@ -131,7 +131,7 @@ template<class K, class Params, class Gaussians, class Upstream>
 static void add_pair(float (&sums)[Row<K>::SUMS], Pixels<K>& pixels, const Place<K>& p,
     const Params& params, const Gaussians& gaussians, const Upstream& v_pixels,
     const Record& record) {
-    const int bits = record.level.bits();
+    const int bits = record.bits();
     WP_PRAGMA_UNROLL
     for (int j = 0; j < PIXELS<K>; ++j) {
         if (!(bits & 3 << first_block(j))) continue;
@@ -201,12 +201,11 @@ static void store_row(
         for (int i = 1; i < K::PARTS; ++i) total += ((Four*)parts[i].columns(p.lane))[n];
         if (n < K::HEAD / 4) {
             float* const head = rows.heads.data + wide(row, rows.heads.shape[1]);
-            ((Four*)(head + wide(first, K::HEAD / K::CHUNK)))[n] = total;
+            ((Four*)(head + wide(first, K::HEAD / CHUNK)))[n] = total;
         } else {
             float* const tail = rows.tails.data + wide(row, rows.tails.shape[1]);
-            constexpr int STEP = R::COLOR + K::CHUNK - K::HEAD;  // of a whole chunk
-            for (int c = 0; c < R::END - K::HEAD; ++c)
-                tail[first / K::CHUNK * STEP + c] = total.of[c];
+            constexpr int STEP = R::COLOR + CHUNK - K::HEAD;  // of a whole chunk
+            for (int c = 0; c < R::END - K::HEAD; ++c) tail[first / CHUNK * STEP + c] = total.of[c];
         }
     }
     if (p.part == 0) atomicOr(&rows.written.data[row >> 5], 1 << (row & 31));
@@ -256,7 +255,7 @@ static void composite_vjp(int index, int lane, float* shared, const Params& para
                 __syncwarp();
                 waiting = 0;
             }
-            const int bits = record.level.bits();
+            const int bits = record.bits();
             if (bits >> STOP != 0) resume_pixels(pixels, p, saved, bits, end - WARP + i);
         }
         __syncwarp();

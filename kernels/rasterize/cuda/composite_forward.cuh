@@ -59,7 +59,7 @@ static int load_batch(Batch& batch, const Place<K>& p, const Params& params,
 template<class K, class Params>
 static int blend_pair(
     Blend<K>& blend, const Place<K>& p, const Params& params, const Record& record, int& stopped) {
-    const int mask = blend.live & record.level.bits();
+    const int mask = blend.live & record.bits();
     int used = 0;
     stopped = 0;
     WP_PRAGMA_UNROLL

@@ -72,7 +72,7 @@ def backward_kernel(channels: int, parts: int, geometry: bool, absolute: bool, p
     """
     sums = geometry * (8 if absolute else 6) + channels
     shared = parts * (WARP * RECORD + WARP + WARP // sums * sums * PITCH)
-    sizes = {"CHANNELS": channels, "PARTS": parts, "SHARED": shared, "CHUNK": CHUNK, "HEAD": HEAD}
+    sizes = {"CHANNELS": channels, "PARTS": parts, "SHARED": shared, "HEAD": HEAD}
     rules = {"GEOMETRY": geometry, "ABSOLUTE": absolute, "PASSES": passes}
     config = constants("Config", **sizes, **rules, ZERO_UPSTREAM=ZERO_UPSTREAM, UNUSED=UNUSED)
     warps = (24 if parts == 4 else 20) if channels < 4 else 16  # as the registers allow

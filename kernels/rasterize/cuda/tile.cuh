@@ -4,6 +4,7 @@
 // which a lane owns one pixel. CUDA.md has the design. K is the struct of a kernel's constants
 // (kernels.py): PARTS of a tile, CHANNELS of a launch, and bits of ``skip``.
 #include "../../runtime/scalars.cuh"
+#include "record.h"
 namespace gamba::raster {
 
 constexpr int WARP = 32, ALL = -1;    // lanes; the mask of all of them
@@ -21,25 +22,15 @@ constexpr int PIXELS = SUB_TILES / K::PARTS;
 // The left one of the two blocks of 4 x 4 pixels that make up sub-tile j.
 static constexpr int first_block(int j) { return j / 2 * 4 + j % 2 * 2; }
 
-// A Gaussian as records.py writes it; a warp reads 16 bytes at a time. In shared memory the bits of
-// a pair are in the place of the limit.
-struct alignas(16) Shape {
-    float x, y, a, k;
-};
-struct alignas(16) Level {
-    float e, log2_opacity, limit, top;
-    int bits() const { return __float_as_int(limit); }
-};
-struct alignas(16) Four {
-    float of[4];
-    void operator+=(const Four& other) {
-        for (int i = 0; i < 4; ++i) of[i] += other.of[i];
-    }
-};
+static inline void operator+=(Four& sum, Four other) {
+    for (int i = 0; i < 4; ++i) sum.of[i] += other.of[i];
+}
+// A record in shared memory, of one chunk: the bits of a pair are in the place of the limit.
 struct Record {
     Shape shape;
     Level level;
     Four color;
+    int bits() const { return __float_as_int(level.limit); }
 };
 static_assert(sizeof(Record) == 48, "kernels.py computes the size of shared memory");
 
