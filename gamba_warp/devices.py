@@ -129,6 +129,21 @@ def pick_precision(name: Precision, device: torch.device, width: int) -> torch.d
     return torch.bfloat16 if faster >= _FASTER else torch.float32
 
 
+def precision_note(name: Precision, device: torch.device, width: int) -> str | None:
+    """Return a line if ``--precision bfloat16`` takes longer than float32; arguments as above."""
+    import torch
+
+    if name != "bfloat16" or device.type != "cpu":
+        return None
+    faster = _bfloat16_speedup(str(device), width, torch.get_num_threads())
+    if faster >= 1:
+        return None
+    return (
+        f"bfloat16 takes {1 / faster:.1f} times as long as float32 on this processor; "
+        "--precision auto takes the faster"
+    )
+
+
 @functools.cache
 def _bfloat16_speedup(name: str, width: int, threads: int) -> float:
     """Return the speed-up of a product in bfloat16 over float32, by the fastest run of each."""

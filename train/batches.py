@@ -20,7 +20,13 @@ import numpy as np
 import torch
 
 from gamba_warp.batch import EXPECTED
-from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_dataset
+from gamba_warp.data.dataset import (
+    ViewDataset,
+    background_note,
+    check_cameras,
+    evenly,
+    open_dataset,
+)
 from gamba_warp.data.gso import scanned
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
@@ -110,6 +116,10 @@ def open_data(config: TrainConfig) -> TrainingData:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
+    try:
+        check_cameras(train)
+    except UserError as error:
+        raise UserError(f"{config.data}: {error}") from error
     notes += filter(None, [background_note(train)])
     held_out = None
     try:

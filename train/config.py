@@ -240,8 +240,10 @@ class TrainConfig:
     def model_config(self) -> GambaConfig:
         """Return the preset with the changes of ``--set``.
 
+        An encoder with fresh weights is trained, and stored with the model.
+
         Raises:
-            UserError: a field is unknown, or its value invalid.
+            UserError: a field is unknown, or its value invalid, or a frozen encoder has no weights.
         """
         names = [f.name for f in fields(GambaConfig)]
         changes = {}
@@ -253,15 +255,30 @@ class TrainConfig:
                 )
             changes[name] = value_of(text)
         try:
-            return replace(PRESETS[self.preset], **changes)
+            config = replace(PRESETS[self.preset], **changes)
+            weights, frozen = self.run.encoder_weights, changes.get("encoder_frozen")
+            if weights == "random" and frozen:
+                raise UserError("encoder_frozen=true needs --encoder-weights FILE, not random ones")
+            if frozen is None and (weights == "random" or weights is None and _is_own(config)):
+                config = replace(config, encoder_frozen=False)
         except UserError as error:
             raise UserError(f"--set: {error}") from error
+        return config
 
     def to_dict(self) -> dict:
         """Return JSON-ready values, with the model's full configuration under ``model``."""
         values = json.loads(json.dumps(asdict(self), default=str))
         values["model"] = json.loads(self.model_config().to_json())
         return values
+
+
+def _is_own(config: GambaConfig) -> bool:
+    """Return True if a script has added the model's encoder to ``ENCODERS``."""
+    if config.encoder in ("none", "vgg16"):
+        return False
+    from gamba_warp.model.encoders import ENCODERS
+
+    return config.encoder in ENCODERS
 
 
 # A run may be resumed with other values of these: they change where it reads and writes and how

@@ -6,6 +6,7 @@ tensors of fixed addresses: the batch, which is copied there, and the numbers of
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import is_dataclass
@@ -50,7 +51,7 @@ class StepGraphs:
         self._stream: Any = None
         self._pool: Any = None
         self._numbers: dict[str, Tensor] = {}
-        self._known: set[Hashable] = set()  # shapes of earlier steps
+        self._times: Counter[Hashable] = Counter()  # how often a shape occurred
         self._graphs: dict[Hashable, _Recorded] = {}
 
     @property
@@ -81,13 +82,14 @@ class StepGraphs:
     def _run(self, batch: Batch, key: Hashable, step: Callable[[Batch], Result]) -> Result:
         if self._graphs and lists_outgrown():
             self._graphs.clear()
+            self._pool = None  # torch refuses one whose graphs are all gone while tensors use it
             forget_graphs()
         shape = key, *((x.shape, x.dtype) if isinstance(x, Tensor) else x for x in _fields(batch))
         found = self._graphs.get(shape)
-        if found is None and shape in self._known and len(self._graphs) < self._most:
+        if found is None and self._times[shape] and self._has_place(shape):
             found = self._capture(shape, batch, step)
+        self._times[shape] += 1
         if found is None:
-            self._known.add(shape)
             return step(batch)
         for own, given in zip(_fields(found.batch), _fields(batch), strict=True):
             if isinstance(own, Tensor):
@@ -95,14 +97,32 @@ class StepGraphs:
         found.graph.replay()
         return found.result
 
+    def _has_place(self, shape: Hashable) -> bool:
+        """Return True if a graph may be added, maybe in place of one of a rarer shape."""
+        if len(self._graphs) < self._most:
+            return True
+        rarest = min(self._graphs, key=self._times.__getitem__, default=None)
+        if rarest is None or self._times[rarest] >= self._times[shape]:
+            return False
+        del self._graphs[rarest]
+        return True
+
     def _capture(
         self, shape: Hashable, batch: Batch, step: Callable[[Batch], Any]
     ) -> _Recorded | None:
         """Capture a step, which does not run it; None if that fails."""
         own = copied(batch)
+        on_gpu = self._device.type == "cuda"
+        state = torch.cuda.get_rng_state(self._device) if on_gpu else None
         try:
             graph, result = self._record(lambda: step(own))
         except Exception as error:  # of torch, a library or the driver; steps work without graphs
+            if state is not None:  # which a capture that failed may have left unusable
+                torch.cuda.set_rng_state(state, self._device)
+            if isinstance(error, torch.cuda.OutOfMemoryError):
+                self._most = len(self._graphs)
+                self._say(f"memory for {self._most} CUDA graphs of steps; others run one by one")
+                return None
             self._say(f"no CUDA graph of a step: {first_line(error)}; steps run one by one")
             self._most = 0
             self._graphs.clear()

@@ -14,6 +14,7 @@ import torch
 
 from gamba_warp.batch import EXPECTED
 from gamba_warp.data.dataset import evenly
+from gamba_warp.devices import precision_note
 from gamba_warp.errors import UserError
 from gamba_warp.files import only_process, output_folder, sweep, write_json
 from gamba_warp.model.gamba import Gamba
@@ -183,7 +184,9 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
         f"{trainer.schedule}, {facts['device']}, products in {facts['precision']} -> "
         f"{config.run.out}"
     )
-    for note in notes:
+    width, device = trainer.model.config.width, trainer.world.device
+    slow = precision_note(config.optim.precision, device, width)
+    for note in [*notes, *([slow] if slow else [])]:
         log.warn(trainer.step, note)
     if checkpoint is not None:
         say(f"resumed {checkpoint} at step {trainer.step}")

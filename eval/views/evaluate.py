@@ -13,7 +13,13 @@ from typing import Any
 from gamba_warp.batch import check_not_read, progress_bar
 from gamba_warp.conventions import GREY, WHITE
 from gamba_warp.data import gso
-from gamba_warp.data.dataset import ViewDataset, background_note, evenly, open_dataset
+from gamba_warp.data.dataset import (
+    ViewDataset,
+    background_note,
+    check_cameras,
+    evenly,
+    open_dataset,
+)
 from gamba_warp.devices import pick_device
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_text
@@ -181,6 +187,7 @@ def open_job(options: ViewsOptions) -> Job:
         output_folder(options.out)
     if options.baselines:
         _add_baselines(job, options)
+    check_cameras(dataset)
     if note := background_note(dataset):
         print(f"warning: {options.data}: {note}", file=sys.stderr)
     return job

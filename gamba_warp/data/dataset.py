@@ -571,6 +571,40 @@ def background_note(dataset: ViewDataset) -> str | None:
     return "no picture has an alpha channel or a mask: the background counts as part of the object"
 
 
+def check_cameras(dataset: ViewDataset) -> None:
+    """Check that the cameras of up to eight objects look at their origin; skips unreadable ones.
+
+    Raises:
+        UserError: most look away from it. The line names a convention by which they would not.
+    """
+    found = []
+    for uid in evenly(dataset.uids, 8):
+        with suppress(*EXPECTED):
+            found.append(dataset.files(uid).camera_to_world)
+    poses = np.concatenate([np.zeros((0, 4, 4)), *found])
+    if not len(poses) or _facing(poses) >= 0.5:
+        return
+    turned = np.diag([1.0, -1.0, -1.0, 1.0])
+    others = {
+        "OpenCV's axes": poses @ turned,
+        "world to camera": np.linalg.inv(poses),
+        "world to camera in OpenCV's axes": np.linalg.inv(poses) @ turned,
+    }
+    name, best = max(((x, _facing(p)) for x, p in others.items()), key=lambda pair: pair[1])
+    hint = f"; as {name} they would look at it" if best >= 0.9 else ""
+    raise UserError(
+        f"{1 - _facing(poses):.0%} of the cameras look away from the object at the origin{hint}: "
+        "poses must be camera to world, with x right, y up, z back"
+    )
+
+
+def _facing(camera_to_world: np.ndarray) -> float:
+    """Share of the cameras whose axis is within 60 degrees of the origin's direction."""
+    axes, places = camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
+    ahead = (axes * places).sum(-1)
+    return float((ahead >= 0.5 * np.linalg.norm(places, axis=-1)).mean())
+
+
 def _read_depth(path: Path | DecodedPicture, width: int, height: int) -> np.ndarray:
     """Read depth ``[height, width]`` float32 in steps of the file, by nearest samples."""
     if isinstance(path, EncodedPicture):

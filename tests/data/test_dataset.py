@@ -7,12 +7,20 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from helpers import micro
 from helpers.micro import to_opengl
 from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.cameras import orbit
-from gamba_warp.data.dataset import SPLITS, background_note, open_dataset, split_of, write_split
+from gamba_warp.data.dataset import (
+    SPLITS,
+    background_note,
+    check_cameras,
+    open_dataset,
+    split_of,
+    write_split,
+)
 
 FOV = math.radians(49.1)
 FOCAL = 0.5 / math.tan(FOV / 2)
@@ -295,3 +303,27 @@ def test_pictures_of_posed_sets_are_not_turned_by_exif(tmp_path, stated):
     assert views.images.shape == (1, 30, 40, 4)
     np.testing.assert_array_equal((255 * views.images[0, ..., :3]).round(), np.asarray(picture))
     assert views.cameras.Ks[0, 0].tolist() == pytest.approx([43.75, 0, 20])
+
+
+@pytest.mark.parametrize(
+    "convention, change",
+    [
+        ("OpenCV's axes", lambda pose: pose @ TURNED),
+        ("world to camera", np.linalg.inv),
+        ("world to camera in OpenCV's axes", lambda pose: TURNED @ np.linalg.inv(pose)),
+    ],
+)
+def test_cameras_that_look_away_are_refused(tmp_path, convention, change):
+    """Their pictures would be of nothing, and a training would end well."""
+    root = micro.write_dataset(tmp_path / "clouds", 2)
+    check_cameras(open_dataset(root))
+    for path in root.glob("*/transforms.json"):
+        values = json.loads(path.read_text())
+        for frame in values["frames"]:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+        path.write_text(json.dumps(values))
+    refused(f"look away from the object at the origin; as {convention} they", check_cameras,
+            open_dataset(root))  # fmt: skip
+
+
+TURNED = np.diag([1.0, -1.0, -1.0, 1.0])

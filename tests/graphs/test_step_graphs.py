@@ -1,5 +1,8 @@
 """Steps repeated by graphs: the same bits as steps one by one, on a recording of operators."""
 
+import gc
+import weakref
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,6 +112,73 @@ def test_graphs_whose_lists_are_outgrown_are_captured_again(monkeypatch):
         assert result.tolist() == [2.0 * number] * 2 and len(made) == calls
     assert kept.count == 1 and not outgrown
     assert [batch.values[0].item() for batch in batches] == [*range(8)]  # no graph writes to one
+
+
+class Pools:
+    """torch's rule for the pool of a capture: it is new, or one of its graphs still lives."""
+
+    def __init__(self, monkeypatch):
+        self.graphs = {}
+        monkeypatch.setattr(torch.cuda, "graph_pool_handle", object)
+        monkeypatch.setattr(
+            torch.cuda, "CUDAGraph", type("Graph", (), {"replay": lambda self: None})
+        )
+        monkeypatch.setattr(torch.cuda, "graph", self.capture)
+
+    @contextmanager
+    def capture(self, graph, pool, stream, capture_error_mode):
+        known = self.graphs.setdefault(pool, weakref.WeakSet([graph]))
+        gc.collect()
+        assert len(known), "the pool's graphs are gone"
+        known.add(graph)
+        yield
+
+
+class Graphs(graphs.StepGraphs):
+    """Graphs by torch's own calls, without a stream."""
+
+    @contextmanager
+    def _on_stream(self):
+        yield
+
+
+def test_graphs_of_a_grown_scene_have_a_pool_of_their_own(monkeypatch):
+    outgrown, said = [], []
+    Pools(monkeypatch)
+    monkeypatch.setattr(graphs, "lists_outgrown", lambda: bool(outgrown))
+    monkeypatch.setattr(graphs, "forget_graphs", outgrown.clear)
+    kept = Graphs(torch.device("cpu"), said.append)
+    batch = Numbers(torch.ones(2))
+    for number in range(6):
+        if number == 4:
+            outgrown.append("by the step before")
+        kept.run(batch, "a", lambda batch: batch.values)
+    assert said == [] and kept.count == 1
+
+
+def test_the_graph_of_a_rare_shape_makes_place():
+    kept = RecordedGraphs(list, most=2)
+    batch = Numbers(torch.ones(2))
+    for key in "aabbbcccc":
+        kept.run(batch, key, lambda batch: 2 * batch.values)
+    assert [shape[0] for shape in kept._graphs] == ["b", "c"]
+
+
+def test_a_capture_without_memory_leaves_the_others(monkeypatch):
+    kept = RecordedGraphs(list, most=8)
+    batch, record = Numbers(torch.ones(2)), kept._record
+
+    def full(run):
+        if kept.count:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return record(run)
+
+    monkeypatch.setattr(kept, "_record", full)
+    for key in "aabbaab":
+        kept.run(batch, key, lambda batch: 2 * batch.values)
+    assert kept.count == 1 and kept.said == [
+        "memory for 1 CUDA graphs of steps; others run one by one"
+    ]
 
 
 def test_a_step_that_cannot_be_captured_runs_as_before(data, tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ from helpers.refusals import refused
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.data.layouts import LAYOUTS
 from gamba_warp.image_metrics import METRICS
-from gamba_warp.model.checkpoint import load_model
+from gamba_warp.model.checkpoint import load_model, read_weights
 from gamba_warp.model.encoders import ENCODERS
 from gamba_warp.model.gamba import DECODERS
 from gamba_warp.train.objective.losses import TERMS
@@ -65,7 +65,7 @@ def data(tmp_path_factory):
 def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, script, capsys):
     out = tmp_path / "run"
     words = ["train", data, "--out", out, "--preset", "tiny", "--set", *micro.MODEL]
-    words += ["encoder=patches", "encoder_size=16", "encoder_frozen=false", "decoder=cloud"]
+    words += ["encoder=patches", "encoder_size=16", "decoder=cloud"]
     words += ["--schedule", "linear", "--size", micro.SIZE]
     words += ["--lpips", "off", "--device", "cpu", "--log-every", "1", "--views-per-object", "2"]
     words += ["--warmup-steps", "1", "--batch-size", "2", "--val-every", "6"]
@@ -82,6 +82,9 @@ def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, scri
     assert script(*words, "--steps", "7") == 0  # the same run goes on
     got = load_model(out / "model.safetensors")
     assert type(got.decoder).__name__ == "Cloud" and got.encoder is not None
+    fresh = next(ENCODERS["patches"](None, None)[0].parameters())
+    assert got.encoder.network.convolution.weight.shape == fresh.shape
+    assert "encoder.network.convolution.weight" in read_weights(out / "model.safetensors", got)
     restore(tables)
     refused("model.safetensors: encoder patches: neither 'none'", load_model,
             out / "model.safetensors")  # fmt: skip

@@ -391,6 +391,19 @@ def test_auto_is_the_precision_that_the_trial_finds(data, tmp_path, monkeypatch,
     assert_same_files(*(tmp_path / name / "model.safetensors" for name in ("auto", chosen)))
 
 
+def test_slow_bfloat16_is_said(data, tmp_path, monkeypatch, capsys):
+    for gain, name, said in (
+        (0.25, "bfloat16", True),
+        (1.5, "bfloat16", False),
+        (0.25, "float32", 0),
+    ):
+        monkeypatch.setattr("gamba_warp.devices._bfloat16_speedup", lambda *_, gain=gain: gain)
+        out = tmp_path / f"{name} {gain}"
+        assert run(data, out, optim={"precision": name}, length={"steps": 1}) == 0
+        words = "bfloat16 takes 4.0 times as long as float32"
+        assert (words in capsys.readouterr().out) == bool(said)
+
+
 def test_decay_is_on_matrices_that_are_not_flagged(data):
     model = Gamba(micro.options(data, data).model_config())
     decayed, plain = build_optimizer(model).param_groups
