@@ -66,7 +66,7 @@ RECIPES: dict[RecipeName, Recipe] = {
             "--lpips on --lpips-weight 0.5": '§4.1: "λ_LPIPS = 0.5"; VGG, §3.3',
             "--radial-mask": '§4.1: "λ_rdist ... initially set at 0.1"; decayed over 10 epochs',
             "--background white": "not stated; that of the authors' public code",
-            "--precision auto": "not stated; bfloat16 in the authors' public code; on a CPU the faster",
+            "--precision auto": "not stated; bfloat16 in the authors' public code",
         },
     ),
     "tiny": _RAYS,
