@@ -94,12 +94,12 @@ static int load_pair(Record& record, const Place<K>& p, const Params& params,
     bits = bits >> p.part * (16 / K::PARTS) & wanted | stops;
     if (bits != 0) {
         const int g = lists.pairs.data[k];
-        const float* const from = gaussians.records.data + wide(g, gaussians.records.shape[1]);
+        const float* const from = record_at(gaussians, g);
         record.shape = *(const Shape*)from;
         Level level = *(const Level*)(from + 4);
         level.limit = __int_as_float(bits);
         record.level = level;
-        if constexpr (K::CHANNELS == 0) record.color = {__int_as_float(g)};
+        if constexpr (K::CHANNELS == 0) record.color = {__int_as_float(g)};  // to find its colours
         else record.color = *(const Four*)(from + 8 + gaussians.first);
     } else if (K::PARTS > 1) {  // no sums, but some of another part's
         record = {};
@@ -148,9 +148,8 @@ static void add_pair(float (&sums)[Row<K>::SUMS], Pixels<K>& pixels, const Place
             for (int c = 0; c < K::CHANNELS; ++c)
                 diff = fmaf(record.color.of[c], pixels.upstream[j][c], diff);
             if constexpr (K::CHANNELS == 0) {
-                const auto& records = gaussians.records;
-                const float* const colors =
-                    records.data + wide(__float_as_int(record.color.of[0]), records.shape[1]) + 8;
+                const int g = __float_as_int(record.color.of[0]);
+                const float* const colors = record_at(gaussians, g) + 8;
                 const float* const v = channels_of(v_pixels.renders, p, j, params, gaussians);
                 for (int c = 0; c < gaussians.channels; ++c) diff = fmaf(colors[c], v[c], diff);
             }
@@ -211,6 +210,7 @@ static void store_row(
     if (p.part == 0) atomicOr(&rows.written.data[row >> 5], 1 << (row & 31));
 }
 
+// The kernel: a block traverses the list of its tile backwards, 32 pairs at a time.
 template<class K, class Params, class Gaussians, class Lists, class Saved, class Upstream,
     class Rows>
 static void composite_vjp(int index, int lane, float* shared, const Params& params,

@@ -36,8 +36,7 @@ template<class K, class Params, class Gaussians, class Lists>
 static int load_batch(Batch& batch, const Place<K>& p, const Params& params,
     const Gaussians& gaussians, const Lists& lists, int k0, int end, int live, int& count) {
     const int k = min(k0 + p.lane, end - 1);  // past the end, the last one
-    const float* const from =
-        gaussians.records.data + wide(lists.pairs.data[k], gaussians.records.shape[1]);
+    const float* const from = record_at(gaussians, lists.pairs.data[k]);
     const Shape shape = *(const Shape*)from;
     Level level = *(const Level*)(from + 4);
     int mask = live;
@@ -124,6 +123,7 @@ static void store_pixels(const Blend<K>& blend, const Place<K>& p, const Params&
     }
 }
 
+// The kernel: a warp traverses the list of its tile, 32 Gaussians at a time.
 template<class K, class Params, class Gaussians, class Lists, class Saved, class Pixels>
 static void composite(int index, int lane, float* shared, const Params& params,
     const Gaussians& gaussians, const Lists& lists, const Saved& saved, const Pixels& pixels) {

@@ -7,9 +7,9 @@
 #include "record.h"
 namespace gamba::raster {
 
-constexpr int WARP = 32, ALL = -1;    // lanes; the mask of all of them
-constexpr int WIDTH = 8, HEIGHT = 4;  // pixels of a sub-tile; two of them side by side
-constexpr int TILE = 16, SUB_TILES = 8;
+constexpr int WARP = 32, ALL = -1;       // lanes; the mask of all of them
+constexpr int WIDTH = 8, HEIGHT = 4;     // pixels of a sub-tile; two of them side by side
+constexpr int TILE = 16, SUB_TILES = 8;  // pixels of a tile's side; its sub-tiles
 // Bit STOP + j of a pair: a pixel of sub-tile j stopped at it. Below are the blocks of 4 x 4 pixels
 // to which it contributed.
 constexpr int STOP = 16, BLOCKS = (1 << STOP) - 1;
@@ -33,6 +33,12 @@ struct Record {
     int bits() const { return __float_as_int(level.limit); }
 };
 static_assert(sizeof(Record) == 48, "kernels.py computes the size of shared memory");
+
+// Where the record of view-major Gaussian g begins; its colours are behind Shape and Level.
+template<class Gaussians>
+static const float* record_at(const Gaussians& gaussians, int g) {
+    return gaussians.records.data + wide(g, gaussians.records.shape[1]);
+}
 
 // The or of all lanes' integers.
 static inline int any_of(int x) {
