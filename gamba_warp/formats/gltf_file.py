@@ -39,6 +39,7 @@ _Width = Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
 _Stride = Annotated[int, msgspec.Meta(ge=1, le=252)]
 # Translation, rotation (a quaternion xyzw) and scale without effect.
 _IDENTITY = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
+_UNIT = np.eye(4)
 
 
 class Entry:
@@ -206,7 +207,7 @@ class GltfFile:
             roots = [index for index in range(len(nodes)) if index not in inner]
         own = self._own_nodes(roots)
         found: list[tuple[Entry, int, np.ndarray]] = []
-        left = [(root, np.eye(4), 0) for root in reversed(roots)]
+        left = [(root, _UNIT, 0) for root in reversed(roots)]
         most = min(MAX_NODES, 8 * len(own))
         while left:
             index, above, depth = left.pop()
@@ -247,9 +248,11 @@ class GltfFile:
 
         They come from ``EXT_mesh_gpu_instancing``; without it, one unit matrix.
         """
+        if not node.values.get("extensions"):  # most nodes, of which a file may have many
+            return _UNIT[None]
         given = node.entry("extensions").entry(INSTANCING).entry("attributes")
         if not given.values:
-            return np.eye(4)[None]
+            return _UNIT[None]
         pose, counts = [], set()
         for name, default in _IDENTITY.items():
             rows = np.array([default])
