@@ -48,9 +48,9 @@ def bench(device: str, folder: str) -> int:
         1 if a result is wrong or could not be computed, else 0, also after an interrupt.
     """
     settings = Settings(torch.device(device), "quick" if device == "cpu" else "normal")
-    cases = conv.cases(settings)
+    cases = conv.tables(settings)
     if device == "cuda":
-        cases += [case for suite in (models, raster, scan) for case in suite.cases(settings)]
+        cases += [case for suite in (models, raster, scan) for case in suite.tables(settings)]
     records: list[dict] = []
     for case in cases:  # a crash loses only the current one
         document = measure([case], settings)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.profiler import profile
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
-from gamba_warp.kernels.bench.measure import Case, Settings, Variant
+from gamba_warp.kernels.bench.measure import Settings, Table, Variant
 from gamba_warp.kernels.cases.problem import BOTH
 from gamba_warp.model.config import PRESETS, Preset
 from gamba_warp.model.gamba import Gamba
@@ -47,9 +47,9 @@ _PARTS = {
 }
 
 
-def cases(settings: Settings) -> list[Case]:
-    """Return the case of a step."""
-    return [Case("step", "batch", steps)]
+def tables(settings: Settings) -> list[Table]:
+    """Return the table of a step."""
+    return [Table("step", "batch", steps)]
 
 
 class Step:

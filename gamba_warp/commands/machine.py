@@ -21,7 +21,7 @@ from ..files import output_folder, write_json, write_text
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 from ..versions import used_versions
 
-# Suite -> the module with its ``cases(settings)``, imported when needed.
+# Suite -> the module with its ``tables(settings)``, imported when needed.
 BENCH = {
     "scan": "gamba_warp.kernels.bench.scan",
     "conv": "gamba_warp.kernels.bench.conv",
@@ -88,7 +88,7 @@ def bench_command(
     chosen = choose(what, BENCH)
     level = "quick" if quick else "full" if full else "normal"
     settings = Settings(pick_device(device), level, peers, threads or torch.get_num_threads())
-    cases = [case for op in chosen for case in load_suite(op).cases(settings)]
+    cases = [case for op in chosen for case in load_suite(op).tables(settings)]
     if only:
         names = list(dict.fromkeys(case.name for case in cases))
         if unknown := [name for name in only if name not in names]:

@@ -16,8 +16,8 @@ from ..files import STARTER
 from ..gaussians import Gaussians
 from ..kernels.bench import raster
 from ..kernels.bench.measure import (
-    Case,
     Settings,
+    Table,
     Variant,
     saved_bytes,
     synchronize,
@@ -45,12 +45,12 @@ _IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # as of DINOv2 ViT-B/14 at 336 pixels
 TOKENS = 128  # number of first tokens compared with the oracle
 
 
-def cases(settings: Settings) -> list[Case]:
-    """Return the cases of models."""
+def tables(settings: Settings) -> list[Table]:
+    """Return the tables of models."""
     builders = {"backbone": backbone, "mixers": mixers}
     builders |= {"one picture": pictures, "skipping": skipping}
-    made = [Case("model", name, build) for name, build in builders.items()]
-    graphs = [Case("model", "CUDA graph", cuda_graphs)]
+    made = [Table("model", name, build) for name, build in builders.items()]
+    graphs = [Table("model", "CUDA graph", cuda_graphs)]
     return made + graphs * (settings.device.type == "cuda")
 
 

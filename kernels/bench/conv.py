@@ -10,15 +10,15 @@ import torch
 from ..cases.conv import conv_problem
 from ..causal_conv1d import causal_conv1d_fn
 from . import peers
-from .measure import Case, Settings, Variant, pair
+from .measure import Settings, Table, Variant, pair
 
 _SIZES = {"quick": (1, 1024, 256, 4)}  # of ``conv_problem``
 _FULL = (1, 16961, 1024, 4)
 
 
-def cases(settings: Settings) -> list[Case]:
-    """Return the cases of the convolution."""
-    return [Case("conv", "operator", operator), Case("conv", "knobs", knobs)]
+def tables(settings: Settings) -> list[Table]:
+    """Return the tables of the convolution."""
+    return [Table("conv", "operator", operator), Table("conv", "knobs", knobs)]
 
 
 def operator(settings: Settings) -> list[Variant]:

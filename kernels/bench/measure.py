@@ -1,4 +1,4 @@
-"""The clock: variants of a case are called once, checked, and timed in turn."""
+"""The clock: variants of a table are called once, checked, and timed in turn."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Settings(NamedTuple):
     """Options of a run.
 
     Attributes:
-        device: device of all cases.
-        level: key of ``LEVELS``; cases also choose their sizes by it.
+        device: device of all variants.
+        level: key of ``LEVELS``; tables also choose their sizes by it.
         peers: True to measure other packages too, if they are installed.
         threads: number of torch's threads on the CPU.
     """
@@ -65,7 +65,7 @@ class Variant:
     """One thing that is timed.
 
     Attributes:
-        name: name within its case, unique for a direction.
+        name: name within its table, unique for a direction.
         run: function that is timed; its first call is timed apart.
         check: function that computes the error before the clock starts, or raises; None, or a
             function that returns None, if there is no oracle.
@@ -94,13 +94,13 @@ class Variant:
     work: Callable[[], Mapping[str, int | float]] | None = None
 
 
-class Case(NamedTuple):
+class Table(NamedTuple):
     """Variants that are timed in turn, so that their ratios come from one run.
 
     Attributes:
         op: name of the suite: scan, conv, raster, model or step.
         name: unique within the op.
-        build: function that makes the inputs and the variants, which are freed after the case; the
+        build: function that makes the inputs and the variants, which are freed after it; the
             first paragraph of its docstring describes the comparison.
     """
 
@@ -130,19 +130,19 @@ def synchronize(device: torch.device) -> None:
 
 
 def measure(
-    cases: Iterable[Case],
+    tables: Iterable[Table],
     settings: Settings,
-    say: Callable[[str, str], None] = lambda case, variant: None,
+    say: Callable[[str, str], None] = lambda table, variant: None,
 ) -> dict:
-    """Measure cases and return the document: machine, settings and records.
+    """Measure tables and return the document: machine, settings and records.
 
     A variant that raises, and a check that fails, are recorded in ``status``; the rest continues.
     Ctrl-C ends the run: ``interrupted`` is set and the measurements are kept.
 
     Args:
-        cases: cases in the order of their measuring.
+        tables: in the order of their measuring.
         settings: settings of the run.
-        say: function that gets the case's and the variant's name before each step.
+        say: function that gets the table's and the variant's name before each step.
 
     Returns:
         ``{machine, settings, interrupted, records}``, ready for JSON. A record has ``op, case,
@@ -163,8 +163,8 @@ def measure(
     before, load = torch.get_num_threads(), os.getloadavg()[0]
     torch.set_num_threads(settings.threads)
     try:
-        for case in cases:
-            _run_case(case, settings, records, say)
+        for table in tables:
+            _run_table(table, settings, records, say)
     except KeyboardInterrupt:
         document["interrupted"] = True
     finally:
@@ -173,16 +173,16 @@ def measure(
     return document
 
 
-def _run_case(case: Case, settings: Settings, records: list[dict], say: Callable) -> None:
-    title = f"{case.op}: {case.name}"
+def _run_table(table: Table, settings: Settings, records: list[dict], say: Callable) -> None:
+    title = f"{table.op}: {table.name}"
     say(title, "inputs")
     try:
-        variants = case.build(settings)
+        variants = table.build(settings)
     except Exception as error:
-        record = _record(case, Variant("all", lambda: None, None), settings)
+        record = _record(table, Variant("all", lambda: None, None), settings)
         records.append(record | {"status": _reason(error)})
         return
-    timed = [_Timed(v, _record(case, v, settings)) for v in variants]
+    timed = [_Timed(v, _record(table, v, settings)) for v in variants]
     try:
         for t in timed:
             say(title, t.variant.name)
@@ -200,11 +200,11 @@ def _run_case(case: Case, settings: Settings, records: list[dict], say: Callable
 _TIMES = ("ms_p20", "ms_p50", "ms_p80", "cpu_ms", "jit_ms")
 
 
-def _record(case: Case, variant: Variant, settings: Settings) -> dict:
-    text = (getattr(case.build, "__doc__", "") or "").split("\n\n")[0]
+def _record(table: Table, variant: Variant, settings: Settings) -> dict:
+    text = (getattr(table.build, "__doc__", "") or "").split("\n\n")[0]
     return {
-        "op": case.op,
-        "case": case.name,
+        "op": table.op,
+        "case": table.name,
         "variant": variant.name,
         "device": settings.device.type,
         "dtype": variant.dtype,
@@ -245,7 +245,7 @@ def _prepare(t: _Timed, settings: Settings) -> None:
 
 
 def _clock(ready: list[_Timed], settings: Settings, say: Callable) -> None:
-    """Time the variants in turn until each has its rounds and the case its time."""
+    """Time the variants in turn until each has its rounds and the table its time."""
     level = LEVELS[settings.level]
     ends = time.perf_counter() + level.seconds * len(ready)
     gc.collect()

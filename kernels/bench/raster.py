@@ -14,14 +14,14 @@ from ..rasterize import Skip
 from ..rasterize.harmonics import colors_seen_from
 from ..rasterize.harmonics.formula import colors_by_formula
 from . import measure, peers
-from .measure import Case, Settings, Variant
+from .measure import Settings, Table, Variant
 
 # An alpha or transmittance below these does not show in float64's picture of 16,384 Gaussians.
 _NO_THRESHOLDS = {"alpha_min": 1e-9, "t_min": 1e-30}
 
 
-def cases(settings: Settings) -> list[Case]:
-    """Return the cases of the rasterizer."""
+def tables(settings: Settings) -> list[Table]:
+    """Return the tables of the rasterizer."""
     builders = {
         "scene": scenes,
         "knobs": knobs,
@@ -31,7 +31,7 @@ def cases(settings: Settings) -> list[Case]:
     if settings.device.type == "cuda":
         builders["32 views"] = many_views
     builders["harmonics"] = harmonics
-    return [Case("raster", name, build) for name, build in builders.items()]
+    return [Table("raster", name, build) for name, build in builders.items()]
 
 
 def make_scene(

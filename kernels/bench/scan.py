@@ -13,15 +13,15 @@ from ..cases.problem import BOTH, DIRECTIONS, Operator
 from ..cases.scan import make_inputs, scan_problem
 from ..selective_scan import selective_scan_fn
 from . import peers
-from .measure import Case, Settings, Variant, pair, saved_bytes, variant
+from .measure import Settings, Table, Variant, pair, saved_bytes, variant
 
 # Tokens, channels, and tokens that the oracle computes.
 SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (16961, 1024, 16961)}
 _HALF = {"dtype": torch.bfloat16}
 
 
-def cases(settings: Settings) -> list[Case]:
-    """Return the cases of the scan."""
+def tables(settings: Settings) -> list[Table]:
+    """Return the tables of the scan."""
     builders = {
         "operator": operator,
         "knobs": knobs,
@@ -31,7 +31,7 @@ def cases(settings: Settings) -> list[Case]:
     }
     if settings.device.type == "cuda":
         builders["training batch"] = training_batch
-    return [Case("scan", name, build) for name, build in builders.items()]
+    return [Table("scan", name, build) for name, build in builders.items()]
 
 
 def make_problem(settings: Settings, channels_seen: int = 32, **changes: int) -> Operator:

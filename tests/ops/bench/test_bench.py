@@ -13,9 +13,9 @@ from gamba_warp import cli
 from gamba_warp.commands import machine
 from gamba_warp.kernels.bench import conv, raster, scan
 from gamba_warp.kernels.bench.measure import (
-    Case,
     NotInstalled,
     Settings,
+    Table,
     Variant,
     measure,
     pair,
@@ -46,7 +46,7 @@ def variant(name="ours", run=lambda: None, error=1e-8, **options):
 
 
 def case(*variants, name="one", op="scan"):
-    return Case(op, name, lambda settings: list(variants))
+    return Table(op, name, lambda settings: list(variants))
 
 
 def run(*cases):
@@ -55,12 +55,12 @@ def run(*cases):
 
 def measured(suite, name, settings=QUICK):
     """Return the records of the case of that name."""
-    return measure([c for c in suite.cases(settings) if c.name == name], settings)["records"]
+    return measure([c for c in suite.tables(settings) if c.name == name], settings)["records"]
 
 
 def stub(monkeypatch, *cases):
     """Makes ``gamba bench scan`` run these cases."""
-    module = type("M", (), {"cases": lambda _: list(cases)})
+    module = type("M", (), {"tables": lambda _: list(cases)})
     monkeypatch.setattr(machine, "load_suite", lambda op: module)
 
 
@@ -106,7 +106,7 @@ def test_a_failed_check_prints_no_time(error):
 def test_a_chart_has_the_sizes_of_the_knobs():
     other = variant("another", parameters={"L": 2})
     some = [variant(x, parameters={"L": 1}, error=e) for x, e in (("a", 1e-6), ("b", 0), ("c", 1))]
-    table = Case("scan", "knobs", lambda settings: [*some, other])
+    table = Table("scan", "knobs", lambda settings: [*some, other])
     (name,), (svg,) = zip(*charts(measure([table], QUICK)).items())
     assert name == "scan" and "scan: L 1" in svg and "1  a, float32" in svg
     assert not any(
@@ -149,7 +149,7 @@ def test_what_raises_is_recorded_and_the_rest_goes_on():
             variant("broken", raises(RuntimeError("no such\nkernel"))),
             variant("fine"),
         ),
-        Case("scan", "two", lambda settings: raises(MemoryError("too big"))()),
+        Table("scan", "two", lambda settings: raises(MemoryError("too big"))()),
         case(variant("last"), name="three"),
     )
     status = {r["variant"]: r["status"] for r in document["records"]}
@@ -331,7 +331,7 @@ def test_cases_run(suite, name):
 def test_cuda_has_its_own_cases():
     """Names only: nothing is run."""
     settings = Settings(torch.device("cuda"), "full")
-    names = {c.name for suite in (scan, conv, raster, models) for c in suite.cases(settings)}
+    names = {c.name for suite in (scan, conv, raster, models) for c in suite.tables(settings)}
     assert {"training batch", "32 views", "CUDA graph"} <= names
 
 
