@@ -76,7 +76,9 @@ def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
     for node, _, matrix in nodes:
         if (index := node.get("mesh", Index)) is None:
             continue
-        skin, placed = node.get("skin", Index), matrix @ file.instances(node)
+        skin, placed = node.get("skin", Index), matrix[None]
+        if "extensions" in node.values:  # not of most nodes, of which a file may have many
+            placed = matrix @ file.instances(node)
         if skin is not None and len(placed) > 1:
             sides.omit(f"instances of a skinned mesh ({INSTANCING}) are not supported")
         key = index, skin, node.get("weights", _SomeWeights, ())

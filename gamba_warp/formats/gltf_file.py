@@ -215,7 +215,7 @@ class GltfFile:
             if len(found) + len(left) > most or depth > len(own):
                 raise UserError(f"{self.path}: nodes form a cycle, or are shared over {most} times")
             node, children, matrix = own[index]
-            matrix = above @ matrix
+            matrix = matrix if above is _UNIT else above @ matrix
             found.append((node, index, matrix))
             left += [(child, matrix, depth + 1) for child in reversed(children)]
         return found
@@ -248,8 +248,6 @@ class GltfFile:
 
         They come from ``EXT_mesh_gpu_instancing``; without it, one unit matrix.
         """
-        if not node.values.get("extensions"):  # most nodes, of which a file may have many
-            return _UNIT[None]
         given = node.entry("extensions").entry(INSTANCING).entry("attributes")
         if not given.values:
             return _UNIT[None]

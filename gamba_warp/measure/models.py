@@ -27,13 +27,11 @@ from ..kernels.cases.problem import BOTH, DIRECTIONS, Error, compare
 from ..kernels.cases.raster import LEAVES, Scene, orbit_cameras
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
-from ..model.checkpoint import load_model
 from ..model.config import PRESETS, GambaConfig
 from ..model.gamba import Gamba
 from ..model.parts.attention import AttentionBlock
 from ..model.parts.block import GambaBlock, prefix_states, run_blocks
 from ..model.posing import reference_cameras
-from ..model.predict import reconstruct
 
 Result = TypeVar("Result")
 LIMITS = {"forward": 1e-5, BOTH: 1e-4}  # allowed relative rms error of blocks to float64
@@ -324,6 +322,9 @@ def skipping(settings: Settings) -> list[Variant]:
     """Work left out in one view of the Gaussians that the shipped model predicts from a picture:
     each switch of ``Skip`` off alone, and all off.
     """
+    from ..model.checkpoint import load_model  # which need more packages than the other tables
+    from ..model.predict import reconstruct
+
     picture = STARTER / "icons" / "blendswap-cc-0-teddybear.png"
     predicted = reconstruct(load_model(), picture).map(torch.clone)  # no tensors of inference
     gaussians = {name: getattr(predicted, name) for name in LEAVES}

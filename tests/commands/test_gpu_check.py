@@ -46,7 +46,7 @@ def test_torch_warp_and_pytest_are_enough(tmp_path):
     assert "skipped" in skipped and "error" not in skipped
     records = json.loads((out / "bench.json").read_text())["records"]
     assert {r["status"] for r in records} == {"ok"} and all(r["ms_p50"] > 0 for r in records)
-    assert "| default | forward |" in (out / "bench.md").read_text()
+    assert "| default | B 1, L 1024, D 256, taps 4 | forward |" in (out / "bench.md").read_text()
 
 
 def test_all_tests_of_the_kernels_are_found():

@@ -30,7 +30,7 @@ PAPER = [
     ("loss.novel_weight", 1.0, "eq. L_train: one mean over V + 1 views"),
     ("loss.lpips_crop", 0, "eq. L_train: whole views"),
     ("optim.schedule", "cosine", "not stated"),
-    ("optim.precision", "bfloat16", "not stated; the public code's"),
+    ("optim.precision", "auto", "not stated; bfloat16 in the public code"),
 ]
 CONSTANTS = [
     (optim.WEIGHT_DECAY, 0.05, "§4.1: and a weight decay of 0.05"),
