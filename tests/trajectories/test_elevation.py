@@ -102,7 +102,7 @@ def test_the_app_begins_with_the_estimate():
     assert work.run_model(load_model(), cut, 3.0).camera[2] == 3.0
 
 
-ICONS = {"by-fordfocus": 9, "cardboard-box": 23, "jacuzzi": 32, "toaster": 27}
+ICONS = {"by-fordfocus": 9, "cardboard-box": 23, "jacuzzi": 32, "toaster": 32}
 
 
 @pytest.mark.parametrize("name", ICONS)
