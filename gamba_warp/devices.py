@@ -140,7 +140,7 @@ def precision_note(name: Precision, device: torch.device, width: int) -> str | N
         return None
     return (
         f"bfloat16 takes {1 / faster:.1f} times as long as float32 on this processor; "
-        "--precision auto takes the faster"
+        "--precision auto chooses the faster one"
     )
 
 

@@ -23,7 +23,7 @@ from gamba_warp.batch import EXPECTED
 from gamba_warp.data.dataset import (
     ViewDataset,
     background_note,
-    check_cameras,
+    camera_note,
     evenly,
     open_dataset,
 )
@@ -116,10 +116,8 @@ def open_data(config: TrainConfig) -> TrainingData:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
         raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
-    try:
-        check_cameras(train)
-    except UserError as error:
-        raise UserError(f"{config.data}: {error}") from error
+    if note := camera_note(train):
+        raise UserError(f"{config.data}: {note}")
     notes += filter(None, [background_note(train)])
     held_out = None
     try:

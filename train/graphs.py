@@ -86,7 +86,7 @@ class StepGraphs:
             forget_graphs()
         shape = key, *((x.shape, x.dtype) if isinstance(x, Tensor) else x for x in _fields(batch))
         found = self._graphs.get(shape)
-        if found is None and self._times[shape] and self._has_place(shape):
+        if found is None and self._times[shape] and self._can_add(shape):
             found = self._capture(shape, batch, step)
         self._times[shape] += 1
         if found is None:
@@ -97,8 +97,8 @@ class StepGraphs:
         found.graph.replay()
         return found.result
 
-    def _has_place(self, shape: Hashable) -> bool:
-        """Return True if a graph may be added, maybe in place of one of a rarer shape."""
+    def _can_add(self, shape: Hashable) -> bool:
+        """Return True if a graph may be added, in place of one of a rarer shape if need be."""
         if len(self._graphs) < self._most:
             return True
         rarest = min(self._graphs, key=self._times.__getitem__, default=None)
@@ -121,7 +121,9 @@ class StepGraphs:
                 torch.cuda.set_rng_state(state, self._device)
             if isinstance(error, torch.cuda.OutOfMemoryError):
                 self._most = len(self._graphs)
-                self._say(f"memory for {self._most} CUDA graphs of steps; others run one by one")
+                self._say(
+                    f"out of memory after {self._most} CUDA graphs; other steps run without one"
+                )
                 return None
             self._say(f"no CUDA graph of a step: {first_line(error)}; steps run one by one")
             self._most = 0

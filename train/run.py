@@ -185,8 +185,7 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
         f"{config.run.out}"
     )
     width, device = trainer.model.config.width, trainer.world.device
-    slow = precision_note(config.optim.precision, device, width)
-    for note in [*notes, *([slow] if slow else [])]:
+    for note in filter(None, [*notes, precision_note(config.optim.precision, device, width)]):
         log.warn(trainer.step, note)
     if checkpoint is not None:
         say(f"resumed {checkpoint} at step {trainer.step}")

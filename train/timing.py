@@ -11,7 +11,7 @@ from torch.autograd.profiler import profile
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.kernels.bench.measure import Settings, Table, Variant
 from gamba_warp.kernels.cases.problem import BOTH
-from gamba_warp.model.config import PRESETS, Preset
+from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.vision.lpips import LPIPS, load_lpips
@@ -53,11 +53,10 @@ def tables(settings: Settings) -> list[Table]:
 
 
 class Step:
-    """A model with its optimizer and a batch of random pictures, as in a training run."""
+    """A model of preset rays, its optimizer and a batch of random images, as in a training run."""
 
     def __init__(
         self,
-        preset: Preset,
         objects: int,
         device: torch.device,
         graph: bool = False,
@@ -66,7 +65,7 @@ class Step:
     ) -> None:
         """Make model and batch; with ``graph`` the third and later runs repeat a CUDA graph."""
         torch.manual_seed(0)
-        config = PRESETS[preset]
+        config = PRESETS["rays"]
         self.model = Gamba(config).to(device)
         self.optimizer = build_optimizer(self.model)
         for group in self.optimizer.param_groups:
@@ -82,8 +81,7 @@ class Step:
         size = config.image_size
         y, x = torch.meshgrid(*2 * [torch.linspace(-1, 1, size)], indexing="ij")
         inputs = torch.rand(objects, size, size, config.input_channels)
-        if config.input_channels == 4:
-            inputs[..., 3] = (x.square() + y.square() < 0.5).float()  # 39 % of the picture
+        inputs[..., 3] = (x.square() + y.square() < 0.5).float()  # 39 % of the picture
         self.batch = Batch(
             [str(i) for i in range(objects)],
             inputs,
@@ -91,7 +89,7 @@ class Step:
             torch.rand(objects, _VIEWS, _SIZE, _SIZE, 4),
             Cameras(views, Ks, _SIZE, _SIZE),
             torch.ones(objects, 1, 3),
-            torch.full((objects, 2, size, size), 1.8) if config.decoder == "rays" else None,
+            torch.full((objects, 2, size, size), 1.8),
         )
         self.batch = with_foreground(self.batch, config)
         if device.type == "cuda":
@@ -147,7 +145,7 @@ def steps(settings: Settings) -> list[Variant]:
     lpips = load_lpips() if lpips_available() else None
     for objects in (2,) if quick else (8, 64) if on_gpu else (8, 16):
         for precision in (torch.float32, torch.bfloat16):
-            step = Step("rays", objects, settings.device, on_gpu, precision, lpips)
+            step = Step(objects, settings.device, on_gpu, precision, lpips)
             made.append(
                 Variant(
                     f"rays, {objects} objects" + (", without LPIPS" if lpips is None else ""),

@@ -16,7 +16,7 @@ from gamba_warp.data import gso
 from gamba_warp.data.dataset import (
     ViewDataset,
     background_note,
-    check_cameras,
+    camera_note,
     evenly,
     open_dataset,
 )
@@ -187,8 +187,7 @@ def open_job(options: ViewsOptions) -> Job:
         output_folder(options.out)
     if options.baselines:
         _add_baselines(job, options)
-    check_cameras(dataset)
-    if note := background_note(dataset):
+    for note in filter(None, (camera_note(dataset), background_note(dataset))):
         print(f"warning: {options.data}: {note}", file=sys.stderr)
     return job
 

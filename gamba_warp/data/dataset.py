@@ -571,38 +571,39 @@ def background_note(dataset: ViewDataset) -> str | None:
     return "no picture has an alpha channel or a mask: the background counts as part of the object"
 
 
-def check_cameras(dataset: ViewDataset) -> None:
-    """Check that the cameras of up to eight objects look at their origin; skips unreadable ones.
+def camera_note(dataset: ViewDataset) -> str | None:
+    """Warning if most cameras of a dataset do not face the origin, else None.
 
-    Raises:
-        UserError: most look away from it. The line names a convention by which they would not.
+    Checks up to eight objects, skipping unreadable ones. The warning names a convention by which
+    the cameras would face it.
     """
     found = []
     for uid in evenly(dataset.uids, 8):
         with suppress(*EXPECTED):
             found.append(dataset.files(uid).camera_to_world)
     poses = np.concatenate([np.zeros((0, 4, 4)), *found])
-    if not len(poses) or _facing(poses) >= 0.5:
-        return
-    turned = np.diag([1.0, -1.0, -1.0, 1.0])
+    facing = _facing(poses)
+    if not len(poses) or facing >= 0.5:
+        return None
+    flip, inverse = np.diag([1.0, -1.0, -1.0, 1.0]), np.linalg.inv(poses)
     others = {
-        "OpenCV's axes": poses @ turned,
-        "world to camera": np.linalg.inv(poses),
-        "world to camera in OpenCV's axes": np.linalg.inv(poses) @ turned,
+        "in OpenCV's axes": poses @ flip,
+        "world to camera": inverse,
+        "world to camera in OpenCV's axes": inverse @ flip,
     }
-    name, best = max(((x, _facing(p)) for x, p in others.items()), key=lambda pair: pair[1])
-    hint = f"; as {name} they would look at it" if best >= 0.9 else ""
-    raise UserError(
-        f"{1 - _facing(poses):.0%} of the cameras look away from the object at the origin{hint}: "
-        "poses must be camera to world, with x right, y up, z back"
+    name = max(others, key=lambda name: _facing(others[name]))
+    hint = f"; they would if read as {name}" if _facing(others[name]) >= 0.9 else ""
+    return (
+        f"{1 - facing:.0%} of the cameras do not face the origin, where the object is expected"
+        f"{hint}: poses are camera to world, x right, y up, z back"
     )
 
 
 def _facing(camera_to_world: np.ndarray) -> float:
-    """Share of the cameras whose axis is within 60 degrees of the origin's direction."""
+    """Fraction of the cameras whose axis is within 60 degrees of the origin's direction."""
     axes, places = camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
     ahead = (axes * places).sum(-1)
-    return float((ahead >= 0.5 * np.linalg.norm(places, axis=-1)).mean())
+    return float((ahead >= 0.5 * np.linalg.norm(places, axis=-1)).sum() / max(1, len(places)))
 
 
 def _read_depth(path: Path | DecodedPicture, width: int, height: int) -> np.ndarray:

@@ -140,7 +140,7 @@ def skipping(settings: Settings) -> list[Variant]:
     for name, (count, scale) in scenes.items():
         scene = make_scene(settings, scale, count)
         made += [v for direction in DIRECTIONS for v in switches(scene, name, direction)]
-    return made + needed(make_scene(settings, 2))
+    return made + partial_gradients(make_scene(settings, 2))
 
 
 _FORWARD = ("tile_test", "block_test", "stopped", "empty_tiles")  # the others are of the gradient
@@ -152,10 +152,12 @@ def switches(scene: Scene, name: str, direction: str) -> list[Variant]:
     names = [x.name for x in fields(Skip) if direction == BOTH or x.name in _FORWARD]
     off = {"all on": (), **{f"{x} off": (x,) for x in names}, "all off": names}
     made = []
-    for label, those in off.items():
-        other = scene.changed(options=scene.options | {"skip": Skip(**dict.fromkeys(those, False))})
+    for label, disabled in off.items():
+        other = scene.changed(
+            options=scene.options | {"skip": Skip(**dict.fromkeys(disabled, False))}
+        )
         check = partial(_difference, other, scene, direction)
-        changes = {"check": check, "limit": 0.0, "oracle": _SAME, "default": not those}
+        changes = {"check": check, "limit": 0.0, "oracle": _SAME, "default": not disabled}
         made.append(_variant(other, f"{name}: {label}", direction, **changes))
     return made
 
@@ -168,7 +170,7 @@ def _difference(scene: Scene, other: Scene, direction: str) -> Error:
     )
 
 
-def needed(scene: Scene) -> list[Variant]:
+def partial_gradients(scene: Scene) -> list[Variant]:
     """Return calls that need a part of the gradients, with the switch for it on and off."""
     half = scene.size // 2
     part = torch.zeros_like(scene.upstream)

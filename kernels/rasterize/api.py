@@ -99,7 +99,7 @@ def rasterization(
     Raises:
         TypeError: a tensor has another dtype, or is not a tensor.
         ValueError: a shape, device or option is not as above; the message names it. Or there are
-            over 2^31 pairs of tiles and Gaussians, and this is not CUDA, or the first such call.
+            over 2^31 pairs of tiles and Gaussians.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered before.
     """
     given = Inputs(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)

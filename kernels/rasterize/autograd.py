@@ -19,7 +19,6 @@ from .cpu import composite as composite_cpu
 from .cpu.project import project_on_lanes, vjp_on_lanes
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
-from .cuda.capacity import MAX_PAIRS
 from .cuda.project import project_on_threads, vjp_on_threads
 from .projection import (
     PROJECTED_SIZES,
@@ -31,6 +30,7 @@ from .projection import (
 )
 from .skip import UNASKED
 from .tiles import (
+    MAX_PAIRS,
     Bins,
     Limits,
     Saved,

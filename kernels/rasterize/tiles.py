@@ -88,6 +88,7 @@ class Saved(NamedTuple):
 
 
 CHUNK = 4  # channels that a launch on CUDA has at most
+MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 
 
 def record_size(channels: int) -> int:

@@ -180,7 +180,7 @@ def check_step_graph(device: torch.device) -> None:
     """Check a step that is repeated by a CUDA graph bit by bit against steps one by one."""
     from gamba_warp.train.timing import Step
 
-    plain, repeated = (Step("rays", 3, device, graph) for graph in (False, True))
+    plain, repeated = (Step(3, device, graph) for graph in (False, True))
     for _ in range(5):
         assert_same((plain.run(),), (repeated.run().clone(),))
     assert repeated.graphs is not None and repeated.graphs.count == 1

@@ -156,7 +156,7 @@ def test_graphs_of_a_grown_scene_have_a_pool_of_their_own(monkeypatch):
     assert said == [] and kept.count == 1
 
 
-def test_the_graph_of_a_rare_shape_makes_place():
+def test_the_graph_of_a_rare_shape_is_dropped():
     kept = RecordedGraphs(list, most=2)
     batch = Numbers(torch.ones(2))
     for key in "aabbbcccc":
@@ -177,7 +177,7 @@ def test_a_capture_without_memory_leaves_the_others(monkeypatch):
     for key in "aabbaab":
         kept.run(batch, key, lambda batch: 2 * batch.values)
     assert kept.count == 1 and kept.said == [
-        "memory for 1 CUDA graphs of steps; others run one by one"
+        "out of memory after 1 CUDA graphs; other steps run without one"
     ]
 
 

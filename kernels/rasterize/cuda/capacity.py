@@ -1,8 +1,8 @@
 """Capacity of the lists in CUDA graphs, which cannot wait for their number of pairs.
 
 Any other call reads its number of pairs back and allocates as many. A graph allocates half as many
-again as the last call of its shape needed; each replay copies its count to the host. Images of a
-replay with more pairs are NaN, so that no step is made with them, and ``lists_outgrown`` says so.
+again as the last call of its shape needed; each replay copies its count to the host. A replay with
+more pairs gives images of NaN, so that a training step skips them, and ``lists_outgrown`` is True.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
+from ..tiles import MAX_PAIRS
+
 _SLOTS = 4096  # shapes remembered; beyond these, the oldest are dropped
 
 
@@ -85,7 +86,7 @@ def graph_capacity(key: Hashable, count: Tensor) -> int:
 
 
 def lists_outgrown() -> bool:
-    """Return True if a captured CUDA graph needs a larger capacity, as its images are NaN.
+    """Return True if a captured CUDA graph has more pairs than its capacity: its images are NaN.
 
     A new capture of the same shapes has the capacity. This does not wait for the device, whose
     counts may be some replays older or newer.

@@ -86,7 +86,7 @@ def composite_forward(
         [as_struct(bins)],
         [as_struct(saved), StructValue(Pixels, renders, transmittances)],
     )
-    if capacity.is_capturing(colors.device):  # a replay with too many pairs must not pass for right
+    if capacity.is_capturing(colors.device):  # NaN where a replay has too many pairs
         short = bins.count > bins.pairs.numel()
         renders.masked_fill_(short, math.nan)
         transmittances.masked_fill_(short, math.nan)
