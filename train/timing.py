@@ -10,7 +10,7 @@ from torch.autograd.profiler import profile
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.kernels.bench.measure import Settings, Table, Variant
-from gamba_warp.kernels.cases.problem import BOTH
+from gamba_warp.kernels.cases.case import BOTH
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras

@@ -11,8 +11,8 @@ import warp as wp
 
 from ..errors import first_line
 from ..kernels.bench.measure import synchronize
-from ..kernels.cases.raster import Scene, orbit_cameras, shell
-from ..kernels.cases.scan import make_inputs, scan_problem
+from ..kernels.cases.raster import orbit_cameras, raster_case, shell
+from ..kernels.cases.scan import make_inputs, scan_case
 from ..model.checkpoint import DEFAULT_CHECKPOINT
 from ..versions import EXTRA_OF, import_open3d, to_install
 from ..vision.weights import FETCH, cache_folder, lpips_available
@@ -84,8 +84,8 @@ def warm_up_kernels() -> Iterator[tuple[str, float, float]]:
         device, spans = torch.device(name), []
         for _ in range(2):
             started = time.perf_counter()
-            scan_problem(make_inputs(1, 32, 32), device, 32).backward()
-            Scene(shell(64), *orbit_cameras(1, 32), 32, device).backward()
+            scan_case(make_inputs(1, 32, 32), device, 32).backward()
+            raster_case(shell(64), orbit_cameras(1, 32), 32, device).backward()
             synchronize(device)
             spans.append(time.perf_counter() - started)
         yield name, spans[0], spans[1]

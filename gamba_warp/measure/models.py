@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -19,12 +19,13 @@ from ..kernels.bench.measure import (
     Settings,
     Table,
     Variant,
+    difference,
     saved_bytes,
     synchronize,
     variant,
 )
-from ..kernels.cases.problem import BOTH, DIRECTIONS, Error, compare
-from ..kernels.cases.raster import LEAVES, Scene, orbit_cameras
+from ..kernels.cases.case import BOTH, DIRECTIONS, Case, Error, compare
+from ..kernels.cases.raster import LEAVES, orbit_cameras, raster_case
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
 from ..model.config import PRESETS, GambaConfig
@@ -34,7 +35,8 @@ from ..model.parts.block import GambaBlock, prefix_states, run_blocks
 from ..model.posing import reference_cameras
 
 Result = TypeVar("Result")
-LIMITS = {"forward": 1e-5, BOTH: 1e-4}  # allowed relative rms error of blocks to float64
+# Allowed relative rms error of blocks to float64; what they add to tokens is a hundredth of these.
+LIMITS = dict.fromkeys(DIRECTIONS, 1e-7)
 # Under capture torch may choose other kernels for a matrix product, and then the results differ by
 # the dtype's rounding.
 GRAPH_LIMITS = {torch.float32: 1e-4, torch.bfloat16: 1e-2}
@@ -52,77 +54,48 @@ def tables(settings: Settings) -> list[Table]:
     return made + graphs * (settings.device.type == "cuda")
 
 
-class Backbone:
-    """Blocks of the paper's size with the condition of one image."""
+def blocks_case(settings: Settings, depth: int) -> Case:
+    """Return blocks of the paper's size with the condition of one image, run as ``Gamba`` does."""
+    quick = settings.level == "quick"
+    config = GambaConfig(dt_rank=8, width=128) if quick else PRESETS["paper"]
+    torch.manual_seed(0)
+    blocks = [
+        GambaBlock(config, _IMAGE_CHANNELS, _IMAGE_CHANNELS).to(settings.device)
+        for _ in range(depth)
+    ]
+    length = 1024 if quick else config.num_gaussians
+    shapes = (length, config.width), (1, _IMAGE_CHANNELS), (_IMAGE_TOKENS, _IMAGE_CHANNELS)
+    tokens, *condition = (torch.randn(1, *shape) for shape in shapes)
+    camera, image = (x.to(settings.device) for x in condition)
 
-    def __init__(self, settings: Settings, depth: int) -> None:
-        quick = settings.level == "quick"
-        config = GambaConfig(dt_rank=8, width=128) if quick else PRESETS["paper"]
-        torch.manual_seed(0)
-        blocks = (GambaBlock(config, _IMAGE_CHANNELS, _IMAGE_CHANNELS) for _ in range(depth))
-        self.blocks = [block.to(settings.device) for block in blocks]
-        self.length = 1024 if quick else config.num_gaussians
-        shapes = (self.length, config.width), (1, _IMAGE_CHANNELS), (_IMAGE_TOKENS, _IMAGE_CHANNELS)
-        tensors = [torch.randn(1, *shape).to(settings.device) for shape in shapes]
-        self.tokens, self.camera, self.image = tensors
-        self.sizes = {"L": self.length, "D": config.width, "depth": depth}
-
-    def run(self, tokens: Tensor) -> Tensor:
-        """Run the blocks like ``Gamba.forward``: the prefix states, then the tokens."""
-        states = prefix_states(self.blocks, self.camera, self.image)
-        return run_blocks(self.blocks, tokens, states)
-
-    @torch.no_grad()
-    def forward(self) -> Tensor:
-        """Run the blocks without gradients (timed)."""
-        return self.run(self.tokens)
-
-    @torch.no_grad()
-    def prepended(self) -> Tensor:
-        """Run the paper's eq. 2 literally, prepending and dropping (timed)."""
-        tokens = self.tokens
-        for block in self.blocks:
+    def function(tokens: Tensor, prepend: bool = False) -> Tensor:
+        if not prepend:
+            return run_blocks(blocks, tokens, prefix_states(blocks, camera, image))
+        for block in blocks:  # the paper's eq. 2 literally, prepending and dropping
             assert block.project_camera is not None and block.project_image is not None
-            prefix = [block.project_camera(self.camera), block.project_image(self.image)]
+            prefix = [block.project_camera(camera), block.project_image(image)]
             hidden, _ = block.mamba(block.norm(torch.cat([*prefix, tokens], dim=1)))
-            tokens = tokens + hidden[:, -self.length :]
+            tokens = tokens + hidden[:, -length:]
         return tokens
 
-    def backward(self) -> tuple[Tensor, ...]:
-        """Compute the gradients of tokens and weights, with the tokens as cotangent (timed)."""
-        tokens = self.tokens.detach().requires_grad_()
-        leaves = [tokens, *(p for block in self.blocks for p in block.parameters())]
-        return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
+    def reference(tokens: Tensor) -> Tensor:
+        for block in blocks:
+            tokens = _reference_block(block, tokens, camera, image)
+        return tokens
 
-    def oracle(self, direction: str) -> str:
-        """Return a description of the check's reference."""
-        text = f"float64 with the condition prepended, first {TOKENS} of {self.length} tokens"
-        return text + (", gradient of these tokens" if direction == BOTH else "")
-
-    def limit(self, direction: str) -> float:
-        """Return the largest allowed error."""
-        return LIMITS[direction]
-
-    def check(self, direction: str, run: Callable[[], Tensor] | None = None) -> Error:
-        """Measure the error of the update of the first tokens, which depend on no later one.
-
-        Or of their gradient, with a cotangent of 0 after them.
-        """
-        first = self.tokens[:, :TOKENS].double().cpu().requires_grad_(direction == BOTH)
-        with torch.set_grad_enabled(direction == BOTH):
-            tokens = first
-            for block in self.blocks:
-                tokens = _reference_block(block, tokens, self.camera, self.image)
-        if direction != BOTH:
-            got = (run or self.forward)()[:, :TOKENS].double().cpu()
-            return compare({"update": got - first}, {"update": tokens - first})
-        leaf = self.tokens.detach().requires_grad_()
-        cotangent = self.tokens.clone()
-        cotangent[:, TOKENS:] = 0
-        (got,) = torch.autograd.grad(self.run(leaf), [leaf], cotangent)
-        (want,) = torch.autograd.grad(tokens, [first], first.detach())
-        name = "gradient of the tokens"
-        return compare({name: got[:, :TOKENS]}, {name: want})
+    first = dict.fromkeys(("tokens", "out"), (slice(None), slice(TOKENS)))
+    return Case(
+        function,
+        reference,
+        {"tokens": tokens},
+        tokens,
+        settings.device,
+        f"float64 with the condition prepended, first {TOKENS} of {length} tokens",
+        {"L": length, "D": config.width, "depth": depth},
+        LIMITS,
+        part=dict.fromkeys(DIRECTIONS, first),
+        parameters=[p for block in blocks for p in block.parameters()],
+    )
 
 
 def _reference_block(block: GambaBlock, tokens: Tensor, camera: Tensor, image: Tensor) -> Tensor:
@@ -174,12 +147,11 @@ def backbone(settings: Settings) -> list[Variant]:
     """
     made = []
     for depth in (1, 2 if settings.level == "quick" else 14):
-        blocks, rounds = Backbone(settings, depth), 3 if depth > 2 else None
+        blocks, rounds = blocks_case(settings, depth), 3 if depth > 2 else None
         name = f"{depth} block{'s' * (depth > 1)}"
         made.append(variant(blocks, name, default=True, rounds=rounds))
-        check = partial(blocks.check, "forward", blocks.prepended)
-        changes: dict[str, Any] = {"run": blocks.prepended, "check": check, "rounds": rounds}
-        made.append(variant(blocks, f"{name}, prefix states off", **changes))
+        prepended = replace(blocks, function=partial(blocks.function, prepend=True))
+        made.append(variant(prepended, f"{name}, prefix states off", rounds=rounds))
         if depth == 1:
             made.append(variant(blocks, name, BOTH, default=True))
     return made
@@ -193,54 +165,39 @@ def mixers(settings: Settings) -> list[Variant]:
     lengths = {"quick": (256, 512), "normal": (1024, 4096), "full": (4096, 16384, 65536)}
     config, made = replace(PRESETS["tiny"], width=256), []
     for length in lengths[settings.level]:
+        tokens = torch.randn(1, length, config.width)
         for name, kind in (("Mamba", GambaBlock), ("transformer", AttentionBlock)):
             torch.manual_seed(0)
-            block = _Mixer(kind(config, 0, 0).to(settings.device), length)
+            block = kind(config, 0, 0).to(settings.device)
+            case = Case(
+                partial(_first_result, block),
+                block,
+                {"tokens": tokens},
+                tokens,
+                settings.device,
+                "a second run (0: the same bits)",
+                {"L": length, "D": config.width},
+                dict.fromkeys(DIRECTIONS, 1e-4),  # products may be added in another order
+                parameters=[*block.parameters()],
+            )
             for direction in DIRECTIONS:
-                made.append(variant(block, f"{name}, {length} tokens", direction, rounds=3))
+                check = partial(difference, case, case, direction)
+                title = f"{name}, {length} tokens"
+                made.append(variant(case, title, direction, rounds=3, check=check))
                 made[-1].peer = name == "transformer"
-            made[-1].work = block.work
+            made[-1].work = partial(_saved, case)
     return made
 
 
-class _Mixer:
-    """A block on the tokens of one sequence."""
+def _first_result(block: GambaBlock | AttentionBlock, tokens: Tensor) -> Tensor:
+    return block(tokens, None)[0]
 
-    def __init__(self, block: GambaBlock | AttentionBlock, length: int) -> None:
-        self.block = block
-        width, device = block.norm.weight.numel(), block.norm.weight.device
-        self.tokens = torch.randn(1, length, width, device=device)
-        self.sizes = {"L": length, "D": width}
 
-    @torch.no_grad()
-    def forward(self) -> Tensor:
-        """Run the block without gradients (timed)."""
-        return self.block(self.tokens, None)[0]
-
-    def backward(self) -> tuple[Tensor, ...]:
-        """Compute the gradients of tokens and weights, with the tokens as cotangent (timed)."""
-        tokens = self.tokens.detach().requires_grad_()
-        out, _ = self.block(tokens, None)
-        return torch.autograd.grad(out, [tokens, *self.block.parameters()], self.tokens)
-
-    def oracle(self, direction: str) -> str:
-        """Return a description of the check's reference."""
-        return "a second run (0: the same bits)"
-
-    def limit(self, direction: str) -> float:
-        """Return the largest allowed error: torch's products may be added in another order."""
-        return LIMITS[direction]
-
-    def check(self, direction: str) -> Error:
-        """Measure the difference of two runs."""
-        run = self.backward if direction == BOTH else lambda: [self.forward()]
-        first, second = ({str(i): x for i, x in enumerate(run())} for _ in range(2))
-        return compare(first, second)
-
-    def work(self) -> dict[str, int]:
-        """Return the bytes that a forward pass keeps for its gradient."""
-        inputs = [self.tokens.detach().requires_grad_(), *self.block.parameters()]
-        return {"saved_bytes": saved_bytes(lambda: self.block(inputs[0], None), inputs)}
+def _saved(case: Case) -> dict[str, int]:
+    leaves = case.leaves()
+    return {
+        "saved_bytes": saved_bytes(lambda: case.call(leaves), [*leaves.values(), *case.parameters])
+    }
 
 
 def without_encoder(config: GambaConfig) -> GambaConfig:
@@ -329,7 +286,7 @@ def skipping(settings: Settings) -> list[Variant]:
     predicted = reconstruct(load_model(), picture).map(torch.clone)  # no tensors of inference
     gaussians = {name: getattr(predicted, name) for name in LEAVES}
     size = 256 if settings.level == "quick" else 512
-    scene = Scene(gaussians, *orbit_cameras(1, size), size, settings.device)
+    scene = raster_case(gaussians, orbit_cameras(1, size), size, settings.device)
     return [v for x in DIRECTIONS for v in raster.switches(scene, "the model's output", x)]
 
 

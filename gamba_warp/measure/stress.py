@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, orbit, plucker_rays
-from ..kernels.cases.case import Case, Op, Outcome, Runs, generator
+from ..kernels.cases.random_case import Op, Outcome, RandomCase, Runs, generator
 from ..kernels.cases.rounding import SAMPLES, Rounding, samples_of
 from ..kernels.cases.scan_oracle import EXP_ULPS, conv, scan
 from ..model.config import GambaConfig
@@ -44,7 +44,7 @@ OPTIONS = {
 }
 
 
-def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], Cameras]:
+def build(case: RandomCase, device: torch.device) -> tuple[Gamba, dict[str, Tensor], Cameras]:
     """Build the model, its differentiable inputs by name, and the cameras."""
     o, kind = case.options, case.kind
     with torch.random.fork_rng(devices=[]):
@@ -104,7 +104,7 @@ def _change(model: Gamba, kind: str) -> None:
 class _Oracle:
     """The network in float64 from its parameters, per sample, with the condition prepended."""
 
-    def __init__(self, case: Case, model: Gamba, trial: int) -> None:
+    def __init__(self, case: RandomCase, model: Gamba, trial: int) -> None:
         self.config, self.r = model.config, Rounding(case.seed, trial)
         self.ulps = _BFLOAT16 if case.options["autocast"] else 1.0
         self.weights = {k: samples_of(p) for k, p in model.named_parameters()}
@@ -234,7 +234,7 @@ def _run(model: Gamba, o: dict, inputs: dict, cameras: Cameras) -> dict[str, Ten
     return gaussians.tensors()
 
 
-def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
+def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     """Run the model, and check all attributes and the gradients of all parameters and inputs."""
     model, inputs, cameras = build(case, device)
     leaves = inputs | dict(model.named_parameters())

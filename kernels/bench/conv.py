@@ -7,12 +7,12 @@ from typing import Any
 
 import torch
 
-from ..cases.conv import conv_problem
+from ..cases.conv import conv_case
 from ..causal_conv1d import causal_conv1d_fn
 from . import peers
 from .measure import Settings, Table, Variant, pair
 
-_SIZES = {"quick": (1, 1024, 256, 4)}  # of ``conv_problem``
+_SIZES = {"quick": (1, 1024, 256, 4)}  # of ``conv_case``
 _FULL = (1, 16961, 1024, 4)
 
 
@@ -23,24 +23,24 @@ def tables(settings: Settings) -> list[Table]:
 
 def operator(settings: Settings) -> list[Variant]:
     """Convolution and SiLU, compared with torch's grouped convolution, in both layouts."""
-    problem = partial(conv_problem, settings.device, _SIZES.get(settings.level, _FULL))
-    made = pair(problem(), "default", default=True)
+    case = partial(conv_case, settings.device, _SIZES.get(settings.level, _FULL))
+    made = pair(case(), "default", default=True)
     drop_in: Any = partial(causal_conv1d_fn, activation="silu")
-    made += pair(problem(drop_in, True), "[B, D, L]")
+    made += pair(case(drop_in, True), "[B, D, L]")
     others = {"torch conv1d": (peers.torch_conv, {"rounds": 10})}
     if settings.peers and settings.device.type == "cuda":
         others["causal-conv1d"] = peers.causal_conv1d, {}
     for name, (function, options) in others.items():
-        made += pair(problem(function, True), name, peer=True, **options)
-        last = problem(peers.channels_last(function, ("x",)))
+        made += pair(case(function, True), name, peer=True, **options)
+        last = case(peers.channels_last(function, ("x",)))
         made += pair(last, f"{name}, channels last", peer=True, **options)
     return made
 
 
 def knobs(settings: Settings) -> list[Variant]:
     """Half precision, compared with the truth of the float32 inputs."""
-    problem = conv_problem(settings.device, _SIZES.get(settings.level, _FULL))
-    made = pair(problem, "float32", default=True)
+    case = conv_case(settings.device, _SIZES.get(settings.level, _FULL))
+    made = pair(case, "float32", default=True)
     for dtype in (torch.bfloat16, torch.float16):
-        made += pair(problem, str(dtype).removeprefix("torch."), options={"dtype": dtype})
+        made += pair(case, str(dtype).removeprefix("torch."), options={"dtype": dtype})
     return made

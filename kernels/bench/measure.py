@@ -20,7 +20,7 @@ import warp as wp
 
 from gamba_warp.versions import __version__
 
-from ..cases.problem import DIRECTIONS, Error
+from ..cases.case import DIRECTIONS, Case, Error, compare
 
 
 class NotInstalled(Exception):
@@ -338,28 +338,36 @@ def saved_bytes(forward: Callable[[], object], inputs: Iterable[torch.Tensor]) -
     return sum(size for pointer, size in seen.items() if pointer not in own)
 
 
-def variant(problem: Any, name: str, direction: str = "forward", **changes: Any) -> Variant:
-    """Return a variant that runs and checks a problem of ``kernels/cases``.
+def variant(case: Case, name: str, direction: str = "forward", **changes: Any) -> Variant:
+    """Return a variant that runs and checks a case.
 
     Args:
-        problem: with ``forward, backward, check, oracle, limit, sizes``.
+        case: what it runs.
         name: of the variant.
         direction: of the variant.
-        changes: attributes of the variant; and ``options`` of the problem's runs.
+        changes: attributes of the variant; and ``options`` of the case's runs.
     """
     options = changes.pop("options", {})
     dtype = options.get("dtype")
     given: dict[str, Any] = {
-        "run": partial(problem.forward if direction == "forward" else problem.backward, **options),
-        "check": partial(problem.check, direction, **options),
-        "limit": problem.limit(direction, dtype) if dtype else problem.limit(direction),
-        "oracle": problem.oracle(direction),
+        "run": partial(case.forward if direction == "forward" else case.backward, **options),
+        "check": partial(case.check, direction, **options),
+        "limit": case.limit(direction, dtype or torch.float32),
+        "oracle": case.oracle(direction),
         "dtype": str(dtype or torch.float32).removeprefix("torch."),
-        "parameters": dict(problem.sizes),
+        "parameters": dict(case.sizes),
     }
     return Variant(name, direction=direction, **(given | changes))
 
 
-def pair(problem: Any, name: str, **changes: Any) -> list[Variant]:
+def pair(case: Case, name: str, **changes: Any) -> list[Variant]:
     """Return the variants of both directions: forward, and forward with all gradients."""
-    return [variant(problem, name, direction, **changes) for direction in DIRECTIONS]
+    return [variant(case, name, direction, **changes) for direction in DIRECTIONS]
+
+
+def difference(case: Case, other: Case, direction: str) -> Error:
+    """Return the difference of two cases' results, or of their gradients."""
+    run = "forward" if direction == "forward" else "backward"
+    results = (getattr(x, run)() for x in (case, other))
+    tensors = (r if isinstance(r, tuple) else (r,) for r in results)
+    return compare(*({str(i): x for i, x in enumerate(r) if torch.is_tensor(x)} for r in tensors))

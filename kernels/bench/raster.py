@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..cases.problem import BOTH, DIRECTIONS, Error, Operator, compare
-from ..cases.raster import LEAVES, TRADE_LIMIT, Scene, orbit_cameras, shell
+from ..cases.case import BOTH, DIRECTIONS, Case, Error, compare
+from ..cases.raster import LEAVES, TRADE_LIMIT, orbit_cameras, raster_case, shell, work_of
 from ..rasterize import Skip
 from ..rasterize.harmonics import colors_seen_from
 from ..rasterize.harmonics.formula import colors_by_formula
@@ -40,21 +41,28 @@ def make_scene(
     count: int | None = None,
     size: int | None = None,
     views: int = 1,
-) -> Scene:
+    **options: Any,
+) -> Case:
     """Return the shell; a quick run has an eighth of the Gaussians and a quarter of the pixels."""
     quick = settings.level == "quick"
     count = count or (2048 if quick else 16384)
     size = size or (256 if quick else 512)
-    return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
+    cameras = orbit_cameras(views, size)
+    return raster_case(shell(count, scale), cameras, size, settings.device, **options)
 
 
-def _variant(scene: Scene, name: str, direction: str = "forward", **changes) -> Variant:
-    work = partial(scene.work, direction == BOTH)
+def _variant(scene: Case, name: str, direction: str = "forward", **changes) -> Variant:
+    work = partial(work_of, scene, direction)
     return measure.variant(scene, name, direction, **({"work": work} | changes))
 
 
-def _pair(scene: Scene, name: str, **changes) -> list[Variant]:
+def _pair(scene: Case, name: str, **changes) -> list[Variant]:
     return [_variant(scene, name, direction, **changes) for direction in DIRECTIONS]
+
+
+def _with(scene: Case, **options: Any) -> Case:
+    """Return the case with other options of ``rasterization``, compared with the same truth."""
+    return replace(scene, function=partial(scene.function, **options))
 
 
 def scenes(settings: Settings) -> list[Variant]:
@@ -72,29 +80,22 @@ def scenes(settings: Settings) -> list[Variant]:
     return made
 
 
-def _peers(scene: Scene, name: str) -> list[Variant]:
+def _peers(scene: Case, name: str) -> list[Variant]:
     """Return the variants of gsplat, the whole operator, which runs on CUDA."""
     if scene.device.type != "cuda":
         return []
-    function = peers.gsplat_rasterization
+    side = scene.sizes["side"]
+
+    def function(*, pixels: Tensor, **arguments: Any) -> tuple[Tensor, Tensor, dict]:
+        return peers.gsplat_rasterization(**arguments, width=side, height=side)
+
+    theirs = replace(scene, function=function)
 
     def error() -> Error:
-        got, want = scene.forward(function)[0], scene.forward()[0]
-        return compare({"picture": got}, {"picture": want})
+        return compare({"image": theirs.forward()[0]}, {"image": scene.forward()[0]})
 
-    return [
-        Variant(
-            name=f"gsplat, {name}",
-            run=partial(run, function),
-            check=error,
-            limit=1e-2,
-            oracle="our float32 picture",
-            direction=direction,
-            peer=True,
-            parameters=dict(scene.sizes),
-        )
-        for direction, run in (("forward", scene.forward), (BOTH, scene.backward))
-    ]
+    changes = {"check": error, "limit": 1e-2, "oracle": "our float32 image", "peer": True}
+    return measure.pair(theirs, f"gsplat, {name}", **changes)
 
 
 def knobs(settings: Settings) -> list[Variant]:
@@ -102,29 +103,30 @@ def knobs(settings: Settings) -> list[Variant]:
     threshold of alpha or T and no radius clip. The defaults suit trained Gaussians and
     other renderers.
     """
-    scene = make_scene(settings, 2).changed(exact=_NO_THRESHOLDS)
-    default = "default: alpha 1/255, T 1e-4"
-    made = _pair(scene, default, limit=TRADE_LIMIT, default=True)
-    quick = settings.level == "quick"
+    scene = make_scene(settings, 2, exact=_NO_THRESHOLDS)
+    made = _pair(scene, "default: alpha 1/255, T 1e-4", limit=TRADE_LIMIT, default=True)
     trades = {f"alpha 1/{n}": {"alpha_min": 1 / n} for n in (4096, 1024, 64, 32, 16)}
     trades |= {f"T {limit:g}": {"t_min": limit} for limit in (1e-6, 1e-3, 1e-2, 1e-1)}
-    if quick:
+    if settings.level == "quick":
         trades = {name: trades[name] for name in ("alpha 1/64", "T 0.01")}
     trades["alpha 1/4096, T 1e-6"] = {"alpha_min": 1 / 4096, "t_min": 1e-6}
-    for radius in (scene.size / 32, scene.size / 16):
+    for radius in (scene.sizes["side"] / 32, scene.sizes["side"] / 16):
         trades[f"radius clip {radius:g}"] = {"radius_clip": radius}
     for name, options in trades.items():
-        made += _pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
+        made += _pair(_with(scene, **options), name, limit=TRADE_LIMIT)
+    gaussians = scene.at()
     for opacity in (0.35, 0.4):
-        kept = scene.gaussians["opacities"] >= opacity
-        pruned = {k: x[kept] for k, x in scene.gaussians.items()}
-        pruned = scene.changed(gaussians=pruned, truth=scene.gaussians)
-        made.append(_variant(pruned, f"no opacities < {opacity}", limit=TRADE_LIMIT))
+        kept = gaussians["opacities"] >= opacity
+        pruned = {k: gaussians[k][kept] for k in LEAVES}
+
+        def function(pruned: dict = pruned, **arguments: Any) -> tuple[Tensor, Tensor, dict]:
+            return scene.function(**(arguments | pruned))
+
+        case = replace(scene, function=function)
+        made.append(_variant(case, f"no opacities < {opacity}", limit=TRADE_LIMIT))
     for dtype in (torch.bfloat16, torch.float16):
         name = str(dtype).removeprefix("torch.")
-        rounded = {k: x.to(dtype) for k, x in scene.gaussians.items()}
-        rounded = scene.changed(gaussians=rounded, truth=scene.gaussians)
-        made += _pair(rounded, f"{name} inputs", limit=TRADE_LIMIT, dtype=name)
+        made += _pair(scene, f"{name} inputs", limit=TRADE_LIMIT, options={"dtype": dtype})
     for v in made:
         v.parameters["scale"] = 2
     return made
@@ -147,37 +149,28 @@ _FORWARD = ("tile_test", "block_test", "stopped", "empty_tiles")  # the others a
 _SAME = "the call with all on (0: the same bits)"
 
 
-def switches(scene: Scene, name: str, direction: str) -> list[Variant]:
+def switches(scene: Case, name: str, direction: str) -> list[Variant]:
     """Return the variants with each switch off alone, and all off; their bits are compared."""
     names = [x.name for x in fields(Skip) if direction == BOTH or x.name in _FORWARD]
     off = {"all on": (), **{f"{x} off": (x,) for x in names}, "all off": names}
     made = []
     for label, disabled in off.items():
-        other = scene.changed(
-            options=scene.options | {"skip": Skip(**dict.fromkeys(disabled, False))}
-        )
-        check = partial(_difference, other, scene, direction)
+        other = _with(scene, skip=Skip(**dict.fromkeys(disabled, False)))
+        check = partial(measure.difference, other, scene, direction)
         changes = {"check": check, "limit": 0.0, "oracle": _SAME, "default": not disabled}
         made.append(_variant(other, f"{name}: {label}", direction, **changes))
     return made
 
 
-def _difference(scene: Scene, other: Scene, direction: str) -> Error:
-    run = "backward" if direction == BOTH else "forward"
-    got, want = (getattr(x, run)() for x in (scene, other))
-    return compare(
-        *({str(i): x for i, x in enumerate(r) if isinstance(x, Tensor)} for r in (got, want))
-    )
-
-
-def partial_gradients(scene: Scene) -> list[Variant]:
+def partial_gradients(scene: Case) -> list[Variant]:
     """Return calls that need a part of the gradients, with the switch for it on and off."""
-    half = scene.size // 2
-    part = torch.zeros_like(scene.upstream)
-    part[:, :half, :half] = scene.upstream[:, :half, :half]
+    half = scene.sizes["side"] // 2
+    quarter = torch.zeros_like(scene.cotangent)
+    quarter[:, :half, :half] = scene.cotangent[:, :half, :half]
+    others = tuple(name for name in scene.inputs if name != "colors")
     cases = {
-        "gradient of colors alone": (scene.changed(wanted=("colors",)), "unasked"),
-        "upstream gradient on a quarter": (scene.changed(cotangent=part), "zero_upstream"),
+        "gradient of colors alone": (replace(scene, fixed=others), "unasked"),
+        "upstream gradient on a quarter": (replace(scene, cotangent=quarter), "zero_upstream"),
     }
     made = []
     for name, (changed, switch) in cases.items():
@@ -191,11 +184,11 @@ def one_call(settings: Settings) -> list[Variant]:
     shells = [shell(4096, 2, seed) for seed in range(objects)]
     viewmats, Ks = orbit_cameras(views, size)
     stacked = {k: torch.stack([x[k] for x in shells]) for k in LEAVES}
-    all_cameras = (x.expand(objects, *x.shape) for x in (viewmats, Ks))
-    together = Scene(stacked, *all_cameras, size=size, device=settings.device)
+    cameras = viewmats.expand(objects, -1, -1, -1), Ks.expand(objects, -1, -1, -1)
+    together = raster_case(stacked, cameras, size, settings.device)
     made = _pair(together, "one call", default=True)
     single = [
-        Scene(gaussians, viewmats[v : v + 1], Ks[v : v + 1], size, settings.device)
+        raster_case(gaussians, (viewmats[v : v + 1], Ks[v : v + 1]), size, settings.device)
         for gaussians in shells
         for v in range(views)
     ]
@@ -233,7 +226,7 @@ def harmonics(settings: Settings) -> list[Variant]:
             "means": torch.randn(1, count, 3, generator=g),
             "centers": 3 * torch.randn(1, views, 3, generator=g),
         }
-        problem = Operator(
+        case = Case(
             partial(colors_seen_from, degree),
             partial(colors_by_formula, degree),
             inputs,
@@ -245,7 +238,7 @@ def harmonics(settings: Settings) -> list[Variant]:
             fixed=() if degree else ("means", "centers"),
         )
         name = f"degree {degree}, {count} Gaussians, {views} view{'s' * (views > 1)}"
-        made += measure.pair(problem, f"ours, {name}", default=True)
-        formula = replace(problem, function=problem.reference)
+        made += measure.pair(case, f"ours, {name}", default=True)
+        formula = replace(case, function=case.reference)
         made += measure.pair(formula, f"the formula in torch, {name}")
     return made

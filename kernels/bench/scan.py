@@ -9,8 +9,8 @@ from functools import partial
 
 import torch
 
-from ..cases.problem import BOTH, DIRECTIONS, Operator
-from ..cases.scan import make_inputs, scan_problem
+from ..cases.case import BOTH, DIRECTIONS, Case
+from ..cases.scan import make_inputs, scan_case
 from ..selective_scan import selective_scan_fn
 from . import peers
 from .measure import Settings, Table, Variant, pair, saved_bytes, variant
@@ -34,35 +34,35 @@ def tables(settings: Settings) -> list[Table]:
     return [Table("scan", name, build) for name, build in builders.items()]
 
 
-def make_problem(settings: Settings, channels_seen: int = 32, **changes: int) -> Operator:
-    """Return a problem of the level's size, but for ``changes`` of ``make_inputs``."""
+def make_case(settings: Settings, channels_seen: int = 32, **changes: int) -> Case:
+    """Return a case of the level's size, but for ``changes`` of ``make_inputs``."""
     length, width, tokens = SIZES[settings.level]
     inputs = make_inputs(**({"batch": 1, "length": length, "channels": width} | changes))
-    return scan_problem(inputs, settings.device, tokens, channels_seen)
+    return scan_case(inputs, settings.device, tokens, channels_seen)
 
 
 def operator(settings: Settings) -> list[Variant]:
     """The whole operator: softplus, bias, skip and gate; in both layouts."""
-    problem = make_problem(settings)
-    return pair(problem, "default", default=True) + pair(_turned(problem), "[B, D, L]")
+    case = make_case(settings)
+    return pair(case, "default", default=True) + pair(_turned(case), "[B, D, L]")
 
 
-_TRANSPOSED = ("u", "delta", "B", "C", "z")
+_TRANSPOSED = ("u", "delta", "B", "C", "z", "out")
 
 
-def _turned(problem: Operator) -> Operator:
+def _turned(case: Case) -> Case:
     """Return the same operator in mamba-ssm's layout."""
     function = partial(selective_scan_fn, delta_softplus=True)
-    return replace(problem, function=function, transposed=(*_TRANSPOSED, "out"))
+    return replace(case, function=function, transposed=_TRANSPOSED)
 
 
-def _peer(problem: Operator, function: Callable, channels_first: bool = True) -> Operator:
+def _peer(case: Case, function: Callable, channels_first: bool = True) -> Case:
     """Return another package's scan on the same inputs, laid out for it; its output is checked."""
     return replace(
-        problem,
+        case,
         function=function,
-        limits=dict.fromkeys(problem.limits, 1e-4),
-        transposed=(*_TRANSPOSED, "out") if channels_first else (),
+        limits=dict.fromkeys(case.limits, 1e-4),
+        transposed=_TRANSPOSED if channels_first else (),
         compared=False,
     )
 
@@ -71,19 +71,19 @@ def knobs(settings: Settings) -> list[Variant]:
     """Every choice that a caller has. Half precision is compared with the truth of the float32
     inputs. The discretisations are different models, each compared with its own formula.
     """
-    problem = make_problem(settings)
-    made = pair(problem, "float32", default=True)
+    case = make_case(settings)
+    made = pair(case, "float32", default=True)
     for dtype in (torch.bfloat16, torch.float16):
         name = f"{str(dtype).removeprefix('torch.')} inputs and output"
-        made += pair(problem, name, options={"dtype": dtype})
+        made += pair(case, name, options={"dtype": dtype})
     for discretization in ("bilinear", "zoh"):
-        made += pair(problem, discretization, options={"discretization": discretization})
-    batch, _, width = problem.inputs["u"].shape
+        made += pair(case, discretization, options={"discretization": discretization})
+    batch, _, width = case.inputs["u"].shape
     state = torch.randn(batch, width, 16, generator=torch.Generator().manual_seed(2))
     tokens = SIZES[settings.level][2]
-    start = scan_problem(problem.inputs, problem.device, tokens, initial_state=state)
+    start = scan_case(case.inputs, case.device, tokens, initial_state=state)
     made += pair(start, "with an initial state")
-    return made + pair(make_problem(settings, groups=4), "4 groups of B and C")
+    return made + pair(make_case(settings, groups=4), "4 groups of B and C")
 
 
 def lengths(settings: Settings) -> list[Variant]:
@@ -92,19 +92,19 @@ def lengths(settings: Settings) -> list[Variant]:
     """
     made = []
     for length in (256, 1024) if settings.level == "quick" else (4096, 16384, 65536):
-        problem = make_problem(settings, 8 if length > 16961 else 32, length=length)
+        case = make_case(settings, 8 if length > 16961 else 32, length=length)
         for direction in DIRECTIONS:
-            work = partial(count_memory, problem, direction)
-            made.append(variant(problem, f"L {length}", direction, rounds=20, work=work))
+            work = partial(count_memory, case, direction)
+            made.append(variant(case, f"L {length}", direction, rounds=20, work=work))
     return made
 
 
-def count_memory(problem: Operator, direction: str) -> dict[str, int]:
+def count_memory(case: Case, direction: str) -> dict[str, int]:
     """Return the bytes of all states, and of the tensors saved for the gradient."""
-    counts = {"state_history_bytes": 4 * math.prod(problem.sizes.values())}
+    counts = {"state_history_bytes": 4 * math.prod(case.sizes.values())}
     if direction == BOTH:
-        leaves = problem.leaves()
-        counts["saved_bytes"] = saved_bytes(lambda: problem.call(leaves), leaves.values())
+        leaves = case.leaves()
+        counts["saved_bytes"] = saved_bytes(lambda: case.call(leaves), leaves.values())
     return counts
 
 
@@ -116,22 +116,22 @@ def layers(settings: Settings) -> list[Variant]:
     quick, made = settings.level == "quick", []
     for length in (256,) if quick else (512, 2048, 8192):
         for width in (64,) if quick else (512, 1536, 5120):
-            problem = scan_problem(make_inputs(1, length, width), settings.device, 512)
+            case = scan_case(make_inputs(1, length, width), settings.device, 512)
             name = f"{length} x {width}"
-            made += pair(problem, name) + pair(_turned(problem), f"{name}, [B, D, L]")
-            made += pair(problem, f"{name}, bfloat16", options=_HALF)
+            made += pair(case, name) + pair(_turned(case), f"{name}, [B, D, L]")
+            made += pair(case, f"{name}, bfloat16", options=_HALF)
             if settings.peers and settings.device.type == "cuda":
                 theirs, label = peers.mamba_ssm_scan, f"mamba-ssm, {name}"
-                made += pair(_peer(problem, theirs), label, peer=True)
+                made += pair(_peer(case, theirs), label, peer=True)
                 last = _peer(
-                    problem, peers.channels_last(theirs, _TRANSPOSED), channels_first=False
+                    case, peers.channels_last(theirs, _TRANSPOSED[:-1]), channels_first=False
                 )
                 made += pair(last, f"{label}, channels last", peer=True)
             if length * width <= 2048 * 1536:  # others' code in torch takes seconds
-                loop, slow = _peer(problem, peers.scan_loop), {"peer": True, "rounds": 3}
+                loop, slow = _peer(case, peers.scan_loop), {"peer": True, "rounds": 3}
                 made.append(variant(loop, f"torch loop, {name}", **slow))
                 if settings.peers:
-                    mambapy = _peer(problem, peers.mambapy_scan, channels_first=False)
+                    mambapy = _peer(case, peers.mambapy_scan, channels_first=False)
                     made += pair(mambapy, f"mambapy, {name}", **slow)
     return made
 
@@ -142,18 +142,18 @@ def packed(settings: Settings) -> list[Variant]:
     """
     length, width, _ = SIZES[settings.level]
     first = length // 8
-    problem = scan_problem(make_inputs(1, length, width), settings.device, first)
-    made = pair(problem, "one sequence", default=True)
+    case = scan_case(make_inputs(1, length, width), settings.device, first)
+    made = pair(case, "one sequence", default=True)
     for count in (8, 64):
         g = torch.Generator().manual_seed(count)
         cuts = first + torch.randperm(length - first, generator=g)[: count - 1].sort().values
         cuts[0] = first
         cuts = torch.tensor([0, *cuts.tolist(), length], dtype=torch.int32, device=settings.device)
-        cut = replace(problem, function=partial(problem.function, cu_seqlens=cuts))
+        cut = replace(case, function=partial(case.function, cu_seqlens=cuts))
         made += pair(cut, f"{count} sequences")
         if count == 8:
             rows = make_inputs(count, int(cuts.diff().max()), width)
-            made += pair(scan_problem(rows, settings.device, first), f"{count} sequences, padded")
+            made += pair(scan_case(rows, settings.device, first), f"{count} sequences, padded")
     return made
 
 
@@ -161,9 +161,9 @@ def training_batch(settings: Settings) -> list[Variant]:
     """A layer of the paper's training: 16 sequences in bfloat16, compared with mamba-ssm."""
     length, width, tokens = SIZES[settings.level]
     inputs = make_inputs(2 if settings.level == "quick" else 16, length, width)
-    problem = scan_problem(inputs, settings.device, min(tokens, 2048))
-    made = pair(problem, "default", options=_HALF, default=True)
-    made.append(variant(make_problem(settings), "one sequence", options=_HALF))
+    case = scan_case(inputs, settings.device, min(tokens, 2048))
+    made = pair(case, "default", options=_HALF, default=True)
+    made.append(variant(make_case(settings), "one sequence", options=_HALF))
     if settings.peers:
-        made += pair(_peer(problem, peers.mamba_ssm_scan), "mamba-ssm", options=_HALF, peer=True)
+        made += pair(_peer(case, peers.mamba_ssm_scan), "mamba-ssm", options=_HALF, peer=True)
     return made

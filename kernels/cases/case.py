@@ -1,282 +1,56 @@
-"""A random case as plain data: its values, its run, and its comparison with float64."""
+"""A computation at a realistic size: inputs by name, runs, and the error to float64."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import chain
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from .rounding import UNDERFLOW, UNIT
-
-FACTOR = 8.0  # largest error, as a multiple of the effect of rounding on the formula
-TRIALS = 5  # evaluations of a case that is over its limit, an odd number; most of them decide
-STEEP_TRIALS = 50  # evaluations of a steep case
-STEEP_RANGE = 8.0  # how far apart the limits of one result are by trial in such a case
-# A result's dtype: its relative error, and its absolute error below its normal numbers.
-_STORED = {
-    torch.float32: (0.0, UNDERFLOW),
-    torch.bfloat16: (2.0**-8, UNDERFLOW),
-    torch.float16: (2.0**-11, 2.0**-25),
-}
-
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
-RANGES = (
-    "normal", "uniform", "zeros", "ones", "alternating", "constant", "tiny", "denormal", "huge",
-    "spread", "spikes",
-)  # fmt: skip
-COTANGENTS = ("normal", "normal", "ones", "spikes", "zeros")
+BOTH = "forward+backward"
+DIRECTIONS = ("forward", BOTH)
+_GRADIENT = "gradient of "
 
 
-class Case(NamedTuple):
-    """All that is needed to build the tensors again.
+class Error(NamedTuple):
+    """Distance of results from the truth.
 
     Attributes:
-        op: name of an ``Op``.
-        kind: one of the op's kinds of extreme values.
-        seed: seed of the values.
-        options: sizes, dtype and switches by name; those not named are plain.
+        rel_rms: rms of the difference over rms of the truth, of the worst tensor.
+        maximum: largest difference over the largest value of the truth, of the worst tensor.
+        worst: name of the tensor with that ``rel_rms``.
     """
 
-    op: str
-    kind: str
-    seed: int
-    options: dict[str, Any]
+    rel_rms: float
+    maximum: float
+    worst: str
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Comparison of one result with float64.
-
-    Attributes:
-        name: name of the result, such as "out" or "gradient of u".
-        error: rms of the difference over rms of the truth, of the whole tensor.
-        ratio: error of the worst part over its limit; above 1 the result fails.
-        nonfinite: count of numbers that are NaN or infinite although the truth fits in the dtype.
-        counts: True to show ``error``, as for a float32 result whose truth is well
-            above numbers that may count as 0, and not itself the rounding error of a sum that
-            cancels.
-        noise: True if rounding changes the worst part by more than half of its truth.
-    """
-
-    name: str
-    error: float
-    ratio: float
-    nonfinite: int = 0
-    counts: bool = True
-    noise: bool = False
+def compare(got: Mapping[str, Tensor], want: Mapping[str, Tensor]) -> Error:
+    """Return the error of named results in float64; NaN or a wrong shape makes it infinite."""
+    rel_rms, maximum, worst = 0.0, 0.0, ""
+    for name, truth in want.items():
+        value, truth = got[name].detach().double().cpu(), truth.detach().double().cpu()
+        if value.shape != truth.shape or not value.isfinite().all():
+            return Error(math.inf, math.inf, name)
+        if not truth.numel():
+            continue
+        difference = value - truth
+        # If the truth is all zeros, the absolute difference is used.
+        rms = truth.square().mean().sqrt().item() or 1.0
+        relative = difference.square().mean().sqrt().item() / rms
+        if relative >= rel_rms:
+            rel_rms, worst = relative, name
+        maximum = max(maximum, (difference.abs().max() / (truth.abs().max() or 1.0)).item())
+    return Error(rel_rms, maximum, worst)
 
 
-@dataclass
-class Outcome:
-    """Result of a case.
-
-    Attributes:
-        comparisons: comparisons, one per result.
-        faults: everything else that is wrong, such as an exception or two runs that differ.
-        pixels: number of pixels that were compared (rasterizer).
-        undecided: number of those pixels in which rounding decides a cut or an order.
-        steep: True to judge each result by the widest limit of many trials.
-    """
-
-    comparisons: list[Comparison] = field(default_factory=list)
-    faults: list[str] = field(default_factory=list)
-    pixels: int = 0
-    undecided: int = 0
-    steep: bool = False
-
-    @property
-    def nonfinite(self) -> int:
-        """The count of numbers that are not finite and should be."""
-        return sum(c.nonfinite for c in self.comparisons)
-
-    @property
-    def worst(self) -> Comparison | None:
-        """The comparison that is nearest to its limit, or farthest beyond it."""
-        return max(self.comparisons, key=lambda c: c.ratio, default=None)
-
-    @property
-    def over(self) -> bool:
-        """True if a result is over its limit and nothing else is wrong."""
-        return (self.failure() or {}).get("what") == "limit"
-
-    def failure(self) -> dict | None:
-        """Return the failure's ``what``, ``name``, ``error`` and ``ratio``, or None.
-
-        ``what`` is "fault", "not finite" or "limit".
-        """
-        nothing = {"error": None, "ratio": None}
-        if self.faults:
-            return {"what": "fault", "name": self.faults[0], **nothing}
-        worst = self.worst
-        if worst is None or worst.ratio <= 1:
-            return None
-        if bad := next((c for c in self.comparisons if c.nonfinite), None):
-            return {"what": "not finite", "name": bad.name, **nothing}
-        return {"what": "limit", "name": worst.name, "error": worst.error, "ratio": worst.ratio}
-
-
-@dataclass(frozen=True)
-class Op:
-    """An operator, or a model, with its random cases.
-
-    Attributes:
-        name: name of the op.
-        kinds: by kind of values, the options that it fixes: a value, or a tuple of values of which
-            one is drawn. The first kind is the plain one.
-        options: by name the values to draw from; the first is the plain one.
-        fit: function that returns the nearest options that make sense together.
-        evaluate: function that runs a case on a device; each trial has other random roundings.
-    """
-
-    name: str
-    kinds: dict[str, dict[str, Any]]
-    options: dict[str, Sequence[Any]]
-    fit: Callable[[dict], dict]
-    evaluate: Callable[[Case, torch.device, int], Outcome]
-
-    @property
-    def plain(self) -> dict[str, Any]:
-        """The simplest value of every option."""
-        return {name: values[0] for name, values in self.options.items()}
-
-
-def mostly(plain: Any, values: Sequence[Any]) -> tuple:
-    """Return values with ``plain`` first, which is drawn in seven cases of ten."""
-    return (plain,) * (7 * len(values) // 3) + (*values,)
-
-
-def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
-    """Run a case and turn an exception into a fault.
-
-    A case that is over its limit is run ``TRIALS`` times, and the middle one of these counts. If it
-    is steep, up to ``STEEP_TRIALS`` count, each result by its widest limit. README.md of
-    kernels/stress says why.
-    """
-    case = case._replace(options=op.plain | case.options)
-    try:
-        found = [op.evaluate(case, device, 0)]
-        if not found[0].over:
-            return found[0]
-        found += [op.evaluate(case, device, trial) for trial in range(1, TRIALS)]
-        found.sort(key=lambda o: o.worst.ratio if o.worst else 0.0)
-        bad = next((o for o in found if o.faults or o.nonfinite), None)
-        by_result = list(zip(*(o.comparisons for o in found)))
-        steep = any(c.noise and c.ratio > 1 for results in by_result for c in results)
-        for ratios in ([c.ratio for c in results] for results in by_result):
-            steep |= max(ratios) > max(1.0, STEEP_RANGE * min(ratios))
-        middle = found[TRIALS // 2]
-        if bad or not (middle.over and steep):
-            return bad or middle
-        least = replace(middle, steep=True)
-        more = (op.evaluate(case, device, trial) for trial in range(TRIALS, STEEP_TRIALS))
-        for other in chain(found, more):
-            if other.faults or other.nonfinite:
-                return other
-            pairs = zip(least.comparisons, other.comparisons)
-            least.comparisons = [replace(c, ratio=min(c.ratio, o.ratio)) for c, o in pairs]
-            if not least.over:
-                break
-        return least
-    except Exception as error:
-        text = str(error).strip().splitlines() or [""]
-        return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
-
-
-def generator(case: Case, name: str) -> torch.Generator:
-    """Make the source of chance for one tensor of a case, independent of its other tensors."""
-    return torch.Generator().manual_seed(case.seed * 1009 + sum(name.encode()))
-
-
-def fill(shape: Sequence[int], kind: str, g: torch.Generator) -> Tensor:
-    """Draw float32 numbers of one of ``RANGES``.
-
-    "alternating" changes sign along dimension 1, "tiny" is around 1e-12, "denormal" around 1e-40
-    and "huge" around 1e4. "spread" is log-uniform in 1e-6..1e4 with either sign. "spikes" is 0,
-    except for one number in sixteen, which is around 1e3.
-    """
-    normal = torch.randn(shape, generator=g)
-    if kind == "uniform":
-        return torch.rand(shape, generator=g)
-    if kind == "spread":
-        return normal.sign() * 10 ** (10 * torch.rand(shape, generator=g) - 6)
-    if kind == "spikes":
-        return 1e3 * normal * (torch.rand(shape, generator=g) < 1 / 16)
-    if kind == "constant":
-        return torch.full(shape, torch.randn((), generator=g).item())
-    if kind in ("zeros", "ones", "alternating"):
-        values = torch.full(shape, float(kind != "zeros"))
-        if kind == "alternating" and len(shape) > 1:
-            values[:, 1::2] = -1
-        return values
-    return normal * {"tiny": 1e-12, "denormal": 1e-40, "huge": 1e4}.get(kind, 1.0)
-
-
-def fits(truth: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return the mask of a truth's numbers that a dtype holds; others may come out infinite."""
-    return truth.detach().abs() < 0.99 * torch.finfo(dtype).max
-
-
-def judge(
-    name: str,
-    got: Tensor,
-    samples: Tensor,
-    parts: tuple[int, ...],
-    extra: Tensor | None = None,
-    shown: Tensor | None = None,
-) -> Comparison:
-    """Compare a result with the samples of its formula; kernels/stress/README.md has the limit.
-
-    Args:
-        name: name of the result.
-        got: the result, float dtype.
-        samples: ``[SAMPLES, *got.shape]`` float64; sample 0 is the truth.
-        parts: dimensions of ``got`` that are taken together as one rms; () compares each number.
-        extra: addition to the limit, of ``got``'s shape without ``parts``.
-        shown: mask of the numbers that make up ``error``; the limit holds for all numbers.
-
-    Raises:
-        ValueError: the shapes do not fit.
-    """
-    samples, value = samples.detach(), got.detach().cpu().double()
-    want = samples[0]
-    if value.shape != want.shape:
-        raise ValueError(f"{name} has shape {tuple(value.shape)}, the truth {tuple(want.shape)}")
-    if not want.numel():
-        return Comparison(name, 0.0, 0.0)
-    relative, absolute = _STORED[got.dtype]
-    held = fits(want, got.dtype)
-    nonfinite = int((held & ~value.isfinite()).sum())
-    if nonfinite:
-        return Comparison(name, math.inf, math.inf, nonfinite)
-
-    def rms(x: Tensor) -> Tensor:
-        x = torch.where(held, x, 0.0).nan_to_num(0.0, 0.0, 0.0)
-        scale = x.abs().amax().clamp_min(1e-300) if x.numel() else 1.0  # squares must not underflow
-        dims = tuple(d % want.dim() - want.dim() for d in parts)
-        return (x / scale).square().mean(dims).sqrt() * scale if dims else x.abs()
-
-    difference = value - want
-    size = rms(want)
-    by_rounding = rms(samples[1:] - want).amax(0)
-    limit = FACTOR * by_rounding + (relative + FACTOR * UNIT) * size
-    limit = limit + absolute * FACTOR + (0.0 if extra is None else extra)
-    ratios = (rms(difference) / limit).flatten()
-    worst = int(ratios.argmax())
-    noise = bool((by_rounding > size / 2).flatten()[worst])
-    parts = tuple(range(want.dim()))
-    held = held if shown is None else held & shown
-    total, spread = rms(want).item(), rms(samples[1:] - want).max().item()
-    counts = got.dtype == torch.float32 and total > 1e-30 and spread < 1e-3 * total
-    error = rms(difference).item() / total if total else 0.0
-    return Comparison(name, error, ratios[worst].item(), 0, counts, noise)
-
-
-def gradients_of(results: dict, leaves: dict, cotangents: dict) -> dict[str, Tensor]:
+def gradients_of(
+    results: Mapping[str, Tensor], leaves: Mapping[str, Tensor], cotangents: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     """Return gradients by leaf; zeros where a result does not depend on it."""
     names = [n for n in results if results[n].requires_grad and results[n].numel()]
     if not names:
@@ -287,58 +61,159 @@ def gradients_of(results: dict, leaves: dict, cotangents: dict) -> dict[str, Ten
     return {k: torch.zeros_like(x) if g is None else g for (k, x), g in zip(leaves.items(), grads)}
 
 
-class Runs:
-    """Two runs of a case, their gradients, and the samples of the formula.
+@dataclass(eq=False)
+class Case:
+    """A computation of tensors by name, and its formula.
 
-    Args:
-        case: its option "cotangent" names the range of the cotangents.
-        run: returns the results by name.
-        leaves: tensors that need a gradient, by name.
-        truths: the formula's results, and perhaps more, ``[SAMPLES, ..]``.
-        samples: the formula's leaves.
-        without: mask of the results that need no gradient.
+    The reference may see a part of the inputs and compute a part of the results, such as the first
+    tokens of a few channels or the crop of an image, if these depend on nothing else. The check's
+    cotangents are 0 outside the part, so that gradients of shared inputs are exact as well.
+
+    Attributes:
+        function: of the inputs by name and of options; the results, one or several.
+        reference: the formula, likewise, of the part.
+        inputs: float32 on the CPU, the truth that every dtype is compared with; None if left out.
+        cotangent: of the first result, for the timed gradient; the check draws its own.
+        device: device of the computation.
+        text: the reference in words.
+        sizes: for the records.
+        limits: largest relative rms error to float64 by direction.
+        half_limits: limits in half precision, explained by the rounding of inputs and output.
+        outputs: names of the results that are compared.
+        cast: names of the inputs that a dtype holds for.
+        part: by direction, the index of the part by name of an input or result.
+        transposed: inputs and results whose last two dimensions are exchanged for ``function``.
+        fixed: inputs without a gradient.
+        parameters: tensors of the function whose gradients are timed too, and not compared.
+        compared: True to compare gradients too, not only the results.
+        truths: results of the reference so far; shared with the copies by ``replace``.
     """
 
-    def __init__(
-        self,
-        case: Case,
-        run: Callable[[], dict[str, Tensor]],
-        leaves: dict[str, Tensor],
-        truths: dict[str, Tensor],
-        samples: dict[str, Tensor],
-        without: Tensor | None = None,
-    ) -> None:
-        self.results, self.cotangents = run(), {}
-        for n, x in self.results.items():
-            v = fill(x.shape, case.options.get("cotangent", "normal"), generator(case, f"v_{n}"))
-            v = v if without is None else torch.where(without, 0.0, v)
-            self.cotangents[n] = v.to(x.dtype)
-        self.grads = gradients_of(self.results, leaves, self.cotangents)
-        again = run()
-        others = gradients_of(again, leaves, self.cotangents)
-        pairs = [(n, x, again[n]) for n, x in self.results.items()]
-        pairs += [(f"gradient of {k}", g, others[k]) for k, g in self.grads.items()]
-        self.faults = [
-            f"two runs differ in {name}"
-            for name, a, b in pairs
-            if not torch.equal(a.nan_to_num(1.5), b.nan_to_num(1.5))
-        ]
-        self.truths = {n: truths[n] for n in self.results}
-        self.true_grads = gradients_of(self.truths, samples, self.cotangents)
+    function: Callable[..., Any]
+    reference: Callable[..., Any]
+    inputs: Mapping[str, Any]
+    cotangent: Tensor
+    device: torch.device
+    text: str
+    sizes: dict[str, int]
+    limits: Mapping[Any, float]
+    half_limits: Mapping[torch.dtype, float] = field(default_factory=dict)
+    outputs: tuple[str, ...] = ("out",)
+    cast: tuple[str, ...] = ()
+    part: Mapping[Any, Mapping[Any, Any]] = field(default_factory=dict)
+    transposed: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
+    parameters: Sequence[Tensor] = ()
+    compared: bool = True
+    truths: dict = field(default_factory=dict)
+    _laid: dict = field(default_factory=dict, init=False)
 
-    def outcome(self, parts: dict[str, tuple[int, ...]], **extra: dict[str, Any]) -> Outcome:
-        """Judge all results, then all gradients.
+    def oracle(self, direction: str) -> str:
+        """Return a description of the reference."""
+        return self.text + (", output only" if direction == BOTH and not self.compared else "")
 
-        Args:
-            parts: of ``judge`` by name; () without parts.
-            extra: further arguments of ``judge`` by name of the result.
-        """
-        made = [
-            judge(n, x, self.truths[n], parts.get(n, ()), **extra.get(n, {}))
-            for n, x in self.results.items()
-        ]
-        made += [
-            judge(f"gradient of {k}", g, self.true_grads[k], parts.get(k, ()))
-            for k, g in self.grads.items()
-        ]
-        return Outcome(made, self.faults)
+    def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
+        """Return the largest error that is allowed."""
+        return self.half_limits.get(dtype, self.limits[direction])
+
+    def at(self, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+        """Return the inputs on the device, as ``function`` takes them, with ``cast`` in a dtype."""
+        if dtype not in self._laid:
+            self._laid[dtype] = {
+                k: x
+                if x is None
+                else self._turn(k, x).to(self.device, dtype if k in self.cast else None)
+                for k, x in self.inputs.items()
+            }
+        return dict(self._laid[dtype])
+
+    def _turn(self, name: str, x: Tensor) -> Tensor:
+        return x.mT.contiguous() if name in self.transposed else x
+
+    def call(self, inputs: Mapping[str, Any], **options: Any) -> Any:
+        """Call the function."""
+        return self.function(**inputs, **options)
+
+    @torch.no_grad()
+    def forward(self, dtype: torch.dtype = torch.float32, **options: Any) -> Any:
+        """Compute the results, without a gradient (timed)."""
+        return self.call(self.at(dtype), **options)
+
+    def leaves(self, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+        """Return the inputs, which require gradients unless they are ``fixed``."""
+        return _leaves(self.at(dtype), self.fixed)
+
+    def backward(self, dtype: torch.dtype = torch.float32, **options: Any) -> tuple[Tensor, ...]:
+        """Compute the results, and all gradients of the first (timed)."""
+        leaves, name = self.leaves(dtype), self.outputs[0]
+        out = self._named(self.call(leaves, **options))[name]
+        key = name, out.dtype
+        if key not in self._laid:
+            self._laid[key] = self._turn(name, self.cotangent).to(out)
+        inputs = [*wanted(leaves).values(), *self.parameters]
+        return torch.autograd.grad(out, inputs, self._laid[key])
+
+    def check(self, direction: str, dtype: torch.dtype = torch.float32, **options: Any) -> Error:
+        """Return the error of the results, and of every gradient if the direction has them."""
+        direction = direction if self.compared else "forward"
+        return compare(self.results(direction, dtype, **options), self.truth(direction, **options))
+
+    def results(
+        self, direction: str, dtype: torch.dtype = torch.float32, **options: Any
+    ) -> dict[str, Tensor]:
+        """Return the results of the function, in the form of ``truth``."""
+        if direction != BOTH:
+            got = self._named(self.forward(dtype, **options))
+            return {k: self.cut(direction, k, x) for k, x in got.items()}
+        leaves, truth = self.leaves(dtype), self.truth(direction, **options)
+        got, heads = self._named(self.call(leaves, **options)), {}
+        for k, x in got.items():
+            head = torch.zeros_like(self._turn(k, x.detach()), device="cpu")
+            head[self._index(direction, k)] = self._drawn(k, truth[k]).to(head.dtype)
+            heads[k] = self._turn(k, head).to(x.device)
+        grads = gradients_of(got, wanted(leaves), heads)
+        made = {k: self.cut(direction, k, x) for k, x in got.items()}
+        return made | {_GRADIENT + k: self.cut(direction, k, x) for k, x in grads.items()}
+
+    def cut(self, direction: str, name: str, x: Tensor) -> Tensor:
+        """Return the part of a result or gradient, laid out as the reference's."""
+        return self._turn(name, x.detach()).cpu()[self._index(direction, name)]
+
+    def _index(self, direction: str, name: str) -> Any:
+        return self.part.get(direction, {}).get(name, ...)
+
+    def _named(self, results: Any) -> dict[str, Tensor]:
+        return dict(zip(self.outputs, results if isinstance(results, tuple) else (results,)))
+
+    def _drawn(self, name: str, like: Tensor) -> Tensor:
+        g = torch.Generator().manual_seed(1 + self.outputs.index(name))
+        return torch.randn(like.shape, generator=g)
+
+    def truth(self, direction: str, **options: Any) -> dict[str, Tensor]:
+        """Return the results, and if asked for the gradients, of the part in float64; kept."""
+        key = direction, *sorted(options.items())
+        if key not in self.truths:
+            seen = {
+                k: x if x is None else x[self._index(direction, k)].double()
+                for k, x in self.inputs.items()
+            }
+            leaves = _leaves(seen, self.fixed)
+            with torch.set_grad_enabled(direction == BOTH):
+                results = self._named(self.reference(**leaves, **options))
+            self.truths[key] = {k: x.detach() for k, x in results.items()}
+            if direction == BOTH:
+                heads = {k: self._drawn(k, x) for k, x in results.items()}
+                grads = gradients_of(results, wanted(leaves), heads)
+                self.truths[key] |= {_GRADIENT + k: x for k, x in grads.items()}
+        return self.truths[key]
+
+
+def _leaves(inputs: Mapping[str, Any], fixed: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        k: x if x is None else x.detach().requires_grad_(k not in fixed) for k, x in inputs.items()
+    }
+
+
+def wanted(leaves: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return those that require gradients."""
+    return {k: x for k, x in leaves.items() if x is not None and x.requires_grad}

@@ -12,8 +12,19 @@ from torch import Tensor
 from ..causal_conv1d import causal_conv1d, causal_conv1d_fn
 from ..causal_conv1d.reference import causal_conv1d_reference
 from . import scan_oracle
-from .case import COTANGENTS, DTYPES, RANGES, Case, Op, Outcome, Runs, fill, generator, mostly
-from .problem import BOTH, Operator
+from .case import BOTH, DIRECTIONS, Case
+from .random_case import (
+    COTANGENTS,
+    DTYPES,
+    RANGES,
+    Op,
+    Outcome,
+    RandomCase,
+    Runs,
+    fill,
+    generator,
+    mostly,
+)
 from .rounding import Rounding, samples_of
 from .scan import LAYOUTS, SEQUENCES, borders, laid
 
@@ -29,13 +40,13 @@ def _reference(**inputs: Tensor) -> Tensor:
 silu = partial(causal_conv1d, activation="silu")
 
 
-def conv_problem(
+def conv_case(
     device: torch.device,
     sizes: tuple[int, int, int, int],
     function: Callable[..., Tensor] = silu,
     transposed: bool = False,
     state: bool = False,
-) -> Operator:
+) -> Case:
     """Return ``function(x, weight, bias)``; the oracle sees all channels of the first tokens.
 
     Args:
@@ -56,7 +67,7 @@ def conv_problem(
     cotangent = torch.randn(batch, length, width, generator=g)
     if state:
         inputs["initial_state"] = torch.randn(batch, taps - 1, width, generator=g)
-    return Operator(
+    return Case(
         function,
         _reference,
         inputs,
@@ -66,8 +77,8 @@ def conv_problem(
         {"B": batch, "L": length, "D": width, "taps": taps},
         LIMITS,
         HALF_LIMITS,
-        cast=("x", "out"),
-        corner=dict.fromkeys(("x", "out"), (slice(None), slice(tokens))),
+        cast=("x",),
+        part=dict.fromkeys(DIRECTIONS, dict.fromkeys(("x", "out"), (slice(None), slice(tokens)))),
         transposed=("x", "out") if transposed else (),
     )
 
@@ -92,7 +103,7 @@ OPTIONS = {
 }
 
 
-def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
+def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
     """Return the leaves by argument, channels last."""
     o, dtype = case.options, DTYPES[case.options["dtype"]]
     batch, length, channels, width = (o[k] for k in ("batch", "length", "channels", "width"))
@@ -126,7 +137,7 @@ def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
     return {k: t if o["api"] == "conv" else t.mT for k, t in zip(("out", "final"), results)}
 
 
-def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
+def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     """Run the operator and compare output, final state and all gradients with float64."""
     o, x = case.options, build(case, device)
     samples: dict[str, Any] = {k: samples_of(t) for k, t in x.items()}

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..rasterize import Skip, rasterization
-from ..rasterize.reference import rasterization_reference
-from .case import (
+from ..rasterize.reference import pixel_centers, rasterization_reference
+from .case import BOTH, Case, gradients_of, wanted
+from .random_case import (
     COTANGENTS,
     DTYPES,
     RANGES,
-    Case,
     Op,
     Outcome,
+    RandomCase,
     Runs,
     fill,
     fits,
     generator,
-    gradients_of,
     mostly,
 )
-from .problem import BOTH, Error, compare
 from .raster_oracle import View, ViewOptions, render_view
 from .rounding import SAMPLES, Rounding, samples_of
 
@@ -33,10 +33,10 @@ LEAVES = ("means", "quats", "scales", "opacities", "colors")
 WORK = ("pairs_box", "pairs", "pairs_traversed", "blocks_traversed", "blocks_used")
 WORK += ("tiles", "tiles_empty")
 _HALF_FOV = math.radians(49.1) / 2
-_FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # width and height, pixels
+_CROPS = {"forward": (48, 40), BOTH: (24, 20)}  # width and height, pixels
 
 # Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
-FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 10.0
+LIMITS, TRADE_LIMIT = {"forward": 1e-4, BOTH: 1e-3}, 10.0
 
 
 def shell(count: int, scale: float = 1.0, seed: int = 0) -> dict[str, Tensor]:
@@ -66,151 +66,79 @@ def orbit_cameras(views: int, size: int) -> tuple[Tensor, Tensor]:
     return viewmats, K.repeat(views, 1, 1)
 
 
-@dataclass(eq=False)
-class Scene:
-    """Gaussians and cameras, run and checked in several ways.
+def raster_case(
+    gaussians: Mapping[str, Any],
+    cameras: tuple[Tensor, Tensor],
+    size: int,
+    device: torch.device,
+    exact: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Case:
+    """Return the rendering of Gaussians, without a gradient of the cameras.
 
-    The dense oracle sees all Gaussians in a small crop of the first view, as a separate camera
-    with the principal point moved; the operator renders the same crop for the check.
+    The reference sees all Gaussians of the first object, and a crop of its first view.
 
-    Attributes:
+    Args:
         gaussians: float32, ``[N, ·]`` or ``[B, N, ·]``.
-        viewmats: ``[.., V, 4, 4]``.
-        Ks: ``[.., V, 3, 3]``.
-        size: side of the picture, pixels.
+        cameras: ``viewmats [.., V, 4, 4]`` and ``Ks [.., V, 3, 3]``.
+        size: side of the image, pixels.
         device: of the operator.
+        exact: options of the reference where it shall not have ours, as ``alpha_min``.
         options: of ``rasterization``.
-        wanted: names of the needed gradients.
-        exact: options of the oracle where it shall not have ours, as ``alpha_min``.
-        truth: Gaussians of the oracle, where ours are others; where fewer, without gradients.
-        cotangent: of the picture, ``[.., V, H, W, 3]``; None: drawn at random.
     """
+    viewmats, Ks = cameras
+    known = {k: x for k, x in options.items() if k not in ("radius_clip", "skip")}
+    if known.pop("rasterize_mode", "classic") == "antialiased":
+        known["antialiased"] = True
+    known |= exact or {}
 
-    gaussians: dict[str, Tensor]
-    viewmats: Tensor
-    Ks: Tensor
-    size: int
-    device: torch.device
-    options: dict = field(default_factory=dict)
-    wanted: tuple[str, ...] = LEAVES
-    exact: dict = field(default_factory=dict)
-    truth: dict[str, Tensor] | None = None
-    cotangent: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        self.gaussians = {
-            k: x if x is None else x.to(self.device) for k, x in self.gaussians.items()
-        }
-        self.viewmats, self.Ks = self.viewmats.to(self.device), self.Ks.to(self.device)
-        upstream = self.cotangent
-        if upstream is None:
-            g = torch.Generator().manual_seed(3)
-            shape = (*self.viewmats.shape[:-2], self.size, self.size, 3)
-            upstream = torch.randn(shape, generator=g)
-        self.upstream = upstream.to(self.device)
-        count, views = self.gaussians["opacities"].shape[-1], self.viewmats.shape[:-2].numel()
-        self.sizes = {"N": count, "side": self.size, "views": views}
-
-    def changed(self, **changes) -> Scene:
-        """Return a copy with other attributes."""
-        return replace(self, **changes)
-
-    def arguments(self) -> dict:
-        """Return the arguments of the operator."""
-        cameras = dict(viewmats=self.viewmats, Ks=self.Ks, width=self.size, height=self.size)
-        return self.gaussians | cameras | self.options
-
-    def forward(self, function=rasterization) -> tuple[Tensor, Tensor, dict]:
-        """Render without gradients (timed)."""
-        with torch.no_grad():
-            return function(**self.arguments())
-
-    def leaves(self) -> dict[str, Tensor]:
-        """Return the Gaussians' parameters that need a gradient."""
-        wanted = [k for k in self.wanted if self.gaussians[k] is not None]
-        return {k: self.gaussians[k].detach().requires_grad_() for k in wanted}
-
-    def backward(self, function=rasterization) -> tuple[Tensor, ...]:
-        """Render and compute the wanted gradients (timed)."""
-        leaves = self.leaves()
-        given: dict[str, Any] = {**self.arguments(), **leaves}
-        image, _, _ = function(**given)
-        return torch.autograd.grad(
-            image, list(leaves.values()), self.upstream[..., : image.shape[-1]]
-        )
-
-    def work(self, backward: bool = False) -> dict[str, int]:
-        """Return the operator's own counts."""
-        leaves = self.leaves()
-        given: dict[str, Any] = {**self.arguments(), **leaves}
-        image, _, meta = rasterization(**given)
-        if backward:
-            cotangent = self.upstream[..., : image.shape[-1]]
-            torch.autograd.grad(image, list(leaves.values()), cotangent)
-        counts = {name: int(meta[name]) for name in (*WORK, *["tiles_skipped"] * backward)}
-        return counts | {"gaussians": self.gaussians["opacities"].numel()}
-
-    def oracle(self, direction: str) -> str:
-        """Return a description of the reference."""
-        width, height = self.crop(direction == BOTH)[2:]
-        text = f"float64, all Gaussians dense, a crop of {width} x {height} pixels"
-        return text + (" without thresholds" if "t_min" in self.exact else "")
-
-    def crop(self, backward: bool) -> tuple[int, int, int, int]:
-        """Return left, top, width and height of a crop within the object, off its centre."""
-        width, height = _BACKWARD_CROP if backward else _FORWARD_CROP
-        left, top = round(0.58 * self.size), round(0.39 * self.size)
-        return left, top, min(width, self.size - left), min(height, self.size - top)
-
-    def limit(self, direction: str) -> float:
-        """Return the largest error that is allowed."""
-        return BACKWARD_LIMIT if direction == BOTH else FORWARD_LIMIT
-
-    def check(self, direction: str) -> Error:
-        """Return the error of picture, alpha and the wanted gradients on the crop."""
-        backward = direction == BOTH
-        left, top, width, height = self.crop(backward)
-        first = (0,) * (self.viewmats.dim() - 3)  # the first object
-        Ks = self.Ks[first][:1].clone()
-        Ks[:, 0, 2] -= left
-        Ks[:, 1, 2] -= top
-        g = torch.Generator().manual_seed(4)
-        shape = (1, height, width)
-        cotangents = [torch.randn(*shape, c, generator=g) for c in (3, 1)]
-        gaussians, truth = (
-            {k: None if x is None else x[first] for k, x in g.items()}
-            for g in (self.gaussians, self.truth or self.gaussians)
-        )
-        rest = dict(viewmats=self.viewmats[first][:1], Ks=Ks, width=width, height=height)
-        got = self._run(rasterization, gaussians, rest, self.options, cotangents, backward)
-        exact = dict(self.options)
-        if exact.pop("rasterize_mode", "classic") == "antialiased":
-            exact["antialiased"] = True
-        exact.pop("radius_clip", None)
-        exact.pop("skip", None)
-        truth = {k: None if x is None else x.double().cpu() for k, x in truth.items()}
-        rest = {k: x.double().cpu() if isinstance(x, Tensor) else x for k, x in rest.items()}
-        want = self._run(
-            rasterization_reference, truth, rest, exact | self.exact, cotangents, backward
-        )
-        if not want["alpha"].any():
+    def reference(**x: Any) -> tuple[Tensor, Tensor]:
+        renders, _, alphas = rasterization_reference(**x, width=size, height=size, **known)
+        if not alphas.any():
             raise ValueError("the crop of the check sees no Gaussian")
-        return compare(got, want)
+        return renders, alphas
 
-    def _run(self, function, gaussians, rest, options, cotangents, backward) -> dict[str, Tensor]:
-        wanted = [k for k in self.wanted if gaussians[k] is not None] if backward else []
-        leaves = {k: gaussians[k].detach().requires_grad_() for k in wanted}
-        with torch.set_grad_enabled(backward):
-            results = function(**(gaussians | leaves), **rest, **options)
-        picture = results[0]
-        alphas = results[2] if function is rasterization_reference else results[1]
-        named = {"picture": picture.detach(), "alpha": alphas.detach()}
-        if backward:
-            pairs = [(x, c.to(x)) for x, c in zip((picture, alphas), cotangents) if x.requires_grad]
-            outputs, cotangents = zip(*pairs)  # alpha does not depend on colours
-            grads = torch.autograd.grad(outputs, list(leaves.values()), cotangents)
-            named |= {f"gradient of {k}": v for k, v in zip(leaves, grads)}
-        return named
+    def function(*, pixels: Tensor, **arguments: Any) -> tuple[Tensor, Tensor, dict]:
+        return rasterization(**arguments, width=size, height=size)
+
+    first = (slice(1),) * (viewmats.dim() - 3)
+    shared = dict.fromkeys(gaussians, first or ...)
+    shared |= dict.fromkeys(("viewmats", "Ks"), (*first, slice(1)))
+    part = {}
+    for direction, (wide, high) in _CROPS.items():  # within the object, off its centre
+        left, top = round(0.58 * size), round(0.39 * size)
+        crop = slice(top, top + high), slice(left, left + wide)
+        images = dict.fromkeys(("renders", "alphas"), (*first, slice(1), *crop))
+        part[direction] = {**shared, "pixels": crop, **images}
+    views = viewmats.shape[:-2].numel()
+    shape = (*viewmats.shape[:-2], size, size, 3)
+    return Case(
+        partial(function, **options),
+        reference,
+        {**gaussians, "viewmats": viewmats, "Ks": Ks, "pixels": pixel_centers(size, size)},
+        torch.randn(shape, generator=torch.Generator().manual_seed(3)),
+        device,
+        "float64, all Gaussians dense, a crop of {} x {} pixels ({} x {} with gradients)".format(
+            *_CROPS["forward"], *_CROPS[BOTH]
+        )
+        + (" without thresholds" if "t_min" in (exact or {}) else ""),
+        {"N": gaussians["opacities"].shape[-1], "side": size, "views": views},
+        LIMITS,
+        outputs=("renders", "alphas"),
+        cast=LEAVES,
+        part=part,
+        fixed=("viewmats", "Ks", "pixels"),
+    )
+
+
+def work_of(case: Case, direction: str) -> dict[str, int]:
+    """Return the operator's own counts."""
+    leaves = case.leaves()
+    images, _, meta = case.call(leaves)
+    if direction == BOTH:
+        gradients_of({"renders": images}, wanted(leaves), {"renders": case.cotangent})
+    counts = {name: int(meta[name]) for name in (*WORK, *["tiles_skipped"] * (direction == BOTH))}
+    return counts | {"gaussians": case.inputs["opacities"].numel()}
 
 
 # Random and hostile cases.
@@ -351,7 +279,7 @@ def _shapes(o: dict, kind: str, sizes: tuple[int, int], g: dict) -> dict[str, Te
     return {"quats": quats, "scales": scales, "opacities": opacities}
 
 
-def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
+def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
     """Return the leaves by argument, with the case's leading dimensions; Ks needs no gradient."""
     o, kind = case.options, case.kind
     lead, num = LEADS[o["lead"]], o["num"]
@@ -382,7 +310,9 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     }
 
 
-def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor | None], Tensor]:
+def poisoned(
+    case: RandomCase, x: dict[str, Tensor | None]
+) -> tuple[dict[str, Tensor | None], Tensor]:
     """Add Gaussians, each with one number that is not finite.
 
     Returns:
@@ -419,7 +349,7 @@ def gaussians_axis(o: dict, name: str) -> int:
     return len(LEADS[o["lead"]]) + (name == "colors" and o["colors_per_view"])
 
 
-def truth(case: Case, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict, View]:
+def truth(case: RandomCase, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict, View]:
     """Return the leaves by name, and all views in float64, as ``rasterization`` renders them.
 
     Each of the view's tensors is ``[.., *lead, V, H, W, C + 1]``; the last channel is alpha.
@@ -485,7 +415,7 @@ _PARTS = {
 }  # fmt: skip
 
 
-def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
+def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     """Run the operator; compare pictures pixel by pixel, gradients Gaussian by Gaussian."""
     o, x = case.options, build(case, device)
     leaves = {k: t for k, t in x.items() if t is not None and k != "Ks"}
@@ -516,7 +446,7 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     return outcome
 
 
-def _poison_faults(case: Case, x: dict, run, runs: Runs) -> list[str]:
+def _poison_faults(case: RandomCase, x: dict, run, runs: Runs) -> list[str]:
     """List what Gaussians that are not finite change in picture and gradients: no bit may."""
     bad, old = poisoned(case, x)
     again = run(bad)

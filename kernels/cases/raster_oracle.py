@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..rasterize.constants import ALPHA_MAX, COMPENSATION_MIN, FRUSTUM_MARGIN, T_MIN
 from ..rasterize.harmonics.formula import colors_by_formula
-from .case import FACTOR
+from .random_case import FACTOR
 from .rounding import UNIT, Rounding
 from .scan_oracle import EXP_ULPS
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -12,8 +13,19 @@ from torch import Tensor
 from ..selective_scan import selective_scan, selective_scan_fn, selective_scan_state
 from ..selective_scan.reference import selective_scan_reference
 from . import scan_oracle
-from .case import COTANGENTS, DTYPES, RANGES, Case, Op, Outcome, Runs, fill, generator, mostly
-from .problem import BOTH, Operator
+from .case import BOTH, DIRECTIONS, Case
+from .random_case import (
+    COTANGENTS,
+    DTYPES,
+    RANGES,
+    Op,
+    Outcome,
+    RandomCase,
+    Runs,
+    fill,
+    generator,
+    mostly,
+)
 from .rounding import Rounding, samples_of
 
 # The relative rms errors to float64 that are allowed. Those of half precision are explained by the
@@ -53,14 +65,14 @@ def make_inputs(
     }
 
 
-def scan_problem(
-    inputs: dict[str, Tensor],
+def scan_case(
+    inputs: Mapping[str, Tensor],
     device: torch.device,
     tokens: int,
     channels: int = 32,
     initial_state: Tensor | None = None,
     softplus: bool = True,
-) -> Operator:
+) -> Case:
     """Return the scan of one set of inputs.
 
     The oracle sees the first tokens and a few channels spread over all. Tokens do not depend on
@@ -92,22 +104,21 @@ def scan_problem(
     if initial_state is not None:
         function = partial(function, initial_state=initial_state.to(device))
     limits = CUDA_LIMITS if device.type == "cuda" else LIMITS
-    part = f", first {tokens} of {length} tokens" if tokens < length else ""
-    per_channel = dict.fromkeys(("u", "delta", "z", "out"), (*first, chosen))
-    return Operator(
+    text = f", first {tokens} of {length} tokens" if tokens < length else ""
+    part = dict.fromkeys(("u", "delta", "z", "out"), (*first, chosen))
+    part |= dict.fromkeys("BC", first) | dict.fromkeys(("A", "D", "delta_bias"), chosen)
+    return Case(
         function,
         reference,
         inputs,
         inputs["u"],
         device,
-        f"float64 loop, {len(chosen)} of {width} channels{part}",
+        f"float64 loop, {len(chosen)} of {width} channels{text}",
         {"B": batch, "L": length, "D": width, "N": inputs["A"].shape[1]},
         limits,
         HALF_LIMITS,
-        cast=("u", "delta", "z", "B", "C", "out"),
-        corner=per_channel
-        | dict.fromkeys("BC", first)
-        | dict.fromkeys(("A", "D", "delta_bias"), chosen),
+        cast=("u", "delta", "z", "B", "C"),
+        part=dict.fromkeys(DIRECTIONS, part),
     )
 
 
@@ -244,7 +255,7 @@ def laid(x: Tensor, layout: str) -> Tensor:
     return x
 
 
-def borders(case: Case, device: torch.device) -> Tensor | None:
+def borders(case: RandomCase, device: torch.device) -> Tensor | None:
     """Return ``cu_seqlens`` of the packed sequences, some without tokens; None for a single one."""
     length, count = case.options["length"], case.options["sequences"]
     if count == 1:
@@ -253,7 +264,7 @@ def borders(case: Case, device: torch.device) -> Tensor | None:
     return torch.tensor([0, *cuts.sort().values.tolist(), length], device=device)
 
 
-def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
+def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
     """Return the leaves by argument, channels last; a constant B is ``[D, N]``."""
     o = case.options
     batch, length, channels, n = (o[k] for k in ("batch", "length", "channels", "states"))
@@ -314,7 +325,7 @@ def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
     return dict(zip(("out", "last"), result if isinstance(result, tuple) else (result,)))
 
 
-def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
+def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     """Run the operator and compare outputs and all gradients with float64."""
     o, r, x = case.options, Rounding(case.seed, trial), build(case, device)
     samples: dict[str, Any] = {name: samples_of(t) for name, t in x.items()}

@@ -65,6 +65,12 @@ def _blend(mean2d, conic, opacity, channels, pixels, alpha_min, alpha_max, t_min
     return weight @ channels, weight.sum(1, keepdim=True)
 
 
+def pixel_centers(width: int, height: int) -> Tensor:
+    """Return the centres ``[H, W, 2]`` of an image's pixels, x and y."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return torch.stack([x, y], -1) + 0.5
+
+
 def render_view(
     means: Tensor,
     quats: Tensor | None,
@@ -83,6 +89,7 @@ def render_view(
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
     t_min: float = T_MIN,
+    pixels: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One object in one view: colours ``[H, W, C]``, depth Σ w z and alpha ``[H, W, 1]``.
 
@@ -103,6 +110,7 @@ def render_view(
         alpha_min: as ``rasterization``.
         alpha_max: as ``rasterization``.
         t_min: as ``rasterization``.
+        pixels: ``[H, W, 2]`` centres of pixels, x and y; None: all of the image.
     """
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = points[:, 2].detach()
@@ -126,16 +134,15 @@ def render_view(
         ratio = torch.linalg.det(cov0) / torch.linalg.det(cov)
         opacity = opacity * ratio.clamp_min(COMPENSATION_MIN**2).sqrt()
     conic = torch.linalg.inv(cov)
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    pixels = torch.stack([x, y], -1).reshape(-1, 2).to(means) + 0.5
+    pixels = (pixel_centers(width, height) if pixels is None else pixels).to(means)
     channels = torch.cat([colors, points[:, 2:]], 1)
     size = max(1, math.ceil(_CHUNK * 64 / max(1, len(order))))
     parts = [
         _blend(mean2d, conic, opacity, channels, chunk, alpha_min, alpha_max, t_min)
-        for chunk in pixels.split(size)
+        for chunk in pixels.flatten(0, 1).split(size)
     ]
-    blended = torch.cat([p[0] for p in parts]).view(height, width, -1)
-    alpha = torch.cat([p[1] for p in parts]).view(height, width, 1)
+    blended = torch.cat([p[0] for p in parts]).view(*pixels.shape[:2], -1)
+    alpha = torch.cat([p[1] for p in parts]).view(*pixels.shape[:2], 1)
     return blended[..., :-1], blended[..., -1:], alpha
 
 
@@ -181,7 +188,6 @@ def rasterization_reference(
             color = color + (1 - alpha) * backgrounds[(*b, v)]
         out.append((color, depth, alpha))
     renders, depths, alphas = (
-        torch.stack(parts).view(*lead, views, height, width, parts[0].shape[-1])
-        for parts in zip(*out)
+        torch.stack(parts).view(*lead, views, *parts[0].shape) for parts in zip(*out)
     )
     return renders, depths, alphas

@@ -17,7 +17,7 @@ from hypothesis.configuration import set_hypothesis_home_dir
 
 from gamba_warp.versions import __version__, installed
 
-from ..cases.case import Case, Op, Outcome, run_case
+from ..cases.random_case import Op, Outcome, RandomCase, run_case
 from ..runtime.tables import markdown
 
 _SLICE = 10.0  # seconds for an operator before the next one has its turn
@@ -37,16 +37,16 @@ class _Stop(BaseException):
 _FAILURES = {what: type(what, (AssertionError,), {}) for what in ("fault", "not finite", "limit")}
 
 
-def cases_of(op: Op) -> st.SearchStrategy[Case]:
+def cases_of(op: Op) -> st.SearchStrategy[RandomCase]:
     """Return the strategy of an op's cases; the simplest has plain options and seed 0."""
 
     @st.composite
-    def draw_case(draw: st.DrawFn) -> Case:
+    def draw_case(draw: st.DrawFn) -> RandomCase:
         kind = draw(st.sampled_from([*op.kinds]))
         options = {name: draw(st.sampled_from(values)) for name, values in op.options.items()}
         for name, value in op.kinds[kind].items():
             options[name] = draw(st.sampled_from(value)) if isinstance(value, tuple) else value
-        return Case(op.name, kind, draw(st.integers(0, 2**31 - 1)), op.fit(options))
+        return RandomCase(op.name, kind, draw(st.integers(0, 2**31 - 1)), op.fit(options))
 
     return draw_case()
 
@@ -139,9 +139,11 @@ class StressRun:
     def _take_turn(
         self, op: Op, turn: int, cases: int | None, until: float, say: Callable[[str], None]
     ) -> None:
-        found: list[tuple[Case, Outcome]] = []  # failing ones, each smaller than the one before
+        found: list[
+            tuple[RandomCase, Outcome]
+        ] = []  # failing ones, each smaller than the one before
 
-        def check(case: Case) -> None:
+        def check(case: RandomCase) -> None:
             nonlocal until
             if time.monotonic() >= until:
                 raise _Stop
@@ -176,7 +178,7 @@ class StressRun:
                 text, case = failure_text(*found[-1]), found[-1][0]._asdict()
                 self.failures.append({"text": text, "case": case})
 
-    def _count(self, case: Case, outcome: Outcome, seconds: float) -> None:
+    def _count(self, case: RandomCase, outcome: Outcome, seconds: float) -> None:
         failed = outcome.failure() is not None
         found = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
         for key in ((case.op, "all"), (case.op, case.kind)):
@@ -218,7 +220,7 @@ class StressRun:
         return "\n".join([*lines, f"{cases} cases, {len(self.failures)} failed"])
 
 
-def failure_text(case: Case, outcome: Outcome) -> str:
+def failure_text(case: RandomCase, outcome: Outcome) -> str:
     """Describe a failure in one line."""
     failure = outcome.failure()
     assert failure is not None

@@ -68,10 +68,10 @@ def test_nothing_to_start_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, 
 
 
 def test_a_wrong_result_fails(monkeypatch, tmp_path, capsys):
-    from gamba_warp.kernels.cases.problem import Operator
+    from gamba_warp.kernels.cases.case import Case
 
-    call = Operator.call
-    monkeypatch.setattr(Operator, "call", lambda *a, **k: call(*a, **k) * 1.001)
+    call = Case.call
+    monkeypatch.setattr(Case, "call", lambda *a, **k: call(*a, **k) * 1.001)
     assert gpu_check.bench("cpu", str(tmp_path)) == 1
     assert "conv: operator: default, forward: check failed" in capsys.readouterr().out
 

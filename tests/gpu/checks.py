@@ -12,12 +12,12 @@ import torch
 from helpers.scan import allowances
 from torch import Tensor
 
-from gamba_warp.kernels.cases.conv import conv_problem
-from gamba_warp.kernels.cases.problem import BOTH, Error, Operator, compare
-from gamba_warp.kernels.cases.raster import Scene, orbit_cameras, shell
-from gamba_warp.kernels.cases.scan import make_inputs, scan_problem
+from gamba_warp.kernels.cases.case import BOTH, Case, Error, compare, wanted
+from gamba_warp.kernels.cases.conv import conv_case
+from gamba_warp.kernels.cases.raster import orbit_cameras, raster_case, shell
+from gamba_warp.kernels.cases.scan import make_inputs, scan_case
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
-from gamba_warp.kernels.rasterize import lists_outgrown, rasterization
+from gamba_warp.kernels.rasterize import lists_outgrown
 from gamba_warp.kernels.runtime import gpu
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 from gamba_warp.measure.models import captured
@@ -61,23 +61,23 @@ def assert_same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
         assert a.equal(b), f"result {i} differs by up to {(a - b).abs().max().item():.2g}"
 
 
-def problem_of(shape: tuple, device: torch.device) -> Operator:
+def scan_of(shape: tuple, device: torch.device) -> Case:
     """Return a scan with an initial state."""
     batch, length, channels, states, groups = shape
     inputs = make_inputs(batch, length, channels, states, groups)
     state = torch.randn(batch, channels, states, generator=torch.Generator().manual_seed(2))
-    return scan_problem(inputs, device, length, channels, state)
+    return scan_case(inputs, device, length, channels, state)
 
 
 def check_scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> float:
     """Check the output and all gradients, each by its own limit; return the worst error."""
-    problem = problem_of(shape, device)
+    case = scan_of(shape, device)
     if dtype != torch.float32:
-        return assert_within(problem.check(BOTH, dtype), HALF_LIMIT)
-    got, truth = problem.results(True), problem.truth(True)
+        return assert_within(case.check(BOTH, dtype), HALF_LIMIT)
+    got, truth = case.results(BOTH), case.truth(BOTH)
     limits = dict.fromkeys(truth, LIMIT)
     if gpu.kind_of(device) == "cuda":
-        more = allowances(lambda off: problem.truth(True, off=off))
+        more = allowances(lambda off: case.truth(BOTH, off=off))
         limits = {name: LIMIT + more[name] for name in truth}
     errors = {name: compare({name: got[name]}, {name: truth[name]}) for name in truth}
     nearest = max(truth, key=lambda name: errors[name].rel_rms / limits[name])
@@ -86,16 +86,16 @@ def check_scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> float:
 
 def check_conv(shape: tuple[int, int, int, int], device: torch.device) -> None:
     """Check the output and all gradients, with an initial state."""
-    assert_within(conv_problem(device, shape, state=True).check(BOTH), LIMIT)
+    assert_within(conv_case(device, shape, state=True).check(BOTH), LIMIT)
 
 
-def scene_of(count: int, size: int, views: int, options: dict, device: torch.device) -> Scene:
+def scene_of(count: int, size: int, views: int, options: dict, device: torch.device) -> Case:
     """Return a shell, without quaternions if ``options`` have None for them."""
     gaussians: dict[str, Any] = {**shell(count, scale=3.0)}
     if "quats" in options:
         gaussians["quats"] = None
     rest = {name: value for name, value in options.items() if name != "quats"}
-    return Scene(gaussians, *orbit_cameras(views, size), size, device, rest)
+    return raster_case(gaussians, orbit_cameras(views, size), size, device, **rest)
 
 
 def check_raster(count: int, size: int, views: int, options: dict, device: torch.device) -> None:
@@ -116,13 +116,13 @@ EACH = [
 
 def layer_of(shape: tuple, device: torch.device) -> tuple[Callable[..., Tensor], list[Tensor]]:
     """Return a layer of convolution and scan, and its inputs on the device."""
-    problem = problem_of(shape, device)
-    inputs = problem.at(torch.float32)
+    case = scan_of(shape, device)
+    inputs = case.at(torch.float32)
     weight = torch.linspace(-0.5, 0.5, 4 * inputs["u"].shape[2], device=device)
 
     def layer(u: Tensor, weight: Tensor) -> Tensor:
         u = causal_conv1d(u, weight, activation="silu")
-        return problem.call({**inputs, "u": u})  # torch 2.6 cannot compile "|" of two dicts
+        return case.call({**inputs, "u": u})  # torch 2.6 cannot compile "|" of two dicts
 
     return layer, [inputs["u"], weight.view(-1, 4)]
 
@@ -166,11 +166,11 @@ def check_layer_graph(device: torch.device) -> None:
             assert_same((out,), (layer(*inputs),))
 
 
-def render_all(scene: Scene) -> dict[str, Tensor]:
-    """Render; return picture, alphas, the number of pairs and all gradients."""
-    leaves = scene.leaves()
-    given: dict[str, Any] = {**scene.arguments(), **leaves}
-    renders, alphas, meta = rasterization(**given)
+def render_all(scene: Case) -> dict[str, Tensor]:
+    """Render; return image, alphas, the number of pairs and all gradients."""
+    given = scene.leaves()
+    leaves = wanted(given)
+    renders, alphas, meta = scene.call(given)
     grads = torch.autograd.grad(renders.square().sum() + alphas.sum(), [*leaves.values()])
     made = {"renders": renders.detach(), "alphas": alphas.detach(), "pairs": meta.bins.count}
     return made | dict(zip(leaves, grads))
@@ -199,7 +199,7 @@ def check_raster_graph(device: torch.device) -> list[int]:
     graph, made = captured(partial(render_all, scene), device)
     found = []
     for factor in (1.0, 0.8, 6.0, 0.25):
-        scene.gaussians["scales"].mul_(factor)  # and with the sizes the number of pairs
+        scene.at()["scales"].mul_(factor)  # and with the sizes the number of pairs
         for value in made.values():
             value.fill_(-1)
         graph.replay()

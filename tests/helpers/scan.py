@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gamba_warp.kernels.cases import problem
+from gamba_warp.kernels.cases import case
 from gamba_warp.kernels.runtime import gpu
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.problem import DISCRETIZATIONS
@@ -95,7 +95,7 @@ def allowances(results, exponential=EX2):
     found = dict.fromkeys(exact, 0.0)
     for off in (Off(decay=exponential), Off(step=1.5 * exponential)):
         for name, value in results(off).items():
-            found[name] += problem.compare({name: value}, {name: exact[name]}).rel_rms
+            found[name] += case.compare({name: value}, {name: exact[name]}).rel_rms
     return found
 
 

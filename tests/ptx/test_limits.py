@@ -4,7 +4,7 @@ import pytest
 import torch
 from gpu.checks import check_scan
 
-from gamba_warp.kernels.cases.problem import Operator
+from gamba_warp.kernels.cases.case import Case
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 
@@ -47,14 +47,14 @@ def lose_carry(monkeypatch, backwards):
 
 def lose_token(monkeypatch):
     """One token of all adds nothing to the state, in one channel."""
-    call = Operator.call
+    call = Case.call
 
     def lost(self, inputs, **options):
         u = inputs["u"].clone()
         u[0, 100, 2] = 0
         return call(self, inputs | {"u": u}, **options)
 
-    monkeypatch.setattr(Operator, "call", lost)
+    monkeypatch.setattr(Case, "call", lost)
 
 
 @pytest.mark.parametrize(

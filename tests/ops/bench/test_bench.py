@@ -25,8 +25,9 @@ from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.bench.report import charts, markdown
 from gamba_warp.kernels.cases import conv as conv_cases
 from gamba_warp.kernels.cases import scan as scan_cases
-from gamba_warp.kernels.cases.problem import BOTH, Error, compare
-from gamba_warp.kernels.cases.scan import make_inputs, scan_problem
+from gamba_warp.kernels.cases.case import BOTH, Error, compare
+from gamba_warp.kernels.cases.raster import work_of
+from gamba_warp.kernels.cases.scan import make_inputs, scan_case
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import models
 from gamba_warp.model.config import PRESETS
@@ -128,10 +129,10 @@ def test_a_wrong_kernel_is_caught(monkeypatch):
     for right, status in ((True, "ok"), (False, "check failed")):
         if not right:
             monkeypatch.setattr(scan_cases, "selective_scan", off(scan_cases.selective_scan, 1))
-        problem = scan_problem(inputs, cpu, 40)
+        made = scan_case(inputs, cpu, 40)
         silu = conv_cases.silu if right else off(conv_cases.silu, 3)
-        other = conv_cases.conv_problem(cpu, (1, 30, 8, 4), silu)
-        records = run(case(*pair(problem, "x"), *pair(other, "y")))["records"]
+        other = conv_cases.conv_case(cpu, (1, 30, 8, 4), silu)
+        records = run(case(*pair(made, "x"), *pair(other, "y")))["records"]
         assert len(records) == 4 and all(r["status"].startswith(status) for r in records)
 
 
@@ -249,21 +250,21 @@ def test_saved_bytes_leaves_the_inputs_out():
 
 
 @pytest.mark.parametrize("groups", [1, 2])
-def test_the_scans_corner_is_the_truth_of_the_whole(groups):
+def test_a_part_of_the_scan_is_the_truth_of_the_whole(groups):
     """The oracle on some tokens and channels finds no error in the reference run on all."""
     inputs = make_inputs(2, 30, 12, states=3, groups=groups)
     state = torch.randn(2, 12, 3)
-    problem = scan_problem(inputs, torch.device("cpu"), 20, 4, initial_state=state)
+    made = scan_case(inputs, torch.device("cpu"), 20, 4, initial_state=state)
 
     def reference(**inputs):
         inputs = {k: x.double() for k, x in inputs.items()}
         start = state.double()
         return selective_scan_reference(**inputs, delta_softplus=True, initial_state=start)[0]
 
-    problem.function = reference
-    assert problem.check("forward").rel_rms < 1e-15
-    assert problem.check(BOTH).rel_rms < 1e-7  # gradients come back in float32
-    assert "4 of 12 channels, first 20 of 30 tokens" in problem.oracle(BOTH)
+    made.function = reference
+    assert made.check("forward").rel_rms < 1e-15
+    assert made.check(BOTH).rel_rms < 1e-7  # gradients come back in float32
+    assert "4 of 12 channels, first 20 of 30 tokens" in made.oracle(BOTH)
 
 
 def test_the_torch_loop_is_the_formula():
@@ -293,9 +294,9 @@ def test_the_scene_and_its_crop():
     """The rasterizer is right on the oracle's crop; a wrong colour is seen."""
     scene = raster.make_scene(QUICK, 2, count=300, size=64)
     assert scene.check(BOTH).rel_rms < 1e-4
-    wrong = scene.changed(exact={"alpha_min": 0.2})
+    wrong = raster.make_scene(QUICK, 2, count=300, size=64, exact={"alpha_min": 0.2})
     assert wrong.check("forward").rel_rms > 1e-2
-    counts = scene.work(True)
+    counts = work_of(scene, BOTH)
     assert counts["pairs"] > 100 and counts["tiles"] == 16 and counts["gaussians"] == 300
 
 
@@ -322,7 +323,7 @@ def test_cases_run(suite, name):
             )
             assert on < off
     if name == "backbone":
-        assert all(0 < r["rel_rms_error"] < 1e-5 for r in records if r["direction"] == "forward")
+        assert all(0 < r["rel_rms_error"] < 1e-7 for r in records)
     if name == "length":
         short, long = (r["work"]["saved_bytes"] for r in records if r["direction"] == BOTH)
         assert long == 4 * short

@@ -7,9 +7,8 @@ import torch
 from helpers import rel_rms
 
 from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
-from gamba_warp.kernels.cases.raster import Scene, orbit_cameras, shell
+from gamba_warp.kernels.cases.raster import orbit_cameras, raster_case, shell
 from gamba_warp.kernels.cases.scan import make_inputs
-from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu_scan
@@ -43,9 +42,9 @@ def test_degree_of_the_decays(degree, low, high):
 
 
 def scene(**options):
-    made = Scene(shell(400, 3), *orbit_cameras(2, 75), 75, torch.device("cpu"), options)
-    made.viewmats[:, 0, 3] += 0.03
-    return made
+    viewmats, Ks = orbit_cameras(2, 75)
+    viewmats[:, 0, 3] += 0.03
+    return raster_case(shell(400, 3), (viewmats, Ks), 75, torch.device("cpu"), **options)
 
 
 def results(of):
@@ -58,9 +57,8 @@ def test_the_limit_of_transmittance(t_min):
     """Against the oracle with the same limit; the default's picture is another one."""
     made = scene(t_min=t_min)
     got, _ = results(made)
-    x = {k: v.double() for k, v in made.gaussians.items()}
-    cameras = (made.viewmats.double(), made.Ks.double(), 75, 75)
-    want, _, alphas = rasterization_reference(*x.values(), *cameras, t_min=t_min)
+    x = {k: v.double() for k, v in made.inputs.items() if k != "pixels"}
+    want, _, alphas = rasterization_reference(**x, width=75, height=75, t_min=t_min)
     # a pixel at a threshold may fall on its other side
     assert ((got[0] - want).abs() < 1e-4).float().mean() > 0.999
     assert ((got[1] - alphas).abs() < 1e-4).float().mean() > 0.999
@@ -71,7 +69,7 @@ def test_the_limit_of_transmittance(t_min):
 @pytest.mark.parametrize("t_min", [0.0, 1.0, -1e-4, float("nan")])
 def test_limits_that_are_refused(t_min):
     with pytest.raises(ValueError, match="t_min must be in"):
-        rasterization(**scene(t_min=t_min).arguments())
+        scene(t_min=t_min).forward()
 
 
 @pytest.fixture(scope="module")

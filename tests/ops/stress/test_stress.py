@@ -11,7 +11,7 @@ from helpers import assert_rel_rms
 from gamba_warp import cli
 from gamba_warp.kernels.cases import conv, raster, scan
 from gamba_warp.kernels.cases import scan_oracle as oracle
-from gamba_warp.kernels.cases.case import Case, run_case
+from gamba_warp.kernels.cases.random_case import RandomCase, run_case
 from gamba_warp.kernels.cases.rounding import Rounding, samples_of
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
@@ -63,7 +63,7 @@ SMALL = {
 def test_every_kind_passes(name, kind):
     op = OPS[name]
     fixed = {k: v[-1] if isinstance(v, tuple) else v for k, v in op.kinds[kind].items()}
-    case = Case(name, kind, 1, op.fit(op.plain | SMALL[name] | fixed))
+    case = RandomCase(name, kind, 1, op.fit(op.plain | SMALL[name] | fixed))
     outcome = run_case(op, case, CPU)
     assert outcome.failure() is None, (outcome.failure(), case)
 
@@ -82,7 +82,7 @@ def test_a_short_run_passes_and_is_the_same_again(name):
 
 @pytest.mark.parametrize("discretization", scan.DISCRETIZATIONS)
 def test_scan_oracle_is_the_reference(discretization):
-    case = Case("scan", "uniform", 5, scan.OP.plain | dict(
+    case = RandomCase("scan", "uniform", 5, scan.OP.plain | dict(
         batch=2, length=29, channels=6, states=3, groups=2, use_D=True, use_z=True, use_bias=True,
         use_state=True, softplus=True,
     ))  # fmt: skip
@@ -105,7 +105,7 @@ def test_scan_oracle_is_the_reference(discretization):
 
 
 def test_conv_oracle_is_the_reference():
-    case = Case("conv", "normal", 5, conv.OP.plain | dict(
+    case = RandomCase("conv", "normal", 5, conv.OP.plain | dict(
         batch=2, length=9, channels=6, width=4, silu=True, use_bias=True, use_state=True
     ))  # fmt: skip
     inputs = conv.build(case, CPU)
@@ -119,7 +119,7 @@ def test_conv_oracle_is_the_reference():
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_raster_oracle_is_the_reference(antialiased):
-    case = Case("raster", "uniform", 3, raster.OP.plain | dict(
+    case = RandomCase("raster", "uniform", 3, raster.OP.plain | dict(
         lead="two", views=2, num=20, width=13, height=9, channels=3, backgrounds=True,
         use_quats=True, mode="RGB+D", antialiased=antialiased,
     ))  # fmt: skip
@@ -148,7 +148,7 @@ def test_raster_oracle_is_the_reference(antialiased):
 def test_an_error_of_the_picture_is_caught_and_a_flip_is_not(monkeypatch):
     """A thousandth more of one Gaussian's colour fails; a cut moved within rounding passes."""
     right = raster.rasterization
-    case = Case("raster", "uniform", 1, raster.OP.plain | dict(
+    case = RandomCase("raster", "uniform", 1, raster.OP.plain | dict(
         num=40, width=17, height=23, channels=3, use_quats=True
     ))  # fmt: skip
 
@@ -171,7 +171,7 @@ def test_an_error_of_the_picture_is_caught_and_a_flip_is_not(monkeypatch):
 
 
 def test_poison_that_leaks_is_a_failure(monkeypatch):
-    case = Case("raster", "not finite", 1, raster.OP.plain | dict(
+    case = RandomCase("raster", "not finite", 1, raster.OP.plain | dict(
         num=30, width=9, height=9, poison=4, use_quats=True
     ))  # fmt: skip
     assert run_case(raster.OP, case, CPU).failure() is None
@@ -187,7 +187,7 @@ def test_poison_that_leaks_is_a_failure(monkeypatch):
 
 def test_model_with_a_small_error_fails(monkeypatch):
     options = stress_model.OP.plain | dict(patches=2, width=8, state_size=2, camera_token=True)
-    case = Case("model", "uniform", 1, options)
+    case = RandomCase("model", "uniform", 1, options)
     assert run_case(stress_model.OP, case, CPU).failure() is None
     monkeypatch.setattr(
         "gamba_warp.model.parts.block.selective_scan_state",
@@ -223,7 +223,7 @@ def test_a_small_error_is_caught_and_reported(monkeypatch, tmp_path, broken_scan
     document = json.loads((tmp_path / "stress.json").read_text())
     (failure,) = document["failures"]  # the first of the scan; the convolution goes on
     assert failure["text"].startswith("scan, ") and "times its limit off" in failure["text"]
-    assert run_case(scan.OP, Case(**failure["case"]), CPU).failure()["what"] == "limit"
+    assert run_case(scan.OP, RandomCase(**failure["case"]), CPU).failure()["what"] == "limit"
     assert sum(row["failures"] for row in document["rows"]) == 1
     assert "## Failures" in (tmp_path / "stress.md").read_text()
     assert failure["text"] in capsys.readouterr().out
@@ -234,7 +234,7 @@ def test_a_failing_case_is_made_small(monkeypatch, broken_scan):
     op = replace(scan.OP, kinds={kind: scan.OP.kinds[kind] for kind in ("uniform", "spread")})
     run = stress.StressRun([op], CPU, seed=0)
     run.run(60, 1e9)
-    case = Case(**run.failures[0]["case"])
+    case = RandomCase(**run.failures[0]["case"])
     changed = {k for k, v in case.options.items() if v != op.plain[k]}
     assert changed == {"use_z"} and (case.kind, case.seed) == ("uniform", 0)
 
@@ -249,7 +249,7 @@ def test_not_finite_and_exceptions_are_failures(monkeypatch, value, what):
         return right(*arguments, **options) * value
 
     monkeypatch.setattr(scan, "selective_scan", wrong)
-    case = Case("scan", "uniform", 1, scan.OP.plain | {"length": 9})
+    case = RandomCase("scan", "uniform", 1, scan.OP.plain | {"length": 9})
     outcome = run_case(scan.OP, case, CPU)
     assert outcome.failure()["what"] == what
     assert (outcome.nonfinite >= 9) == (value is not None)
@@ -258,7 +258,8 @@ def test_not_finite_and_exceptions_are_failures(monkeypatch, value, what):
 def test_two_runs_that_differ_are_a_failure(monkeypatch):
     right, count = scan.selective_scan, iter(range(100))
     monkeypatch.setattr(scan, "selective_scan", lambda *a, **k: right(*a, **k) + next(count) * 1e-8)
-    outcome = run_case(scan.OP, Case("scan", "uniform", 1, scan.OP.plain | {"length": 9}), CPU)
+    plain = scan.OP.plain | {"length": 9}
+    outcome = run_case(scan.OP, RandomCase("scan", "uniform", 1, plain), CPU)
     assert outcome.faults == ["two runs differ in out"]
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gamba_warp.kernels.cases import conv, raster, scan
-from gamba_warp.kernels.cases.case import Case, Comparison, Outcome, judge, run_case
+from gamba_warp.kernels.cases.random_case import Comparison, Outcome, RandomCase, judge, run_case
 from gamba_warp.kernels.cases.rounding import SAMPLES, UNDERFLOW, Rounding, samples_of
 from gamba_warp.kernels.cases.scan_oracle import states
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
@@ -23,13 +23,13 @@ CORPUS = json.loads(Path(__file__).with_name("corpus.json").read_text())
 
 @pytest.mark.parametrize("name", CORPUS)
 def test_cases_that_failed_once_pass(name):
-    case = Case(**CORPUS[name])
+    case = RandomCase(**CORPUS[name])
     outcome = run_case(OPS[case.op], case, CPU)
     assert outcome.comparisons and outcome.failure() is None, outcome.failure()
 
 
 @pytest.mark.parametrize("name", [name for name in CORPUS if name.startswith("raster")])
-def test_cases_of_the_rasterizer_pass_on_cuda(from_ptx, name):
+def test_examples_of_the_rasterizer_pass_on_cuda(from_ptx, name):
     from_ptx()
     test_cases_that_failed_once_pass(name)
 
@@ -90,7 +90,7 @@ def test_most_trials_decide(ratios, fails):
         return Outcome([Comparison("out", 1e-7, ratios[trial])])
 
     op = replace(raster.OP, evaluate=evaluate)
-    outcome = run_case(op, Case("raster", "uniform", 0, {}), CPU)
+    outcome = run_case(op, RandomCase("raster", "uniform", 0, {}), CPU)
     assert (outcome.failure() is not None) == fails and seen == [*range(len(ratios))]
 
 
@@ -110,7 +110,7 @@ def test_the_widest_limit_counts_for_steep_cases_alone(noise, ratios, at, fails,
         other = Comparison("gradient of u", 20.0, ratios[trial == 1], noise=noise)
         return Outcome([Comparison("out", 1e-7, 0.9 if trial == at else 4.0), other])
 
-    outcome = run_case(replace(raster.OP, evaluate=evaluate), Case("raster", "x", 0, {}), CPU)
+    outcome = run_case(replace(raster.OP, evaluate=evaluate), RandomCase("raster", "x", 0, {}), CPU)
     assert (outcome.failure() is not None) == fails and outcome.steep == (trials > 5)
     assert seen == [*range(trials)]
 
@@ -132,7 +132,7 @@ def test_a_fault_in_one_trial_is_a_failure():
         faults = ["two runs differ in out"] if trial == 3 else []
         return Outcome([Comparison("out", 1e-7, 1.2 if trial == 0 else 0.5)], faults)
 
-    outcome = run_case(replace(raster.OP, evaluate=evaluate), Case("raster", "x", 0, {}), CPU)
+    outcome = run_case(replace(raster.OP, evaluate=evaluate), RandomCase("raster", "x", 0, {}), CPU)
     assert outcome.faults
 
 
@@ -186,7 +186,7 @@ def test_the_slope_of_a_decay_may_lose_a_small_product():
 
 def test_a_gradient_that_is_not_finite_beside_poison_is_a_failure(monkeypatch):
     """Only numbers beyond the dtype's range may be infinite, and only those of the right row."""
-    case = Case(**CORPUS["raster-gradient-beyond-float16"])
+    case = RandomCase(**CORPUS["raster-gradient-beyond-float16"])
     right = raster.gradients_of
     for row in range(9):
 
@@ -210,7 +210,7 @@ def test_the_reference_in_float32_is_far_off(monkeypatch, kind):
         return colors, alphas, None
 
     options = dict(num=30, width=17, height=13, channels=3, use_quats=True)
-    case = Case("raster", kind, 1, raster.OP.plain | options)
+    case = RandomCase("raster", kind, 1, raster.OP.plain | options)
     assert raster.evaluate(case, CPU).worst.ratio < 0.5
     monkeypatch.setattr(raster, "rasterization", by_reference)
     assert raster.evaluate(case, CPU).worst.ratio > 100
