@@ -31,7 +31,8 @@ from ..kernels.selective_scan.reference import selective_scan_reference
 from ..model.config import PRESETS, GambaConfig
 from ..model.gamba import Gamba
 from ..model.parts.attention import AttentionBlock
-from ..model.parts.block import GambaBlock, prefix_states, run_blocks
+from ..model.parts.block import GambaBlock, run_blocks
+from ..model.parts.prefix import prefix_states
 from ..model.posing import reference_cameras
 
 Result = TypeVar("Result")

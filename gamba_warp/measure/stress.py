@@ -13,8 +13,9 @@ from ..kernels.cases.rounding import SAMPLES, Rounding, samples_of
 from ..kernels.cases.scan_oracle import EXP_ULPS, conv, scan
 from ..model.config import GambaConfig
 from ..model.gamba import Gamba
-from ..model.parts.block import GambaBlock, prefix_states
+from ..model.parts.block import GambaBlock
 from ..model.parts.decoder import MIN_SCALE
+from ..model.parts.prefix import prefix_states
 from ..model.parts.tokens import normalize_imagenet
 
 KINDS = (

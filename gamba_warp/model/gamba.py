@@ -15,9 +15,10 @@ from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
 from .parts.attention import AttentionBlock
-from .parts.block import GambaBlock, make_norm, prefix_states, run_blocks
+from .parts.block import GambaBlock, make_norm, run_blocks
 from .parts.decoder import GaussianDecoder
 from .parts.patches import Foreground, find_foreground
+from .parts.prefix import prefix_states
 from .parts.rays import RayDecoder
 from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder

@@ -9,7 +9,8 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba, make_blocks
-from gamba_warp.model.parts.block import prefix_states, run_blocks
+from gamba_warp.model.parts.block import run_blocks
+from gamba_warp.model.parts.prefix import prefix_states
 from helpers import assert_rel_rms
 
 FIELDS = ("means", "scales", "opacities", "colors")

@@ -9,7 +9,9 @@ from helpers.mamba import TRANSITIONS, layer_in_float64
 from helpers.model import perturbed
 
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.parts.block import GambaBlock, Mamba, prefix_states
+from gamba_warp.model.parts.block import GambaBlock
+from gamba_warp.model.parts.mamba import Mamba
+from gamba_warp.model.parts.prefix import prefix_states
 
 
 def _config(**changes) -> GambaConfig:

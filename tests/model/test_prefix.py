@@ -7,7 +7,7 @@ from helpers.model import assert_plain_form, inputs, micro, moved_blocks
 
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.parts.block import prefix_states
+from gamba_warp.model.parts.prefix import prefix_states
 
 
 def prepend_and_drop(blocks, tokens, camera, image):

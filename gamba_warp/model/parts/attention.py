@@ -17,7 +17,8 @@ from torch.nn import functional as F
 
 from ...kernels.runtime.packed import Packed
 from ..config import GambaConfig
-from .block import Block, Blocks, make_norm, product, stacked
+from .block import Block, make_norm
+from .prefix import Blocks, product, stacked
 
 
 class Memory(NamedTuple):

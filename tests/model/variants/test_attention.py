@@ -21,7 +21,8 @@ from gamba_warp.errors import UserError
 from gamba_warp.kernels.runtime.packed import Packed
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.parts.block import prefix_states, run_blocks
+from gamba_warp.model.parts.block import run_blocks
+from gamba_warp.model.parts.prefix import prefix_states
 
 
 def make_blocks(depth: int, camera: int, image: int, **changes) -> torch.nn.ModuleList:

@@ -17,7 +17,9 @@ from helpers.model import (
 from helpers.refusals import refused
 
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.parts.block import mixed_positions, prefix_states, run_blocks
+from gamba_warp.model.parts.block import run_blocks
+from gamba_warp.model.parts.mixed import mixed_positions
+from gamba_warp.model.parts.prefix import prefix_states
 
 
 def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
