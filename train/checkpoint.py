@@ -1,18 +1,19 @@
-"""Checkpoints: folders ``RUN/checkpoints/step_000123/``, written atomically.
+"""State of a run, and its checkpoints: folders ``RUN/checkpoints/step_000123/``.
 
-A checkpoint holds ``model.safetensors`` and ``ema.safetensors``, models that every command can
-load; ``state.pt``, the further tensors and plain values of a bit-identical continuation; and
-``checksums.json``, the SHA-256 of each of these files.
+A checkpoint is written atomically. It holds ``model.safetensors`` and ``ema.safetensors``, models
+that every command can load; ``state.pt``, the further tensors and plain values of a bit-identical
+continuation; and ``checksums.json``, the SHA-256 of each of these files.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import torch
@@ -25,16 +26,13 @@ from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 from gamba_warp.untrusted.torch_files import read_torch
 
-from .config import (
-    STEP_SIZE,
-    DataConfig,
-    LengthConfig,
-    TrainConfig,
-    config_differences,
-)
-from .optim import NewLength
+from .batches import TrainingData
+from .config import STEP_SIZE, DataConfig, LengthConfig, TrainConfig, config_differences
+from .ddp import World
+from .optim import Ema, NewLength, Schedule, build_optimizer, checked_moments
 
 STATE_VERSION = 2
+KEPT = 2  # checkpoints that remain
 CHECKSUMS = "checksums.json"
 _NAME = re.compile(r"step_(\d+)")
 _NEEDED = {"model.safetensors": "", "state.pt": ""}  # required even if not in the checksums
@@ -42,7 +40,169 @@ _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=10**12)]
 
 
-class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+class Setup(NamedTuple):
+    """Setup of a run, which stays the same throughout.
+
+    Attributes:
+        config: the options.
+        data: training and validation data.
+        world: this process among all.
+    """
+
+    config: TrainConfig
+    data: TrainingData
+    world: World
+
+    @property
+    def step_size(self) -> int:
+        """Objects of a step, over all processes."""
+        views = self.config.views
+        return views.batch_size * views.accumulate * self.world.size
+
+    @property
+    def steps_per_epoch(self) -> float:
+        """Steps of a pass over the objects."""
+        return len(self.data.objects) / self.step_size
+
+    def schedule(self, length: LengthConfig) -> Schedule:
+        """Return the schedule of a run of some length."""
+        total = length.steps
+        if total is None and (length.epochs or not length.minutes):
+            total = math.ceil((length.epochs or 400) * self.steps_per_epoch)
+        return Schedule(self.config.optim, total, length.minutes)
+
+
+class Score(NamedTuple):
+    """Result of a validation.
+
+    Attributes:
+        step: optimizer steps done.
+        psnr: of novel views (of inputs without novel ones), dB, the mean over the objects.
+    """
+
+    step: int
+    psnr: float
+
+    def __str__(self) -> str:
+        return f"{self.psnr:.4g} dB at step {self.step}"
+
+
+@dataclass(kw_only=True)
+class RunState:
+    """State of a run: everything that its steps and validations change.
+
+    Attributes:
+        model: the model, on the world's device.
+        ema: running average of its weights, or None.
+        optimizer: of the model.
+        schedule: of the learning rate.
+        step: optimizer steps done.
+        skipped: steps that were not finite.
+        skipped_in_row: the last ones of them.
+        elapsed: seconds of training.
+        scores: of the ``first``, ``best`` and ``last`` validation.
+        saved: step of the last checkpoint in the run folder; -1 without one.
+    """
+
+    model: Gamba
+    ema: Ema | None
+    optimizer: torch.optim.Optimizer
+    schedule: Schedule
+    step: int = 0
+    skipped: int = 0
+    skipped_in_row: int = 0
+    elapsed: float = 0.0
+    scores: dict[str, Score] = field(default_factory=dict)
+    saved: int = -1
+
+    @classmethod
+    def begin(cls, model: Gamba, setup: Setup) -> RunState:
+        """Return the state before the first step."""
+        decay = setup.config.optim.ema
+        return cls(
+            model=model,
+            optimizer=build_optimizer(model),
+            ema=Ema(model, decay) if decay else None,
+            schedule=setup.schedule(setup.config.length),
+        )
+
+    @property
+    def models(self) -> dict[str, Gamba]:
+        """Models of a checkpoint by file stem; the last one is the result."""
+        return {"model": self.model} | ({"ema": self.ema.model} if self.ema else {})
+
+    @property
+    def result(self) -> Gamba:
+        """Model that is validated and written at the end."""
+        return self.ema.model if self.ema else self.model
+
+    def save(self, setup: Setup) -> None:
+        """Write a checkpoint, unless this step has one.
+
+        Raises:
+            UserError: as ``save_checkpoint``.
+        """
+        if self.saved == self.step:
+            return
+        values = {
+            "version": STATE_VERSION,
+            "config": setup.config.to_dict(),
+            "objects": setup.data.fingerprint,
+            "step": self.step,
+            "skipped": self.skipped,
+            "skipped_in_row": self.skipped_in_row,
+            "elapsed": self.elapsed,
+            "world_size": setup.world.size,
+            "ema_updates": self.ema.updates if self.ema else 0,
+            "scores": {name: tuple(score) for name, score in self.scores.items()},
+            "new_length": asdict(self.schedule.since),
+            "optimizer": self.optimizer.state_dict(),
+            "rng": torch.get_rng_state(),
+            "rng_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        }
+        save_checkpoint(setup.config.run.out, self.step, self.models, values, KEPT)
+        self.saved = self.step
+
+    def restore(self, checkpoint: Path, setup: Setup) -> str | None:
+        """Continue from a checkpoint, bit-identically on one device.
+
+        Everything is read and checked before anything is loaded. Only the main process reads, so no
+        shared disk is needed.
+
+        Returns:
+            A line about the learning rate if the run has another length.
+
+        Raises:
+            UserError: the checkpoint is damaged, or belongs to a run with other options, data or
+                number of objects a step; the message names the differences.
+        """
+
+        def read() -> tuple[Stored, LengthConfig, dict[str, Any], dict[str, Any]]:
+            stored, length = read_run(checkpoint, setup)
+            moments = checked_moments(self.optimizer, stored.optimizer, checkpoint / "state.pt")
+            files = {name: checkpoint / f"{name}.safetensors" for name in self.models}
+            weights = {n: read_weights_of(files[n], model) for n, model in self.models.items()}
+            return stored, length, moments, weights
+
+        stored, length, moments, weights = setup.world.on_main(read)
+        for name, model in self.models.items():
+            model.load_stored_state(weights[name])
+        if self.ema is not None:
+            self.ema.updates = stored.ema_updates
+        self.optimizer.load_state_dict(moments)
+        self.step, self.elapsed = stored.step, stored.elapsed
+        self.skipped, self.skipped_in_row = stored.skipped, stored.skipped_in_row
+        self.scores = {name: Score(*score) for name, score in stored.scores.items()}
+        old = replace(setup.schedule(length), since=stored.new_length)
+        self.schedule, note = self.schedule.after(old, self.step, self.elapsed)
+        self.saved = self.step if checkpoint.parent.parent == setup.config.run.out else -1
+        torch.set_rng_state(stored.rng)
+        if len(stored.rng_cuda) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(stored.rng_cuda)
+        return note
+
+
+class Stored(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """Fields of ``state.pt``: everything that a resumed run needs besides the weights."""
 
     version: int
@@ -58,7 +218,14 @@ class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     rng: Any
     rng_cuda: list[Any]
     new_length: NewLength
-    scores: dict[str, tuple[_Count, float]]  # values of Trainer.scores, by name
+    scores: dict[str, tuple[_Count, float]]  # values of RunState.scores, by name
+
+
+class _Plan(msgspec.Struct):
+    """Part of the stored options that a resumed run is compared with by itself."""
+
+    length: LengthConfig
+    views: DataConfig
 
 
 def step_of(checkpoint: Path) -> int:
@@ -163,16 +330,9 @@ def _newest_whole(found: list[Path], warn: Callable[[str], None]) -> Path:
 
 
 def damage(checkpoint: Path) -> str | None:
-    """Describe the damage of a checkpoint's files; None if they are intact.
-
-    Checkpoints of older versions, without ``checksums.json``, only get the checks of each format.
-    """
+    """Describe the damage of a checkpoint's files; None if they are intact."""
     try:
         listed = checkpoint / CHECKSUMS
-        if not listed.exists():
-            read_state(checkpoint)
-            read_config(checkpoint / "model.safetensors")
-            return None
         for name, wanted in {**_NEEDED, **read_document(listed, dict[str, _Digest])}.items():
             path = checkpoint / plain_name(name, str(listed))
             if path.is_symlink() or not path.is_file():  # reading a pipe would never end
@@ -197,14 +357,14 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
-def check_state(state: dict[str, Any], source: str) -> State:
-    """Check types and ranges of a ``Trainer.state``, except the optimizer's part.
+def check_state(state: dict[str, Any], source: str) -> Stored:
+    """Check types and ranges of a ``state.pt``, except the optimizer's part.
 
     Raises:
         UserError: a field is missing, unknown, of the wrong type or out of range.
     """
     try:
-        fields = msgspec.convert(state, State)
+        fields = msgspec.convert(state, Stored)
         msgspec.json.encode(fields.config)  # only plain values, so that they can be compared
         for rng in (fields.rng, *fields.rng_cuda):
             if not isinstance(rng, torch.Tensor) or rng.dtype != torch.uint8 or rng.ndim != 1:
@@ -216,53 +376,42 @@ def check_state(state: dict[str, Any], source: str) -> State:
     return fields
 
 
-def read_run(
-    checkpoint: Path, config: TrainConfig, objects: str, processes: int
-) -> tuple[State, LengthConfig]:
+def read_run(checkpoint: Path, setup: Setup) -> tuple[Stored, LengthConfig]:
     """Read and check the ``state.pt`` of a resumed run; also return its planned length.
-
-    Args:
-        checkpoint: the checkpoint's folder.
-        config: options of the resumed run.
-        objects: ``TrainingData.fingerprint`` of the resumed run.
-        processes: their number in the resumed run.
 
     Raises:
         UserError: the state is damaged, or of a run with other options, data or number of objects
             a step; the message names the differences, and how to continue nevertheless.
     """
-    stored, source = read_state(checkpoint), str(checkpoint / "state.pt")
-    version = stored.get("version")
+    values, source = read_state(checkpoint), str(checkpoint / "state.pt")
+    version = values.get("version")
     if type(version) is not int or version != STATE_VERSION:  # a tensor's comparison may raise
         raise UserError(f"{checkpoint}: unsupported state version {str(version)[:40]!r}")
-    state = check_state(stored, source)
-    there, here = state.config, config.to_dict()
+    stored = check_state(values, source)
     try:
-        kinds = {"length": LengthConfig, "views": DataConfig}
-        groups = {
-            name: msgspec.convert(there.get(name), kind, dec_hook=lambda kind, value: kind(value))
-            for name, kind in kinds.items()
-        }
+        plan = msgspec.convert(stored.config, _Plan, dec_hook=lambda kind, value: kind(value))
     except (ValueError, TypeError) as error:
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
-    views = groups["views"]
-    step_size = views.batch_size * views.accumulate * state.world_size
-    differing = config_differences(there, here, ignored=() if config.views.made else STEP_SIZE)
-    if state.objects != objects:
-        differing.append(f"objects ({state.objects[:80]} there, {objects} here)")
-    if config.views.made and state.world_size != processes:
-        differing.append(f"world_size ({state.world_size} there, {processes} here)")
-    mine = config.views.batch_size * config.views.accumulate * processes
-    if mine != step_size:
-        each, rest = divmod(step_size, config.views.accumulate * processes)
+    config, processes = setup.config, setup.world.size
+    ignored = () if config.views.made else STEP_SIZE
+    differing = config_differences(stored.config, config.to_dict(), ignored=ignored)
+    if stored.objects != setup.data.fingerprint:
+        names = f"{stored.objects[:80]} there, {setup.data.fingerprint} here"
+        differing.append(f"objects ({names})")
+    if config.views.made and stored.world_size != processes:
+        differing.append(f"world_size ({stored.world_size} there, {processes} here)")
+    there = plan.views.batch_size * plan.views.accumulate * stored.world_size
+    here = setup.step_size
+    if here != there:
+        each, rest = divmod(there, config.views.accumulate * processes)
         way = "" if rest else f": --batch-size {each} keeps it"
-        differing.append(f"objects a step ({step_size} there, {mine} here{way})")
+        differing.append(f"objects a step ({there} there, {here} here{way})")
     if differing:
         raise UserError(
             f"{checkpoint}: belongs to another run: {', '.join(differing[:20])}; to start from its "
             f"weights alone: --init {checkpoint}, and another --out"
         )
-    return state, groups["length"]
+    return stored, plan.length
 
 
 def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Path:
@@ -288,29 +437,6 @@ def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Pat
     if not names:
         raise UserError(f"--init {path}: holds neither a model nor a checkpoint")
     return path / names[0]
-
-
-def initial_differences(path: Path, config: TrainConfig, objects: str) -> list[str] | None:
-    """Compare this run with the one that made a model file, if it is known.
-
-    Args:
-        path: the model file; a checkpoint's state or a run's ``config.json`` may be in its folder.
-        config: options of this run.
-        objects: ``TrainingData.fingerprint`` of this run.
-
-    Returns:
-        Differences, each with both values; None if the run of the file is unknown.
-    """
-    try:
-        if (path.parent / "state.pt").is_file():
-            state = check_state(read_state(path.parent), str(path.parent / "state.pt"))
-            stored, theirs = state.config, state.objects
-        else:
-            stored, theirs = read_document(path.parent / "config.json", dict[str, Any]), objects
-        differing = config_differences(stored, config.to_dict(), free=True)
-    except (UserError, AttributeError, TypeError):  # the weights alone suffice
-        return None
-    return differing + (["the list of objects"] if theirs != objects else [])
 
 
 def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:

@@ -27,7 +27,7 @@ def train_command(config: tyro.conf.OmitArgPrefixes[TrainConfig]) -> int:
     import torch
 
     from .ddp import world
-    from .run import train
+    from .loop import train
 
     if config.run.threads is not None:
         torch.set_num_threads(config.run.threads)

@@ -18,7 +18,10 @@ from torch import Tensor
 from gamba_warp.errors import first_line
 from gamba_warp.kernels.rasterize import forget_graphs, lists_outgrown
 
+from .config import TrainConfig
 from .data.samples import Batch, copied
+from .ddp import World
+from .log import say
 
 MOST = 64  # graphs that are kept; each holds the results of a step
 Result = TypeVar("Result")
@@ -30,6 +33,22 @@ class _Recorded(NamedTuple):
     graph: torch.cuda.CUDAGraph
     batch: Batch
     result: Any
+
+
+def open_graphs(
+    config: TrainConfig, world: World, optimizer: torch.optim.Optimizer
+) -> StepGraphs | None:
+    """Prepare CUDA graphs of the steps; None on a CPU, or if a step has several parts."""
+    if world.device.type != "cuda":
+        return None
+    if config.views.accumulate > 1 or world.size > 1:
+        if world.main and config.run.graph == "auto":
+            why = "--accumulate" if config.views.accumulate > 1 else "several processes"
+            say(f"no CUDA graphs with {why}")
+        return None
+    for group in optimizer.param_groups:
+        group["capturable"] = True
+    return StepGraphs(world.device, say, MOST if config.run.graph == "auto" else 0)
 
 
 class StepGraphs:

@@ -9,7 +9,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
@@ -38,6 +38,9 @@ class RunLog:
         Raises:
             UserError: the file cannot be written.
         """
+        self._said: set[str] = set()
+        self._failed: set[str] = set()  # uids of objects
+        self._board: Any = None  # a ``SummaryWriter``
         try:
             # Unbuffered, so that a failed write is known at once and leaves nothing pending.
             self._file = open(run / "log.jsonl", "a+b", buffering=0)
@@ -46,8 +49,6 @@ class RunLog:
             self._truncate(self._file.read(size).rfind(b"\n") + 1)
         except OSError as error:
             raise UserError(f"cannot write {run / 'log.jsonl'}: {error.strerror}") from error
-        self._said: set[str] = set()
-        self._board: Any = None  # a ``SummaryWriter``
         with self._guarded("tensorboard"), suppress(ImportError):
             from torch.utils.tensorboard import SummaryWriter
 
@@ -96,6 +97,12 @@ class RunLog:
         say(f"gamba train: {message}")
         self.write("warning", step, message=message)
 
+    def warn_of_objects(self, step: int, failures: Mapping[str, str]) -> None:
+        """Warn of each object that could not be read, by uid, once."""
+        for uid in [uid for uid in failures if uid not in self._failed]:
+            self._failed.add(uid)
+            self.warn(step, f"{uid} is skipped: {failures[uid]}")
+
     def sample(self, step: int, path: Path, rows: list[Tensor]) -> None:
         """Write sample pictures, see ``strip_of``, also to TensorBoard; warn if that fails."""
         strip = strip_of(rows)
@@ -113,6 +120,19 @@ class RunLog:
         if self._board is not None:
             with self._guarded("tensorboard"):
                 self._board.close()
+
+
+class NoLog(RunLog):
+    """Log of a process that is not the main one: nothing is written or printed."""
+
+    def __init__(self) -> None:
+        self._failed = set()
+
+    def write(self, event: str, step: int, **values: object) -> None:
+        """Write nothing."""
+
+    def warn(self, step: int, message: str) -> None:
+        """Print nothing."""
 
 
 def say(text: str, file: TextIO | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Computations on batches: losses, gradients, the model's health, and the validation."""
+"""A training step: losses, gradients, the update of the weights, and the model's health."""
 
 from __future__ import annotations
 
@@ -13,23 +13,20 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from gamba_warp.cameras import view_angles
-from gamba_warp.conventions import GROUNDS, WHITE, over_another, over_background
+from gamba_warp.conventions import over_background
 from gamba_warp.devices import network_precision
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import all_figures, mask_iou, measure
-from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 from gamba_warp.vision.lpips import LPIPS
 
 from .data.samples import Batch
-from .objective.losses import LossInputs, loss_terms, rendered_psnr, total_loss, translucency
+from .graphs import StepGraphs
+from .objective.losses import LossInputs, loss_terms, rendered_psnr, total_loss
 from .objective.radial_mask import NEAR, project_means
 from .optim import Ema
 
+CLIP = 1.0  # largest norm of the gradient (paper, §4.1)
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
-FAR_VIEW, CLEAR = 60.0, 0.02  # degrees; alpha: see ``_far_figures``
-STRIP_VIEWS, STRIP_OBJECTS = 6, 4  # views and objects of a validation's sample pictures
 
 
 class Objective(NamedTuple):
@@ -142,10 +139,9 @@ def compute_gradients(
     batches: Iterable[Batch],
     objective: Objective,
     *,
-    clip: float,
     count: int = 1,
 ) -> Gradients:
-    """Set the parameters' gradients to the gradients of the mean loss over some batches; clip them.
+    """Set the parameters' gradients to those of the mean loss over some batches, clipped to CLIP.
 
     Several processes exchange their gradients once, with the last batch.
 
@@ -154,7 +150,6 @@ def compute_gradients(
         optimizer: the optimizer whose parameters get gradients; no step is made here.
         batches: ``count`` batches on the model's device.
         objective: as for ``forward``.
-        clip: largest norm of the gradient.
         count: number of batches, >= 1.
     """
     optimizer.zero_grad(set_to_none=True)
@@ -168,7 +163,7 @@ def compute_gradients(
             (result.loss / count).backward()
         losses.append(result.loss.detach())
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    norm = torch.nn.utils.clip_grad_norm_(parameters, clip)
+    norm = torch.nn.utils.clip_grad_norm_(parameters, CLIP)
     return Gradients(torch.stack(losses).mean(), norm, batch, result)
 
 
@@ -176,7 +171,7 @@ def update(
     optimizer: torch.optim.Optimizer,
     ema: Ema | None,
     share: float | Tensor,
-    made: Gradients,
+    grads: Gradients,
     model: Callable,
 ) -> Tensor:
     """Update the weights, unless loss or gradient is not finite on any process.
@@ -187,21 +182,80 @@ def update(
         optimizer: fused AdamW.
         ema: the average of the weights, which is updated, too; or None.
         share: ``ema.next_share()``, or a scalar tensor of it on the device.
-        made: the gradients, which the parameters have.
+        grads: the gradients, which the parameters have.
         model: as for ``compute_gradients``.
 
     Returns:
         ``[3]``: loss, norm of the gradient, and 1 if the step was skipped.
     """
-    numbers = torch.stack([made.loss, made.norm])
-    bad = 1 - numbers.isfinite().all().float()
+    stats = torch.stack([grads.loss, grads.norm])
+    bad = 1 - stats.isfinite().all().float()
     if isinstance(model, DistributedDataParallel):  # all processes must act alike
         dist.all_reduce(bad, dist.ReduceOp.MAX, model.process_group)
     vars(optimizer)["found_inf"] = bad  # as torch.amp.GradScaler sets it
     optimizer.step()
     if ema is not None:
         ema.update((1 - bad) * share)
-    return torch.cat([numbers, bad[None]])
+    return torch.cat([stats, bad[None]])
+
+
+class Step(NamedTuple):
+    """Outcome of an optimizer step.
+
+    Attributes:
+        stats: ``[3]``, see ``update``.
+        batch: the last batch.
+        result: result of ``forward`` on the last batch; the next step of a graph overwrites it.
+    """
+
+    stats: Tensor
+    batch: Batch
+    result: StepResult
+
+
+def make_step(
+    model: Callable,
+    optimizer: torch.optim.Optimizer,
+    ema: Ema | None,
+    objective: Objective,
+    accumulate: int = 1,
+    graphs: StepGraphs | None = None,
+) -> Callable[[Iterable[Batch], Mapping[str, float], float], Step]:
+    """Return the function of an optimizer step: ``(batches, weights, learning rate) -> Step``.
+
+    Args:
+        model: ``Gamba`` or a wrapper of it.
+        optimizer: fused AdamW.
+        ema: the average of the weights, or None.
+        objective: of the steps, but for its weights.
+        accumulate: number of batches of a step.
+        graphs: if given, a step of one batch is captured and repeated as a CUDA graph.
+    """
+
+    def eager(
+        batches: Iterable[Batch],
+        weights: Mapping[str, Any],
+        rate: float | Tensor,
+        share: float | Tensor,
+    ) -> Step:
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        weighted = objective._replace(weights=weights)
+        grads = compute_gradients(model, optimizer, batches, weighted, count=accumulate)
+        return Step(update(optimizer, ema, share, grads, model), grads.batch, grads.result)
+
+    def run(batches: Iterable[Batch], weights: Mapping[str, float], rate: float) -> Step:
+        share = ema.next_share() if ema else 1.0
+        if graphs is None:
+            return eager(batches, weights, rate, share)
+        (batch,) = batches
+        number, key = graphs.number, tuple(sorted(n for n, w in weights.items() if w))
+        given = {n: w if n == "novel" else number(n, w) for n, w in weights.items() if w}
+        rest = number("learning rate", rate), number("share of the average", share)
+        step = graphs.run(batch, key, lambda own: eager([own], given, *rest))
+        return step._replace(stats=step.stats.clone())  # the next step of a graph overwrites it
+
+    return run
 
 
 @torch.no_grad()
@@ -229,6 +283,14 @@ def health(result: StepResult, batch: Batch) -> dict[str, Tensor]:
     }
 
 
+def means(step: Step) -> dict[str, float]:
+    """Read the means of the loss terms of a step's last batch, and its ``health``."""
+    terms = {f"loss_{n}": term.detach().mean() for n, term in step.result.terms.items()}
+    found = terms | health(step.result, step.batch)
+    values = torch.stack([value.double() for value in found.values()]).tolist()
+    return dict(zip(found, values))
+
+
 def collapse_reason(figures: Mapping[str, float]) -> str | None:
     """Describe a collapse by the figures of ``health`` in one line; None without one."""
     if figures["target_alpha"] > 0 and figures["mean_alpha"] < 0.1 * figures["target_alpha"]:
@@ -238,101 +300,3 @@ def collapse_reason(figures: Mapping[str, float]) -> str | None:
     if figures["spread"] < 0.01:
         return f"the Gaussians sit in one point (spread {figures['spread']:.2g})"
     return None
-
-
-@torch.no_grad()
-def validate(
-    model: Gamba, batches: Iterable[Batch], objective: Objective, device: torch.device
-) -> tuple[dict[str, float], list[Tensor]]:
-    """Compute the validation's figures, as means over objects in float32.
-
-    Args:
-        model: the model; switched to eval mode, and back.
-        batches: batches of one object each on white, the input view first, from
-            ``fixed_batches``.
-        objective: as for ``forward``.
-        device: the model's device.
-
-    Returns:
-        Figures: ``loss``; ``psnr`` (dB), ``ssim``, ``mask_iou`` and, if given, ``lpips`` of whole
-        pictures on white; ``psnr_black`` and ``psnr_grey`` on these backgrounds (LPIPS on them
-        would nearly triple the time). All but ``loss`` end in ``_input`` for the input view and
-        ``_novel`` for the mean over the others, if any; pictures under 11x11 have no ``ssim``.
-        And rows ``[V, H, W, 3]`` for ``strip_of``, true above predicted for the first objects.
-    """
-    was_training = model.training
-    model.eval()
-    sums: dict[str, list[float]] = {}
-    rows: list[Tensor] = []
-    for batch in batches:
-        batch = batch.to(device)
-        result = forward(model, batch, objective)
-        measures = _measures(result, batch, objective.lpips)
-        figures = {"loss": result.loss.item()}
-        for key, values in measures.items():
-            figures[f"{key}_input"] = values[0].item()
-            if len(values) > 1:
-                figures[f"{key}_novel"] = values[1:].mean().item()
-        figures |= _far_figures(result, batch, objective.lpips)
-        for name, value in figures.items():
-            sums.setdefault(name, []).append(value)
-        if len(rows) < 2 * STRIP_OBJECTS:
-            rows += [result.target[0, :STRIP_VIEWS], result.rendering.rgb[0, :STRIP_VIEWS]]
-    model.train(was_training)
-    return {name: sum(values) / len(values) for name, values in sums.items()}, rows
-
-
-def _far_figures(
-    result: StepResult, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
-) -> dict[str, float]:
-    """Figures of views of one object more than ``FAR_VIEW`` degrees from the input; may be empty.
-
-    ``translucency_far`` is the mean over pixels that are not clear: of rendered alpha, which shows
-    a body of many faint Gaussians, and for scale of true alpha. LPIPS is on grey and on black.
-    """
-    far = view_angles(batch.cameras)[0] > FAR_VIEW
-    if not far.any():
-        return {}
-    rgb, alpha, true = (
-        result.rendering.rgb[0][far],
-        result.rendering.alpha[0][far],
-        batch.targets[0][far],
-    )
-    figures = {
-        "mask_iou_far": mask_iou(alpha[..., 0] > 0.5, true[..., 3] > 0.5).mean().item(),
-        "translucency_far": _mean_translucency(alpha[..., 0]),
-        "translucency_far_true": _mean_translucency(true[..., 3]),
-    }
-    if lpips is not None:
-        for name, grey in GROUNDS.items():
-            got = over_another(rgb, alpha, WHITE, grey).clamp(0, 1)
-            figures[f"lpips_{name}_far"] = lpips(got, over_background(true, grey)).mean().item()
-    return figures
-
-
-def _mean_translucency(alphas: Tensor) -> float:
-    """Mean over views ``[V, H, W]`` of the mean over pixels that are not clear."""
-    values = [translucency(a[a > CLEAR]).mean().item() for a in alphas if (a > CLEAR).any()]
-    return sum(values) / max(1, len(values))
-
-
-def _measures(
-    result: StepResult, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
-) -> dict[str, Tensor]:
-    """Metrics of a validation object, each ``[V+1]``."""
-    rgb, alpha, true = result.rendering.rgb[0], result.rendering.alpha[0], batch.targets[0]
-    got, want = rgb.clamp(0, 1), result.target[0]
-
-    def pictures(grey: float) -> tuple[Tensor, Tensor]:
-        if grey == WHITE:
-            return got, want
-        return over_another(rgb, alpha, WHITE, grey).clamp(0, 1), over_background(true, grey)
-
-    masks = alpha[..., 0] > 0.5, true[..., 3] > 0.5
-    side = min(want.shape[-3:-1])
-    keys = [key for key, metric in all_figures().items() if side >= metric.least_side]
-    measures = measure(pictures, masks, keys)
-    if lpips is not None:
-        terms = result.terms
-        measures["lpips"] = terms["lpips"][0] if "lpips" in terms else lpips(got, want)
-    return measures

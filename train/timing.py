@@ -20,12 +20,12 @@ from gamba_warp.vision.weights import lpips_available
 from .config import LossConfig, OptimConfig
 from .data.samples import Batch, with_foreground
 from .graphs import StepGraphs
-from .loop import CLIP
 from .objective.losses import Progress, term_weights
 from .optim import Ema, build_optimizer
-from .step import Objective, compute_gradients, update
+from .step import Objective, make_step
 
 _VIEWS, _SIZE = 3, 128  # of an object, the input view included
+_RATE = 1e-6  # the weights hardly move, so every round does the same work
 # As the shipped weights were trained at last (docs/lab/rays.md, run 28).
 _LOSSES = LossConfig(
     lpips_weight=0.35,
@@ -69,13 +69,17 @@ class Step:
         self.model = Gamba(config).to(device)
         self.optimizer = build_optimizer(self.model)
         for group in self.optimizer.param_groups:
-            group["lr"] = 1e-6  # the weights hardly move, so every round does the same work
             group["capturable"] = graph
         self.graphs = StepGraphs(device, print) if graph else None
         self.ema = Ema(self.model, OptimConfig.ema)
-        weights = term_weights(_LOSSES, Progress(1, 1.0, 0.5))
-        crop = _LOSSES.lpips_crop
-        self.objective = Objective(weights, lpips and lpips.to(device), crop, precision)
+        self.weights = term_weights(_LOSSES, Progress(1, 1.0, 0.5))
+        objective = Objective({}, lpips and lpips.to(device), _LOSSES.lpips_crop, precision)
+        self.plain = make_step(self.model, self.optimizer, self.ema, objective)
+        self.step = self.plain
+        if self.graphs is not None:
+            self.step = make_step(
+                self.model, self.optimizer, self.ema, objective, graphs=self.graphs
+            )
         views = orbit(90.0 * torch.arange(_VIEWS), 20.0, 1.8).expand(objects, -1, -1, -1)
         Ks = intrinsics(_SIZE, _SIZE).expand(objects, _VIEWS, 3, 3)
         size = config.image_size
@@ -96,16 +100,8 @@ class Step:
             self.batch = self.batch.for_gpu().to(device)
 
     def run(self) -> Tensor:
-        """Make the whole step and return loss and norm of the gradient (timed)."""
-        share = self.ema.next_share()
-        if self.graphs is None:
-            return self._step(self.batch, share)
-        given = self.graphs.number("share", share)
-        return self.graphs.run(self.batch, None, lambda batch: self._step(batch, given))
-
-    def _step(self, batch: Batch, share: float | Tensor) -> Tensor:
-        made = compute_gradients(self.model, self.optimizer, [batch], self.objective, clip=CLIP)
-        return update(self.optimizer, self.ema, share, made, self.model)
+        """Make the whole step and return loss, norm of the gradient, and 1 if skipped (timed)."""
+        return self.step([self.batch], self.weights, _RATE).stats
 
     def work(self) -> dict[str, float]:
         """Count the samples of a step, and the share of each of ``_PARTS`` in one without a graph.
@@ -118,7 +114,7 @@ class Step:
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")
         found = profile(use_device="cuda" if on_gpu else None, use_kineto=on_gpu)
         with found:
-            self._step(self.batch, 0.0)
+            self.plain([self.batch], self.weights, _RATE)
         events = found.key_averages()
         whole = sum(getattr(event, f"self_{kind}") for event in events) or 1
         shares = {

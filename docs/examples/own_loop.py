@@ -16,7 +16,8 @@ from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.config import PRESETS
 from gamba_warp.train.batches import FixedObjects, fixed_batches
 from gamba_warp.train.data.samples import choose_views, join, load_sample
-from gamba_warp.train.step import Objective, forward, validate
+from gamba_warp.train.step import Objective, compute_gradients
+from gamba_warp.train.validation import validate
 
 parser = argparse.ArgumentParser()
 parser.add_argument("data", nargs="+", type=Path)
@@ -46,15 +47,12 @@ for step in range(1, options.steps + 1):
         index = int(rng.integers(len(dataset := sets[number])))
         views = choose_views(dataset.num_views(index), 3, None, rng)
         samples.append(load_sample(dataset, index, views, config.image_size, config, torch.ones(3)))
-    loss = forward(model, join(samples, config).to(device), objective).loss
-    optimizer.zero_grad()
-    loss.backward()
-    torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+    grads = compute_gradients(model, optimizer, [join(samples, config).to(device)], objective)
     optimizer.step()
     if step % 100 == 0 or step == options.steps:
         batches = fixed_batches(held_out, config, config.image_size, {})
         figures, _ = validate(model, batches, objective, device)
-        print(step, loss.item(), figures["psnr_novel"], figures["ssim_novel"])
+        print(step, grads.loss.item(), figures["psnr_novel"], figures["ssim_novel"])
         if (score := figures["ssim_novel"]) > best:  # the best by another figure than PSNR
             best = score
             save_model(options.out / "model.safetensors", model)

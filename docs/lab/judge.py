@@ -34,7 +34,8 @@ from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import posed_input
 from gamba_warp.train.batches import FixedObjects, fixed_batches
-from gamba_warp.train.step import Objective, validate
+from gamba_warp.train.step import Objective
+from gamba_warp.train.validation import validate
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.vision.lpips import load_lpips
 

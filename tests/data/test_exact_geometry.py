@@ -94,7 +94,7 @@ def test_a_whole_step_rounds_in_the_network_alone(cameras, tmp_path, monkeypatch
     weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "lpips": 0.0, "rdist": 0.1}
     optimizer = torch.optim.SGD([cloud.means], lr=0.1)
     with Products() as seen:
-        made = compute_gradients(lambda *_: cloud, optimizer, [batch], Objective(weights), clip=1.0)
+        made = compute_gradients(lambda *_: cloud, optimizer, [batch], Objective(weights))
         health(made.result, batch)
     assert not seen.rounded and made.norm > 0
 

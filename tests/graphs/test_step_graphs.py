@@ -12,8 +12,12 @@ from helpers import micro
 
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train import graphs
-from gamba_warp.train.batches import open_data
-from gamba_warp.train.loop import Trainer
+from gamba_warp.train.batches import Batches, open_data
+from gamba_warp.train.checkpoint import RunState, Setup
+from gamba_warp.train.log import NoLog
+from gamba_warp.train.loop import Outcomes
+from gamba_warp.train.objective.losses import Progress, term_weights
+from gamba_warp.train.step import Objective, make_step, means
 
 from .recording import RecordedGraphs
 
@@ -35,7 +39,7 @@ def squares(got, want):
 
 
 def trained(data, out, kind, most):
-    """Train with at most so many graphs; return the trainer and its losses.
+    """Train with at most so many graphs; return the state, the graphs, and each step's figures.
 
     As on a GPU, a step's numbers are read with the next step, whose graph has overwritten its own.
     """
@@ -44,42 +48,51 @@ def trained(data, out, kind, most):
     optim = {"ema": 0.9, "lr": 1e-2, "warmup_steps": 1}
     length = {"steps": STEPS}
     config = micro.options(data, out, model, loss=loss, optim=optim, length=length)
+    setup = Setup(config, open_data(config), micro.ALONE)
     torch.manual_seed(1)
-    trainer = Trainer(config, Gamba(config.model_config()), open_data(config), micro.ALONE, lpips)
-    take = trainer._batches.take
-
-    def whole(number):  # pictures' stems, as on a GPU
-        batch = take(number)
-        own = batch.foreground and replace(batch.foreground, boxes=[])
-        targets = batch.targets + (torch.nan if number == BAD else 0)
-        return replace(batch, foreground=own, targets=targets)
-
-    trainer._batches.take = whole
-    trainer._read_steps = lambda late=0: Trainer._read_steps(trainer, 1)
-    optimizer, ema = trainer.optimizer, trainer.ema.model
-    trainer.graphs = RecordedGraphs(
+    state = RunState.begin(Gamba(config.model_config()).train(), setup)
+    kept = RecordedGraphs(
         lambda: [
-            *trainer.parameters,
-            *ema.parameters(),
-            *(x for entry in optimizer.state.values() for x in entry.values()),
+            *state.model.parameters(),
+            *state.result.parameters(),
+            *(x for entry in state.optimizer.state.values() for x in entry.values()),
         ],
         most,
     )
-    trainer.model.train()
-    figures = [trainer.train_step() for _ in range(STEPS)]
-    trainer._batches.close()
-    return trainer, figures
+    objective = Objective({}, lpips, config.loss.lpips_crop)
+    step = make_step(state.model, state.optimizer, state.ema, objective, graphs=kept)
+    batches, outcomes = (
+        Batches(setup.data, config, micro.ALONE, lambda number: 2, STEPS),
+        Outcomes(state, micro.ALONE, NoLog()),
+    )
+    figures = []
+    for number in range(STEPS):
+        batch = batches.take(number)  # with images' stems, as on a GPU
+        own = batch.foreground and replace(batch.foreground, boxes=[])
+        targets = batch.targets + (torch.nan if number == BAD else 0)
+        progress = Progress(number, number / setup.steps_per_epoch, number / STEPS)
+        outcome = step(
+            [replace(batch, foreground=own, targets=targets)],
+            term_weights(config.loss, progress),
+            config.optim.lr * state.schedule.share(number, 0.0),
+        )
+        state.step += 1
+        outcomes.add(outcome.stats)
+        figures.append(means(outcome) | {"late": outcomes.read(1)})
+    outcomes.read()
+    batches.close()
+    return state, kept, figures
 
 
 @pytest.mark.parametrize("kind", ["rays", "bins"])
 def test_repeated_steps_have_the_same_bits(data, tmp_path, kind):
-    one, wanted = trained(data, tmp_path / "one", kind, 0)
-    other, got = trained(data, tmp_path / "other", kind, 64)
-    assert one.graphs.replays == 0 and other.graphs.replays >= STEPS // 2
-    assert not other.graphs.said
+    one, none, wanted = trained(data, tmp_path / "one", kind, 0)
+    other, kept, got = trained(data, tmp_path / "other", kind, 64)
+    assert none.replays == 0 and kept.replays >= STEPS // 2
+    assert not kept.said
     assert one.skipped == other.skipped == 1
     for a, b in zip(wanted, got, strict=True):
-        for name in a.keys() - {"seconds", "wait_share", "views_per_second"}:
+        for name in a:
             np.testing.assert_equal(b[name], a[name], name)  # of the bad step they are NaN
     for name, model in one.models.items():
         theirs = other.models[name].state_dict()
@@ -185,12 +198,10 @@ def test_a_step_that_cannot_be_captured_runs_as_before(data, tmp_path, monkeypat
     def refuse(self, run):
         raise RuntimeError("operation not permitted\nwhen stream is capturing")
 
-    one, _ = trained(data, tmp_path / "one", "bins", 0)
+    one, _, _ = trained(data, tmp_path / "one", "bins", 0)
     monkeypatch.setattr(RecordedGraphs, "_record", refuse)
-    other, _ = trained(data, tmp_path / "other", "bins", 64)
-    assert other.graphs.replays == 0
-    assert other.graphs.said == [
-        "no CUDA graph of a step: operation not permitted; steps run one by one"
-    ]
+    other, kept, _ = trained(data, tmp_path / "other", "bins", 64)
+    assert kept.replays == 0
+    assert kept.said == ["no CUDA graph of a step: operation not permitted; steps run one by one"]
     for name, value in one.model.state_dict().items():
         assert torch.equal(value, other.model.state_dict()[name]), name

@@ -11,12 +11,12 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
 from gamba_warp.render import render
-from gamba_warp.train import loop
+from gamba_warp.train import checkpoint
 from gamba_warp.train.config import TrainConfig
 from gamba_warp.train.ddp import World
-from gamba_warp.train.run import train
+from gamba_warp.train.loop import train
 
-loop.KEPT = 9  # tests compare the checkpoints of all steps of short runs
+checkpoint.KEPT = 9  # tests compare the checkpoints of all steps of short runs
 ALONE = World(0, 1, torch.device("cpu"))
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 SIZE = 16

@@ -218,12 +218,12 @@ def released(result, path, out):
     config(settings, path, out)
 
 
-def fingerprint(trainer):
-    """A hash of the state that a trainer restores."""
-    digest = hashlib.sha256(repr([trainer.step, trainer.skipped, trainer.elapsed]).encode())
-    state = [trainer.model.state_dict(), trainer.optimizer.state_dict()["state"]]
-    state.append(trainer.ema.model.state_dict() if trainer.ema else {})
-    for name, value in sorted(_flat(state).items()):
+def fingerprint(state):
+    """A hash of the state of a run."""
+    digest = hashlib.sha256(repr([state.step, state.skipped, state.elapsed]).encode())
+    parts = [state.optimizer.state_dict()["state"]]
+    parts += [model.state_dict() for model in state.models.values()]
+    for name, value in sorted(_flat(parts).items()):
         digest.update(name.encode())
         digest.update(value.detach().numpy().tobytes() if hasattr(value, "detach") else b"")
     return digest.hexdigest()

@@ -30,7 +30,7 @@ from gamba_warp.model.encoders import read_state
 from gamba_warp.model.released import convert_released
 from gamba_warp.photo.cutout import CutoutOptions, cut_out
 from gamba_warp.photo.matte import Matte
-from gamba_warp.train.checkpoint import find_checkpoint
+from gamba_warp.train.checkpoint import damage
 from gamba_warp.train.data.shards import Shards
 from gamba_warp.trajectories.files import load_path
 from gamba_warp.viewer.page import write_viewer
@@ -108,22 +108,22 @@ def _shards(path: Path, out: Path) -> Any:
 
 
 @functools.lru_cache(1)
-def _trainer() -> Any:
-    return seeds.trainer(Path(tempfile.mkdtemp(prefix="trainer-")))
+def _run() -> Any:
+    return seeds.new_run(Path(tempfile.mkdtemp(prefix="run-")))
 
 
 def _training(path: Path, out: Path) -> Any:
-    trainer = _trainer()
-    before = checks.fingerprint(trainer)
-    found = find_checkpoint(trainer.config.run.out, str(path))
+    setup, state = _run()
+    before = checks.fingerprint(state)
+    damage(path)  # read by itself, so that the state behind wrong checksums is read, too
     try:
-        trainer.restore(found)
+        state.restore(path, setup)
     except Exception:
-        if checks.fingerprint(trainer) != before:
-            _trainer.cache_clear()
+        if checks.fingerprint(state) != before:
+            _run.cache_clear()
             raise AssertionError("refused, but a part of it is loaded already") from None
         raise
-    return trainer
+    return state
 
 
 def _plan(path: Path, out: Path) -> Any:

@@ -31,7 +31,7 @@ from gamba_warp.model.config import PRESETS
 from gamba_warp.model.encoders import ImageEncoder
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.batches import open_data
-from gamba_warp.train.loop import Trainer
+from gamba_warp.train.checkpoint import RunState, Setup
 from gamba_warp.train.sources.pack import write_pack
 
 Files = dict[str, bytes]
@@ -394,26 +394,26 @@ def released() -> Kinds:
     return {"released": {"released.pth": theirs(model)}}
 
 
-def trainer(folder: Path) -> Trainer:
-    """A trainer on a dataset of one object, written into a folder."""
+def new_run(folder: Path) -> tuple[Setup, RunState]:
+    """A run on a dataset of one object, written into a folder, before its first step."""
     parts = {"version": 1, "train": ["chair"], "val": [], "test": []}
     put({**transforms("chair"), "split.json": as_json(parts)}, folder / "data")
     views = {"batch_size": 1, "size": 8, "views_per_object": 1}
     config = micro.options(folder / "data", folder / "run", TINY_SET, views=views)
     torch.manual_seed(0)
-    model = Gamba(config.model_config())
-    return Trainer(config, model, open_data(config), micro.ALONE, None)
+    setup = Setup(config, open_data(config), micro.ALONE)
+    return setup, RunState.begin(Gamba(config.model_config()), setup)
 
 
 def checkpoints() -> Kinds:
     """A checkpoint of training, whose optimizer has made one step."""
     with tempfile.TemporaryDirectory() as name:
-        made = trainer(Path(name))
-        for parameter in made.parameters:
+        setup, state = new_run(Path(name))
+        for parameter in state.model.parameters():
             parameter.grad = torch.full_like(parameter, 1e-3)
-        made.optimizer.step()
-        made.step = 1
-        made.save()
+        state.optimizer.step()
+        state.step = 1
+        state.save(setup)
         folder = next((Path(name) / "run" / "checkpoints").iterdir())
         files = sorted(folder.iterdir(), key=lambda path: path.name != "state.pt")
         return {"checkpoint": {path.name: path.read_bytes() for path in files}}

@@ -10,7 +10,7 @@ from helpers.refusals import refused, refused_command
 
 from gamba_warp import cli
 from gamba_warp.model.config import PRESETS
-from gamba_warp.train import command, loop, optim
+from gamba_warp.train import command, optim, step
 from gamba_warp.train.command import expand
 from gamba_warp.train.config import TrainConfig, command_line
 from gamba_warp.train.objective import losses
@@ -34,7 +34,7 @@ PAPER = [
 ]
 CONSTANTS = [
     (optim.WEIGHT_DECAY, 0.05, "§4.1: and a weight decay of 0.05"),
-    (loop.CLIP, 1.0, "§4.1: Gradient clipping of value 1.0 ... the L2 norm of gradients"),
+    (step.CLIP, 1.0, "§4.1: Gradient clipping of value 1.0 ... the L2 norm of gradients"),
     (optim.FIRST_VIEWS, 2, "§3.3: we progressively increase the number of views from 2"),
     (optim.LAST_VIEWS, 6, "§3.3: to 6 during training"),
     (losses.RDIST_WEIGHT, 0.1, "§4.1: λ_rdist ... is initially set at 0.1"),

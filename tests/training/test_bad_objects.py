@@ -7,7 +7,7 @@ from helpers.micro import ALONE, lines
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
 from gamba_warp.train.batches import Batches, FixedObjects, fixed_batches, open_data
-from gamba_warp.train.run import train
+from gamba_warp.train.loop import train
 
 
 @pytest.fixture

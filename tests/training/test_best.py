@@ -5,7 +5,7 @@ import torch
 from helpers import micro
 from helpers.views import eval_views
 
-from gamba_warp.train import loop
+from gamba_warp.train import validation
 from gamba_warp.train.checkpoint import list_checkpoints
 
 
@@ -41,7 +41,7 @@ def scripted(monkeypatch, figures):
         for psnr in figures
         for more in (90 - 2 * psnr, 0)
     )
-    monkeypatch.setattr(loop, "validate", lambda *_: next(told))
+    monkeypatch.setattr(validation, "validate", lambda *_: next(told))
 
 
 def test_the_best_is_by_novel_views(data, tmp_path, monkeypatch):

@@ -81,13 +81,10 @@ def test_other_losses_are_refused_and_init_is_named(data, done, tmp_path, capsys
     init = list_checkpoints(done)[-1]
     capsys.readouterr()
     assert run(data, tmp_path / "new", run={"init": init}, **other) == 0
-    (said,) = [s for s in capsys.readouterr().out.splitlines() if s.startswith("starts from")]
-    assert f"weights of {init / 'ema.safetensors'}, of a run with other " in said
-    assert "loss.novel_weight (1.0 there, 0.5 here)" in said and "length.steps (8" in said
-    assert "optim" not in said and "run." not in said
+    assert f"starts from the weights of {init / 'ema.safetensors'}\n" in capsys.readouterr().out
 
 
-def test_init_takes_a_checkpoint_a_run_or_a_model(data, done, tmp_path, capsys):
+def test_init_takes_a_checkpoint_a_run_or_a_model(data, done, tmp_path):
     newest = list_checkpoints(done)[-1]
     finished = tmp_path / "moved"  # a finished run without its checkpoints
     finished.mkdir()
@@ -98,7 +95,6 @@ def test_init_takes_a_checkpoint_a_run_or_a_model(data, done, tmp_path, capsys):
         out = tmp_path / str(number)
         assert run(data, out, run={"init": source}, **STILL) == 0
         assert same_weights(out / "model.safetensors", wanted)
-    assert "their run is not known" in capsys.readouterr().out
     for file in ("ema.safetensors", "model.safetensors"):
         assert not same_weights(newest / file, list_checkpoints(done)[0] / file)
     refused("holds neither a model nor a checkpoint", run, data, tmp_path / "x", run={"init": data})

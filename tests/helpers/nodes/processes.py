@@ -60,7 +60,7 @@ def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -
     commands = []
     for rank, own in enumerate(arguments):
         script = f"{(patch or {}).get(rank, '')}\nimport sys\nfrom gamba_warp import cli\n"
-        script += "from gamba_warp.train import loop\nloop.KEPT = 9\n"
+        script += "from gamba_warp.train import checkpoint\ncheckpoint.KEPT = 9\n"
         script += "cli.main(['train', *sys.argv[1:]])\n"
         commands.append([python(), "-c", script, *own])
     return run_all(commands)

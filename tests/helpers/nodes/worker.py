@@ -15,21 +15,21 @@ import torch
 import tyro
 
 from gamba_warp.errors import UserError
-from gamba_warp.train import loop
+from gamba_warp.train import checkpoint
 from gamba_warp.train.config import TrainConfig
 from gamba_warp.train.ddp import world
-from gamba_warp.train.run import train
+from gamba_warp.train.loop import train
 from helpers.disk import full_at
 
 
 def main() -> None:
     plan, result = map(Path, sys.argv[1:])
     torch.set_num_threads(1)
-    loop.KEPT = 9
+    checkpoint.KEPT = 9
     ends = {}
     with world("cpu") as place:
         if not place.main:  # as if each had its own disk: only the first can read a checkpoint
-            loop.read_run = None
+            checkpoint.read_run = None
         for name, arguments, limits in json.loads(plan.read_text()):
             if name == "copy":
                 with place.together():
