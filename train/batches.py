@@ -12,7 +12,11 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -42,6 +46,7 @@ from .ddp import World
 
 _TRIES = 100  # objects tried in turn until one can be read
 VAL_VIEWS = 4  # novel views of an object in a validation
+_READ, _SIZED = 16, 4096  # objects whose first image, and sizes of files, are in a digest
 
 
 class FixedObjects(NamedTuple):
@@ -85,6 +90,48 @@ class TrainingData:
             else [str(self.shards.count), *(url.rpartition("/")[2] for url in self.shards.urls)]
         )
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
+
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        """Hashes of the content: of each object, of several in a large set, or of each shard here.
+
+        Of an object its cameras; of up to ``_SIZED`` objects the sizes of all files; of up to
+        ``_READ`` the first image. Times are left out, since copies have others.
+        """
+        if self.shards is not None:
+            urls = [url for url in self.shards.urls if "://" not in url]
+            return {os.path.basename(url): str(_size(url)) for url in urls}
+        chosen, found = sorted(set(self.objects)), {}
+        read, sized = (set(evenly(chosen, count)) for count in (_READ, _SIZED))
+        step = max(1, math.ceil(len(chosen) / _SIZED))
+        for part in (chosen[at : at + step] for at in range(0, len(chosen), step)):
+            digest = hashlib.sha256()
+            for index in part:
+                digest.update(self.train.digest(index).encode())
+                if index in sized:
+                    files = self.train.files(index)
+                    kinds = filter(None, (files.images, files.masks, files.depths, files.backs))
+                    paths = [path for path in chain.from_iterable(kinds) if isinstance(path, Path)]
+                    digest.update(repr([_size(path) for path in paths]).encode())
+                    if index in read and paths:
+                        with suppress(OSError):  # the training reports it when it matters
+                            digest.update(paths[0].read_bytes())
+            names = dict.fromkeys(self.train.uids[index] for index in (part[0], part[-1]))
+            found[" to ".join(names)] = digest.hexdigest()[:16]
+        return found
+
+    @property
+    def content(self) -> str:
+        """Hash of ``digests``; a run with other images of the same names is another run."""
+        return hashlib.sha256(repr(self.digests).encode()).hexdigest()[:16]
+
+
+def _size(path: str | Path) -> int:
+    """Bytes of a file; -1 if it cannot be read."""
+    try:
+        return os.stat(path).st_size
+    except OSError:
+        return -1
 
 
 def open_data(config: TrainConfig) -> TrainingData:

@@ -148,6 +148,7 @@ class RunState:
             "version": STATE_VERSION,
             "config": setup.config.to_dict(),
             "objects": setup.data.fingerprint,
+            "content": setup.data.content,
             "step": self.step,
             "skipped": self.skipped,
             "skipped_in_row": self.skipped_in_row,
@@ -208,6 +209,7 @@ class Stored(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     version: int
     config: dict[str, Any]
     objects: str
+    content: str = ""  # unknown
     step: _Count
     skipped: _Count
     skipped_in_row: _Count
@@ -398,6 +400,9 @@ def read_run(checkpoint: Path, setup: Setup) -> tuple[Stored, LengthConfig]:
     if stored.objects != setup.data.fingerprint:
         names = f"{stored.objects[:80]} there, {setup.data.fingerprint} here"
         differing.append(f"objects ({names})")
+    elif stored.content not in ("", setup.data.content):
+        names = f"{stored.content[:80]} there, {setup.data.content} here"
+        differing.append(f"images and cameras of these objects ({names})")
     if config.views.made and stored.world_size != processes:
         differing.append(f"world_size ({stored.world_size} there, {processes} here)")
     there = plan.views.batch_size * plan.views.accumulate * stored.world_size

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import math
 import socket
 import sys
 from collections.abc import Callable, Mapping
@@ -12,8 +10,6 @@ from pathlib import Path
 
 import torch
 
-from gamba_warp.batch import EXPECTED
-from gamba_warp.data.dataset import evenly
 from gamba_warp.devices import precision_note
 from gamba_warp.errors import UserError
 from gamba_warp.files import only_process, output_folder, sweep, write_json
@@ -26,33 +22,15 @@ from .log import NoLog, RunLog, say
 
 _COMPUTE = ("torch", "warp-lang", "numpy", "pillow", "kornia", "timm")
 _PYTHON = ".".join(map(str, sys.version_info[:2]))
-_PICTURES = 16  # objects whose first picture is compared between processes
-_DIGESTS = 4096  # compared between processes: of one object each, or of several in a large set
 
 
 def facts_of(setup: Setup, lpips: bool) -> Mapping[str, dict[str, object]]:
-    """Return the facts that all processes must have in common, see ``World.agree``.
-
-    For the data: a hash per object, or of several, of the cameras and, for some objects, of the
-    first picture.
-    """
+    """Return the facts that all processes must have in common, see ``World.agree``."""
     config, data, world = setup
-    chosen, contents = sorted(set(data.objects)) if data.shards is None else [], {}
-    read, size = evenly(chosen, _PICTURES), max(1, math.ceil(len(chosen) / _DIGESTS))
-    for part in (chosen[at : at + size] for at in range(0, len(chosen), size)):
-        digest = hashlib.sha256()
-        for index in part:
-            digest.update(data.train.digest(index).encode())
-            if index in read:
-                with contextlib.suppress(*EXPECTED):  # the training reports it when it matters
-                    picture = data.train.load(index, [0], depths=0).images
-                    digest.update(picture.numpy().tobytes())
-        names = dict.fromkeys(data.train.uids[index] for index in (part[0], part[-1]))
-        contents[" to ".join(names)] = digest.hexdigest()[:16]
     known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
     return {
         "options": {**options_of_all(config.to_dict()), **known},
-        "data": contents,
+        "data": {**data.digests},
         "versions": {"gamba-warp": __version__, "python": _PYTHON, **installed(*_COMPUTE)},
     }
 

@@ -14,9 +14,10 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from gamba_warp.errors import UserError
+from gamba_warp.files import sha256
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.train import config as options
-from gamba_warp.train.checkpoint import list_checkpoints
+from gamba_warp.train.checkpoint import list_checkpoints, save_checkpoint
 from gamba_warp.train.config import command_line, config_differences
 from gamba_warp.train.step import weigh_views
 
@@ -82,6 +83,31 @@ def test_other_losses_are_refused_and_init_is_named(data, done, tmp_path, capsys
     capsys.readouterr()
     assert run(data, tmp_path / "new", run={"init": init}, **other) == 0
     assert f"starts from the weights of {init / 'ema.safetensors'}\n" in capsys.readouterr().out
+
+
+def test_other_images_of_the_same_names_are_refused(data, done, tmp_path):
+    """A copy, whose files have other times, resumes; a checkpoint that knows no content does."""
+    other, groups = tmp_path / "clouds", {"length": {"steps": 9}, "optim": {"ema": 0.5}}
+    shutil.copytree(data, other, copy_function=shutil.copyfile)
+    last = list_checkpoints(done)[-1]
+    assert run(other, tmp_path / "a", run={"resume": str(last)}, **groups) == 0
+    image = other / "cloudb" / "004.png"
+    shutil.copyfile(other / "cloudc" / "004.png", image)
+    assert image.stat().st_size != (data / "cloudb" / "004.png").stat().st_size
+    words = r"images and cameras of these objects \(\w+ there, \w+ here\)"
+    refused(words, run, other, tmp_path / "b", run={"resume": str(last)}, **groups)
+    state = torch.load(last / "state.pt", weights_only=True)
+    del state["content"]
+    older = save_checkpoint(tmp_path / "older", 8, {}, state, keep=1)
+    for name in ("model", "ema"):
+        shutil.copy(last / f"{name}.safetensors", older)
+    sums = {path.name: sha256(path) for path in older.iterdir() if path.suffix != ".json"}
+    (older / "checksums.json").write_text(json.dumps(sums))
+    assert run(other, tmp_path / "c", run={"resume": str(older)}, **groups) == 0
+    first = other / "clouda" / "000.png"  # an image of the same size
+    first.write_bytes(bytes([*first.read_bytes()[:-1], 0]))
+    resumed = {"resume": str(list_checkpoints(tmp_path / "c")[-1])}
+    refused(words, run, other, tmp_path / "d", run=resumed, **groups)
 
 
 def test_init_takes_a_checkpoint_a_run_or_a_model(data, done, tmp_path):
