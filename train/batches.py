@@ -162,7 +162,10 @@ def open_data(config: TrainConfig) -> TrainingData:
     if not objects:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
     if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
-        raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
+        line = f"{config.data} has no depth images (gamba data render --depth)"
+        if config.run.recipe is None:
+            raise UserError(f"--depth-weight: {line}")
+        notes.append(f"{line}: its objects are trained without the loss of depth")
     if note := camera_note(train):
         raise UserError(f"{config.data}: {note}")
     notes += filter(None, [background_note(train)])

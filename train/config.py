@@ -164,8 +164,9 @@ class RunConfig:
             override them, and so does DATA if it comes first; without --out that run itself is
             resumed.
         recipe: Set of options: "paper" is the paper's training, with 256 objects a step over all
-            processes; "tiny" or "rays" is the shipped model's, at its size. Further options
-            override it; with --help it shows the recipe's options and their sources.
+            processes; "rays" is the shipped model's network in one run; "tiny" is a small model
+            with the paper's decoder, to compare with. Further options override it; with --help it
+            shows the recipe's options and their sources.
         resume: "auto" resumes from the newest checkpoint of the run folder; else "never", or the
             path of a checkpoint. The number of processes may be another one, if --batch-size and
             --accumulate keep the number of objects a step.

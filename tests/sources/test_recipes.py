@@ -1,7 +1,10 @@
 """``gamba train --recipe``: every number of the paper, batches over processes, and priority."""
 
 import json
+import re
 import shlex
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import tyro
@@ -16,6 +19,7 @@ from gamba_warp.train.config import TrainConfig, command_line
 from gamba_warp.train.objective import losses
 from gamba_warp.train.recipes import RECIPES, recipe_words, table_of
 
+ROOT = Path(__file__).parents[2]
 # Each number of the paper's training, quoted from its text.
 PAPER = [
     ("views.size", 512, "not stated; the side of the input, §4.1, and of G-Objaverse"),
@@ -117,11 +121,30 @@ def test_a_given_option_wins_wherever_it_stands():
 
 
 def test_the_shipped_models_recipe():
-    config = parse("data", "--recipe", "tiny")
+    config, card = parse("data", "--recipe", "rays"), (ROOT / "docs/model-card.md").read_text()
     assert config.preset == "rays" and config.model_config() == PRESETS["rays"]
-    assert RECIPES["tiny"] is RECIPES["rays"]
-    assert (config.length.steps, config.views.batch_size, config.views.size) == (19250, 4, 128)
-    assert config.loss.depth_weight == 0.3 and not config.loss.radial_mask
+    assert (config.length.steps, config.views.batch_size, config.optim.lr) == (5500, 16, 3e-4)
+    shipped = re.search(r"gamba train (.*?)```", card, re.DOTALL)[1].replace("\\\n", "")
+    shipped = parse(*shlex.split(shipped))  # its losses are those of the recipe from the start
+    assert config.loss == replace(shipped.loss, lpips_after=1500)
+    for name in ("front_share", "mirror", "recolor", "made", "background", "views_per_object"):
+        assert getattr(config.views, name) == getattr(shipped.views, name), name
+    assert "not measured" in RECIPES["rays"].about
+
+
+def test_the_small_models_recipe_is_its_command():
+    command = json.loads((ROOT / "starter/tiny.json").read_text())["command"]
+    recipe, wanted = parse("data", "--recipe", "tiny"), parse(*shlex.split(command)[2:])
+    assert replace(recipe, data=wanted.data, run=wanted.run) == wanted
+
+
+def test_the_recipe_takes_data_without_depth(tmp_path, capsys):
+    data = micro.write_dataset(tmp_path / "data")
+    words = [str(data), "--recipe", "rays", "--set", *micro.MODEL, "ray_cells=4", "ray_features=8"]
+    words += ["--batch-size", "2", "--steps", "1", "--size", "16", "--lpips", "off", "--made", "0"]
+    words += ["--lpips-crop", "0", "--device", "cpu", "--out", str(tmp_path / "run")]
+    assert cli.run("train", words) == 0
+    assert "has no depth images (gamba data render --depth): its" in capsys.readouterr().out
 
 
 def test_a_run_records_its_recipe(tmp_path, capsys):
@@ -150,7 +173,7 @@ def test_help_shows_what_a_recipe_sets(capsys):
 @pytest.mark.parametrize(
     "words, reason",
     [
-        (["--recipe", "rats"], "--recipe rats: expected one of paper, tiny, rays"),
+        (["--recipe", "rats"], "--recipe rats: expected one of paper, rays, tiny"),
         (["--recipe", "rats", "--help"], "--recipe rats: expected one of"),
         (["--recipe"], "--recipe: expected a recipe's name"),
         (["--recipe", "tiny", "--config", "run"], "--recipe and --config: give one of them"),

@@ -180,5 +180,5 @@ def test_bad_use_is_said_in_one_line(tmp_path):
     clouds = micro.write_dataset(tmp_path / "clouds")
     with pytest.raises(UserError, match='needs the decoder "rays"'):
         run(clouds, tmp_path / "out", loss={"lpips": "off", "depth_weight": 1.0})
-    with pytest.raises(UserError, match="has no depth pictures"):
+    with pytest.raises(UserError, match="has no depth images"):
         run(clouds, tmp_path / "out", RAYS, loss={"lpips": "off", "depth_weight": 1.0})
