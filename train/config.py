@@ -179,6 +179,8 @@ class RunConfig:
         val_objects: Held-out objects to validate on, and as many training objects beside them.
         save_every: Steps between two checkpoints; one is always saved at the end, and the last two
             are kept.
+        save_minutes: Minutes after which a checkpoint is saved anyway, so that a run that is killed
+            loses no more.
         device: Device to train on; "auto" is the GPU if there is one.
         threads: Number of CPU threads; all cores if not given.
         recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
@@ -198,6 +200,7 @@ class RunConfig:
     val_every: _Every = 500
     val_objects: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
     save_every: _Count = 500
+    save_minutes: Minutes | None = None
     device: DeviceChoice = "auto"
     threads: Threads | None = None
     recompute: bool = False

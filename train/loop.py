@@ -99,6 +99,7 @@ def train(config: TrainConfig, world: World) -> int:
         model.train()
         bar = run_bar(total, minutes, state.step, state.elapsed / 60, world.main)
         first, began, collapsed = state.step, time.monotonic() - state.elapsed, False
+        saved = state.elapsed
         stops = stop_requests(insist=True)
         with stops as received, contextlib.closing(bar), contextlib.closing(batches):
             while True:
@@ -118,9 +119,11 @@ def train(config: TrainConfig, world: World) -> int:
                 tuned = state.step == 0 and run.init is not None  # compared with its beginning
                 if run.val_every and (due or tuned or (over and not stop)):
                     world.on_main(partial(validator.run, state, progress))
-                if stop or over or (new and state.step % run.save_every == 0):
+                waits = run.save_minutes and state.elapsed - saved >= 60 * run.save_minutes
+                if stop or over or (new and (waits or state.step % run.save_every == 0)):
                     outcomes.read()
                     world.on_main(partial(state.save, setup))
+                    saved = state.elapsed
                 if stop or over:
                     break
 

@@ -3,23 +3,26 @@
 # From the root of a checkout:
 #
 #   docs/lab/gpu_train.sh pack PACK DATA...                 here; PACK gets part.000, part.001, ...
+#   docs/lab/gpu_train.sh check PACK                        here: imports from the pack and torch alone
 #   docs/lab/gpu_train.sh train PACK MINUTES OUT [OPTION]   there, with the parts in PACK
 #
 # DATA are datasets of `gamba data render --depth`; the first is the one to train on, the others
-# follow --extra. OUT gets weights (float16), log.jsonl and the lines of the run. OPTIONs go to
-# `gamba train`; the last of each name counts. In the environment: PYTHON (of the machine, 3.12),
-# PART (MiB of a part, 30), VIEWS and DEPTHS (kept of each object, 10 and 3), OBJECTS (of each
-# dataset at most), BATCH (objects a step, 64).
+# follow --extra. OUT gets weights (float16), log.jsonl and the lines of the run; its run folder is
+# PACK/run, with a checkpoint every two minutes: after a kill the same line goes on. OPTIONs go to
+# `gamba train` and replace the script's. In the environment: PYTHON (of the machine, 3.12),
+# PART (MiB of a part, 30), VIEWS and DEPTHS (kept of each object, 10 and 3), OBJECTS (of
+# each dataset at most), BATCH (objects a step, 64), ARCH (of the GPU, 90).
 set -euo pipefail
 task=${1:-} pack=${2:-}
-[ -n "$pack" ] && [ -f setup.cfg ] || { sed -n '2,13s/^# \{0,1\}//p' "$0" >&2; exit 2; }
+[ -n "$pack" ] && [ -f setup.cfg ] || { sed -n '2,16s/^# \{0,1\}//p' "$0" >&2; exit 2; }
 
 make_pack() {
   local made=$pack/made version=${PYTHON:-3.12} python=.venv/bin/python
   rm -rf "$pack" && mkdir -p "$made/site" "$pack/wheels"
   local platforms=() name
   for name in _2_28 _2_27 _2_17 2014 1; do platforms+=(--platform "manylinux${name}_x86_64"); done
-  for name in warp-lang msgspec tyro docstring-parser typeguard typing-extensions kornia kornia_rs packaging; do
+  for name in warp-lang msgspec tyro docstring-parser typeguard typing-extensions kornia kornia_rs packaging \
+    safetensors pillow tqdm filelock; do
     $python -m pip download -q --no-deps --only-binary=:all: "${platforms[@]}" \
       --python-version "$version" --implementation cp -d "$pack/wheels" \
       "$name==$($python -m pip show "$name" 2>/dev/null | sed -n 's/^Version: //p')"
@@ -76,9 +79,82 @@ for root in map(Path, sys.argv[2:]):
     print(root.name, len(uids), "objects")
 END
   printf '%s\n' "${@##*/}" >"$made/data/order"
-  tar -C "$made" --sort=name -cf - . | xz -1 -T0 | split -b "${PART:-30}M" -d -a 3 - "$pack/part."
+  compile_kernels "$made/kernels"
+  tar -C "$made" --sort=name -czf - . | split -b "${PART:-30}M" -d -a 3 - "$pack/part."
   rm -rf "$made"
   du -h "$pack"/part.* | sed 's/^/  /'
+}
+
+# The kernels of a step of BATCH objects, compiled for the GPU: a step on torch's fake tensors tells
+# which. Other shapes are compiled there when they occur.
+compile_kernels() {
+  PYTHONPATH=$PWD:$PWD/tests WARP_CACHE_PATH=$1 .venv/bin/python -W ignore - "${BATCH:-64}" "${ARCH:-90}" <<'END'
+import sys
+
+import torch
+import warp as wp
+from graphs.test_training_step import TERMS, batch_of
+from ptx import dry_run
+
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.train.step import Objective, forward
+
+batch, architecture = map(int, sys.argv[1:])
+weights = TERMS["rays"][0] | {"mask_l1": 0.25}
+objective = Objective(weights, lambda got, want: (got - want).abs().mean((-3, -2, -1)), 64)
+config, done = PRESETS["rays"], set()
+with dry_run.dry_run() as launches:
+    with torch.device("cuda"):
+        model, inputs = Gamba(config), batch_of(config, batch, 4, 128)
+    dry_run.run_backward([forward(model, inputs, objective).loss])
+for launch in launches:
+    module = launch.kernel.module
+    if (module, launch.block) not in done:
+        done.add((module, launch.block))
+        module.options["block_dim"] = launch.block
+        wp.compile_aot_module(module, arch=architecture, use_ptx=False)
+print(len(done), "modules of kernels compiled")
+END
+}
+
+# Import what the training needs from the pack, this checkout, and torch and numpy with what they need.
+check() {
+  room=$(mktemp -d)
+  trap 'rm -rf "$room"' EXIT
+  cat "$pack"/part.* | tar -C "$room" -xzf -
+  .venv/bin/python - "$room/image" <<'END'
+import re
+import sys
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+folder, waiting, done = Path(sys.argv[1]), ["torch", "numpy"], set()
+folder.mkdir()
+while waiting:
+    name = re.match(r"[\w.-]+", waiting.pop())[0]
+    try:
+        found = distribution(name)
+    except PackageNotFoundError:  # of another system
+        continue
+    if name not in done:
+        done.add(name)
+        waiting += [line for line in found.requires or () if "extra ==" not in line]
+        for top in {file.parts[0] for file in found.files or ()} - {"..", "__pycache__"}:
+            (folder / top).exists() or (folder / top).symlink_to(found.locate_file(top))
+END
+  PYTHONPATH=$room/site:$PWD:$room/image GAMBA_CACHE=$room .venv/bin/python -S -W ignore - "$room" <<'END'
+import sys
+from importlib import import_module
+from pathlib import Path
+
+for name in ("gamba_warp.cli", "gamba_warp.train.loop", "gamba_warp.train.command"):
+    import_module(name)
+for name in ("warp", "msgspec", "tyro", "kornia", "safetensors.torch", "PIL.Image", "tqdm", "filelock"):
+    where = Path(import_module(name).__file__)
+    assert where.is_relative_to(Path(sys.argv[1]) / "site"), f"{name} is from {where}"
+print("everything is imported from the pack; torch and numpy are the machine's")
+END
 }
 
 train() {
@@ -87,8 +163,8 @@ train() {
   room=$(mktemp -d)
   trap 'rm -rf "$room"' EXIT
   mkdir -p "$out"
-  cat "$pack"/part.* | xz -d -T0 | tar -C "$room" -xf -
-  export PYTHONPATH=$room/site:$PWD GAMBA_CACHE=$room PYTHONUNBUFFERED=1
+  cat "$pack"/part.* | tar -C "$room" -xzf -
+  export PYTHONPATH=$room/site:$PWD GAMBA_CACHE=$room WARP_CACHE_PATH=$room/kernels PYTHONUNBUFFERED=1
   python3 - "$room" <<'END'
 import sys
 from safetensors.torch import load_file, save_file
@@ -100,17 +176,22 @@ END
   while read -r name; do order+=("$room/data/$name"); done <"$room/data/order"
   local extra=()
   [ "${#order[@]}" -gt 1 ] && extra=(--extra "${order[@]:1}")
-  local code=0
-  python3 -W ignore -m gamba_warp train "${order[0]}" "${extra[@]}" --preset rays \
-    --init starter/rays.safetensors --minutes "$minutes" --batch-size "${BATCH:-64}" \
-    --views-per-object 3 --schedule trapezoid --decay-share 0.5 --warmup-steps 30 --lr 1e-3 --ema 0.999 \
-    --no-radial-mask --depth-weight 0.5 --ssim-weight 0.3 --novel-weight 3 --mask-l1-weight 0.25 \
-    --translucency-weight 0.06 --lpips on --lpips-weight 0.3 --lpips-crop 64 --background random \
-    --front-share 0.5 --mirror 0.5 --recolor 0.3 --precision bfloat16 --cache --val-every 0 \
-    --save-every 100000 --out "$room/run" "$@" 2>&1 | tee "$out/lines.txt" || code=$?
-  [ -d "$room/run/checkpoints" ] || return "$code"
-  cp "$room/run/log.jsonl" "$room/run/config.json" "$out/"
-  python3 - "$room/run" "$out" <<'END'
+  local code=0 given=" $* " words=()
+  default() { [[ $given == *" $1 "* ]] || words+=("$@"); }
+  default --preset rays && default --init starter/rays.safetensors && default --minutes "$minutes"
+  default --batch-size "${BATCH:-64}" && default --views-per-object 3 && default --schedule trapezoid
+  default --decay-share 0.5 && default --warmup-steps 30 && default --lr 1e-3 && default --ema 0.999
+  default --no-radial-mask && default --depth-weight 0.5 && default --ssim-weight 0.3
+  default --novel-weight 3 && default --mask-l1-weight 0.25 && default --translucency-weight 0.06
+  default --lpips on && default --lpips-weight 0.3 && default --lpips-crop 64
+  default --background random && default --front-share 0.5 && default --mirror 0.5
+  default --recolor 0.3 && default --precision bfloat16 && default --cache && default --val-every 0
+  default --save-every 100000 && default --save-minutes 2 && default --out "$pack/run"
+  python3 -W ignore -m gamba_warp train "${order[0]}" "${extra[@]}" "${words[@]}" "$@" 2>&1 |
+    tee "$out/lines.txt" || code=$?
+  [ -d "$pack/run/checkpoints" ] || return "$code"
+  cp "$pack/run/log.jsonl" "$pack/run/config.json" "$out/"
+  python3 - "$pack/run" "$out" <<'END'
 import sys
 from pathlib import Path
 from safetensors import safe_open
@@ -128,6 +209,7 @@ END
 
 case $task in
   pack) make_pack "${@:3}" ;;
+  check) check ;;
   train) train "${@:3}" ;;
-  *) echo "gpu_train.sh: pack or train, not '$task'" >&2; exit 2 ;;
+  *) echo "gpu_train.sh: pack, check or train, not '$task'" >&2; exit 2 ;;
 esac

@@ -307,6 +307,10 @@ def test_minutes_alone_limit_the_run(data, tmp_path, monkeypatch):
     # One step in 29 is left at the end of the cosine: 0.5 (1 + cos(28/29 π)) = 0.003.
     assert rates[-1] < 0.02 * max(rates)
     assert max(rates) > 0.9e-3
+    saving = {"run": {"save_every": 99, "save_minutes": 0.1}}  # six readings
+    assert run(data, tmp_path / "saving", length={"steps": 20}, **saving) == 0
+    steps = [int(path.name[5:]) for path in list_checkpoints(tmp_path / "saving")]
+    assert len(steps) == 4 and steps[-1] == 20 and steps[1] - steps[0] == 6
     options = {"length": {"steps": 99, "minutes": 0.1}}
     assert run(data, tmp_path / "both", **options) == 0
     (warning,) = (record["message"] for record in lines(tmp_path / "both", "warning"))
