@@ -38,10 +38,9 @@ def main(*data: Path) -> None:
     Args:
         data: folders made by `gamba data render`, which together have the objects.
     """
-    from gamba_warp import load_model, reconstruct
+    from gamba_warp import load_model
     from gamba_warp.pages.turntable import turntable_frames
-    from gamba_warp.trajectories.elevation import estimate_elevation
-    from gamba_warp.trajectories.paths import set_up
+    from gamba_warp.pipeline import reconstruct_object
 
     model = load_model()
     cells = []
@@ -50,9 +49,9 @@ def main(*data: Path) -> None:
         rgba = load_rgba(path)
         seen = Image.fromarray(to_uint8(over_background(rgba, GREY)))
         still = np.asarray(seen.resize((SIDE, SIDE), Image.Resampling.BICUBIC))
-        gaussians = reconstruct(model, rgba)
-        upright = set_up(gaussians, estimate_elevation(gaussians).degrees)
-        turn = turntable_frames(upright, size=SIDE, frames=FRAMES, elevation=10.0)
+        result = reconstruct_object(model, name, rgba)
+        view = result.view.changed(elevation=10.0)
+        turn = turntable_frames(result.gaussians, view, size=SIDE, frames=FRAMES)
         pair = np.stack([np.broadcast_to(still, turn.shape), turn])[:, :, CROP:-CROP, CROP:-CROP]
         cells.append(np.concatenate([*pair], 2))
     rows = [np.concatenate(cells[i : i + COLUMNS], 2) for i in range(0, len(cells), COLUMNS)]

@@ -55,13 +55,13 @@ _DONE = {
     "mesh": 0.9,
 }
 
-State = tuple[work.Reconstruction, list[Path]]  # the shown result, and its files
+State = tuple[work.EditableObject, list[Path]]  # the shown result, and its files
 
 
 class Result(NamedTuple):
     """A result of the strip, and the file of its small picture."""
 
-    made: work.Reconstruction
+    made: work.EditableObject
     picture: Path
 
 
@@ -300,7 +300,7 @@ class Actions:
         return page_errors()(write)
 
     def _added(
-        self, results: list[Result], made: work.Reconstruction, request: gr.Request
+        self, results: list[Result], made: work.EditableObject, request: gr.Request
     ) -> tuple:
         """Append a result, and show it."""
         path = self._new_folder(request) / "result.png"
@@ -375,15 +375,15 @@ def _forget_surfaces(results: list[Result]) -> None:
         result.made.surface = None
 
 
-def _presented(made: work.Reconstruction) -> tuple:
+def _presented(made: work.EditableObject) -> tuple:
     """Return state, viewer, the buttons of files, no files, the view, and the elevation."""
     files, on = gr.update(value=None, visible=False), gr.update(visible=True)
     info = f"Estimate: {made.estimate}. Change it if the object leans."
-    elevation = gr.update(value=made.camera[2], info=info)
+    elevation = gr.update(value=made.view.elevation, info=info)
     return (made, []), _frame(made), on, files, VIEWS[1], elevation
 
 
-def _frame(made: work.Reconstruction) -> str:
+def _frame(made: work.EditableObject) -> str:
     document = html.escape(work.viewer(made), quote=True)
     return _FRAME.format(name=html.escape(made.name, quote=True), document=document)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ..batch import for_each, plan_outputs
+from ..batch import for_each, plan_outputs, say
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -74,7 +74,9 @@ def export_command(
             zero), and print their number; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from ..pages.export import ExportJob, export, find_gaussians
+    from ..formats.gaussians.files import comments_of
+    from ..formats.read import find_gaussians, read_with_warning
+    from ..pipeline import Object, ObjectFiles
     from ..trajectories.paths import Viewpoint
 
     options = SurfaceOptions(
@@ -88,25 +90,24 @@ def export_command(
         largest=largest,
         smooth=smooth,
     )
-    job = ExportJob(
-        options=files,
-        surface=options,
-        device=pick_device(device),
-        view=Viewpoint().changed(elevation, distance, fov),
-        drop_bad=drop_bad,
-    )
-    if not job.suffixes():
+    view = Viewpoint().changed(elevation, distance, fov)
+    outputs = ObjectFiles(options=files, surface=options, device=pick_device(device))
+    if not outputs.suffixes():
         raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
-    job.require()
+    outputs.require()
     found, failures = find_gaussians(inputs)
     if not found:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
-    names = plan_outputs(found, job.suffixes(), files.out)
+    names = plan_outputs(found, outputs.suffixes(), files.out)
     output_folder(files.out)
     results = Results("file", len(found), files.out, failures)
 
     def one(name: str, path: Path) -> None:
-        results.made.append({"input": str(path), "name": name, **export(name, path, job)})
+        gaussians = read_with_warning(path, drop_bad)
+        item = Object(name=name, gaussians=gaussians, view=view, in_unit=True)
+        count, figures = outputs.write(item, comments_of(path))
+        say(" ".join([f"{name}: {count}", *figures["notes"]]))
+        results.made.append({"input": str(path), "name": name, **figures})
 
     for_each(names, one, "export", "file", failures)
     return results

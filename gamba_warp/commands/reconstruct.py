@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -89,12 +88,10 @@ def reconstruct_command(
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, FILE_NAME, load_model
     from ..model.detail import checked_detail
-    from ..model.predict import reconstruct
     from ..pages.card import about_model
-    from ..pages.export import Outputs, write_outputs
     from ..pages.sheet import Sheet
     from ..photo.cutout import CutoutOptions, cut_out
-    from ..trajectories.elevation import estimate_elevation
+    from ..pipeline import ReconstructionFiles, reconstruct_object
 
     pictures, failures = _find_pictures(images, mask, recursive)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
@@ -104,11 +101,11 @@ def reconstruct_command(
             "--checkpoint FILE"
         )
     file = checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
-    outputs = Outputs(
+    outputs = ReconstructionFiles(
         options=files,
+        device=chosen,
         checkpoint=checkpoint,
         about=about_model(file),
-        camera=(camera.distance, camera.fov),
         inputs=save_inputs,
     )
     outputs.require()
@@ -139,24 +136,21 @@ def reconstruct_command(
         if cut.warning:
             warn(path, [f"{cut.warning} --save-inputs writes the cut-out for a picture editor."])
         STAGES.begin("network")
-        started = time.perf_counter()
-        made = reconstruct(model, cut.rgba, precision, detail)
-        gaussians = made.to("cpu")  # waits for the device
-        seconds = time.perf_counter() - started
-        elevation, between = camera.elevation, None
-        if elevation is None:
-            estimate = estimate_elevation(gaussians)
-            elevation, between = estimate.degrees, estimate[1:] if estimate.doubtful else None
+        result = reconstruct_object(model, name, cut.rgba, camera.elevation, precision, detail)
+        estimate, between = result.estimate, None
+        if camera.elevation is None:
+            between = estimate[1:] if estimate.doubtful else None
             say(f"{name}: the camera's elevation is about {estimate}; --elevation states it.")
-        view = outputs.view(model.config, elevation)
-        figures = write_outputs(name, cut, gaussians.to(chosen), outputs, view, seconds)
+        elevation = result.view.elevation
+        result.view = result.view.changed(None, camera.distance, camera.fov)
+        count, figures = outputs.write_result(result, cut)
+        for line in (f"{name}: {count}", *figures["notes"]):
+            say(line)
         source = {"input": str(path), "name": name, "cutout": cut.how, "warning": cut.warning}
         results.made.append(source | {"elevation": elevation, "elevation_doubt": between} | figures)
 
     for_each(names, one, "reconstruct", "picture", failures)
-    if outputs.sheet is not None:
-        outputs.sheet.write()
-    outputs.write_index()
+    outputs.finish()
     return results
 
 

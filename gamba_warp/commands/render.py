@@ -65,7 +65,7 @@ def render_command(
             zero), and print their number; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from ..pages.export import find_gaussians, read_with_warning
+    from ..formats.read import find_gaussians, read_with_warning
     from ..surfaces.extract import unit_frame
     from ..trajectories.film import Film, parse_background, parse_size, plan_path, shoot
     from ..trajectories.movies import require_movie

@@ -48,7 +48,7 @@ def view_command(
 
     import numpy as np
 
-    from ..pages.export import read_with_warning
+    from ..formats.read import read_with_warning
     from ..trajectories.paths import Viewpoint
     from ..viewer.pack import own_frame, read_viewed_mesh, visible
     from ..viewer.page import write_viewer

@@ -14,10 +14,10 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
-from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..files import write_text
 from ..gaussians import Gaussians
 from ..images import to_uint8
+from ..trajectories.paths import Viewpoint
 from ..viewer.page import POLICY, frame_element, frames_script
 from .templates import render
 from .turntable import SECONDS
@@ -47,9 +47,7 @@ class Section:
             numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval.
         header: names of the table's columns.
         details: long texts by name, initially hidden.
-        distance: of the viewer's camera from the origin, object units.
-        fov: field of view of the viewer's camera, degrees.
-        elevation: initial elevation of the viewer's camera, degrees.
+        view: initial camera of the viewer; with a picture, the picture's.
     """
 
     title: str
@@ -65,9 +63,7 @@ class Section:
     table: Sequence[Sequence[str | int | float]] = ()
     header: Sequence[str] = ()
     details: Mapping[str, str] = field(default_factory=dict)
-    distance: float = DEFAULT_DISTANCE
-    fov: float = DEFAULT_FOV
-    elevation: float = 0.0
+    view: Viewpoint = Viewpoint()
 
 
 def page_text(title: str, text: str, sections: Sequence[Section], auto: bool = False) -> str:
@@ -152,7 +148,6 @@ def _element(content: io.BytesIO, kind: str, label: str, css: str = "") -> str:
 
 def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
     assert section.gaussians is not None
-    viewpoint = (section.distance, section.fov, section.elevation)
     which = "view" if section.picture is None else "camera"  # the camera of the picture
     element = frame_element(
         f"viewer{number}",
@@ -162,7 +157,7 @@ def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
         picture=section.picture,
         poster=poster,
         auto=auto,
-        **{which: viewpoint},
+        **{which: section.view.camera},
     )
     return Markup(element)
 

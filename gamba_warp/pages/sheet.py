@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +50,7 @@ class Sheet:
             view: of the turntable.
         """
         flat = over_background(resize_rgba(rgba, _TILE, _TILE), GREY)
-        turn = turntable_frames(gaussians, size=_TILE, frames=VIEWS, **asdict(view))
+        turn = turntable_frames(gaussians, view, size=_TILE, frames=VIEWS)
         self._rows.append((name, np.concatenate([to_uint8(flat), *turn], axis=1)))
 
     def write(self) -> None:

@@ -6,39 +6,32 @@ from pathlib import Path
 
 import numpy as np
 
-from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV, GREY
+from ..conventions import GREY
 from ..gaussians import Gaussians
 from ..images import to_uint8
 from ..trajectories.movies import render_path, save_movie
-from ..trajectories.paths import turntable
+from ..trajectories.paths import Viewpoint, turntable
 
+FRONT = Viewpoint()
 SECONDS = 3.0  # length of one turn
 
 
 def turntable_frames(
-    gaussians: Gaussians,
-    *,
-    size: int = 256,
-    frames: int = 48,
-    elevation: float = 0.0,
-    distance: float = DEFAULT_DISTANCE,
-    fov: float = DEFAULT_FOV,
+    gaussians: Gaussians, view: Viewpoint = FRONT, *, size: int = 256, frames: int = 48
 ) -> np.ndarray:
     """Render one full turn on grey, from the reference view, with several views per launch.
 
     Args:
         gaussians: one object without batch dimension, in the reference frame, on the device that
             renders.
+        view: of the first frame; the others have its elevation.
         size: side of the square frames, pixels, >= 1.
         frames: number of views, >= 1.
-        elevation: degrees; a camera of positive elevation looks down.
-        distance: distance of the camera from the object's centre, object units.
-        fov: vertical field of view, degrees.
 
     Returns:
         ``[frames, size, size, 3]`` uint8.
     """
-    cameras = turntable(frames, elevation, distance, fov, size)
+    cameras = turntable(frames, view.elevation, view.distance, view.fov, size)
     return np.stack([picture for picture, _ in render_path(gaussians, cameras, (GREY, GREY, GREY))])
 
 

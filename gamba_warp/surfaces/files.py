@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch
 
 from ..color_spaces import to_linear
 from ..conventions import Axes
@@ -16,10 +15,8 @@ from ..errors import UserError
 from ..files import atomic_path
 from ..formats.names import MESH_FORMATS, MeshFormat
 from ..formats.parts import merged
-from ..gaussians import Gaussians
 from ..images import to_uint8
-from .extract import Surface, surface_of
-from .options import SurfaceOptions
+from .extract import Surface
 from .texture import Texture
 
 
@@ -114,37 +111,26 @@ def mesh_suffixes(formats: Sequence[MeshFormat], texture: int) -> list[str]:
 
 def write_meshes(
     base: Path,
-    gaussians: Gaussians,
+    surface: Surface,
     formats: Sequence[MeshFormat],
-    options: SurfaceOptions,
     axes: Axes,
-    device: torch.device,
-    texture: int = 0,
     size_mm: float | None = None,
-) -> Surface:
-    """Extract an object's surface and write it as ``NAME-mesh.FORMAT``.
+) -> None:
+    """Write an object's surface as ``NAME-mesh.FORMAT``.
 
     Args:
         base: folder and NAME.
-        gaussians: an object of any size and position.
+        surface: of any size and position.
         formats: formats of the files.
-        options: of the surface.
         axes: of all formats except .glb, which is always y up.
-        device: device that renders.
-        texture: side of a texture, pixels; 0: none.
         size_mm: longest side in the files, in millimetres (in a .glb, whose unit is the metre, a
-            thousandth of that); None: the Gaussians' size.
-
-    Returns:
-        The surface in the Gaussians' own frame.
+            thousandth of that); None: the surface's size.
 
     Raises:
-        UserError: the surface is empty, or a file cannot be written.
+        UserError: a file cannot be written.
     """
-    found = surface_of(gaussians, options, device, texture)
-    longest = float(np.ptp(found.vertices, axis=0).max())
+    longest = float(np.ptp(surface.vertices, axis=0).max())
     for kind in formats:
         scale = 1.0 if size_mm is None else size_mm / longest / (1000 if kind == "glb" else 1)
-        sized = replace(found, vertices=found.vertices * scale)
+        sized = replace(surface, vertices=surface.vertices * scale)
         save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), sized, axes)
-    return found

@@ -49,7 +49,7 @@ class ElevationEstimate(NamedTuple):
 
     def __str__(self) -> str:
         doubt = f", in doubt ({self.low} to {self.high})" if self.doubtful else ""
-        return f"{self.degrees} degrees{doubt}"
+        return f"{self.degrees} degree{'' if abs(self.degrees) == 1 else 's'}{doubt}"
 
 
 UNKNOWN = ElevationEstimate(0, round(ANGLES[0]), round(ANGLES[-1]))

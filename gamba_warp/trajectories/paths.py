@@ -30,6 +30,11 @@ class Viewpoint:
     distance: float = DEFAULT_DISTANCE
     fov: float = DEFAULT_FOV
 
+    @property
+    def camera(self) -> tuple[float, float, float]:
+        """Distance, field of view and elevation, in the order of ``viewer.page.viewer_parts``."""
+        return self.distance, self.fov, self.elevation
+
     def changed(
         self,
         elevation: float | None = None,

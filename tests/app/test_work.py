@@ -23,10 +23,9 @@ from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import load_model
-from gamba_warp.pages import turntable
 from gamba_warp.photo import models
 from gamba_warp.photo.cutout import CutoutOptions
-from gamba_warp.surfaces import extract, files  # noqa: F401 (it must not find the stand-in)
+from gamba_warp.surfaces import extract
 from gamba_warp.viewer.pack import visible
 
 RED, GREEN = (0.8, 0.1, 0.1), (0.1, 0.6, 0.2)
@@ -56,17 +55,17 @@ def test_a_picture_from_above_stands_upright(tmp_path, made):
     cut = cutting.cut_picture(picture, "thing.png", CutoutOptions())
     above = work.run_model(load_model(STARTER / "tiny.safetensors"), cut, 30.0)
     turn = orbit(torch.zeros(1), 30.0)[0, :3, :3]
-    torch.testing.assert_close(above.gaussians.means @ turn.T, made.gaussians.means)
-    assert above.camera == (*made.camera[:2], 30.0) and made.camera[2] == 0
-    made = work.Reconstruction("thing", made.whole, made.camera, 0.0, made.picture)
+    torch.testing.assert_close(above.kept.means @ turn.T, made.kept.means)
+    assert above.view == made.view.changed(30.0) and made.view.elevation == 0
+    made = replace(made, name="thing", surface=None)
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
     made.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
-    nothing = bytes(-(-visible(made.whole, "").num // 8))
+    nothing = bytes(-(-visible(made.gaussians, "").num // 8))
     for elevation in (10.0, 30.0):  # rotations add up
         work.edit(made, elevation, nothing)
-    torch.testing.assert_close(made.gaussians.means, above.gaussians.means, atol=1e-6, rtol=0)
+    torch.testing.assert_close(made.kept.means, above.kept.means, atol=1e-6, rtol=0)
     np.testing.assert_allclose(made.surface.vertices, corners @ turn.double().numpy(), atol=1e-6)
-    assert made.camera == above.camera and made.chosen == above.chosen == 30
+    assert made.view == above.view and made.chosen == above.chosen == 30
     path, _ = work.write(above, "ply", tmp_path)
     options = quick(STARTER / "tiny.safetensors", tmp_path / "out", 30)
     assert run_reconstruct(picture, *options) == 0
@@ -255,8 +254,8 @@ def test_every_kind_of_file(made, tmp_path):
     for kind in work.GAUSSIANS:
         path, note = work.write(made, kind, tmp_path)
         assert path.name == "My-thing-v2" + suffixes[kind]
-        assert read_gaussians(path).num == made.gaussians.drawn().num > 0
-        assert f"{made.gaussians.drawn().num:,} Gaussians" in note
+        assert read_gaussians(path).num == made.kept.drawn().num > 0
+        assert f"{made.kept.drawn().num:,} Gaussians" in note
     path, _ = work.write(made, "html", tmp_path)
     assert "<canvas" in path.read_text(encoding="utf-8")
     refused("no such kind of file: exe", work.write, made, "exe", tmp_path)
@@ -288,7 +287,7 @@ def test_a_mesh(made, tmp_path, monkeypatch):
         assert path.name == f"My-thing-v2-mesh{suffix}"
         mesh = trimesh.load(path, force="mesh")
         assert len(mesh.faces) == 4 and mesh.bounds[:, 1].tolist() == [-1, 0]  # y up
-    assert asked == [(made.gaussians.num, 50_000, True, side, "cpu") for side in (0, 512)]
+    assert asked == [(made.kept.num, 50_000, True, side, "cpu") for side in (0, 512)]
     refused("no such mesh", work.MeshChoice.of, "50,000 faces", "10,000 faces", True)
     asked.clear()
     monkeypatch.setattr(work, "FRAMES", 2)
@@ -301,38 +300,38 @@ def test_a_mesh(made, tmp_path, monkeypatch):
 
 
 def test_what_is_removed_is_in_no_file(made, tmp_path, monkeypatch):
-    made = work.Reconstruction("thing", made.whole, made.camera, 0.0, made.picture)
-    seen = visible(made.whole, "thing")
+    made = replace(made, name="thing", surface=None)
+    seen = visible(made.gaussians, "thing")
     bits = np.zeros(seen.num, bool)
     bits[[0, 3, seen.num - 1]] = True
     made.surface = Mock()
     work.edit(made, 0, np.packbits(bits, bitorder="little").tobytes())
-    assert made.surface is None and made.gaussians.num == made.whole.num - 3
-    left = visible(made.gaussians, "thing")
+    assert made.surface is None and made.kept.num == made.gaussians.num - 3
+    left = visible(made.kept, "thing")
     torch.testing.assert_close(left.means, seen.means[~torch.from_numpy(bits)])
     for kind in ("ply", "splat"):
         path, note = work.write(made, kind, tmp_path)
-        assert read_gaussians(path).num == made.gaussians.drawn().num == seen.num - 3
+        assert read_gaussians(path).num == made.kept.drawn().num == seen.num - 3
     asked = []
     monkeypatch.setattr(extract, "surface_of", lambda gaussians, *_: asked.append(gaussians.num))
     monkeypatch.setattr(
-        turntable, "turntable_frames", lambda gaussians, **_: asked.append(gaussians.num)
+        work, "turntable_frames", lambda gaussians, *_, **__: asked.append(gaussians.num)
     )
-    monkeypatch.setattr(turntable, "save_turntable", lambda *_: None)
+    monkeypatch.setattr(work, "save_turntable", lambda *_: None)
     work.surface_of(made, work.MESH)
     work.write(made, "gif", tmp_path)
-    assert asked == [made.gaussians.num] * 2
+    assert asked == [made.kept.num] * 2
     again = work.viewer(made)
     removed = np.packbits(bits, bitorder="little").tobytes()
     assert f'"count": {seen.num},' in again and base64.b64encode(removed).decode() in again
     work.edit(made, 0, bytes(-(-seen.num // 8)))
-    assert made.gaussians.num == made.whole.num
+    assert made.kept.num == made.gaussians.num
 
 
 def test_a_mesh_of_an_object_that_is_edited_meanwhile(page, made, monkeypatch):
     """The file is written, but the surface, of the object before, is not kept."""
-    made = work.Reconstruction("thing", made.whole, made.camera, 0.0, made.picture)
-    size = -(-visible(made.whole, "").num // 8)
+    made = replace(made, name="thing", surface=None)
+    size = -(-visible(made.gaussians, "").num // 8)
 
     def write(one, kind, folder, *_):
         if kind == "mesh-stl":
@@ -410,7 +409,7 @@ def test_an_elevation_set_by_hand_stays_with_its_picture(page, made, monkeypatch
     )
 
     def new(key):
-        return work.Reconstruction("a", made.whole, made.camera, 0.0, made.picture, given=key)
+        return replace(made, name="a", given=key)
 
     one, other = (Mock(key=key) for key in "ab")
     monkeypatch.setattr("gamba_warp.app.actions.apply_strokes", lambda cut, _: cut)
@@ -418,7 +417,7 @@ def test_an_elevation_set_by_hand_stays_with_its_picture(page, made, monkeypatch
     for cut in (one, one, other, one):
         results = page.reconstruct(cut, None, results, MagicMock(), lambda *_: None)[4]
         if len(results) == 2:
-            work.edit(results[1].made, 35, bytes(-(-visible(made.whole, "").num // 8)))
+            work.edit(results[1].made, 35, bytes(-(-visible(made.gaussians, "").num // 8)))
             results[1].made.chosen = 35
     assert asked[:3] == [None, None, None] and asked[3] == 35
 

@@ -14,6 +14,7 @@ from helpers.refusals import refused_command
 from helpers.views import cloud_of
 from PIL import Image
 
+from gamba_warp import pipeline
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
 from gamba_warp.data.preprocess import composite
 from gamba_warp.errors import UserError
@@ -21,13 +22,13 @@ from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.images import find_pictures, save_image
 from gamba_warp.model import checkpoint as checkpoints
-from gamba_warp.model import predict
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.predict import reconstruct
 from gamba_warp.pages.turntable import save_turntable, turntable_frames
 from gamba_warp.photo import cutout
 from gamba_warp.render import render
+from gamba_warp.trajectories.paths import Viewpoint
 
 
 @pytest.fixture
@@ -65,10 +66,10 @@ def test_turntable_begins_at_the_reference_view_and_turns():
 
 def test_turntable_chunks_make_no_difference(monkeypatch):
     gaussians = some(40)
-    whole = turntable_frames(gaussians, size=20, frames=7, elevation=20.0)
+    whole = turntable_frames(gaussians, Viewpoint(20.0), size=20, frames=7)
     monkeypatch.setattr("gamba_warp.trajectories.movies._CHUNK_PIXELS", 2 * 20 * 20)
     np.testing.assert_array_equal(
-        turntable_frames(gaussians, size=20, frames=7, elevation=20.0), whole
+        turntable_frames(gaussians, Viewpoint(20.0), size=20, frames=7), whole
     )
 
 
@@ -169,7 +170,7 @@ def test_the_number_of_gaussians_is_told_once_they_are_written(
     def full(*_, **__):
         raise UserError("no space left")
 
-    monkeypatch.setattr("gamba_warp.pages.export.write_gaussians", full)
+    monkeypatch.setattr("gamba_warp.pipeline.write_gaussians", full)
     assert run_reconstruct(picture, *quick(checkpoint, tmp_path)) == 1
     texts = capsys.readouterr()
     assert "Gaussians" not in texts.out and "no space left" in texts.err
@@ -179,7 +180,7 @@ def test_the_number_of_gaussians_is_told_once_they_are_written(
 def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeypatch, frame):
     ends = torch.tensor([0.35, -0.1, 0.0])
     stick = cloud_of((torch.arange(64.0)[:, None] / 63) * ends, 0.04, 0.9, [0.9, 0.1, 0.1])
-    monkeypatch.setattr(predict, "reconstruct", lambda *_: stick)
+    monkeypatch.setattr(pipeline, "reconstruct", lambda *_: stick)
     options = [*quick(checkpoint, tmp_path), "--mesh", "ply"]
     options += ["--frame", frame] if frame else []
     assert run_reconstruct(picture, *options) == 0
@@ -365,6 +366,6 @@ def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeyp
 def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):
     gaussians = some(9)
     gaussians.means[3] = float("nan")
-    monkeypatch.setattr(predict, "reconstruct", lambda *_: gaussians)
+    monkeypatch.setattr(pipeline, "reconstruct", lambda *_: gaussians)
     assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
     assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err

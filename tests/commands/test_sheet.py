@@ -20,15 +20,15 @@ def test_a_row_is_the_input_and_views_around(tmp_path):
     sheet, gaussians = Sheet(tmp_path / "s.png"), some(40)
     rgba = np.zeros((64, 64, 4), np.float32)
     rgba[16:48, 16:48] = (1, 0, 0, 1)
-    sheet.add("first", rgba, gaussians, Viewpoint(20.0, SMALLEST.distance, SMALLEST.fov))
+    view = Viewpoint(20.0, SMALLEST.distance, SMALLEST.fov)
+    sheet.add("first", rgba, gaussians, view)
     sheet.write()
     picture = load_rgba(tmp_path / "s.png")[..., :3]
     assert picture.shape == (18 + 128, 6 * 128, 3)
     tiles = picture[18:].reshape(128, 1 + VIEWS, 128, 3).transpose(1, 0, 2, 3)
     assert np.abs(tiles[0][64, 64] - (1, 0, 0)).max() < 0.01
     assert np.abs(tiles[0][4, 4] - 0.5).max() < 0.01
-    camera = {"elevation": 20.0, "distance": SMALLEST.distance, "fov": SMALLEST.fov}
-    want = turntable_frames(gaussians, size=128, frames=VIEWS, **camera) / 255
+    want = turntable_frames(gaussians, view, size=128, frames=VIEWS) / 255
     np.testing.assert_array_equal(tiles[1][:, 1:], want[0].astype(np.float32)[:, 1:])  # and a line
     np.testing.assert_array_equal(tiles[2:], want[1:].astype(np.float32))
     assert picture[:18, 128:].min() == 1 and picture[:18, :128].min() < 0.6  # the name

@@ -19,7 +19,7 @@ _FORKS.set_forkserver_preload(
         *("timm", "trimesh", "gamba_warp.measure.models"),
         *("gamba_warp.eval.shapes.pairs", "gamba_warp.eval.views.evaluate"),
         *("gamba_warp.model.predict", "gamba_warp.model.released"),
-        *("gamba_warp.pages.export", "gamba_warp.train.loop", "gamba_warp.train.data.render"),
+        *("gamba_warp.pipeline", "gamba_warp.train.loop", "gamba_warp.train.data.render"),
     ]
 )
 

@@ -28,8 +28,8 @@ from gamba_warp.files import (
     write_json,
     write_text,
 )
+from gamba_warp.formats.read import find_gaussians
 from gamba_warp.images import find_pictures, save_image
-from gamba_warp.pages.export import find_gaussians
 from gamba_warp.pages.turntable import save_turntable
 
 

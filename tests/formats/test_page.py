@@ -13,6 +13,7 @@ from helpers.refusals import refused
 from PIL import Image, features
 
 from gamba_warp.pages.page import Section, demo_page, page_text, reconstruction_page
+from gamba_warp.trajectories.paths import Viewpoint
 
 
 class Page(html.parser.HTMLParser):
@@ -89,7 +90,7 @@ def test_a_page_holds_everything_and_asks_for_nothing(tmp_path):
 
 
 def test_the_viewer_gets_the_gaussians_and_the_camera(tmp_path):
-    section = full(distance=2.25, fov=40, elevation=30)
+    section = full(view=Viewpoint(30.0, 2.25, 40.0))
     for write, auto in ((demo_page, False), (reconstruction_page, True)):
         write(tmp_path / "a.html", [section] if not auto else section)
         page = Page(tmp_path / "a.html")

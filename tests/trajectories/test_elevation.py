@@ -98,8 +98,8 @@ def run_json(capsys, *words) -> dict:
 def test_the_app_begins_with_the_estimate():
     cut = cutting.cut_picture(ICON, "thing.png", CutoutOptions())
     made = work.run_model(load_model(), cut)
-    assert made.camera[2] > 10 and made.estimate == f"{made.camera[2]} degrees"
-    assert work.run_model(load_model(), cut, 3.0).camera[2] == 3.0
+    assert made.view.elevation == made.estimate.degrees > 10
+    assert work.run_model(load_model(), cut, 3.0).view.elevation == 3.0
 
 
 ICONS = {"by-fordfocus": 9, "cardboard-box": 23, "jacuzzi": 32, "toaster": 32}

@@ -12,14 +12,14 @@ from helpers.images import cut_out
 from helpers.model import SMALLEST, run_reconstruct
 from PIL import Image
 
+from gamba_warp import pipeline
 from gamba_warp.cli import run
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.pages import export
 from gamba_warp.pages.turntable import turntable_frames
 from gamba_warp.surfaces.extract import Surface, unit_frame
-from gamba_warp.trajectories.paths import upright
+from gamba_warp.trajectories.paths import Viewpoint, upright
 
 
 def first_frame(path):
@@ -43,11 +43,11 @@ def model(tmp_path_factory):
 def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
     meshed = []
 
-    def written(base, gaussians, *_):
+    def extracted(gaussians, *_):
         meshed.append(gaussians)
         return Surface(np.eye(4, 3), np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))
 
-    monkeypatch.setattr(export, "write_meshes", written)
+    monkeypatch.setattr(pipeline, "surface_of", extracted)
     picture = cut_out(tmp_path / "thing.png")
     plain, turned = tmp_path / "plain", tmp_path / "turned"
     common = [picture, "--checkpoint", model, "--size", 48, "--frames", 4]
@@ -61,7 +61,7 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
     torch.testing.assert_close(meshed[0].means, after.means)  # meshes are made of what is turned
     # The first view of both turntables is the input's, where the camera stood.
     straight, above, lying = (
-        turntable_frames(gaussians, size=48, frames=1, elevation=elevation)[0].astype(int)
+        turntable_frames(gaussians, Viewpoint(elevation), size=48, frames=1)[0].astype(int)
         for gaussians, elevation in ((before, 0.0), (after, 30.0), (before, 30.0))
     )
     assert np.abs(straight - above).max() <= 3 < np.abs(straight - lying).max() - 2  # rounding
@@ -78,7 +78,7 @@ def test_field_of_view_and_distance_are_those_of_what_is_rendered(tmp_path, mode
     same = load_ply(tmp_path / "a" / "thing.ply"), load_ply(tmp_path / "b" / "thing.ply")
     assert torch.equal(same[0].means, same[1].means)  # the Gaussians do not depend on it
     assert camera_of((tmp_path / "a" / "thing.html").read_text()) == (4, 20, 0)
-    want = turntable_frames(same[0], size=48, frames=1, distance=4.0, fov=20.0)[0]
+    want = turntable_frames(same[0], Viewpoint(0.0, 4.0, 20.0), size=48, frames=1)[0]
     assert np.abs(first_frame(tmp_path / "a" / "thing.gif") - want).mean() < 1
 
 
@@ -91,7 +91,7 @@ def test_export_and_view_start_from_there(tmp_path, monkeypatch):
     out = tmp_path / "out"
     assert run("export", [str(tmp_path / "a.ply"), "--out", str(out), *options, *view]) == 0
     moved = load_ply(tmp_path / "a.ply").in_unit(*unit_frame(gaussians))
-    want = turntable_frames(moved, size=48, frames=1, elevation=25.0, distance=3.0, fov=30.0)[0]
+    want = turntable_frames(moved, Viewpoint(25.0, 3.0, 30.0), size=48, frames=1)[0]
     assert np.abs(first_frame(out / "a.gif") - want).mean() < 3
     assert camera_of((out / "a.html").read_text()) == (3, 30, 25)
     page = tmp_path / "view.html"

@@ -12,6 +12,7 @@ from gamba_warp.formats.ply import save_ply
 from gamba_warp.pages.page import Section, demo_page, reconstruction_page
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
+from gamba_warp.trajectories.paths import Viewpoint
 
 
 def run(arguments) -> int:
@@ -77,7 +78,9 @@ def test_the_viewer_of_a_reconstruction_starts_by_itself(browser_page, tmp_path)
     vertices = 0.4 * torch.eye(3).numpy()
     mesh = Surface(vertices, np.array([[0, 1, 2]]), None)
     picture = np.ones((9, 9, 4), np.float32)
-    section = Section("A chair", gaussians=some(40), picture=picture, mesh=mesh, elevation=20.0)
+    section = Section(
+        "A chair", gaussians=some(40), picture=picture, mesh=mesh, view=Viewpoint(20.0)
+    )
     reconstruction_page(tmp_path / "a.html", section)
     opened = browser_page(tmp_path / "a.html", 800, 600)
     (frame,) = frames(opened, 1)
