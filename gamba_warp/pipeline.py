@@ -26,15 +26,14 @@ from .gaussians import Gaussians
 from .images import save_image, to_uint8
 from .model.predict import reconstruct
 from .pages.options import FileOptions
-from .pages.page import Section, index_page, reconstruction_page
+from .pages.page import Section, write_page
 from .pages.sheet import Sheet
-from .pages.turntable import save_turntable, turntable_frames
 from .photo.cutout import CutOut
 from .surfaces.extract import Surface, surface_of, unit_frame
 from .surfaces.files import mesh_suffixes, write_meshes
 from .surfaces.options import BROWSER_FACES, TEXTURE, TEXTURED_FACES, SurfaceOptions
 from .trajectories.elevation import ElevationEstimate, estimate_elevation
-from .trajectories.movies import require_movie
+from .trajectories.movies import require_movie, save_turntable, turntable_frames
 from .trajectories.paths import Viewpoint, set_up
 
 if TYPE_CHECKING:
@@ -206,7 +205,7 @@ class ObjectFiles:
             STAGES.begin("mesh")
             start = time.perf_counter()
             mesh = surface_of(gaussians, self.surface, self.device, self.texture)
-            write_meshes(base, mesh, self.mesh, options.frame, options.size_mm)
+            write_meshes(base, mesh, self.mesh, options.axes, options.size_mm)
             seconds = time.perf_counter() - start
             counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
             colors = f", texture of {self.texture} pixels" if self.texture else ""
@@ -227,7 +226,8 @@ class ObjectFiles:
             STAGES.begin("page")
             ends = [end for end in self.suffixes(meshes) if end != ".html"]
             section.files = [section.title + end for end in ends]
-            reconstruction_page(self.options.out / f"{section.title}.html", section)
+            title = section.title
+            write_page(self.options.out / f"{title}.html", title, [section], auto=True)
 
 
 @dataclass(kw_only=True)
@@ -285,7 +285,8 @@ class ReconstructionFiles(ObjectFiles):
             self.sheet.write()
         if len(self.thumbnails) > 1:
             title = f"{len(self.thumbnails):,} reconstructions"
-            index_page(self.options.out / INDEX, title, self.thumbnails)
+            links = [Section("", links=self.thumbnails)]
+            write_page(self.options.out / INDEX, title, links, "Input and result of each.")
 
 
 def _closedness(mesh: Surface) -> str:

@@ -26,8 +26,9 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.color_spaces import to_display, to_linear
 from gamba_warp.errors import UserError
 from gamba_warp.formats.catalogue import find_meshes
-from gamba_warp.formats.gaussians.files import read_gaussians, write_gaussians
+from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.meshes import TexturedMesh, default_up, load_mesh
+from gamba_warp.formats.read import read_gaussians
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.render import render
 

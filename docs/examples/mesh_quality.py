@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from gamba_warp.cameras import fibonacci_sphere
-from gamba_warp.formats.gaussians.files import read_gaussians
+from gamba_warp.formats.read import read_gaussians
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.render import render
 from gamba_warp.surfaces.extract import Surface, extract_surface, unit_frame

@@ -39,8 +39,8 @@ def main(*data: Path) -> None:
         data: folders made by `gamba data render`, which together have the objects.
     """
     from gamba_warp import load_model
-    from gamba_warp.pages.turntable import turntable_frames
     from gamba_warp.pipeline import reconstruct_object
+    from gamba_warp.trajectories.movies import turntable_frames
 
     model = load_model()
     cells = []

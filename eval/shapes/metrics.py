@@ -9,10 +9,9 @@ import numpy as np
 import torch
 
 from gamba_warp.cameras import intrinsics, orbit
-from gamba_warp.gaussians import Gaussians
 
 from .align import aligned, symmetry
-from .load import LoadedShape, centers
+from .load import LoadedShape
 from .occupancy import RULES, grid_around, syncdreamer_grid
 from .options import ChamferForm
 from .protocol import GeometryProtocol
@@ -136,7 +135,7 @@ def shape_iou(
         and, if ``iou`` is None, ``iou_reason``.
     """
     if protocol.occupancy == "none":
-        return {"iou": None, "iou_reason": "the protocol takes none"}
+        return {"iou": None, "iou_reason": "the protocol defines no occupancy"}
     if isinstance(predicted, Points):
         return {"iou": None, "iou_reason": "the prediction is a point cloud"}
     if isinstance(truth, Points):
@@ -179,7 +178,7 @@ def chamfer_by_transform(
     true = Points(sample(truth.shape, _FEW, protocol.seed).positions)
     few = (_FEW, protocol.seed + 1)
     source, found = predicted.source, {}
-    of = centers(source, *few) if isinstance(source, Gaussians) else sample(source, *few)
+    of = sample(source, *few)
     points = of.positions
     searched = (AS_IS, f"{MIRRORED} along x")
     for name in searched if "turn" in protocol.align else TRANSFORMS:

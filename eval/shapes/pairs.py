@@ -24,6 +24,7 @@ from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, sha256, visible, warn_of_others, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes, object_names
+from gamba_warp.formats.names import SHAPE_SUFFIXES
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_lines
 from gamba_warp.versions import __version__, installed
@@ -40,7 +41,7 @@ from ..report import (
 )
 from .options import ShapesOptions
 from .protocol import GeometryProtocol
-from .shape import SUFFIXES, Similarity
+from .shape import Mesh, Points, Similarity, positions_of
 from .sheet import save_sheet
 from .table import page, summaries
 
@@ -285,15 +286,15 @@ def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Pa
     A further file of the same name is another object if it was rendered as one (``find_meshes``).
     """
     files = [path for path in visible(folder, "*") if path.is_file()]
-    warn_of_others(folder, files, SUFFIXES)
-    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+    warn_of_others(folder, files, SHAPE_SUFFIXES)
+    paths = sorted(path for path in files if path.suffix.lower() in SHAPE_SUFFIXES)
     names = object_names([path.relative_to(folder).with_suffix("") for path in paths])
     found: dict[str, list[Path]] = {}
     for name, path in zip(names, paths):
         other = f"{name}-{path.suffix[1:].lower()}"
         found.setdefault(other if name in found and other in rendered else name, []).append(path)
     if not found:
-        raise UserError(f"{folder}: contains no files of type {', '.join(SUFFIXES)}")
+        raise UserError(f"{folder}: contains no files of type {', '.join(SHAPE_SUFFIXES)}")
     return found
 
 
@@ -332,7 +333,7 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
-    from .load import FRAME_AXES, load_prediction, load_truth, scale_note
+    from .load import FRAME_AXES, load_prediction, load_truth
     from .metrics import chamfer_by_transform, compare
 
     stages = Stopwatch(3)
@@ -342,7 +343,7 @@ def evaluate_pair(
         predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     with stages("compare"):
         if note := scale_note(predicted.shape, protocol):
-            predicted.notes.append(note)
+            predicted.warnings.append(note)
         metrics = compare(predicted.shape, truth.shape, protocol)
         check_finite(metrics)
         turned = check_finite(chamfer_by_transform(predicted, truth, protocol))
@@ -365,6 +366,14 @@ def evaluate_pair(
         "gt_normalization": truth.motion.record(),
         "seconds": stages.seconds,
     }
+
+
+def scale_note(shape: Mesh | Points, protocol: GeometryProtocol) -> str:
+    """Return a warning if a prediction's size is far from the truth's, which is 1; else ""."""
+    side = float(np.ptp(positions_of(shape), axis=0).max())
+    if {"box", "scale", "icp"} & {*protocol.align} or 0.1 <= side <= 10:
+        return ""
+    return f"its side is {side:.3g} times the truth's: other units? --align scale fits them"
 
 
 def evaluate_pairs(

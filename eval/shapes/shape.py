@@ -13,17 +13,11 @@ from typing import TYPE_CHECKING, TypeAlias, overload
 import numpy as np
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
-from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
-from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.formats.parts import merged
 from gamba_warp.versions import import_open3d
 
 if TYPE_CHECKING:
     from gamba_warp.gaussians import Gaussians
-
-
-SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)))
 
 
 @dataclass
@@ -170,23 +164,58 @@ class Similarity:
         }
 
 
-def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
-    """Sample points of a shape: uniformly by area on a mesh, at most ``count`` from a cloud.
+def positions_of(shape: Shape) -> np.ndarray:
+    """Return the vertices, points, or centres of Gaussians, ``[N, 3]``."""
+    if isinstance(shape, Mesh):
+        return shape.vertices
+    return shape.positions if isinstance(shape, Points) else shape.means.numpy()
+
+
+def unit_motion(shape: Mesh | Points, turn: np.ndarray) -> Similarity:
+    """Return the motion that rotates a shape, centres it, and makes its longest side 1.
 
     Args:
-        shape: a mesh or a cloud; a cloud of at most ``count`` points is returned unchanged.
+        shape: at least two distinct points.
+        turn: rotation ``[3, 3]`` to z-up.
+
+    Raises:
+        UserError: the extent is zero, or lost to rounding far from the origin.
+    """
+    points = positions_of(shape) @ turn.T
+    low, high = points.min(0), points.max(0)
+    extent = (high - low).max()
+    if extent <= 1e-10 * max(abs(low).max(), abs(high).max()):
+        raise UserError("all its points coincide, or are too close to tell apart")
+    return Similarity(turn, -(low + high) / 2 / extent, 1 / extent)
+
+
+def sample(shape: Shape, count: int, seed: int) -> Points:
+    """Sample points of a shape.
+
+    Those of a mesh are uniform by area, those of a cloud at most ``count`` of it, and those of
+    Gaussians centres, drawn with replacement and with probability proportional to opacity.
+
+    Args:
+        shape: of any kind; a cloud of at most ``count`` points is returned unchanged.
         count: number of points.
         seed: of the draw.
 
     Raises:
-        UserError: the mesh has no area.
+        UserError: the mesh has no area, or all Gaussians are fully transparent.
     """
+    rng = np.random.default_rng(seed)
     if isinstance(shape, Points):
         if len(shape.positions) <= count:
             return shape
-        keep = np.random.default_rng(seed).choice(len(shape.positions), count, replace=False)
+        keep = rng.choice(len(shape.positions), count, replace=False)
         normals = None if shape.normals is None else shape.normals[keep]
         return Points(shape.positions[keep], normals)
+    if not isinstance(shape, Mesh):
+        weights = shape.opacities.double().cpu().numpy()
+        if weights.sum() <= 0:
+            raise UserError("all Gaussians are fully transparent")
+        chosen = rng.choice(len(weights), count, p=weights / weights.sum())
+        return Points(shape.means.double().cpu().numpy()[chosen])
     o3d = import_open3d()
     has_area = np.linalg.norm(shape.normals(), axis=1) > 0
     if not has_area.any():

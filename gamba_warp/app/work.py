@@ -20,12 +20,12 @@ from ..formats.gaussians.files import to_be_written, write_gaussians
 from ..formats.names import MESH_FORMATS, SPLAT_FORMATS, splat_suffix
 from ..gaussians import Gaussians
 from ..images import save_image, to_uint8
-from ..pages.turntable import save_turntable, turntable_frames
 from ..pipeline import Reconstruction, reconstruct_object
 from ..surfaces import extract
 from ..surfaces.extract import Surface
 from ..surfaces.files import save_mesh
 from ..surfaces.options import SurfaceOptions
+from ..trajectories.movies import save_turntable, turntable_frames
 from ..trajectories.paths import set_up, upright
 from ..viewer.pack import visible_order
 from ..viewer.page import viewer_page, write_viewer
@@ -183,7 +183,7 @@ def edit(made: EditableObject, elevation: float, removed: bytes) -> None:
         raise UserError("the removed parts are not those of this object")
     gone = torch.from_numpy(bits[: len(order)].astype(bool))
     if gone.all():
-        raise UserError("nothing of the object would be left")
+        raise UserError("this removes all Gaussians")
     before, surface, angle = made.removed, made.surface, elevation - made.view.elevation
     made.removed = torch.zeros_like(before).index_fill(0, order[gone], True)
     if not made.removed.equal(before):

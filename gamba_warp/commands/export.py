@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ..batch import for_each, plan_outputs, say
+from ..batch import for_each, plan_outputs, say, warn
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -74,8 +74,8 @@ def export_command(
             zero), and print their number; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from ..formats.gaussians.files import comments_of
-    from ..formats.read import find_gaussians, read_with_warning
+    from ..formats.read import find_gaussians, read
+    from ..gaussians import Gaussians
     from ..pipeline import Object, ObjectFiles
     from ..trajectories.paths import Viewpoint
 
@@ -103,9 +103,11 @@ def export_command(
     results = Results("file", len(found), files.out, failures)
 
     def one(name: str, path: Path) -> None:
-        gaussians = read_with_warning(path, drop_bad)
-        item = Object(name=name, gaussians=gaussians, view=view, in_unit=True)
-        count, figures = outputs.write(item, comments_of(path))
+        found = read(path, drop_bad, Gaussians)
+        warn(path, found.warnings)
+        assert isinstance(found.shape, Gaussians)
+        item = Object(name=name, gaussians=found.shape, view=view, in_unit=True)
+        count, figures = outputs.write(item, found.comments)
         say(" ".join([f"{name}: {count}", *figures["notes"]]))
         results.made.append({"input": str(path), "name": name, **figures})
 

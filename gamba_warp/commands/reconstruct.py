@@ -20,7 +20,8 @@ from ..pages.options import RECONSTRUCTED, FileOptions
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 from .results import Results, reported
 
-MAX_STDIN = 1 << 28  # bytes of a picture from the standard input
+MAX_STDIN = 1 << 28  # bytes of an image from the standard input
+_PIPED = "gamba-stdin-"  # start of the name of its folder
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,8 @@ class CameraOptions:
     Attributes:
         elevation: Elevation of the picture's camera above the object, degrees; all results are
             rotated so that the object is upright. By default it is estimated from the Gaussians.
-        fov: Field of view of turntable, sheet and 3D viewer, degrees; by default the model's
-            (49.1). Without --distance the object keeps its size in the picture.
+        fov: Field of view of turntable, sheet and 3D viewer, degrees; by default that of the
+            model, 49.1. Without --distance the object keeps its size in the picture.
         distance: Distance of their camera, object units; by default the model's (1.5).
     """
 
@@ -131,10 +132,10 @@ def reconstruct_command(
 
     def one(name: str, path: Path) -> None:
         STAGES.begin("cutting out")
-        cut = cut_out(path, options)
-        say(f"{places[name] if len(names) > 1 else ''}{path}: {cut.how}")
+        cut, given = cut_out(path, options), _given(path)
+        say(f"{places[name] if len(names) > 1 else ''}{given}: {cut.how}")
         if cut.warning:
-            warn(path, [f"{cut.warning} --save-inputs writes the cut-out for a picture editor."])
+            warn(given, [f"{cut.warning} --save-inputs writes the cut-out for a picture editor."])
         STAGES.begin("network")
         result = reconstruct_object(model, name, cut.rgba, camera.elevation, precision, detail)
         estimate, between = result.estimate, None
@@ -146,10 +147,11 @@ def reconstruct_command(
         count, figures = outputs.write_result(result, cut)
         for line in (f"{name}: {count}", *figures["notes"]):
             say(line)
-        source = {"input": str(path), "name": name, "cutout": cut.how, "warning": cut.warning}
+        source = {"input": str(given), "name": name, "cutout": cut.how, "warning": cut.warning}
         results.made.append(source | {"elevation": elevation, "elevation_doubt": between} | figures)
 
     for_each(names, one, "reconstruct", "picture", failures)
+    failures[:] = [(_given(path), reason) for path, reason in failures]
     outputs.finish()
     return results
 
@@ -177,9 +179,14 @@ def _find_pictures(
     return pictures, failures
 
 
+def _given(path: Path) -> Path:
+    """Return a file as it was given: the copy of the standard input is ``-``."""
+    return Path("-") if path.parent.name.startswith(_PIPED) else path
+
+
 def _standard_input() -> Path:
     """Return a copy of the standard input, which is removed at the end."""
-    folder = tempfile.TemporaryDirectory(prefix="gamba-")
+    folder = tempfile.TemporaryDirectory(prefix=_PIPED)
     atexit.register(folder.cleanup)
     path = Path(folder.name) / "stdin"
     content = sys.stdin.buffer.read(MAX_STDIN + 1)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, cast
 import tyro
 from msgspec import Meta
 
-from ..batch import check_not_read, for_each, plan_outputs, progress_bar
+from ..batch import check_not_read, for_each, plan_outputs, progress_bar, warn
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -65,7 +65,7 @@ def render_command(
             zero), and print their number; without it such a file is refused.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from ..formats.read import find_gaussians, read_with_warning
+    from ..formats.read import find_gaussians, read_gaussians
     from ..surfaces.extract import unit_frame
     from ..trajectories.film import Film, parse_background, parse_size, plan_path, shoot
     from ..trajectories.movies import require_movie
@@ -110,7 +110,9 @@ def render_command(
 
     def one(target: str, path: Path) -> None:
         count = len(film.cameras.viewmats)
-        gaussians = read_with_warning(path, drop_bad)
+        left_out: list[str] = []
+        gaussians = read_gaussians(path, left_out if drop_bad else None)
+        warn(path, left_out)
         with progress_bar(total=count, desc=path.name, unit="view", leave=False) as bar:
             shoot(Path(target), kind, gaussians, unit_frame(gaussians), film, chosen, bar.update)
 

@@ -1,4 +1,4 @@
-"""``gamba view``: a file of Gaussians in the browser."""
+"""``gamba view``: Gaussians or a mesh in the browser."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def view_command(
     /,
     out: Path | None = None,
     mesh: Path | None = None,
-    mesh_frame: Axes = "opengl",
+    mesh_axes: Axes | None = None,
     open_browser: bool = True,
     elevation: Elevation = 0.0,
     fov: Fov | None = None,
     distance: Distance | None = None,
     drop_bad: bool = False,
 ) -> None:
-    """Show Gaussians in a browser, as one self-contained HTML page.
+    """Show Gaussians or a mesh in a browser, as one self-contained HTML page.
 
     Args:
-        file: Gaussians (.ply, .splat, .spz, .glb).
+        file: Gaussians (.ply, .splat, .spz, .glb), or a mesh (.glb, .obj, .ply, .stl).
         out: File for the page; a temporary file by default.
         mesh: A mesh of the same object, shown too (.glb, .obj, .ply, .stl).
-        mesh_frame: Axes of the mesh; opengl is y up, gamba's default for meshes.
+        mesh_axes: Axes of the mesh; by default those that its file states, else opengl: y up.
         open_browser: Open the browser.
         elevation: Initial elevation of the camera above the object, degrees.
         fov: Field of view, degrees; 49.1 by default. Without --distance the object keeps its size
@@ -48,19 +48,29 @@ def view_command(
 
     import numpy as np
 
-    from ..formats.read import read_with_warning
+    from ..formats.clouds import Cloud
+    from ..formats.meshes import TexturedMesh
+    from ..formats.read import read
+    from ..gaussians import Gaussians
     from ..trajectories.paths import Viewpoint
-    from ..viewer.pack import own_frame, read_viewed_mesh, visible
+    from ..viewer.pack import own_frame, viewed_mesh, visible
     from ..viewer.page import write_viewer
 
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"--out {out}: the page is an .html file")
-    gaussians = read_with_warning(file, drop_bad)
-    surface = None
-    if mesh is not None:
-        surface = read_viewed_mesh(mesh, mesh_frame)
-        warn(mesh, surface.warnings)
+    found = read(file, drop_bad)
+    if isinstance(found.shape, Cloud):
+        raise UserError(f"{file}: contains points; gamba view shows Gaussians and meshes")
+    gaussians = found.shape if isinstance(found.shape, Gaussians) else None
+    if mesh is not None and gaussians is None:
+        raise UserError(f"--mesh goes with Gaussians, {file} contains a mesh")
+    warn(file, found.warnings)
+    shown, surface = found if mesh is None else read(mesh, only=TexturedMesh), None
+    if isinstance(shown.shape, TexturedMesh):
+        surface = viewed_mesh(shown.shape, mesh_axes or shown.axes)
+    if mesh is not None and gaussians is not None and surface is not None:
+        warn(mesh, shown.warnings)
         size = own_frame(visible(gaussians, file.name), file.name).size
         scale = size / float(np.ptp(surface.vertices, axis=0).max())
         if not 0.5 < scale < 2:  # of --size-mm
@@ -70,8 +80,7 @@ def view_command(
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"
     start = Viewpoint().changed(elevation, distance, fov)
-    view = (start.distance, start.fov, start.elevation)
-    write_viewer(page, file.name, gaussians, mesh=surface, view=view)
+    write_viewer(page, file.name, gaussians, mesh=surface, view=start.camera)
     print(page, flush=True)
     if open_browser and not webbrowser.open(page.resolve().as_uri()):
         print("gamba: no browser was found; open the page above in one", file=sys.stderr)

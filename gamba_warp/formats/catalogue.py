@@ -15,7 +15,7 @@ from ..errors import UserError
 from ..files import visible, warn_of_others
 from ..untrusted.documents import read_document
 from ..untrusted.names import MAX_NAME, parts_of, plain_name
-from .meshes import SUFFIXES
+from .names import MESH_SUFFIXES
 
 CATALOGUE = "catalogue.json"  # next to the meshes: names and attribution, see ``find_meshes``
 # Names of files and folders that do not identify an object.
@@ -67,8 +67,8 @@ def find_meshes(folder: Path) -> list[Mesh]:
     known = _read_catalogue(folder / CATALOGUE)
     meshes: dict[str, Mesh] = {}
     files = [path for path in visible(folder, "*") if path.is_file()]
-    warn_of_others(folder, files, SUFFIXES)
-    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+    warn_of_others(folder, files, MESH_SUFFIXES)
+    paths = sorted(path for path in files if path.suffix.lower() in MESH_SUFFIXES)
     named = _name_parts([path.relative_to(folder).with_suffix("") for path in paths])
     for path, parts in zip(paths, named):
         model = path.relative_to(folder).as_posix()
@@ -82,7 +82,7 @@ def find_meshes(folder: Path) -> list[Mesh]:
         about = entry.attribution or {}, entry.rotation, folder
         meshes[uid] = Mesh(path, uid, name, group, *about)
     if not meshes:
-        raise UserError(f"{folder}: no mesh files ({', '.join(SUFFIXES)})")
+        raise UserError(f"{folder}: no mesh files ({', '.join(MESH_SUFFIXES)})")
     return [meshes[uid] for uid in sorted(meshes)]
 
 

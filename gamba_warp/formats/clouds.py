@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import UserError
-from .headers import MAX_VALUES, open_shape, read_rows
-from .ply_data import PlyData, read_ply
+from .headers import MAX_VALUES, Source, read_rows
+from .ply_data import PlyData
 
-SUFFIXES = (".xyz", ".ply")
 MAX_POINTS = MAX_VALUES // 3
 _AXES = ("x", "y", "z")
 
@@ -27,51 +26,44 @@ class Cloud(NamedTuple):
     """Points of a file."""
 
     positions: np.ndarray  # [N, 3] float64, finite, N > 0
-    normals: np.ndarray | None = None  # [N, 3] float64 of any length, not checked
+    normals: np.ndarray | None = None  # [N, 3] float64 of unit length; None if one has none
 
 
-def read_cloud(path: Path) -> Cloud:
-    """Read a cloud by its suffix, one of ``SUFFIXES``.
-
-    Raises:
-        UserError: the file is missing, empty, over ``MAX_POINTS`` points or malformed, a word is
-            not a number, or a point is not finite.
-    """
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise UserError(f"{path}: not one of {', '.join(SUFFIXES)}")
-    try:
-        return _checked(path, reader(path))
-    except MemoryError as error:
-        raise UserError(f"{path}: not enough memory for it") from error
-
-
-def _checked(path: Path, cloud: Cloud) -> Cloud:
-    count = len(cloud.positions)
+def _checked(path: Path, positions: np.ndarray, normals: np.ndarray | None = None) -> Cloud:
+    """Return a cloud. Raises UserError if it has no points, too many, or one is not finite."""
+    count = len(positions)
     if count == 0:
         raise UserError(f"{path}: contains no points")
     if count > MAX_POINTS:
         raise UserError(f"{path}: {count} points, over the limit of {MAX_POINTS}")
-    bad = count - np.count_nonzero(np.isfinite(cloud.positions).all(1))
+    bad = count - np.count_nonzero(np.isfinite(positions).all(1))
     if bad:
         raise UserError(f"{path}: {bad} of {count} points are not finite")
-    return cloud
+    if normals is not None:
+        with np.errstate(over="ignore"):
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / lengths if np.isfinite(lengths).all() and lengths.all() else None
+    return Cloud(positions, normals)
 
 
-def _read_xyz(path: Path) -> Cloud:
-    with open_shape(path) as (file, _):
-        table = read_rows(file.read(), str(path), comments=True).table(str(path))
+def read_xyz(source: Source) -> Cloud:
+    """Read the points of an ``.xyz`` file.
+
+    Raises:
+        UserError: the file has over ``MAX_POINTS`` points or none, a word is not a number, the
+            rows differ in length, or a point is not finite.
+    """
+    source.check()
+    path = source.path
+    table = read_rows(source.file.read(), str(path), comments=True).table(str(path))
     if len(table) and table.shape[1] < 3:
         raise UserError(f"{path}: {table.shape[1]} columns, expected x y z")
-    return Cloud(np.ascontiguousarray(table[:, :3]))
+    return _checked(path, np.ascontiguousarray(table[:, :3]))
 
 
 def cloud_of(path: Path, data: PlyData) -> Cloud:
-    """Return the cloud of a ``.ply`` file's content. Raises UserError as ``read_cloud``."""
+    """Return the cloud of a ``.ply`` file's content. Raises UserError as ``read_xyz``."""
     positions = data.numbers("vertex", _AXES)
     if positions is None:
         raise UserError(f"{path}: its vertices have no x, y and z")
-    return _checked(path, Cloud(positions, data.numbers("vertex", ("nx", "ny", "nz"))))
-
-
-_READERS = {".xyz": _read_xyz, ".ply": lambda path: cloud_of(path, read_ply(path))}
+    return _checked(path, positions, data.numbers("vertex", ("nx", "ny", "nz")))

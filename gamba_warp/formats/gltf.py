@@ -25,9 +25,7 @@ from .gltf_file import (
     GltfFile,
     Index,
     normalised,
-    open_gltf,
 )
-from .headers import open_shape
 from .materials import Material, SideFiles, plain
 from .parts import Part, strip_faces, to_rgba8
 
@@ -52,14 +50,13 @@ _KNOWN = {
 }
 
 
-def read_gltf(path: Path, sides: SideFiles) -> Iterator[Part]:
+def gltf_parts(file: GltfFile, sides: SideFiles) -> Iterator[Part]:
     """Yield the triangles of the default scene of a ``.glb`` or ``.gltf`` file.
 
     Raises:
         UserError: the file is malformed.
     """
-    with open_shape(path) as (stream, size):
-        file = open_gltf(path, stream, size, lambda uri: sides.read(unquote(uri), uri))
+    path = file.path
     for name in file.extensions:
         if name not in _KNOWN:
             warn = sides.warnings.append if name.startswith("KHR_materials") else sides.omit

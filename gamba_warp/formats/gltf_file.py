@@ -8,18 +8,19 @@ from __future__ import annotations
 import base64
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
-from urllib.parse import unquote_to_bytes
+from typing import Annotated, Any, Literal
+from urllib.parse import unquote, unquote_to_bytes
 
 import msgspec
 import numpy as np
 
 from ..errors import UserError
 from ..untrusted.documents import parse_document
-from .headers import MAX_FILE, compare_sizes
+from .headers import MAX_FILE, Source, compare_sizes
+from .materials import SideFiles
 
 MAX_NODES = 200_000  # of a scene, each way to a node counted, and instances of its meshes
 MAX_PRIMITIVES = 20_000  # in a scene
@@ -78,10 +79,6 @@ class Entry:
         return [Entry(f"{self.where}.{name}[{i}]", item) for i, item in enumerate(items)]
 
 
-def _no_side_file(uri: str) -> bytes:
-    raise UserError("its data are in another file, which is not read")
-
-
 @dataclass
 class GltfFile:
     """A document and its buffers. All methods raise UserError if the file is malformed."""
@@ -90,7 +87,7 @@ class GltfFile:
     document: Entry  # the root object
     extensions: list[str]  # names of all extensions anywhere in the document
     binary: bytes | None  # the binary chunk of a .glb
-    side_file: Callable[[str], bytes]  # reads the file of a URI
+    sides: SideFiles  # reads the files of URIs
     size: int  # bytes, including other files of it that were read
     _numbers: int = 0
     _buffers: dict[int, bytes] = field(default_factory=dict)
@@ -117,7 +114,7 @@ class GltfFile:
     def content(self, uri: str) -> bytes:
         """Return the bytes of a URI: embedded data, or a file in the document's folder."""
         if not uri.startswith("data:"):
-            found = self.side_file(uri)
+            found = self.sides.read(unquote(uri), uri)
             self.size += len(found)
             return found
         head, _, data = uri.partition(",")
@@ -290,21 +287,19 @@ def _matrices(moves: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> np.nd
     return matrices
 
 
-def open_gltf(
-    path: Path, file: BinaryIO, size: int, side_file: Callable[[str], bytes] = _no_side_file
-) -> GltfFile:
-    """Read the document of a glTF file of ``size`` bytes, and its first binary chunk.
+def open_gltf(source: Source, sides: SideFiles) -> GltfFile:
+    """Read the document of a glTF file, and its first binary chunk.
 
     Args:
-        path: if its suffix is ``.gltf``, the file is a document; else a container of one.
-        file: at its start.
-        size: of the file, bytes.
-        side_file: reads the file of a URI.
+        source: if its suffix is ``.gltf``, the file is a document; else a container of one.
+        sides: reads the files of URIs.
 
     Raises:
         UserError: the container or the document is malformed, or it requires an extension that
             packs triangles.
     """
+    path, file, size = source
+    source.check()
     text, binary = file.read(), None
     if path.suffix.lower() != ".gltf":
         text, binary = _chunks(path, text, size)
@@ -312,7 +307,7 @@ def open_gltf(
     needed = document.get("extensionsRequired", list[str], [])
     names = [name.decode("ascii", "replace") for name in _EXTENSION.findall(text)]
     names = dict.fromkeys([*document.get("extensionsUsed", list[str], []), *needed, *names])
-    gltf = GltfFile(path, document, list(names), binary, side_file, size)
+    gltf = GltfFile(path, document, list(names), binary, sides, size)
     if {*PACKED} & {*needed}:
         gltf.refuse_packed()
     return gltf

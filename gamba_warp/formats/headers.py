@@ -21,33 +21,47 @@ BOM = b"\xef\xbb\xbf"
 _BLOCK = 1 << 22  # bytes of a text that are read at once
 
 
+class Source(NamedTuple):
+    """An open file of a shape, at its start."""
+
+    path: Path
+    file: BinaryIO
+    size: int  # bytes
+
+    def head(self, count: int) -> bytes:
+        """Return the first bytes, and leave the file at its start."""
+        found = self.file.read(count)
+        self.file.seek(0)
+        return found
+
+    def check(self, limit: int = MAX_FILE) -> None:
+        """Raise UserError if the file has more bytes than the limit."""
+        if self.size > limit:
+            raise UserError(f"{self.path}: over {limit >> 20} MB, the limit for a shape")
+
+
 @contextmanager
-def open_shape(path: Path, limit: int = MAX_FILE) -> Iterator[tuple[BinaryIO, int]]:
-    """Open a shape file of at most ``limit`` bytes; yield it and its size in bytes.
+def open_shape(path: Path, limit: int = MAX_FILE) -> Iterator[Source]:
+    """Open a shape file of at most ``limit`` bytes.
 
     Raises:
         UserError: it is missing, not a plain file, empty or too large, cannot be read, or the body
             runs out of memory.
     """
     try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
+        if "\0" in str(path) or (path.exists() and not (path.is_file() or path.is_dir())):
             raise UserError(f"{path}: not a plain file")
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
             if size == 0:
                 raise UserError(f"{path}: the file is empty, not a {path.suffix} file")
-            check_limit(path, size, limit)
-            yield file, size
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise UserError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+            source = Source(path, file, size)
+            source.check(limit)
+            yield source
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror or error}") from error
     except MemoryError as error:
         raise UserError(f"{path}: not enough memory for it") from error
-
-
-def check_limit(path: Path, size: int, limit: int) -> None:
-    """Raise UserError if a file has more bytes than the limit."""
-    if size > limit:
-        raise UserError(f"{path}: over {limit >> 20} MB, the limit for a shape")
 
 
 def compare_sizes(path: Path, says: str, wanted: int, there: int, exact: bool = True) -> None:

@@ -8,7 +8,7 @@ The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up by convention
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,24 +18,35 @@ from numpy.typing import ArrayLike
 
 from ..color_spaces import to_linear
 from ..errors import UserError
-from .gltf import read_gltf
+from .gltf import gltf_parts
+from .gltf_file import open_gltf
+from .headers import Source, open_shape
 from .materials import GREY, Material, SideFiles
+from .names import MESH_SUFFIXES
 from .obj import read_obj
 from .off import read_off
 from .parts import Part, used_vertices
-from .ply_data import PlyData
-from .ply_mesh import read_ply_mesh
+from .ply_data import parse_ply
+from .ply_mesh import ply_parts
 from .stl import read_stl
 
-_READERS: dict[str, Callable[[Path, SideFiles], Iterator[Part]]] = {
+
+def _read_gltf(source: Source, sides: SideFiles) -> Iterator[Part]:
+    return gltf_parts(open_gltf(source, sides), sides)
+
+
+def _read_ply(source: Source, sides: SideFiles) -> Iterator[Part]:
+    return ply_parts(parse_ply(source), sides)
+
+
+_READERS: dict[str, Callable[[Source, SideFiles], Iterator[Part]]] = {
     ".obj": read_obj,
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".ply": read_ply_mesh,
+    ".glb": _read_gltf,
+    ".gltf": _read_gltf,
+    ".ply": _read_ply,
     ".stl": read_stl,
     ".off": read_off,
 }
-SUFFIXES = tuple(_READERS)
 Y_UP = (".obj", ".glb", ".gltf")
 MAX_REACH = 1e18  # the squares of larger coordinates overflow float32
 MAX_PARTS = 40_000_000  # vertices and faces; their arrays take 4 GB
@@ -125,9 +136,7 @@ def default_up(path: str | Path) -> str:
     return "y" if Path(path).suffix.lower() in Y_UP else "z"
 
 
-def load_mesh(
-    path: str | Path, root: Path | None = None, ply: PlyData | None = None
-) -> TexturedMesh:
+def load_mesh(path: str | Path, root: Path | None = None) -> TexturedMesh:
     """Read a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
     A missing texture is replaced by its material's plain colour, a missing material by grey, a
@@ -137,34 +146,40 @@ def load_mesh(
     Args:
         path: the file.
         root: the folder above the file in which it may name other files; by default its own.
-        ply: content of a ``.ply`` file that was read already; or None.
 
     Raises:
         UserError: missing, malformed, no faces, vertices not finite, or no extent.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise UserError(f"{path}: not a mesh file ({', '.join(SUFFIXES)})")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise UserError(f"{path}: not a mesh file ({', '.join(MESH_SUFFIXES)})")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
-    sides = SideFiles(path, root=root)
+    with open_shape(path) as source:
+        return read_mesh(source, SideFiles(path, root=root))
+
+
+def read_mesh(source: Source, sides: SideFiles) -> TexturedMesh:
+    """Read an open file by its suffix, one of ``MESH_SUFFIXES``; errors as for ``load_mesh``."""
+    source.check()
+    return mesh_of(_READERS[source.path.suffix.lower()](source, sides), sides)
+
+
+def mesh_of(found: Iterable[Part], sides: SideFiles) -> TexturedMesh:
+    """Join the parts of a file to one mesh; errors as for ``load_mesh``."""
     parts: list[TexturedMesh] = []
     count = 0
-    reader = _READERS[path.suffix.lower()]
-    try:
-        for part in reader(path, sides) if ply is None else read_ply_mesh(path, sides, ply):
-            if not len(part.faces):
-                continue
-            parts.append(_complete(part, sides))
-            count += len(part.faces) + len(parts[-1].vertices)  # a scene may repeat one part
-            if count > MAX_PARTS:
-                limit = f"over {MAX_PARTS} vertices and faces, the limit for a mesh"
-                raise UserError(f"{path}: {limit}")
-        if not parts:
-            raise UserError(f"{path}: no faces")
-        return _without_flat(_joined(parts, sides))
-    except MemoryError as error:
-        raise UserError(f"{path}: not enough memory for it") from error
+    for part in found:
+        if not len(part.faces):
+            continue
+        parts.append(_complete(part, sides))
+        count += len(part.faces) + len(parts[-1].vertices)  # a scene may repeat one part
+        if count > MAX_PARTS:
+            limit = f"over {MAX_PARTS} vertices and faces, the limit for a mesh"
+            raise UserError(f"{sides.path}: {limit}")
+    if not parts:
+        raise UserError(f"{sides.path}: no faces")
+    return _without_flat(_joined(parts, sides))
 
 
 def _complete(part: Part, sides: SideFiles) -> TexturedMesh:

@@ -12,6 +12,8 @@ SPLAT_FORMATS: tuple[str, ...] = get_args(SplatFormat)
 MESH_FORMATS: tuple[str, ...] = get_args(MeshFormat)
 # Suffixes of files of Gaussians; .ply and .glb may hold a mesh as well.
 SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".glb")
+MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
+SHAPE_SUFFIXES = (*MESH_SUFFIXES, ".xyz", ".splat", ".spz")
 
 
 def splat_suffix(kind: str) -> str:

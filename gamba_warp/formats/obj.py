@@ -15,11 +15,11 @@ from .headers import (
     BOM,
     Lines,
     Rows,
+    Source,
     blocks_of,
     is_blank,
     is_number,
     joined_rows,
-    open_shape,
     parse_numbers,
     parse_rows,
     without_comments,
@@ -37,14 +37,14 @@ _LEAST = {b"v": 3, b"vt": 1, b"vn": 3}  # numbers of a line at least, by its fir
 _IGNORED = {"g", "o", "s", "mg", "lod", "bevel", "shadow_obj", "trace_obj"}
 
 
-def read_obj(path: Path, sides: SideFiles) -> Iterator[Part]:
+def read_obj(source: Source, sides: SideFiles) -> Iterator[Part]:
     """Yield a part for each material.
 
     Raises:
         UserError: a line of vertices or faces is malformed, or a face names a missing vertex.
     """
-    with open_shape(path) as (file, _):
-        text = file.read().removeprefix(BOM).replace(b"\\\r\n", b" ")
+    path = source.path
+    text = source.file.read().removeprefix(BOM).replace(b"\\\r\n", b" ")
     if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise UserError(f"{path}: text in UTF-16, but an .obj file must be UTF-8")
     text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from ..errors import UserError
-from .headers import BOM, check_lines, open_shape, read_rows
+from .headers import BOM, Source, check_lines, read_rows
 from .materials import SideFiles
 from .parts import Part, cut_polygons, to_rgba8
 from .ply_data import spread
@@ -21,16 +20,16 @@ _HEADER_LINES, _HEADER_LINE = 1000, 1 << 12  # lines of a header, and letters of
 _HEADER = re.compile(r"(ST)?(C)?(N)?OFF(?![A-Z])\s*(.*)")
 
 
-def read_off(path: Path, sides: SideFiles) -> Iterator[Part]:
+def read_off(source: Source, sides: SideFiles) -> Iterator[Part]:
     """Yield the one part of a file.
 
     Raises:
         UserError: it holds less or more than its header states, or a word is not a number.
     """
-    with open_shape(path) as (file, _):
-        found = _HEADER.fullmatch(_next_line(file))
-        counts = (found[4] or _next_line(file)).split() if found else []
-        text = file.read()
+    path, file, _ = source
+    found = _HEADER.fullmatch(_next_line(file))
+    counts = (found[4] or _next_line(file)).split() if found else []
+    text = file.read()
     if found is None or len(counts) < 2 or not all(w.isdecimal() for w in counts[:2]):
         raise UserError(f"{path}: broken header, expected OFF and the vertex and face counts")
     count, faces = (int(word[:18]) for word in counts[:2])

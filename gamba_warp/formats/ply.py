@@ -113,10 +113,10 @@ def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
             attribute is missing, the Gaussians change with time, or ``checked_gaussians`` refuses
             them.
     """
-    return gaussians_of(Path(path), read_ply(Path(path)), left_out)
+    return ply_gaussians(Path(path), read_ply(Path(path)), left_out)
 
 
-def gaussians_of(path: Path, data: PlyData, left_out: list[str] | None = None) -> Gaussians:
+def ply_gaussians(path: Path, data: PlyData, left_out: list[str] | None = None) -> Gaussians:
     """Return the Gaussians of a file's content, as ``load_ply`` does."""
     packed = data.header.is_packed
     read = {*WORDS} if packed else {name for names in _GROUPS.values() for name in names}

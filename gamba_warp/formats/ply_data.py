@@ -13,7 +13,7 @@ from .headers import (
     MAX_FILE,
     MAX_VALUES,
     Rows,
-    check_limit,
+    Source,
     check_lines,
     compare_sizes,
     open_shape,
@@ -107,7 +107,7 @@ class PlyData(NamedTuple):
         return np.stack([np.asarray(column, np.float64) for column in found], 1)
 
 
-def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
+def _read_header(path: Path, file: BinaryIO) -> PlyHeader:
     """Read the header at the start of a file, and leave the file's position undefined.
 
     Raises:
@@ -161,20 +161,21 @@ def read_ply(path: Path) -> PlyData:
     Raises:
         UserError: as for ``parse_ply``, or the file cannot be read.
     """
-    with open_shape(path, MAX_SPLATS) as (file, size):
-        return parse_ply(path, file, size)
+    with open_shape(path, MAX_SPLATS) as source:
+        return parse_ply(source)
 
 
-def parse_ply(path: Path, file: BinaryIO, size: int) -> PlyData:
-    """Read every element of an open ``.ply`` file of ``size`` bytes, from its start.
+def parse_ply(source: Source) -> PlyData:
+    """Read every element of an open ``.ply`` file.
 
     Raises:
         UserError: not a ``.ply`` file, too large, it holds less or more than its header states, a
             word is not a number, or a name is given twice.
     """
-    header = read_ply_header(path, file)
+    path, file, size = source
+    header = _read_header(path, file)
     _check_header(path, header)
-    check_limit(path, size, MAX_SPLATS if header.has_gaussians else MAX_FILE)
+    source.check(MAX_SPLATS if header.has_gaussians else MAX_FILE)
     file.seek(header.start)
     says = ", ".join(f"{element.count} {element.name}" for element in header.elements)
     if header.format == "ascii":

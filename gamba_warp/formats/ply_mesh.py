@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 from ..errors import UserError
 from .materials import Material, SideFiles
 from .parts import Part, cut_polygons, strip_faces, to_rgba8
-from .ply_data import Columns, PlyData, PlyList, read_ply
+from .ply_data import Columns, PlyData, PlyList
 
 _CORNERS = ("vertex_indices", "vertex_index")
 # Names of the channels of a colour, and of texture coordinates.
@@ -21,13 +20,13 @@ _UVS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _TEXTURE = re.compile(r"TextureFile\s+(.*)", re.I)
 
 
-def read_ply_mesh(path: Path, sides: SideFiles, data: PlyData | None = None) -> Iterator[Part]:
-    """Yield the one part of a file; ``data`` is its content, if it was read already.
+def ply_parts(data: PlyData, sides: SideFiles) -> Iterator[Part]:
+    """Yield the one part of a file's content.
 
     Raises:
-        UserError: as for ``read_ply``, or vertices without a position, or faces without corners.
+        UserError: vertices without a position, or faces without corners.
     """
-    data = data or read_ply(path)
+    path = sides.path
     vertices, faces = data.elements.get("vertex", {}), data.elements.get("face", {})
     points = data.numbers("vertex", ("x", "y", "z"))
     strips = {} if faces else data.elements.get("tristrips", {})

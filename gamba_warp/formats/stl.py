@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
-from .headers import BOM, Lines, blocks_of, compare_sizes, open_shape, read_rows
+from .headers import BOM, Lines, Source, blocks_of, compare_sizes, read_rows
 from .materials import SideFiles
 from .parts import Part
 
@@ -17,7 +17,7 @@ _HEAD = 84  # bytes of a binary file before its faces: a text and their count
 _FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
+def read_stl(source: Source, sides: SideFiles) -> Iterator[Part]:
     """Yield the one part of a file; its faces share no vertices.
 
     A file is text if it begins with "solid", without zero bytes, and does not have the length of
@@ -26,8 +26,8 @@ def read_stl(path: Path, sides: SideFiles) -> Iterator[Part]:
     Raises:
         UserError: it holds less than it states, or a word is not a number.
     """
-    with open_shape(path) as (file, size):
-        data = file.read()
+    path, file, size = source
+    data = file.read()
     count = struct.unpack_from("<I", data, 80)[0] if size >= _HEAD else -1
     start = data[: 1 << 12].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
     if size != _HEAD + 50 * count and start.startswith(b"solid") and b"\0" not in start:

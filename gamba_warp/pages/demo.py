@@ -15,11 +15,11 @@ from ..conventions import GREY, over_background
 from ..errors import UserError
 from ..formats.ply import load_ply
 from ..photo.cutout import cut_out
+from ..trajectories.movies import turntable_frames
 from ..untrusted.documents import read_document
 from .card import OF_GROUNDS, OF_PICTURES, ModelCard, about_model, read_card
-from .page import Section, demo_page
+from .page import Section, write_page
 from .sheet import tiles
-from .turntable import turntable_frames
 
 _BASELINES = {
     "background": "an empty picture",
@@ -103,7 +103,7 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
         *held_out,
         *icons,
     ]
-    demo_page(path, sections, text=text)
+    write_page(path, "Gamba demo", sections, text)
 
 
 def _turned(title: str, text: str, ply: Path) -> Section:

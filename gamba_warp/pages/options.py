@@ -23,18 +23,18 @@ class FileOptions:
             neither page nor turntable.
         json: Print the results as a JSON object in place of text.
         splats: Files of the Gaussians.
-        mesh: Files of a mesh of the surface, in colour except .stl (gamba export has more options).
-        faces: Largest number of faces of the mesh; 0 keeps all. By default 50,000, with a texture
-            10,000.
-        texture: Side of the mesh's colour texture in pixels, in the .glb, or beside the .obj with a
-            .mtl; 0 for none. By default 1024 with --mesh glb.
+        mesh: Files of a mesh of the surface, in colour except .stl.
+        faces: Largest number of faces of the mesh; 0 keeps all. By default 50,000, or 10,000 with a
+            texture.
+        texture: Side of the mesh's colour texture in pixels, in the .glb, or beside the .obj with
+            its .mtl; 0 for none. By default 1024 with --mesh glb.
         watertight: Make the mesh closed, as a slicer for 3D printing needs it.
         size_mm: Longest side of the mesh in millimetres, the unit of slicers.
         page: Write an HTML page with a 3D viewer, and the input and the turntable, if any.
         turntable: Animation of one turn.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
-        frame: Axes of meshes except .glb; opengl is y up, opencv y down like files of Gaussians.
+        axes: Axes of meshes except .glb; opengl is y up, opencv y down like files of Gaussians.
         min_opacity: Leave out Gaussians with a lower opacity; by default 1/255, below which they
             are never drawn. 0 keeps all.
     """
@@ -51,7 +51,7 @@ class FileOptions:
     turntable: Literal["gif", "mp4", "none"] = "none"
     size: Side = 256
     frames: Frames = 48
-    frame: Axes = "opengl"
+    axes: Axes = "opengl"
     min_opacity: Opacity | None = None
 
 

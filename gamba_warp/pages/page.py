@@ -17,10 +17,10 @@ from PIL import Image
 from ..files import write_text
 from ..gaussians import Gaussians
 from ..images import to_uint8
+from ..trajectories.movies import SECONDS
 from ..trajectories.paths import Viewpoint
 from ..viewer.page import POLICY, frame_element, frames_script
 from .templates import render
-from .turntable import SECONDS
 
 _NUMBER = re.compile(r"[-+]?[0-9][0-9.,e+-]*( %| to [0-9.,e+-]+)?")
 _ABSENT = ("", "-", "absent")
@@ -86,39 +86,15 @@ def page_text(title: str, text: str, sections: Sequence[Section], auto: bool = F
     )
 
 
-def reconstruction_page(path: str | Path, section: Section) -> None:
-    """Write the page of one reconstruction atomically; its viewer is large and starts on load.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    write_text(path, page_text(section.title, "", [section], auto=True))
-
-
-def demo_page(
-    path: str | Path, sections: Sequence[Section], *, title: str = "Gamba demo", text: str = ""
+def write_page(
+    path: str | Path, title: str, sections: Sequence[Section], text: str = "", auto: bool = False
 ) -> None:
-    """Write a page of many sections atomically; its viewers start on request.
+    """Write ``page_text`` to a file, atomically; arguments as there.
 
     Raises:
         UserError: the file cannot be written.
     """
-    write_text(path, page_text(title, text, sections))
-
-
-def index_page(path: str | Path, title: str, results: Mapping[str, np.ndarray]) -> None:
-    """Write atomically a page with links to the pages of many reconstructions in its folder.
-
-    Args:
-        path: the file.
-        title: heading of the page.
-        results: thumbnails ``[H, W, 3]`` uint8 by name; NAME.html is the page.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    text = "Input and result of each."
-    write_text(path, page_text(title, text, [Section("", links=results)]))
+    write_text(path, page_text(title, text, sections, auto))
 
 
 def _image(picture: np.ndarray, label: str, css: str = "", kind: str = "PNG") -> str:

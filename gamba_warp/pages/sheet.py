@@ -13,8 +13,8 @@ from ..errors import UserError
 from ..files import atomic_path
 from ..gaussians import Gaussians
 from ..images import load_rgba, to_uint8
+from ..trajectories.movies import turntable_frames
 from ..trajectories.paths import Viewpoint
-from .turntable import turntable_frames
 
 SUFFIXES = (".png", ".webp", ".jpg", ".jpeg")
 VIEWS = 5

@@ -18,14 +18,13 @@ from ..gaussians import Gaussians
 from ..images import save_image
 from ..untrusted.ranges import check_range
 from .files import load_path
-from .movies import check_gif, render_path, save_movie, save_pictures
+from .movies import SECONDS, check_gif, render_path, save_movie, save_pictures
 from .paths import TURNS, Viewpoint, placed, spiral, to_unit, turntable
 
 Kind = Literal["gif", "mp4", "png"]
 Color = tuple[float, float, float]
 
 FRAMES = 48  # of one turn
-SECONDS = 3.0  # of one turn
 FPS = 24.0  # of a camera file without a rate
 SIDE = 512  # pixels
 _SIDES = Meta(ge=16, le=4096)
@@ -112,8 +111,7 @@ def plan_path(
         point = Viewpoint().changed(**view)
         count = frames or turns * FRAMES
         shape = (width, height or width)
-        cameras = make(count, point.elevation, point.distance, point.fov, shape)
-        return cameras, False, count / (turns * SECONDS)
+        return make(count, point, shape), False, count / (turns * SECONDS)
     given = [name for name, value in {**view, "frames": frames}.items() if value is not None]
     if given:
         raise UserError(f"--{given[0]} applies to a turntable or a spiral, not to a file")

@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from ..cameras import Cameras
+from ..conventions import GREY
 from ..errors import UserError
 from ..files import atomic_folder, atomic_path
 from ..gaussians import Gaussians
@@ -22,7 +23,9 @@ from ..images import to_uint8
 from ..render import render
 from ..versions import require
 from .files import save_path
+from .paths import FRONT, Viewpoint, turntable
 
+SECONDS = 3.0  # of one turn of a turntable
 CAMERAS = "transforms.json"  # in a folder of pictures
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch, which takes a few hundred MB
 _CHUNK_GAUSSIANS = 1 << 22  # Gaussians projected in one launch, over all of its views
@@ -240,3 +243,39 @@ def save_pictures(
                 fields |= {"depth": f"{name}-depth.png", "depth_unit": unit}
             extra.append(fields)
         save_path(temporary / CAMERAS, cameras, rate, extra)
+
+
+def turntable_frames(
+    gaussians: Gaussians, view: Viewpoint = FRONT, *, size: int = 256, frames: int = 48
+) -> np.ndarray:
+    """Render one full turn on grey, from the reference view, with several views per launch.
+
+    Args:
+        gaussians: one object without batch dimension, in the reference frame, on the device that
+            renders.
+        view: of the first frame; the others have its elevation.
+        size: side of the square frames, pixels, >= 1.
+        frames: number of views, >= 1.
+
+    Returns:
+        ``[frames, size, size, 3]`` uint8.
+    """
+    cameras = turntable(frames, view, size)
+    return np.stack([picture for picture, _ in render_path(gaussians, cameras, (GREY, GREY, GREY))])
+
+
+def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECONDS) -> None:
+    """Write frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
+
+    Args:
+        path: ends in ``.gif`` or ``.mp4``.
+        frames: ``[F, H, W, 3]`` uint8; for MP4 the last row or column is repeated if their number
+            is odd, since H.264 needs even sizes.
+        seconds: length of one turn.
+
+    Raises:
+        UserError: another suffix, or the file cannot be written.
+    """
+    grey = int(to_uint8(np.array(GREY)))
+    sample = frames[:: max(1, len(frames) // 8)]
+    save_movie(path, frames, len(frames) / seconds, sample, (grey, grey, grey))

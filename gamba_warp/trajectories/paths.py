@@ -56,68 +56,43 @@ class Viewpoint:
         )
 
 
-def turntable(
-    frames: int,
-    elevation: float = 0.0,
-    distance: float = DEFAULT_DISTANCE,
-    fov: float = DEFAULT_FOV,
-    size: int | tuple[int, int] = 256,
-) -> Cameras:
+FRONT = Viewpoint()
+
+
+def turntable(frames: int, view: Viewpoint = FRONT, size: int | tuple[int, int] = 256) -> Cameras:
     """Return one full turn about the origin at one elevation; the first camera has azimuth 0.
 
     Args:
         frames: number of cameras, >= 1.
-        elevation: degrees; a camera of positive elevation looks down.
-        distance: of the cameras from the origin.
-        fov: field of view of the picture's shorter side, degrees.
-        size: side of square pictures, or width and height, pixels.
+        view: of the first camera.
+        size: side of square images, or width and height, pixels.
 
     Returns:
         Cameras ``[frames]``, float32 on the CPU, in a world where up is -y (see ``orbit``).
     """
     azimuths = torch.arange(frames) * (360.0 / frames)
-    return _around(azimuths, elevation, distance, fov, size)
+    return _around(azimuths, view.elevation, view, size)
 
 
-def spiral(
-    frames: int,
-    elevation: float = 0.0,
-    distance: float = DEFAULT_DISTANCE,
-    fov: float = DEFAULT_FOV,
-    size: int | tuple[int, int] = 256,
-) -> Cameras:
+def spiral(frames: int, view: Viewpoint = FRONT, size: int | tuple[int, int] = 256) -> Cameras:
     """Return ``TURNS`` turns about the origin with a varying elevation.
 
-    The elevation follows one period of a sine of ``SWING`` degrees about ``elevation``, so that the
-    path is closed and shows the object from above and below.
-
-    Args:
-        frames: number of cameras, >= 1.
-        elevation: of the first camera, degrees.
-        distance: as for ``turntable``.
-        fov: as for ``turntable``.
-        size: as for ``turntable``.
-
-    Returns:
-        Cameras ``[frames]``, as ``turntable``.
+    The elevation follows one period of a sine of ``SWING`` degrees about the view's, so that the
+    path is closed and shows the object from above and below. Arguments as for ``turntable``.
     """
-    share = torch.arange(frames) / frames
-    rise = elevation + SWING * torch.sin(2 * math.pi * share)
-    return _around(360.0 * TURNS * share, rise.clamp(-90, 90), distance, fov, size)
+    fraction = torch.arange(frames) / frames
+    rise = view.elevation + SWING * torch.sin(2 * math.pi * fraction)
+    return _around(360.0 * TURNS * fraction, rise.clamp(-90, 90), view, size)
 
 
 def _around(
-    azimuths: Tensor,
-    elevation: float | Tensor,
-    distance: float,
-    fov: float,
-    size: int | tuple[int, int],
+    azimuths: Tensor, elevation: float | Tensor, view: Viewpoint, size: int | tuple[int, int]
 ) -> Cameras:
     width, height = (size, size) if isinstance(size, int) else size
-    K = intrinsics(width, height, fov)
+    K = intrinsics(width, height, view.fov)
     if width < height:  # the angle applies to the width, so that a centred object is not cropped
         K[[0, 1], [0, 1]] *= width / height
-    viewmats = orbit(azimuths, elevation, distance)
+    viewmats = orbit(azimuths, elevation, view.distance)
     return Cameras(viewmats, K.expand(len(azimuths), 3, 3), width, height)
 
 

@@ -8,16 +8,15 @@ w >= 0. Gaussians are sorted by covered area, so that the viewer can skip the la
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from ..color_spaces import to_display, to_linear
-from ..conventions import Axes
 from ..errors import UserError
-from ..formats.meshes import TexturedMesh, load_mesh
+from ..formats.meshes import TexturedMesh
+from ..formats.read import UNKNOWN, rotation_between
 from ..gaussians import Gaussians
 from ..images import to_uint8
 
@@ -61,6 +60,12 @@ def own_frame(gaussians: Gaussians, name: str) -> Frame:
     if not 0 < size < np.inf:
         raise UserError(f"{name}: all Gaussians are at one point, so there is nothing to look at")
     return Frame((low + high) / 2, size)
+
+
+def frame_of_mesh(mesh: Any) -> Frame:
+    """Return a frame that moves a mesh's bounding box to the origin, with a longest side of 1."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    return Frame((low + high) / 2, float((high - low).max()))
 
 
 def visible(gaussians: Gaussians, name: str) -> Gaussians:
@@ -144,36 +149,32 @@ class ViewedMesh(NamedTuple):
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64.
         colors: ``[V, 3]`` float32, display values in [0, 1].
-        warnings: of the file, as ``TexturedMesh`` has them.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray
-    warnings: list[str]
 
 
-def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
-    """Read a mesh file for the viewer, which uses OpenCV's axes (y down).
+def viewed_mesh(mesh: TexturedMesh, axes: str = "opengl") -> ViewedMesh:
+    """Convert a mesh for the viewer, which uses OpenCV's axes (y down).
 
     A texture is reduced to its colours at the corners.
 
     Args:
-        path: the file.
-        axes: of the file; ``save_mesh`` writes OpenGL's (y up) by default.
-
-    Raises:
-        UserError: as ``load_mesh``.
+        mesh: as in its file.
+        axes: of the mesh; those that ``formats.read.read`` calls unknown are taken for OpenGL's (y
+            up), which ``save_mesh`` writes by default.
     """
-    mesh = load_mesh(path)
-    vertices = mesh.vertices * ([1.0, -1.0, -1.0] if axes == "opengl" else 1.0)
+    turn = rotation_between("opengl" if axes == UNKNOWN else axes, "opencv")
+    vertices = mesh.vertices @ turn.T
     paint = (255 * _corner_colors(mesh) + 0.5).astype(np.int64)
     # A vertex with several colours is split.
     keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]
     found, corners = np.unique(keys, return_inverse=True)
     colors = np.stack([found >> 16 & 255, found >> 8 & 255, found & 255], 1) / np.float32(255)
     faces = corners.reshape(mesh.faces.shape)
-    return ViewedMesh(vertices[found >> 24], faces, colors, mesh.warnings)
+    return ViewedMesh(vertices[found >> 24], faces, colors)
 
 
 def _corner_colors(mesh: TexturedMesh) -> np.ndarray:

@@ -19,7 +19,7 @@ from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..files import write_text
 from ..gaussians import Gaussians
 from ..images import to_uint8
-from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
+from .pack import Frame, frame_of_mesh, own_frame, pack_gaussians, pack_mesh, visible
 
 # In order of their dependencies.
 _SCRIPTS = "shaders gl sorter camera controls packed meshes open edit ui main".split()
@@ -47,7 +47,7 @@ class ViewerParts(NamedTuple):
     mesh: str
 
 
-def viewer_page(title: str, gaussians: Gaussians, **options: Any) -> str:
+def viewer_page(title: str, gaussians: Gaussians | None, **options: Any) -> str:
     """Return the viewer of one object as a document, for a file or the ``srcdoc`` of a frame.
 
     Arguments and errors are those of ``viewer_parts``.
@@ -56,7 +56,7 @@ def viewer_page(title: str, gaussians: Gaussians, **options: Any) -> str:
     return _filled(program_page(title), parts._asdict())
 
 
-def write_viewer(path: str | Path, title: str, gaussians: Gaussians, **options: Any) -> None:
+def write_viewer(path: str | Path, title: str, gaussians: Gaussians | None, **options: Any) -> None:
     """Write ``viewer_page`` to a file, atomically; arguments and errors as there.
 
     Raises:
@@ -82,7 +82,7 @@ def _program(name: str) -> str:
 
 def viewer_parts(
     title: str,
-    gaussians: Gaussians,
+    gaussians: Gaussians | None,
     *,
     mesh: Any = None,
     camera: tuple[float, float, float] | None = None,
@@ -95,7 +95,8 @@ def viewer_parts(
 
     Args:
         title: name of the object.
-        gaussians: ``[N]`` in the world of ``cameras.orbit``: y down, the input seen from azimuth 0.
+        gaussians: ``[N]`` in the world of ``cameras.orbit``: y down, the input seen from azimuth 0;
+            None shows the mesh alone.
         mesh: the object's surface in the same world, with ``vertices [V, 3]``, ``faces [F, 3]`` and
             ``colors [V, 3]`` in [0, 1] or None; or no mesh.
         camera: distance from the origin in object units, field of view of the shorter side and
@@ -113,20 +114,22 @@ def viewer_parts(
         UserError: a value is not finite, nothing can be seen, or the object has no extent.
         ValueError: there is a batch dimension.
     """
-    seen = visible(gaussians, title)
-    frame = own_frame(seen, title) if camera is None else Frame(np.zeros(3), 1.0)
+    seen = None if gaussians is None else visible(gaussians, title)
+    frame = Frame(np.zeros(3), 1.0)
+    if camera is None:
+        frame = frame_of_mesh(mesh) if seen is None else own_frame(seen, title)
     distance, fov, elevation = camera or view or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
     home = {"azimuth": 0.0, "elevation": math.radians(elevation), "distance": distance}
     home |= {"target": [0.0, 0.0, 0.0], "fov": fov}
-    records, harmonics = pack_gaussians(seen, frame)
+    records, harmonics = (b"", b"") if seen is None else pack_gaussians(seen, frame)
     surface, vertices, faces = (b"", 0, 0) if mesh is None else pack_mesh(mesh, frame, title)
     about = {
         "title": title,
         "note": note,
-        "total": gaussians.num,
-        "count": seen.num,
-        "degree": seen.degree,
-        "antialiased": seen.antialiased,
+        "total": gaussians.num if gaussians else 0,
+        "count": seen.num if seen else 0,
+        "degree": seen.degree if seen else 0,
+        "antialiased": seen.antialiased if seen else False,
         "vertices": vertices,
         "faces": faces,
         "home": home,

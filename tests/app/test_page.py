@@ -16,7 +16,7 @@ from helpers.children import ran
 from helpers.matting import matting_network
 from PIL import Image
 
-from gamba_warp.formats.gaussians.files import read_gaussians
+from gamba_warp.formats.read import read_gaussians
 from gamba_warp.images import save_image
 from gamba_warp.trajectories.paths import set_up
 

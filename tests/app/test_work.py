@@ -19,8 +19,8 @@ from gamba_warp.app import cutting, guard, main_thread, work
 from gamba_warp.batch import STAGES
 from gamba_warp.cameras import orbit
 from gamba_warp.files import STARTER
-from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.formats.ply import load_ply
+from gamba_warp.formats.read import read_gaussians
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.photo import models

@@ -76,7 +76,7 @@ def test_a_glb_has_a_texture_and_a_size_of_print_is_millimetres(ball, tmp_path, 
 
 
 def test_frame_faces_and_colors_follow_the_options(ball, tmp_path):
-    options = ["--frame", "opencv", "--faces", "300", "--no-colors", "--mesh", "ply"]
+    options = ["--axes", "opencv", "--faces", "300", "--no-colors", "--mesh", "ply"]
     assert export(ball, "--out", tmp_path / "out", *options) == 0
     mesh = trimesh.load(tmp_path / "out" / "egg-mesh.ply")
     assert np.abs(mesh.bounds.mean(0) - [10, 20, 30]).max() < 0.2

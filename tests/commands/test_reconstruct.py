@@ -25,9 +25,9 @@ from gamba_warp.model import checkpoint as checkpoints
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.predict import reconstruct
-from gamba_warp.pages.turntable import save_turntable, turntable_frames
 from gamba_warp.photo import cutout
 from gamba_warp.render import render
+from gamba_warp.trajectories.movies import save_turntable, turntable_frames
 from gamba_warp.trajectories.paths import Viewpoint
 
 
@@ -158,7 +158,11 @@ def test_a_picture_of_the_standard_input(tmp_path, picture, checkpoint, monkeypa
         assert run_reconstruct("-", *quick(checkpoint, tmp_path / "out")) == code
     texts = capsys.readouterr()
     assert "stdin: 64 Gaussians." in texts.out and (tmp_path / "out" / "stdin.ply").is_file()
-    assert "stdin: the file is empty\n" in texts.err and texts.err.count("\n") == 1
+    assert (
+        "-: the file is empty\n" in texts.err
+        and "/stdin" not in texts.err + texts.out
+        and texts.err.count("\n") == 1
+    )
     monkeypatch.setattr("gamba_warp.commands.reconstruct.MAX_STDIN", 8)
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(bytes(9))))
     refused_command(capsys, "reconstruct", ["-"], "-: over 0 MB on the standard input")
@@ -182,7 +186,7 @@ def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeyp
     stick = cloud_of((torch.arange(64.0)[:, None] / 63) * ends, 0.04, 0.9, [0.9, 0.1, 0.1])
     monkeypatch.setattr(pipeline, "reconstruct", lambda *_: stick)
     options = [*quick(checkpoint, tmp_path), "--mesh", "ply"]
-    options += ["--frame", frame] if frame else []
+    options += ["--axes", frame] if frame else []
     assert run_reconstruct(picture, *options) == 0
     mesh = load_mesh(tmp_path / "thing-mesh.ply")
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
@@ -217,7 +221,7 @@ def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     few = load_ply(tmp_path / "thing.ply").num
     said = f"thing: {few} Gaussians, {64 - few} left out"
     assert 0 < few < 64 and said in capsys.readouterr().out
-    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--frame", "opencv") == 0
+    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--axes", "opencv") == 0
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--no-recenter") == 0
     kept = cutout.cut_out(picture, cutout.CutoutOptions(recenter=False)).rgba

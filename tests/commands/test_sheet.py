@@ -12,7 +12,7 @@ from PIL import Image
 
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.pages.sheet import VIEWS, Sheet
-from gamba_warp.pages.turntable import turntable_frames
+from gamba_warp.trajectories.movies import turntable_frames
 from gamba_warp.trajectories.paths import Viewpoint
 
 

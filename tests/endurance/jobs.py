@@ -53,7 +53,7 @@ JOBS = {
     "export": Job(
         "export {world}/gaussians --out {out} --voxels 24 --views 8 --pixels 32 --mesh glb ply "
         f"--splats ply --page --turntable gif {SMALL}",
-        "--frame opencv",
+        "--axes opencv",
     ),
     "render": Job(
         "render {world}/gaussians --out {out} --kind png --size 32 --frames 3 --depth --device cpu",

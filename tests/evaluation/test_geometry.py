@@ -11,13 +11,12 @@ from helpers.refusals import refused
 from helpers.views import cloud_of, evaluated
 
 from gamba_warp.cameras import fibonacci_sphere
-from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
+from gamba_warp.eval.shapes.load import load_shape, load_truth
 from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, nearest, sample
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.density import opacity_volume
-from gamba_warp.surfaces.options import SurfaceOptions
 
 
 def join(*meshes):
@@ -72,7 +71,7 @@ def test_density_is_the_union_of_the_gaussians(count, limit):
 def test_centers_are_drawn_by_opacity():
     one = shell(0.4, count=2)
     one.opacities = torch.tensor([0.25, 0.75])
-    points = to_surface(one, SurfaceOptions(method="centers"), 0, 4000).positions
+    points = sample(one, 4000, 0).positions
     share = np.mean(np.abs(points - one.means[1].numpy()).max(1) < 1e-6)
     assert abs(share - 0.75) < 0.03  # four standard deviations of 4000 draws
 
@@ -80,7 +79,7 @@ def test_centers_are_drawn_by_opacity():
 def test_nothing_visible():
     faint = shell(0.4, count=50)
     faint.opacities = torch.zeros(50)
-    refused("Gaussian", to_surface, faint, SurfaceOptions(method="centers"), 0, 10)
+    refused("Gaussian", sample, faint, 10, 0)
 
 
 def test_points_are_repeatable_and_area_uniform():
@@ -128,7 +127,7 @@ def test_truth_is_normalised_and_turned(tmp_path):
     truth = load_truth(tmp_path / "a.obj", protocol())  # y-up by its suffix
     mesh = truth.shape
     assert np.allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.25, 1.0])
-    again = truth.motion.apply(load_shape(tmp_path / "a.obj"))
+    again = truth.motion.apply(load_shape(tmp_path / "a.obj")[0])
     assert np.allclose(np.unique(again.vertices, axis=0), mesh.vertices)
 
 

@@ -133,7 +133,7 @@ def test_true_counts_pass(tmp_path):
     for name, content in good.items():
         (tmp_path / name).write_bytes(content)
         if name != "e.glb":  # its three points are one
-            shape = load_shape(tmp_path / name)
+            shape, _ = load_shape(tmp_path / name)
             got = shape.vertices if isinstance(shape, Mesh) else shape.positions
             assert sorted(got.tolist()) == sorted(np.eye(3).tolist()), name
 

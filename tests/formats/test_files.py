@@ -30,7 +30,7 @@ from gamba_warp.files import (
 )
 from gamba_warp.formats.read import find_gaussians
 from gamba_warp.images import find_pictures, save_image
-from gamba_warp.pages.turntable import save_turntable
+from gamba_warp.trajectories.movies import save_turntable
 
 
 def test_sha256_of_a_large_file_takes_little_memory(tmp_path):

@@ -15,7 +15,7 @@ from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.parts import cut_polygons
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
-from gamba_warp.viewer.pack import read_viewed_mesh
+from gamba_warp.viewer.pack import viewed_mesh
 
 V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 FOUR = ["0 0 0", "1 0 0", "1 1 0", "0 1 0"]
@@ -441,7 +441,7 @@ def test_colours_round_trip(tmp_path, kind):
     assert np.abs(mesh.colors[..., :3].astype(int) - colors[faces]).max() <= 1
     assert (mesh.colors[..., 3] == 255).all() and not mesh.warnings
     np.testing.assert_allclose(places(mesh), points[faces] * [1, -1, -1], atol=1e-6)
-    viewed = read_viewed_mesh(path)
+    viewed = viewed_mesh(load_mesh(path))
     np.testing.assert_allclose(viewed.colors[viewed.faces], colors[faces] / 255, atol=1.01 / 255)
 
 

@@ -12,7 +12,7 @@ from helpers.gaussians import some
 from helpers.refusals import refused
 from PIL import Image, features
 
-from gamba_warp.pages.page import Section, demo_page, page_text, reconstruction_page
+from gamba_warp.pages.page import Section, page_text, write_page
 from gamba_warp.trajectories.paths import Viewpoint
 
 
@@ -74,7 +74,7 @@ def full(title="A chair", **changes):
 
 
 def test_a_page_holds_everything_and_asks_for_nothing(tmp_path):
-    demo_page(tmp_path / "a.html", [full(), full("Second")], title="Demo", text="All of it.")
+    write_page(tmp_path / "a.html", "Demo", [full(), full("Second")], "All of it.")
     page = Page(tmp_path / "a.html")
     text = re.sub(r"(?s)<script.*?</script>", "", page.source)  # a policy keeps scripts at home
     addresses = re.findall(r"(?:src|href|url|action)\s*[=(]\s*[\"']?([^\"')\s>]+)", text)
@@ -91,8 +91,8 @@ def test_a_page_holds_everything_and_asks_for_nothing(tmp_path):
 
 def test_the_viewer_gets_the_gaussians_and_the_camera(tmp_path):
     section = full(view=Viewpoint(30.0, 2.25, 40.0))
-    for write, auto in ((demo_page, False), (reconstruction_page, True)):
-        write(tmp_path / "a.html", [section] if not auto else section)
+    for auto in (False, True):
+        write_page(tmp_path / "a.html", "", [section], auto=auto)
         page = Page(tmp_path / "a.html")
         (viewer,) = [a for a in page.all("div") if a.get("class") == "viewer"]
         assert ("data-auto" in viewer) == auto
@@ -117,7 +117,7 @@ def test_the_viewer_gets_the_gaussians_and_the_camera(tmp_path):
 
 def test_pictures_come_back_from_the_page(tmp_path):
     section = full(gaussians=None)
-    demo_page(tmp_path / "a.html", [section])
+    write_page(tmp_path / "a.html", "", [section])
     images = [decoded(a["src"]) for a in Page(tmp_path / "a.html").all("img")]
     (tmp_path / "input.png").write_bytes(images[0][1])
     with Image.open(tmp_path / "input.png") as image:
@@ -134,7 +134,7 @@ def test_text_is_escaped(tmp_path):
     section.table, section.details = [(nasty, 1), (1.5, nasty)], {nasty: nasty}
     section.views, section.files = {nasty: pictures(1, 4, 4, 3)}, [nasty]
     section.links = {nasty: frames(1)[0]}
-    demo_page(tmp_path / "a.html", [section], title=nasty, text=nasty)
+    write_page(tmp_path / "a.html", nasty, [section], nasty)
     page = Page(tmp_path / "a.html")
     assert not page.all("b") and "</script><b" not in page.source
     assert page.text.count(nasty) == 14
@@ -149,7 +149,7 @@ def test_tables_show_numbers_to_four_digits():
     written = page_text("", "", [Section("t", table=rows, header="abc")])
     for text in ('<td class="number">-1.5</td>', "<td>0.5 <span>[0.4, 0.6]</span></td>"):
         assert text in written
-    refused(r"cannot write /dev/null/a\.html", demo_page, "/dev/null/a.html", [])
+    refused(r"cannot write /dev/null/a\.html", write_page, "/dev/null/a.html", "", [])
 
 
 def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):
@@ -157,7 +157,7 @@ def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):
     for name in names:
         (tmp_path / name).write_bytes(b"ply\nformat binary_little_endian 1.0\n" + bytes(range(256)))
     section = Section("a", picture=pictures(9, 9, 4), gaussians=some(20), files=names)
-    reconstruction_page(path, section)
+    write_page(path, "a", [section], auto=True)
     links = [link for link in Page(path).all("a") if "download" in link]
     assert [urllib.parse.unquote(link["href"]) for link in links] == names
     opened = browser_page(path, 1280, 900, accept_downloads=True)
@@ -174,7 +174,7 @@ def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):
 def test_a_wide_table_fits_a_phone(tmp_path, browser_page):
     header = ["", "views", "PSNR on black", "LPIPS on black", "PSNR on grey", "LPIPS on grey"]
     rows = [["the training object most like it", "new views", 13.552, "absent", 20.957, "absent"]]
-    demo_page(tmp_path / "a.html", [Section("Numbers", header=header, table=rows)])
+    write_page(tmp_path / "a.html", "", [Section("Numbers", header=header, table=rows)])
     phone = browser_page(tmp_path / "a.html", 390, 800).page
     assert phone.evaluate(
         "(box => box.scrollWidth <= box.clientWidth)(document.querySelector('.scroll'))"

@@ -22,8 +22,8 @@ from gamba_warp.errors import UserError
 from gamba_warp.eval.compare import join, markdown_page, read_reports
 from gamba_warp.eval.shapes.load import load_shape
 from gamba_warp.formats.catalogue import find_meshes
-from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.formats.meshes import default_up, load_mesh
+from gamba_warp.formats.read import read_gaussians
 from gamba_warp.images import load_rgba
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.encoders import read_state
@@ -182,7 +182,7 @@ READERS = {
     "view": Reader(_view, checks.page, seeds.splats, 2),
     "cameras": Reader(_cameras, checks.cameras, seeds.cameras),
     "mesh": Reader(_mesh, checks.mesh, seeds.meshes),
-    "shape": Reader(alone(load_shape), checks.shape, seeds.shapes, 12),
+    "shape": Reader(alone(lambda path: load_shape(path)[0]), checks.shape, seeds.shapes, 12),
     "dataset": Reader(_dataset, checks.views, seeds.datasets, 8, True),
     "shards": Reader(_shards, checks.views, seeds.shards, 6, True),
     "catalogue": Reader(alone(find_meshes), checks.catalogue, seeds.catalogues, 4, True),

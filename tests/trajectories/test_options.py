@@ -17,8 +17,8 @@ from gamba_warp.cli import run
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.pages.turntable import turntable_frames
 from gamba_warp.surfaces.extract import Surface, unit_frame
+from gamba_warp.trajectories.movies import turntable_frames
 from gamba_warp.trajectories.paths import Viewpoint, upright
 
 

@@ -46,19 +46,19 @@ def write(path, value):
 
 
 def test_a_turntable_begins_in_front_and_turns_once():
-    cameras = turntable(5, elevation=20.0, distance=2.5, fov=30.0, size=(70, 50))
+    cameras = turntable(5, Viewpoint(20.0, 2.5, 30.0), (70, 50))
     torch.testing.assert_close(cameras.viewmats, orbit(torch.arange(5) * 72.0, 20.0, 2.5))
     torch.testing.assert_close(cameras.Ks, intrinsics(70, 50, 30.0).expand(5, 3, 3))
     assert (cameras.width, cameras.height) == (70, 50)
     # The field of view is that of the shorter side, so a tall picture shows a ball whole as well.
-    tall = turntable(1, distance=2.5, fov=30.0, size=(50, 70))
+    tall = turntable(1, Viewpoint(0.0, 2.5, 30.0), (50, 70))
     assert float(tall.Ks[0, 0, 0]) == pytest.approx(25 / math.tan(math.radians(15)))
     assert float(tall.Ks[0, 1, 1]) == pytest.approx(25 / math.tan(math.radians(15)))
 
 
 def test_a_spiral_rises_falls_and_closes():
     count = 32
-    cameras = spiral(count, elevation=10.0, distance=1.7)
+    cameras = spiral(count, Viewpoint(10.0, 1.7))
     centers = -(cameras.viewmats[:, :3, :3].mT @ cameras.viewmats[:, :3, 3:])[..., 0]
     assert torch.allclose(centers.norm(dim=-1), torch.tensor(1.7), atol=1e-5)
     heights = torch.rad2deg(torch.asin(-centers[:, 1] / 1.7))  # up is -y
@@ -67,7 +67,7 @@ def test_a_spiral_rises_falls_and_closes():
     assert float(heights.min()) == pytest.approx(10 - SWING, abs=1e-3)
     steps = (centers.roll(-1, 0) - centers).norm(dim=-1)
     assert float(steps.max()) < 1.5 * float(steps.min())  # also from the last to the first
-    assert len(spiral(3, elevation=80.0).viewmats) == 3  # beyond the pole it stays at the pole
+    assert len(spiral(3, Viewpoint(80.0)).viewmats) == 3  # beyond the pole it stays at the pole
 
 
 def test_another_field_of_view_keeps_the_object_as_large():
@@ -97,7 +97,7 @@ def test_upright_puts_the_camera_where_it_stood():
 
 def test_cameras_move_with_their_object():
     points, center, side = torch.randn(9, 3), torch.tensor([3.0, -20.0, 7.0]), 0.4
-    cameras = turntable(3, elevation=15.0)
+    cameras = turntable(3, Viewpoint(15.0))
     pixels, depths = seen_at(cameras, points)
     there = placed(cameras, center, side)
     pixels2, depths2 = seen_at(there, points.double() * side + center)

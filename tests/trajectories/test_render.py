@@ -14,7 +14,7 @@ from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.render import render
 from gamba_warp.surfaces.extract import unit_frame
 from gamba_warp.trajectories.files import load_path, save_path
-from gamba_warp.trajectories.paths import turntable
+from gamba_warp.trajectories.paths import Viewpoint, turntable
 
 CENTER, SIDE = torch.tensor([30.0, -7.0, 12.0]), 5.0
 
@@ -45,7 +45,7 @@ def test_a_turntable_of_pictures_with_its_cameras(thing, tmp_path, capsys):
     assert "1 file, 0 failures" in capsys.readouterr().out
     folder = tmp_path / "out" / "thing"
     moved = gaussians.in_unit(*unit_frame(gaussians))
-    cameras = turntable(3, 20.0, size=(40, 24))
+    cameras = turntable(3, Viewpoint(20.0), (40, 24))
     seen = render(moved, cameras, torch.ones(3), depth=True)
     made = np.stack(pictures(folder))
     # rounding to 8 bits

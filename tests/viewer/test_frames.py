@@ -9,7 +9,7 @@ from helpers.gaussians import some
 
 from gamba_warp.cli import main
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.pages.page import Section, demo_page, reconstruction_page
+from gamba_warp.pages.page import Section, write_page
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.trajectories.paths import Viewpoint
@@ -52,7 +52,7 @@ def frames(opened, count):
 def test_viewers_of_a_page_start_when_asked(browser_page, tmp_path):
     turn = np.zeros((2, 8, 8, 3), np.uint8)
     sections = [Section(f"Chair {i}", gaussians=some(40), turntable=turn) for i in range(2)]
-    demo_page(tmp_path / "a.html", sections)
+    write_page(tmp_path / "a.html", "", sections)
     opened = browser_page(tmp_path / "a.html", 800, 600)
     assert not opened.page.query_selector("iframe")
     for button in opened.page.query_selector_all(".viewer button"):
@@ -65,7 +65,7 @@ def test_viewers_of_a_page_start_when_asked(browser_page, tmp_path):
 
 def test_the_first_of_many_viewers_goes_back_to_its_picture(browser_page, tmp_path):
     sections = [Section(f"Chair {i}", gaussians=some(5)) for i in range(7)]
-    demo_page(tmp_path / "a.html", sections)
+    write_page(tmp_path / "a.html", "", sections)
     opened = browser_page(tmp_path / "a.html", 800, 600)
     opened.page.evaluate("document.querySelectorAll('.viewer button').forEach((b) => b.click())")
     found = opened.page.evaluate(
@@ -81,7 +81,7 @@ def test_the_viewer_of_a_reconstruction_starts_by_itself(browser_page, tmp_path)
     section = Section(
         "A chair", gaussians=some(40), picture=picture, mesh=mesh, view=Viewpoint(20.0)
     )
-    reconstruction_page(tmp_path / "a.html", section)
+    write_page(tmp_path / "a.html", section.title, [section], auto=True)
     opened = browser_page(tmp_path / "a.html", 800, 600)
     (frame,) = frames(opened, 1)
     assert shown(frame) > 100
@@ -107,6 +107,27 @@ def test_view_shows_a_mesh_too(ball, tmp_path, capsys):
     assert run(["view", str(ball), "--out", str(tmp_path / "page.webm")]) == 2
     assert "page.webm: the page is an .html file" in capsys.readouterr().err
     assert not page.exists() and not (tmp_path / "page.webm").exists()
+
+
+def test_view_shows_a_mesh_alone(browser_page, tmp_path, capsys):
+    """As large as Gaussians would be, whatever its axes, and without their buttons."""
+    surface = Surface(20 * np.eye(3), np.array([[0, 1, 2]]), np.eye(3, dtype=np.float32))
+    page, pixels = tmp_path / "page.html", []
+    for name, axes in (("a.glb", "opengl"), ("a.ply", "opencv"), ("a.stl", "opengl")):
+        save_mesh(tmp_path / name, surface, axes)
+        arguments = ["view", str(tmp_path / name), "--out", str(page), "--no-open-browser"]
+        assert run(arguments) == 0
+        opened = browser_page(page, 201, 150)
+        pixels.append(opened.promised("gambaViewer.rest().then(() => gambaViewer.png())"))
+        assert opened.page.inner_text("#about") == "1 faces" and not opened.messages
+        visible = [opened.page.is_visible(f"[data-mode={x}]") for x in ("gaussians", "mesh")]
+        assert visible == [False, True] and opened.page.evaluate("gambaViewer.mode") == "mesh"
+    assert pixels[0] == pixels[1] != pixels[2]  # an .stl has no colours
+    (tmp_path / "a.xyz").write_text("0 1 2\n")
+    assert run(["view", str(tmp_path / "a.xyz"), "--no-open-browser"]) == 2
+    assert "a.xyz: contains points; gamba view shows" in capsys.readouterr().err
+    assert run(["view", str(tmp_path / "a.glb"), "--mesh", str(tmp_path / "a.stl")]) == 2
+    assert "a.glb contains a mesh" in capsys.readouterr().err
 
 
 def test_view_without_a_browser_says_so_in_one_line(ball, tmp_path, monkeypatch, capsys):

@@ -9,6 +9,7 @@ import torch
 from helpers.gaussians import rotations, some
 from helpers.refusals import refused
 
+from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.viewer.pack import (
@@ -17,7 +18,7 @@ from gamba_warp.viewer.pack import (
     own_frame,
     pack_gaussians,
     pack_mesh,
-    read_viewed_mesh,
+    viewed_mesh,
     visible,
 )
 from gamba_warp.viewer.page import viewer_page, write_viewer
@@ -128,9 +129,9 @@ def test_a_mesh_file_comes_back_in_the_axes_of_the_gaussians(tmp_path, kind):
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     colors = np.array([[0.2, 0.4, 0.6], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]], np.float32)
     save_mesh(tmp_path / f"a.{kind}", Surface(vertices, faces, colors))
-    found = read_viewed_mesh(tmp_path / f"a.{kind}")
+    found = viewed_mesh(load_mesh(tmp_path / f"a.{kind}"))
     np.testing.assert_allclose(found.vertices[found.faces], vertices[faces], atol=1e-6)
     # 8 bits; those of .glb are linear light, which is coarser in the dark
     np.testing.assert_allclose(found.colors[found.faces], colors[faces], atol=0.02)
-    turned = read_viewed_mesh(tmp_path / f"a.{kind}", "opencv")
+    turned = viewed_mesh(load_mesh(tmp_path / f"a.{kind}"), "opencv")
     assert np.abs(turned.vertices[turned.faces] - vertices[faces] * [1, -1, -1]).max() < 1e-6

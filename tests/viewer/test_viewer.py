@@ -16,14 +16,16 @@ from PIL import Image
 
 from gamba_warp import render
 from gamba_warp.cameras import Cameras, intrinsics, orbit
-from gamba_warp.formats.gaussians.files import read_gaussians, write_gaussians
+from gamba_warp.formats.gaussians.files import write_gaussians
+from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.names import splat_suffix
 from gamba_warp.formats.ply import save_ply
+from gamba_warp.formats.read import read_gaussians
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.surfaces.texture import Texture
-from gamba_warp.viewer.pack import read_viewed_mesh
+from gamba_warp.viewer.pack import viewed_mesh
 from gamba_warp.viewer.page import write_viewer
 
 CAMERA = (1.5, 49.1, 0.0)
@@ -389,7 +391,7 @@ def test_a_dropped_mesh_is_shown_as_gamba_view_shows_it(viewer, tmp_path, kind):
     path = tmp_path / f"chair.{kind.split()[-1]}"
     save_mesh(path, mesh)
     gaussians = colourful(40)
-    opened = viewer(gaussians, mesh=read_viewed_mesh(path), camera=None)
+    opened = viewer(gaussians, mesh=viewed_mesh(load_mesh(path)), camera=None)
     opened.page.keyboard.press("3")
     wanted = canvas(opened)
     opened = viewer(gaussians, camera=None)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -16,8 +15,7 @@ from torch.nn import functional as F
 
 from ...errors import UserError
 from ...gaussians import SH_C0, Gaussians
-from ..gltf_file import Entry, GltfFile, Index, open_gltf
-from ..headers import open_shape
+from ..gltf_file import Entry, GltfFile, Index
 from .arrays import checked_gaussians, flip_axes
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -32,13 +30,9 @@ def harmonic_names(degree: int) -> list[str]:
     return [f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}" for l, n in pairs]
 
 
-def holds_gaussians(path: Path, file: BinaryIO, size: int) -> bool:
-    """Return True if a .glb file has a primitive with the extension; False if it is damaged."""
-    try:
-        meshes = open_gltf(path, file, size).document.entries("meshes")
-        return any(_splats(mesh) for mesh in meshes)
-    except UserError:
-        return False
+def has_gaussians(file: GltfFile) -> bool:
+    """Return True if a primitive has the extension. Raises UserError if the file is malformed."""
+    return any(_splats(mesh) for mesh in file.document.entries("meshes"))
 
 
 def _splats(mesh: Entry) -> list[Entry]:
@@ -46,20 +40,17 @@ def _splats(mesh: Entry) -> list[Entry]:
     return [p for p in mesh.entries("primitives") if EXTENSION in p.entry("extensions").values]
 
 
-def load_glb(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
+def gltf_gaussians(file: GltfFile, left_out: list[str] | None = None) -> Gaussians:
     """Read all Gaussians of a ``.glb``'s scene, moved by its nodes, as one object.
 
     ``left_out`` as for ``checked_gaussians``, with a line for each primitive.
 
     Raises:
-        UserError: the file is missing, not a ``.glb``, truncated, malformed or without Gaussians,
-            an attribute is missing or of another type, the colour space is another, a node
-            stretches or mirrors, or the values are invalid.
+        UserError: the file is malformed or its scene without Gaussians, an attribute is missing or
+            of another type, the colour space is another, a node stretches or mirrors, or the
+            values are invalid.
     """
-    path = Path(path)
-    with open_shape(path) as (stream, size):
-        file = open_gltf(path, stream, size)
-    parts = []
+    path, parts = file.path, []
     for node, _, matrix in file.placed_nodes():
         index = node.get("mesh", Index)
         found = [] if index is None else _splats(file.item("meshes", index))

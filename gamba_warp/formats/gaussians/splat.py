@@ -15,7 +15,7 @@ from ...errors import UserError
 from ...files import atomic_path
 from ...gaussians import Gaussians
 from ...images import to_uint8
-from ..headers import open_shape
+from ..headers import Source
 from .arrays import checked_gaussians, export_arrays
 
 RECORD = np.dtype(
@@ -46,23 +46,23 @@ def save_splat(path: str | Path, gaussians: Gaussians) -> str | None:
     return f"{path}: a .splat has no place for {' and '.join(lost)}." if lost else None
 
 
-def load_splat(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
+def read_splat(source: Source, left_out: list[str] | None = None) -> Gaussians:
     """Read a ``.splat`` file, from this or another program, as one object.
 
     The format has no header: any file of whole records with valid values is accepted.
     ``left_out`` as for ``checked_gaussians``.
 
     Raises:
-        UserError: the file is missing or not of whole records, or its values are invalid.
+        UserError: the file is not of whole records, or its values are invalid.
     """
-    path = Path(path)
-    with open_shape(path) as (file, size):
-        if size % RECORD.itemsize:
-            raise UserError(
-                f"{path}: truncated or not a .splat file, {size} bytes are not a multiple of "
-                f"{RECORD.itemsize}"
-            )
-        records = np.frombuffer(file.read(), RECORD)
+    path, file, size = source
+    source.check()
+    if size % RECORD.itemsize:
+        raise UserError(
+            f"{path}: truncated or not a .splat file, {size} bytes are not a multiple of "
+            f"{RECORD.itemsize}"
+        )
+    records = np.frombuffer(file.read(), RECORD)
     rgba = records["rgba"].astype(np.float32) / 255
     arrays = {
         "means": records["means"],

@@ -20,7 +20,7 @@ import torch
 from ...errors import UserError
 from ...files import atomic_path
 from ...gaussians import SH_C0, Gaussians
-from ..headers import open_shape
+from ..headers import Source
 from .arrays import (
     DEGREES,
     MIN_SCALE,
@@ -90,18 +90,18 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(at, at + _CHUNK) for at in range(0, count, _CHUNK))
 
 
-def load_spz(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
+def read_spz(source: Source, left_out: list[str] | None = None) -> Gaussians:
     """Read an ``.spz`` file of version 1 to 4, from this or another program, as one object.
 
     ``left_out`` as for ``checked_gaussians``.
 
     Raises:
-        UserError: the file is missing, not ``.spz``, of another version, truncated or longer than
+        UserError: the file is not ``.spz``, of another version, truncated or longer than
             it states, or its values are invalid; or version 4 without a module for ZSTD.
     """
-    path = Path(path)
-    with open_shape(path) as (file, _):
-        found = unpacked(path, file.read())
+    path = source.path
+    source.check()
+    found = unpacked(path, source.file.read())
     start, columns = 0, []
     for size in found.widths:
         rows = np.frombuffer(found.body, np.uint8, found.count * size, start)

@@ -71,7 +71,7 @@ class Viewer {
     this.about = about;
     dressPage(about);
     this.setWipe(0);
-    this.setMode("gaussians");
+    this.setMode(about.count ? "gaussians" : "mesh");
     this.send({ kind: "load", ...parts, vertices: about.vertices, faces: about.faces });
   }
 
@@ -258,7 +258,7 @@ class Viewer {
   }
 
   setMode(mode) {
-    if (mode === "mesh" && !this.about.faces) return;
+    if (!this.about[mode === "mesh" ? "faces" : "count"]) return;
     this.mode = mode;
     for (const button of document.querySelectorAll("[data-mode]"))
       button.setAttribute("aria-pressed", button.dataset.mode === mode);

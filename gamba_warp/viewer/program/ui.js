@@ -11,14 +11,15 @@ const byId = (name) => document.getElementById(name);
 function dressPage(about) {
   document.title = about.title;
   byId("name").textContent = about.title;
-  const parts = [`${about.total.toLocaleString("en")} Gaussian${about.total === 1 ? "" : "s"}`];
+  const parts = about.total ? [`${about.total.toLocaleString("en")} Gaussian${about.total === 1 ? "" : "s"}`] : [];
   if (about.faces) parts.push(`${about.faces.toLocaleString("en")} faces`);
   if (about.note) parts.push(about.note);
   byId("about").textContent = parts.join(" · ");
-  document.querySelector("[data-mode=mesh]").hidden = !about.faces;
+  for (const button of document.querySelectorAll("[data-mode]"))
+    button.hidden = !about[button.dataset.mode === "mesh" ? "faces" : "count"];
   byId("do-input").hidden = !about.input;
   const wipe = byId("wipe"), [left, right] = wipe.querySelectorAll("span"), slider = wipe.querySelector("input");
-  wipe.hidden = !about.picture && !about.faces;
+  wipe.hidden = !about.picture && !(about.faces && about.count);
   document.documentElement.classList.toggle("wipes", !wipe.hidden);
   left.textContent = about.picture ? "Input" : "Gaussians";
   right.textContent = about.faces ? "Mesh" : "Gaussians";

@@ -15,10 +15,13 @@ from helpers.judges.splats import check
 from helpers.meshes import glb
 
 from gamba_warp.errors import UserError
+from gamba_warp.eval.shapes.load import KINDS, load_shape
 from gamba_warp.formats.gaussians.compressed import BOUNDS
-from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
+from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.gaussians.splat import RECORD
+from gamba_warp.formats.meshes import Y_UP
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
+from gamba_warp.formats.read import read, read_gaussians
 
 
 def refused(path, *words):
@@ -69,8 +72,7 @@ def test_empty_missing_and_a_folder(tmp_path, kind):
 def test_another_file(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes(b"some text")
-    refused(path, "not Gaussians")
-    assert splat_kind(path) is None
+    refused(path, "not one of .obj")
 
 
 @pytest.mark.parametrize("wrong", [299, 301, 10_000_000, 2**32 - 1])
@@ -243,7 +245,7 @@ CHANGES = {
     "circle": (lambda t, p: t["nodes"][0].update({"children": [0]}), "cycle"),
     "stretched": (lambda t, p: t["nodes"][0].update({"scale": [1, 2, 1]}), "stretches"),
     "mirrored": (lambda t, p: t["nodes"][0].update({"scale": [1, -1, 1]}), "stretches"),
-    "no extension": (lambda t, p: p.pop("extensions"), "contains no Gaussians"),
+    "no extension": (lambda t, p: p.pop("extensions"), "contains a mesh, not Gaussians"),
 }
 
 
@@ -305,29 +307,32 @@ def test_meshes_are_no_gaussians(tmp_path):
     box = trimesh.creation.box()
     for suffix in ("glb", "ply", "stl", "obj"):
         box.export(tmp_path / f"box.{suffix}")
-        assert splat_kind(tmp_path / f"box.{suffix}") is None
-        refused(tmp_path / f"box.{suffix}")
+        refused(tmp_path / f"box.{suffix}", "contains a mesh, not Gaussians")
 
 
-@pytest.mark.parametrize("kind", [*SPLAT_FORMATS, "glb"])
-def test_an_evaluation_takes_gaussians_of_any_format_and_meshes_as_meshes(sound, tmp_path, kind):
-    from gamba_warp.eval.shapes.load import load_shape
-    from gamba_warp.gaussians import Gaussians
-
-    path, _ = sound(kind)
-    assert isinstance(load_shape(path), Gaussians)
-    suffix = path.suffix if path.suffix in (".ply", ".glb") else ".ply"
-    trimesh.creation.box().export(tmp_path / f"box{suffix}")
-    assert len(load_shape(tmp_path / f"box{suffix}").faces) == 12
-
-
-def test_an_evaluation_opens_a_ply_once(sound, tmp_path, monkeypatch):
-    from gamba_warp.eval.shapes.load import load_shape
-
+def test_every_file_is_opened_once(sound, tmp_path, monkeypatch):
+    boxes = [tmp_path / f"box.{suffix}" for suffix in ("ply", "glb", "obj", "stl", "off")]
+    for path in boxes:
+        trimesh.creation.box().export(path)
+    boxes.append(tmp_path / "points.xyz")
+    boxes[-1].write_text("0 1 2\n")
     opened, plain = [], open
-    trimesh.creation.box().export(tmp_path / "box.ply")
     monkeypatch.setattr("builtins.open", lambda *a, **k: opened.append(a[0]) or plain(*a, **k))
-    for path in (sound("ply")[0], tmp_path / "box.ply"):
+    for path in (*(sound(kind)[0] for kind in (*SPLAT_FORMATS, "glb")), *boxes):
         opened.clear()
-        load_shape(path)
+        found = read(path)
         assert opened == [path]
+        kind = "points" if path.suffix == ".xyz" else "mesh" if path in boxes else "gaussians"
+        assert KINDS[type(load_shape(path)[0])] == kind
+        want = "opencv" if kind == "gaussians" else "opengl" if path.suffix in Y_UP else "unknown"
+        assert found.axes == want
+
+
+def test_other_files_are_told_what_to_do(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"x")
+    said = {"a.png": "gamba reconstruct", "a.sog": "SuperSplat", "a.txt": "not one of .obj"}
+    for name, reason in said.items():
+        (tmp_path / name).write_bytes(b"some text")
+        assert reason in refusals.refused(None, read, tmp_path / name)
+    (tmp_path / "b.obj").touch()
+    assert f"such as {tmp_path / 'b.obj'}" in refusals.refused("a folder", read, tmp_path)

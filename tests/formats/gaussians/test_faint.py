@@ -8,12 +8,13 @@ from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
-from gamba_warp.formats.gaussians.files import read_gaussians, to_be_written, write_gaussians
+from gamba_warp.formats.gaussians.files import to_be_written, write_gaussians
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
 from gamba_warp.formats.ply import load_ply, save_ply
-from gamba_warp.pages.turntable import turntable_frames
+from gamba_warp.formats.read import read_gaussians
 from gamba_warp.render import render
 from gamba_warp.surfaces.extract import unit_frame
+from gamba_warp.trajectories.movies import turntable_frames
 
 LIMIT = np.float32(1 / 255)
 AROUND = [np.nextafter(LIMIT, 0, dtype="f4"), LIMIT, np.nextafter(LIMIT, 1, dtype="f4")]

@@ -8,9 +8,10 @@ from helpers.judges.npm import npm_package, run_node
 from helpers.judges.splats import ALLOWED, check, differences, published
 
 from gamba_warp.cli import run
-from gamba_warp.formats.gaussians.files import read_gaussians, write_gaussians
+from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
 from gamba_warp.formats.ply import flip_axes
+from gamba_warp.formats.read import read_gaussians
 
 CONVERTER = ("@playcanvas/splat-transform", "2.7.1")
 
@@ -26,7 +27,7 @@ def test_an_object_lies_the_same_way_in_every_format(tmp_path, kind):
     written = []
     for frame in ("opengl", "opencv"):
         out = tmp_path / frame
-        options = ["--out", out, "--mesh", "--splats", kind, "--frame", frame]
+        options = ["--out", out, "--mesh", "--splats", kind, "--axes", frame]
         assert run("export", [str(word) for word in (tmp_path / "a.ply", *options)]) == 0
         written.append(out / f"a{splat_suffix(kind)}")
         centres, found = published(written[-1], kind)

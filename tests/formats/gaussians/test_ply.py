@@ -10,9 +10,9 @@ from helpers.refusals import refused
 from gamba_warp.cameras import Cameras, intrinsics
 from gamba_warp.errors import FileWarning
 from gamba_warp.formats.gaussians.arrays import rest_names
-from gamba_warp.formats.gaussians.files import comments_of, splat_kind
 from gamba_warp.formats.gaussians.spz import save_spz
 from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.formats.read import read
 from gamba_warp.gaussians import SH_C0, Gaussians
 from gamba_warp.render import render
 
@@ -101,10 +101,10 @@ def test_steps_that_are_coarse_for_the_object_are_named(tmp_path, far, warned):
     made = some()
     made.means += far
     save_ply(tmp_path / "a.ply", made)
-    for read in (lambda: load_ply(tmp_path / "a.ply"), lambda: save_spz(tmp_path / "a.spz", made)):
+    for run in (lambda: load_ply(tmp_path / "a.ply"), lambda: save_spz(tmp_path / "a.spz", made)):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            read()
+            run()
         # 24 bits of an .spz leave steps of 1/8192 beside 1,000, and 1/16 beside 300,000
         lines = [str(line.message) for line in told if line.category is FileWarning]
         assert bool(lines) == warned, lines
@@ -150,7 +150,7 @@ def test_properties_that_are_not_read_are_named_and_moments_refused(tmp_path):
     write(path, header(1, properties=[*PROPERTIES, *others]), np.ones(29, "<f4").tobytes())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert splat_kind(path) == "ply" and load_ply(path).num == 1
+        assert read(path).shape.num == load_ply(path).num == 1
     write(path, header(1, properties=[*PROPERTIES, "filter_3D"]), np.ones(15, "<f4").tobytes())
     with pytest.warns(FileWarning, match="properties that are not read: filter_3d"):
         load_ply(path)
@@ -185,8 +185,7 @@ def test_another_element_may_come_first_and_a_comment_may_say_end_header(tmp_pat
         body = b"".join(lists) + rows.tobytes()
     path = write(tmp_path / "a.ply", lines, body)
     assert load_ply(path).means.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert splat_kind(path) == "ply"
-    assert comments_of(path) == ["before end_header", "after"]
+    assert read(path).comments == ["before end_header", "after"]
 
 
 def test_extremes_stay_finite(tmp_path):
