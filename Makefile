@@ -124,7 +124,7 @@ figures: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.figures $(REPORTS)
 
 # The table of scanned objects in docs/model-card.md: renders the meshes of a folder and evaluates the shipped model on them.
-# make scanned MESHES=FOLDER OPTIONS="--no-lpips --limit 8"
+# make scanned MESHES=FOLDER OPTIONS="--lpips off --limit 8"
 scanned: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.scanned $(MESHES) $(OPTIONS)
 

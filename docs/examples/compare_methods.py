@@ -48,7 +48,7 @@ def common(options: argparse.Namespace) -> list[object]:
     """Options common to all evaluations of views, as required by ``gamba compare``."""
     words: list[object] = ["--data", options.data, "--limit", options.objects]
     words += ["--views", options.views, "--device", "cpu", "--strips", 0, "--sheet", 0]
-    return words if options.lpips else [*words, "--no-lpips"]
+    return [*words, "--lpips", options.lpips]
 
 
 def make_hulls(out: Path, meshes: Path, uids: list[str], cameras: int) -> None:
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--views", type=int, default=9, help="views per object, the input included")
     parser.add_argument("--points", type=int, default=100_000, help="points on each surface")
     parser.add_argument("--voxels", type=int, default=128, help="voxels per unit, for Gaussians")
-    parser.add_argument("--no-lpips", dest="lpips", action="store_false")
+    parser.add_argument("--lpips", choices=("auto", "on", "off"), default="auto")
     options = parser.parse_args(arguments)
     out: Path = options.out
     uids = evaluate_shipped(out, options)

@@ -37,7 +37,7 @@ def main(
     out: Path = Path("out/scanned"),
     checkpoint: Path = DEFAULT_CHECKPOINT,
     limit: int | None = None,
-    lpips: bool = True,
+    lpips: Literal["auto", "on", "off"] = "auto",
     up: Literal["auto", "y", "z"] = "auto",
     page: Path | Literal["none"] = PAGE,
 ) -> int:
@@ -49,7 +49,7 @@ def main(
         out: folder of the results.
         checkpoint: the model.
         limit: number of objects, evenly spaced by name.
-        lpips: also compute LPIPS, which takes most of the time.
+        lpips: as for eval-views; LPIPS takes most of the time.
         up: the axis that points up in the files; auto depends on their format.
         page: the page to update; none only prints the table.
 
@@ -63,7 +63,7 @@ def main(
     model = ["--checkpoint", checkpoint, "--data", views, "--split", "all", "--views", 5]
     few = [] if limit is None else ["--limit", limit]
     more = ["--save-gaussians", "--strips", 0, "--sheet", 100, "--out", out / "eval"]
-    code = _run("eval-views", *model, *more, *few, *([] if lpips else ["--no-lpips"]))
+    code = _run("eval-views", *model, *more, *few, "--lpips", lpips)
     words = ["--frame", "reference", "--data", views, "--out", out / "shapes"]
     gaussians = out / "eval" / "gaussians"
     code |= _run(

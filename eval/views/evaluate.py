@@ -160,9 +160,10 @@ def open_job(options: ViewsOptions) -> Job:
     elif options.resize_pictures:
         raise UserError(f"--resize-pictures: {options.checkpoint} holds no pictures")
     network, reason = None, "not asked for"
-    if options.lpips:
-        reason = None if lpips_available() else f"no weights; fetch them with: {FETCH}"
-        network = None if reason else load_lpips().to(device)
+    if options.lpips == "auto" and not lpips_available():
+        reason = f"no weights; fetch them with: {FETCH}"
+    elif options.lpips != "off":
+        network, reason = load_lpips().to(device), None
     protocol = ViewsProtocol(
         name=options.protocol,
         changed=options.changed(),

@@ -29,10 +29,10 @@ class ViewsOptions:
         out: Folder for report.json, objects.csv, table.md, contact_sheet.png and strips/ (input |
             prediction | truth); without it only the table is printed.
         protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, with the
-            first view as the input; the report lists missing objects. It fixes --size, --reference,
-            --views, --split and --limit. splatter-image, leangaussian, gamba: these papers' values,
-            as far as published (gamba eval-geometry --protocol NAME --explain); these options
-            change them, and the report notes that.
+            first view as the input; the report lists missing objects. It fixes split, size, limit,
+            reference and number of views. splatter-image, leangaussian, gamba: these papers'
+            values, as far as published (gamba eval-geometry --protocol NAME --explain); these
+            options change them, and the report notes that.
         split: Split of the dataset.
         reference: Index of the input view; 0 by default.
         views: Number of views of an object, input included, evenly spaced; all by default.
@@ -44,7 +44,8 @@ class ViewsOptions:
             the nearest training object.
         retrieval_data: Datasets whose training objects the nearest one is taken from; by default
             DATA.
-        lpips: LPIPS, if its weights are installed (gamba weights lpips).
+        lpips: Use of LPIPS: auto if its weights are installed (gamba weights lpips), on requires
+            them.
         strips: Number of objects with comparison pictures, from the first.
         sheet: Number of best, median and worst objects each in the contact sheet; 0 for none.
         save_gaussians: Also write OUT/gaussians/NAME.ply, in the input camera's
@@ -79,7 +80,7 @@ class ViewsOptions:
     objects: Path | None = None
     baselines: bool = True
     retrieval_data: tuple[Path, ...] = ()
-    lpips: bool = True
+    lpips: Literal["auto", "on", "off"] = "auto"
     strips: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
     sheet: Annotated[int, Meta(ge=0, le=100)] = 2
     save_gaussians: bool = False

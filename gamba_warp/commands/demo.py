@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from pathlib import Path
+from typing import Literal
 
 from .. import processes
 from ..errors import UserError
@@ -24,7 +25,7 @@ _MAKE = "make setup unpacks it in a checkout; elsewhere give the folder of one b
 def demo_command(
     out: Path = Path("out/demo"),
     starter: Path = STARTER,
-    lpips: bool = False,
+    lpips: Literal["on", "off"] = "off",
 ) -> int:
     """Reconstruct and evaluate pictures and objects with the shipped model, and write a page.
 
@@ -33,7 +34,7 @@ def demo_command(
     Args:
         out: Folder for everything; OUT/index.html is the page.
         starter: The starter set's folder.
-        lpips: Evaluate LPIPS too, and fetch its weights (64 MB) if they are missing.
+        lpips: Use of LPIPS; on fetches its weights (64 MB) if they are missing.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT
     from ..pages.demo import DemoResults, write_demo
@@ -53,7 +54,7 @@ def demo_command(
     )
     with only_process(out, "runs a demo"):
         started = time.perf_counter()
-        if lpips:
+        if lpips == "on":
             _gamba("weights", "lpips", may_fail=True)
         _evaluate(results, starter, out / "truth", lpips)
         spent = f"{(time.perf_counter() - started) / 60:.1f} minutes"
@@ -84,7 +85,7 @@ def _call(words: list[str]) -> int:
     return processes.run_gamba(words, None, ())
 
 
-def _evaluate(results, starter: Path, truth: Path, lpips: bool) -> None:
+def _evaluate(results, starter: Path, truth: Path, lpips: str) -> None:
     """Run the shipped model on pictures and objects outside its training set."""
     model, views, data = results.shipped, results.views, starter / "data"
     _gamba(
@@ -93,7 +94,7 @@ def _evaluate(results, starter: Path, truth: Path, lpips: bool) -> None:
     )
     _gamba(
         *("eval-views", "--checkpoint", model, "--data", data, "--views", 9),
-        *("--out", views, "--save-gaussians", *(() if lpips else ("--no-lpips",))),
+        *("--out", views, "--save-gaussians", "--lpips", "auto" if lpips == "on" else "off"),
     )
     # The true meshes of the predicted objects, so that the folders pair by name.
     output_folder(truth)

@@ -50,7 +50,7 @@ COMMANDS = {
     "data pack": "data pack set out",
     "data index": "data index set",
     "train": "train set --preset tiny --out out --steps 1 --lpips off --batch-size 1",
-    "eval-views": "eval-views --checkpoint {model} --data set --split all --out out --no-lpips",
+    "eval-views": "eval-views --checkpoint {model} --data set --split all --out out --lpips off",
     "compare": "compare {odd}.yaml {odd}.glb",
     "configuration": "train set --config {odd}",
     "unknown command": "{odd}",

@@ -65,7 +65,7 @@ JOBS = {
     ),
     "eval-views": Job(
         "eval-views --checkpoint {world}/run/model.safetensors --data {world}/data --out {out} "
-        "--split all --no-lpips --save-gaussians --device cpu",
+        "--split all --lpips off --save-gaussians --device cpu",
         "--views 3",
     ),
     "eval-geometry": Job(

@@ -223,7 +223,7 @@ def test_what_cannot_be_had_is_listed(data, tmp_path, capsys):
 def test_no_output_folder(data, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.iterdir())
-    places = ["--checkpoint", "pred", "--data", "data", "--no-lpips", "--device", "cpu"]
+    places = ["--checkpoint", "pred", "--data", "data", "--lpips", "off", "--device", "cpu"]
     capsys.readouterr()
     assert run("eval-views", [*places, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["num_ok"] == 1

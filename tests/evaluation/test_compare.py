@@ -226,7 +226,7 @@ def test_the_worked_example(tmp_path, capsys):
     if not (ROOT / "starter" / "data").is_dir():
         pytest.skip("the starter set is in a checkout alone")
     example = runpy.run_path(str(ROOT / "docs/examples/compare_methods.py"))
-    words = f"--out {tmp_path} --objects 1 --views 3 --points 1000 --voxels 24 --no-lpips"
+    words = f"--out {tmp_path} --objects 1 --views 3 --points 1000 --voxels 24 --lpips off"
     example["main"](words.split())
     joined = json.loads((tmp_path / "compare.json").read_text())
     rows = {row["name"]: row for row in joined["rows"]}

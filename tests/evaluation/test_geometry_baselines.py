@@ -132,7 +132,7 @@ def test_what_cannot_be_placed(world, case, capsys):
         write_split(world / "data", test=["twin", "seen"])
     if case == "out":
         places = ["--checkpoint", str(world / "pred"), "--data", str(world / "data")]
-        assert run("eval-views", [*places, "--no-lpips", "--save-retrieval", str(meshes)]) == 2
+        assert run("eval-views", [*places, "--lpips", "off", "--save-retrieval", str(meshes)]) == 2
     else:
         assert evaluate_views(world, "--save-retrieval", str(meshes), *options) == (2, None)
     error = capsys.readouterr().err

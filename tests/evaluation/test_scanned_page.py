@@ -62,7 +62,7 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
     page.write_text(f"before\n{parts}\nafter\n")
     assert scanned.main(tmp_path / "glb", out=tmp_path / "out", page=page) == 1
     assert [words[0] for words in ran] == ["data render", "eval-views", "eval-geometry"]
-    assert ran[1][-1] != "--no-lpips" and str(tmp_path / "out" / "views") in ran[1]
+    assert ran[1][-1] == "auto" and str(tmp_path / "out" / "views") in ran[1]
     assert ran[2][1:3] == [str(tmp_path / "out" / "eval" / "gaussians"), str(tmp_path / "glb")]
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n")

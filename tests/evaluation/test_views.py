@@ -75,9 +75,10 @@ def painted(monkeypatch):
     monkeypatch.setattr(module, "render_views", paint)
 
 
-def evaluate(folder, *options, pred="pred", lpips="--no-lpips"):
+def evaluate(folder, *options, pred="pred", lpips="off"):
     split = [] if "--split" in options else ["--split", "all"]
-    words = ["--checkpoint", folder / pred, "--data", folder / "data", "--device", "cpu", lpips]
+    words = ["--checkpoint", folder / pred, "--data", folder / "data", "--device", "cpu"]
+    words += ["--lpips", lpips]
     return evaluated("eval-views", folder / "out", *words, *split, *options)
 
 
@@ -157,7 +158,7 @@ def test_choose_views():
 
 def test_lpips_without_weights(data, painted, monkeypatch):
     monkeypatch.setenv("GAMBA_CACHE", str(data / "cache"))
-    code, report = evaluate(data, "--limit", "1", lpips="--lpips")
+    code, report = evaluate(data, "--limit", "1", lpips="auto")
     assert code == 0 and report["mean"]["lpips"] is None
     assert "gamba weights lpips" in report["protocol"]["lpips_reason"]
 
@@ -167,7 +168,7 @@ def test_lpips_with_weights(data, painted):
 
     if not lpips_available():
         pytest.skip("the LPIPS weights are not in the cache (gamba weights lpips)")
-    _, report = evaluate(data, "--limit", "1", "--views", "2", lpips="--lpips")
+    _, report = evaluate(data, "--limit", "1", "--views", "2", lpips="auto")
     assert report["protocol"]["lpips"] == "VGG16, version 0.1"
     # a prediction that differs by rounding, against an empty picture
     for key in ("lpips", "lpips_black", "lpips_grey"):

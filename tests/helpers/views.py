@@ -68,5 +68,5 @@ def evaluated(command: str, out: Path, *words: object) -> tuple[int, dict | None
 
 def eval_views(pred: Path, data: Path, out: Path, *options: object) -> tuple[int, dict | None]:
     """Runs ``eval-views`` on the CPU, without LPIPS."""
-    words = ("--checkpoint", pred, "--data", data, "--no-lpips", "--device", "cpu", *options)
+    words = ("--checkpoint", pred, "--data", data, "--lpips", "off", "--device", "cpu", *options)
     return evaluated("eval-views", out, *words)

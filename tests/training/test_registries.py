@@ -90,7 +90,7 @@ def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, scri
             out / "model.safetensors")  # fmt: skip
     words = ["eval-views", "--checkpoint", out / "model.safetensors", "--data", data, "--json"]
     capsys.readouterr()
-    assert script(*words, "--no-baselines", "--no-lpips", "--split", "val") == 0
+    assert script(*words, "--no-baselines", "--lpips", "off", "--split", "val") == 0
     assert "mae" in json.loads(capsys.readouterr().out)["objects"][0]
 
 
