@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import inspect
 import io
 import os
 import re
@@ -15,10 +16,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from difflib import get_close_matches
 from functools import partial, wraps
-from itertools import dropwhile, takewhile
 from typing import Any, Literal, NamedTuple, TextIO, cast
 
 import tyro
+from tyro import _errors as errors  # bounded in setup.cfg
 
 from .batch import STAGES
 from .devices import keep_memory, quiet_warp, share_cores, use_fastest_products
@@ -73,7 +74,7 @@ COMMANDS = {
     "compare": Command("Reports of several methods in one table.", "", (), (), _COMPARE),
     "ablate": Command("Train and compare variants of a model.", "all", _METRICS, _MODEL, _ABLATION),
     "export": Command("Gaussians to meshes, splats and pages.", "mesh", (), _DRAWING),
-    "view": Command("Gaussians in the browser."),
+    "view": Command("Gaussians or a mesh in the browser."),
     "render": Command("Gaussians to pictures and movies along a path.", "", (), _DRAWING),
     "app": Command("Pictures to 3D on a page of this machine.", "app", _GRADIO, _PICTURES, _APP),
     "bench": Command("Run time against error, on this machine.", "", (), _MODEL, _MACHINE),
@@ -198,14 +199,25 @@ def _common(arguments: list[str]) -> tuple[list[str], bool, bool]:
 
 # A missing option has the default None, which users cannot give.
 _CONFIG = (tyro.conf.DisallowNone, tyro.conf.HelptextFromCommentsOff)
+_NO_DEFAULT = re.compile(r"\s*\(default:\s*(None)?\)")
+_KINDS = {"INT": "a whole number", "FLOAT": "a number"}
+# Earlier names of options.
+RENAMED = {"--frame": "--axes", "--mesh-frame": "--mesh-axes", "--no-lpips": "--lpips off"}
 
 
 def help_text(name: str, command: Callable, arguments: list[str]) -> str:
     """Return the help of a command, by tyro, and the options that every command has."""
+    # tyro would keep the line breaks of an argument's text; a text begins with a capital.
+    inner = inspect.unwrap(command)
+    doc = re.sub(r"(?<=\S)\n {8,}(?=\S)", " ", inspect.cleandoc(inner.__doc__ or ""))
+    inner.__doc__ = re.sub(
+        r"(?m)^ {4}\w+: \w", lambda start: start[0][:-1] + start[0][-1].upper(), doc
+    )
     shown = io.StringIO()
     with redirect_stdout(shown), suppress(SystemExit):
         tyro.cli(command, args=[*arguments, "--help"], prog=f"gamba {name}", config=_CONFIG)
-    lines = [line.rstrip() for line in shown.getvalue().splitlines()]
+    text = _NO_DEFAULT.sub("", shown.getvalue())
+    lines = [line.rstrip() for line in text.splitlines()]
     common = "-q, --quiet: errors and warnings only; -v, --verbose: times, and errors in full"
     return "\n".join([*lines, f"every command: {common}", ""])
 
@@ -214,7 +226,7 @@ def _parsed(command: Callable, arguments: list[str], program: str) -> partial[in
     """Return the command with its arguments.
 
     Raises:
-        UserError: they are invalid; what tyro prints in a box, in one line.
+        UserError: they are invalid.
     """
     calls: list[partial[int | None]] = []
 
@@ -222,32 +234,47 @@ def _parsed(command: Callable, arguments: list[str], program: str) -> partial[in
     def keep(*values: Any, **options: Any) -> None:
         calls.append(partial(command, *values, **options))
 
-    said = io.StringIO()
-    try:
-        with redirect_stderr(said):
-            tyro.cli(keep, args=arguments, prog=program, config=_CONFIG)
-    except SystemExit as error:
-        # A title, perhaps a rule, the message, a rule, and how to get help; in a box, perhaps.
-        rows = [re.sub("[│╭╮╰╯]", " ", line)[2:] for line in said.getvalue().splitlines()[1:]]
-        rows = dropwhile(_is_rule, rows)
-        rows = takewhile(lambda row: not _is_rule(row), rows)
-        # Texts of help are indented twice.
-        text = " ".join(row.strip() for row in rows if not row.startswith(" " * 8)).rstrip(".")
-        text = re.sub(r"\('.*?'\)", _choices, text)
-        raise UserError(f"{text or 'invalid arguments'}; {program} --help") from error
-    finally:
-        if calls:
-            sys.stderr.write(said.getvalue())
+    def refuse(event: errors.ParseErrorEvent) -> None:
+        raise UserError(f"{_reason(event)}; {program} --help")
+
+    with errors.on_parse_error(refuse):
+        tyro.cli(keep, args=arguments, prog=program, config=_CONFIG)
     return calls[0]
 
 
-def _choices(found: re.Match) -> str:
-    """Return tyro's list of choices in order, without the default of a missing option."""
-    return ", ".join(sorted({*re.findall("'(.*?)'", found[0])} - {"None"}))
+def _reason(event: errors.ParseErrorEvent) -> str:
+    """Return what is wrong with the arguments."""
+    if isinstance(event, errors.MissingArgs) and not event.unrecognized_tokens:
+        names = [_name(missing.arg) for missing in event.missing_arguments]
+        return f"missing argument{'s' * (len(names) > 1)}: {', '.join(names)}"
+    if isinstance(event, (errors.UnrecognizedArgs, errors.MissingArgs)):
+        given = isinstance(event, errors.UnrecognizedArgs)
+        tokens = event.tokens if given else event.unrecognized_tokens
+        name = next((token for token in tokens if token.startswith("--")), None)
+        if name is None:
+            return f"unexpected argument{'s' * (len(tokens) > 1)}: {' '.join(tokens)}"
+        name = name.partition("=")[0]
+        return f"{name} is now {RENAMED[name]}" if name in RENAMED else f"unknown option {name}"
+    if isinstance(event, errors.InvalidChoice):
+        choices = ", ".join(sorted({*event.choices} - {"None"}))
+        return f"invalid choice '{event.value}' for {_name(event.argument)}: not one of {choices}"
+    if isinstance(event, errors.BadValue):
+        name = _name(event.argument)
+        return f"{name} needs a value" if name.startswith("-") else f"missing argument: {name}"
+    if isinstance(event, errors.InstantiationFailure):
+        kind = "" if event.argument is None else event.argument.lowered.metavar
+        values = re.findall("'(.*?)'", event.message) if kind in _KINDS else []
+        where = "" if event.argument is None else f"{_name(event.argument)}: "
+        if values:
+            return f"{where}expected {_KINDS[str(kind)]}, got '{values[-1]}'"
+        return where + event.message.partition("\n")[0]
+    return "invalid arguments"
 
 
-def _is_rule(row: str) -> bool:
-    return not row.strip("─- ")
+def _name(argument: Any) -> str:
+    """Return an option, or a positional argument in capitals."""
+    name = argument.display_name()
+    return name if name.startswith("-") else name.rpartition(".")[2].upper()
 
 
 def _expanded(command: Callable, arguments: list[str]) -> list[str]:

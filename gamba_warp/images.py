@@ -205,7 +205,8 @@ def _still(path: str | Path, content: bytes | None = None) -> Iterator[Image.Ima
             size = os.path.getsize(path) if content is None else len(content)
             small = size <= _COUNT_FRAMES_UP_TO
             frames = getattr(image, "n_frames", 1) if small else "many"
-            raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
+            kind, part = ("a TIFF", "page") if image.format == "TIFF" else ("an animation", "frame")
+            raise UserError(f"{path}: {kind} of {frames} {part}s; give one {part}")
         yield image
 
 

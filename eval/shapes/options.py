@@ -45,17 +45,17 @@ class ShapesOptions:
         set: Fields of the protocol, FIELD=JSON each: --set num_points=10000 surface.voxels=64
             thresholds=[0.1,0.2]. "--explain" lists them.
         surface: Method that turns Gaussians into a surface; centers is a diagnostic.
-        align: Steps that align predictions with the truth, in order: box (bounding boxes), scale
-            (centroids and spread of points), yaw and turn (rotation search about the upward axis or
-            any), rigid and icp (ICP without and with scale); or none.
+        align: Steps that align predictions with the truth, in order: box (bounding boxes),
+            scale (centroids and spread of points), yaw and turn (rotation search about the upward
+            axis or any), rigid and icp (ICP without and with scale); or none.
         frame: Frame of the predictions: the GT file's, its unit frame (z-up, longest side 1,
             centred), or the reference camera's (needs --data).
         up: Upward axis of GT files; auto goes by the format: y for .obj, .glb and .gltf; for others
             it is unknown, and z is assumed.
-        pred_axes: Axes of PRED files: opencv (y down), opengl (y up), z-up, or frame: those of
-            --frame. auto goes by the format: opencv for Gaussians, opengl for .obj, .glb and .gltf;
-            if those of PRED or GT are unknown, coordinates are used unchanged, and the report notes
-            it.
+        pred_axes: Axes of PRED files: opencv (y down), opengl (y up), z-up, or frame: those that
+            the frame has. auto goes by the format: opencv for Gaussians, opengl for .obj, .glb and
+            .gltf; if those of PRED or GT are unknown, coordinates are used unchanged, and the
+            report notes it.
         data: Dataset whose objects have the same names, for --frame reference.
         reference: Index of the input view, for --frame reference.
         distance: Distance of the input camera in the model's world, for --frame reference.

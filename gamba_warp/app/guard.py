@@ -315,7 +315,7 @@ class Guard:
             call = parse_document(body, _Call, "the call")
             kinds = self._inputs.get(call.fn_index)
             if kinds is None or len(kinds) != len(call.data):
-                raise UserError(f"the page has no such function (number {call.fn_index})")
+                raise UserError(f"unknown endpoint {call.fn_index}")
             given = [parse_document(bytes(d), k, "the call") for d, k in zip(call.data, kinds)]
             for item in given:
                 if isinstance(item, Painted):

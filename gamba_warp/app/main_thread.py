@@ -63,7 +63,7 @@ class MainThread:
                     signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
             return future.result()
         except CancelledError:
-            raise UserError("gamba app was ended; start it again") from None
+            raise UserError("gamba app has stopped; restart it") from None
 
     def work(self) -> None:
         """Run jobs until Ctrl-C or another exception that is not an ``Exception``."""

@@ -120,8 +120,8 @@ def one_device(tensors: dict[str, Any]) -> None:
     """
     devices = {x.device for x in tensors.values() if isinstance(x, Tensor)}
     if len(devices) > 1 or not {device.type for device in devices} <= {"cpu", "cuda"}:
-        names = ", ".join(sorted(map(str, devices)))
-        raise ValueError(f"{', '.join(tensors)} must be on one device, cpu or cuda, got {names}")
+        names = ", ".join(f"{k} on {x.device}" for k, x in tensors.items() if isinstance(x, Tensor))
+        raise ValueError(f"tensors must be on the same device, cpu or cuda, got {names}")
 
 
 def with_order(function: Callable[..., Any], names: str, **fixed: Any) -> Callable[..., Any]:

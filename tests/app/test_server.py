@@ -406,7 +406,7 @@ def test_jobs_are_done_by_the_one_that_works():
         (5, threading.get_ident()),
         "no picture",
         "ours",
-        "gamba app was ended; start it again",
+        "gamba app has stopped; restart it",
     ]
 
 

@@ -103,9 +103,10 @@ def bad_files(folder):
     ]:
         (folder / name).write_bytes(content)
         yield name, folder / name, reason
-    for name in ("moving.gif", "moving.webp"):
+    for name in ("moving.gif", "moving.webp", "pages.tiff"):
         first.convert("RGB").save(folder / name, save_all=True, append_images=[second])
-        yield name, folder / name, "animated picture (2 frames)"
+        part = "a TIFF of 2 pages" if name == "pages.tiff" else "an animation of 2 frames"
+        yield name, folder / name, part
 
 
 def cut_out(path, colour=(0.8, 0.3, 0.1)):

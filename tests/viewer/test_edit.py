@@ -123,7 +123,7 @@ def test_marks_can_be_cleared_and_the_view_turned(edited):
     stroke(page, -0.42, 0.42)
     assert states(page) == [1] * 8
     page.keyboard.press("Delete")
-    assert page.inner_text("#message-text") == "Nothing would be left."
+    assert page.inner_text("#message-text") == "This removes all Gaussians."
     page.keyboard.down("Shift")
     stroke(page, -0.4, -0.4)
     page.keyboard.up("Shift")

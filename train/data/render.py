@@ -123,7 +123,7 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
     model = load_mesh(mesh.path, root=mesh.root)
     views = draw_views(model, mesh.uid, replace(settings, up=up), mesh.rotation)
     if not views.images[..., 3].any():
-        raise UserError(f"{mesh.path}: every picture of it is empty")
+        raise UserError(f"{mesh.path}: all views are empty")
     suffix, options = "webp", {"lossless": True, "method": 2, "quality": 50}
     if settings.format == "png":
         suffix, options = "png", {}

@@ -24,17 +24,17 @@ class Settings:
     """Settings that determine the pixels; stored in every ``transforms.json``.
 
     Attributes:
-        views: number of views of an object.
-        size: pixels a side.
-        fov: vertical field of view, degrees.
-        seed: seed of cameras and lights, which also depend on the object's uid.
-        depth: also write 16-bit depth pictures, of the first and of the last surface.
-        format: format of the pictures; both are lossless.
-        up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
-        fronts: number of views from the front, the first ones.
-        spread: largest share by which a camera stands further away than necessary.
-        stretch: stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
-        fov_spread: draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
+        views: Number of views of an object.
+        size: Pixels a side.
+        fov: Vertical field of view, degrees.
+        seed: Seed of cameras and lights, which also depend on the object's uid.
+        depth: Also write 16-bit depth pictures, of the first and of the last surface.
+        format: Format of the pictures; both are lossless.
+        up: The axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
+        fronts: Number of views from the front, the first ones.
+        spread: Largest share by which a camera stands further away than necessary.
+        stretch: Stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
+        fov_spread: Draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
         light: varied makes the lights of the objects differ more.
         poses: "drawn", or "gso": that evaluation's poses, the input view first.
     """

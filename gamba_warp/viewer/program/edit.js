@@ -96,7 +96,7 @@ class Editor {
   remove() {
     if (!this.state.includes(MARKED)) return;
     if (!this.state.includes(0)) {
-      say("Nothing would be left.");
+      say("This removes all Gaussians.");
       setTimeout(say, 3000, "");
       return;
     }
