@@ -302,22 +302,8 @@ class Batches:
             self._made.close()
         self._pool.shutdown(cancel_futures=True)
 
-    def batch(self, number: int, novel: int) -> Batch:
-        """Load the ``number``-th batch synchronously, with ``novel`` novel views."""
-        self._begin(number)
-        return join([self.sample(n, novel) for n in self._numbers(number)], self.model)
-
-    def sample(self, number: int, novel: int) -> Batch:
-        """Load the ``number``-th sample; an unreadable object is replaced by the next.
-
-        Raises:
-            UserError: as ``take``.
-        """
-        self._begin(number // self.config.views.batch_size // self.world.size)
-        return self._record_failures(self.prepare(number, novel))
-
     def prepare(self, number: int, novel: int) -> Prepared:
-        """Load a sample like ``sample``, but only report failures; safe in any order on threads."""
+        """Load the ``number``-th sample, on a thread; after an unreadable object the next one."""
         views, seed = self.config.views, self.config.run.seed
         rng = np.random.default_rng([seed, 2, number])
         background = torch.ones(3) if views.background == "white" else torch.zeros(3)

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import torch
@@ -31,7 +31,6 @@ from .config import STEP_SIZE, DataConfig, LengthConfig, TrainConfig, config_dif
 from .ddp import World
 from .optim import Ema, NewLength, Schedule, build_optimizer, checked_moments
 
-STATE_VERSION = 2
 KEPT = 2  # checkpoints that remain
 CHECKSUMS = "checksums.json"
 _NAME = re.compile(r"step_(\d+)")
@@ -145,7 +144,7 @@ class RunState:
         if self.saved == self.step:
             return
         values = {
-            "version": STATE_VERSION,
+            "version": 2,
             "config": setup.config.to_dict(),
             "objects": setup.data.fingerprint,
             "content": setup.data.content,
@@ -206,7 +205,7 @@ class RunState:
 class Stored(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """Fields of ``state.pt``: everything that a resumed run needs besides the weights."""
 
-    version: int
+    version: Literal[2]
     config: dict[str, Any]
     objects: str
     content: str = ""  # unknown
@@ -385,11 +384,8 @@ def read_run(checkpoint: Path, setup: Setup) -> tuple[Stored, LengthConfig]:
         UserError: the state is damaged, or of a run with other options, data or number of objects
             a step; the message names the differences, and how to continue nevertheless.
     """
-    values, source = read_state(checkpoint), str(checkpoint / "state.pt")
-    version = values.get("version")
-    if type(version) is not int or version != STATE_VERSION:  # a tensor's comparison may raise
-        raise UserError(f"{checkpoint}: unsupported state version {str(version)[:40]!r}")
-    stored = check_state(values, source)
+    source = str(checkpoint / "state.pt")
+    stored = check_state(read_state(checkpoint), source)
     try:
         plan = msgspec.convert(stored.config, _Plan, dec_hook=lambda kind, value: kind(value))
     except (ValueError, TypeError) as error:

@@ -289,7 +289,6 @@ def _is_own(config: GambaConfig) -> bool:
 # long it is, but not the result of a step. All others must stay the same.
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers", "views.cache"}
 _MUST_STAY = {"run.seed"}
-_COMPARED_IF_FREE = {"data", "length.steps", "length.epochs", "length.minutes"}
 # The batch of a process and its accumulation may change if the objects of a step stay.
 STEP_SIZE = {"views.batch_size", "views.accumulate"}
 FOLLOWING = {"model"}  # of a config.json: it follows from the options
@@ -329,15 +328,12 @@ def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:
     return config
 
 
-def config_differences(
-    stored: dict, current: dict, free: bool = False, ignored: Container[str] = ()
-) -> list[str]:
+def config_differences(stored: dict, current: dict, ignored: Container[str] = ()) -> list[str]:
     """Compare two ``to_dict`` values; a missing option counts as its default.
 
     Args:
         stored: of the resumed run; an older version may have fewer options.
         current: of this run.
-        free: also compare the data and the length, which may change when a run is resumed.
         ignored: names of options that are not compared.
 
     Returns:
@@ -347,9 +343,8 @@ def config_differences(
     old, new = ({**defaults, **_flatten(values)} for values in (stored, current))
     differing = []
     for name in sorted(old.keys() | new.keys()):
-        may_change = name in _MAY_CHANGE or name.split(".")[0] in _MAY_CHANGE
-        compared = not may_change or name in _MUST_STAY or (free and name in _COMPARED_IF_FREE)
-        if old.get(name) != new.get(name) and compared and name not in ignored:
+        may_change = {name, name.split(".")[0]} & _MAY_CHANGE and name not in _MUST_STAY
+        if old.get(name) != new.get(name) and not may_change and name not in ignored:
             there, here = (str(values.get(name))[:80] for values in (old, new))
             differing.append(f"{name} ({there} there, {here} here)")
     return differing

@@ -154,25 +154,26 @@ class World:
         mine: Mapping[str, dict[str, object]] = {}
         with self.together():
             mine = facts()
-        known = self.gather((socket.gethostname(), mine))
-        host, here = known[0]
-        others = [rank for rank, (_, found) in enumerate(known) if found != here]
-        if not others:
-            return
-        (name, there), parts = known[others[0]], []
-        for subject, ours in here.items():
-            theirs = there[subject]
-            pairs = {k: (theirs.get(k, "missing"), ours.get(k, "missing")) for k in ours | theirs}
-            differing = {key: pair for key, pair in sorted(pairs.items()) if pair[0] != pair[1]}
-            shown = [f"{k} is {str(b)[:60]}, not {str(a)[:60]}" for k, (b, a) in differing.items()]
-            more = [f"{len(shown) - _MAX_SHOWN} more"] if len(shown) > _MAX_SHOWN else []
-            if shown:
-                parts.append(f"{subject}: {', '.join(shown[:_MAX_SHOWN] + more)}")
-        like = f", like {len(others) - 1} more," if len(others) > 1 else ""
-        raise UserError(
-            f"process {others[0]} on {name}{like} is not set up like process 0 on {host}: "
-            f"{'; '.join(parts)}"
-        )
+        (host, here), *others = self.gather((socket.gethostname(), mine))
+        for rank, (name, there) in enumerate(others, 1):
+            parts = []
+            for subject, ours in here.items():
+                theirs = there[subject]
+                both = {
+                    k: (theirs.get(k, "missing"), ours.get(k, "missing")) for k in ours | theirs
+                }
+                shown = [
+                    f"{k} is {str(b)[:60]}, not {str(a)[:60]}"
+                    for k, (b, a) in both.items()
+                    if a != b
+                ]
+                if shown:
+                    parts.append(f"{subject}: {', '.join(sorted(shown)[:_MAX_SHOWN])}")
+            if parts:
+                raise UserError(
+                    f"process {rank} on {name} is not set up like process 0 on {host}: "
+                    f"{'; '.join(parts)}"
+                )
 
 
 @contextmanager

@@ -138,15 +138,8 @@ class StepGraphs:
         except Exception as error:  # of torch, a library or the driver; steps work without graphs
             if state is not None:  # which a capture that failed may have left unusable
                 torch.cuda.set_rng_state(state, self._device)
-            if isinstance(error, torch.cuda.OutOfMemoryError):
-                self._most = len(self._graphs)
-                self._say(
-                    f"out of memory after {self._most} CUDA graphs; other steps run without one"
-                )
-                return None
-            self._say(f"no CUDA graph of a step: {first_line(error)}; steps run one by one")
-            self._most = 0
-            self._graphs.clear()
+            self._most = len(self._graphs)  # of steps that fit, which stay
+            self._say(f"no CUDA graph of a step: {first_line(error)}; such steps run one by one")
             return None
         found = self._graphs[shape] = _Recorded(graph, own, result)
         return found

@@ -120,29 +120,15 @@ END
 
 # Import what the training needs from the pack, this checkout, and torch and numpy with what they need.
 check() {
+  local name folder
   room=$(mktemp -d)
   trap 'rm -rf "$room"' EXIT
   cat "$pack"/part.* | tar -C "$room" -xzf -
-  .venv/bin/python - "$room/image" <<'END'
-import re
-import sys
-from importlib.metadata import PackageNotFoundError, distribution
-from pathlib import Path
-
-folder, waiting, done = Path(sys.argv[1]), ["torch", "numpy"], set()
-folder.mkdir()
-while waiting:
-    name = re.match(r"[\w.-]+", waiting.pop())[0]
-    try:
-        found = distribution(name)
-    except PackageNotFoundError:  # of another system
-        continue
-    if name not in done:
-        done.add(name)
-        waiting += [line for line in found.requires or () if "extra ==" not in line]
-        for top in {file.parts[0] for file in found.files or ()} - {"..", "__pycache__"}:
-            (folder / top).exists() or (folder / top).symlink_to(found.locate_file(top))
-END
+  folder=$(.venv/bin/python -c "import torch; print(torch.__path__[0])")
+  mkdir "$room/image"
+  for name in torch torchgen functorch numpy numpy.libs sympy mpmath networkx jinja2 markupsafe fsspec; do
+    ln -s "${folder%/*}/$name" "$room/image"
+  done
   PYTHONPATH=$room/site:$PWD:$room/image GAMBA_CACHE=$room .venv/bin/python -S -W ignore - "$room" <<'END'
 import sys
 from importlib import import_module

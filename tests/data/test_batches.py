@@ -8,7 +8,7 @@ from contextlib import nullcontext, suppress
 import pytest
 import torch
 from helpers import micro
-from helpers.micro import ALONE
+from helpers.micro import ALONE, take
 from helpers.refusals import refused
 
 from gamba_warp.errors import UserError
@@ -45,7 +45,7 @@ def test_the_queue_gives_the_batches_of_the_source(data, workers):
 
     ahead = batches_of(data, workers=workers, novel=novel, last=7)
     for number in range(7):
-        same(ahead.take(number), batches_of(data).batch(number, novel(number)))
+        same(ahead.take(number), take(batches_of(data, novel=novel), number))
     ahead.close()
 
 
@@ -56,17 +56,17 @@ def test_a_mirrored_sample_keeps_its_views_and_its_background(data):
         for config in (micro.options(data, data, views=views | {"mirror": m}) for m in (0.0, 1.0))
     )
     for number in range(4):
-        one, other = (each.sample(number, 2) for each in (plain, turned))
+        one, other = (take(each, number) for each in (plain, turned))
         assert one.uids == other.uids and torch.equal(one.background, other.background)
         assert torch.equal(one.targets.flip(-2), other.targets)
 
 
 def test_each_process_takes_its_part(data):
-    whole = batches_of(data, 4)
+    whole = batches_of(data, 4, novel=lambda _: 1)
     parts = [batches_of(data, 2, 2, World(r, 2, ALONE.device), lambda _: 1) for r in (0, 1)]
     for number in range(3):
         uids = [uid for part in parts for uid in part.take(number).uids]
-        assert uids == whole.batch(number, 1).uids
+        assert uids == take(whole, number).uids
     for part in parts:
         part.close()
 
@@ -87,7 +87,7 @@ def test_no_more_batches_are_begun_than_there_are_threads_ahead(data):
 def test_an_error_is_raised_in_its_step(data, workers, monkeypatch):
     """More than half of the objects fail one after the other: always in the same batch."""
     real = batches.load_sample
-    order = [batches_of(data, 1).sample(n, 0).uids[0] for n in range(5)]
+    order = [take(batches_of(data, 1), n).uids[0] for n in range(5)]
 
     def load(dataset, index, *rest):
         if dataset.uids[index] in order[1:4]:

@@ -190,7 +190,7 @@ def test_a_capture_without_memory_leaves_the_others(monkeypatch):
     for key in "aabbaab":
         kept.run(batch, key, lambda batch: 2 * batch.values)
     assert kept.count == 1 and kept.said == [
-        "out of memory after 1 CUDA graphs; other steps run without one"
+        "no CUDA graph of a step: CUDA out of memory; such steps run one by one"
     ]
 
 
@@ -202,6 +202,8 @@ def test_a_step_that_cannot_be_captured_runs_as_before(data, tmp_path, monkeypat
     monkeypatch.setattr(RecordedGraphs, "_record", refuse)
     other, kept, _ = trained(data, tmp_path / "other", "bins", 64)
     assert kept.replays == 0
-    assert kept.said == ["no CUDA graph of a step: operation not permitted; steps run one by one"]
+    assert kept.said == [
+        "no CUDA graph of a step: operation not permitted; such steps run one by one"
+    ]
     for name, value in one.model.state_dict().items():
         assert torch.equal(value, other.model.state_dict()[name]), name

@@ -12,6 +12,7 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
 from gamba_warp.render import render
 from gamba_warp.train import checkpoint
+from gamba_warp.train.batches import Batch, Batches
 from gamba_warp.train.config import TrainConfig
 from gamba_warp.train.ddp import World
 from gamba_warp.train.loop import train
@@ -113,6 +114,12 @@ def options(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dic
 def run(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dict) -> int:
     """Train with ``options`` in this process; return the exit code."""
     return train(options(data, out, model, **groups), ALONE)
+
+
+def take(source: Batches, number: int) -> Batch:
+    """The batch of a number, with none prepared ahead."""
+    source.last = number + 1
+    return source.take(number)
 
 
 def same_weights(a: Path, b: Path) -> bool:

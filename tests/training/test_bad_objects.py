@@ -2,7 +2,7 @@
 
 import pytest
 from helpers import micro
-from helpers.micro import ALONE, lines
+from helpers.micro import ALONE, lines, take
 
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
@@ -30,15 +30,15 @@ def source_of(root):
 
 def test_objects_that_go_bad_during_a_run_are_passed_over(root):
     source = source_of(root)
-    before = [source.sample(n, 1).uids[0] for n in range(6)]
+    before = [take(source, n).uids[0] for n in range(6)]
     assert len(set(before)) == 6 and not source.failures
     spoil(root, "a", "b", "c")
-    after = [source.sample(n, 1).uids[0] for n in range(12)]
+    after = [take(source, n).uids[0] for n in range(12)]
     assert set(after) == {"cloudd", "cloude", "cloudf"}
     assert set(source.failures) == {"clouda", "cloudb", "cloudc"}
     assert "not a picture" in source.failures["clouda"]
     again = source_of(root)  # a resumed run draws the same batches
-    assert [again.sample(n, 1).uids[0] for n in range(12)] == after
+    assert [take(again, n).uids[0] for n in range(12)] == after
 
 
 def test_more_than_half_of_the_objects_end_the_run(root):
@@ -46,7 +46,7 @@ def test_more_than_half_of_the_objects_end_the_run(root):
     spoil(root, "a", "b", "c", "d")
     with pytest.raises(UserError, match=r"^4 of 6 objects cannot be read; the last: .*\.png: not"):
         for number in range(12):
-            source.sample(number, 1)
+            take(source, number)
 
 
 def test_too_many_in_a_row_end_the_run(root, monkeypatch):
@@ -55,7 +55,7 @@ def test_too_many_in_a_row_end_the_run(root, monkeypatch):
     monkeypatch.setattr(batches, "_TRIES", 2)
     with pytest.raises(UserError, match="^2 objects in a row cannot be read; the last: "):
         for number in range(30):
-            source.sample(number, 1)
+            take(source, number)
 
 
 @pytest.mark.parametrize("error", [MemoryError(), OSError(5, "I/O error"), RuntimeError("a\nb")])
@@ -68,7 +68,7 @@ def test_whatever_one_object_raises_stops_no_other(root, monkeypatch, error):
         return real(dataset, index, *rest)
 
     monkeypatch.setattr(batches, "load_sample", load)
-    assert {source.sample(n, 1).uids[0] for n in range(6)} == {f"cloud{c}" for c in "bcdef"}
+    assert {take(source, n).uids[0] for n in range(6)} == {f"cloud{c}" for c in "bcdef"}
     assert len(source.failures["clouda"].splitlines()) == 1
 
 

@@ -70,16 +70,16 @@ def test_two_sets_of_one_name_are_refused(roots, tmp_path):
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, share):
-    options = micro.options(roots[0], tmp_path, views={"front_share": share})
+    options = micro.options(roots[0], tmp_path, views={"front_share": share, "batch_size": 1})
     data = replace(open_data(options), objects=[0])
     dataset = data.train
     poses = dataset.files(0).camera_to_world
     assert 0 < len(front_views(poses)) < micro.VIEWS
-    source = Batches(data, options, micro.ALONE)
+    source = Batches(data, options, micro.ALONE, lambda number: 1)
     views = dataset.load(0)
     seen = set()
     for number in range(40):
-        target = source.sample(number, 1).targets[0, 0]
+        target = micro.take(source, number).targets[0, 0]
         seen |= {v for v in range(micro.VIEWS) if views.images[v].equal(target)}
     assert seen == (set(front_views(poses)) if share else set(range(micro.VIEWS)))
 

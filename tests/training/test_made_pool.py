@@ -114,11 +114,11 @@ def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, sha
     def batches(made):
         views = {"made": made, "batch_size": 8}
         options = micro.options(data, data, views=views)
-        return Batches(open_data(options), options, micro.ALONE)
+        return Batches(open_data(options), options, micro.ALONE, lambda number: 2)
 
     plain, mixed = batches(0.0), batches(share)
     try:
-        ours, theirs = mixed.batch(0, 2), plain.batch(0, 2)
+        ours, theirs = micro.take(mixed, 0), micro.take(plain, 0)
     finally:
         mixed.close()
     made = [uid.startswith("made-") for uid in ours.uids]
