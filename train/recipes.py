@@ -57,7 +57,7 @@ RECIPES: dict[RecipeName, Recipe] = {
             "--preset rays": "starter/rays.json: 128² input, Gaussians on the pixels' rays",
             "--size 128": "all runs",
             "--steps 5500": "run 24: 1,940 steps in 105 minutes",
-            "--batch-size 16 --lr 3e-4": "run 24: gains more than batches of 8 at 4e-4",
+            "--batch-size 16 --lr 3e-4": "run 24",
             "--views-per-object 3": "run 30",
             "--schedule trapezoid --decay-share 0.7": "run 24: decay from .3 of the run on",
             "--ema 0.998": "losses against translucency",
