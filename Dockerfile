@@ -1,4 +1,4 @@
-# Pictures to 3D on a CPU: docker build -t gamba . && docker run --rm -v "$PWD:/work" gamba reconstruct photo.png -o out
+# Images to 3D on a CPU: docker build -t gamba . && docker run --rm -v "$PWD:/work" gamba reconstruct photo.png -o out
 FROM python:3.12-slim AS build
 WORKDIR /source
 COPY . .

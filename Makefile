@@ -37,13 +37,13 @@ $(TOOLS): $(STAMP)
 	@$(EDIT) '.[test]'
 	@touch $@
 
-# The starter set's pictures are a thousand files, which the repository keeps as one.
+# The starter set's images are a thousand files, which the repository keeps as one.
 starter/data: starter/data.tar
 	@echo "Unpacking $<."
 	@tar -xf $< -C starter && touch $@
 
 demo: $(STAMP)
-	@echo "Reconstructing 12 pictures and evaluating 4 objects with the shipped model."
+	@echo "Reconstructing 12 images and evaluating 4 objects with the shipped model."
 	$(BIN)/gamba demo
 
 # Two processes share the tests, a file each at a time, in the order of their names: by the number of
@@ -76,7 +76,7 @@ debug: $(TOOLS)
 		tests/ops/causal_conv1d tests/ops/rasterize tests/ops/runtime tests/ops/selective_scan \
 		tests/ops/ssim
 
-# Hostile files for every reader, or for READERS='shape or picture', as SEED draws them.
+# Hostile files for every reader, or for READERS='shape or image', as SEED draws them.
 MINUTES ?= 10
 READERS ?=
 hostile: $(TOOLS)
@@ -118,7 +118,7 @@ format: $(TOOLS)
 	$(BIN)/ruff format .
 	git ls-files -z '*.h' '*.cuh' '*.cpp' | xargs -0r $(BIN)/clang-format -i
 
-# Tables and pictures of the pages from results that are kept; REPORTS="--views out/eval/report.json"
+# Tables and images of the pages from results that are kept; REPORTS="--views out/eval/report.json"
 # puts an evaluation of the shipped model into its card first.
 figures: $(TOOLS)
 	PYTHONPATH=docs $(BIN)/python -m lab.figures $(REPORTS)

@@ -43,7 +43,7 @@ _KIND_BY_FIELD = {"max_psnr": VIEWS, "occupancy": SHAPES}
 _MAY_DIFFER = {
     VIEWS: (
         *("source", "data", "split", "split_version", "uids", "uids_sha256"),
-        *("baselines", "contact_sheet", "distance", "rendering", "pictures", "resize_pictures"),
+        *("baselines", "contact_sheet", "distance", "rendering", "images", "resize_images"),
         *("lpips", "lpips_reason", "grounds", "name", "changed"),
     ),
     SHAPES: ("name", "definitions", "frame", "pred_axes", "reference", "distance"),
@@ -330,8 +330,8 @@ def markdown_page(joined: dict[str, Any]) -> str:
     protocols = {
         name: of.get(VIEWS, {}).get("protocol", {}) for name, of in joined["reports"].items()
     }
-    if resized := [name for name, of in protocols.items() if of.get("resize_pictures")]:
-        parts.append(f"Pictures of {', '.join(resized)} were resized to the true ones.")
+    if resized := [name for name, of in protocols.items() if of.get("resize_images")]:
+        parts.append(f"Images of {', '.join(resized)} were resized to the true ones.")
     for kind, methods in joined["missing"].items():
         for name, missing in methods.items():
             if missing:

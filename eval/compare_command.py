@@ -29,7 +29,7 @@ def compare_command(
 
     First evaluate each method by eval-views, eval-geometry or both; give a name twice for both
     reports. Means are over the objects that all methods have. Reports of different protocols, or of
-    different true pictures or shapes, are refused.
+    different true images or shapes, are refused.
 
     Args:
         reports: NAME=FILE: a report.json, or its folder.

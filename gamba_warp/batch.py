@@ -167,7 +167,7 @@ STAGES = Stages()
 
 
 def counted(count: int, unit: str) -> str:
-    """Format a count: ``1 picture``, ``2 pictures``."""
+    """Format a count: ``1 image``, ``2 images``."""
     return f"{count:,} {unit}" + ("" if count == 1 else "s")
 
 

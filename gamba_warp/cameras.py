@@ -21,13 +21,13 @@ _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 @dataclass
 class Cameras:
-    """V pinhole cameras with one picture size.
+    """V pinhole cameras with one image size.
 
     Attributes:
         viewmats: ``[.., V, 4, 4]`` world to camera, OpenCV frame.
         Ks: ``[.., V, 3, 3]`` intrinsics in pixels.
-        width: width of the pictures, pixels.
-        height: height of the pictures, pixels.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
     """
 
     viewmats: Tensor
@@ -46,7 +46,7 @@ class Cameras:
         )
 
     def resized(self, width: int, height: int) -> Cameras:
-        """Return the same cameras for another picture size; the field of view stays."""
+        """Return the same cameras for another image size; the field of view stays."""
         factor = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
         return Cameras(self.viewmats, self.Ks * factor[:, None], width, height)
 

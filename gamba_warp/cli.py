@@ -57,11 +57,11 @@ _APP, _GRADIO = "gamba_warp.app.server", ("gradio",)
 _RENDERS, _METRICS = ("trimesh", "open3d", "manifold3d"), ("kornia",)
 _MODEL: Any = ("kernels", "network")
 _DRAWING: Any = ("kernels", "cores")
-_PICTURES: Any = (*_MODEL, "cores")
+_IMAGES: Any = (*_MODEL, "cores")
 # A command has one or two words.
 COMMANDS = {
     "demo": Command("Reconstruct and evaluate the starter set.", "all", SHAPES, _MODEL),
-    "reconstruct": Command("Pictures to 3D Gaussians.", "photo", (), _PICTURES),
+    "reconstruct": Command("Images to 3D Gaussians.", "photo", (), _IMAGES),
     "train": Command("Train a model on posed views.", "train", _METRICS, _MODEL, _TRAIN),
     "data furniture": Command("Get 820 models.", "", (), (), _DATA),
     "data made": Command("Make models of random parts.", "mesh", MADE, (), _DATA),
@@ -75,8 +75,8 @@ COMMANDS = {
     "ablate": Command("Train and compare variants of a model.", "all", _METRICS, _MODEL, _ABLATION),
     "export": Command("Gaussians to meshes, splats and pages.", "mesh", (), _DRAWING),
     "view": Command("Gaussians or a mesh in the browser."),
-    "render": Command("Gaussians to pictures and movies along a path.", "", (), _DRAWING),
-    "app": Command("Pictures to 3D on a page of this machine.", "app", _GRADIO, _PICTURES, _APP),
+    "render": Command("Gaussians to images and movies along a path.", "", (), _DRAWING),
+    "app": Command("Images to 3D on a page of this machine.", "app", _GRADIO, _IMAGES, _APP),
     "bench": Command("Run time against error, on this machine.", "", (), _MODEL, _MACHINE),
     "stress": Command(
         "Random hostile cases against float64.", "stress", ("hypothesis",), ("kernels",), _MACHINE

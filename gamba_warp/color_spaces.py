@@ -1,4 +1,4 @@
-"""Colour spaces of pictures, and their conversion to sRGB.
+"""Colour spaces of images, and their conversion to sRGB.
 
 A file tells its space by an ICC profile, or by numbers: code points of ITU-T H.273 (PNG's cICP,
 HEIC's and AVIF's nclx), PNG's cHRM and gAMA, or the interoperability index of EXIF.
@@ -100,7 +100,7 @@ _CURVES: dict[int, Curve] = {
 
 
 def conversion(image: Image.Image, warn: Callable[[str], None]) -> Convert | None:
-    """Return the conversion of a picture's 8-bit pixels to sRGB; alpha is kept.
+    """Return the conversion of an image's 8-bit pixels to sRGB; alpha is kept.
 
     Args:
         image: not decoded yet.
@@ -208,7 +208,7 @@ def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Im
     source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
     space = cast(Any, source.profile).xcolor_space.strip()  # missing in Pillow's stub
     if space not in {"L": ("GRAY", "RGB"), "RGB": ("RGB",), "CMYK": ("CMYK",)}[mode]:
-        raise ValueError(f"it is for {space}, but the picture is {mode}")
+        raise ValueError(f"it is for {space}, but the image is {mode}")
     source_mode = "L" if space == "GRAY" else space
     # For speed littleCMS interpolates grey between a few steps; the table below has all 256.
     flags = ImageCms.Flags.NOOPTIMIZE if mode == "L" else ImageCms.Flags.NONE
@@ -236,7 +236,7 @@ def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Im
 def _keeping_alpha(
     colours: Callable[[Image.Image], Image.Image],
 ) -> Callable[[Image.Image], Image.Image]:
-    """Extend a conversion to pictures with alpha, which is copied."""
+    """Extend a conversion to images with alpha, which is copied."""
 
     def convert(band: Image.Image) -> Image.Image:
         made = colours(band)

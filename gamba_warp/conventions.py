@@ -9,7 +9,7 @@ DEFAULT_DISTANCE = 1.5  # of the reference camera from the object's centre, obje
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
-# Grey values of the backgrounds that pictures are compared on. Black and grey are used besides
+# Grey values of the backgrounds that images are compared on. Black and grey are used besides
 # white because a white haze is invisible on white. Keys of metrics on white are plain; the others
 # end in the background's name. Turntables and sheets are on grey, which shows dark and bright haze.
 WHITE, GREY = 1.0, 0.5
@@ -48,7 +48,7 @@ def over_background(rgba, background):
 
 
 def over_another(rgb, alpha, old, new):
-    """Move a composited picture to another background, by its alpha; nothing is clipped.
+    """Move a composited image to another background, by its alpha; nothing is clipped.
 
     Args:
         rgb: ``[.., H, W, 3]`` on the background ``old``, an array or a tensor.

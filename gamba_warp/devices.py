@@ -63,7 +63,7 @@ def keep_memory() -> None:
 
     Otherwise glibc returns the tensors of torch's operators, of some MiB each, to the system at
     once, and the system clears each page at the next use (docs/lab/step.md has the cost per
-    picture). Results of our operators stay in the pool of ``kernels/runtime/memory.py``, in every
+    image). Results of our operators stay in the pool of ``kernels/runtime/memory.py``, in every
     program and also over 256 MiB, from where glibc returns blocks as before.
 
     The allocator is process-wide, so only commands call this; a program that runs the network often

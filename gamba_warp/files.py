@@ -22,7 +22,7 @@ from .errors import FileWarning, UserError
 PACKAGE = Path(__file__).resolve().parent
 # The folder of a checkout: of this package, of tests/ and of starter/.
 CHECKOUT = PACKAGE.parent
-# The shipped model and example pictures: two in an installed package, more in a checkout, which
+# The shipped model and example images: two in an installed package, more in a checkout, which
 # also has the starter set's data.
 STARTER = PACKAGE / "starter" if (PACKAGE / "starter").is_dir() else CHECKOUT / "starter"
 CONFIG = "config.json"  # options of a command, in the folder of its results

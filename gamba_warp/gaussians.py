@@ -88,7 +88,7 @@ class Gaussians:
 
         Args:
             least: opacity below which a Gaussian is left out. None: 1/255, below which the
-                rasterizer draws nothing, so that pictures stay bit-identical.
+                rasterizer draws nothing, so that images stay bit-identical.
         """
         return self.select(self.is_drawn(least))
 

@@ -51,7 +51,7 @@ def bench(device: str, folder: str) -> int:
     tables = conv.tables(settings)
     if device == "cuda":
         made = [table for suite in (models, raster, scan) for table in suite.tables(settings)]
-        # the model's picture needs packages that the check does not ask for
+        # the model's image needs packages that the check does not ask for
         tables += [table for table in made if (table.op, table.name) != ("model", "skipping")]
     records: list[dict] = []
     for table in tables:  # a crash loses only the current one

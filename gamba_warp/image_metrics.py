@@ -14,13 +14,13 @@ from .conventions import GROUNDS, WHITE
 if TYPE_CHECKING:
     from torch import Tensor
 
-MAX_PSNR = 100.0  # dB; of equal pictures, whose PSNR is infinite
+MAX_PSNR = 100.0  # dB; of equal images, whose PSNR is infinite
 SSIM_WINDOW = 11  # pixels
 SSIM_SIGMA = 1.5  # pixels; kornia has it fixed
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """Compute the peak signal-to-noise ratio of the whole picture, in dB, at most ``MAX_PSNR``.
+    """Compute the peak signal-to-noise ratio of the whole image, in dB, at most ``MAX_PSNR``.
 
     Args:
         a: ``[.., H, W, C]`` in [0, 1].
@@ -45,16 +45,16 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
         b: the same shape.
 
     Returns:
-        ``[..]`` float64, 1 for equal pictures.
+        ``[..]`` float64, 1 for equal images.
 
     Raises:
-        ValueError: the shapes differ, or the pictures are smaller than the window.
+        ValueError: the shapes differ, or the images are smaller than the window.
     """
     from kornia.metrics import ssim as ssim_map
 
     _same_shape(a, b)
     if min(a.shape[-3:-1]) < SSIM_WINDOW:
-        raise ValueError(f"pictures of {a.shape[-2]}x{a.shape[-3]}; SSIM needs 11x11 or more")
+        raise ValueError(f"images of {a.shape[-2]}x{a.shape[-3]}; SSIM needs 11x11 or more")
     # float64, because in flat regions variances are differences of nearly equal numbers.
     x, y = (v.double().reshape(-1, *v.shape[-3:]).permute(0, 3, 1, 2) for v in (a, b))
     values = ssim_map(x, y, SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
@@ -86,7 +86,7 @@ class Metric(NamedTuple):
 
     Attributes:
         title: heading of its column.
-        compare: function of pictures ``[V, H, W, 3]`` in [0, 1] or masks ``[V, H, W]`` bool, and
+        compare: function of images ``[V, H, W, 3]`` in [0, 1] or masks ``[V, H, W]`` bool, and
             the true ones; returns ``[V]``. None: LPIPS, whose network may be missing.
         unit: or "".
         digits: decimals shown.
@@ -94,7 +94,7 @@ class Metric(NamedTuple):
         of_masks: compares masks (alpha) instead of colours.
         on_grounds: depends on the background, so it is also computed on each of ``GROUNDS``.
         ground: the key of ``GROUNDS`` that it is computed on; None: white.
-        least_side: it is undefined for pictures with a shorter side.
+        least_side: it is undefined for images with a shorter side.
         in_compare: shown in the table of ``gamba compare``; its JSON has all metrics.
     """
 
@@ -145,14 +145,14 @@ def all_figures() -> dict[str, Metric]:
 
 
 def measure(
-    pictures: Callable[[float], tuple[Tensor, Tensor]],
+    images: Callable[[float], tuple[Tensor, Tensor]],
     masks: tuple[Tensor, Tensor] | None,
     keys: Container[str] | None = None,
 ) -> dict[str, Tensor]:
     """Compute every metric that needs no network.
 
     Args:
-        pictures: returns the pictures to judge and the true ones on a grey value.
+        images: returns the images to judge and the true ones on a grey value.
         masks: of the same views, see ``Metric.compare``; None without masks.
         keys: of the metrics, or None for all.
 
@@ -166,7 +166,7 @@ def measure(
     for key, metric in all_figures().items():
         if metric.compare is None or (keys is not None and key not in keys):
             continue
-        pair = masks if metric.of_masks else pictures(metric.grey)
+        pair = masks if metric.of_masks else images(metric.grey)
         if pair is not None:
             found[key] = metric.compare(*pair)
     return found

@@ -1,6 +1,6 @@
-"""Reading and writing pictures; common formats become RGBA, and errors name the file.
+"""Reading and writing images; common formats become RGBA, and errors name the file.
 
-``open_picture`` opens every untrusted picture: few formats, size checked before decoding.
+``open_image`` opens every untrusted image: few formats, size checked before decoding.
 ``to_rgba`` converts it to sRGB with alpha.
 """
 
@@ -28,8 +28,8 @@ MAX_SIDE = 32_768  # pixels; panoramas are shorter, and padding to a square stay
 # Pillow knows thirty more; one of them (EPS) starts another program, and none is for photos.
 # JPEG includes MPO.
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM")
-PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
-PICTURE_SUFFIXES |= {".heic", ".heif", ".avif"}
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
+IMAGE_SUFFIXES |= {".heic", ".heif", ".avif"}
 
 _COUNT_FRAMES_UP_TO = 16 << 20  # bytes of a file; counting frames reads all of it
 _BAND = 1 << 22  # pixels converted at once
@@ -52,13 +52,13 @@ _QUIET = threading.Lock()  # warning filters are process-wide
 
 
 @contextmanager
-def open_picture(
+def open_image(
     source: str | Path | BinaryIO,
     name: object = None,
     max_pixels: int = MAX_PIXELS,
     formats: Sequence[str] = FORMATS,
 ) -> Iterator[Image.Image]:
-    """Open a picture; its size is checked before anything is decoded.
+    """Open an image; its size is checked before anything is decoded.
 
     Errors of the decoder inside the ``with`` block become one line too.
 
@@ -69,10 +69,10 @@ def open_picture(
         formats: Pillow's names of the allowed formats, whatever the file's suffix.
 
     Yields:
-        The picture, not decoded yet. EXIF rotation is not applied.
+        The image, not decoded yet. EXIF rotation is not applied.
 
     Raises:
-        UserError: it is missing, empty, not a plain file or picture of these formats, a raw
+        UserError: it is missing, empty, not a plain file or image of these formats, a raw
             photograph, larger than ``max_pixels`` or ``MAX_SIDE``, or damaged.
     """
     name = source if name is None else name
@@ -88,7 +88,7 @@ def open_picture(
     except UserError:
         raise
     except UnidentifiedImageError as error:
-        raise UserError(f"{name}: not a picture that can be read") from error
+        raise UserError(f"{name}: not an image that can be read") from error
     except Image.DecompressionBombError as error:
         raise UserError(f"{name}: is over {max_pixels >> 20} megapixels") from error
     except Exception as error:  # decoders raise errors of nearly any type on damaged files
@@ -107,7 +107,7 @@ def _check_raw(image: Image.Image, name: object) -> None:
 
 
 def check_size(width: int, height: int, name: object, max_pixels: int = MAX_PIXELS) -> None:
-    """Refuse a picture that is larger than ``max_pixels``, or longer than ``MAX_SIDE``.
+    """Refuse an image that is larger than ``max_pixels``, or longer than ``MAX_SIDE``.
 
     Raises:
         UserError: it is too large; the message begins with ``name``.
@@ -126,7 +126,7 @@ def _check_file(path: str | Path, name: object) -> None:
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise UserError(f"{name}: {getattr(error, 'strerror', None) or error}") from error
     if stat.S_ISDIR(found.st_mode):
-        raise UserError(f"{name}: is a folder, not a picture")
+        raise UserError(f"{name}: is a folder, not an image")
     if not stat.S_ISREG(found.st_mode):
         raise UserError(f"{name}: not a plain file")
     if found.st_size == 0:
@@ -144,14 +144,14 @@ def _without_warnings() -> Iterator[None]:
 def load_rgba(
     path: str | Path, longest: int | None = None, warn: Callable[[str], None] | None = None
 ) -> np.ndarray:
-    """Read one still picture.
+    """Read one still image.
 
     Grey, palette, RGB, CMYK and RGBA files of 8 and 16 bits are converted to sRGB
     (``color_spaces``), and EXIF rotation is applied. HEIC needs pillow-heif.
 
     Args:
         path: the file.
-        longest: pixels; a picture at least four times as long is reduced by a whole factor,
+        longest: pixels; an image at least four times as long is reduced by a whole factor,
             weighted by alpha, to no less than twice this. None keeps its size.
         warn: as for ``to_rgba``.
 
@@ -159,14 +159,14 @@ def load_rgba(
         ``[H, W, 4]`` float32 in [0, 1], colour not premultiplied; alpha is 1 if the file has none.
 
     Raises:
-        UserError: the file is missing, empty, not a picture, truncated, animated or too large.
+        UserError: the file is missing, empty, not an image, truncated, animated or too large.
     """
     with _still(path) as image:
         return to_rgba(image, path, np.float32, longest, turned=True, warn=warn)
 
 
 def load_rgba8(path: str | Path, content: bytes | None = None) -> np.ndarray:
-    """Read a picture of a posed set like ``load_rgba``, but ``[H, W, 4]`` uint8, as stored.
+    """Read an image of a posed set like ``load_rgba``, but ``[H, W, 4]`` uint8, as stored.
 
     EXIF rotation is not applied: the cameras of COLMAP and others are for the stored pixels.
 
@@ -178,8 +178,8 @@ def load_rgba8(path: str | Path, content: bytes | None = None) -> np.ndarray:
         return to_rgba(image, path, np.uint8)
 
 
-def picture_size(path: str | Path, turned: bool = True) -> tuple[int, int]:
-    """Return width and height of a still picture, without decoding it.
+def image_size(path: str | Path, turned: bool = True) -> tuple[int, int]:
+    """Return width and height of a still image, without decoding it.
 
     Args:
         path: the file.
@@ -199,7 +199,7 @@ def _still(path: str | Path, content: bytes | None = None) -> Iterator[Image.Ima
         _check_file(path, path)  # opening a pipe would wait for its writer
     formats = (*FORMATS, *_phone_formats(path, content))
     source = path if content is None else io.BytesIO(content)
-    with open_picture(source, path, max_pixels=MAX_PIXELS, formats=formats) as image:
+    with open_image(source, path, max_pixels=MAX_PIXELS, formats=formats) as image:
         # Phones append a preview or a depth map to a JPEG (MPO) or a HEIC.
         if image.format not in ("MPO", "HEIF") and getattr(image, "is_animated", False):
             size = os.path.getsize(path) if content is None else len(content)
@@ -218,7 +218,7 @@ def _phone_formats(path: str | Path, content: bytes | None) -> tuple[str, ...]:
             with open(path, "rb") as file:
                 head = file.read(12)
     except OSError:
-        return ()  # ``open_picture`` reports it
+        return ()  # ``open_image`` reports it
     if head[4:8] != b"ftyp":
         return ()
     if head[8:12] in (b"avif", b"avis"):
@@ -255,7 +255,7 @@ def to_rgba(
     profiled: bool = True,
     warn: Callable[[str], None] | None = None,
 ) -> np.ndarray:
-    """Decode a picture of ``open_picture``, and free it on the way.
+    """Decode an image of ``open_image``, and free it on the way.
 
     Args:
         image: not decoded yet.
@@ -285,7 +285,7 @@ def to_rgba(
 
 
 def _with_alpha(image: Image.Image) -> Image.Image:
-    """Return the picture in a mode of ``_PLAIN``, I or F, with a transparent value made alpha."""
+    """Return the image in a mode of ``_PLAIN``, I or F, with a transparent value made alpha."""
     key, raw = image.info.get("transparency"), _raw_mode(image)
     if raw in _LOW_BYTES and image.format == "PNG":
         return _rounded(image, raw, key)
@@ -381,62 +381,62 @@ def _warn_once(line: str) -> None:
         warnings.warn(line, FileWarning, stacklevel=2)
 
 
-def to_uint8(picture: np.ndarray) -> np.ndarray:
+def to_uint8(image: np.ndarray) -> np.ndarray:
     """Round ``[.., C]`` float values in [0, 1] to 8 bits; NaN becomes 0."""
-    return (np.clip(np.nan_to_num(picture), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    return (np.clip(np.nan_to_num(image), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
+def save_image(path: str | Path, image: np.ndarray, **options) -> None:
     """Write ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], in the format of the suffix.
 
     Raises:
         UserError: the file cannot be written.
     """
-    pixels = to_uint8(np.asarray(picture))
+    pixels = to_uint8(np.asarray(image))
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
     with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, **options)
 
 
-def find_pictures(
+def find_images(
     images: Sequence[Path], recursive: bool = False
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Resolve files and folders to picture files.
+    """Resolve files and folders to image files.
 
     Args:
-        images: files, which are kept unchanged, and folders, whose files with a picture's suffix
+        images: files, which are kept unchanged, and folders, whose files with an image's suffix
             follow in sorted order.
         recursive: also take those in their sub-folders; links to folders are not followed.
 
     Returns:
-        The files, each once; and the folders without pictures, with the reason.
+        The files, each once; and the folders without images, with the reason.
     """
-    pictures: dict[Path, None] = {}
+    paths: dict[Path, None] = {}
     failures = []
     for path in images:
         if not path.is_dir():
-            pictures[path] = None
+            paths[path] = None
             continue
         try:
-            inside = sorted(p for p in _inside(path, recursive)[0] if _is_picture(p))
+            inside = sorted(p for p in _inside(path, recursive)[0] if _is_image(p))
         except OSError as error:
             failures.append((path, error.strerror))
             continue
-        pictures.update(dict.fromkeys(inside))
+        paths.update(dict.fromkeys(inside))
         if not inside:
             more = left_out(path, recursive)
-            failures.append((path, "the folder holds no pictures" + (f" ({more})" if more else "")))
-    return list(pictures), failures
+            failures.append((path, "the folder holds no images" + (f" ({more})" if more else "")))
+    return list(paths), failures
 
 
 def left_out(path: Path, recursive: bool = False) -> str:
-    """Return the entries of a folder that ``find_pictures`` leaves out; none for a file."""
+    """Return the entries of a folder that ``find_images`` leaves out; none for a file."""
     try:
         files, folders = _inside(path, recursive) if path.is_dir() else ([], [])
     except OSError:
         return ""
-    counts, hint = [other_kinds(files, PICTURE_SUFFIXES)], ""
+    counts, hint = [other_kinds(files, IMAGE_SUFFIXES)], ""
     if folders and not recursive:
         counts.append(f"{len(folders)} folder{'s' * (len(folders) > 1)}")
         hint = "; --recursive takes the folders"
@@ -444,8 +444,8 @@ def left_out(path: Path, recursive: bool = False) -> str:
     return f"{said} skipped{hint}" if said else ""
 
 
-def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in PICTURE_SUFFIXES
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def _inside(path: Path, recursive: bool) -> tuple[list[Path], list[Path]]:

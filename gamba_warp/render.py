@@ -57,7 +57,7 @@ def render(
     if gaussians.antialiased:
         options.setdefault("rasterize_mode", "antialiased")
     with record_function("rasterizer"):
-        pictures, alpha, meta = rasterization(
+        images, alpha, meta = rasterization(
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.scales,
@@ -71,4 +71,4 @@ def render(
             render_mode="RGB+ED" if depth else "RGB",
             **options,
         )
-    return Rendering(pictures[..., :3], alpha, pictures[..., 3:] if depth else None, meta)
+    return Rendering(images[..., :3], alpha, images[..., 3:] if depth else None, meta)

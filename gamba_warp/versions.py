@@ -1,6 +1,6 @@
 """Versions of this package and its dependencies, required and optional.
 
-The core (setup.cfg, ``install_requires``) runs the kernels and the model, and turns a picture with
+The core (setup.cfg, ``install_requires``) runs the kernels and the model, and turns an image with
 alpha into a ``.ply``, a turntable and a page. Everything else needs an extra; ``to_install`` tells
 how to install it.
 """

@@ -74,7 +74,7 @@ def from_ptx():
 
 @pytest.fixture
 def one_thread():
-    """Use one thread, which is faster for pictures of a few pixels."""
+    """Use one thread, which is faster for images of a few pixels."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

@@ -365,7 +365,7 @@ class Batches:
             self._stream = self.data.shards.stream(int(order.generate_state(1)[0]))
         if not views.made or self._made is not None:
             return
-        pictures = Settings(
+        images = Settings(
             views=MADE_VIEWS,
             size=max(views.size, self.model.image_size),
             seed=self.config.run.seed,
@@ -379,7 +379,7 @@ class Batches:
             seed=self.config.run.seed,
             rank=world.rank,
             world=world.size,
-            views=pictures,
+            views=images,
         )
         self._made = Pool(options, math.floor(number * views.batch_size * views.made))
 

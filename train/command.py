@@ -20,7 +20,7 @@ _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 4,000
 def train_command(config: tyro.conf.OmitArgPrefixes[TrainConfig]) -> int:
     """Train a model on posed views.
 
-    Loss, optimizer and schedules are the paper's. Writes checkpoints, log.jsonl, sample pictures
+    Loss, optimizer and schedules are the paper's. Writes checkpoints, log.jsonl, sample images
     and at the end model.safetensors into the run folder. Ctrl-C saves and stops; the same command
     resumes. Several GPUs: torchrun --nproc-per-node N -m gamba_warp.train DATA ...
     """

@@ -53,11 +53,11 @@ class DataConfig:
     Attributes:
         batch_size: Objects per step and process, before accumulation.
         accumulate: Batches per optimizer step.
-        size: Side of the rendered pictures, pixels.
+        size: Side of the rendered images, pixels.
         views_per_object: Novel views per object; if not given, they grow evenly over the run from 2
             to 6.
-        background: Colour behind the rendered and the true pictures; "random" draws one for each
-            object and step. The input picture always has the model's own background.
+        background: Colour behind the rendered and the true images; "random" draws one for each
+            object and step. The input image always has the model's own background.
         extra: More datasets; their training objects are added to DATA's. The objects of one
             that is named twice come twice in an epoch.
         front_share: Share of the samples whose input is a view from the front: the object's first,
@@ -67,9 +67,9 @@ class DataConfig:
         recolor: Share of the samples whose colour channels are permuted and change gamma.
         made: Share of the samples that show made objects (gamba data made), which other processes
             make and render during the training; the others are of the datasets.
-        cache: Keep decoded pictures in memory, with 8 bits a channel. Depth pictures are read when
+        cache: Keep decoded images in memory, with 8 bits a channel. Depth images are read when
             they are used.
-        workers: Threads that decode pictures ahead of the training; also the largest number of
+        workers: Threads that decode images ahead of the training; also the largest number of
             batches kept ready. By default 1, or with a GPU one per core, at most 8. The number
             does not change the result.
     """
@@ -110,7 +110,7 @@ class LossConfig:
             of crops; the result is a weighted mean over the views.
         depth_weight: Weight of the depth loss: the first layer of "rays" is pulled to the first
             surface of the input view, the last layer to the last surface. The data needs depth
-            pictures (gamba data render --depth); not in the paper.
+            images (gamba data render --depth); not in the paper.
         mask_l1_weight: Weight of the absolute error of alpha, added to its squared error: where a
             position is unknown, its minimum is at 0 or 1 and not between. Not in the paper.
         translucency_weight: Weight of 4 alpha (1 - alpha) of rendered alpha beyond that of the true
@@ -175,7 +175,7 @@ class RunConfig:
             with another --out to continue with other losses or data.
         encoder_weights: File of the image encoder's weights, or "random" to train one from scratch.
         log_every: Steps between two lines of the log.
-        val_every: Steps between two validations (and sample pictures); 0 for none.
+        val_every: Steps between two validations (and sample images); 0 for none.
         val_objects: Held-out objects to validate on, and as many training objects beside them.
         save_every: Steps between two checkpoints; one is always saved at the end, and the last two
             are kept.

@@ -173,5 +173,5 @@ def _fields(value: Any) -> Iterator[Any]:
     for field in vars(value).values():
         if is_dataclass(field):
             yield from _fields(field)
-        elif not isinstance(field, list):  # names, and pictures that only a CPU uses
+        elif not isinstance(field, list):  # names, and images that only a CPU uses
             yield field

@@ -1,4 +1,4 @@
-"""Log of a run: one JSON object per line, TensorBoard, and sample pictures."""
+"""Log of a run: one JSON object per line, TensorBoard, and sample images."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class RunLog:
             self.warn(step, f"{uid} is skipped: {failures[uid]}")
 
     def sample(self, step: int, path: Path, rows: list[Tensor]) -> None:
-        """Write sample pictures, see ``strip_of``, also to TensorBoard; warn if that fails."""
+        """Write sample images, see ``strip_of``, also to TensorBoard; warn if that fails."""
         strip = strip_of(rows)
         try:
             save_image(path, strip)
@@ -112,7 +112,7 @@ class RunLog:
             self.warn(step, str(error))
         if self._board is not None:
             with self._guarded("tensorboard"):
-                self._board.add_image("val/pictures", to_uint8(strip), step, dataformats="HWC")
+                self._board.add_image("val/images", to_uint8(strip), step, dataformats="HWC")
 
     def close(self) -> None:
         """Close the files."""
@@ -174,7 +174,7 @@ def _to_json(value: Any) -> Any:
 
 
 def strip_of(rows: list[Tensor]) -> np.ndarray:
-    """Join pictures to one: each of ``rows`` is ``[V, H, W, 3]`` in [0, 1], left to right."""
+    """Join images to one: each of ``rows`` is ``[V, H, W, 3]`` in [0, 1], left to right."""
     strips = [torch.cat(list(row), dim=1) for row in rows]
     width = max(strip.shape[1] for strip in strips)
     padded = [torch.nn.functional.pad(s, (0, 0, 0, width - s.shape[1]), value=1.0) for s in strips]

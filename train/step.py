@@ -57,8 +57,8 @@ class StepResult:
         loss: scalar, with its graph.
         terms: unweighted terms by name, each ``[B, V+1]``.
         gaussians: predicted Gaussians, ``[B]``.
-        rendering: their pictures, ``[B, V+1]``.
-        target: true pictures on the batch's background, ``[B, V+1, H, W, 3]``.
+        rendering: their images, ``[B, V+1]``.
+        target: true images on the batch's background, ``[B, V+1, H, W, 3]``.
     """
 
     loss: Tensor
@@ -264,7 +264,7 @@ def health(result: StepResult, batch: Batch) -> dict[str, Tensor]:
 
     Returns:
         ``psnr`` of the batch in dB; ``mean_alpha`` of the rendered and ``target_alpha`` of the true
-        pictures, both in [0, 1]; ``visible_share``, the share of Gaussians that are not transparent
+        images, both in [0, 1]; ``visible_share``, the share of Gaussians that are not transparent
         and project into some view; ``spread``, the rms distance of the centres from their mean in
         object units.
     """
@@ -294,7 +294,7 @@ def means(step: Step) -> dict[str, float]:
 def collapse_reason(figures: Mapping[str, float]) -> str | None:
     """Describe a collapse by the figures of ``health`` in one line; None without one."""
     if figures["target_alpha"] > 0 and figures["mean_alpha"] < 0.1 * figures["target_alpha"]:
-        return f"the pictures are almost empty (mean alpha {figures['mean_alpha']:.2g})"
+        return f"the images are almost empty (mean alpha {figures['mean_alpha']:.2g})"
     if figures["visible_share"] < 0.02:
         return f"almost no Gaussian is visible (share {figures['visible_share']:.2g})"
     if figures["spread"] < 0.01:

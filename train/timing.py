@@ -43,7 +43,7 @@ _PARTS = {
     "convolution": ("gamba_warp::causal_conv1d",),
     "rasterizer": ("gamba_warp::rasterize",),
     "products": ("aten::mm", "aten::addmm", "aten::bmm"),
-    "pictures' convolutions": ("aten::convolution",),
+    "images' convolutions": ("aten::convolution",),
 }
 
 
@@ -85,7 +85,7 @@ class Step:
         size = config.image_size
         y, x = torch.meshgrid(*2 * [torch.linspace(-1, 1, size)], indexing="ij")
         inputs = torch.rand(objects, size, size, config.input_channels)
-        inputs[..., 3] = (x.square() + y.square() < 0.5).float()  # 39 % of the picture
+        inputs[..., 3] = (x.square() + y.square() < 0.5).float()  # 39 % of the image
         self.batch = Batch(
             [str(i) for i in range(objects)],
             inputs,

@@ -191,7 +191,7 @@ def _measures(
     rgb, alpha, true = result.rendering.rgb[0], result.rendering.alpha[0], batch.targets[0]
     got, want = rgb.clamp(0, 1), result.target[0]
 
-    def pictures(grey: float) -> tuple[Tensor, Tensor]:
+    def images(grey: float) -> tuple[Tensor, Tensor]:
         if grey == WHITE:
             return got, want
         return over_another(rgb, alpha, WHITE, grey).clamp(0, 1), over_background(true, grey)
@@ -199,7 +199,7 @@ def _measures(
     masks = alpha[..., 0] > 0.5, true[..., 3] > 0.5
     side = min(want.shape[-3:-1])
     keys = [key for key, metric in all_figures().items() if side >= metric.least_side]
-    measures = measure(pictures, masks, keys)
+    measures = measure(images, masks, keys)
     if lpips is not None:
         terms = result.terms
         measures["lpips"] = terms["lpips"][0] if "lpips" in terms else lpips(got, want)

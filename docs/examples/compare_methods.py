@@ -1,13 +1,13 @@
-"""Compares methods by their files in one table, with the expected form of pictures and meshes.
+"""Compares methods by their files in one table, with the expected form of images and meshes.
 
 Run ``python docs/examples/compare_methods.py --out out/compare`` in a checkout; it uses the
 starter set, and ends with the table of ``gamba compare``. The methods:
 
-- **shipped**: the shipped model, evaluated as a model. Its pictures and Gaussians are written too.
-- **retrieval**, **billboard**: two baselines in the form of external results, folders of pictures
+- **shipped**: the shipped model, evaluated as a model. Its images and Gaussians are written too.
+- **retrieval**, **billboard**: two baselines in the form of external results, folders of images
   named like the true ones. They have no meshes, and "-" in the table.
-- **hull**: the convex hull of the *true* shape, in grey. No method can make it from one picture;
-  it stands for an external program: pictures with their own cameras (``transforms.json``), and
+- **hull**: the convex hull of the *true* shape, in grey. No method can make it from one image;
+  it stands for an external program: images with their own cameras (``transforms.json``), and
   meshes in the frame of the true ones.
 """
 
@@ -38,7 +38,7 @@ def evaluate_shipped(out: Path, options: argparse.Namespace) -> list[str]:
     """Evaluate the shipped model's views; return the names of the objects."""
     gamba(
         *("eval-views", "--checkpoint", STARTER / "rays.safetensors", "--out", out / "shipped"),
-        *("--save-gaussians", "--save-pictures", *common(options)),
+        *("--save-gaussians", "--save-images", *common(options)),
     )
     report = json.loads((out / "shipped" / "report.json").read_text())
     return [record["name"] for record in report["objects"]]
@@ -52,7 +52,7 @@ def common(options: argparse.Namespace) -> list[object]:
 
 
 def make_hulls(out: Path, meshes: Path, uids: list[str], cameras: int) -> None:
-    """Make the fourth method's files: ``meshes/NAME.ply``, and ``pictures/NAME`` with cameras.
+    """Make the fourth method's files: ``meshes/NAME.ply``, and ``images/NAME`` with cameras.
 
     ``data render`` uses the dataset's cameras, because it has the same seed.
     """
@@ -60,9 +60,9 @@ def make_hulls(out: Path, meshes: Path, uids: list[str], cameras: int) -> None:
     for uid in uids:
         mesh = trimesh.load(meshes / f"{uid}.ply", force="mesh")
         mesh.convex_hull.export(out / "meshes" / f"{uid}.ply")
-    shutil.rmtree(out / "pictures", ignore_errors=True)
+    shutil.rmtree(out / "images", ignore_errors=True)
     gamba(
-        *("data", "render", out / "meshes", "--out", out / "pictures"),
+        *("data", "render", out / "meshes", "--out", out / "images"),
         *("--views", cameras, "--workers", 1),
     )
 
@@ -84,14 +84,14 @@ def main(arguments: list[str] | None = None) -> None:
     cameras = json.loads((options.data / uids[0] / "transforms.json").read_text())["frames"]
     make_hulls(out / "hull", options.meshes, uids, len(cameras))
 
-    # Pictures: a folder for each method, in it a folder for each object.
-    pictures = {
-        "retrieval": out / "shipped" / "pictures" / "retrieval",
-        "billboard": out / "shipped" / "pictures" / "billboard",
-        "hull": out / "hull" / "pictures",
+    # Images: a folder for each method, in it a folder for each object.
+    images = {
+        "retrieval": out / "shipped" / "images" / "retrieval",
+        "billboard": out / "shipped" / "images" / "billboard",
+        "hull": out / "hull" / "images",
     }
     reports = {"shipped": [out / "shipped"]}
-    for name, folder in pictures.items():
+    for name, folder in images.items():
         place = out / f"{name}-views"
         words = ["--predictions", folder, "--no-baselines", "--out", place]
         gamba("eval-views", *words, *common(options))

@@ -24,12 +24,12 @@ RATES = dict(means=2e-3, scales=1e-2, quats=5e-3, opacities=2e-2, colors=1e-2)
 
 
 def photograph(name: str, size: int) -> Tensor:
-    """A picture of ``skimage.data``, ``[H, W, 3]`` in [0, 1], its longer side ``size`` pixels."""
-    picture = torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1)[None] / 255
-    height, width = picture.shape[2:]
+    """An image of ``skimage.data``, ``[H, W, 3]`` in [0, 1], its longer side ``size`` pixels."""
+    image = torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1)[None] / 255
+    height, width = image.shape[2:]
     scale = size / max(height, width)
     shape = (round(height * scale), round(width * scale))
-    return torch.nn.functional.interpolate(picture, shape, mode="area")[0].permute(1, 2, 0)
+    return torch.nn.functional.interpolate(image, shape, mode="area")[0].permute(1, 2, 0)
 
 
 def start(count: int) -> dict[str, torch.nn.Parameter]:
@@ -79,7 +79,7 @@ def strategy_of(name: str, steps: int, most: int):
 
 
 def fit(target: Tensor, name: str = "mcmc", steps: int = 400, count: int = 400, most: int = 1200):
-    """Fit and print; return the picture ``[H, W, 3]``, its PSNR and the number of Gaussians."""
+    """Fit and print; return the image ``[H, W, 3]``, its PSNR and the number of Gaussians."""
     torch.manual_seed(0)
     height, width, _ = target.shape
     params = start(count)
@@ -87,9 +87,9 @@ def fit(target: Tensor, name: str = "mcmc", steps: int = 400, count: int = 400, 
     strategy, state = strategy_of(name, steps, most)
     strategy.check_sanity(params, optimizers)
     for step in range(steps):
-        picture, info = draw(params, width, height, name != "mcmc")
+        image, info = draw(params, width, height, name != "mcmc")
         strategy.step_pre_backward(params, optimizers, state, step, info)
-        loss = (picture - target).abs().mean()
+        loss = (image - target).abs().mean()
         if name == "mcmc":  # unneeded Gaussians fade and are relocated
             loss = loss + 1e-3 * params["opacities"].sigmoid().mean()
         loss.backward()
@@ -99,21 +99,21 @@ def fit(target: Tensor, name: str = "mcmc", steps: int = 400, count: int = 400, 
         more = {"lr": RATES["means"]} if name == "mcmc" else {"packed": False}
         strategy.step_post_backward(params, optimizers, state, step, info, **more)
     with torch.no_grad():
-        picture = draw(params, width, height, False)[0].clamp(0, 1)
-    psnr = -10 * math.log10((picture - target).square().mean())
+        image = draw(params, width, height, False)[0].clamp(0, 1)
+    psnr = -10 * math.log10((image - target).square().mean())
     print(f"{name}: {len(params['means'])} Gaussians, {steps} steps, PSNR {psnr:.2f} dB")
-    return picture, psnr, len(params["means"])
+    return image, psnr, len(params["means"])
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--picture", default="astronaut", help="a name in skimage.data")
+    parser.add_argument("--image", default="astronaut", help="a name in skimage.data")
     parser.add_argument("--size", type=int, default=128, help="pixels of the longer side")
     parser.add_argument("--strategy", choices=["mcmc", "default"], default="mcmc")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--out", default="photograph.png", help="target and fit side by side")
     options = parser.parse_args()
-    target = photograph(options.picture, options.size)
-    picture = fit(target, options.strategy, options.steps)[0]
-    both = torch.cat([target, picture], 1)
+    target = photograph(options.image, options.size)
+    image = fit(target, options.strategy, options.steps)[0]
+    both = torch.cat([target, image], 1)
     imageio.imwrite(options.out, (both * 255).round().byte().numpy())

@@ -128,7 +128,7 @@ def views(gaussians: Gaussians, number: int, width: int, height: int) -> dict[st
 def frames_a_second(
     gaussians: Gaussians, cameras: Cameras, turns: int
 ) -> tuple[float, Tensor, dict]:
-    """The frames a second of the median view, rendered one by one, the first picture and counts."""
+    """The frames a second of the median view, rendered one by one, the first image and counts."""
     white = torch.ones(3)
     first = render(gaussians, cameras[:1], white)
     times = []
@@ -142,8 +142,8 @@ def frames_a_second(
     return 1 / statistics.median(times), first.rgb[0], counts
 
 
-def save_picture(path: Path, rgb: Tensor) -> None:
-    """Write a picture ``[H, W, 3]`` as PNG."""
+def save_image(path: Path, rgb: Tensor) -> None:
+    """Write an image ``[H, W, 3]`` as PNG."""
     from PIL import Image
 
     Image.fromarray((rgb.clamp(0, 1) * 255).round().byte().numpy()).save(path)
@@ -154,7 +154,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="folder of meshes, or the .ply of an earlier run")
     parser.add_argument("--out", type=Path, help="output .ply")
-    parser.add_argument("--pictures", type=Path, help="folder for a picture of each kind of view")
+    parser.add_argument("--images", type=Path, help="folder for an image of each kind of view")
     parser.add_argument("--count", type=int, default=1 << 20, help="Gaussians")
     parser.add_argument("--objects", type=int, default=256)
     parser.add_argument("--seed", type=int, default=0)
@@ -172,14 +172,14 @@ def main() -> None:
     print(f"{hall.num:,} Gaussians, {options.threads} threads")
     for width, height in SIZES:
         for name, cameras in views(hall, options.views, width, height).items():
-            rate, picture, counts = frames_a_second(hall, cameras, options.turns)
+            rate, image, counts = frames_a_second(hall, cameras, options.turns)
             print(
                 f"  {width} x {height} {name:<10} {rate:6.1f} frames/s"
                 f"   ({counts['seen']:,} seen and {counts['pairs']:,} pairs in the first view)"
             )
-            if options.pictures:
-                options.pictures.mkdir(parents=True, exist_ok=True)
-                save_picture(options.pictures / f"{name.replace(' ', '-')}-{height}.png", picture)
+            if options.images:
+                options.images.mkdir(parents=True, exist_ok=True)
+                save_image(options.images / f"{name.replace(' ', '-')}-{height}.png", image)
 
 
 if __name__ == "__main__":

@@ -55,12 +55,12 @@ def shade(surface: Surface, face: np.ndarray, weights: np.ndarray) -> np.ndarray
 
 
 def flat(surface: Surface, cameras) -> torch.Tensor:
-    """Pictures ``[V, PIXELS, PIXELS, 3]`` of a mesh without light, on white."""
+    """Images ``[V, PIXELS, PIXELS, 3]`` of a mesh without light, on white."""
     o3d = import_open3d()
     scene = o3d.t.geometry.RaycastingScene()
     vertices, faces = surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)
     scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
-    side, pictures = PIXELS * FINER, []
+    side, images = PIXELS * FINER, []
     for viewmat, K in zip(cameras.viewmats.double(), cameras.Ks.double()):
         fine = torch.cat([K[:2] * FINER, K[2:]])
         rays = scene.create_rays_pinhole(
@@ -70,10 +70,10 @@ def flat(surface: Surface, cameras) -> torch.Tensor:
         hit = np.isfinite(found["t_hit"])
         last = found["primitive_uvs"][hit]
         weights = np.column_stack([1 - last.sum(1), last])
-        picture = np.ones((side, side, 3), np.float32)
-        picture[hit] = shade(surface, found["primitive_ids"][hit].astype(np.int64), weights)
-        pictures.append(picture.reshape(PIXELS, FINER, PIXELS, FINER, 3).mean((1, 3)))
-    return torch.from_numpy(np.stack(pictures))
+        image = np.ones((side, side, 3), np.float32)
+        image[hit] = shade(surface, found["primitive_ids"][hit].astype(np.int64), weights)
+        images.append(image.reshape(PIXELS, FINER, PIXELS, FINER, 3).mean((1, 3)))
+    return torch.from_numpy(np.stack(images))
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -93,11 +93,11 @@ def main() -> None:
     for name, voxels, most, side in KINDS:
         options = SurfaceOptions(voxels=voxels, faces=most, colors=not side)
         surface = extract_surface(gaussians, options, side)
-        picture = flat(surface, cameras)
-        first = picture if first is None else first
-        own = "" if first is picture else f"{psnr(picture, first):.2f}"
+        image = flat(surface, cameras)
+        first = image if first is None else first
+        own = "" if first is image else f"{psnr(image, first):.2f}"
         faces = f"{len(surface.faces):,}"
-        print(f"| {name} | {faces} | {psnr(picture, truth):.2f} | {own} |", flush=True)
+        print(f"| {name} | {faces} | {psnr(image, truth):.2f} | {own} |", flush=True)
 
 
 if __name__ == "__main__":

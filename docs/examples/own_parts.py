@@ -26,22 +26,22 @@ def edge_error(inputs):
 
 
 def mean_error(a, b):
-    """Mean absolute error of pictures ``[V, H, W, 3]``, ``[V]``."""
+    """Mean absolute error of images ``[V, H, W, 3]``, ``[V]``."""
     return (a.double() - b.double()).abs().mean((-3, -2, -1))
 
 
 def read_orbit(folder):
-    """Object of ``orbit.json``: pictures on a ring, ``{"distance", "focal", "pictures"}``."""
+    """Object of ``orbit.json``: images on a ring, ``{"distance", "focal", "images"}``."""
     about = json.loads((folder / "orbit.json").read_text())
-    count = len(about["pictures"])
+    count = len(about["images"])
     angles = 2 * np.pi * np.arange(count) / count
     poses = np.tile(np.eye(4), (count, 1, 1))  # OpenGL: the camera looks along -z, y is up
     poses[:, 0, 0] = poses[:, 2, 2] = np.cos(angles)
     poses[:, 0, 2], poses[:, 2, 0] = np.sin(angles), -np.sin(angles)
     poses[:, :3, 3] = about["distance"] * poses[:, :3, 2]
-    focal = about["focal"]  # in sides of the picture
+    focal = about["focal"]  # in sides of the image
     Ks = np.tile([[focal, 0, 0.5], [0, focal, 0.5], [0, 0, 1]], (count, 1, 1))
-    return ObjectFiles([folder / name for name in about["pictures"]], poses, Ks, [None] * count)
+    return ObjectFiles([folder / name for name in about["images"]], poses, Ks, [None] * count)
 
 
 def build_patches(config, weights):

@@ -60,8 +60,8 @@ for root in map(Path, sys.argv[2:]):
         about["frames"] = [frames[i] for i in (*fronts, *evenly(others, views - len(fronts)))]
         for number, frame in enumerate(about["frames"]):
             name = f"{number}.webp"
-            picture = Image.open(source / frame["file_path"])
-            picture.save(folder / name, quality=80, alpha_quality=90, method=4)
+            image = Image.open(source / frame["file_path"])
+            image.save(folder / name, quality=80, alpha_quality=90, method=4)
             frame["file_path"] = name
             for key in ("depth_file_path", "back_file_path"):
                 if key not in frame:

@@ -41,7 +41,7 @@ def main(
     up: Literal["auto", "y", "z"] = "auto",
     page: Path | Literal["none"] = PAGE,
 ) -> int:
-    """Renders, evaluates and writes the page's table and its picture of all objects.
+    """Renders, evaluates and writes the page's table and its image of all objects.
 
     Args:
         folder: of the meshes, named by object.
@@ -77,7 +77,7 @@ def main(
         write_text(page, with_parts(page.read_text(encoding="utf-8"), "make scanned", parts))
         with Image.open(out / "eval" / "contact_sheet.png") as sheet:
             half = sheet.convert("RGB").reduce(2)
-        with atomic_path(page.parent / "pictures" / "scanned.webp") as path:
+        with atomic_path(page.parent / "images" / "scanned.webp") as path:
             half.save(path, "WEBP", quality=80, method=6)
     return code
 

@@ -42,7 +42,7 @@ blendswap-cc-0-cuckooclock scopia-cat scopia-futon scopia-jacuzzi
 blendswap-cc-0-horse2 blendswap-cc-0-teddybear scopia-dog-house scopia-toaster
 """.split()
 
-# Single pictures by another renderer, of objects outside the training split.
+# Single images by another renderer, of objects outside the training split.
 ICONS = """
 blendswap-cc-0-horse2 blendswap-cc-0-kitchenaid blendswap-cc-0-teddybear
 blendswap-cc-by-decorativeplant blendswap-cc-by-fordfocus katorlegaz-fire-hydrant
@@ -54,7 +54,7 @@ INTRO = """# Where the starter set comes from
 
 Everything here is made from models of Sweet Home 3D's furniture libraries. `data/` holds new
 renderings. `meshes/` holds the models' triangles without materials, moved to a common frame:
-longest side 1, centred, z up. `icons/` holds the libraries' own pictures, unchanged. Thanks to
+longest side 1, centred, z up. `icons/` holds the libraries' own images, unchanged. Thanks to
 everybody named below.
 
 Licences: [CC BY 3.0](https://creativecommons.org/licenses/by/3.0/),

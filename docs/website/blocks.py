@@ -12,7 +12,7 @@ PAGES = sorted(
     path
     for folder in ("docs", "kernels", "eval", "train")
     for path in (ROOT / folder).rglob("*.md")
-    if "pictures" not in path.parts
+    if "images" not in path.parts
 )
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 # A block, and the comment before it that says that it runs: <!-- run -->, or with options that

@@ -1,9 +1,9 @@
-"""Draws docs/pictures/frames.webp: the frames of docs/cameras.md, by the project's own renderer.
+"""Draws docs/images/frames.webp: the frames of docs/cameras.md, by the project's own renderer.
 
     python docs/website/frames.py
 
-Everything in it is 3D Gaussians: the object, reconstructed by the shipped model from a picture of
-the starter set, the cube, the camera of the picture, and the axes. Only the names are drawn on top.
+Everything in it is 3D Gaussians: the object, reconstructed by the shipped model from an image of
+the starter set, the cube, the camera of the image, and the axes. Only the names are drawn on top.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gamba_warp.conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from gamba_warp.files import STARTER, atomic_path
 from gamba_warp.images import to_uint8
 
-PICTURE = Path(__file__).parents[1] / "pictures" / "frames.webp"
+IMAGE = Path(__file__).parents[1] / "images" / "frames.webp"
 OBJECT = "blendswap-cc-0-teddybear"  # CC0
 SIDE = 420  # pixels of a panel
 RED, GREEN, BLUE = (0.85, 0.1, 0.1), (0.05, 0.6, 0.1), (0.1, 0.25, 0.9)
@@ -35,7 +35,7 @@ Line = tuple[tuple[float, ...], tuple[float, ...], tuple[float, float, float]]
 
 
 def main() -> None:
-    """Write the picture."""
+    """Write the image."""
     viewmat = orbit(torch.tensor([48.0]), elevation=20.0, distance=3.0)
     viewmat[:, :3, 3] += viewmat[:, :3, :3] @ torch.tensor([0.0, 0.0, 0.45])  # looks between both
     cameras = Cameras(viewmat, intrinsics(SIDE, SIDE, 44.0)[None], SIDE, SIDE)
@@ -46,11 +46,11 @@ def main() -> None:
             ((0, 0, 0), tuple(0.75 * x for x in a), c) for a, c in zip(axes, (RED, GREEN, BLUE))
         ]
         drawn = joined(thing, lines(cube() + camera(), 0.006), lines(arrows, 0.012))
-        picture = render(drawn, cameras, background=torch.ones(3)).rgb[0]
-        panel = Image.fromarray(to_uint8(picture.numpy()))
+        image = render(drawn, cameras, background=torch.ones(3)).rgb[0]
+        panel = Image.fromarray(to_uint8(image.numpy()))
         write_names(panel, title, axes, cameras)
         sheet.paste(panel, (SIDE * number, 0))
-    with atomic_path(PICTURE) as path:
+    with atomic_path(IMAGE) as path:
         sheet.save(path, "WEBP", quality=90, method=6)
 
 
@@ -114,7 +114,7 @@ def write_names(panel: Image.Image, title: str, axes, cameras: Cameras) -> None:
         fill = tuple(int(255 * c) for c in color)
         draw.text((x, y), name, fill=fill, anchor="mm", font=ImageFont.load_default(26))
     _, y = pixel(torch.tensor([0.0, 0.3, -DEFAULT_DISTANCE]), cameras)
-    draw.text((14, y), "camera of the\ninput picture", fill="black",
+    draw.text((14, y), "camera of the\ninput image", fill="black",
               font=ImageFont.load_default(15))  # fmt: skip
 
 

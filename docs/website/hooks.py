@@ -81,7 +81,7 @@ def on_nav(nav, config, files):
     from mkdocs.structure.nav import Section
     from mkdocs.structure.pages import Page
 
-    own = ("api/", "code/", "repository/", "pictures/")
+    own = ("api/", "code/", "repository/", "images/")
     left = [
         file.page or Page(None, file, config)
         for file in files.documentation_pages()
@@ -127,7 +127,7 @@ def _content(path: str) -> str | bytes:
 
 
 def _notebook(path: Path) -> str:
-    """A notebook as Markdown, with its pictures inside."""
+    """A notebook as Markdown, with its images inside."""
     import base64
 
     from nbconvert import MarkdownExporter

@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-# A link or picture in Markdown whose target is no address of the web and no place in the same page.
+# A link or image in Markdown whose target is no address of the web and no place in the same page.
 LINK = re.compile(r"(!?\[[^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*\]\()(?!https?:|mailto:|#)([^()\s]+)(\))")
 FENCE = re.compile(r"^( *)(```+).*?^\1\2 *$", re.MULTILINE | re.DOTALL)
 

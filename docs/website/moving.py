@@ -1,11 +1,11 @@
-"""Draws docs/pictures/turntables.webp: turning objects outside the shipped model's training set.
+"""Draws docs/images/turntables.webp: turning objects outside the shipped model's training set.
 
     python docs/website/moving.py data/furniture128 out/scanned/views
 
-Left of each pair is the input, right of it the shipped model's reconstruction of that picture. The
+Left of each pair is the input, right of it the shipped model's reconstruction of that image. The
 objects are of furniture's test split and of Google Scanned Objects (``make scanned`` renders them),
-one of a kind, chosen by eye; docs/pictures/held-out.webp has the best, the middle and the worst of
-furniture by PSNR, docs/pictures/scanned.webp all scanned objects.
+one of a kind, chosen by eye; docs/images/held-out.webp has the best, the middle and the worst of
+furniture by PSNR, docs/images/scanned.webp all scanned objects.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ SIDE = 200  # pixels of the input and of the turntable
 CROP = 10  # empty pixels left out at each edge
 FRAMES = 40
 MILLISECONDS = 100  # duration of a frame
-PICTURE = Path(__file__).parents[1] / "pictures" / "turntables.webp"
+IMAGE = Path(__file__).parents[1] / "images" / "turntables.webp"
 
 
 def main(*data: Path) -> None:
-    """Write the picture.
+    """Write the image.
 
     Args:
         data: folders made by `gamba data render`, which together have the objects.
@@ -56,10 +56,10 @@ def main(*data: Path) -> None:
         cells.append(np.concatenate([*pair], 2))
     rows = [np.concatenate(cells[i : i + COLUMNS], 2) for i in range(0, len(cells), COLUMNS)]
     frames = [Image.fromarray(frame) for frame in np.concatenate(rows, 1)]
-    with atomic_path(PICTURE) as path:
+    with atomic_path(IMAGE) as path:
         options = {"duration": MILLISECONDS, "loop": 0, "quality": 80, "method": 6}
         frames[0].save(path, "WEBP", save_all=True, append_images=frames[1:], **options)
-    print(f"{PICTURE}: {PICTURE.stat().st_size / 1e6:.2f} MB")
+    print(f"{IMAGE}: {IMAGE.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

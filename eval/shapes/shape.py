@@ -266,7 +266,7 @@ def visible_points(
 ) -> Points:
     """Back-project depth maps like SyncDreamer's script, with one mean point per voxel.
 
-    As there, depth is interpolated linearly in the picture, not in space, and the depth of a
+    As there, depth is interpolated linearly in the image, not in space, and the depth of a
     pixel's centre is put on the ray through its upper left corner. Neither is exact: with large
     faces points move by hundredths. But exact points would change the figures.
 

@@ -23,7 +23,7 @@ _LABEL, _GAP = 20, 6  # pixels
 _TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-def picture_of(shape: Mesh | Points) -> np.ndarray:
+def image_of(shape: Mesh | Points) -> np.ndarray:
     """Draw a shape in its truth's unit frame from two sides, ``[SIDE, 2 SIDE]`` uint8 grey.
 
     Faces are shaded by their angle to the camera, points by their depth.
@@ -62,7 +62,7 @@ def _draw_points(points: Any, viewmat: np.ndarray, K: np.ndarray) -> np.ndarray:
 def _draw_pair(
     pair: Any, protocol: GeometryProtocol, motion: Similarity | None = None
 ) -> dict[str, Any]:
-    """Return a record with the pictures of a pair, as it was compared; runs in a child."""
+    """Return a record with the images of a pair, as it was compared; runs in a child."""
     from .load import FRAME_AXES, load_prediction, load_truth
     from .metrics import align_shape
 
@@ -70,7 +70,7 @@ def _draw_pair(
     into, axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
     predicted = load_prediction(pair.pred, into, axes, protocol)
     shapes = align_shape(predicted.shape, truth.shape, protocol)[0], truth.shape
-    return {"name": pair.name, "status": OK, "pictures": np.hstack([*map(picture_of, shapes)])}
+    return {"name": pair.name, "status": OK, "images": np.hstack([*map(image_of, shapes)])}
 
 
 def save_sheet(
@@ -95,7 +95,7 @@ def save_sheet(
     by_name = {pair.name: pair for pair in pairs}
     wanted = [by_name[record["name"]] for record in chosen]
     drawn = evaluate_pairs(wanted, evaluate=_draw_pair)
-    pictures = {record["name"]: record.get("pictures") for record in drawn}
+    images = {record["name"]: record.get("images") for record in drawn}
     high = SIDE + _LABEL + _GAP
     sheet = Image.new("L", (4 * SIDE, _LABEL + high * len(chosen)), 255)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
@@ -106,7 +106,7 @@ def save_sheet(
         iou = "" if record["iou"] is None else f", Volume IoU {record['iou']:.3f}"
         text = f"{record['name'][:60]}: Chamfer {record['chamfer']:.4f}{iou}"
         draw.text((4, top + 3), text.encode(errors="replace").decode(), 60, font)
-        if (picture := pictures[record["name"]]) is not None:
-            sheet.paste(Image.fromarray(picture), (0, top + _LABEL))
+        if (image := images[record["name"]]) is not None:
+            sheet.paste(Image.fromarray(image), (0, top + _LABEL))
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="PNG")

@@ -1,6 +1,6 @@
 """Baselines without a model, which a single-view model has to beat.
 
-A baseline maps a ``Truth`` to pictures of all its views. It uses only the input view and the
+A baseline maps a ``Truth`` to images of all its views. It uses only the input view and the
 cameras; the retrieval uses the training split too.
 """
 
@@ -31,9 +31,9 @@ Baseline = Callable[[Truth], Shown | None]
 THUMBNAIL = 32  # pixels per side, for the retrieval
 _CHUNK = 512  # thumbnails compared at once by colour
 MEANING = {
-    "background": "an empty picture for every view",
-    "input_copy": "the input picture for every view",
-    "billboard": "the input picture, with its alpha, as a plane through the object's centre "
+    "background": "an empty image for every view",
+    "input_copy": "the input image for every view",
+    "billboard": "the input image, with its alpha, as a plane through the object's centre "
     "parallel to the input's image plane, seen from both sides; bilinear at pixel centres",
     "retrieval": f"the training view nearest to the input among all views of all other training "
     f"objects; distance: 1 - IoU of the alphas (sum of minima over sum of maxima) + mean absolute "
@@ -45,23 +45,23 @@ MEANING = {
 
 
 def background(truth: Truth) -> Shown:
-    """Return an empty picture for every view."""
+    """Return an empty image for every view."""
     white = torch.full_like(truth.rgb[:1], WHITE).expand_as(truth.rgb)
     return Shown(white, torch.zeros_like(truth.images[..., 3]))
 
 
 def input_copy(truth: Truth) -> Shown:
-    """Return the input picture for every view."""
+    """Return the input image for every view."""
     alpha = truth.images[..., 3]
     return Shown(truth.rgb[:1].expand_as(truth.rgb), alpha[:1].expand_as(alpha))
 
 
 def billboard(truth: Truth) -> Shown:
-    """Render the input picture as a plane through the object's centre, parallel to its image plane.
+    """Render the input image as a plane through the object's centre, parallel to its image plane.
 
     The centre is the origin and the input camera's axes are the world's, so the plane is
     z = 0. The intersection of each pixel's ray is projected into the input camera, which is exact.
-    From behind the picture is mirrored; edge-on the plane is invisible.
+    From behind the image is mirrored; edge-on the plane is invisible.
     """
     viewmats, Ks = truth.cameras.viewmats.double(), truth.cameras.Ks.double()
     count, height, width = truth.mask.shape
@@ -80,7 +80,7 @@ def billboard(truth: Truth) -> Shown:
     # Within 1e-5 of the plane's direction a ray sees less than a pixel, or rounding errors.
     hit = (depth > 0) & (rays[..., 2].abs() > 1e-5) & grid.isfinite().all(-1)
     hit &= projected[..., 2] > 0
-    grid = torch.where(hit[..., None], grid, 2.0)  # outside the picture
+    grid = torch.where(hit[..., None], grid, 2.0)  # outside the image
     rgba = truth.images[0].double()
     premultiplied = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
     sampled = grid_sample(
@@ -93,7 +93,7 @@ def billboard(truth: Truth) -> Shown:
 
 
 class NearestView(NamedTuple):
-    """A training view, nearest to a query picture.
+    """A training view, nearest to a query image.
 
     Attributes:
         uid: its object.
@@ -169,7 +169,7 @@ class Retrieval:
         return None if at < 0 else NearestView(*self._sources[at], best)
 
     def __call__(self, truth: Truth) -> Shown | None:
-        """Return the pictures; None without another object. Raises UserError for a bad picture."""
+        """Return the images; None without another object. Raises UserError for a bad image."""
         found = self.nearest(truth.images[0].cpu(), truth.uid)
         if found is None:
             return None
@@ -185,7 +185,7 @@ class Retrieval:
         needed, rows = chosen.unique(return_inverse=True)
         images = self.training.load(uid, needed.tolist(), truth.rgb.shape[1]).images
         if images.shape[1:3] != truth.rgb.shape[1:3]:
-            raise UserError(f"{uid}: its pictures have a different size")
+            raise UserError(f"{uid}: its images have a different size")
         return shown(images[rows].to(truth.images.device))
 
 
@@ -216,7 +216,7 @@ class TrainingMeshes:
             raise UserError(f"{folder}: has no mesh of any of the {len(training)} training objects")
 
     def place(self, found: NearestView, distance: float) -> Surface:
-        """Place an object's mesh so that its nearest view coincides with the input picture.
+        """Place an object's mesh so that its nearest view coincides with the input image.
 
         Args:
             found: the object and its nearest view.

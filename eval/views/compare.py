@@ -24,13 +24,13 @@ from gamba_warp.vision.lpips import LPIPS
 from ..averages import mean_of
 
 BATCH = 4  # views compared at once; bounds the memory of LPIPS features
-NEARLY_EMPTY = 0.01  # share of the picture; see ViewsProtocol
+NEARLY_EMPTY = 0.01  # share of the image; see ViewsProtocol
 
 Values = dict[str, float | None]  # one view's metrics
 
 
 class Shown(NamedTuple):
-    """Pictures to compare.
+    """Images to compare.
 
     Attributes:
         rgb: ``[V, H, W, 3]`` on white; renderings are not yet clipped to [0, 1].
@@ -59,16 +59,16 @@ class ViewsProtocol:
         split: split of the dataset.
         reference: index of the input view.
         views: number of views of an object, input included, evenly spaced in file order; None: all.
-        size: height of the pictures compared; None: the files' own.
+        size: height of the images compared; None: the files' own.
         lpips: the network, or None.
         lpips_reason: why LPIPS is missing, or None.
         distance: of the input camera from the object's centre, object units.
         background: grey value behind both sides.
-        grounds: grey values of the other backgrounds, by suffix of their metrics' names. Pictures
+        grounds: grey values of the other backgrounds, by suffix of their metrics' names. Images
             without alpha are not compared on them.
-        region: part of the picture covered by the image metrics.
+        region: part of the image covered by the image metrics.
         rendering: clipping and rounding of predicted values.
-        max_psnr: dB, of equal pictures.
+        max_psnr: dB, of equal images.
         ssim: window and convention.
         mask_iou: definition of a covered pixel.
         averaging: order of the means.
@@ -79,8 +79,8 @@ class ViewsProtocol:
             any prediction.
         mean_error: definition of the PSNR of the mean error.
         evaluation: a named evaluation and its missing objects, or None.
-        pictures: reading and matching of pictures under test; None: Gaussians are rendered.
-        resize_pictures: pictures of another size are resized.
+        images: reading and matching of images under test; None: Gaussians are rendered.
+        resize_images: images of another size are resized.
         name: of the protocol.
         changed: names of its options that were changed.
     """
@@ -105,8 +105,8 @@ class ViewsProtocol:
     nearly_empty: float = NEARLY_EMPTY
     mean_error: str = "mean squared error over views, then objects, as PSNR"
     evaluation: dict[str, Any] | None = None
-    pictures: str | None = None
-    resize_pictures: bool = False
+    images: str | None = None
+    resize_images: bool = False
     name: str = "default"
     changed: list[str] = field(default_factory=list)
 
@@ -120,11 +120,11 @@ class Truth:
         images: ``[V, H, W, 4]`` straight RGBA in [0, 1]; view 0 is the input.
         cameras: V cameras in the input camera's world.
         views: their V indices in the dataset.
-        shown: the pictures to compare.
-        rgb: ``[V, H, W, 3]``, the pictures on white.
+        shown: the images to compare.
+        rgb: ``[V, H, W, 3]``, the images on white.
         mask: ``[V, H, W]`` bool.
-        coverage: V shares of the picture covered by the object: means of alpha, in [0, 1].
-        digest: SHA-256 of the pictures, 16 digits.
+        coverage: V shares of the image covered by the object: means of alpha, in [0, 1].
+        digest: SHA-256 of the images, 16 digits.
     """
 
     uid: str
@@ -141,7 +141,7 @@ class Truth:
 
 
 def shown(images: Tensor) -> Shown:
-    """Return straight RGBA ``[V, H, W, 4]`` as pictures to compare."""
+    """Return straight RGBA ``[V, H, W, 4]`` as images to compare."""
     return Shown(over_background(images, WHITE), images[..., 3])
 
 
@@ -189,14 +189,14 @@ def compare(candidates: Mapping[str, Shown], truth: Truth) -> dict[str, list[Val
     are None for a candidate without alpha.
     """
     result: dict[str, list[Values]] = {}
-    for name, pictures in candidates.items():
-        alpha, mask = pictures.alpha, pictures.mask()
+    for name, images in candidates.items():
+        alpha, mask = images.alpha, images.mask()
         found = measure(
-            lambda grey, shown=pictures: (shown.on(grey), truth.shown.on(grey)),
+            lambda grey, shown=images: (shown.on(grey), truth.shown.on(grey)),
             None if mask is None else (mask, truth.mask),
             [k for k, m in all_figures().items() if alpha is not None or m.ground is None],
         )
-        values = dict.fromkeys(all_figures(), [None] * len(pictures.rgb))
+        values = dict.fromkeys(all_figures(), [None] * len(images.rgb))
         values |= {key: figures.tolist() for key, figures in found.items()}
         values["mse"] = (10 ** (-found["psnr"] / 10)).tolist()
         result[name] = [dict(zip(values, row)) for row in zip(*values.values())]
@@ -213,7 +213,7 @@ def add_lpips(
     """Add LPIPS, on every background, to the result of ``compare``.
 
     Features take nearly all the time. They are computed once for the truth, and once for a
-    candidate with the same picture (an expanded tensor) in every view. A progress bar appears after
+    candidate with the same image (an expanded tensor) in every view. A progress bar appears after
     two seconds.
     """
     about = {"desc": f"LPIPS of {truth.uid}", "unit": "batch", "leave": False, "delay": 2}
@@ -223,7 +223,7 @@ def add_lpips(
         for key, metric in figures.items():
             grey = metric.grey
             known = {n: c for n, c in candidates.items() if c.alpha is not None or grey == WHITE}
-            shown = {name: pictures.on(grey) for name, pictures in known.items()}
+            shown = {name: images.on(grey) for name, images in known.items()}
             fixed = {
                 n: lpips.features(shown[n][0]) for n, c in known.items() if not c.rgb.stride(0)
             }

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: strips per object, and a sheet of best, median and worst."""
+"""Images of an evaluation: strips per object, and a sheet of best, median and worst."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gamba_warp.images import save_image, to_uint8
 
 from .compare import Truth, choose_views
 
-TILE = 128  # pixels per side; pictures are fitted into it
+TILE = 128  # pixels per side; images are fitted into it
 _LABEL, _HEADER, _GAP, _LINE = 200, 22, 4, 16  # pixels
 RULE = "by PSNR of the novel views, of the input view where there are no others"
 
@@ -28,7 +28,7 @@ class Row:
 
     Attributes:
         lines: its label.
-        shown: the input picture ``[H, W, 3]`` in [0, 1].
+        shown: the input image ``[H, W, 3]`` in [0, 1].
         truth: true views ``[k, H, W, 3]`` in [0, 1].
         predicted: the same views as predicted.
     """
@@ -60,7 +60,7 @@ def choose_ranks(count: int, each: int) -> dict[int, str]:
 
 
 def label(record: dict[str, Any], place: str) -> list[str]:
-    """Return the lines next to an object's pictures: its name, rank and metrics."""
+    """Return the lines next to an object's images: its name, rank and metrics."""
     lines = [record["name"], place]
     for kind, values in (("novel", record), ("input", record["input"])):
         known = [
@@ -91,9 +91,9 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
         for k, line in enumerate(row.lines):
             grey = (0, 0, 0) if k == 0 else (80, 80, 80)
             draw.text((6, top + 4 + k * _LINE), line, fill=grey, font=font)
-        for start, pictures in zip(starts, (row.shown[None], row.truth, row.predicted)):
-            for k, picture in enumerate(pictures):
-                pixels = Image.fromarray(to_uint8(np.asarray(picture.cpu())))
+        for start, images in zip(starts, (row.shown[None], row.truth, row.predicted)):
+            for k, image in enumerate(images):
+                pixels = Image.fromarray(to_uint8(np.asarray(image.cpu())))
                 tile = ImageOps.pad(pixels, (TILE, TILE), color=(255, 255, 255))
                 edge = (0, 0, TILE - 1, TILE - 1)
                 ImageDraw.Draw(tile).rectangle(edge, outline=(225, 225, 225))

@@ -54,9 +54,9 @@ from .compare import (
     summary,
 )
 from .contact_sheet import RULE, Row, choose_ranks, contact_sheet, label, save_strips
+from .images import MEANING as IMAGES
+from .images import ImagePredictions, Images, save_images
 from .options import ViewsOptions
-from .pictures import MEANING as PICTURES
-from .pictures import PicturePredictions, Pictures, save_pictures
 from .predictions import Predictions, open_predictions
 from .table import page, tables_of, without_nearly_empty
 
@@ -99,10 +99,10 @@ class Job:
     meshes: TrainingMeshes | None = None
     retrieval_data: list[str] = field(default_factory=list)
 
-    def predict(self, truth: Truth) -> Gaussians | Pictures:
-        """Return the Gaussians or pictures under test. Raises UserError if they are missing."""
-        if isinstance(self.predictions, PicturePredictions):
-            return self.predictions.pictures(self.dataset, truth)
+    def predict(self, truth: Truth) -> Gaussians | Images:
+        """Return the Gaussians or images under test. Raises UserError if they are missing."""
+        if isinstance(self.predictions, ImagePredictions):
+            return self.predictions.images(self.dataset, truth)
         return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
 
     def fail(self, name: str, error: Exception | str) -> None:
@@ -110,16 +110,16 @@ class Job:
         self.failures.append({"name": name, "reason": failure(name, error)["reason"]})
 
     def shown(self, truth: Truth) -> dict[str, Shown]:
-        """Return the pictures of each baseline; failures are recorded and stop no other."""
+        """Return the images of each baseline; failures are recorded and stop no other."""
         result = {}
         for name, baseline in self.baselines.items():
             try:
-                pictures = baseline(truth)
+                images = baseline(truth)
             except ERRORS as error:
                 self.fail(f"{truth.uid} ({name})", error)
                 continue
-            if pictures is not None:
-                result[name] = pictures
+            if images is not None:
+                result[name] = images
         return result
 
 
@@ -145,20 +145,20 @@ def open_job(options: ViewsOptions) -> Job:
         options.distance,
         device,
         options.encoder_weights,
-        resize=options.resize_pictures,
+        resize=options.resize_images,
         margin=options.background_margin,
         precision=options.precision,
         detail=options.detail,
         size=size,
     )
     rendered: dict[str, Any] = {}
-    if isinstance(predictions, PicturePredictions):
+    if isinstance(predictions, ImagePredictions):
         if options.save_gaussians:
-            raise UserError(f"--save-gaussians: {options.checkpoint} holds pictures")
+            raise UserError(f"--save-gaussians: {options.checkpoint} holds images")
         predictions.check(uids)
-        rendered = {"rendering": "pictures of 8 bits", "pictures": PICTURES}
-    elif options.resize_pictures:
-        raise UserError(f"--resize-pictures: {options.checkpoint} holds no pictures")
+        rendered = {"rendering": "images of 8 bits", "images": IMAGES}
+    elif options.resize_images:
+        raise UserError(f"--resize-images: {options.checkpoint} holds no images")
     network, reason = None, "not asked for"
     if options.lpips == "auto" and not lpips_available():
         reason = f"no weights; fetch them with: {FETCH}"
@@ -176,7 +176,7 @@ def open_job(options: ViewsOptions) -> Job:
         lpips_reason=reason,
         distance=predictions.distance,
         evaluation=evaluation,
-        resize_pictures=options.resize_pictures,
+        resize_images=options.resize_images,
         **rendered,
     )
     job = Job(predictions, dataset, uids, protocol, network, device)
@@ -197,8 +197,8 @@ def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
     """Raise UserError if an output of this evaluation would replace an input."""
     if options.out is None:
         return
-    if options.save_pictures:
-        made = (options.out / "pictures").resolve()
+    if options.save_images:
+        made = (options.out / "images").resolve()
         if made in (options.checkpoint.resolve(), *options.checkpoint.resolve().parents):
             raise UserError(f"{options.checkpoint}: would be overwritten; give another --out")
     targets = [options.out / "strips" / f"{uid}.png" for uid in uids[: options.strips]]
@@ -250,7 +250,7 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
     job, folder = open_job(options), options.out
     objects: list[dict[str, Any]] = []
     folders: dict[str, Path] = {}
-    for name in ("gaussians", "retrieval", "pictures"):
+    for name in ("gaussians", "retrieval", "images"):
         if folder and getattr(options, f"save_{name}"):
             folders[name] = output_folder(folder / name)
     interrupted = False
@@ -277,11 +277,11 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
     return report
 
 
-def pictures_of(predicted: Gaussians | Pictures, truth: Truth) -> Pictures:
-    """Return the prediction as pictures of the true views; Gaussians are rendered."""
-    if isinstance(predicted, Pictures):
+def images_of(predicted: Gaussians | Images, truth: Truth) -> Images:
+    """Return the prediction as images of the true views; Gaussians are rendered."""
+    if isinstance(predicted, Images):
         return predicted
-    return Pictures(render_views(predicted, truth.cameras))
+    return Images(render_views(predicted, truth.cameras))
 
 
 def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dict[str, Any]:
@@ -291,14 +291,14 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         job: shared state.
         uid: the object.
         folders: of its outputs: ``strips``, ``gaussians``, ``retrieval`` (its mesh) and
-            ``pictures`` (the compared ones, in a folder for the model and for each baseline).
+            ``images`` (the compared ones, in a folder for the model and for each baseline).
 
     Returns:
         The object's record, including its baselines' records.
 
     Raises:
         UserError: a file cannot be read or written, or a number is not finite.
-        ValueError: pictures are too small for a metric.
+        ValueError: images are too small for a metric.
     """
     stages = Stopwatch(4)
     with stages("load"):
@@ -306,31 +306,31 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
     with stages("predict"):
         predicted = job.predict(truth)
     with stages("render"):
-        pictures = pictures_of(predicted, truth)
+        images = images_of(predicted, truth)
     with stages("baselines"):
         baselines = job.shown(truth)
-    candidates = {"": pictures.shown} | baselines
+    candidates = {"": images.shown} | baselines
     with stages("compare"):
         by_view = compare(candidates, truth)
     with stages("lpips"):
         if job.network:
             add_lpips(by_view, candidates, truth, job.network)
-    if not pictures.has_input:
+    if not images.has_input:
         by_view[""][0] = dict.fromkeys(by_view[""][0])
     found = job.retrieval.found.get(uid) if job.retrieval else None
     gaussians = predicted if isinstance(predicted, Gaussians) else None
 
     if "strips" in folders:
-        save_strips(folders["strips"] / f"{uid}.png", pictures.shown.on(), truth)
+        save_strips(folders["strips"] / f"{uid}.png", images.shown.on(), truth)
     if "gaussians" in folders and gaussians is not None:
         path = folders["gaussians"] / f"{uid}.ply"
         path.parent.mkdir(parents=True, exist_ok=True)
         save_ply(path, gaussians)
-    if "pictures" in folders:
-        model = {} if pictures.shown.alpha is None else {"model": pictures.shown}
+    if "images" in folders:
+        model = {} if images.shown.alpha is None else {"model": images.shown}
         for name, candidate in (model | baselines).items():
-            where = folders["pictures"] / name / uid
-            save_pictures(where, job.dataset.files(uid), truth.views, candidate)
+            where = folders["images"] / name / uid
+            save_images(where, job.dataset.files(uid), truth.views, candidate)
     if "retrieval" in folders and found and job.meshes:
         try:
             job.meshes.save(folders["retrieval"] / f"{uid}.ply", found, job.protocol.distance)
@@ -347,7 +347,7 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         "views": truth.views,
         "coverage": truth.coverage,
         "num_nearly_empty": sum(share < NEARLY_EMPTY for share in truth.coverage),
-        **({"pictures": pictures.record} if pictures.record else {}),
+        **({"images": images.record} if images.record else {}),
         **({} if gaussians is None else {"gaussians": gaussians.num}),
         "truth_sha256": truth.digest,
         "seconds": stages.seconds,
@@ -372,7 +372,7 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         record = done[rank]
         try:
             truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
-            made = pictures_of(job.predict(truth), truth).shown
+            made = images_of(job.predict(truth), truth).shown
         except ERRORS:  # a file changed meanwhile; the report has its record
             continue
         views = choose_views(len(truth.rgb), 0, SHEET_VIEWS + 1)[1:]
@@ -443,7 +443,7 @@ def make_views_report(
         protocol,
         objects,
         versions,
-        left_out=("baselines", "num_nearly_empty", "retrieval", "pictures"),
+        left_out=("baselines", "num_nearly_empty", "retrieval", "images"),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},
         left_out_baselines=dict(left_out)
         | {name: "none of the objects has it" for name, records in others.items() if not records},

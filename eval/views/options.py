@@ -23,7 +23,7 @@ class ViewsOptions:
 
     Attributes:
         checkpoint: A model; a folder of .ply files named by object; or a folder with a folder of
-            pictures for each object, rendered by any method at the dataset's
+            images for each object, rendered by any method at the dataset's
             cameras (docs/evaluate.md).
         data: Dataset of posed views.
         out: Folder for report.json, objects.csv, table.md, contact_sheet.png and strips/ (input |
@@ -36,26 +36,26 @@ class ViewsOptions:
         split: Split of the dataset.
         reference: Index of the input view; 0 by default.
         views: Number of views of an object, input included, evenly spaced; all by default.
-        size: Height of the pictures compared; the files' own by default.
+        size: Height of the images compared; the files' own by default.
         limit: Number of objects, evenly spaced in the order of names; all by default.
         objects: Text file of the objects of --protocol gso in place of its own list, one name a
             line; the report states that.
-        baselines: Also score an empty picture, a copy of the input, the input as a billboard, and
+        baselines: Also score an empty image, a copy of the input, the input as a billboard, and
             the nearest training object.
         retrieval_data: Datasets whose training objects the nearest one is taken from; by default
             DATA.
         lpips: Use of LPIPS: auto if its weights are installed (gamba weights lpips), on requires
             them.
-        strips: Number of objects with comparison pictures, from the first.
+        strips: Number of objects with comparison images, from the first.
         sheet: Number of best, median and worst objects each in the contact sheet; 0 for none.
         save_gaussians: Also write OUT/gaussians/NAME.ply, in the input camera's
             world (eval-geometry --frame reference reads them).
         save_retrieval: Folder of the meshes that DATA was rendered from (with catalogue.json, or
             named by object): also write OUT/retrieval/NAME.ply, the retrieval's training mesh,
             placed so that the input camera sees its nearest view (eval-geometry --frame reference).
-        save_pictures: Also write OUT/pictures/NAME/OBJECT/VIEW.png: the compared pictures of the
-            model and of each baseline, in the format of pictures of other methods.
-        resize_pictures: Accept pictures under test of another size, and resize them.
+        save_images: Also write OUT/images/NAME/OBJECT/VIEW.png: the compared images of the
+            model and of each baseline, in the format of images of other methods.
+        resize_images: Accept images under test of another size, and resize them.
         distance: Distance of the input camera, for .ply files; a checkpoint states its own.
         background_margin: For a model: drop 3DGS tokens of plain background farther than this many
             patches from the object. Models are not trained for it, except with the decoder "rays",
@@ -85,8 +85,8 @@ class ViewsOptions:
     sheet: Annotated[int, Meta(ge=0, le=100)] = 2
     save_gaussians: bool = False
     save_retrieval: Path | None = None
-    save_pictures: bool = False
-    resize_pictures: bool = False
+    save_images: bool = False
+    resize_images: bool = False
     distance: Annotated[float, Meta(ge=0.01, le=1000)] = DEFAULT_DISTANCE
     background_margin: Annotated[int, Meta(ge=0, le=4096)] | None = None
     detail: Detail | None = None
@@ -110,7 +110,7 @@ class ViewsOptions:
             raise UserError("--objects: needs --protocol gso")
         if self.retrieval_data and not self.baselines:
             raise UserError("--retrieval-data: needs the baselines")
-        for name in ("save_gaussians", "save_pictures"):
+        for name in ("save_gaussians", "save_images"):
             if getattr(self, name) and self.out is None:
                 raise UserError(f"{option(name)}: needs --out")
         if self.save_retrieval and (self.out is None or not self.baselines):

@@ -1,4 +1,4 @@
-"""Predictions under test: a checkpoint, a folder of ``.ply`` Gaussians, or one of pictures."""
+"""Predictions under test: a checkpoint, a folder of ``.ply`` Gaussians, or one of images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gamba_warp.model.checkpoint import FILE_NAME, load_model
 from gamba_warp.model.detail import checked_detail, split_front
 from gamba_warp.model.posing import posed_input
 
-from .pictures import PicturePredictions, holds_pictures
+from .images import ImagePredictions, holds_images
 
 
 class PlyPredictions:
@@ -75,7 +75,7 @@ class ModelPredictions:
         file = path / FILE_NAME if path.is_dir() else path
         self.source = {"kind": "checkpoint", "path": path.name, "sha256": sha256(file)}
         if self.model.config.decoder == "rays":
-            self.source["detail"] = "as the picture has pixels" if detail is None else str(detail)
+            self.source["detail"] = "as the image has pixels" if detail is None else str(detail)
         if margin is not None:
             self.source["background_margin"] = str(margin)
         if self.precision != torch.float32:
@@ -86,7 +86,7 @@ class ModelPredictions:
         """Run the model on the reference view, on the model's own background.
 
         Arguments and result as in ``PlyPredictions.gaussians``. The front splits by the
-        picture at the compared size.
+        image at the compared size.
         """
         config = self.model.config
         views = dataset.load(uid, views=[reference], size=config.image_size)
@@ -99,7 +99,7 @@ class ModelPredictions:
         return split_front(gaussians, images[0], rgba.cpu().numpy(), config, detail, cameras)
 
 
-Predictions: TypeAlias = PlyPredictions | ModelPredictions | PicturePredictions
+Predictions: TypeAlias = PlyPredictions | ModelPredictions | ImagePredictions
 
 
 def open_predictions(
@@ -113,33 +113,33 @@ def open_predictions(
     detail: Detail | None = None,
     size: int | None = None,
 ) -> Predictions:
-    """Open a folder with ``.ply`` files or with pictures, else a checkpoint.
+    """Open a folder with ``.ply`` files or with images, else a checkpoint.
 
     Args:
         path: the folder or the checkpoint.
         distance: of the reference camera, for ``.ply`` files; a checkpoint states its own.
         device: torch device.
         encoder_weights: as for ``load_model``.
-        resize: resize pictures of another size.
+        resize: resize images of another size.
         margin: ``background_margin`` of a model, see ``Gamba.forward``.
         precision: of a model's matrix products, see ``devices.pick_precision``.
         detail: of a model's front, see ``model.predict.reconstruct``.
-        size: height of the compared pictures; None: the files' height.
+        size: height of the compared images; None: the files' height.
 
     Raises:
         UserError: ``path`` is missing, the checkpoint cannot be read, or a margin, a precision or a
             detail is given without a model that takes it.
     """
     if not path.exists():
-        raise UserError(f"{path}: no such checkpoint, folder of .ply files or of pictures")
+        raise UserError(f"{path}: no such checkpoint, folder of .ply files or of images")
     if path.is_dir() and next(visible(path, "*.ply"), None) is not None:
         found = PlyPredictions(path, distance, device)
     elif path.is_dir() and next(path.glob("*.safetensors"), None) is None:
-        if not holds_pictures(path):
+        if not holds_images(path):
             raise UserError(
-                f"{path}: holds neither .ply files nor folders of pictures nor a checkpoint"
+                f"{path}: holds neither .ply files nor folders of images nor a checkpoint"
             )
-        found = PicturePredictions(path, distance, device, resize)
+        found = ImagePredictions(path, distance, device, resize)
     else:
         return ModelPredictions(path, device, encoder_weights, margin, precision, detail, size)
     for name, given in (

@@ -111,7 +111,7 @@ def _markdown(rows: Rows, signed: bool, columns: dict[str, Column], of: str = "m
 def page(report: dict[str, Any]) -> str:
     """Return the text of ``table.md`` from a report of ``eval-views``."""
     counts, lpips = report["nearly_empty"], report["protocol"]["lpips_reason"]
-    few = f"nearly empty (the object covers under {100 * NEARLY_EMPTY:g} % of the true picture)."
+    few = f"nearly empty (the object covers under {100 * NEARLY_EMPTY:g} % of the true image)."
     note = f"None of the {counts['of_views']} views is {few}"
     if counts["views"]:
         note = (

@@ -43,7 +43,7 @@ class Evaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         split: part of the dataset.
         objects: their number, evenly spaced in the order of names.
         views: per object, including the input, evenly spaced.
-        size: height of the pictures compared, pixels; None: the files' own.
+        size: height of the images compared, pixels; None: the files' own.
     """
 
     split: Literal["val", "test"] = "test"

@@ -23,15 +23,15 @@ from .cutting import (
     Cut,
     apply_strokes,
     cut_by_network,
-    cut_picture,
-    editor_picture,
+    cut_image,
+    editor_image,
     examples,
     note_of,
     read_strokes,
     reset_mask,
     switch_areas,
 )
-from .guard import MAX_PICTURES, VISITOR
+from .guard import MAX_IMAGES, VISITOR
 from .main_thread import Cancelled, MainThread
 from .visitor_files import VisitorFiles
 
@@ -59,10 +59,10 @@ State = tuple[work.EditableObject, list[Path]]  # the shown result, and its file
 
 
 class Result(NamedTuple):
-    """A result of the strip, and the file of its small picture."""
+    """A result of the strip, and the file of its small image."""
 
     made: work.EditableObject
-    picture: Path
+    image: Path
 
 
 @contextmanager
@@ -122,15 +122,15 @@ class Actions:
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """Take a dropped or pasted picture; the guard has checked its owner."""
+        """Take a dropped or pasted image; the guard has checked its owner."""
         if not given or not given.get("path"):
             return self.end_session()
-        name = given.get("orig_name") or "picture"
+        name = given.get("orig_name") or "image"
         progress(0.2, "Looking for the object")
         try:
-            cut = self._call(request, cut_picture, Path(given["path"]), name, self._options)
+            cut = self._call(request, cut_image, Path(given["path"]), name, self._options)
         except UserError as error:
-            gr.Warning(html.escape(str(error)), title="This picture cannot be used")
+            gr.Warning(html.escape(str(error)), title="This image cannot be used")
             return self.end_session()
         return *self._shown(cut, request), gr.skip()
 
@@ -141,7 +141,7 @@ class Actions:
 
     @page_errors()
     def end_session(self) -> tuple:
-        """Clear the picture; its results stay."""
+        """Clear the image; its results stay."""
         gone, empty = gr.update(visible=False), gr.update(value=None, visible=False)
         view = gr.update(value=VIEWS[1], visible=False)
         return None, gone, empty, "", gone, view, gr.skip(), None
@@ -153,7 +153,7 @@ class Actions:
         if type(index) is not int or not 0 <= index < len(found):
             raise UserError(f"not one of the {len(found)} examples")
         path, title = found[index]
-        cut = self._call(request, cut_picture, path, title, self._options)
+        cut = self._call(request, cut_image, path, title, self._options)
         return *self._shown(cut, request), str(path)
 
     @page_errors()
@@ -186,7 +186,7 @@ class Actions:
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """Cut the picture out again by a network."""
+        """Cut the image out again by a network."""
         progress(0.2, "Cutting out with a network")
         again = self._call(request, cut_by_network, _given(cut), self._options)
         return self._edited(again, request)
@@ -202,7 +202,7 @@ class Actions:
     ) -> tuple:
         """Reconstruct the object and show its viewer; pending strokes are applied first.
 
-        An elevation that was set by hand for this picture stays.
+        An elevation that was set by hand for this image stays.
         """
         before = _given(cut)
         after = apply_strokes(before, _layers(painted))
@@ -221,30 +221,30 @@ class Actions:
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> Iterator[tuple]:
-        """Reconstruct several pictures, each with the cut-out that is found; yield each result."""
+        """Reconstruct several images, each with the cut-out that is found; yield each result."""
         given, before, doubted = given or [], results, []
         with page_errors():
             for number, file in enumerate(given):
-                name = file.get("orig_name") or "picture"
-                progress(number / len(given), f"Picture {number + 1} of {len(given)}")
+                name = file.get("orig_name") or "image"
+                progress(number / len(given), f"Image {number + 1} of {len(given)}")
                 try:
-                    cut = self._call(request, cut_picture, Path(file["path"]), name, self._options)
+                    cut = self._call(request, cut_image, Path(file["path"]), name, self._options)
                     made = self._call(request, work.run_model, self._model, cut)
                 except Cancelled:
                     raise
                 except UserError as error:
                     text = f"{name}: {str(error).removeprefix(f'{name}: ')}"
-                    gr.Warning(html.escape(text), title="This picture cannot be used")
+                    gr.Warning(html.escape(text), title="This image cannot be used")
                     continue
                 if cut.warning:
                     doubted.append(name)
                 results, *shown = self._added(results, made, request)
                 yield gr.update(open=False), results, *shown
             if doubted:
-                text = f"{', '.join(doubted)}. Give such a picture alone to correct it."
+                text = f"{', '.join(doubted)}. Give such an image alone to correct it."
                 gr.Warning(html.escape(text), title="These cut-outs may be wrong")
             if results is before:
-                raise UserError("none of these pictures can be used")
+                raise UserError("none of these images can be used")
 
     @page_errors()
     def choose(self, results: list[Result], event: gr.EventData) -> tuple:
@@ -306,10 +306,10 @@ class Actions:
         path = self._new_folder(request) / "result.png"
         self._call(request, work.thumbnail, made, path, self._device)
         _forget_surfaces(results)
-        kept = [*results, Result(made, path)][-MAX_PICTURES:]
+        kept = [*results, Result(made, path)][-MAX_IMAGES:]
         if len(kept) == len(results):
-            gr.Info(f"The strip keeps the last {MAX_PICTURES} results.")
-        strip = [(str(result.picture), result.made.name) for result in kept]
+            gr.Info(f"The strip keeps the last {MAX_IMAGES} results.")
+        strip = [(str(result.image), result.made.name) for result in kept]
         shown = gr.update(value=strip, visible=len(kept) > 1, selected_index=None)
         return kept, shown, *_presented(made)
 
@@ -364,7 +364,7 @@ class Actions:
         gradio would rewrite the same file while the browser reads it.
         """
         path = self._new_folder(request) / "cut-out.png"
-        save_image(path, editor_picture(cut) / 255.0)
+        save_image(path, editor_image(cut) / 255.0)
         value = {"background": str(path), "layers": [], "composite": str(path)}
         return gr.update(value=value, visible=True)
 
@@ -396,7 +396,7 @@ def _state(state: State | None) -> State:
 
 def _given(cut: Cut | None) -> Cut:
     if cut is None:
-        raise UserError("give a picture first; an older one may have expired")
+        raise UserError("give an image first; an older one may have expired")
     return cut
 
 

@@ -1,4 +1,4 @@
-"""Example pictures, the cut-out of a picture, and strokes that correct its mask."""
+"""Example images, the cut-out of an image, and strokes that correct its mask."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ if TYPE_CHECKING:
     from ..photo.cutout import CutoutOptions
 
 
-SIDE = 720  # longer side of the editor's picture, pixels
+SIDE = 720  # longer side of the editor's image, pixels
 KEEP, REMOVE = "#2f6fed", "#e8590c"  # brush colours: blue and orange, safe for colour-blind users
-STROKE = 0.6  # opacity of a stroke, so that the picture shows through
+STROKE = 0.6  # opacity of a stroke, so that the image shows through
 MAX_STROKES = 4 << 20  # pixels of a layer; the page sends SIDE x SIDE
 _TILE = 12  # side of the checkerboard's squares, pixels
 _LIGHT, _DARK = 0.97, 0.86
 _GHOST = 0.22  # opacity of the removed parts, so that they can be painted back
 # Options of the command line in the words of photo/cutout.py.
-_OPTIONS = re.compile(r" \(--keep-holes[^)]*\)|; give a picture with .*")
+_OPTIONS = re.compile(r" \(--keep-holes[^)]*\)|; give an image with .*")
 _NAME = re.compile(r"[^\w-]+")
 FOLDER = STARTER / "icons"  # the examples
 
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """A picture and the mask of its object.
+    """An image and the mask of its object.
 
     Attributes:
         name: valid as a file name.
-        rgb: ``[H, W, 3]`` float32 in [0, 1], the picture at its working size.
+        rgb: ``[H, W, 3]`` float32 in [0, 1], the image at its working size.
         mask: ``[H, W]`` float32 in [0, 1], 1 on the object.
         first: the mask before any stroke.
         found: ``[S, S, 4]`` float32, the object cut out and centred before any stroke, without
             background colour along its edge; None if no object was found.
-        ghost: True if the picture has colours where the mask is 0.
+        ghost: True if the image has colours where the mask is 0.
         note: method of the cut-out and doubts, for the page, before any stroke.
         warning: the doubts alone.
-        path: file of the picture.
-        network: label of a button that cuts the picture out again by a network; empty without one.
+        path: file of the image.
+        network: label of a button that cuts the image out again by a network; empty without one.
         areas: ``[H, W]`` bool, enclosed areas of a plain background's colour.
-        key: unpredictable name of the picture.
+        key: unpredictable name of the image.
     """
 
     name: str
@@ -67,8 +67,8 @@ class Cut:
     key: str = field(default_factory=lambda: secrets.token_hex(8))
 
 
-def cut_picture(path: Path, name: str, options: CutoutOptions) -> Cut:
-    """Read a picture and find its object; the mask is empty if none is found.
+def cut_image(path: Path, name: str, options: CutoutOptions) -> Cut:
+    """Read an image and find its object; the mask is empty if none is found.
 
     Args:
         path: an untrusted file.
@@ -76,7 +76,7 @@ def cut_picture(path: Path, name: str, options: CutoutOptions) -> Cut:
         options: options of the cut-out.
 
     Raises:
-        UserError: the picture cannot be read; the message has the visitor's name.
+        UserError: the image cannot be read; the message has the visitor's name.
     """
     from ..data.preprocess import WORKING_SIZE, shrink
     from ..images import load_rgba
@@ -89,7 +89,7 @@ def cut_picture(path: Path, name: str, options: CutoutOptions) -> Cut:
         raise UserError(str(error).replace(str(path), shown)) from error
     try:
         cut = cut_out(path, options)
-    except UserError as error:  # the picture is valid, so the object can be painted by hand
+    except UserError as error:  # the image is valid, so the object can be painted by hand
         reason = _OPTIONS.sub("", str(error).removeprefix(f"{path}: "))
         mask = np.zeros(rgba.shape[:2], np.float32)
         note = f"No object was found ({reason}). Paint over the object with the blue brush."
@@ -125,7 +125,7 @@ def _network(options: CutoutOptions) -> str:
 
 
 def cut_by_network(cut: Cut, options: CutoutOptions) -> Cut:
-    """Return the cut-out of the same picture by the matting network, which may be fetched.
+    """Return the cut-out of the same image by the matting network, which may be fetched.
 
     Raises:
         UserError: the network cannot be fetched or run, or finds no object.
@@ -138,14 +138,14 @@ def cut_by_network(cut: Cut, options: CutoutOptions) -> Cut:
             models.fetch(best, best.address)
     except models.NotFetched as error:
         raise UserError(f"the network cannot be fetched: {error}") from None
-    again = cut_picture(cut.path, cut.name, options)
+    again = cut_image(cut.path, cut.name, options)
     if again.found is None:
         raise UserError(f"the network does not help: {again.note.partition('. Paint')[0]}")
     return replace(again, key=cut.key)
 
 
 def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Return the picture with the found object's edge colours, so that strokes leave no fringe."""
+    """Return the image with the found object's edge colours, so that strokes leave no fringe."""
     from ..data.preprocess import PRESENT
 
     present = mask > PRESENT
@@ -164,11 +164,11 @@ def stem(name: str) -> str:
     return _NAME.sub("-", Path(name).stem).strip("-_")[:60] or "object"
 
 
-def editor_picture(cut: Cut) -> np.ndarray:
+def editor_image(cut: Cut) -> np.ndarray:
     """Draw the cut-out over a checkerboard, with the removed parts faint, for the editor.
 
     Returns:
-        ``[h, w, 3]`` uint8, the longer side ``SIDE`` pixels for any picture.
+        ``[h, w, 3]`` uint8, the longer side ``SIDE`` pixels for any image.
     """
     from ..images import to_uint8
 
@@ -182,7 +182,7 @@ def editor_picture(cut: Cut) -> np.ndarray:
 
 
 def painted_size(cut: Cut) -> tuple[int, int]:
-    """Return height and width of ``editor_picture``."""
+    """Return height and width of ``editor_image``."""
     height, width = cut.mask.shape
     factor = SIDE / max(height, width)
     return max(1, round(height * factor)), max(1, round(width * factor))
@@ -197,9 +197,9 @@ def read_strokes(path: Path) -> np.ndarray:
     Raises:
         UserError: it is not a PNG, or larger than any canvas.
     """
-    from ..images import open_picture
+    from ..images import open_image
 
-    with open_picture(path, "the strokes", MAX_STROKES, ("PNG",)) as image:
+    with open_image(path, "the strokes", MAX_STROKES, ("PNG",)) as image:
         return np.asarray(image.convert("RGBA"))
 
 
@@ -208,7 +208,7 @@ def apply_strokes(cut: Cut, layers: Sequence[np.ndarray]) -> Cut:
 
     Args:
         cut: before the strokes.
-        layers: ``[h, w, 4]`` uint8 each, straight alpha, of any size, covering the whole picture.
+        layers: ``[h, w, 4]`` uint8 each, straight alpha, of any size, covering the whole image.
 
     Returns:
         The argument itself if nothing is painted.
@@ -249,7 +249,7 @@ def switch_areas(cut: Cut) -> Cut:
     return replace(cut, mask=cleared if left else np.maximum(cleared, cut.areas))
 
 
-def model_picture(cut: Cut) -> np.ndarray:
+def model_image(cut: Cut) -> np.ndarray:
     """Return the object as the model's input.
 
     Returns:
@@ -284,7 +284,7 @@ def _resized(values: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def examples() -> list[tuple[Path, str]]:
-    """Return the shipped pictures, sorted by name, each with a title.
+    """Return the shipped images, sorted by name, each with a title.
 
     An installed package has two, a checkout more.
     """

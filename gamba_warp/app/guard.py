@@ -27,7 +27,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from ..errors import UserError, first_line
-from ..images import PICTURE_SUFFIXES
+from ..images import IMAGE_SUFFIXES
 from ..untrusted.documents import parse_document
 from .connections import READ_SECONDS
 from .cutting import examples
@@ -68,7 +68,7 @@ _HEAD = 1 << 16  # bytes of an upload besides its files
 _CALL_SECONDS = READ_SECONDS  # to receive it completely
 UPLOAD_SECONDS = 300.0
 MAX_AT_ONCE = 16  # requests of one visitor
-MAX_PICTURES = 12  # of one upload, and results of one page
+MAX_IMAGES = 12  # of one upload, and results of one page
 # Others are ignored: gradio fails with several ranges, or with non-ASCII digits.
 _RANGE = re.compile(b"bytes=([0-9]{1,15}-[0-9]{0,15}|-[0-9]{1,15})")
 
@@ -285,7 +285,7 @@ class Guard:
 
         form = FormData()
         try:
-            sent = Request(request.scope, counted).form(max_files=MAX_PICTURES, max_fields=0)
+            sent = Request(request.scope, counted).form(max_files=MAX_IMAGES, max_fields=0)
             form = await asyncio.wait_for(sent, UPLOAD_SECONDS)
             if not form:
                 raise HTTPException(400, "not an upload of files")
@@ -303,7 +303,7 @@ class Guard:
         if file.size > self._max_bytes:
             raise HTTPException(413, "the file is over the maximum allowed size")
         suffix = PurePath(file.filename or "").suffix.lower()
-        name = f"picture{suffix if suffix in PICTURE_SUFFIXES else ''}"
+        name = f"image{suffix if suffix in IMAGE_SUFFIXES else ''}"
         path = self._files.new_folder(visitor, file.size) / name
         with open(path, "wb") as out:
             shutil.copyfileobj(file.file, out)

@@ -12,14 +12,14 @@ from msgspec import Meta
 from . import work
 from .actions import VIEWS, Actions
 from .cutting import FOLDER, KEEP, REMOVE, SIDE, STROKE, examples
-from .guard import MAX_PICTURES, Edit, GivenFile, Painted
+from .guard import MAX_IMAGES, Edit, GivenFile, Painted
 from .visitor_files import KEEP_SECONDS
 
 WAITING = 16  # queued requests; further ones are rejected
 _TITLE = """<h1>Gamba</h1>
-<p>One picture becomes a 3D object. Everything is computed on this machine, and nothing is sent
+<p>One image becomes a 3D object. Everything is computed on this machine, and nothing is sent
 out.</p>"""
-_EMPTY = """<div class="stage empty"><p>The object will appear here.<br>Give a picture, check its
+_EMPTY = """<div class="stage empty"><p>The object will appear here.<br>Give an image, check its
 cut-out, and make it 3D.</p></div>"""
 _FILES = {"Gaussians": work.GAUSSIANS, "Mesh": work.MESHES, "To show": work.SHOWS}
 _BRUSHES = {"Paint what to keep": KEEP, "Paint what to remove": REMOVE}
@@ -50,7 +50,7 @@ def build(actions: Actions) -> gr.Blocks:
     """Build the page; ``server.serve`` serves it.
 
     One action runs at a time over all pages, because they share the device. gradio's preprocessing
-    is off: it would decode pictures differently and without limits.
+    is off: it would decode images differently and without limits.
     """
     gr.set_static_paths([FOLDER])
     page = gr.Blocks(title="Gamba", analytics_enabled=False, fill_width=True)
@@ -62,7 +62,7 @@ def build(actions: Actions) -> gr.Blocks:
         cut, made, results = (
             gr.State(first, time_to_live=KEEP_SECONDS) for first in (None, None, [])
         )
-        small_pictures: dict[str, Any] = {
+        small_images: dict[str, Any] = {
             "height": "auto",
             "allow_preview": False,
             "object_fit": "contain",
@@ -78,26 +78,26 @@ def build(actions: Actions) -> gr.Blocks:
         }
         with gr.Row(elem_id="bench"):
             with gr.Column(scale=5, min_width=300, elem_id="left"):
-                picture = gr.Image(
-                    label="Picture",
+                image = gr.Image(
+                    label="Image",
                     sources=["upload", "clipboard"],
                     type="filepath",
                     image_mode=None,
                     height=170,
                     buttons=[],
-                    placeholder="Drop a picture here\nor click to choose one",
-                    elem_id="picture",
+                    placeholder="Drop an image here\nor click to choose one",
+                    elem_id="image",
                 )
-                with gr.Accordion("Examples, or several pictures", elem_id="more") as more:
+                with gr.Accordion("Examples, or several images", elem_id="more") as more:
                     gallery = gr.Gallery(
                         [(str(path), title) for path, title in examples()],
                         show_label=False,
                         columns=6,
                         elem_id="examples",
-                        **small_pictures,
+                        **small_images,
                     )
                     several = gr.UploadButton(
-                        f"Several pictures at once (up to {MAX_PICTURES})",
+                        f"Several images at once (up to {MAX_IMAGES})",
                         file_count="multiple",
                         file_types=["image"],
                         size="sm",
@@ -140,9 +140,9 @@ def build(actions: Actions) -> gr.Blocks:
                 strip = gr.Gallery(
                     label="Results",
                     visible=False,
-                    columns=MAX_PICTURES,
+                    columns=MAX_IMAGES,
                     elem_id="results",
-                    **small_pictures,
+                    **small_images,
                 )
                 buttons: dict[str, gr.Button] = {}
                 with gr.Column(visible=False, elem_id="files") as files_part:
@@ -180,11 +180,11 @@ def build(actions: Actions) -> gr.Blocks:
         free: dict[str, Any] = {"preprocess": False, "api_visibility": "private"}
         shared: dict[str, Any] = {**free, "show_progress_on": status}
         one = {**shared, "concurrency_id": "gamba", "concurrency_limit": 1}
-        shown = [cut, cut_part, editor, note, network, view, more, picture]
+        shown = [cut, cut_part, editor, note, network, view, more, image]
         mask = [cut, editor, note, network]
-        # (The event ``input`` sends the old picture when it is cleared.)
-        picture.upload(actions.take, picture, shown, **one)
-        picture.clear(actions.end_session, None, shown, **one)
+        # (The event ``input`` sends the old image when it is cleared.)
+        image.upload(actions.take, image, shown, **one)
+        image.clear(actions.end_session, None, shown, **one)
         gallery.select(actions.load_example, None, shown, **one)
         # Has its own queue, so that it waits for no other event.
         brush.change(_painting, brush, editor, show_progress="hidden", **free)
@@ -225,7 +225,7 @@ def build(actions: Actions) -> gr.Blocks:
     return page
 
 
-_Several: Any = Annotated[list[GivenFile], Meta(max_length=MAX_PICTURES)]
+_Several: Any = Annotated[list[GivenFile], Meta(max_length=MAX_IMAGES)]
 
 
 def _brush(color: str) -> gr.Brush:

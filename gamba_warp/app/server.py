@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 PREFIX = "gamba-app-"
-_PAGES = 8  # pages whose pictures and results are kept at once
+_PAGES = 8  # pages whose images and results are kept at once
 BACKLOG = 64  # pending connections; each takes a descriptor
 
 
@@ -47,7 +47,7 @@ def app_command(
     max_upload_mb: Annotated[int, Meta(ge=1, le=1024)] = 30,
     device: DeviceChoice = "auto",
 ) -> None:
-    """Serve a page on this machine that turns pictures into 3D objects, until Ctrl-C.
+    """Serve a page on this machine that turns images into 3D objects, until Ctrl-C.
 
     Args:
         checkpoint: Trained model (.safetensors); the shipped model by default.
@@ -56,7 +56,7 @@ def app_command(
             rembg's; by default rembg's copy on this machine, else it is fetched once (179 MB).
         port: Port of 127.0.0.1; 0 picks a free one.
         open_browser: Open the browser; the address is printed in any case.
-        max_upload_mb: Largest picture file, MB.
+        max_upload_mb: Largest image file, MB.
         device: Device that computes; auto is the GPU if there is one.
     """
     with listener(port) as listening, work_folder() as folder:

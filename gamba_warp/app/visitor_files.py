@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ..errors import UserError
 
-KEEP_SECONDS = 3600  # time that unused files, pictures and results are kept
+KEEP_SECONDS = 3600  # time that unused files, images and results are kept
 MAX_TOTAL = 1 << 30  # bytes of all files together; at least the largest --max-upload-mb
 MAX_PER_VISITOR = 1 << 28  # bytes; at least one file of --max-upload-mb is allowed
 
@@ -85,7 +85,7 @@ class VisitorFiles:
                 return Path(path)
         except (OSError, ValueError):  # too long, or with a NUL
             pass
-        raise UserError("this file is missing or has expired; give the picture again")
+        raise UserError("this file is missing or has expired; give the image again")
 
     def sweep(self) -> None:
         """Remove expired files of inactive visitors."""

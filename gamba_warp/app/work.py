@@ -29,7 +29,7 @@ from ..trajectories.movies import save_turntable, turntable_frames
 from ..trajectories.paths import set_up, upright
 from ..viewer.pack import visible_order
 from ..viewer.page import viewer_page, write_viewer
-from .cutting import Cut, model_picture
+from .cutting import Cut, model_image
 
 if TYPE_CHECKING:
     from ..model.gamba import Gamba
@@ -50,7 +50,7 @@ TEXTURES = {"No texture": 0, **{f"Texture {side}": side for side in (512, 1024, 
 UNRENDERED = {*GAUSSIANS, "html"}  # kinds whose writing renders nothing
 KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
 LOWEST, HIGHEST = -30, 90  # elevations that can be set by hand, degrees
-_PICTURE, _SMALL = 512, 128  # largest side of a kept input; side of a thumbnail, pixels
+_IMAGE, _SMALL = 512, 128  # largest side of a kept input; side of a thumbnail, pixels
 
 
 class MeshChoice(NamedTuple):
@@ -80,16 +80,16 @@ class EditableObject(Reconstruction):
     """Reconstruction that can be edited; ``gaussians`` are all, ``kept`` those left.
 
     Attributes:
-        picture: the model's input ``[S, S, 4]`` uint8, reduced.
+        image: the model's input ``[S, S, 4]`` uint8, reduced.
         surface: of ``kept``, the last one that was extracted, or None.
         choice: its number of faces at most, and if it is closed.
-        given: key of the picture.
+        given: key of the image.
         chosen: elevation that was set by hand, or None.
         removed: ``[N]`` bool, Gaussians that were removed by hand; every edit makes a new tensor.
         key: unpredictable name.
     """
 
-    picture: np.ndarray
+    image: np.ndarray
     surface: Surface | None = None
     choice: tuple[int, bool] | None = None
     given: str = ""
@@ -113,10 +113,10 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Editabl
     Raises:
         UserError: also if the mask is empty.
     """
-    rgba = model_picture(cut)
+    rgba = model_image(cut)
     found = reconstruct_object(model, cut.name, rgba, elevation)
-    small = to_uint8(shrink(rgba, _PICTURE))
-    return EditableObject(**vars(found), picture=small, given=cut.key, chosen=elevation)
+    small = to_uint8(shrink(rgba, _IMAGE))
+    return EditableObject(**vars(found), image=small, given=cut.key, chosen=elevation)
 
 
 def surface_of(
@@ -145,7 +145,7 @@ def surface_of(
 
 
 def thumbnail(made: EditableObject, path: Path, device: str = "cpu") -> None:
-    """Write a small picture of the object, from the input's camera.
+    """Write a small image of the object, from the input's camera.
 
     Raises:
         UserError: the file cannot be written.
@@ -171,7 +171,7 @@ def edit(made: EditableObject, elevation: float, removed: bytes) -> None:
 
     Args:
         made: the reconstruction.
-        elevation: of the picture's camera above the object, degrees; the result is upright.
+        elevation: of the image's camera above the object, degrees; the result is upright.
         removed: a bit for each Gaussian, in the order of the viewer, the lowest bit first.
 
     Raises:
@@ -198,7 +198,7 @@ def edit(made: EditableObject, elevation: float, removed: bytes) -> None:
 
 
 def _shown(made: EditableObject) -> dict:
-    return {"camera": made.view.camera, "mesh": made.surface, "picture": made.picture / 255.0}
+    return {"camera": made.view.camera, "mesh": made.surface, "image": made.image / 255.0}
 
 
 def write(

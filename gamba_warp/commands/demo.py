@@ -12,7 +12,7 @@ from ..errors import UserError
 from ..files import STARTER, only_process, output_folder
 from ..untrusted.ranges import ranged
 
-# An installed package has the shipped model and two pictures, but neither views nor meshes.
+# An installed package has the shipped model and two images, but neither views nor meshes.
 # LPIPS in the loss would take most of a short CPU run.
 _TRAINING = (
     "--preset rays --minutes 5 --lpips off --no-radial-mask --ssim-weight 0.2 --batch-size 4 "
@@ -27,7 +27,7 @@ def demo_command(
     starter: Path = STARTER,
     lpips: Literal["on", "off"] = "off",
 ) -> int:
-    """Reconstruct and evaluate pictures and objects with the shipped model, and write a page.
+    """Reconstruct and evaluate images and objects with the shipped model, and write a page.
 
     An installed package lacks most of the starter set, and tells where to get it.
 
@@ -59,7 +59,7 @@ def demo_command(
         _evaluate(results, starter, out / "truth", lpips)
         spent = f"{(time.perf_counter() - started) / 60:.1f} minutes"
         text = (
-            f"Results of the shipped model ({results.shipped.name}) on pictures of unseen objects; "
+            f"Results of the shipped model ({results.shipped.name}) on images of unseen objects; "
             f"it was not trained on this machine. The whole demo took {spent}."
         )
         write_demo(out / "index.html", results, text)
@@ -86,7 +86,7 @@ def _call(words: list[str]) -> int:
 
 
 def _evaluate(results, starter: Path, truth: Path, lpips: str) -> None:
-    """Run the shipped model on pictures and objects outside its training set."""
+    """Run the shipped model on images and objects outside its training set."""
     model, views, data = results.shipped, results.views, starter / "data"
     _gamba(
         *("reconstruct", results.icons, "--checkpoint", model, "--out", results.results),

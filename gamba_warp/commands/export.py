@@ -67,7 +67,7 @@ def export_command(
         smooth: Number of smoothing steps.
         elevation: Elevation of the camera of turntable and 3D viewer above the object, degrees.
         fov: Its field of view, degrees; 49.1 by default. Without --distance the object keeps its
-            size in the picture.
+            size in the image.
         distance: Its distance from the object's centre, in units of the longest side; 1.5 by
             default.
         drop_bad: Leave out invalid Gaussians (a value that is not finite, a rotation of length

@@ -1,4 +1,4 @@
-"""``gamba reconstruct``: pictures to 3D Gaussians, files, turntables and pages."""
+"""``gamba reconstruct``: images to 3D Gaussians, files, turntables and pages."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _PIPED = "gamba-stdin-"  # start of the name of its folder
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Camera of the picture, and of its results.
+    """Camera of the image, and of its results.
 
     Attributes:
-        elevation: Elevation of the picture's camera above the object, degrees; all results are
+        elevation: Elevation of the image's camera above the object, degrees; all results are
             rotated so that the object is upright. By default it is estimated from the Gaussians.
         fov: Field of view of turntable, sheet and 3D viewer, degrees; by default that of the
-            model, 49.1. Without --distance the object keeps its size in the picture.
+            model, 49.1. Without --distance the object keeps its size in the image.
         distance: Distance of their camera, object units; by default the model's (1.5).
     """
 
@@ -63,26 +63,26 @@ def reconstruct_command(
     device: DeviceChoice = "auto",
     precision: Precision = "float32",
 ) -> Results:
-    """Turn pictures of single objects into 3D Gaussians, in one forward pass each.
+    """Turn images of single objects into 3D Gaussians, in one forward pass each.
 
     Args:
-        images: Picture files, or folders of them; - is a picture from the standard input.
+        images: Image files, or folders of them; - is an image from the standard input.
         checkpoint: Trained model (.safetensors); the shipped model by default.
         encoder_weights: The image encoder's weights, if the model has a pretrained one.
         files: Outputs to write.
-        camera: Camera of the picture, and of its results.
-        sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
-        mask: Picture that is brighter, or opaque, on the object (for a single image).
+        camera: Camera of the image, and of its results.
+        sheet: Also one image of all inputs and five views around each (.png, .webp, .jpg).
+        mask: Image that is brighter, or opaque, on the object (for a single image).
         matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or a URL of one of rembg's.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
         cutout: How the object is cut out; auto is the first that finds one. none takes the whole
-            picture.
+            image.
         keep_holes: Keep areas of a plain background's colour that the object encloses.
-        recursive: Also take the pictures in the folders of a folder.
+        recursive: Also take the images in the folders of a folder.
         recenter: Centre the object, at the size of training; else it keeps its position and size in
-            a square picture.
+            a square image.
         detail: Number of Gaussians per side that each of the front may split into, for the
-            picture's sharpness; by default the most that the cut-out's pixels allow.
+            image's sharpness; by default the most that the cut-out's pixels allow.
         save_inputs: Also write each cut-out as NAME-input.png, which may be edited and used again.
         device: Device that computes; auto is the GPU if there is one.
         precision: Precision of the network's matrix products; auto is bfloat16 if that is faster.
@@ -94,7 +94,7 @@ def reconstruct_command(
     from ..photo.cutout import CutoutOptions, cut_out
     from ..pipeline import ReconstructionFiles, reconstruct_object
 
-    pictures, failures = _find_pictures(images, mask, recursive)
+    paths, failures = _find_images(images, mask, recursive)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
     if not checkpoint.exists():
         raise UserError(
@@ -111,9 +111,9 @@ def reconstruct_command(
     )
     outputs.require()
     reads = (mask, Path(matte_model) if matte_model else None, sam, file, encoder_weights)
-    names = plan_outputs(pictures, outputs.suffixes(), files.out, reads, outputs.own(len(pictures)))
+    names = plan_outputs(paths, outputs.suffixes(), files.out, reads, outputs.own(len(paths)))
     if sheet is not None:
-        check_not_read([sheet], [*pictures, *reads])
+        check_not_read([sheet], [*paths, *reads])
         outputs.sheet = Sheet(sheet)
         output_folder(sheet.parent)
     STAGES.begin("model")
@@ -127,7 +127,7 @@ def reconstruct_command(
     targets = [files.out / (name + suffix) for name in names for suffix in outputs.suffixes()]
     if older := sum(target.exists() for target in targets):
         say(f"{files.out}: {counted(older, 'file')} of an earlier run will be replaced")
-    results = Results("picture", len(pictures), files.out, failures)
+    results = Results("image", len(paths), files.out, failures)
     places = {name: f"[{n}/{len(names)}] " for n, name in enumerate(names, 1)}
 
     def one(name: str, path: Path) -> None:
@@ -135,7 +135,7 @@ def reconstruct_command(
         cut, given = cut_out(path, options), _given(path)
         say(f"{places[name] if len(names) > 1 else ''}{given}: {cut.how}")
         if cut.warning:
-            warn(given, [f"{cut.warning} --save-inputs writes the cut-out for a picture editor."])
+            warn(given, [f"{cut.warning} --save-inputs writes the cut-out for an image editor."])
         STAGES.begin("network")
         result = reconstruct_object(model, name, cut.rgba, camera.elevation, precision, detail)
         estimate, between = result.estimate, None
@@ -150,33 +150,33 @@ def reconstruct_command(
         source = {"input": str(given), "name": name, "cutout": cut.how, "warning": cut.warning}
         results.made.append(source | {"elevation": elevation, "elevation_doubt": between} | figures)
 
-    for_each(names, one, "reconstruct", "picture", failures)
+    for_each(names, one, "reconstruct", "image", failures)
     failures[:] = [(_given(path), reason) for path, reason in failures]
     outputs.finish()
     return results
 
 
-def _find_pictures(
+def _find_images(
     images: tuple[Path, ...], mask: Path | None, recursive: bool
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Return picture files, and failures with reasons. Raises UserError without a file."""
-    from ..images import find_pictures, left_out
+    """Return image files, and failures with reasons. Raises UserError without a file."""
+    from ..images import find_images, left_out
 
     example = next(iter(sorted((STARTER / "icons").glob("*.png"))), None)
     if not images:
-        raise UserError(f"give at least one picture or folder, such as {example or 'photo.png'}")
+        raise UserError(f"give at least one image or folder, such as {example or 'photo.png'}")
     if example and images == (Path("photo.png"),) and not images[0].exists():  # the pages' example
-        raise UserError(f"photo.png: no such file; give a picture of yours, or {example}")
+        raise UserError(f"photo.png: no such file; give an image of yours, or {example}")
     given = [_standard_input() if str(path) == "-" else path for path in dict.fromkeys(images)]
-    pictures, failures = find_pictures(given, recursive)
-    if mask is not None and len(pictures) != 1:
-        raise UserError(f"--mask goes with one picture, {len(pictures)} are given")
-    if not pictures:
+    paths, failures = find_images(given, recursive)
+    if mask is not None and len(paths) != 1:
+        raise UserError(f"--mask goes with one image, {len(paths)} are given")
+    if not paths:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     for folder in images:
         if line := left_out(folder, recursive):
             say(f"{folder}: {line}")
-    return pictures, failures
+    return paths, failures
 
 
 def _given(path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""``gamba render``: pictures and movies of Gaussians along a camera path."""
+"""``gamba render``: images and movies of Gaussians along a camera path."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def render_command(
     drop_bad: bool = False,
     device: DeviceChoice = "auto",
 ) -> Results:
-    """Render Gaussians along a camera path to a GIF, a video, or a folder of pictures.
+    """Render Gaussians along a camera path to a GIF, a video, or a folder of images.
 
     A turntable and a spiral go around the object's centre, with -y up as in gamba's files. Cameras
     of a file are in the frame of the Gaussians.
@@ -50,14 +50,14 @@ def render_command(
             (docs/cameras.md), transforms.json, or nerfstudio's camera path.
         out: Folder for the results; for a single input also a .gif, an .mp4, a .png of one view, or
             - for such a file on the standard output.
-        kind: Kind of output; png is a folder of pictures and a transforms.json. By default
+        kind: Kind of output; png is a folder of images and a transforms.json. By default
             that of --out, else gif.
-        size: Width of the pictures, or width and height, pixels; by default the file's, else 512.
-        frames: Number of pictures of a turntable (48) or spiral (96).
-        fps: Pictures per second; by default the file's, else 3 seconds per turn.
+        size: Width of the images, or width and height, pixels; by default the file's, else 512.
+        frames: Number of images of a turntable (48) or spiral (96).
+        fps: Images per second; by default the file's, else 3 seconds per turn.
         elevation: Elevation of a turntable's camera above the object, degrees.
-        fov: Field of view of the picture's shorter side, degrees; 49.1 by default. Without
-            --distance the object keeps its size in the picture.
+        fov: Field of view of the image's shorter side, degrees; 49.1 by default. Without
+            --distance the object keeps its size in the image.
         distance: Distance of the camera from the object's centre, in units of its longest side.
         background: white, black, gray, #rrggbb, or none (transparent, png only).
         depth: Also 16-bit depth maps (png only).
@@ -86,7 +86,7 @@ def render_command(
     film.rate = film.rate if fps is None else fps
     if kind != "png" and (film.background is None or depth):
         given = "--depth" if depth else "--background none"
-        raise UserError(f"{given} needs pictures: give --kind png")
+        raise UserError(f"{given} needs images: give --kind png")
     files, failures = find_gaussians(inputs)
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
@@ -97,9 +97,9 @@ def render_command(
         if len(files) != 1:
             raise UserError(f"--out {out}: {len(files)} files are given; give a folder")
         if png and depth:
-            raise UserError(f"--out {out}: --depth makes two pictures of a view; give a folder")
+            raise UserError(f"--out {out}: --depth makes two images of a view; give a folder")
         if png and count != 1:
-            raise UserError(f"--out {out}: one picture, but there are {count} views; give a folder")
+            raise UserError(f"--out {out}: one image, but there are {count} views; give a folder")
         check_not_read([out], [*files, *reads])
         targets = {str(out): files[0]}
     else:

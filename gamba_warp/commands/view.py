@@ -37,7 +37,7 @@ def view_command(
         open_browser: Open the browser.
         elevation: Initial elevation of the camera above the object, degrees.
         fov: Field of view, degrees; 49.1 by default. Without --distance the object keeps its size
-            in the picture.
+            in the image.
         distance: Initial distance of the camera from the object's centre, in units of its longest
             side; 1.5 by default.
         drop_bad: Leave out invalid Gaussians (a value that is not finite, a rotation of length

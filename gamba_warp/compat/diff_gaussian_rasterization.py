@@ -119,8 +119,8 @@ class _Results(tuple):
         return super().__iter__()
 
 
-class _InPicture(torch.autograd.Function):
-    """Centres in pixels, whose gradient also goes to ``means2D``, in units of half the picture.
+class _InImage(torch.autograd.Function):
+    """Centres in pixels, whose gradient also goes to ``means2D``, in units of half the image.
 
     In the same units the sums of absolute values, which the compositor's gradient has set before,
     go to ``means2D_densify``.
@@ -244,7 +244,7 @@ class GaussianRasterizer(torch.nn.Module):
         Args:
             means3D: ``[N, 3]``; float32, bfloat16 or float16, as all.
             means2D: ``[N, 3]``, whose values are not used; its gradient is that of the centres in
-                the picture, in units of half its sides.
+                the image, in units of half its sides.
             opacities: ``[N, 1]`` or ``[N]`` in (0, 1).
             shs: ``[N, K, 3]`` harmonics' coefficients, K >= (sh_degree + 1)²; or None.
             colors_precomp: ``[N, C]`` in their place.
@@ -314,7 +314,7 @@ def rasterize_gaussians(
     densify = x.get("means2D_densify")
     absolute = None if densify is None else torch.zeros_like(projected.means2d)
     half = width / 2, height / 2
-    centers: Any = _InPicture.apply(projected.means2d, x["means2D"], densify, absolute, half)
+    centers: Any = _InImage.apply(projected.means2d, x["means2D"], densify, absolute, half)
 
     fork = _fork
     depth, channels = projected.depths[..., None], colors

@@ -12,7 +12,7 @@ from torch import Tensor
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 INDEX_DTYPES = (torch.int32, torch.int64)
-MAX_SIDE = 2**15  # pixels of a picture
+MAX_SIDE = 2**15  # pixels of an image
 
 Shape = tuple["int | str", ...]
 
@@ -95,7 +95,7 @@ def at_least_0(**numbers: float) -> None:
 
 
 def side(**pixels: Any) -> list[int]:
-    """Return sizes of pictures or tiles as ints, given as any integers from 1 to 32,768.
+    """Return sizes of images or tiles as ints, given as any integers from 1 to 32,768.
 
     Raises:
         ValueError: one is not; numpy's integers and 0-d tensors of integers are.

@@ -1,1 +1,1 @@
-"""Datasets of posed views, and pictures prepared for a model."""
+"""Datasets of posed views, and images prepared for a model."""

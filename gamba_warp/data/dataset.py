@@ -28,13 +28,13 @@ from ..batch import EXPECTED, progress_bar
 from ..cameras import Cameras, from_opengl
 from ..errors import UserError, first_line
 from ..files import write_json
-from ..images import check_size, load_rgba8, open_picture
+from ..images import check_size, load_rgba8, open_image
 from ..untrusted.documents import read_document
 from .layouts import (
     GOBJAVERSE,
     LAYOUTS,
-    DecodedPicture,
-    EncodedPicture,
+    DecodedImage,
+    EncodedImage,
     ObjectFiles,
     find_objects,
     one_line,
@@ -233,13 +233,13 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
             files = None
             try:
                 files = _read_folder(root, layout, uid)
-                _check_pictures(files)
+                _check_images(files)
                 digest = content_digest(files)
             except (UserError, OSError) as error:
                 bad[uid] = one_line(first_line(error))
             if files is not None and layout == "transforms" and isinstance(files.images[0], Path):
-                pictures = files.images[0].parent.relative_to(path).as_posix()
-                marks = [*marks, *marks_of(path, [pictures])] if pictures != "." else marks
+                images = files.images[0].parent.relative_to(path).as_posix()
+                marks = [*marks, *marks_of(path, [images])] if images != "." else marks
             yield Entry(uid, digest, bad.get(uid, ""), marks)
 
     return write_manifest(root, layout, lists, entries(), len(folders)), len(folders), bad
@@ -255,7 +255,7 @@ _CAMERA_FILES = {
 
 
 def content_digest(files: ObjectFiles) -> str:
-    """Return 16 hexadecimal digits of an object's cameras and kinds of pictures."""
+    """Return 16 hexadecimal digits of an object's cameras and kinds of images."""
     kinds = f"{len(files.images)} {files.depths is None} {files.backs is None}"
     digest = hashlib.sha256(kinds.encode())
     for numbers in (files.camera_to_world, files.Ks):
@@ -263,8 +263,8 @@ def content_digest(files: ObjectFiles) -> str:
     return digest.hexdigest()[:16]
 
 
-def _check_pictures(files: ObjectFiles) -> None:
-    """Raise UserError if a picture is missing; folders with many pictures are listed once."""
+def _check_images(files: ObjectFiles) -> None:
+    """Raise UserError if an image is missing; folders with many images are listed once."""
     kinds = filter(None, (files.images, files.masks, files.depths, files.backs))
     paths = [path for path in chain.from_iterable(kinds) if isinstance(path, Path)]
     parents = Counter(path.parent for path in paths)
@@ -302,9 +302,9 @@ class ViewDataset:
         self._digests: dict[str, str] = {} if manifest is None else manifest.digests
         self._bad: dict[str, str] = {} if manifest is None else manifest.bad
         self._files: dict[str, ObjectFiles] = {}  # the last ones used
-        # By path and size: the picture, and the (width, height) of the file.
-        self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
-        self._pictures = {} if cache else None
+        # By path and size: the image, and the (width, height) of the file.
+        self._images: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
+        self._images = {} if cache else None
 
     def __len__(self) -> int:
         return len(self.uids)
@@ -322,7 +322,7 @@ class ViewDataset:
         added = {f"{name}/{uid}": renamed[id(read)] for uid, read in other._readers.items()}
         if twice := sorted(added.keys() & self._readers.keys()):
             raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
-        cache = self._pictures is not None
+        cache = self._images is not None
         both = ViewDataset(self._readers | added, self.layout, cache, self.split_version)
         for known, mine, theirs in (
             (both._digests, self._digests, other._digests),
@@ -370,7 +370,7 @@ class ViewDataset:
         return len(self.files(index).images)
 
     def check(self) -> dict[str, str]:
-        """Return reasons by uid, for objects with invalid cameras or missing pictures.
+        """Return reasons by uid, for objects with invalid cameras or missing images.
 
         Objects of a manifest were checked before; the others are read, with a progress bar.
         """
@@ -378,7 +378,7 @@ class ViewDataset:
         unknown = [uid for uid in self.uids if uid not in self._digests]
         for uid in progress_bar(unknown, lines=True, delay=2.0, desc="checking", unit="object"):
             try:
-                _check_pictures(self.files(uid))
+                _check_images(self.files(uid))
             except UserError as error:
                 bad[uid] = str(error)
         return bad
@@ -395,10 +395,10 @@ class ViewDataset:
         Args:
             index: position in ``uids``, or a uid.
             views: numbers of the views, in this order; None means all. Only their files are opened.
-            size: height of the returned pictures; the width follows. None keeps the files' size.
+            size: height of the returned images; the width follows. None keeps the files' size.
                 Colour is premultiplied and area-filtered, so that no background bleeds in; depth
                 takes the nearest sample.
-            depths: number of these views, from the first, whose depth pictures are read, if there
+            depths: number of these views, from the first, whose depth images are read, if there
                 are any; None means all.
 
         Raises:
@@ -406,7 +406,7 @@ class ViewDataset:
         """
         uid = self._uid(index)
         files, wanted = self.files(uid), self._wanted(uid, views, size)
-        pixels, Ks = self.pictures(uid, wanted, size)
+        pixels, Ks = self.images(uid, wanted, size)
         images = torch.from_numpy(np.divide(pixels, np.float32(255), dtype=np.float32))
         height, width = images.shape[1:3]
         unit = np.float32(files.depth_unit)
@@ -437,7 +437,7 @@ class ViewDataset:
             raise UserError(f"size {size}: must be at least 1")
         return wanted
 
-    def pictures(
+    def images(
         self, index: int | str, views: Sequence[int] | None = None, size: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Decode views of one object to 8 bits.
@@ -459,31 +459,31 @@ class ViewDataset:
         pixels: np.ndarray | None = None
         Ks = np.empty((len(wanted), 3, 3))
         for number, v in enumerate(wanted):
-            picture, Ks[number] = self._view(files, v, size)
-            height, width = picture.shape[:2]
+            image, Ks[number] = self._view(files, v, size)
+            height, width = image.shape[:2]
             if pixels is None:
                 if len(wanted) * width * height > MAX_LOADED:
                     raise UserError(
                         f"{uid}: {len(wanted)} views of {width}x{height} are over "
-                        f"{MAX_LOADED >> 20} megapixels; ask for smaller pictures"
+                        f"{MAX_LOADED >> 20} megapixels; ask for smaller images"
                     )
                 pixels = np.empty((len(wanted), height, width, 4), np.uint8)
-            if picture.shape != pixels.shape[1:]:
+            if image.shape != pixels.shape[1:]:
                 got, others = f"{width}x{height}", f"{pixels.shape[2]}x{pixels.shape[1]}"
                 raise UserError(f"{files.images[v]}: is {got}, the object's others are {others}")
-            pixels[number] = picture
+            pixels[number] = image
         assert pixels is not None  # there is at least one view
         return pixels, Ks
 
     def depth_steps(
         self, index: int | str, width: int, height: int, views: Sequence[int] | None = None
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Read depth pictures of an object, of its first and of its last surfaces.
+        """Read depth images of an object, of its first and of its last surfaces.
 
         Args:
             index: as for ``load``.
-            width: width of the pictures, pixels.
-            height: height of the pictures, pixels.
+            width: width of the images, pixels.
+            height: height of the images, pixels.
             views: numbers of the views; None means all.
 
         Returns:
@@ -507,68 +507,68 @@ class ViewDataset:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Load RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the requested size."""
         path, stated = files.images[view], files.sizes[view]
-        found = self._pictures.get((path, size)) if self._pictures is not None else None
+        found = self._images.get((path, size)) if self._images is not None else None
         if found is None:
-            picture = _read_rgba8(path)
-            height, width = picture.shape[:2]
+            image = _read_rgba8(path)
+            height, width = image.shape[:2]
             if stated not in (None, (width, height)):
                 wanted = f"{stated[0]}x{stated[1]}"
                 raise UserError(f"{path}: is {width}x{height}, but its cameras are for {wanted}")
             if files.masks is not None:
-                picture = _masked(picture, files.masks[view])
+                image = _masked(image, files.masks[view])
             if size not in (None, height):
                 new = (max(1, round(width * size / height)), size)
                 check_size(*new, f"{path}: at height {size}")
                 # PIL premultiplies RGBA itself, and its box filter is the exact area average, so no
                 # background bleeds in.
                 kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
-                picture = np.asarray(Image.fromarray(picture).resize(new, kind))
-            found = picture, (width, height)
-            if self._pictures is not None:
-                self._pictures[path, size] = found
-        picture, original = found
+                image = np.asarray(Image.fromarray(image).resize(new, kind))
+            found = image, (width, height)
+            if self._images is not None:
+                self._images[path, size] = found
+        image, original = found
         from_size = (1.0, 1.0) if stated is None else original
-        factor = [picture.shape[1] / from_size[0], picture.shape[0] / from_size[1], 1.0]
-        return picture, files.Ks[view] * np.array(factor)[:, None]
+        factor = [image.shape[1] / from_size[0], image.shape[0] / from_size[1], 1.0]
+        return image, files.Ks[view] * np.array(factor)[:, None]
 
 
-def _read_rgba8(path: Path | DecodedPicture) -> np.ndarray:
-    return path.read() if isinstance(path, DecodedPicture) else load_rgba8(path)
+def _read_rgba8(path: Path | DecodedImage) -> np.ndarray:
+    return path.read() if isinstance(path, DecodedImage) else load_rgba8(path)
 
 
-def _masked(picture: np.ndarray, path: Path | DecodedPicture) -> np.ndarray:
-    """Multiply the alpha of RGBA ``[H, W, 4]`` uint8 with a grey picture of the same size.
+def _masked(image: np.ndarray, path: Path | DecodedImage) -> np.ndarray:
+    """Multiply the alpha of RGBA ``[H, W, 4]`` uint8 with a grey image of the same size.
 
     A mask of zeros and ones counts as black and white, as in nerfstudio.
     """
     mask = _read_rgba8(path)
-    if mask.shape != picture.shape:
-        got, wanted = (f"{x.shape[1]}x{x.shape[0]}" for x in (mask, picture))
-        raise UserError(f"{path}: the mask is {got}, its picture {wanted}")
+    if mask.shape != image.shape:
+        got, wanted = (f"{x.shape[1]}x{x.shape[0]}" for x in (mask, image))
+        raise UserError(f"{path}: the mask is {got}, its image {wanted}")
     if (mask[..., :2] != mask[..., 1:3]).any() or (mask[..., 3] != 255).any():
         raise UserError(f"{path}: a mask must be grey and opaque, white on the object")
     weight = mask[..., 0].astype(np.uint16)
     if weight.max() == 1:
         weight *= 255
-    alpha = (picture[..., 3] * weight + 127) // 255
-    return np.dstack([picture[..., :3], alpha.astype(np.uint8)])
+    alpha = (image[..., 3] * weight + 127) // 255
+    return np.dstack([image[..., :3], alpha.astype(np.uint8)])
 
 
 def background_note(dataset: ViewDataset) -> str | None:
-    """Warning if the pictures of a dataset have no transparent background, else None.
+    """Warning if the images of a dataset have no transparent background, else None.
 
     Checks the first view of up to eight objects, skipping unreadable ones.
     """
     checked = False
     for uid in evenly(dataset.uids, 8):
         with suppress(*EXPECTED):
-            pixels, _ = dataset.pictures(uid, [0])
+            pixels, _ = dataset.images(uid, [0])
             if (pixels[..., 3] < 255).any():
                 return None
             checked = True
     if not checked:
         return None
-    return "no picture has an alpha channel or a mask: the background counts as part of the object"
+    return "no image has an alpha channel or a mask: the background counts as part of the object"
 
 
 def camera_note(dataset: ViewDataset) -> str | None:
@@ -606,14 +606,14 @@ def _facing(camera_to_world: np.ndarray) -> float:
     return float((ahead >= 0.5 * np.linalg.norm(places, axis=-1)).sum() / max(1, len(places)))
 
 
-def _read_depth(path: Path | DecodedPicture, width: int, height: int) -> np.ndarray:
+def _read_depth(path: Path | DecodedImage, width: int, height: int) -> np.ndarray:
     """Read depth ``[height, width]`` float32 in steps of the file, by nearest samples."""
-    if isinstance(path, EncodedPicture):
+    if isinstance(path, EncodedImage):
         opened = path.open()
-    elif isinstance(path, DecodedPicture):
+    elif isinstance(path, DecodedImage):
         opened = nullcontext(Image.fromarray(path.read()))
     else:
-        opened = open_picture(path)
+        opened = open_image(path)
     with opened as image:
         if len(image.getbands()) != 1:
             raise UserError(f"{path}: has {len(image.getbands())} channels, depth has one")

@@ -1,4 +1,4 @@
-"""Evaluation ``gso``: its 60 Google Scanned Objects, poses and picture size.
+"""Evaluation ``gso``: its 60 Google Scanned Objects, poses and image size.
 
 The paper (§4.1) evaluates 60 objects of the set at 512² and does not name them. These 60 are
 another choice, fixed by name: ten of each of six groups, chosen for variety by their names only,

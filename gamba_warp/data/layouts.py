@@ -3,7 +3,7 @@
 - ``transforms``: ``<uid>/transforms.json`` of nerfstudio and Blender: ``w, h, fl_x, fl_y, cx, cy``
   (or ``camera_angle_x``), for all frames or for each, and ``frames`` of ``file_path`` and
   ``transform_matrix`` (camera to world, OpenGL). Without ``w`` and ``h`` the size is that of the
-  first picture. ``mask_path``, if every frame has one, is the object's alpha. ``gamba data render``
+  first image. ``mask_path``, if every frame has one, is the object's alpha. ``gamba data render``
   writes this layout.
 - ``nerf``: ``<uid>/transforms_train.json`` and optionally ``transforms_val.json`` and
   ``transforms_test.json`` of the same form: all their frames are views of one object.
@@ -32,17 +32,17 @@ from msgspec import Meta, Struct
 
 from ..errors import UserError
 from ..files import walk
-from ..images import PICTURE_SUFFIXES, load_rgba8, open_picture, picture_size
+from ..images import IMAGE_SUFFIXES, image_size, load_rgba8, open_image
 from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
 from ..untrusted.names import Within, inside
 
 GOBJAVERSE = "campos_512_v4"
-GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON states no x_fov
+GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the image, if the JSON states no x_fov
 MAX_VIEWS = 10_000  # of an object
 MAX_SIDE = 16_384  # pixels of a camera
 NEAREST, FARTHEST = 1e-3, 1e4  # camera's distance from the object's centre, in the file's units
-SHORTEST, LONGEST = 1e-2, 1e3  # focal lengths, in sides of the picture
+SHORTEST, LONGEST = 1e-2, 1e3  # focal lengths, in sides of the image
 _LAST_ROW = 0.0, 0.0, 0.0, 1.0  # of a pose
 _LARGEST = 1e9  # of any number in a camera file
 _MAX_TEXT = 500  # letters of a name or of an attribution
@@ -60,11 +60,11 @@ _PIXELS = "fl_x", "fl_y", "cx", "cy"
 _LENS = {*("w", "h", "camera_angle_x", "camera_angle_y"), *_PIXELS}
 _LENS |= {*_DISTORTIONS, *_MODELS}
 _FIT = 0.02  # tolerance for a simplified mesh, in sides of the cube
-PICTURES = (".webp", ".png", ".jpg", ".jpeg")
+IMAGES = (".webp", ".png", ".jpg", ".jpeg")
 
 
-class DecodedPicture:
-    """Picture in memory.
+class DecodedImage:
+    """Image in memory.
 
     Attributes:
         stem: empty, in place of a path's.
@@ -76,14 +76,14 @@ class DecodedPicture:
         """Return the pixels: RGBA ``[H, W, 4]`` uint8, or depth ``[H, W]`` float32 in steps.
 
         Raises:
-            UserError: the picture is damaged.
+            UserError: the image is damaged.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
-class EncodedPicture(DecodedPicture):
-    """Content of a picture's file, of a shard."""
+class EncodedImage(DecodedImage):
+    """Content of an image's file, of a shard."""
 
     name: str
     content: bytes
@@ -95,8 +95,8 @@ class EncodedPicture(DecodedPicture):
         return load_rgba8(self.name, self.content)
 
     def open(self):
-        """Open it as ``images.open_picture``."""
-        return open_picture(io.BytesIO(self.content), self.name)
+        """Open it as ``images.open_image``."""
+        return open_image(io.BytesIO(self.content), self.name)
 
 
 Sizes = list[tuple[int, int] | None]
@@ -137,26 +137,26 @@ class ObjectFiles:
     """Files and cameras of the views of one object.
 
     Attributes:
-        images: the V pictures: paths, or pictures in memory.
+        images: the V images: paths, or images in memory.
         camera_to_world: ``[V, 4, 4]`` float64, OpenGL frame, object units.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
-        sizes: width and height of each of the V pictures as stated by the file, or None.
-        masks: V grey pictures to multiply with the alpha of ``images``, or None.
-        depths: the V depth pictures, or None.
-        backs: V pictures of the last surface's depth, or None.
-        depth_unit: length of one step of the depth pictures, object units.
+        sizes: width and height of each of the V images as stated by the file, or None.
+        masks: V grey images to multiply with the alpha of ``images``, or None.
+        depths: the V depth images, or None.
+        backs: V images of the last surface's depth, or None.
+        depth_unit: length of one step of the depth images, object units.
         name: readable name.
         attribution: creator, licence, source; may be empty.
         placement: of the rendered mesh, or None if unknown.
     """
 
-    images: Sequence[Path | DecodedPicture]
+    images: Sequence[Path | DecodedImage]
     camera_to_world: np.ndarray
     Ks: np.ndarray
     sizes: Sequence[tuple[int, int] | None]
-    masks: Sequence[Path | DecodedPicture] | None = None
-    depths: Sequence[Path | DecodedPicture] | None = None
-    backs: Sequence[Path | DecodedPicture] | None = None
+    masks: Sequence[Path | DecodedImage] | None = None
+    depths: Sequence[Path | DecodedImage] | None = None
+    backs: Sequence[Path | DecodedImage] | None = None
     depth_unit: float = 1.0
     name: str = ""
     attribution: dict[str, str] = field(default_factory=dict)
@@ -212,9 +212,9 @@ def check_cameras(
                 (distances >= NEAREST) & (distances <= FARTHEST) | (not around_object)
             ),
             "focal lengths must be positive": positive,
-            "focal lengths of {focal[0]:g} and {focal[1]:g} sides of the picture, expected "
+            "focal lengths of {focal[0]:g} and {focal[1]:g} sides of the image, expected "
             "{short:g} to {long:g}": ((focal >= SHORTEST) & (focal <= LONGEST)).all(1),
-            "the principal point is far outside the picture": (
+            "the principal point is far outside the image": (
                 ((center >= -1) & (center <= 2)).all(1)
             ),
             "the pose's last row is not 0 0 0 1": _is_last_row(poses[:, 3]),
@@ -266,7 +266,7 @@ def _side(values: dict[str, Any], key: str, source: str) -> int:
 
 
 def _focal(angle: float, source: str) -> float:
-    """Focal length, in sides of the picture, of a field of view in radians."""
+    """Focal length, in sides of the image, of a field of view in radians."""
     if not 0 < angle < math.pi:
         raise UserError(f"{source}: a field of view of {angle:g} radians, expected 0 to pi")
     return 0.5 / math.tan(angle / 2)
@@ -283,14 +283,14 @@ def _check_lens(values: dict, source: str) -> None:
         if model is not None and str(model).lower() not in _PINHOLES:
             raise UserError(
                 f"{source}: {key} is {repr(model)[:40]}; only pinhole cameras are supported, "
-                "so the pictures must be undistorted first"
+                "so the images must be undistorted first"
             )
     for key in sorted(_DISTORTIONS & values.keys()):
         value = values[key]
         if any(value) if isinstance(value, list) else value:
             raise UserError(
                 f"{source}: {key} = {repr(value)[:40]}: lens distortion is not supported; "
-                "undistort the pictures first"
+                "undistort the images first"
             )
 
 
@@ -299,7 +299,7 @@ def _intrinsics(
 ) -> tuple[np.ndarray, tuple[int, int] | None]:
     """Read K and the size of one frame; ``size`` returns it if the frame does not state one.
 
-    Without a size K is in fractions of a square picture.
+    Without a size K is in fractions of a square image.
     """
     _check_lens(values, source)
     stated = None
@@ -328,7 +328,7 @@ def _intrinsics(
 
 
 def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
-    """Read the cameras of a file in the form of ``transforms.json``, ignoring its pictures.
+    """Read the cameras of a file in the form of ``transforms.json``, ignoring its images.
 
     Returns:
         ``camera_to_world [V, 4, 4]`` float64 (OpenGL), ``Ks [V, 3, 3]`` float64 and the V sizes,
@@ -379,11 +379,11 @@ def _cameras(
 _PATHS = ("file_path", "mask_path", "depth_file_path", "back_file_path")
 
 
-# From a name in a document, and the document's for errors, to the picture.
-Find = Callable[[Any, str], Path | DecodedPicture]
+# From a name in a document, and the document's for errors, to the image.
+Find = Callable[[Any, str], Path | DecodedImage]
 
 
-def _pictures(path: Path | str, frames: list[dict], find: Find) -> dict[str, list]:
+def _images(path: Path | str, frames: list[dict], find: Find) -> dict[str, list]:
     """Files named by the frames, by the name of the field."""
     files: dict[str, list] = {key: [] for key in _PATHS}
     for i, frame in enumerate(frames):
@@ -399,19 +399,19 @@ def _pictures(path: Path | str, frames: list[dict], find: Find) -> dict[str, lis
         repeated = next((p for p, n in Counter(paths).items() if n > 1), None)
         if repeated and key != "mask_path":  # frames may share a mask
             name = Path(str(repeated)).name
-            raise UserError(f"{path}: two frames name the picture {name}")
+            raise UserError(f"{path}: two frames name the image {name}")
     if 0 < len(files["mask_path"]) < len(frames):
         raise UserError(f"{path}: {len(files['mask_path'])} of {len(frames)} frames have a mask")
     return files
 
 
-def _with_suffix(picture: Path | DecodedPicture) -> Path | DecodedPicture:
+def _with_suffix(image: Path | DecodedImage) -> Path | DecodedImage:
     """Blender omits the suffix; a dot may then be part of the name."""
-    if not isinstance(picture, Path) or picture.suffix.lower() in PICTURE_SUFFIXES:
-        return picture
-    if os.path.lexists(picture):
-        return picture
-    found = [picture.with_name(picture.name + suffix) for suffix in PICTURES]
+    if not isinstance(image, Path) or image.suffix.lower() in IMAGE_SUFFIXES:
+        return image
+    if os.path.lexists(image):
+        return image
+    found = [image.with_name(image.name + suffix) for suffix in IMAGES]
     return next((p for p in found if p.exists()), found[1])
 
 
@@ -435,7 +435,7 @@ def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFil
     """Make an object of the frames of documents such as ``transforms.json``.
 
     Args:
-        documents: for each its name, its content, and its way from names to pictures. The common
+        documents: for each its name, its content, and its way from names to images. The common
             values are those of the first.
 
     Raises:
@@ -446,7 +446,7 @@ def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFil
     top: dict = {}
     for path, content, find in documents:
         common, frames = _frames(path, content)
-        top, found = top or common, _pictures(path, frames, find)
+        top, found = top or common, _images(path, frames, find)
         first = found["file_path"][0]
         parts.append(_cameras(path, common, frames, cache(partial(_size_of, first))))
         for key in _PATHS:
@@ -478,10 +478,10 @@ def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFil
     )
 
 
-def _size_of(picture: Path | DecodedPicture) -> tuple[int, int]:
-    if isinstance(picture, Path):
-        return picture_size(picture, turned=False)
-    height, width = picture.read().shape[:2]
+def _size_of(image: Path | DecodedImage) -> tuple[int, int]:
+    if isinstance(image, Path):
+        return image_size(image, turned=False)
+    height, width = image.read().shape[:2]
     return width, height
 
 
@@ -509,8 +509,8 @@ class _View(Struct):
     y_fov: float | None = None
 
 
-def _aspect(picture: Path) -> float:
-    width, height = picture_size(picture, turned=False)
+def _aspect(image: Path) -> float:
+    width, height = image_size(image, turned=False)
     return width / height
 
 
@@ -521,8 +521,8 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
     both = [[view / f"{view.name}{suffix}" for suffix in (".json", ".png")] for view in found]
     views = [view for view, files in zip(found, both) if all(map(os.path.lexists, files))]
     if not views:
-        raise UserError(f"{folder / GOBJAVERSE}: no views with both picture and camera")
-    aspect = 0.0  # of the first picture, opened only if needed
+        raise UserError(f"{folder / GOBJAVERSE}: no views with both image and camera")
+    aspect = 0.0  # of the first image, opened only if needed
     poses, Ks, names = [], [], [str(view / f"{view.name}.json") for view in views]
     for name in names:
         camera = read_document(name, _View)
@@ -530,7 +530,7 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
         pose[:3, 1:3] *= -1  # OpenCV to OpenGL
         poses.append(pose)
         if camera.x_fov is None or camera.y_fov is None:
-            # Pixels are square, the picture may not be.
+            # Pixels are square, the image may not be.
             aspect = aspect or _aspect(inside(views[0], f"{views[0].name}.png", name))
         if camera.x_fov is None:
             focal_x = GOBJAVERSE_FOCAL / aspect

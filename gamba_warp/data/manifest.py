@@ -1,7 +1,7 @@
 """Manifest of a dataset: its objects, checked once and listed in ``DATA/gamba-manifest.jsonl``.
 
 Opening a large dataset takes hundreds of system calls for each object: its folder, its camera file,
-and each picture. ``gamba data index`` makes them once; ``open_dataset`` then reads the manifest
+and each image. ``gamba data index`` makes them once; ``open_dataset`` then reads the manifest
 and compares at most three sizes and times of each object, and the list of each folder above them.
 
 The first line is a ``Head``, each further line an ``Entry``. Times are of this machine's copy:
@@ -63,7 +63,7 @@ class Entry(msgspec.Struct, array_like=True):
         uid: path of its folder under the root.
         digest: of its cameras, see ``ViewDataset.digest``; zeros if it cannot be read.
         reason: why it cannot be read, or empty.
-        marks: its camera files and the folders of its pictures, at most three.
+        marks: its camera files and the folders of its images, at most three.
     """
 
     uid: str

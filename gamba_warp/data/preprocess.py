@@ -1,6 +1,6 @@
-"""Steps from a picture to the model's input: masks, centring, compositing.
+"""Steps from an image to the model's input: masks, centring, compositing.
 
-``photo/cutout.py`` chooses the steps for a picture.
+``photo/cutout.py`` chooses the steps for an image.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from torch import Tensor
 
 from ..conventions import over_background
 from ..errors import UserError, first_line
-from ..images import load_rgba, picture_size, to_uint8
+from ..images import image_size, load_rgba, to_uint8
 from ..untrusted.torch_files import read_torch
 
 BORDER_RATIO = 0.2  # share of the square left free around the object's longer side
-WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model uses more
+WORKING_SIZE = 1024  # pixels; larger images are reduced first, since no model uses more
 
 SAM_FILES = (
     "published are sam_vit_b_01ec64.pth (375 MB; ViT-L and ViT-H are larger) at "
@@ -28,7 +28,7 @@ SAM_FILES = (
 )
 
 _TRANSPARENT = 0.5  # a pixel of lower alpha is outside of a cut-out object
-# Transparent shares of a picture's border or of the whole from which it is a cut-out: the rounded
+# Transparent shares of an image's border or of the whole from which it is a cut-out: the rounded
 # corners of a screenshot are less.
 _CUT_BORDER, _CUT_SHARE = 0.15, 0.05
 PRESENT = 0.05  # least alpha of a pixel within the object's bounds
@@ -38,7 +38,7 @@ _COLORED, _DARK = 0.1, 0.25
 
 
 def has_alpha(rgba: np.ndarray, any_share: bool = False) -> bool:
-    """True if the object of a picture ``[H, W, 4]`` is cut out.
+    """True if the object of an image ``[H, W, 4]`` is cut out.
 
     A real share of its border or of the whole is transparent; or, with ``any_share``, a pixel.
     """
@@ -49,15 +49,15 @@ def has_alpha(rgba: np.ndarray, any_share: bool = False) -> bool:
 
 
 def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
-    """Read alpha ``[H, W]`` in [0, 1] from a mask file, reduced like the picture in ``load_rgba``.
+    """Read alpha ``[H, W]`` in [0, 1] from a mask file, reduced like the image in ``load_rgba``.
 
     The object is brighter than the rest, by whatever two values, or it is the mask's own alpha.
 
     Raises:
-        UserError: the mask, or the picture's size, cannot be read, they differ in size, or the mask
+        UserError: the mask, or the image's size, cannot be read, they differ in size, or the mask
             has several labels.
     """
-    sizes = [picture_size(file) for file in (mask, path)]
+    sizes = [image_size(file) for file in (mask, path)]
     if sizes[0] != sizes[1]:
         stated = [f"{width}x{height}" for width, height in sizes]
         raise UserError(f"{mask}: the mask is {stated[0]} but {path} is {stated[1]}")
@@ -92,10 +92,10 @@ def recenter(rgba: np.ndarray, border_ratio: float | None = BORDER_RATIO) -> np.
     Args:
         rgba: ``[H, W, 4]`` in [0, 1].
         border_ratio: share of the square's side that the box's longer side leaves free, [0, 1);
-            None uses the whole picture instead of the box.
+            None uses the whole image instead of the box.
 
     Returns:
-        ``[S, S, 4]`` float32; S = longer side / (1 - border_ratio), or the picture's longer side.
+        ``[S, S, 4]`` float32; S = longer side / (1 - border_ratio), or the image's longer side.
 
     Raises:
         ValueError: hardly any pixel is opaque.
@@ -145,8 +145,8 @@ def composite(rgba: np.ndarray, size: int, background: float = 1.0) -> Tensor:
     return torch.from_numpy(_resize(flat, size, size)).clamp(0, 1)
 
 
-def _resize(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    planes = torch.from_numpy(np.ascontiguousarray(picture, np.float32)).permute(2, 0, 1)[None]
+def _resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    planes = torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]
     out = torch.nn.functional.interpolate(
         planes, (height, width), mode="bilinear", align_corners=False, antialias=True
     )
@@ -156,7 +156,7 @@ def _resize(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 class SamSegmenter:
     """Segment Anything through kornia, with weights from a file.
 
-    The object is assumed in the middle: the prompt is a box without a tenth of the picture on each
+    The object is assumed in the middle: the prompt is a box without a tenth of the image on each
     side.
 
     Args:

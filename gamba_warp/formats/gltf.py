@@ -33,20 +33,20 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _OTHERS = {0: "points", 1: "lines", 2: "a line loop", 3: "a line strip"}
 _REPEAT = 10497
 _FREE_PRIMITIVES, _PRIMITIVE = 1000, 500  # in any file; bytes of each further one and its accessors
-_GLOSSY = 4 << 20  # largest picture of an older material in memory, bytes
+_GLOSSY = 4 << 20  # largest image of an older material in memory, bytes
 _EACH = 3  # numbers that a vertex or a face of the scene counts as
 _Weights = tuple[float, ...]
 _SomeWeights = Annotated[_Weights, msgspec.Meta(min_length=1)]
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 _GLOSS = "KHR_materials_pbrSpecularGlossiness"
-_PICTURES = ("EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds")
+_IMAGES = ("EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds")
 # Extensions that are read, change neither shape nor colours, or are warned of where they are used.
 _KNOWN = {
     *("EXT_lights_image_based", "EXT_texture_webp", "FB_ngon_encoding", "KHR_lights_punctual"),
     *("KHR_animation_pointer", "KHR_materials_emissive_strength", "KHR_materials_ior"),
     *(_GLOSS, INSTANCING, "KHR_materials_unlit", "KHR_materials_variants"),
     *("KHR_mesh_quantization", "KHR_texture_transform", "KHR_xmp", "KHR_xmp_json_ld"),
-    *(*_PICTURES, *PACKED),
+    *(*_IMAGES, *PACKED),
 }
 
 
@@ -102,7 +102,7 @@ class _Reader:
     def __init__(self, file: GltfFile, sides: SideFiles) -> None:
         self.file, self.sides, self.warn = file, sides, sides.warnings.append
         self._looks: dict[int, tuple[Material, Entry]] = {}
-        self._pictures: dict[int, np.ndarray | None] = {}
+        self._images: dict[int, np.ndarray | None] = {}
 
     def triangles(
         self, primitive: Entry, weights: _Weights
@@ -219,7 +219,7 @@ class _Reader:
             else:
                 color[3], alpha = 1.0, np.where(shown, 255, 0).astype(np.uint8)
                 if (alpha != texture[..., 3]).any():
-                    kept = self.sides.claim(texture.nbytes, "a picture without its transparency")
+                    kept = self.sides.claim(texture.nbytes, "an image without its transparency")
                     texture = np.dstack([texture[..., :3], alpha]) if kept else None
         return Material(plain(color), texture), info
 
@@ -228,16 +228,16 @@ class _Reader:
         from trimesh.visual.gloss import specular_to_pbr
 
         names = ("diffuseTexture", "specularGlossinessTexture")
-        pictures = [(name, self.texture(gloss.entry(name))) for name in names]
-        # Some .7 s for two pictures of 1,024 pixels: they are made smaller, and count more.
-        size = sum(min(x.nbytes, _GLOSSY) for _, x in pictures if x is not None)
-        if not self.sides.claim(6 * size, "glossy pictures"):
-            pictures = [(name, None) for name in names]
+        images = [(name, self.texture(gloss.entry(name))) for name in names]
+        # Some .7 s for two images of 1,024 pixels: they are made smaller, and count more.
+        size = sum(min(x.nbytes, _GLOSSY) for _, x in images if x is not None)
+        if not self.sides.claim(6 * size, "glossy images"):
+            images = [(name, None) for name in names]
         found = specular_to_pbr(
             diffuseFactor=gloss.vector("diffuseFactor", _WHITE),
             specularFactor=gloss.vector("specularFactor", _WHITE[:3]),
             glossinessFactor=gloss.get("glossinessFactor", float, 1.0),
-            **{name: x if x is None else _smaller(x) for name, x in pictures},
+            **{name: x if x is None else _smaller(x) for name, x in images},
         )
         texture = found.get("baseColorTexture")
         texture = None if texture is None else np.array(texture.convert("RGBA"))
@@ -245,7 +245,7 @@ class _Reader:
         return np.array(found.get("baseColorFactor", _WHITE)), texture, info
 
     def texture(self, info: Entry) -> np.ndarray | None:
-        """Return the picture of a texture; None, and a warning, if it cannot be read."""
+        """Return the image of a texture; None, and a warning, if it cannot be read."""
         if not info.values:
             return None
         try:
@@ -253,22 +253,22 @@ class _Reader:
             webp = texture.entry("extensions").entry("EXT_texture_webp")
             source = webp.get("source", Index, texture.get("source", Index))
             if source is None:
-                names = ", ".join(x for x in self.file.extensions if x in _PICTURES) or "nothing"
-                raise UserError(f"a texture's picture is named by {names}, which is not supported")
-            if source not in self._pictures:
-                self._pictures[source] = None
-                self._pictures[source] = self.picture(source)
-            return self._pictures[source]
+                names = ", ".join(x for x in self.file.extensions if x in _IMAGES) or "nothing"
+                raise UserError(f"a texture's image is named by {names}, which is not supported")
+            if source not in self._images:
+                self._images[source] = None
+                self._images[source] = self.image(source)
+            return self._images[source]
         except UserError as error:
             self.warn(str(error))
             return None
 
-    def picture(self, source: int) -> np.ndarray | None:
+    def image(self, source: int) -> np.ndarray | None:
         """Return an image as ``SideFiles.texture`` does."""
-        image, name = self.file.item("images", source), f"image {source}"
-        if (view := image.get("bufferView", Index)) is not None:
+        entry, name = self.file.item("images", source), f"image {source}"
+        if (view := entry.get("bufferView", Index)) is not None:
             return self.sides.texture(self.file.view(view), name)
-        uri = image.get("uri", str, "")
+        uri = entry.get("uri", str, "")
         name = name if uri.startswith("data:") else unquote(uri[:100])
         return self.sides.texture(self.file.content(uri), name)
 
@@ -307,7 +307,7 @@ class _Reader:
 
 
 def _smaller(texture: np.ndarray) -> Image.Image:
-    """Return a picture of at most ``_GLOSSY`` bytes."""
+    """Return an image of at most ``_GLOSSY`` bytes."""
     image = Image.fromarray(texture)
     while 4 * image.width * image.height > _GLOSSY:
         image = image.reduce(2)

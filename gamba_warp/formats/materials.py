@@ -1,6 +1,6 @@
 """Materials and textures of meshes, read only from the mesh's own folder.
 
-The files are plain, of bounded size, and pictures of a known format. Missing or unreadable ones are
+The files are plain, of bounded size, and images of a known format. Missing or unreadable ones are
 replaced and named; they never stop the mesh.
 """
 
@@ -18,7 +18,7 @@ from PIL import Image
 
 from ..color_spaces import to_linear
 from ..errors import UserError
-from ..images import FORMATS, open_picture, to_rgba
+from ..images import FORMATS, open_image, to_rgba
 from ..untrusted.documents import read_bytes
 from ..untrusted.names import inside
 
@@ -26,7 +26,7 @@ GREY = 0.6  # display value of a surface whose colour is not known
 MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
 MAX_SIDE_FILE = 256 << 20  # bytes of a file in the mesh's folder
 MAX_SIDE_FILES = 1 << 30  # bytes of all of them, and of all textures in memory
-# Bytes to which the pictures of a mesh may be decoded: a plain one has few bytes in its file.
+# Bytes to which the images of a mesh may be decoded: a plain one has few bytes in its file.
 FREE_PIXELS, PIXELS_PER_BYTE = 192 << 20, 64
 _UNSEEN = 8  # of 255: the alpha channel of a texture without a larger alpha is ignored
 # Options of MTL stand before the name: "-s 1 1 1 -clamp on wood.jpg".
@@ -63,7 +63,7 @@ class SideFiles:
     omitted: list[str] = field(default_factory=list)  # the warnings that concern the shape
     left: int = MAX_SIDE_FILES  # bytes that side files may still have
     texels: int = MAX_SIDE_FILES  # bytes that textures may still take
-    pixels: int = FREE_PIXELS  # bytes to which pictures may still be decoded
+    pixels: int = FREE_PIXELS  # bytes to which images may still be decoded
     root: Path | None = None  # the folder in which files are read; None: the mesh's own
 
     def omit(self, what: str) -> None:
@@ -91,8 +91,8 @@ class SideFiles:
             self.warnings.append(f"{name}: too many pixels for the size of its file, left out")
         return self.pixels >= 0
 
-    def picture(self, name: str, profiled: bool = True) -> np.ndarray | None:
-        """Return the picture that an MTL file names, as ``texture`` does."""
+    def image(self, name: str, profiled: bool = True) -> np.ndarray | None:
+        """Return the image that an MTL file names, as ``texture`` does."""
         shown = _shown(name)
         for option, numbers in _MOVING.findall(name[:2000]):
             if not re.fullmatch(_AS_IT_IS[option], numbers):
@@ -106,7 +106,7 @@ class SideFiles:
     def texture(
         self, data: bytes | memoryview, name: str, profiled: bool = False
     ) -> np.ndarray | None:
-        """Decode a picture to ``[h, w, 4]`` uint8 RGBA; None, and a warning, if that fails.
+        """Decode an image to ``[h, w, 4]`` uint8 RGBA; None, and a warning, if that fails.
 
         Colour profiles are used if ``profiled``; glTF 2.0 ignores them (3.8.3, images).
         """
@@ -114,7 +114,7 @@ class SideFiles:
         try:
             # The content of TARGA files does not tell their kind.
             formats = ("TGA",) if name.lower().endswith(".tga") else FORMATS
-            with open_picture(io.BytesIO(data), name, formats=formats) as image:
+            with open_image(io.BytesIO(data), name, formats=formats) as image:
                 if not self.claim(4 * image.width * image.height, name):
                     return None
                 pixels = to_rgba(image, name, profiled=profiled, warn=self.warnings.append)

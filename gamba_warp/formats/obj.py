@@ -275,17 +275,17 @@ def _material(options: dict[str, str], name: str, sides: SideFiles) -> Material:
     if color is not None and color_range(color) > 1:
         sides.warnings.append(f"the colour of {name[:60]} goes to 255")
         color = color / 255
-    picture = options.get("map_kd", options.get("map_ka"))
+    file = options.get("map_kd", options.get("map_ka"))
     if light is not None and light.any():
-        if color is not None and not color.any() and picture is None:
+        if color is not None and not color.any() and file is None:
             sides.warnings.append("emission of a surface is drawn as its base colour, shaded")
-            color, picture = light, options.get("map_ke")
+            color, image = light, options.get("map_ke")
         else:
             sides.warnings.append("emission of a surface with a base colour is not drawn")
-    texture = sides.picture(picture) if picture else None
+    texture = sides.image(file) if file else None
     if texture is not None:
         color = np.ones(3)
-        mask = sides.picture(options["map_d"], profiled=False) if "map_d" in options else None
+        mask = sides.image(options["map_d"], profiled=False) if "map_d" in options else None
         if mask is not None:  # its alpha, or its grey
             image = Image.fromarray(mask)
             alpha = image.getchannel("A") if mask[..., 3].min() < 255 else image.convert("L")

@@ -58,7 +58,7 @@ def ply_parts(data: PlyData, sides: SideFiles) -> Iterator[Part]:
     material = None
     files = [m[1].strip() for m in map(_TEXTURE.match, data.header.comments) if m]
     if files:
-        texture = sides.picture(files[0])
+        texture = sides.image(files[0])
         if len({*files}) > 1:
             sides.warnings.append(f"one of {len({*files})} textures is read")
         if texture is not None:

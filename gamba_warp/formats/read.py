@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import UserError
 from ..files import warn_of_others
 from ..gaussians import Gaussians
-from ..images import PICTURE_SUFFIXES
+from ..images import IMAGE_SUFFIXES
 from .clouds import Cloud, cloud_of, read_xyz
 from .gaussians.glb import gltf_gaussians, has_gaussians
 from .gaussians.splat import read_splat
@@ -130,7 +130,7 @@ def rotation_between(axes: str, others: str) -> np.ndarray:
 
 def _advice(suffix: str) -> str:
     """Return what to do with a file that is no shape."""
-    if suffix in PICTURE_SUFFIXES:
+    if suffix in IMAGE_SUFFIXES:
         return "an image; gamba reconstruct makes Gaussians of it"
     if suffix in _CONVERTED:
         tool = "SuperSplat (superspl.at/editor) and splat-transform convert it to .ply"

@@ -1,4 +1,4 @@
-"""Benchmark of whole models: a picture to Gaussians, and the blocks against float64."""
+"""Benchmark of whole models: an image to Gaussians, and the blocks against float64."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ TOKENS = 128  # number of first tokens compared with the oracle
 def tables(settings: Settings) -> list[Table]:
     """Return the tables of models."""
     builders = {"backbone": backbone, "mixers": mixers}
-    builders |= {"one picture": pictures, "skipping": skipping}
+    builders |= {"one image": images, "skipping": skipping}
     made = [Table("model", name, build) for name, build in builders.items()]
     graphs = [Table("model", "CUDA graph", cuda_graphs)]
     return made + graphs * (settings.device.type == "cuda")
@@ -143,7 +143,7 @@ def _reference_block(block: GambaBlock, tokens: Tensor, camera: Tensor, image: T
 
 
 def backbone(settings: Settings) -> list[Variant]:
-    """One block and all blocks of the paper's size on one picture's tokens. Prefix states off:
+    """One block and all blocks of the paper's size on one image's tokens. Prefix states off:
     condition prepended and dropped in each block, as the paper has it.
     """
     made = []
@@ -227,7 +227,7 @@ def captured(
 
 
 class Inference:
-    """A model with a posed picture on its device, run eagerly or by a CUDA graph."""
+    """A model with a posed image on its device, run eagerly or by a CUDA graph."""
 
     def __init__(self, model: Gamba, device: torch.device) -> None:
         self.model, self.device = model.to(device).eval(), device
@@ -261,8 +261,8 @@ class Inference:
         return compare(got.tensors(), self.eager(truth).tensors())
 
 
-def pictures(settings: Settings) -> list[Variant]:
-    """A posed picture to Gaussians by preset, without the image encoder. The models are whole and
+def images(settings: Settings) -> list[Variant]:
+    """A posed image to Gaussians by preset, without the image encoder. The models are whole and
     have fresh weights; two runs must give the same bits.
     """
     made = []
@@ -277,14 +277,14 @@ def pictures(settings: Settings) -> list[Variant]:
 
 
 def skipping(settings: Settings) -> list[Variant]:
-    """Work left out in one view of the Gaussians that the shipped model predicts from a picture:
+    """Work left out in one view of the Gaussians that the shipped model predicts from an image:
     each switch of ``Skip`` off alone, and all off.
     """
     from ..model.checkpoint import load_model  # which need more packages than the other tables
     from ..model.predict import reconstruct
 
-    picture = STARTER / "icons" / "blendswap-cc-0-teddybear.png"
-    predicted = reconstruct(load_model(), picture).map(torch.clone)  # no tensors of inference
+    image = STARTER / "icons" / "blendswap-cc-0-teddybear.png"
+    predicted = reconstruct(load_model(), image).map(torch.clone)  # no tensors of inference
     gaussians = {name: getattr(predicted, name) for name in LEAVES}
     size = 256 if settings.level == "quick" else 512
     scene = raster_case(gaussians, orbit_cameras(1, size), size, settings.device)
@@ -292,7 +292,7 @@ def skipping(settings: Settings) -> list[Variant]:
 
 
 def cuda_graphs(settings: Settings) -> list[Variant]:
-    """The paper's model, with its untrained encoder if timm is installed: a posed picture to
+    """The paper's model, with its untrained encoder if timm is installed: a posed image to
     Gaussians launch by launch, and by a CUDA graph.
     """
     torch.manual_seed(0)

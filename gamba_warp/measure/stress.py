@@ -1,4 +1,4 @@
-"""Random and hostile cases of the model: a picture to Gaussians against float64."""
+"""Random and hostile cases of the model: an image to Gaussians against float64."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class GambaConfig:
     """Architecture of a Gamba network: everything but the weights.
 
     Attributes:
-        image_size: side H = W of the input picture, pixels; a multiple of ``patch_size``.
+        image_size: side H = W of the input image, pixels; a multiple of ``patch_size``.
         patch_size: side p of the patches that become 3DGS tokens, pixels; the number of Gaussians
             is L = 4·(H/p)² (paper §3.2), in general ``num_orders``·(H/p)².
         width: channels D of a token.
@@ -78,7 +78,7 @@ class GambaConfig:
         encoder_size: side of the encoder's input, pixels.
         encoder_resize: resizing to that size: "bicubic", antialiased, or "bilinear" between the
             four nearest pixels.
-        encoder_normalize: normalise pictures to the mean and deviation of the ViT's training.
+        encoder_normalize: normalise images to the mean and deviation of the ViT's training.
         encoder_class_token: keep a ViT's class token (register tokens are always dropped).
         encoder_frozen: do not train the encoder, and leave it out of checkpoints.
         decoder_width: channels of the decoder's shared MLP; 0 means ``width``.
@@ -109,7 +109,7 @@ class GambaConfig:
             "opaque" like its cell. Needs two layers.
         distance: distance of the reference camera from the object's centre, object units.
         fov: vertical field of view of the reference camera, degrees.
-        background: background colour of the input picture.
+        background: background colour of the input image.
     """
 
     image_size: Annotated[int, Meta(ge=1, le=4096)] = 512
@@ -225,19 +225,19 @@ class GambaConfig:
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians: L, or with "rays" the number for a picture without background."""
+        """Number of Gaussians: L, or with "rays" the number for an image without background."""
         if self.decoder == "rays":
             return self.ray_layers * (self.grid_size * self.ray_cells) ** 2
         return self.num_tokens
 
     @property
     def input_channels(self) -> int:
-        """Channels of the pictures that the network takes: RGB, or with "rays" RGBA."""
+        """Channels of the images that the network takes: RGB, or with "rays" RGBA."""
         return 4 if self.decoder == "rays" else 3
 
     @property
     def pixel_channels(self) -> int:
-        """Channels of a pixel in a 3DGS token: the picture's, and its Plücker ray."""
+        """Channels of a pixel in a 3DGS token: the image's, and its Plücker ray."""
         return self.input_channels + 6
 
     @property

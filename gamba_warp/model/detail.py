@@ -1,13 +1,13 @@
-"""Splitting of the front Gaussians of ``rays`` to the resolution of the input picture.
+"""Splitting of the front Gaussians of ``rays`` to the resolution of the input image.
 
-The network sees the picture at ``image_size``; a photograph has more pixels. After the network,
+The network sees the image at ``image_size``; a photograph has more pixels. After the network,
 each front cell may therefore split into k x k children, each on the ray of its own small pixel:
 
 - Depth, the network's contribution to the logit of the opacity, and the parent's offset from its
   ray are interpolated between the cells, weighted by alpha. The opacity is over a half where alpha
   is 1: a network uncertain of the depth makes a faint front, through which the colours of the
   layers behind it, without detail, would show.
-- Colour and alpha are taken from the picture at k times the resolution of the cells.
+- Colour and alpha are taken from the image at k times the resolution of the cells.
 - Sizes are the parent's, across the view 1/k of them, but large enough that neighbours overlap: at
   ``image_size`` a rasterizer's own widening covers the gaps between small Gaussians, at k times
   that size it does not. Sizes along the view stay, so that no crack opens from the side.
@@ -17,9 +17,9 @@ each front cell may therefore split into k x k children, each on the ray of its 
 
 Plain cells do not split. Cells that contain or touch background split in 2 x 2 at most: a
 rasterizer widens every Gaussian by a part of its own pixel, so more of them along a silhouette
-make it wider in pictures smaller than the intended one. For the same reason two rounds of
+make it wider in images smaller than the intended one. For the same reason two rounds of
 correction take colours at k times the cells, but opacities from the errors of two smaller
-pictures, of twice as many pixels as cells and of as many.
+images, of twice as many pixels as cells and of as many.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ OFFSET_SHARE = {2: 0.5, 4: 0.125}
 MIN_OPACITY = 0.5  # logit; least opacity of a child where alpha is 1
 ROUNDS = 2  # of correction
 OPACITY_GAIN = 8.0  # added to the logit of an opacity per missing unit of alpha
-SMALL_SHARE = 0.2  # of that, for the smaller picture: a large one loses what a small one gains
+SMALL_SHARE = 0.2  # of that, for the smaller image: a large one loses what a small one gains
 FAINT = 0.05  # alpha of a rendered pixel below which its colour is unreliable
 
 
@@ -60,9 +60,9 @@ def checked_detail(detail: Detail | None, config: GambaConfig, side: int) -> Det
     """Return the number of children a side of a cell.
 
     Args:
-        detail: the requested number; None takes the largest that the picture's pixels allow.
+        detail: the requested number; None takes the largest that the image's pixels allow.
         config: of the model.
-        side: side of the square input picture, pixels.
+        side: side of the square input image, pixels.
 
     Raises:
         UserError: detail is not such a number, or more than 1 for a decoder other than ``rays``.
@@ -82,14 +82,14 @@ def checked_detail(detail: Detail | None, config: GambaConfig, side: int) -> Det
 
 
 def fill_gaps(gaussians: Gaussians, config: GambaConfig, camera: Cameras) -> Gaussians:
-    """Enlarge small Gaussians across the view, so that larger pictures have no gaps between them.
+    """Enlarge small Gaussians across the view, so that larger images have no gaps between them.
 
     At ``image_size`` a rasterizer's own widening covers the gaps.
 
     Args:
         gaussians: ``[N]``, result of a model with the decoder ``rays``.
         config: of the model.
-        camera: ``[1]``, camera of the picture in the model's world, see ``posing``.
+        camera: ``[1]``, camera of the image in the model's world, see ``posing``.
     """
     side = _cells(config)
     least = WHOLE_MIN_SIZE * camera.viewmats[0, 2, 3] / camera.resized(side, side).Ks[0, 1, 1]
@@ -106,16 +106,16 @@ def split_front(
     detail: Detail,
     camera: Cameras,
 ) -> Gaussians:
-    """Split the front of a reconstruction where the picture shows more than one colour a cell.
+    """Split the front of a reconstruction where the image shows more than one colour a cell.
 
     Args:
-        gaussians: ``[N]``, result of a model with the decoder ``rays`` for one picture.
+        gaussians: ``[N]``, result of a model with the decoder ``rays`` for one image.
         image: ``[H, W, 4]`` in [0, 1], straight alpha: the input of the model, on the device of
             ``gaussians``.
-        rgba: ``[S, S, 4]`` in [0, 1], straight alpha: the same picture at its own size.
+        rgba: ``[S, S, 4]`` in [0, 1], straight alpha: the same image at its own size.
         config: of the model.
         detail: largest number of children a side of a cell.
-        camera: ``[1]``, camera of the picture in the model's world, see ``posing``.
+        camera: ``[1]``, camera of the image in the model's world, see ``posing``.
 
     Returns:
         Gaussians of the same frame: those that did not split, then at most ``MAX_CHILDREN``
@@ -129,10 +129,10 @@ def split_front(
     camera = camera.to(device)
     whole = fill_gaps(gaussians, config, camera)
     step = config.image_size // side
-    picture = premultiplied(large[None])
+    shown = premultiplied(large[None])
     alpha = F.avg_pool2d(image[None, None, ..., 3], step)
     cells = alpha.flatten().nonzero()[:, 0]  # of each front Gaussian
-    counts = _children_a_side(picture, alpha, detail).flatten()
+    counts = _children_a_side(shown, alpha, detail).flatten()
     splits = counts[cells] > 1
     if not splits.any():
         return whole
@@ -142,33 +142,33 @@ def split_front(
     parent[cells] = torch.arange(len(cells), device=device)
     fields = _fields(front, cells, alpha, camera)
     made = [
-        _children(front, parent, fields, counts == count, count, picture, camera)
+        _children(front, parent, fields, counts == count, count, shown, camera)
         for count in sorted({2, detail})
     ]
     children, pixels = _concatenate([one for one, _ in made]), torch.cat([at for _, at in made])
     stays = ~is_front
     stays[is_front] = ~splits
-    return _correct(whole.select(stays), children, pixels, picture, camera, detail)
+    return _correct(whole.select(stays), children, pixels, shown, camera, detail)
 
 
 def _cells(config: GambaConfig) -> int:
-    """Number of cells a side of the picture."""
+    """Number of cells a side of the image."""
     return config.grid_size * config.ray_cells
 
 
-def _children_a_side(picture: Tensor, alpha: Tensor, detail: int) -> Tensor:
+def _children_a_side(image: Tensor, alpha: Tensor, detail: int) -> Tensor:
     """Children a side of each cell, 1, 2 or ``detail``: ``[cells, cells]``.
 
     If there would be more than ``MAX_CHILDREN`` children, the cells with the least contrast split
     in 2 x 2.
 
     Args:
-        picture: ``[1, 4, H, W]``, see ``premultiplied``.
+        image: ``[1, 4, H, W]``, see ``premultiplied``.
         alpha: ``[1, 1, cells, cells]``.
         detail: largest number.
     """
     # Include the neighbouring cells: an unsplit parent would blur an edge between cells.
-    both = F.max_pool2d(torch.cat([picture, -picture], 1), detail)
+    both = F.max_pool2d(torch.cat([image, -image], 1), detail)
     most, least = F.max_pool2d(both, 3, stride=1, padding=1).chunk(2, 1)
     contrast = (most + least).amax(1)[0]
     splits = (contrast > PLAIN) & (alpha[0, 0] > 0)
@@ -210,7 +210,7 @@ def _children(
     fields: Tensor,
     mask: Tensor,
     count: int,
-    picture: Tensor,
+    image: Tensor,
     camera: Cameras,
 ) -> tuple[Gaussians, Tensor]:
     """Make the ``count`` x ``count`` children of the cells of a mask.
@@ -221,8 +221,8 @@ def _children(
         fields: ``[1, 5, cells, cells]``, see ``_fields``.
         mask: ``[cells²]`` bool, the cells to split.
         count: children a side of a cell.
-        picture: ``[1, 4, H, W]``, see ``premultiplied``.
-        camera: of the picture.
+        image: ``[1, 4, H, W]``, see ``premultiplied``.
+        camera: of the image.
 
     Returns:
         The children opaque enough to be drawn, and their pixels ``[.., 2]`` int64, row and column.
@@ -232,9 +232,9 @@ def _children(
     row, column = grid.nonzero(as_tuple=True)
     fine = F.interpolate(fields, (size, size), mode="bilinear")[0][:, row, column].T
     depth, opacity, off = (fine[:, :4] / fine[:, 4:]).split([1, 1, 2], -1)
-    rgba = F.avg_pool2d(picture, picture.shape[-1] // size)[0][:, row, column].T
+    rgba = F.avg_pool2d(image, image.shape[-1] // size)[0][:, row, column].T
     index = parent[row // count * side + column // count]
-    detail, K = picture.shape[-1] // side, camera.resized(size, size).Ks[0]
+    detail, K = image.shape[-1] // side, camera.resized(size, size).Ks[0]
     across = depth * _across(row, column, K) + OFFSET_SHARE[detail] * off
     points = torch.cat([across, depth], -1)
     quats = None if front.quats is None else front.quats[index]
@@ -247,7 +247,7 @@ def _children(
         opacities=torch.sigmoid(opacity + EMPTY * (rgba[:, 3:] - 1))[:, 0],
         colors=(rgba[:, :3] / rgba[:, 3:].clamp_min(1e-3)).clamp(0, 1),
     )
-    step = picture.shape[-1] // size
+    step = image.shape[-1] // size
     pixels = torch.stack([row, column], -1) * step + step // 2
     drawn = ~(children.opacities < ALPHA_MIN)
     return children.select(drawn), pixels[drawn]
@@ -279,7 +279,7 @@ def _correct(
     others: Gaussians,
     children: Gaussians,
     pixels: Tensor,
-    picture: Tensor,
+    image: Tensor,
     camera: Cameras,
     detail: int,
 ) -> Gaussians:
@@ -290,11 +290,11 @@ def _correct(
     Args:
         others: the Gaussians that did not split.
         children: ``[M]``.
-        pixels: ``[M, 2]``, row and column in the picture.
-        picture: ``[1, 4, H, W]``, see ``premultiplied``.
-        camera: of the picture.
+        pixels: ``[M, 2]``, row and column in the image.
+        image: ``[1, 4, H, W]``, see ``premultiplied``.
+        camera: of the image.
     """
-    size, want = picture.shape[-1], picture[0].permute(1, 2, 0)
+    size, want = image.shape[-1], image[0].permute(1, 2, 0)
     row, column = pixels.unbind(-1)
     for _ in range(ROUNDS):
         both = _concatenate([others, children])
@@ -303,7 +303,7 @@ def _correct(
         logits = torch.logit(children.opacities, 1e-4)
         for step, share in ((detail // 2, 1 - SMALL_SHARE), (detail, SMALL_SHARE)):
             found = render(both, camera.resized(size // step, size // step)).alpha[0, ..., 0]
-            missing = F.avg_pool2d(picture[:, 3:], step)[0, 0] - found
+            missing = F.avg_pool2d(image[:, 3:], step)[0, 0] - found
             logits = logits + share * OPACITY_GAIN * missing[row // step, column // step]
         children = replace(
             children,

@@ -24,7 +24,7 @@ MAX_PARAMETERS = 4 * 10**9  # 16 GB, far above any network of ``timm``
 
 
 class ImageEncoder(nn.Module):
-    """Network from pictures to tokens, at one picture size; made by ``build_encoder``.
+    """Network from images to tokens, at one image size; made by ``build_encoder``.
 
     A frozen encoder stays in eval mode and records no graph.
 
@@ -114,7 +114,7 @@ def _vgg16(config: GambaConfig, weights: Weights | None) -> tuple[nn.Module, int
     return network, network.dim
 
 
-# Encoders that are not ViTs of timm, by name: functions that return a network from pictures
+# Encoders that are not ViTs of timm, by name: functions that return a network from images
 # ``[B, S, S, 3]`` in [0, 1], S = ``config.encoder_size``, to tokens ``[B, K, C]``, and C. A script
 # may add to it (docs/train-your-own.md).
 ENCODERS: dict[str, Callable[[GambaConfig, Weights | None], tuple[nn.Module, int]]] = {
@@ -212,7 +212,7 @@ def _create_vit(config: GambaConfig, pretrained: bool) -> VisionTransformer:
 
 
 def _load_vit(vit: VisionTransformer, state: dict[str, Any], path: str) -> None:
-    """Load timm's or Meta's weights; timm resizes the positions if the picture size differs."""
+    """Load timm's or Meta's weights; timm resizes the positions if the image size differs."""
     from timm.models.vision_transformer import checkpoint_filter_fn
 
     if "register_tokens" in state:

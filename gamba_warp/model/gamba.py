@@ -39,7 +39,7 @@ def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) 
 
 
 class Gamba(nn.Module):
-    """Network from one posed picture to Gaussians (paper §3.2, GambaFormer and decoder).
+    """Network from one posed image to Gaussians (paper §3.2, GambaFormer and decoder).
 
     Attributes:
         recompute: keep only each block's input for the gradient, and recompute the block in the
@@ -91,7 +91,7 @@ class Gamba(nn.Module):
                 vars(parameter)["_no_weight_decay"] = True
 
     def condition(self, images: Tensor, cameras: Cameras) -> list[Any]:
-        """Compute the state of each block after picture and camera (``prefix_states``).
+        """Compute the state of each block after image and camera (``prefix_states``).
 
         It is the whole contribution of the prefix; with the decoder ``triplane`` the states of the
         planes' blocks follow. Arguments and errors as in ``forward``.
@@ -114,28 +114,28 @@ class Gamba(nn.Module):
         background_margin: int | None = None,
         foreground: Foreground | None = None,
     ) -> Gaussians:
-        """Predict the Gaussians of each picture's object.
+        """Predict the Gaussians of each image's object.
 
         Args:
             images: ``[B, H, W, 3]`` RGB in [0, 1] on ``config.background``, H = W =
                 ``config.image_size``; for the decoder ``rays`` ``[B, H, W, 4]`` RGBA with straight
                 alpha.
-            cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same picture size.
-            condition: the result of ``condition`` for the same pictures and cameras, if already
+            cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same image size.
+            condition: the result of ``condition`` for the same images and cameras, if already
                 computed.
             background_margin: drop the 3DGS tokens of patches that are plain background in every
-                picture, except within this many patches of another one; 0 keeps only the object's
+                image, except within this many patches of another one; 0 keeps only the object's
                 own patches. This is faster, but the model was not trained for it
                 (docs/lab/benchmarks.md, "Blocks and models", has the error). None drops nothing.
                 On CUDA it reads one number back. The decoder ``rays`` is trained on, and always
-                uses, only the object's own patches, per picture; None is 0 there. A margin adds
+                uses, only the object's own patches, per image; None is 0 there. A margin adds
                 patches to its network, but no Gaussians.
-            foreground: with ``rays``, ``find_foreground`` of the pictures, on their device, if made
+            foreground: with ``rays``, ``find_foreground`` of the images, on their device, if made
                 before; else alpha is read back from a GPU.
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or
-            the number of kept tokens, in their order. With ``rays`` N belongs to the picture with
+            the number of kept tokens, in their order. With ``rays`` N belongs to the image with
             the most foreground cells; the others are padded with Gaussians of opacity 0.
 
         Raises:

@@ -1,7 +1,7 @@
-"""Posed input: pictures and their cameras in the world of the model.
+"""Posed input: images and their cameras in the world of the model.
 
 This world has its origin at the object's centre and the axes of the reference camera, which is the
-camera of the input picture at the model's distance (``GambaConfig.distance``).
+camera of the input image at the model's distance (``GambaConfig.distance``).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def reference_cameras(config: GambaConfig, count: int) -> Cameras:
-    """Reference camera of a model, repeated ``count`` times, for pictures without a pose.
+    """Reference camera of a model, repeated ``count`` times, for images without a pose.
 
     Args:
-        config: of the model; gives the size of the square pictures, the field of view and the
+        config: of the model; gives the size of the square images, the field of view and the
             distance.
-        count: number of input pictures.
+        count: number of input images.
 
     Returns:
         Cameras ``[count]``, float32 on the CPU.
@@ -53,7 +53,7 @@ def posed_input(views: ObjectViews, config: GambaConfig) -> tuple[Tensor, Camera
     """Convert the first view of an object to a model's input.
 
     Args:
-        views: of one object; pictures of the model's ``image_size``.
+        views: of one object; images of the model's ``image_size``.
         config: of the model; gives the background and the distance.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Prediction of a model for one picture."""
+"""Prediction of a model for one image."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 @torch.inference_mode()
 def reconstruct(
     model: Gamba,
-    picture: str | Path | np.ndarray,
+    image: str | Path | np.ndarray,
     precision: Precision = "float32",
     detail: Detail | None = None,
 ) -> Gaussians:
-    """Reconstruct one picture, taken as seen by the reference camera.
+    """Reconstruct one image, taken as seen by the reference camera.
 
     Args:
         model: on any device, in evaluation mode.
-        picture: a file, whose object ``photo.cutout.cut_out`` cuts out and centres without
+        image: a file, whose object ``photo.cutout.cut_out`` cuts out and centres without
             downloads; or the ``rgba`` of its result, ``[S, S, 4]`` in [0, 1] with the object in the
             middle.
         precision: of the network's products, see ``devices.pick_precision``.
         detail: largest number of Gaussians a side into which each front one splits, see
             ``detail.split_front``; 1 for the network's output. None is the largest that the
-            picture's pixels allow; a picture with too few has no gaps, see ``detail.fill_gaps``.
+            image's pixels allow; an image with too few has no gaps, see ``detail.fill_gaps``.
 
     Returns:
         Gaussians ``[N]``, float32, on the model's device, in the reference camera's frame.
@@ -48,13 +48,13 @@ def reconstruct(
             the model cannot split its front.
         ValueError: the array has another shape.
     """
-    rgba = picture
+    rgba = image
     if not isinstance(rgba, np.ndarray):
         from ..photo.cutout import CutoutOptions, cut_out
 
         rgba = cut_out(rgba, CutoutOptions(fetch=False)).rgba
     if rgba.ndim != 3 or rgba.shape[0] != rgba.shape[1] or rgba.shape[2] != 4:
-        raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
+        raise ValueError(f"image has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config
     chosen = checked_detail(detail, config, len(rgba))
     device = next(model.parameters()).device
@@ -69,7 +69,7 @@ def reconstruct(
 
 
 def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:
-    """Convert a picture to a model's input.
+    """Convert an image to a model's input.
 
     Args:
         rgba: ``[S, S, 4]`` in [0, 1], straight alpha.

@@ -22,7 +22,7 @@ _LIMIT = 1 << 20  # bytes; a card usually has a few kB
 _Text = Annotated[str, Meta(max_length=2000)]
 _Count = Annotated[int, Meta(ge=0, le=10**12)]
 _Name = Annotated[str, Meta(max_length=80)]
-OF_PICTURES = {key: metric.head for key, metric in OF_VIEWS.items()}
+OF_IMAGES = {key: metric.head for key, metric in OF_VIEWS.items()}
 OF_GROUNDS = {key: metric.head for key, metric in on_grounds().items()}
 # Title and decimals of each metric.
 METRICS = {

@@ -17,18 +17,18 @@ from ..formats.ply import load_ply
 from ..photo.cutout import cut_out
 from ..trajectories.movies import turntable_frames
 from ..untrusted.documents import read_document
-from .card import OF_GROUNDS, OF_PICTURES, ModelCard, about_model, read_card
+from .card import OF_GROUNDS, OF_IMAGES, ModelCard, about_model, read_card
 from .page import Section, write_page
 from .sheet import tiles
 
 _BASELINES = {
-    "background": "an empty picture",
+    "background": "an empty image",
     "input_copy": "a copy of the input",
     "billboard": "the input as a flat cut-out",
     "retrieval": "the training object most like it",
 }
 _LIBRARY = re.compile(r"^(blendswap-cc-(0|by)|katorlegaz|reallusion|scopia)-")
-_FIRST = 6  # pictures in the first section
+_FIRST = 6  # images in the first section
 _TURN = 24  # views of a turntable
 _SHOWN = 5  # of these, in the first section
 
@@ -39,7 +39,7 @@ class DemoResults:
 
     Attributes:
         shipped: the shipped model file.
-        icons: pictures that were reconstructed.
+        icons: images that were reconstructed.
         results: of ``gamba reconstruct``; some may be missing.
         views: results of ``gamba eval-views`` of the shipped model.
         shapes: results of ``gamba eval-geometry``; the report may be missing.
@@ -78,20 +78,20 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
             f"input view: {record['input']['psnr']:.1f} dB."
         )
         section = _turned(_name(strip), caption, results.views / "gaussians" / f"{strip.stem}.ply")
-        section.picture, section.views = shown[0][0], {"Predicted": shown[1], "Truth": shown[2]}
+        section.image, section.views = shown[0][0], {"Predicted": shown[1], "Truth": shown[2]}
         held_out.append(section)
     icons, others = [], []
     for icon in sorted(results.icons.glob("*.png")):
         ply = results.results / f"{icon.stem}.ply"
         if ply.exists():
-            caption = "Shipped model; a picture by another renderer."
+            caption = "Shipped model; an image by another renderer."
             icons.append(_turned(f"Icon: {_name(icon)}", caption, ply))
-            icons[-1].picture = cut_out(icon).rgba
+            icons[-1].image = cut_out(icon).rgba
             if _name(icon) not in map(_name, strips):
                 others.append(icons[-1])
     mixed = [section for pair in zip_longest(held_out, others) for section in pair if section]
     first = (
-        "Each row has the input picture, then views of the result of one pass of the shipped model "
+        "Each row has the input image, then views of the result of one pass of the shipped model "
         f"on this machine, in steps of {360 * (_TURN // _SHOWN) // _TURN} degrees from the input "
         "view. The model was trained on none of these objects."
     )
@@ -120,9 +120,9 @@ def _name(path: Path) -> str:
 
 def _around(section: Section) -> np.ndarray:
     """Return the input and some frames of the turntable, ``[1 + _SHOWN, S, S, 3]``."""
-    assert section.picture is not None and section.turntable is not None
+    assert section.image is not None and section.turntable is not None
     frames = section.turntable[:: len(section.turntable) // _SHOWN][:_SHOWN] / 255.0
-    flat = section.picture
+    flat = section.image
     if flat.shape[-1] == 4:
         flat = over_background(flat, GREY)
     side = frames.shape[1]
@@ -152,11 +152,11 @@ def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | Non
         text += (
             f" Over the {rows[0].objects} test objects of the README the shipped model has "
             f"{known['model']:.1f} dB in new views. These few are harder for every method, because "
-            "they fill more of their pictures: an empty picture, which is right wherever nothing "
+            "they fill more of their images: an empty image, which is right wherever nothing "
             f"is, has {empty:.1f} dB here and {known['background']:.1f} dB there."
         )
     haze = "A white haze is invisible on white, but counts here."
-    parts = ("Numbers", text, OF_PICTURES), ("Numbers on black and on grey", haze, OF_GROUNDS)
+    parts = ("Numbers", text, OF_IMAGES), ("Numbers on black and on grey", haze, OF_GROUNDS)
     sections = []
     for title, caption, names in parts:
         rows = [[label, views, *(_cell(m.get(k)) for k in names)] for label, views, m in figures]

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages with pictures, a 3D viewer and numbers in one file."""
+"""Self-contained HTML pages with images, a 3D viewer and numbers in one file."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Section:
     Attributes:
         title: heading.
         text: a sentence or two; an empty line separates paragraphs.
-        picture: the input, ``[H, W, 3|4]`` floats in [0, 1].
+        image: the input, ``[H, W, 3|4]`` floats in [0, 1].
         turntable: frames ``[F, H, W, 3]`` uint8.
         gaussians: one object ``[N]``, for the 3D viewer.
         mesh: its surface, with ``vertices``, ``faces`` and ``colors``, for the viewer; or None.
-        strip: one wide picture ``[H, W, 3]``, floats in [0, 1].
-        views: pictures ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
+        strip: one wide image ``[H, W, 3]``, floats in [0, 1].
+        views: images ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
             such as "Predicted" above "Truth".
         links: thumbnails ``[H, W, 3]`` uint8 by name, which link to NAME.html in the page's folder.
         files: names of files in the page's folder, for download.
@@ -47,12 +47,12 @@ class Section:
             numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval.
         header: names of the table's columns.
         details: long texts by name, initially hidden.
-        view: initial camera of the viewer; with a picture, the picture's.
+        view: initial camera of the viewer; with an image, the image's.
     """
 
     title: str
     text: str = ""
-    picture: np.ndarray | None = None
+    image: np.ndarray | None = None
     turntable: np.ndarray | None = None
     gaussians: Gaussians | None = None
     mesh: Any = None
@@ -97,11 +97,11 @@ def write_page(
     write_text(path, page_text(title, text, sections, auto))
 
 
-def _image(picture: np.ndarray, label: str, css: str = "", kind: str = "PNG") -> str:
+def _image(image: np.ndarray, label: str, css: str = "", kind: str = "PNG") -> str:
     """Return an ``<img>``; WEBP takes a quarter of a PNG's size, without a visible difference."""
     content = io.BytesIO()
     options = {"optimize": True} if kind == "PNG" else {"quality": 85}
-    Image.fromarray(to_uint8(picture)).save(content, kind, **options)
+    Image.fromarray(to_uint8(image)).save(content, kind, **options)
     return _element(content, kind, label, css)
 
 
@@ -124,13 +124,13 @@ def _element(content: io.BytesIO, kind: str, label: str, css: str = "") -> str:
 
 def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
     assert section.gaussians is not None
-    which = "view" if section.picture is None else "camera"  # the camera of the picture
+    which = "view" if section.image is None else "camera"  # the camera of the image
     element = frame_element(
         f"viewer{number}",
         section.title,
         section.gaussians,
         mesh=section.mesh,
-        picture=section.picture,
+        image=section.image,
         poster=poster,
         auto=auto,
         **{which: section.view.camera},

@@ -1,4 +1,4 @@
-"""Sheet of many inputs and their results in one picture file."""
+"""Sheet of many inputs and their results in one image file."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ def tiles(path: Path, columns: int = 3) -> np.ndarray:
     """Return the views of a strip of an evaluation or a fit: square ones in columns.
 
     Args:
-        path: the picture.
+        path: the image.
         columns: of views.
 
     Returns:
         ``[columns, V, S, S, 3]`` in [0, 1]; for ``gamba eval-views`` input, prediction and truth.
 
     Raises:
-        UserError: the picture cannot be read.
+        UserError: the image cannot be read.
         ValueError: its views are not square.
     """
     rgb = load_rgba(path)[..., :3]

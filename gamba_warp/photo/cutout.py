@@ -42,24 +42,24 @@ Method = Literal["alpha", "mask", "plain", "matte", "sam", "grabcut", "none"]
 
 MEND = (
     "If it is wrong: gamba reconstruct --save-inputs writes the cut-out as NAME-input.png; erase "
-    "or restore parts of it in a picture editor and give that file, or give --mask FILE."
+    "or restore parts of it in an image editor and give that file, or give --mask FILE."
 )
 _HOW: dict[str, str] = {
-    "alpha": "The picture's own transparency is the cut-out{fringe}.",
+    "alpha": "The image's own transparency is the cut-out{fringe}.",
     "mask": "The mask {mask} cut the object out{fringe}.",
     "plain": "The plain background was removed{holes}{why}.",
     "matte": "The matting model {model} cut the object out.",
     "sam": "Segment Anything cut the object out, expected in the middle.",
     "grabcut": "GrabCut cut the object out by colours alone, expected in the middle{why}.",
-    "none": "The whole picture is the object.",
+    "none": "The whole image is the object.",
 }
 _NAMES = {"sam": "Segment Anything", "matte": "matting model", "grabcut": "GrabCut"}
-_LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the picture covered by an object
-_MOST_EDGE = 0.7  # share of the picture's border that an object may cover
+_LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the image covered by an object
+_MOST_EDGE = 0.7  # share of the image's border that an object may cover
 _UNSURE = 0.4  # largest share of alpha's sum in pixels that are neither object nor background
 
 # A result is doubted if the object
-_BORDER = 0.02  # covers more than this share of the picture's border,
+_BORDER = 0.02  # covers more than this share of the image's border,
 _PART = 0.15  # has further parts of at least this share of its largest,
 _MIN_EDGE_CONTRAST = 0.06  # differs by less than this from the background beside it
 _MAX_WEAK_SHARE = 0.3  # along more than this share of its outline,
@@ -69,10 +69,10 @@ _MAX_SOFT_SHARE = (
 
 _LIKE_GROUND = "it is coloured like the background: parts may be lost, or enclosed background kept"
 
-_PREVIEW_SIDE = 360  # longer side of each picture of ``CutOut.beside``
+_PREVIEW_SIDE = 360  # longer side of each image of ``CutOut.beside``
 _HAZE = 0.1  # lower alpha is set to 0
 _OPAQUE = 0.5  # a warning is given if alpha is lower everywhere
-# An object of a smaller longer side in the reduced picture is cut from the whole one.
+# An object of a smaller longer side in the reduced image is cut from the whole one.
 _CLOSE = WORKING_SIZE // 2  # pixels
 _SAME = 0.8  # least IoU of both cut-outs; else the first one's mask is enlarged
 _FEW_PIXELS = 128  # longer side of an object, below which a result is blurred
@@ -80,14 +80,14 @@ _FEW_PIXELS = 128  # longer side of an object, below which a result is blurred
 
 @dataclass
 class CutoutOptions:
-    """Options and loaded models of the cut-out, shared by all pictures of a command.
+    """Options and loaded models of the cut-out, shared by all images of a command.
 
     Attributes:
-        mask: picture of the same size, brighter (or opaque) on the object.
+        mask: image of the same size, brighter (or opaque) on the object.
         matte_model: an ISNet or U2-Net in ONNX, or the URL of a copy of one of rembg's; None: one
             of rembg's, from its cache or fetched.
         sam: a checkpoint of Segment Anything, used instead of the matting model.
-        recenter: centre the object, its longer side ``0.8`` of the square; else the picture keeps
+        recenter: centre the object, its longer side ``0.8`` of the square; else the image keeps
             its frame, padded to a square.
         device: device of Segment Anything; the matting model runs on the CPU.
         fetch: allow fetching a matting model.
@@ -110,7 +110,7 @@ class CutoutOptions:
     _no_matte: bool = field(default=False, init=False, repr=False)
 
     def checked(self) -> CutoutOptions:
-        """Open the given files, so that errors come before any picture; return ``self``.
+        """Open the given files, so that errors come before any image; return ``self``.
 
         Raises:
             UserError: a file is missing, of another kind, or not used by the chosen method.
@@ -151,16 +151,16 @@ class CutoutOptions:
 
 @dataclass(frozen=True)
 class CutOut:
-    """An object that was cut out of a picture.
+    """An object that was cut out of an image.
 
     Attributes:
         rgba: ``[S, S, 4]`` float32 in [0, 1]: the object in the middle, its longer side
             ``0.8 · S``; without ``CutoutOptions.recenter`` at its place.
         method: of the cut-out.
         how: the method in a sentence.
-        source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels per side.
+        source_rgb: the image, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels per side.
         mask: alpha of the object in it, ``[H, W]`` float32 in [0, 1].
-        editable: ``[h, w, 4]`` float32: the whole picture, or a small object with what is around
+        editable: ``[h, w, 4]`` float32: the whole image, or a small object with what is around
             it at its own pixels, with colours in transparent parts too, so that an editor can
             restore them in a PNG, which may be used as input again.
         warning: reasons to doubt the cut-out, and a remedy; empty without a doubt.
@@ -184,7 +184,7 @@ class CutOut:
         return " ".join(filter(None, (self.how, self.warning, MEND)))
 
     def beside(self) -> np.ndarray:
-        """Return the picture beside its cut-out on grey, ``[H, 2 W, 3]``."""
+        """Return the image beside its cut-out on grey, ``[H, 2 W, 3]``."""
         both = (np.dstack([self.source_rgb, x]) for x in (np.ones_like(self.mask), self.mask))
         small = np.hstack([shrink(half, _PREVIEW_SIDE) for half in both])
         return over_background(small, GREY)
@@ -202,18 +202,18 @@ class _Found(NamedTuple):
 
 
 def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
-    """Read a picture and cut its object out.
+    """Read an image and cut its object out.
 
-    A given mask comes first; then the picture's own transparency, Segment Anything or a matting
+    A given mask comes first; then the image's own transparency, Segment Anything or a matting
     model if given or in the cache, a plain background, a matting model that is fetched, and
     GrabCut.
 
     Args:
-        path: any picture that ``load_rgba`` reads.
+        path: any image that ``load_rgba`` reads.
         options: options.
 
     Raises:
-        UserError: the picture or a file of ``options`` cannot be read, or no object is found.
+        UserError: the image or a file of ``options`` cannot be read, or no object is found.
         ModuleNotFoundError: a library for a file of ``options`` is not installed.
     """
     options = CutoutOptions() if options is None else options
@@ -249,7 +249,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
             if not few:
                 raise
     if found is None or few and not found.rgba[..., 3].any():
-        found = _Found("alpha", rgba)  # the object may well fill the picture
+        found = _Found("alpha", rgba)  # the object may well fill the image
     method, rgba = found.method, found.rgba
     close, around = rgba, source
     if options.recenter:
@@ -274,7 +274,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     doubts = [] if own else doubts_of(source, rgba[..., 3])
     if method == "mask" and (edge := _on_border(rgba[..., 3] > 0.5)) > _BORDER:
         inverted = " (is the mask inverted?)" if edge > _MOST_EDGE else ""
-        doubts.append(f"it touches the picture's border{inverted}")
+        doubts.append(f"it touches the image's border{inverted}")
     doubts += [found.doubt] if found.doubt else []
     if method == "grabcut":  # docs/reconstruct.md has the figure
         doubts.append("colours alone fail for more than half of photographs")
@@ -298,18 +298,18 @@ def _at_own_pixels(
     found: _Found,
     options: CutoutOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an object that is small in the reduced picture as it is in the whole one.
+    """Return an object that is small in the reduced image as it is in the whole one.
 
     Args:
         path: named in errors.
-        whole: ``[H, W, 4]``, the picture with its alpha or the mask's.
-        source: ``[h, w, 3]``, the reduced picture.
-        found: its cut-out in the reduced picture.
+        whole: ``[H, W, 4]``, the image with its alpha or the mask's.
+        source: ``[h, w, 3]``, the reduced image.
+        found: its cut-out in the reduced image.
         options: options.
 
     Returns:
-        ``[h, w, 4]``, the object and what is around it, and ``[h, w, 3]``, the picture there; or
-        the reduced picture's.
+        ``[h, w, 4]``, the object and what is around it, and ``[h, w, 3]``, the image there; or
+        the reduced image's.
     """
     rgba, scale = found.rgba, len(whole) / len(found.rgba)
     rows, columns = (np.flatnonzero((rgba[..., 3] > PRESENT).any(axis)) for axis in (1, 0))
@@ -389,7 +389,7 @@ def _cut_by_methods(path: str | Path, rgb: np.ndarray, options: CutoutOptions) -
             return _Found(method, _blended(rgb, alpha), why=why)
         reasons.append(f"{_NAMES[method]}: {fault}")
     raise UserError(
-        f"{path}: cannot tell object from background ({'; '.join(reasons)}); give a picture with a "
+        f"{path}: cannot tell object from background ({'; '.join(reasons)}); give an image with a "
         "transparent or plain background, --mask FILE, --matte-model FILE or --sam FILE"
     )
 
@@ -398,12 +398,12 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
     """Return reasons to doubt a cut-out that may be right.
 
     Args:
-        rgb: the picture, ``[H, W, 3]`` in [0, 1].
+        rgb: the image, ``[H, W, 3]`` in [0, 1].
         alpha: ``[H, W]`` in [0, 1].
     """
     inside, found = alpha > 0.5, []
     if _on_border(inside) > _BORDER:
-        found.append("it touches the picture's border")
+        found.append("it touches the image's border")
     if find_spec("skimage") is not None:
         from skimage.measure import label
 
@@ -429,12 +429,12 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
 
 
 def _on_border(inside: np.ndarray) -> float:
-    """Return the fraction of a picture's border that an object ``[H, W]`` bool covers."""
+    """Return the fraction of an image's border that an object ``[H, W]`` bool covers."""
     return float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean())
 
 
 def fault_of(alpha: np.ndarray) -> str | None:
-    """Return why a mask cannot be a single object completely in the picture; None if it can.
+    """Return why a mask cannot be a single object completely in the image; None if it can.
 
     Args:
         alpha: ``[H, W]`` in [0, 1].
@@ -444,9 +444,9 @@ def fault_of(alpha: np.ndarray) -> str | None:
     if share < _LEAST_SHARE:
         return "nothing stands out"
     if share > _MOST_SHARE:
-        return "all of the picture would be the object"
+        return "all of the image would be the object"
     if (edge := _on_border(inside)) > _MOST_EDGE:
-        return f"it would touch {edge:.0%} of the picture's border"
+        return f"it would touch {edge:.0%} of the image's border"
     if alpha[(alpha > 0.1) & (alpha < 0.9)].sum() > _UNSURE * alpha.sum():
         return "it has no clear border"
     return None

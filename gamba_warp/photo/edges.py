@@ -18,13 +18,13 @@ _REACH = 2  # pixels between these and solid ones
 _LEAST = 20  # number of these
 _FRINGE = 0.1  # least rms difference of their colours from the solid ones beside them
 _UNEXPLAINED = 0.2  # largest share of its square that white or black may leave
-_WIDTH = 128  # a rim is this part of the picture's longer side wide, at least two pixels
+_WIDTH = 128  # a rim is this part of the image's longer side wide, at least two pixels
 # The same two bounds for a rim, and the least excess of its background over what alpha admits.
 _RIM_FRINGE, _RIM_UNEXPLAINED, _EXCESS = 0.08, 0.3, 0.17
 
 
 def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
-    """Remove white or black that is mixed into the edge of a picture with transparency.
+    """Remove white or black that is mixed into the edge of an image with transparency.
 
     Icons and cut-outs often keep the colours that their edge had on white. A soft edge has such a
     colour if it explains the difference to the mean of the solid pixels beside; a hard one has a
@@ -34,7 +34,7 @@ def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
         rgba: ``[H, W, 4]`` in [0, 1], straight alpha.
 
     Returns:
-        The picture, and "white" or "black"; the same picture and None if its edge has neither.
+        The image, and "white" or "black"; the same image and None if its edge has neither.
     """
     alpha = rgba[..., 3]
     solid = alpha > _SOLID
@@ -52,7 +52,7 @@ def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
 
 
 def _unmixed(rgba: np.ndarray, alpha: np.ndarray, color: float) -> np.ndarray:
-    """Return a picture of another alpha, without the grey value ``color`` that is mixed into it."""
+    """Return an image of another alpha, without the grey value ``color`` that is mixed into it."""
     share = alpha[..., None]
     colors = (rgba[..., :3] - (1 - share) * color) / np.maximum(share, 1e-3)
     return np.dstack([colors.clip(0, 1), alpha]).astype(np.float32)
@@ -69,10 +69,10 @@ def without_background(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         alpha: ``[H, W]`` in [0, 1].
     """
     alpha = _narrowed(rgb, alpha)
-    picture, share = _planes(rgb), _planes(alpha[..., None])
+    image, share = _planes(rgb), _planes(alpha[..., None])
     ours, theirs = local_colors(rgb, alpha, max(2, max(rgb.shape[:2]) // 64))
-    colors = ours + share * (picture - share * ours - (1 - share) * theirs)
-    colors = torch.where(share > _SOLID, picture, colors).clamp(0, 1)
+    colors = ours + share * (image - share * ours - (1 - share) * theirs)
+    colors = torch.where(share > _SOLID, image, colors).clamp(0, 1)
     return np.dstack([colors[0].permute(1, 2, 0).numpy(), alpha])
 
 
@@ -138,6 +138,6 @@ def _around(rgb: np.ndarray, weight: np.ndarray, radius: int) -> tuple[Tensor, T
     return mean[:, :3] / mean[:, 3:].clamp(min=1e-5), mean[:, 3:]
 
 
-def _planes(picture: np.ndarray) -> Tensor:
+def _planes(image: np.ndarray) -> Tensor:
     """Return ``[H, W, C]`` as ``[1, C, H, W]`` float32."""
-    return torch.from_numpy(np.ascontiguousarray(picture, np.float32)).permute(2, 0, 1)[None]
+    return torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]

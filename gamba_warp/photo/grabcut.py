@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_SIDE = 256  # longer side of the segmented picture, pixels
-_LEAST = 16  # smallest shorter side of a picture, pixels
+_SIDE = 256  # longer side of the segmented image, pixels
+_LEAST = 16  # smallest shorter side of an image, pixels
 _ROUNDS = 5  # of mixtures and cut
 _STEPS = 150  # of the primal-dual iteration per round, warm-started by the last one
 _PARTS = 5  # Gaussians of a mixture
@@ -45,11 +45,11 @@ def grabcut(rgb: np.ndarray) -> np.ndarray:
         return np.zeros((height, width), np.float32)
     factor = min(1.0, _SIDE / max(height, width))
     small = (max(4, round(height * factor)), max(4, round(width * factor)))
-    picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
-    colors = _resized(picture, small)[0].permute(1, 2, 0).contiguous().numpy()
+    image = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
+    colors = _resized(image, small)[0].permute(1, 2, 0).contiguous().numpy()
     inside = _connected(torch.from_numpy(_cut(colors))[None, None].float())
     alpha = _resized(inside, (height, width))
-    return _guided_filter(alpha, picture, max(1, round(1 / factor)))[0, 0].clamp(0, 1).numpy()
+    return _guided_filter(alpha, image, max(1, round(1 / factor)))[0, 0].clamp(0, 1).numpy()
 
 
 def _resized(planes: Tensor, size: tuple[int, int]) -> Tensor:
@@ -184,14 +184,14 @@ def _connected(inside: Tensor) -> Tensor:
     return found
 
 
-def _guided_filter(alpha: Tensor, picture: Tensor, radius: int) -> Tensor:
-    """Align the border of an enlarged alpha with the picture's edges (guided filter)."""
+def _guided_filter(alpha: Tensor, image: Tensor, radius: int) -> Tensor:
+    """Align the border of an enlarged alpha with the image's edges (guided filter)."""
     size = 2 * radius + 1
 
     def mean(planes: Tensor) -> Tensor:
         return functional.avg_pool2d(planes, size, 1, size // 2, count_include_pad=False)
 
-    grey = picture.mean(1, keepdim=True)
+    grey = image.mean(1, keepdim=True)
     mean_grey, mean_alpha = mean(grey), mean(alpha)
     variance = mean(grey * grey) - mean_grey.square()
     slope = (mean(grey * alpha) - mean_grey * mean_alpha) / (variance + 1e-4)

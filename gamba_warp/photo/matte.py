@@ -19,7 +19,7 @@ from ..versions import require, to_install
 from . import models
 
 MAX_MODEL = 2 << 30  # bytes of a model's file; rembg's largest has 1.1 GB
-_SECONDS = 300.0  # for one picture; it takes about six on two cores
+_SECONDS = 300.0  # for one image; it takes about six on two cores
 _MEMORY = 8 << 30  # bytes; ISNet takes two gigabytes
 
 

@@ -167,15 +167,15 @@ def _stays_secure(response: Any, **options: Any) -> None:
 
 
 def alpha_of(task: tuple[str, tuple[int, int], np.ndarray | None, int]) -> np.ndarray | None:
-    """Run a network on one picture.
+    """Run a network on one image.
 
     Args:
         task: the model's file; its size and mtime, as a cache key; RGB ``[H, W, 3]`` uint8, or None
             to check the file only; and the number of threads.
 
     Returns:
-        The network's alpha ``[h, w]`` float32 in [0, 1], h and w of its input; None without a
-        picture.
+        The network's alpha ``[h, w]`` float32 in [0, 1], h and w of its input; None without an
+        image.
 
     Raises:
         UserError: the file is not a matting network, or its output is not finite.
@@ -215,10 +215,10 @@ def _opened(
         raise UserError(f"{path}: not a model in ONNX ({first_line(error)})") from error
     shape = list(inputs[0].shape) if len(inputs) == 1 and outputs else []
     if len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
-        raise UserError(f"{path}: not a matting model (it takes no picture of three colours)")
+        raise UserError(f"{path}: not a matting model (it takes no image of three colours)")
     height, width = (side if isinstance(side, int) else _OPEN for side in shape[2:])
     if not all(_SIDES[0] <= side <= _SIDES[1] for side in (height, width)):
-        raise UserError(f"{path}: takes pictures of {width}x{height}; sides may be {_SIDES}")
+        raise UserError(f"{path}: takes images of {width}x{height}; sides may be {_SIDES}")
     return session, (height, width), (inputs[0].name, outputs[0].name)
 
 

@@ -27,19 +27,19 @@ _SAMPLES = 20_000  # pixels of a fit
 _FITS = 3
 _RIM = 2  # pixels along the border whose alpha is fractional
 # An enclosed area is background if
-_HOLE = 0.0003  # it has at least this share of the picture, and
+_HOLE = 0.0003  # it has at least this share of the image, and
 _LEAST_HOLE = 12  # pixels,
 _BIAS = 0.006  # its median differs by at most this, or by a third of the noise, and
-_ISLANDS = 0.03  # at most this share of it is text or pictures on it, and
+_ISLANDS = 0.03  # at most this share of it is text or images on it, and
 _FAINT, _FAINT_SHARE = 0.15, 0.2  # at most this share of its surroundings differs by less
 # A pixel may be shadow if it has
 _DARKEST = 0.45  # at least this share of the background's light,
 _HUE = 0.025  # its hue within this, and
 _SLOPE = 0.02  # at most this change from pixel to pixel. Areas of such pixels are shadow if
-_STRIP = 0.001, 0.35  # they have at least this share of the picture, at most this of the object,
+_STRIP = 0.001, 0.35  # they have at least this share of the image, at most this of the object,
 _FOOT = 0.8  # lie this far down the object (nine of ten pixels), and
 _CONTACT = 0.25  # border on background along this share of their border
-# In a picture of about this longer side an object may have the background's own colour if
+# In an image of about this longer side an object may have the background's own colour if
 _SMALL = 256  # pixels,
 _STEP, _STEPLESS = 0.03, 0.15  # over this share of its outline changes by less a pixel, or
 _EXACT, _KEPT = 0.02, 0.05  # enclosed areas with a median within this have more of it than this,
@@ -47,7 +47,7 @@ _LIGHT, _LIGHT_SHARE = 0.3, 0.1  # and over this share of its outline differs by
 
 
 class Plain(NamedTuple):
-    """A picture without its plain background.
+    """An image without its plain background.
 
     Attributes:
         rgba: ``[H, W, 4]`` float32, straight alpha.
@@ -65,7 +65,7 @@ class Plain(NamedTuple):
 
 
 def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
-    """Remove a plain background, which has the colour of most of the picture's border.
+    """Remove a plain background, which has the colour of most of the image's border.
 
     Along the edge alpha is fractional, and the background's share is removed from the colour, so no
     fringe is left on another background.
@@ -75,7 +75,7 @@ def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
         keep_holes: keep enclosed areas of the background's colour.
 
     Returns:
-        None if the background is not plain. A picture of one colour is all background.
+        None if the background is not plain. An image of one colour is all background.
     """
     edge = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     color = np.median(edge, axis=0)

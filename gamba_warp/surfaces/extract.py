@@ -29,7 +29,7 @@ class Surface:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64, F > 0.
         colors: ``[V, 3]`` float32 RGB in [0, 1] (display values), or None.
-        texture: the colours as a picture, or None.
+        texture: the colours as an image, or None.
         moved: mean and largest distance of the surface before it was closed from this one, in units
             of the longest side, or None.
     """
@@ -86,7 +86,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
         smooth=options.smooth,
         max_faces=0 if options.watertight else options.faces,
     )
-    colors = picture = moved = None
+    colors = image = moved = None
     if options.watertight:
         STAGES.begin("mesh closing")
         before = vertices
@@ -101,9 +101,9 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
     if texture:
         STAGES.begin("mesh texture")
         assert views is not None
-        picture = bake_texture(vertices, faces, views, options.voxels, texture)
+        image = bake_texture(vertices, faces, views, options.voxels, texture)
     STAGES.begin("mesh")  # what follows, such as its file
-    return Surface(vertices, faces, colors, picture, moved)
+    return Surface(vertices, faces, colors, image, moved)
 
 
 def near_and_visible(gaussians: Gaussians) -> Gaussians:

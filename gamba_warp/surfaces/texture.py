@@ -21,7 +21,7 @@ def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels:
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``.
-        views: pictures and depth.
+        views: images and depth.
         voxels: number of voxels per unit; a view sees a vertex if its depth there differs by less
             than four voxels.
 
@@ -50,7 +50,7 @@ def point_colors(
     Args:
         positions: ``[P, 3]``.
         directions: ``[P, 3]``, unit normals of the surface there, outside.
-        views: pictures and depth.
+        views: images and depth.
         voxels: number of voxels per unit; a view sees a point if its depth there differs by less
             than four voxels.
 
@@ -98,19 +98,19 @@ def _seen(
     visible = inside & ((found - seen[:, 2]).abs() < near) & (found < CLEAR)
     # Interpolated between the centres of pixels that hit the object.
     hit = ((depth > 0) & (depth < CLEAR)).to(rgb)[..., None]
-    picture = torch.cat([rgb * hit, hit], -1).permute(2, 0, 1)[None]
+    image = torch.cat([rgb * hit, hit], -1).permute(2, 0, 1)[None]
     grid = (at / size * 2 - 1)[None, None]
-    sampled = torch.nn.functional.grid_sample(picture, grid, align_corners=False)[0, :, 0].T
+    sampled = torch.nn.functional.grid_sample(image, grid, align_corners=False)[0, :, 0].T
     color = sampled[:, :3] / sampled[:, 3:].clamp_min(1e-6)
     return visible, color
 
 
 @dataclass
 class Texture:
-    """Colours of a surface as a picture.
+    """Colours of a surface as an image.
 
     Attributes:
-        uvs: ``[F, 3, 2]`` float64 in [0, 1], positions of each face's corners in the picture; v is
+        uvs: ``[F, 3, 2]`` float64 in [0, 1], positions of each face's corners in the image; v is
             up.
         image: ``[N, N, 3]`` float32 RGB in [0, 1] (display values), the first row on top.
     """
@@ -127,13 +127,13 @@ def bake_texture(
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``.
-        views: pictures and depth.
+        views: images and depth.
         voxels: number of voxels a unit; a view sees a texel if its depth there differs by less
             than four voxels.
-        side: N of the picture, pixels.
+        side: N of the image, pixels.
 
     Raises:
-        UserError: the picture is too small for the faces, or no view sees the surface.
+        UserError: the image is too small for the faces, or no view sees the surface.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -180,7 +180,7 @@ def covered_texels(uvs: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, 
 
     Args:
         uvs: ``[F, 3, 2]``, v up.
-        side: of the picture, pixels.
+        side: of the image, pixels.
 
     Returns:
         ``[T]`` the texels, row by row from the top, ``[T]`` the face of each, and ``[T, 3]`` the

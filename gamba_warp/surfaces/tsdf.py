@@ -24,7 +24,7 @@ _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch
 
 @dataclass
 class Views:
-    """Pictures and depth maps of cameras around an object, on the CPU.
+    """Images and depth maps of cameras around an object, on the CPU.
 
     Attributes:
         cameras: ``[V]``.
@@ -65,13 +65,13 @@ def look_around(gaussians: Gaussians, options: SurfaceOptions) -> Views:
 
     Args:
         gaussians: one object, about the origin, on the device that renders.
-        options: with the number and side of the pictures, and the thresholds of depth.
+        options: with the number and side of the images, and the thresholds of depth.
 
     Raises:
         UserError: no pixel of any view is covered.
     """
     reach = gaussians.means.norm(dim=-1) + 2 * gaussians.scales.amax(-1)
-    # Quantile, because a single far Gaussian would shrink all others in the pictures.
+    # Quantile, because a single far Gaussian would shrink all others in the images.
     radius = float(torch.quantile(reach.cpu()[:: 1 + gaussians.num // 2**20], 0.999)) * 1.05
     count = options.views
     cameras = sphere_cameras(count, radius, options.pixels)

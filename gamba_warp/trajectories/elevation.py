@@ -1,4 +1,4 @@
-"""Elevation of the camera that took a picture, from the Gaussians made of it.
+"""Elevation of the camera that took an image, from the Gaussians made of it.
 
 The network works in the camera's axes, so an object seen from above leans back. Upright, most
 things have a concentrated vertical profile (of horizontal faces, say), and little height and depth.
@@ -22,7 +22,7 @@ from ..gaussians import Gaussians
 
 ANGLES = np.arange(-20.0, 65.1, 2.5)  # degrees
 ENTROPY_WEIGHT, HEIGHT_WEIGHT, DEPTH_WEIGHT = 4.5, 22.0, 25.0  # the latter per object unit
-USUAL, SPREAD = 12.0, 20.0  # degrees; of pictures of single objects
+USUAL, SPREAD = 12.0, 20.0  # degrees; of images of single objects
 LEAST_OPACITY = 0.3  # of counted Gaussians
 _FEWEST, _MOST = 50, 4_000  # counted Gaussians; more are thinned out
 _DOUBTFUL = 15.0  # degrees between the quartiles

@@ -60,7 +60,7 @@ class CameraPath:
 
     Attributes:
         cameras: ``[V]`` float64.
-        fps: pictures per second from the file, or None.
+        fps: images per second from the file, or None.
     """
 
     cameras: Cameras
@@ -72,7 +72,7 @@ def load_path(file: str | Path, size: tuple[int, int | None] | None = None) -> C
 
     Args:
         file: JSON of at most 64 MB.
-        size: width and height of the pictures, or only the width, which keeps the aspect ratio.
+        size: width and height of the images, or only the width, which keeps the aspect ratio.
             Another ratio keeps the vertical field of view, and shows more or less at the sides.
             None is the file's own size.
 
@@ -104,8 +104,8 @@ def save_path(
     Args:
         file: the ``.json``.
         cameras: ``[V]``.
-        fps: pictures per second.
-        extra: further fields of each of the V frames, such as the name of its picture.
+        fps: images per second.
+        extra: further fields of each of the V frames, such as the name of its image.
 
     Raises:
         UserError: the file cannot be written.
@@ -147,7 +147,7 @@ def _of_transforms(file: Path, source: str) -> Cameras:
         raise UserError(f"{source}: cameras of different sizes ({names}); a path has one size")
     ((width, height),) = stated
     for K, size in zip(Ks, sizes):
-        if size is None:  # in fractions of the picture's side
+        if size is None:  # in fractions of the image's side
             K[:2] *= DEFAULT_SIDE
     views = from_opengl(torch.from_numpy(poses))
     return Cameras(views, torch.from_numpy(Ks), width, height)
@@ -163,7 +163,7 @@ def _centred(width: int, height: int, fov: float) -> Tensor:
 
 
 def _sized(cameras: Cameras, width: int, height: int | None) -> Cameras:
-    """Return the cameras for pictures of another size, with the same vertical field of view."""
+    """Return the cameras for images of another size, with the same vertical field of view."""
     if height is None:
         height = max(1, round(cameras.height * width / cameras.width))
     scale = height / cameras.height

@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from ..images import save_image
 from ..untrusted.ranges import check_range
 from .files import load_path
-from .movies import SECONDS, check_gif, render_path, save_movie, save_pictures
+from .movies import SECONDS, check_gif, render_path, save_images, save_movie
 from .paths import TURNS, Viewpoint, placed, spiral, to_unit, turntable
 
 Kind = Literal["gif", "mp4", "png"]
@@ -73,8 +73,8 @@ class Film:
     Attributes:
         cameras: ``[V]``, in an object's unit frame, or in the file's own frame.
         own: True if they are in the file's own frame.
-        rate: pictures per second.
-        background: RGB in [0, 1], or None for transparent pictures.
+        rate: images per second.
+        background: RGB in [0, 1], or None for transparent images.
         depth: also write depth maps.
     """
 
@@ -96,11 +96,11 @@ def plan_path(
     Args:
         trajectory: turntable, spiral, or a file of cameras.
         size: as from ``parse_size``.
-        frames: number of pictures of a turntable or spiral.
+        frames: number of images of a turntable or spiral.
         view: elevation, distance and fov of a turntable or spiral; None is the default.
 
     Returns:
-        The cameras, True if they are in the file's own frame, and the pictures per second.
+        The cameras, True if they are in the file's own frame, and the images per second.
 
     Raises:
         UserError: the file is invalid, or an option does not apply to it.
@@ -119,7 +119,7 @@ def plan_path(
     for side in (path.cameras.width, path.cameras.height):
         if side > int(_SIDES.le or 0) or side < 1:
             name = f"{path.cameras.width}x{path.cameras.height}"
-            raise UserError(f"{trajectory}: pictures of {name}; give a smaller --size")
+            raise UserError(f"{trajectory}: images of {name}; give a smaller --size")
     return path.cameras, True, path.fps or FPS
 
 
@@ -141,7 +141,7 @@ def shoot(
         frame: its centre ``[3]`` and its longest side.
         film: cameras and options.
         device: device that renders.
-        tell: called with the number of newly finished pictures, for a progress bar.
+        tell: called with the number of newly finished images, for a progress bar.
 
     Raises:
         UserError: a file cannot be written, or is too large for its kind.
@@ -154,8 +154,8 @@ def shoot(
     near = {"near_plane": min(_NEAR, _NEAR / side)}
 
     def views(part: Cameras):
-        for picture, depth in render_path(moved, part, film.background, film.depth, **near):
-            yield picture, None if depth is None else depth * side
+        for image, depth in render_path(moved, part, film.background, film.depth, **near):
+            yield image, None if depth is None else depth * side
 
     def counted():
         for view in views(cameras):
@@ -166,15 +166,15 @@ def shoot(
         save_image(target, next(counted())[0] / 255.0)
         return
     if kind == "png":
-        save_pictures(target, counted(), own, film.rate)
+        save_images(target, counted(), own, film.rate)
         return
     count = len(cameras.viewmats)
     every = cameras[:: max(1, count // _SAMPLE)]
     if kind == "gif":
         check_gif(cameras.width, cameras.height, count)
-        sample = np.stack([picture for picture, _ in views(every)])
+        sample = np.stack([image for image, _ in views(every)])
     else:
         sample = np.zeros((0, 1, 1, 3), np.uint8)
     red, green, blue = (round(255 * value) for value in film.background or (1.0, 1.0, 1.0))
-    frames = (picture for picture, _ in counted())
+    frames = (image for image, _ in counted())
     save_movie(target, frames, film.rate, sample, (red, green, blue))

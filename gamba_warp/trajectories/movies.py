@@ -1,4 +1,4 @@
-"""Pictures along a camera path, and their files: GIF, MP4, folders of PNG."""
+"""Images along a camera path, and their files: GIF, MP4, folders of PNG."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .files import save_path
 from .paths import FRONT, Viewpoint, turntable
 
 SECONDS = 3.0  # of one turn of a turntable
-CAMERAS = "transforms.json"  # in a folder of pictures
+CAMERAS = "transforms.json"  # in a folder of images
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch, which takes a few hundred MB
 _CHUNK_GAUSSIANS = 1 << 22  # Gaussians projected in one launch, over all of its views
 _GIF_BYTES = 512 << 20  # Pillow holds all frames of a GIF, one byte per pixel
@@ -43,17 +43,17 @@ def render_path(
     depth: bool = False,
     **options,
 ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
-    """Render along a path, several views per launch, and yield the pictures one by one.
+    """Render along a path, several views per launch, and yield the images one by one.
 
     Args:
         gaussians: one object without batch dimension, on the device that renders.
         cameras: ``[V]``.
-        background: RGB in [0, 1]; None makes RGBA pictures with straight alpha.
+        background: RGB in [0, 1]; None makes RGBA images with straight alpha.
         depth: render the expected depth too.
         options: further arguments of ``rasterization``.
 
     Yields:
-        For each view the picture ``[H, W, 3|4]`` uint8, and the depth ``[H, W]`` float32 along the
+        For each view the image ``[H, W, 3|4]`` uint8, and the depth ``[H, W]`` float32 along the
         camera's axis, 0 on the background, or None.
     """
     cameras = cameras.to(gaussians.means.device, torch.float32)
@@ -68,8 +68,8 @@ def render_path(
         depths = None
         if seen.depth is not None:
             depths = torch.where(seen.alpha > 0.5, seen.depth, 0.0)[..., 0].cpu().numpy()
-        for number, picture in enumerate(rgb.cpu().numpy()):
-            yield to_uint8(picture), None if depths is None else depths[number]
+        for number, image in enumerate(rgb.cpu().numpy()):
+            yield to_uint8(image), None if depths is None else depths[number]
 
 
 def require_movie(kind: str) -> None:
@@ -121,7 +121,7 @@ def check_gif(width: int, height: int, frames: int) -> None:
     if width * height * frames > _GIF_BYTES:
         raise UserError(
             f"{frames} frames of {width}x{height} are too many for a .gif; write an .mp4 or "
-            "pictures (--kind png), or give a smaller --size"
+            "images (--kind png), or give a smaller --size"
         )
 
 
@@ -134,15 +134,15 @@ def _write_gif(
 ) -> None:
     palette = _palette(sample, background)
 
-    def pictures() -> Iterator[Image.Image]:
+    def images() -> Iterator[Image.Image]:
         for frame in frames:
-            picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
+            image = Image.fromarray(frame).quantize(palette=palette)  # dithered
             # Pillow's colour lookup is coarse, so that white may become a similar colour.
             red, green, blue = (frame[..., i] == background[i] for i in range(3))
-            picture.paste(0, mask=Image.fromarray(red & green & blue))
-            yield picture
+            image.paste(0, mask=Image.fromarray(red & green & blue))
+            yield image
 
-    rest = pictures()
+    rest = images()
     # GIF counts time in units of 10 ms, and viewers slow down frames under 20 ms.
     duration = max(20, round(100 / rate) * 10)
     next(rest).save(path, save_all=True, append_images=rest, duration=duration, loop=0)
@@ -203,13 +203,13 @@ def check_folder(path: Path) -> None:
     if not path.exists():
         return
     if not path.is_dir():
-        raise UserError(f"{path}: is a file; pictures go into a folder")
+        raise UserError(f"{path}: is a file; images go into a folder")
     other = next((p.name for p in path.iterdir() if not _OURS.fullmatch(p.name)), None)
     if other is not None:
         raise UserError(f"{path}: holds other files ({other}); give another --out")
 
 
-def save_pictures(
+def save_images(
     folder: Path,
     views: Iterable[tuple[np.ndarray, np.ndarray | None]],
     cameras: Cameras,
@@ -224,7 +224,7 @@ def save_pictures(
         folder: replaced if it exists; see ``check_folder``.
         views: from ``render_path``, with depths in the cameras' own unit.
         cameras: ``[V]``, in the frame of the rendered file.
-        rate: pictures per second, for ``transforms.json``.
+        rate: images per second, for ``transforms.json``.
 
     Raises:
         UserError: it cannot be written.
@@ -232,9 +232,9 @@ def save_pictures(
     check_folder(folder)
     with atomic_folder(folder, replace=True) as temporary:
         extra = []
-        for number, (picture, depth) in enumerate(views):
+        for number, (image, depth) in enumerate(views):
             name = f"{number:04d}"
-            Image.fromarray(picture).save(temporary / f"{name}.png")
+            Image.fromarray(image).save(temporary / f"{name}.png")
             fields: dict[str, object] = {"file_path": f"{name}.png"}
             if depth is not None:
                 unit = max(float(depth.max()), 1e-9) / _DEPTH_STEPS
@@ -261,7 +261,7 @@ def turntable_frames(
         ``[frames, size, size, 3]`` uint8.
     """
     cameras = turntable(frames, view, size)
-    return np.stack([picture for picture, _ in render_path(gaussians, cameras, (GREY, GREY, GREY))])
+    return np.stack([image for image, _ in render_path(gaussians, cameras, (GREY, GREY, GREY))])
 
 
 def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECONDS) -> None:

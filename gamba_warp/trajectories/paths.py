@@ -23,7 +23,7 @@ class Viewpoint:
     Attributes:
         elevation: degrees; a camera of positive elevation looks down.
         distance: of the camera from the object's centre, object units.
-        fov: field of view of the picture's shorter side, degrees.
+        fov: field of view of the image's shorter side, degrees.
     """
 
     elevation: float = 0.0
@@ -43,7 +43,7 @@ class Viewpoint:
     ) -> Viewpoint:
         """Return the viewpoint with some values replaced; None keeps a value.
 
-        A new field of view without a distance keeps the object's size in the picture by moving the
+        A new field of view without a distance keeps the object's size in the image by moving the
         camera.
         """
         if fov is not None and distance is None:
@@ -126,7 +126,7 @@ def placed(cameras: Cameras, center: Tensor, side: float) -> Cameras:
         side: its longest side there.
 
     Returns:
-        Cameras ``[V]`` float64 that see the same picture, with depths ``side`` times as long.
+        Cameras ``[V]`` float64 that see the same image, with depths ``side`` times as long.
     """
     viewmats = cameras.viewmats.double().clone()
     shift = (viewmats[..., :3, :3] @ center.double().cpu()[:, None])[..., 0]

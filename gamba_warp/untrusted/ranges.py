@@ -44,7 +44,7 @@ Opacity = Annotated[float, Meta(ge=0, le=1)]
 Elevation = Annotated[float, Meta(ge=-90, le=90)]  # degrees
 Fov = Annotated[float, Meta(ge=1, le=160)]  # degrees
 Distance = Annotated[float, Meta(ge=0.05, le=1000)]  # object units
-Rate = Annotated[float, Meta(gt=0, le=1000)]  # pictures a second
+Rate = Annotated[float, Meta(gt=0, le=1000)]  # images a second
 
 
 def range_error(value: float, limits: Meta) -> str | None:

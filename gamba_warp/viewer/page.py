@@ -23,7 +23,7 @@ from .pack import Frame, frame_of_mesh, own_frame, pack_gaussians, pack_mesh, vi
 
 # In order of their dependencies.
 _SCRIPTS = "shaders gl sorter camera controls packed meshes open edit ui main".split()
-_PICTURE = 512  # longest side of the input, pixels
+_IMAGE = 512  # longest side of the input, pixels
 # The page may load only inlined content; the sorting worker is made from a text of the page.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
@@ -87,7 +87,7 @@ def viewer_parts(
     mesh: Any = None,
     camera: tuple[float, float, float] | None = None,
     view: tuple[float, float, float] | None = None,
-    picture: np.ndarray | None = None,
+    image: np.ndarray | None = None,
     note: str = "",
     edit: dict[str, Any] | None = None,
 ) -> ViewerParts:
@@ -104,7 +104,7 @@ def viewer_parts(
             lines. None: without an input; the object may have any size and position.
         view: the initial view without a camera; its distance is from the object's centre, in units
             of the object's longest side.
-        picture: the input from ``camera``, ``[S, S, 3|4]`` in [0, 1], which a slider shows.
+        image: the input from ``camera``, ``[S, S, 3|4]`` in [0, 1], which a slider shows.
         note: a few words below the title.
         edit: lets the viewer edit the object, and tell the page around its frame: ``key`` of the
             object, ``elevation`` of ``camera``, and ``removed``, in base64 a bit for each Gaussian
@@ -134,7 +134,7 @@ def viewer_parts(
         "faces": faces,
         "home": home,
         "input": None if camera is None else home,
-        "picture": "" if picture is None else _data_url(picture),
+        "image": "" if image is None else _data_url(image),
         "frame": {"center": frame.center.tolist(), "size": frame.size},
         "edit": edit,
     }
@@ -142,9 +142,9 @@ def viewer_parts(
     return ViewerParts(json_text(about), *packed)
 
 
-def _data_url(picture: np.ndarray) -> str:
-    content, image = io.BytesIO(), Image.fromarray(to_uint8(picture))
-    image.thumbnail((_PICTURE, _PICTURE))
+def _data_url(image: np.ndarray) -> str:
+    content, image = io.BytesIO(), Image.fromarray(to_uint8(image))
+    image.thumbnail((_IMAGE, _IMAGE))
     image.save(content, "WEBP", quality=90)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
 

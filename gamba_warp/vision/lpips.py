@@ -1,4 +1,4 @@
-"""LPIPS with VGG16: perceptual distance of pictures (Zhang et al. 2018)."""
+"""LPIPS with VGG16: perceptual distance of images (Zhang et al. 2018)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..devices import float32_weights
 from .vgg import VGG16Trunk
 from .weights import WIDTHS, read_cached
 
-# LPIPS's normalisation of pictures in [-1, 1] (its "scaling layer").
+# LPIPS's normalisation of images in [-1, 1] (its "scaling layer").
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
@@ -29,14 +29,14 @@ class LPIPS(nn.Module):
             self.register_buffer(f"lin{k}", torch.empty(width))
         self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None], persistent=False)
         self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None], persistent=False)
-        # Pictures [.., H, W, 3] are channels last, and the convolutions keep that layout.
+        # Images [.., H, W, 3] are channels last, and the convolutions keep that layout.
         self.trunk.to(memory_format=torch.channels_last)
         renamed = {n if n.startswith("lin") else f"trunk.{n}": v for n, v in state.items()}
         self.load_state_dict(renamed)
         self.eval()
 
     def forward(self, a: Tensor, b: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
-        """Compute the distance of picture pairs, differentiable in both inputs.
+        """Compute the distance of image pairs, differentiable in both inputs.
 
         Args:
             a: ``[.., H, W, 3]`` RGB in [0, 1], H and W at least 16.
@@ -46,7 +46,7 @@ class LPIPS(nn.Module):
                 the cosine).
 
         Returns:
-            ``[..]`` float32, 0 for equal pictures.
+            ``[..]`` float32, 0 for equal images.
 
         Raises:
             ValueError: the shapes differ, are not RGB, or are smaller than 16 pixels.
@@ -63,25 +63,25 @@ class LPIPS(nn.Module):
                 y = self._lower(b, a.detach())[0]
         return self.distance(x, y).reshape(a.shape[:-3])
 
-    def features(self, pictures: Tensor) -> list[Tensor]:
+    def features(self, images: Tensor) -> list[Tensor]:
         """Compute the features for ``distance``: five maps ``[B, C, h, w]``, unit length per pixel.
 
         Args:
-            pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
+            images: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
         """
-        return [_unit(y) for y in self.trunk(self._normalized(pictures))]
+        return [_unit(y) for y in self.trunk(self._normalized(images))]
 
     def _lower(self, a: Tensor, b: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Compute ``features`` of both by ``VGG16Trunk.lower``."""
         found = self.trunk.lower(self._normalized(a), self._normalized(b))
         return [_unit(y) for y in found[0]], [_unit(y) for y in found[1]]
 
-    def _normalized(self, pictures: Tensor) -> Tensor:
-        x = pictures.reshape(-1, *pictures.shape[-3:]).permute(0, 3, 1, 2)
+    def _normalized(self, images: Tensor) -> Tensor:
+        x = images.reshape(-1, *images.shape[-3:]).permute(0, 3, 1, 2)
         return (2 * x - 1 - self.shift) / self.scale
 
     def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
-        """Compute distances ``[B]`` from two ``features``, to compare one picture with many."""
+        """Compute distances ``[B]`` from two ``features``, to compare one image with many."""
         total = a[0].new_zeros(len(a[0]))
         for k, (x, y) in enumerate(zip(a, b, strict=True)):
             weighted = torch.einsum("bchw,c->bhw", (x - y).square(), getattr(self, f"lin{k}"))

@@ -87,10 +87,10 @@ class VGG16Trunk(nn.Module):
         """Map normalised ``[B, 3, H, W]`` to the features relu1_2, 2_2, 3_3, 4_3 and 5_3.
 
         Raises:
-            ValueError: the pictures are smaller than 16 pixels.
+            ValueError: the images are smaller than 16 pixels.
         """
         if min(x.shape[-2:]) < 16:
-            raise ValueError(f"pictures are {x.shape[-1]}x{x.shape[-2]}; VGG16 needs 16x16 or more")
+            raise ValueError(f"images are {x.shape[-1]}x{x.shape[-2]}; VGG16 needs 16x16 or more")
         outputs = []
         for block, layers in enumerate(CONVS):
             x = F.max_pool2d(x, 2) if block else x
@@ -110,7 +110,7 @@ class VGG16Trunk(nn.Module):
             b: the same shape.
         """
         if min(a.shape[-2:]) < 16:
-            raise ValueError(f"pictures are {a.shape[-1]}x{a.shape[-2]}; VGG16 needs 16x16 or more")
+            raise ValueError(f"images are {a.shape[-1]}x{a.shape[-2]}; VGG16 needs 16x16 or more")
         if not self.turned or next(iter(self.turned.values())).device != a.device:
             self._lower_weights()
         made = _Lower.apply(a, b, self)
@@ -156,7 +156,7 @@ class VGG16Features(nn.Module):
         Tokens are in row-major order.
 
         Raises:
-            ValueError: the pictures are smaller than 16 pixels.
+            ValueError: the images are smaller than 16 pixels.
         """
         x = ((images - self.mean) / self.std).permute(0, 3, 1, 2)
         return self.trunk(x)[-1].flatten(2).mT

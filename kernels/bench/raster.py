@@ -17,7 +17,7 @@ from ..rasterize.harmonics.formula import colors_by_formula
 from . import measure, peers
 from .measure import Settings, Table, Variant
 
-# An alpha or transmittance below these does not show in float64's picture of 16,384 Gaussians.
+# An alpha or transmittance below these does not show in float64's image of 16,384 Gaussians.
 _NO_THRESHOLDS = {"alpha_min": 1e-9, "t_min": 1e-30}
 
 
@@ -179,7 +179,7 @@ def partial_gradients(scene: Case) -> list[Variant]:
 
 
 def one_call(settings: Settings) -> list[Variant]:
-    """Several objects in a few views each: in one call, and in as many as pictures."""
+    """Several objects in a few views each: in one call, and in as many as images."""
     objects, views, size = (2, 2, 64) if settings.level == "quick" else (8, 4, 128)
     shells = [shell(4096, 2, seed) for seed in range(objects)]
     viewmats, Ks = orbit_cameras(views, size)

@@ -25,7 +25,7 @@ _WORK = {
     "share of convolution": "convolution",
     "share of rasterizer": "rasterizer",
     "share of products": "products",
-    "share of pictures' convolutions": "pictures' convolutions",
+    "share of images' convolutions": "images' convolutions",
 }
 _UNSTEADY = 1.3  # ratio of the 80 % and 20 % quantiles from which a time is marked
 _BUSY = 1.2  # wall time over CPU time from which a machine is busy

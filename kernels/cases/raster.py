@@ -416,10 +416,10 @@ _PARTS = {
 
 
 def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
-    """Run the operator; compare pictures pixel by pixel, gradients Gaussian by Gaussian."""
+    """Run the operator; compare images pixel by pixel, gradients Gaussian by Gaussian."""
     o, x = case.options, build(case, device)
     leaves = {k: t for k, t in x.items() if t is not None and k != "Ks"}
-    samples, picture = truth(case, x, trial)
+    samples, image = truth(case, x, trial)
     names = ("alpha_min", "alpha_max", "eps2d", "radius_clip", "width", "height")
 
     def run(x: dict = x) -> dict[str, Tensor]:
@@ -433,21 +433,21 @@ def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
         )
         return {"renders": renders, "alphas": alphas}
 
-    truths = {"renders": picture.blended[..., :-1], "alphas": picture.blended[..., -1:]}
-    runs = Runs(case, run, leaves, truths, samples, without=picture.loose)
+    truths = {"renders": image.blended[..., :-1], "alphas": image.blended[..., -1:]}
+    runs = Runs(case, run, leaves, truths, samples, without=image.loose)
     outcome = runs.outcome(
         _PARTS,
-        renders={"extra": picture.allowance[..., :-1], "shown": ~picture.undecided},
-        alphas={"extra": picture.allowance[..., -1:], "shown": ~picture.undecided},
+        renders={"extra": image.allowance[..., :-1], "shown": ~image.undecided},
+        alphas={"extra": image.allowance[..., -1:], "shown": ~image.undecided},
     )
     if o["poison"]:
         outcome.faults += _poison_faults(case, x, run, runs)
-    outcome.pixels, outcome.undecided = picture.undecided.numel(), int(picture.undecided.sum())
+    outcome.pixels, outcome.undecided = image.undecided.numel(), int(image.undecided.sum())
     return outcome
 
 
 def _poison_faults(case: RandomCase, x: dict, run, runs: Runs) -> list[str]:
-    """List what Gaussians that are not finite change in picture and gradients: no bit may."""
+    """List what Gaussians that are not finite change in image and gradients: no bit may."""
     bad, old = poisoned(case, x)
     again = run(bad)
     others = gradients_of(again, {k: bad[k] for k in runs.grads}, runs.cotangents)

@@ -1,4 +1,4 @@
-"""1 - SSIM of pictures with its gradient."""
+"""1 - SSIM of images with its gradient."""
 
 from .api import dissimilarity
 

@@ -11,9 +11,9 @@ from .reference import WINDOW
 
 
 def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tensor | None]:
-    """Computes 1 - SSIM of pictures, and its derivative by ``got`` (README).
+    """Computes 1 - SSIM of images, and its derivative by ``got`` (README).
 
-    A picture's value depends on no other picture. Windows in which two pictures are equal, as they
+    An image's value depends on no other image. Windows in which two images are equal, as they
     are on the background, add 0 and have no slope; a CPU skips pixels of no other window.
     float32 on a CPU has kernels; other dtypes and devices take matrix products, which have to keep
     all digits: where the process allows rounding, the caller has to switch it off.
@@ -25,7 +25,7 @@ def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tenso
 
     Returns:
         Values ``[P]``, means over channels and whole windows, and the slope ``[P, H, W, C]``, both
-        in the dtype of the pictures.
+        in the dtype of the images.
 
     Raises:
         TypeError: the dtypes differ or are not floating, or the devices differ.

@@ -1,4 +1,4 @@
-"""1 - SSIM of float32 pictures on a CPU: sizes and launches of the kernels of ``ssim_cpu.h``."""
+"""1 - SSIM of float32 images on a CPU: sizes and launches of the kernels of ``ssim_cpu.h``."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from .reference import EDGE
 
 _LANES = 16
 _STRIP = 8  # rows of windows of a task, whose values are summed before they are stored
-# Largest size of a launch's pictures, in numbers: data between two launches is some ten
+# Largest size of a launch's images, in numbers: data between two launches is some ten
 # times as large, and should stay in the cache.
 _TOGETHER = 1 << 18
 
 
 @struct
 class Maps:
-    """Pictures and the data between the launches; without a slope the last three are empty."""
+    """Images and the data between the launches; without a slope the last three are empty."""
 
     channels: int
-    scale: float  # 1 / windows of a picture, all channels
+    scale: float  # 1 / windows of an image, all channels
     got: wp.array3d[wp.float32]
     want: wp.array3d[wp.float32]
     shift: wp.array3d[wp.float32]  # [P, 1, E], subtracted from the sums
@@ -50,7 +50,7 @@ _across, _down, _up, _back = map(_kernel, ("across", f"down<{_STRIP}>", "up", "b
 
 
 def dissimilarity_on_lanes(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tensor | None]:
-    """Computes ``dissimilarity`` of float32 pictures on the CPU.
+    """Computes ``dissimilarity`` of float32 images on the CPU.
 
     Args:
         got: ``[P, H, W, C]`` without a gradient.
@@ -82,7 +82,7 @@ def _between(
 
 
 def _compute(got: Tensor, want: Tensor, slope: Tensor | None, scratch: Tensor) -> Tensor:
-    """Values ``[n]`` of pictures that are computed together; the slope goes into ``slope``."""
+    """Values ``[n]`` of images that are computed together; the slope goes into ``slope``."""
     windows = (got.shape[1] - EDGE) * (got.shape[2] - EDGE) * got.shape[3]
     # Reductions of bool are slow. A difference of float32 is 0 only between equal numbers.
     apart = torch.sub(got, want, out=scratch[: got.numel()].view(got.shape)).abs_().amax(0)
@@ -111,8 +111,8 @@ def _compute(got: Tensor, want: Tensor, slope: Tensor | None, scratch: Tensor) -
     return values.sum((1, 2)) / windows
 
 
-def _rows(pictures: Tensor) -> Tensor:
+def _rows(images: Tensor) -> Tensor:
     """``[P, H, W, C]``, whose rows are dense, as ``[P, H, W · C]`` without a copy."""
-    count, height, width, channels = pictures.shape
-    strides = (*pictures.stride()[:2], 1)
-    return pictures.as_strided((count, height, width * channels), strides)
+    count, height, width, channels = images.shape
+    strides = (*images.stride()[:2], 1)
+    return images.as_strided((count, height, width * channels), strides)

@@ -16,13 +16,13 @@ from torch.nn.functional import pad
 from .reference import C1, C2, EDGE, SIGMA, WINDOW
 
 _TILE = 32  # columns of a banded product
-_TOGETHER = 1 << 17  # numbers of the pictures that a CPU takes together, two of 128²
+_TOGETHER = 1 << 17  # numbers of the images that a CPU takes together, two of 128²
 
 
 def groups(
     size: int, got: Tensor, want: Tensor, slopes: Tensor | None
 ) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
-    """Pictures that are computed together, at most ``size``, with the views of their slopes."""
+    """Images that are computed together, at most ``size``, with the views of their slopes."""
     for i in range(0, len(got), size):
         part = slice(i, i + size)
         yield got[part], want[part], None if slopes is None else slopes[part]
@@ -42,7 +42,7 @@ def box_of_windows(unequal: Tensor) -> tuple[slice, slice] | None:
 def dissimilarity_by_products(
     got: Tensor, want: Tensor, slope: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Computes ``dissimilarity`` of pictures of any floating dtype, on any device.
+    """Computes ``dissimilarity`` of images of any floating dtype, on any device.
 
     Args:
         got: ``[P, H, W, C]`` without a gradient.

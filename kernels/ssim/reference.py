@@ -7,12 +7,12 @@ from torch import Tensor
 
 WINDOW = 11  # pixels, side of the Gaussian window
 SIGMA = 1.5  # pixels
-C1, C2 = 0.01**2, 0.03**2  # for pictures in [0, 1]
-EDGE = WINDOW - 1  # pixels minus windows of a picture, in each direction
+C1, C2 = 0.01**2, 0.03**2  # for images in [0, 1]
+EDGE = WINDOW - 1  # pixels minus windows of an image, in each direction
 
 
 def dissimilarity_reference(got: Tensor, want: Tensor) -> Tensor:
-    """Computes 1 - SSIM of pictures, differentiable; windows are unfolded, so it is for small ones.
+    """Computes 1 - SSIM of images, differentiable; windows are unfolded, so it is for small ones.
 
     Args:
         got: ``[P, H, W, C]``.

@@ -15,7 +15,7 @@ from helpers.images import bytes_of
 from PIL import Image
 
 from gamba_warp.app.cutting import examples
-from gamba_warp.app.guard import MAX_PICTURES
+from gamba_warp.app.guard import MAX_IMAGES
 from gamba_warp.app.work import KINDS
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
@@ -48,7 +48,7 @@ def program(served):
 
 @pytest.fixture
 def private(tmp_path):
-    """A picture of the user, outside the app's folder."""
+    """An image of the user, outside the app's folder."""
     path = tmp_path / "private.png"
     path.write_bytes(bytes_of(Image.new("RGB", (60, 60), "white")))
     return path
@@ -68,7 +68,7 @@ def test_a_program_that_does_as_the_page_does(program, private):
     layer = Image.new("RGBA", (720, 720), (0, 0, 255, 255))
     painted = {"layers": [given(program.upload(bytes_of(layer)))], "background": {"path": "/"}}
     _, editor, note, _ = program.result(MEND, [None, painted])["data"]
-    assert "edited" in note and "touches the picture" in note
+    assert "edited" in note and "touches the image" in note
     after = editor["value"]["background"]["path"]
     assert program.ask("/manifest.json").body == b"{}"  # the page links it
     assert Path(after).read_bytes() != Path(shown).read_bytes()
@@ -90,9 +90,9 @@ def test_enclosed_areas_are_filled_and_cleared(program):
 
 def made_square(program):
     """Make an object; return its key, and the number of Gaussians that the viewer has."""
-    picture = Image.new("RGB", (200, 200), "white")
-    picture.paste((200, 30, 20), (50, 50, 150, 150))
-    program.result(TAKE, [given(program.upload(bytes_of(picture)))])
+    image = Image.new("RGB", (200, 200), "white")
+    image.paste((200, 30, 20), (50, 50, 150, 150))
+    program.result(TAKE, [given(program.upload(bytes_of(image)))])
     page = str(program.result(MAKE, [None, None, None])["data"])
     edit = html.unescape(html.unescape(page[page.index("{&quot;title") :]))
     key = re.search(r'"key": "(\w+)"', edit)[1]
@@ -166,7 +166,7 @@ def test_only_files_of_the_visitor_are_taken(served, program, private, meta):
             lines[str(path), number] = answer.status, answer.line
     assert len(set(lines.values())) == 1, lines
     assert set(lines.values()) == {
-        (400, "this file is missing or has expired; give the picture again")
+        (400, "this file is missing or has expired; give the image again")
     }
     for item in (str(private), [given(private)], {"url": str(private)}, 1, {"a": given(private)}):
         for number, data in ((TAKE, [item]), (MEND, [None, item]), (MEND, [item, None])):
@@ -174,11 +174,11 @@ def test_only_files_of_the_visitor_are_taken(served, program, private, meta):
 
 
 def test_a_session_is_that_of_its_visitor(served, program, private):
-    """A page's picture is not available to another that knows its session."""
+    """A page's image is not available to another that knows its session."""
     assert "data" in program.result(TAKE, [given(program.upload(private.read_bytes()))])
     assert "data" in program.result(RESTART, [None])
     other = Program(served.host, session=program.session).opened()
-    assert other.result(RESTART, [None])["error"].startswith("give a picture first")
+    assert other.result(RESTART, [None])["error"].startswith("give an image first")
 
 
 def test_only_files_of_the_visitor_are_shown(served, program, private):
@@ -197,8 +197,8 @@ def test_only_files_of_the_visitor_are_shown(served, program, private):
     "content, reason",
     [
         (bytes_of(Image.new("1", (9000, 9000))), "9000x9000 is over 4 megapixels"),
-        (bytes_of(Image.new("RGB", (50, 50)), "EPS"), "not a picture that can be read"),
-        (bytes_of(Image.new("RGB", (50, 50)), "TIFF"), "not a picture that can be read"),
+        (bytes_of(Image.new("RGB", (50, 50)), "EPS"), "not an image that can be read"),
+        (bytes_of(Image.new("RGB", (50, 50)), "TIFF"), "not an image that can be read"),
         (bytes_of(Image.new("RGB", (500, 50)))[:70], "cannot be decoded"),
         (b"", "the file is empty"),
     ],
@@ -295,9 +295,9 @@ def test_a_page_that_is_open_is_heard_of(served, program):
 
 def test_the_job_of_a_closed_page_ends(served, program, private):
     """The next visitor does not wait until all files of the one who left are written."""
-    picture = Image.new("RGB", (200, 200), "white")
-    picture.paste((200, 30, 20), (50, 50, 150, 150))
-    program.result(TAKE, [given(program.upload(bytes_of(picture)))])
+    image = Image.new("RGB", (200, 200), "white")
+    image.paste((200, 30, 20), (50, 50, 150, 150))
+    program.result(TAKE, [given(program.upload(bytes_of(image)))])
     assert "data" in program.result(MAKE, [None, None, None])
     assert program.join(ZIP, [None, "200,000 faces", "Texture 2048", True]).status == 200
     cookie, host = f"Cookie: {program.headers['Cookie']}", f"Host: {served.host}"
@@ -368,7 +368,7 @@ def test_no_such_function_is_one_line(program, number):
     [
         *[(TAKE, []), (TAKE, [None, None]), (BRUSH, ["Paint it black"]), (BRUSH, [0])],
         *[(MAKE, [None] * 2), (MAKE, [None, 0, None])],
-        *[(SEVERAL, [[{"path": "x"}] * (MAX_PICTURES + 1), None]), (SEVERAL, ["x", None])],
+        *[(SEVERAL, [[{"path": "x"}] * (MAX_IMAGES + 1), None]), (SEVERAL, ["x", None])],
     ],
 )
 def test_other_inputs_are_one_line(program, number, data):
@@ -417,7 +417,7 @@ def test_uploads_are_bounded(served, program, bare):
         (huge, FORM, 413),
         (form(b"x"), {}, 400),
         (b"nothing", FORM, 400),
-        (head * (MAX_PICTURES + 1) + b"--edge--\r\n", FORM, 400),
+        (head * (MAX_IMAGES + 1) + b"--edge--\r\n", FORM, 400),
         (field, FORM, 400),
         (iter([form(b"x")]), FORM, 411),
     ):
@@ -432,6 +432,6 @@ def test_uploads_are_bounded(served, program, bare):
 def test_the_name_of_an_upload_is_not_its_own(served, program):
     for name in ("../../../evil.png", "/etc/evil.PNG", "a\\..\\evil.png", "evil.html", ".png"):
         path = Path(program.upload(b"x", name))
-        assert path.name in ("picture.png", "picture")
+        assert path.name in ("image.png", "image")
         assert path.is_relative_to(served.temporary)
     assert not [path for path in served.temporary.rglob("*") if "evil" in path.name]

@@ -55,7 +55,7 @@ def opened(served, browser_page):
     found.page.on("console", found.hear)
     found.page.on("pageerror", lambda error: found.complaints.append(str(error)))
     found.page.goto(served.address)
-    found.page.wait_for_selector("#picture input[type=file]", state="attached")
+    found.page.wait_for_selector("#image input[type=file]", state="attached")
     yield found
     here = (served.address, "data:", "blob:")
     assert not [url for url in found.asked if not url.startswith(here)], "all stays on this machine"
@@ -63,7 +63,7 @@ def opened(served, browser_page):
 
 
 def give(page, path):
-    page.locator("#picture input[type=file]").set_input_files(str(path))
+    page.locator("#image input[type=file]").set_input_files(str(path))
 
 
 def toast(page):
@@ -72,7 +72,7 @@ def toast(page):
 
 
 def middle(page):
-    """Return the colour in the middle of the editor's picture, 0 to 255."""
+    """Return the colour in the middle of the editor's image, 0 to 255."""
     shot = Image.open(io.BytesIO(page.locator("#editor canvas").first.screenshot()))
     x, y = shot.width // 2, shot.height // 2
     return np.asarray(shot.convert("RGB"))[y - 2 : y + 3, x - 2 : x + 3].mean((0, 1))
@@ -87,9 +87,9 @@ def until(found, what):
 
 
 def red_square(folder):
-    picture = np.ones((200, 200, 3))
-    picture[40:160, 40:160] = RED
-    save_image(folder / "my square.png", picture)
+    image = np.ones((200, 200, 3))
+    image[40:160, 40:160] = RED
+    save_image(folder / "my square.png", image)
     return folder / "my square.png"
 
 
@@ -119,7 +119,7 @@ def test_the_whole_way(opened, served, tmp_path):
 
     until(paint, "a stroke is seen")
     page.get_by_role("button", name="Apply strokes").click()
-    # A little of what is cut away still shows; a picture that loads is white, or nearly.
+    # A little of what is cut away still shows; an image that loads is white, or nearly.
     until(lambda: 150 < middle(page)[1] < 220 < middle(page)[0] + 10, "the middle is cut away")
     page.get_by_role("button", name="Start over").click()
     until(lambda: middle(page)[1] < 60, "the middle is back")
@@ -146,15 +146,15 @@ def test_the_whole_way(opened, served, tmp_path):
     assert "my-square.ply" in listed and "my-square.spz" in listed
 
 
-def test_several_pictures_and_a_strip(opened, tmp_path):
+def test_several_images_and_a_strip(opened, tmp_path):
     page = opened.page
-    pictures = [red_square(tmp_path), tmp_path / "blue.png"]
+    images = [red_square(tmp_path), tmp_path / "blue.png"]
     pixels = np.ones((200, 200, 3))
     pixels[50:150, 80:190] = 0.1, 0.2, 0.8
-    save_image(pictures[1], pixels)
+    save_image(images[1], pixels)
     with page.expect_file_chooser() as chosen:
         page.locator("#several").click()
-    chosen.value.set_files(pictures)
+    chosen.value.set_files(images)
     page.wait_for_selector("#results button >> nth=1")
 
     def viewed():
@@ -226,7 +226,7 @@ def test_the_object_is_rotated_at_once(opened, tmp_path):
     np.testing.assert_allclose(turned.means, wanted, atol=1e-5)
     assert np.abs(turned.means - whole.means).max() > 0.05
 
-    page.locator("#picture").get_by_label("Remove Image").click()
+    page.locator("#image").get_by_label("Remove Image").click()
     page.wait_for_selector("#cut", state="hidden")
     give(page, tmp_path / "blue.png")
     page.wait_for_selector("#cut", state="visible")
@@ -289,7 +289,7 @@ def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
     page.wait_for_selector("#editor canvas")
     page.wait_for_selector("#note:has-text('transparency')")
     save_image(tmp_path / "even.png", np.full((50, 60, 3), 0.5))
-    page.locator("#picture").get_by_label("Remove Image").click()
+    page.locator("#image").get_by_label("Remove Image").click()
     page.wait_for_selector("#cut", state="hidden")
     give(page, tmp_path / "even.png")
     page.wait_for_selector("#note:has-text('No object was found')")
@@ -377,12 +377,12 @@ def test_a_doubted_cut_out_is_made_again_by_a_network(browser_page, tmp_path, mo
         page.wait_for_selector("#network", state="hidden")
 
 
-def test_no_picture_is_one_line(opened, tmp_path):
+def test_no_image_is_one_line(opened, tmp_path):
     page = opened.page
     bad = tmp_path / "<b>no.png"
-    bad.write_bytes(b"nothing of a picture")
+    bad.write_bytes(b"nothing of an image")
     give(page, bad)
-    assert "<b>no.png: not a picture that can be read" in toast(page)
+    assert "<b>no.png: not an image that can be read" in toast(page)
     assert page.locator("#cut").count() == 0 or page.locator("#cut").is_hidden()
 
 
@@ -392,7 +392,7 @@ def test_too_large_an_upload_is_refused(opened, served, tmp_path):
     big.write_bytes(b"\x89PNG" + bytes((MEGABYTES << 20) + 1))
     give(page, big)
     assert "exceed the maximum allowed size" in toast(page)
-    opened.complaints.clear()  # gradio's page logs that it has no picture to show
+    opened.complaints.clear()  # gradio's page logs that it has no image to show
     # Warp keeps headers in a folder of its own while it compiles
     files = (p for p in served.temporary.rglob("*") if not p.parent.name.startswith("wp_pch_"))
     left = [p for p in files if p.is_file() and p.stat().st_size > 1 << 20]

@@ -164,7 +164,7 @@ def test_all_uploads_together_are_bounded(tmp_path):
 
 
 def kept_file(files, visitor, size=1000):
-    path = files.new_folder(visitor, size) / "picture.png"
+    path = files.new_folder(visitor, size) / "image.png"
     path.write_bytes(bytes(size))
     return path
 
@@ -280,7 +280,7 @@ def test_old_files_go_by_themselves(tmp_path, monkeypatch):
     monkeypatch.setattr(guard, "KEEP_SECONDS", 0.06)
     monkeypatch.setattr(visitor_files, "KEEP_SECONDS", 0.06)
     files = VisitorFiles(tmp_path)
-    path = files.new_folder("a") / "picture.png"
+    path = files.new_folder("a") / "image.png"
     path.write_bytes(b"x")
 
     async def lives(scope, receive, send):
@@ -314,7 +314,7 @@ def left_folder(path, mode=0o700):
     """Folder of a killed process."""
     path.mkdir()
     path.chmod(mode)
-    (path / "picture.png").write_bytes(b"x")
+    (path / "image.png").write_bytes(b"x")
     (path / ".lock").write_text("1\n")
     return path
 
@@ -338,10 +338,10 @@ def test_a_link_is_not_followed(tmp_path, temporary):
     (temporary / f"{server.PREFIX}folder").symlink_to(home)
     left = left_folder(temporary / f"{server.PREFIX}lock")
     (left / ".lock").unlink()
-    (left / ".lock").symlink_to(home / "picture.png")
+    (left / ".lock").symlink_to(home / "image.png")
     with server.work_folder():
         assert (home / ".lock").exists() and left.exists()
-    assert (home / "picture.png").read_bytes() == b"x"
+    assert (home / "image.png").read_bytes() == b"x"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="folders have owners and modes on POSIX alone")
@@ -391,7 +391,7 @@ def test_jobs_are_done_by_the_one_that_works():
 
     def ask():
         found.append(main_thread.call(lambda a, b: (a + b, threading.get_ident()), 2, 3))
-        for error in (UserError("no picture"), ZeroDivisionError("ours"), KeyboardInterrupt()):
+        for error in (UserError("no image"), ZeroDivisionError("ours"), KeyboardInterrupt()):
             try:
                 main_thread.call(fail, error)
             except Exception as caught:
@@ -404,7 +404,7 @@ def test_jobs_are_done_by_the_one_that_works():
     thread.join(timeout=10)
     assert found == [
         (5, threading.get_ident()),
-        "no picture",
+        "no image",
         "ours",
         "gamba app has stopped; restart it",
     ]

@@ -1,4 +1,4 @@
-"""From a picture to files, without the page."""
+"""From an image to files, without the page."""
 
 import base64
 import re
@@ -33,26 +33,26 @@ RED, GREEN = (0.8, 0.1, 0.1), (0.1, 0.6, 0.2)
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """A picture of a red square and a green one beside it, on white."""
-    picture = np.ones((60, 100, 3))
-    picture[20:40, 15:35] = RED
-    picture[20:40, 60:80] = GREEN
+    """An image of a red square and a green one beside it, on white."""
+    image = np.ones((60, 100, 3))
+    image[20:40, 15:35] = RED
+    image[20:40, 60:80] = GREEN
     path = tmp_path_factory.mktemp("two") / "two.png"
-    save_image(path, picture)
+    save_image(path, image)
     return path
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    picture = cut_out(tmp_path_factory.mktemp("made") / "thing.png")
-    cut = cutting.cut_picture(picture, "My  thing.v2.png", CutoutOptions())
+    image = cut_out(tmp_path_factory.mktemp("made") / "thing.png")
+    cut = cutting.cut_image(image, "My  thing.v2.png", CutoutOptions())
     return work.run_model(load_model(STARTER / "tiny.safetensors"), cut)
 
 
-def test_a_picture_from_above_stands_upright(tmp_path, made):
+def test_a_image_from_above_stands_upright(tmp_path, made):
     """Rotation like ``reconstruct --elevation``, in the viewer's camera and in every file."""
-    picture = cut_out(tmp_path / "thing.png")
-    cut = cutting.cut_picture(picture, "thing.png", CutoutOptions())
+    image = cut_out(tmp_path / "thing.png")
+    cut = cutting.cut_image(image, "thing.png", CutoutOptions())
     above = work.run_model(load_model(STARTER / "tiny.safetensors"), cut, 30.0)
     turn = orbit(torch.zeros(1), 30.0)[0, :3, :3]
     torch.testing.assert_close(above.kept.means @ turn.T, made.kept.means)
@@ -68,7 +68,7 @@ def test_a_picture_from_above_stands_upright(tmp_path, made):
     assert made.view == above.view and made.chosen == above.chosen == 30
     path, _ = work.write(above, "ply", tmp_path)
     options = quick(STARTER / "tiny.safetensors", tmp_path / "out", 30)
-    assert run_reconstruct(picture, *options) == 0
+    assert run_reconstruct(image, *options) == 0
     theirs = load_ply(tmp_path / "out" / "thing.ply")
     torch.testing.assert_close(load_ply(path).means, theirs.means)
 
@@ -82,22 +82,22 @@ def stroke(shape, box, color):
     return layer
 
 
-def test_a_plain_picture_is_cut_out(two):
-    cut = cutting.cut_picture(two, "two.png", CutoutOptions())
+def test_a_plain_image_is_cut_out(two):
+    cut = cutting.cut_image(two, "two.png", CutoutOptions())
     assert cut.mask.shape == (60, 100) and cut.name == "two"
     assert cut.mask[30, 25] == 1 and cut.mask[30, 70] == 1 and cut.mask[5, 5] == 0
     assert "plain background" in cut.note
-    assert cutting.model_picture(cut) is cut.found
+    assert cutting.model_image(cut) is cut.found
 
 
 @pytest.mark.parametrize("size", [(60, 100), (432, 720), (31, 57)])
 def test_strokes_keep_and_remove(two, size):
-    cut = cutting.cut_picture(two, "two.png", CutoutOptions())
+    cut = cutting.cut_image(two, "two.png", CutoutOptions())
     without = cutting.apply_strokes(cut, [stroke(size, (0.2, 0.5, 0.8, 1.0), cutting.REMOVE)])
     assert without.mask[30, 25] == 1 and without.mask[30, 70] == 0
     assert "2 separate parts" in cut.note == cutting.note_of(cut)
     assert "edited" in cutting.note_of(without) and "parts" not in cutting.note_of(without)
-    side = cutting.model_picture(without).shape[0]
+    side = cutting.model_image(without).shape[0]
     assert side == 25  # 20 pixels are four fifths of it
     assert cut.mask[30, 70] == 1, "the first one is as it was"
     again = cutting.apply_strokes(without, [stroke(size, (0.2, 0.5, 0.8, 0.9), cutting.KEEP)])
@@ -109,7 +109,7 @@ def test_strokes_keep_and_remove(two, size):
 
 
 def post(folder):
-    """A picture of a red post, which touches the border, so that its cut-out is doubted."""
+    """An image of a red post, which touches the border, so that its cut-out is doubted."""
     rgb = np.ones((60, 80, 3))
     rgb[20:, 30:50] = 0.8, 0.2, 0.1
     save_image(folder / "post.png", rgb)
@@ -124,7 +124,7 @@ def test_a_doubted_cut_out_has_no_command_but_a_network(tmp_path, monkeypatch):
     monkeypatch.setenv("U2NET_HOME", str(home))
 
     def cut():
-        found = cutting.cut_picture(post(tmp_path), "post.png", options)
+        found = cutting.cut_image(post(tmp_path), "post.png", options)
         assert "may be wrong: it touches" in found.note and "Paint what to keep" in found.note
         assert "gamba" not in found.note and "--" not in found.note
         return found
@@ -156,12 +156,12 @@ def test_a_doubted_cut_out_has_no_command_but_a_network(tmp_path, monkeypatch):
 def test_words_of_the_command_line_are_not_for_the_page(tmp_path):
     options = CutoutOptions(notify=lambda line: None)
     save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
-    assert "--" not in cutting.cut_picture(tmp_path / "even.png", "even.png", options).note
+    assert "--" not in cutting.cut_image(tmp_path / "even.png", "even.png", options).note
     rgb = np.ones((60, 80, 3))
     rgb[10:50, 20:60] = 0.8, 0.2, 0.1
     rgb[20:40, 30:50] = 1
     save_image(tmp_path / "ring.png", rgb)
-    note = cutting.cut_picture(tmp_path / "ring.png", "ring.png", options).note
+    note = cutting.cut_image(tmp_path / "ring.png", "ring.png", options).note
     assert "with 1 enclosed area of it" in note and "--" not in note
 
 
@@ -171,7 +171,7 @@ def test_enclosed_areas_are_cleared_and_filled(tmp_path):
     rgb[20:40, 30:50] = 1  # a hole
     rgb[42:46, 30:50] = 0.95  # of another white: matter
     save_image(tmp_path / "ring.png", rgb)
-    cut = cutting.cut_picture(tmp_path / "ring.png", "ring.png", CutoutOptions())
+    cut = cutting.cut_image(tmp_path / "ring.png", "ring.png", CutoutOptions())
     assert cut.mask[30, 40] == 0 and cut.mask[44, 40] == 1 and "1 enclosed area" in cut.note
     cleared = cutting.switch_areas(cut)
     assert cleared.mask[30, 40] == 0 and cleared.mask[44, 40] == 0 and cleared.mask[15, 40] == 1
@@ -181,51 +181,51 @@ def test_enclosed_areas_are_cleared_and_filled(tmp_path):
 
 
 def test_a_mended_object_has_no_fringe(tmp_path):
-    """Along a smoothed edge the picture mixes object and background; the found colours do not."""
-    picture = Image.new("RGB", (400, 400), "white")
-    picture.paste((200, 20, 20), (100, 120, 300, 280))
-    picture = picture.rotate(20, Image.Resampling.BICUBIC, fillcolor="white")
-    picture.resize((100, 100), Image.Resampling.LANCZOS).save(tmp_path / "a.png")
-    cut = cutting.cut_picture(tmp_path / "a.png", "a.png", CutoutOptions())
+    """Along a smoothed edge the image mixes object and background; the found colours do not."""
+    image = Image.new("RGB", (400, 400), "white")
+    image.paste((200, 20, 20), (100, 120, 300, 280))
+    image = image.rotate(20, Image.Resampling.BICUBIC, fillcolor="white")
+    image.resize((100, 100), Image.Resampling.LANCZOS).save(tmp_path / "a.png")
+    cut = cutting.cut_image(tmp_path / "a.png", "a.png", CutoutOptions())
     mended = cutting.apply_strokes(cut, [stroke((50, 50), (0.4, 0.4, 0.6, 0.6), cutting.REMOVE)])
-    rgba = cutting.model_picture(mended)
+    rgba = cutting.model_image(mended)
     edge = rgba[(rgba[..., 3] > 0.3) & (rgba[..., 3] < 0.95)]
     # White would have a green of 1; what the flood leaves of it is within its tolerance.
     assert len(edge) > 20 and np.quantile(edge[:, 1], 0.9) < 0.4
 
 
 def test_what_is_painted_on(two):
-    cut = cutting.cut_picture(two, "two.png", CutoutOptions())
-    shown = cutting.editor_picture(cut)
+    cut = cutting.cut_image(two, "two.png", CutoutOptions())
+    shown = cutting.editor_image(cut)
     assert shown.shape == (432, 720, 3) and shown.dtype == np.uint8
     np.testing.assert_allclose(shown[216, 180], np.multiply(RED, 255), atol=2)
     corner = {tuple(shown[y, x]) for y in (5, 17) for x in (5, 17)}
     assert len(corner) == 2, "a checkerboard"
     gone = replace(cut, mask=np.zeros_like(cut.mask))
-    faint = cutting.editor_picture(gone)[216, 180].astype(int)
+    faint = cutting.editor_image(gone)[216, 180].astype(int)
     assert faint[0] > faint[1] + 20, "what is cut away still shows, faintly"
-    bare = cutting.editor_picture(replace(gone, ghost=False))[216, 180]
+    bare = cutting.editor_image(replace(gone, ghost=False))[216, 180]
     assert len(set(bare.tolist())) == 1
 
 
 def test_without_an_object_it_can_be_painted(tmp_path):
-    """A uniform picture has no object; the painted area is cut out."""
+    """A uniform image has no object; the painted area is cut out."""
     save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
-    cut = cutting.cut_picture(tmp_path / "even.png", "even.png", CutoutOptions())
+    cut = cutting.cut_image(tmp_path / "even.png", "even.png", CutoutOptions())
     assert not cut.mask.any() and cut.note.startswith("No object was found (")
     assert str(tmp_path) not in cut.note
-    refused("no object found.*paint over the object", cutting.model_picture, cut)
+    refused("no object found.*paint over the object", cutting.model_image, cut)
     painted = cutting.apply_strokes(cut, [stroke((80, 100), (0.25, 0.2, 0.75, 0.8), cutting.KEEP)])
-    assert cutting.model_picture(painted).shape == (38, 38, 4)  # 30 pixels over 0.8
+    assert cutting.model_image(painted).shape == (38, 38, 4)  # 30 pixels over 0.8
     removed = cutting.apply_strokes(painted, [stroke((8, 10), (0, 0, 1, 1), cutting.REMOVE)])
-    refused("no object found", cutting.model_picture, removed)
+    refused("no object found", cutting.model_image, removed)
     assert "may be wrong" not in cutting.note_of(removed)
 
 
-def test_no_pictures(tmp_path):
+def test_no_images(tmp_path):
     for name, path, reason in bad_files(tmp_path):
         said = refused(
-            re.escape(reason) or None, cutting.cut_picture, path, "given.png", CutoutOptions()
+            re.escape(reason) or None, cutting.cut_image, path, "given.png", CutoutOptions()
         )
         assert said.startswith("given.png: ") and str(tmp_path) not in said, name
 
@@ -265,8 +265,8 @@ def test_every_kind_of_file(made, tmp_path):
 def test_the_turntable(made, tmp_path, monkeypatch):
     monkeypatch.setattr(work, "FRAMES", 3)
     path, _ = work.write(made, "gif", tmp_path)
-    with Image.open(path) as picture:
-        assert picture.n_frames == 3 and picture.size == (work.SIZE, work.SIZE)
+    with Image.open(path) as image:
+        assert image.n_frames == 3 and image.size == (work.SIZE, work.SIZE)
 
 
 def test_a_mesh(made, tmp_path, monkeypatch):
@@ -354,7 +354,7 @@ def page(made, tmp_path, monkeypatch):
     pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
     from gamba_warp.app import actions
 
-    monkeypatch.setattr(actions, "cut_picture", lambda path, name, _: Mock(title=name, warning=""))
+    monkeypatch.setattr(actions, "cut_image", lambda path, name, _: Mock(title=name, warning=""))
     monkeypatch.setattr(work, "run_model", lambda _, cut: replace(made, name=cut.title))
     monkeypatch.setattr(work, "viewer", lambda made: made.name)
     monkeypatch.setattr(work, "thumbnail", lambda *_: None)
@@ -363,7 +363,7 @@ def page(made, tmp_path, monkeypatch):
 
 
 def results_of(page, names, results):
-    """Yield the results, and the strip, after each picture."""
+    """Yield the results, and the strip, after each image."""
     given = [{"path": "a", "orig_name": name} for name in names]
     for _, kept, strip, *_ in page.take_all(given, results, MagicMock(), lambda *_: None):
         yield kept, strip["value"]
@@ -372,7 +372,7 @@ def results_of(page, names, results):
 def test_the_strip_keeps_the_last_results(page, monkeypatch):
     said = []
     monkeypatch.setattr("gradio.Info", said.append)
-    results, most = [], guard.MAX_PICTURES
+    results, most = [], guard.MAX_IMAGES
     for count in (most - 1, 1, 1):
         assert not said
         *_, (results, strip) = results_of(
@@ -383,7 +383,7 @@ def test_the_strip_keeps_the_last_results(page, monkeypatch):
     assert said == ["The strip keeps the last 12 results."]
 
 
-def test_each_of_several_pictures_is_shown_once_it_is_done(page, made, monkeypatch):
+def test_each_of_several_images_is_shown_once_it_is_done(page, made, monkeypatch):
     run = []
     monkeypatch.setattr(work, "run_model", lambda _, cut: run.append(cut.title) or made)
     shown = results_of(page, "abc", [])
@@ -402,7 +402,7 @@ def test_each_of_several_pictures_is_shown_once_it_is_done(page, made, monkeypat
     assert run == ["a", "b", "cancelled"], "the next one is not begun"
 
 
-def test_an_elevation_set_by_hand_stays_with_its_picture(page, made, monkeypatch):
+def test_an_elevation_set_by_hand_stays_with_its_image(page, made, monkeypatch):
     asked = []
     monkeypatch.setattr(
         work, "run_model", lambda _, cut, angle: asked.append(angle) or new(cut.key)
@@ -438,7 +438,7 @@ def test_what_waits_for_the_device(page, made, tmp_path):
             listed, _ = page.writer(kind)(state, *inputs)
             assert listed["value"] == [str(path) for path in state[1]] and state[1][0].is_file()
     assert events["cancel"].concurrency_id != events["make"].concurrency_id
-    for name in ("picture", "examples", "make", "several", "results", "file-ply", "file-gif"):
+    for name in ("image", "examples", "make", "several", "results", "file-ply", "file-gif"):
         assert [each.elem_id for each in events[name].show_progress_on] == ["status"]
 
 
@@ -460,7 +460,7 @@ def test_the_stages_of_a_mesh_are_shown(page, made, monkeypatch):
 def test_the_viewer_has_the_input_and_the_last_mesh(made):
     made = replace(made, surface=None)
     bare = work.viewer(made)
-    assert '"faces": 0' in bare and '"picture": "data:image/webp;base64,' in bare
+    assert '"faces": 0' in bare and '"image": "data:image/webp;base64,' in bare
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
     made.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
     assert '"faces": 1,' in work.viewer(made)

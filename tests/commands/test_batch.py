@@ -96,8 +96,8 @@ def test_what_is_read_is_never_an_output(tmp_path):
 
 def test_a_file_in_a_folder_that_is_read_is_never_an_output(tmp_path):
     (tmp_path / "data" / "chair").mkdir(parents=True)
-    picture = tmp_path / "data" / "chair" / "a.png"
-    check_not_read([picture], [tmp_path / "data" / "chair"])
-    picture.touch()
-    refused("a.png: would be overwritten", check_not_read, [picture], [tmp_path / "data" / "chair"])
-    check_not_read([picture], [tmp_path / "data" / "table", tmp_path / "none"])
+    image = tmp_path / "data" / "chair" / "a.png"
+    check_not_read([image], [tmp_path / "data" / "chair"])
+    image.touch()
+    refused("a.png: would be overwritten", check_not_read, [image], [tmp_path / "data" / "chair"])
+    check_not_read([image], [tmp_path / "data" / "table", tmp_path / "none"])

@@ -278,7 +278,7 @@ NONSENSE = {
         "min-opacity": "nan -1 2", "frames": "1 1000000000",
         "elevation": "91 nan", "fov": "0 180", "distance": "nan 0",
     },
-    "reconstruct PICTURE": {
+    "reconstruct IMAGE": {
         "size": "8 100000", "frames": "1 1000000000", "min-opacity": "nan -1",
         "elevation": "91 nan", "fov": "0 180", "distance": "nan 0",
     },

@@ -93,8 +93,8 @@ def test_formats_of_gaussians(ball, tmp_path, capsys):
     again, before = load_ply(out / "egg.ply"), load_ply(ball)
     assert torch.allclose(again.means, before.means, atol=1e-5)
     assert (out / "egg.splat").stat().st_size == 32 * 2500
-    picture = np.array(Image.open(out / "egg.gif").convert("RGB"))
-    assert (picture < 250).any(-1).mean() > 0.1  # it is in the picture, wherever it was
+    image = np.array(Image.open(out / "egg.gif").convert("RGB"))
+    assert (image < 250).any(-1).mean() > 0.1  # it is in the image, wherever it was
     assert "<script" in (out / "egg.html").read_text()
     assert "2,500 Gaussians" in capsys.readouterr().out
 

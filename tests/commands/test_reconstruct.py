@@ -20,7 +20,7 @@ from gamba_warp.data.preprocess import composite
 from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.ply import load_ply
-from gamba_warp.images import find_pictures, save_image
+from gamba_warp.images import find_images, save_image
 from gamba_warp.model import checkpoint as checkpoints
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.gamba import Gamba
@@ -32,15 +32,15 @@ from gamba_warp.trajectories.paths import Viewpoint
 
 
 @pytest.fixture
-def picture(tmp_path):
+def image(tmp_path):
     return cut_out(tmp_path / "thing.png")
 
 
 @pytest.mark.parametrize("background", ["white", "black"])
-def test_the_model_sees_the_object_from_the_reference_camera(picture, background):
+def test_the_model_sees_the_object_from_the_reference_camera(image, background):
     model, seen = Gamba(replace(SMALLEST, distance=2.0, fov=40, background=background)), []
     model.register_forward_pre_hook(lambda _, given: seen.append(given))
-    rgba = cutout.cut_out(picture).rgba
+    rgba = cutout.cut_out(image).rgba
     gaussians = reconstruct(model, rgba)
     assert gaussians.means.shape == (gaussians.num, 3)
     ((images, cameras),) = seen
@@ -128,16 +128,16 @@ def test_turntables_that_cannot_be_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
+def test_a_image_becomes_every_file(tmp_path, image, checkpoint, capsys):
     out = tmp_path / "deep" / "out"
-    arguments = [picture, "--checkpoint", checkpoint, "--out", out, "--size", 32, "--frames", 4]
+    arguments = [image, "--checkpoint", checkpoint, "--out", out, "--size", 32, "--frames", 4]
     assert run_reconstruct(*arguments, "--splats", "ply", "splat", "spz", "--elevation", 0) == 0
     files = {path.name: path.stat().st_size for path in out.iterdir()}
     names = ["thing.gif", "thing.html", "thing.ply", "thing.splat", "thing.spz"]
     assert sorted(files) == names and all(files.values())
     gaussians = load_ply(out / "thing.ply")
     with torch.inference_mode():
-        want = reconstruct(load_model(checkpoint), cutout.cut_out(picture).rgba)
+        want = reconstruct(load_model(checkpoint), cutout.cut_out(image).rgba)
     assert gaussians.num == 64 and files["thing.splat"] == 64 * 32
     # float32 through a logarithm or a logit
     torch.testing.assert_close(gaussians.means, want.means)
@@ -149,11 +149,11 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     assert "model.safetensors" in table and "no card" not in table
     assert "Trained on: not known: this model has no card" in card
     said = capsys.readouterr().out
-    assert "thing: 64 Gaussians.\n" in said and "1 picture, 0 failures" in said
+    assert "thing: 64 Gaussians.\n" in said and "1 image, 0 failures" in said
 
 
-def test_a_picture_of_the_standard_input(tmp_path, picture, checkpoint, monkeypatch, capsys):
-    for content, code in ((picture.read_bytes(), 0), (b"", 1)):
+def test_a_image_of_the_standard_input(tmp_path, image, checkpoint, monkeypatch, capsys):
+    for content, code in ((image.read_bytes(), 0), (b"", 1)):
         monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
         assert run_reconstruct("-", *quick(checkpoint, tmp_path / "out")) == code
     texts = capsys.readouterr()
@@ -169,76 +169,76 @@ def test_a_picture_of_the_standard_input(tmp_path, picture, checkpoint, monkeypa
 
 
 def test_the_number_of_gaussians_is_told_once_they_are_written(
-    tmp_path, picture, checkpoint, monkeypatch, capsys
+    tmp_path, image, checkpoint, monkeypatch, capsys
 ):
     def full(*_, **__):
         raise UserError("no space left")
 
     monkeypatch.setattr("gamba_warp.pipeline.write_gaussians", full)
-    assert run_reconstruct(picture, *quick(checkpoint, tmp_path)) == 1
+    assert run_reconstruct(image, *quick(checkpoint, tmp_path)) == 1
     texts = capsys.readouterr()
     assert "Gaussians" not in texts.out and "no space left" in texts.err
 
 
 @pytest.mark.parametrize("frame", ["opencv", "opengl", None])
-def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeypatch, frame):
+def test_a_mesh_of_what_was_reconstructed(tmp_path, image, checkpoint, monkeypatch, frame):
     ends = torch.tensor([0.35, -0.1, 0.0])
     stick = cloud_of((torch.arange(64.0)[:, None] / 63) * ends, 0.04, 0.9, [0.9, 0.1, 0.1])
     monkeypatch.setattr(pipeline, "reconstruct", lambda *_: stick)
     options = [*quick(checkpoint, tmp_path), "--mesh", "ply"]
     options += ["--axes", frame] if frame else []
-    assert run_reconstruct(picture, *options) == 0
+    assert run_reconstruct(image, *options) == 0
     mesh = load_mesh(tmp_path / "thing-mesh.ply")
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     want = [0.175, -0.05 if frame == "opencv" else 0.05, 0.0]
     assert np.abs(middle - want).max() < 0.02  # half a Gaussian
-    assert run_reconstruct(picture, *options, "--min-opacity", 0.95) == 1  # nothing is left
+    assert run_reconstruct(image, *options, "--min-opacity", 0.95) == 1  # nothing is left
 
 
-def test_the_precision_reaches_the_network(tmp_path, picture, checkpoint, monkeypatch, capsys):
+def test_the_precision_reaches_the_network(tmp_path, image, checkpoint, monkeypatch, capsys):
     monkeypatch.setattr("gamba_warp.devices._bfloat16_speedup", lambda *_: 2.0)
     made = {}
     for precision in ("float32", "bfloat16", "auto"):
         options = [*quick(checkpoint, tmp_path / precision), "--precision", precision]
-        assert run_reconstruct(picture, *options) == 0
+        assert run_reconstruct(image, *options) == 0
         made[precision] = load_ply(tmp_path / precision / "thing.ply").means
     assert torch.equal(made["auto"], made["bfloat16"])
     gap = (made["bfloat16"] - made["float32"]).abs().max()
     assert 0 < gap < 0.02  # object units; a bfloat16 has 8 digits
     options = [*quick(checkpoint, tmp_path / "no"), "--precision", "float16"]
-    assert run_reconstruct(picture, *options) == 2
+    assert run_reconstruct(image, *options) == 2
     assert "precision" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
-def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
-    arguments = [picture, "--checkpoint", checkpoint, "--out", tmp_path, "--no-page"]
+def test_options_reach_the_files(tmp_path, image, checkpoint, capsys):
+    arguments = [image, "--checkpoint", checkpoint, "--out", tmp_path, "--no-page"]
     arguments += ["--elevation", 0]
     assert run_reconstruct(*arguments, "--turntable", "mp4", "--size", 16, "--frames", 2) == 0
     assert (tmp_path / "thing.mp4").stat().st_size > 0 and not (tmp_path / "thing.html").exists()
     plain = load_ply(tmp_path / "thing.ply")
     limit = plain.opacities.median().item()
-    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--min-opacity", limit) == 0
+    assert run_reconstruct(*quick(checkpoint, tmp_path), image, "--min-opacity", limit) == 0
     few = load_ply(tmp_path / "thing.ply").num
     said = f"thing: {few} Gaussians, {64 - few} left out"
     assert 0 < few < 64 and said in capsys.readouterr().out
-    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--axes", "opencv") == 0
+    assert run_reconstruct(*quick(checkpoint, tmp_path), image, "--axes", "opencv") == 0
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
-    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--no-recenter") == 0
-    kept = cutout.cut_out(picture, cutout.CutoutOptions(recenter=False)).rgba
+    assert run_reconstruct(*quick(checkpoint, tmp_path), image, "--no-recenter") == 0
+    kept = cutout.cut_out(image, cutout.CutoutOptions(recenter=False)).rgba
     want = reconstruct(load_model(checkpoint), kept).means
     got = load_ply(tmp_path / "thing.ply").means
     torch.testing.assert_close(got, want.detach(), atol=1e-5, rtol=0)  # the file's rounding
     assert not torch.allclose(got, plain.means, atol=1e-3)
     save_image(tmp_path / "mask.png", np.eye(20, 30))
     mask = ["--mask", tmp_path / "mask.png"]
-    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, *mask) == 0
-    masked = cutout.cut_out(picture, cutout.CutoutOptions(mask=mask[1])).rgba
+    assert run_reconstruct(*quick(checkpoint, tmp_path), image, *mask) == 0
+    masked = cutout.cut_out(image, cutout.CutoutOptions(mask=mask[1])).rgba
     want = reconstruct(load_model(checkpoint), masked).means
     got = load_ply(tmp_path / "thing.ply").means
     torch.testing.assert_close(got, want.detach(), atol=1e-5, rtol=0)
 
 
-def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):
+def test_one_bad_image_does_not_stop_the_others(tmp_path, checkpoint, capsys):
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     cases = [(path, reason) for name, path, reason in bad_files(folder) if name != "folder"]
@@ -267,7 +267,7 @@ def test_a_folder_has_one_page_that_leads_to_every_result(tmp_path, checkpoint, 
     folder.mkdir()
     for name in ("index.png", "a b.png", "a b.webp"):
         cut_out(folder / name)
-    (folder / "bad.png").write_bytes(b"no picture")
+    (folder / "bad.png").write_bytes(b"no image")
     options = ["--checkpoint", checkpoint, "--out", out, "--size", 16, "--frames", 2]
     assert run_reconstruct(folder, *options) == 1
     said = capsys.readouterr().out
@@ -288,12 +288,12 @@ def test_folders_are_searched(tmp_path, checkpoint, capsys):
     folder, empty = tmp_path / "in", tmp_path / "empty"
     folder.mkdir(), empty.mkdir()
     cut_out(folder / "b.png"), cut_out(folder / "a.PNG")
-    (folder / "notes.txt").write_text("no picture")
-    assert find_pictures([folder, folder / "b.png"]) == ([folder / "a.PNG", folder / "b.png"], [])
+    (folder / "notes.txt").write_text("no image")
+    assert find_images([folder, folder / "b.png"]) == ([folder / "a.PNG", folder / "b.png"], [])
     assert run_reconstruct(*quick(checkpoint, tmp_path / "out"), folder, empty) == 1
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.ply", "b.ply"]
     said = capsys.readouterr()
-    assert f"{empty}: the folder holds no pictures" in said.err
+    assert f"{empty}: the folder holds no images" in said.err
     assert f"{folder}: 1 file of other kinds (.txt) skipped\n" in said.out
     assert (
         f"[2/2] {folder / 'b.png'}: " in said.out and f"results in {tmp_path / 'out'}" in said.out
@@ -316,60 +316,60 @@ def test_a_doubtful_cut_out_is_said_and_shown(tmp_path, checkpoint, capsys):
     options = ["--checkpoint", checkpoint, "--out", tmp_path / "out", "--turntable", "none"]
     assert run_reconstruct(tmp_path / "post.png", *options, "--size", 16, "--frames", 2) == 0
     said = capsys.readouterr().err
-    assert "may be wrong: it touches the picture's border." in said and "--save-inputs" in said
+    assert "may be wrong: it touches the image's border." in said and "--save-inputs" in said
     page = (tmp_path / "out" / "post.html").read_text()
     assert "may be wrong: it touches" in page and 'class="strip"' in page
 
 
-@pytest.mark.parametrize("which", ["picture", "mask", "checkpoint"])
+@pytest.mark.parametrize("which", ["image", "mask", "checkpoint"])
 def test_nothing_that_is_read_is_replaced(tmp_path, checkpoint, capsys, which):
     photo, mask = cut_out(tmp_path / "photo.png"), cut_out(tmp_path / "mask.png")
     model = tmp_path / "model.safetensors"
     model.write_bytes(checkpoint.read_bytes())
-    victim = {"picture": photo, "mask": mask, "checkpoint": model}[which]
+    victim = {"image": photo, "mask": mask, "checkpoint": model}[which]
     victim = victim.rename(tmp_path / "photo.gif")  # the turntable's name
-    files = {"picture": photo, "mask": mask, "checkpoint": model} | {which: victim}
+    files = {"image": photo, "mask": mask, "checkpoint": model} | {which: victim}
     before = {path: path.read_bytes() for path in files.values()}
     options = ["--mask", files["mask"], "--checkpoint", files["checkpoint"], "--out", tmp_path]
     said = f"gamba: {victim}: would be overwritten by an output; give another --out"
-    refused_command(capsys, "reconstruct", [files["picture"], *options], said)
+    refused_command(capsys, "reconstruct", [files["image"], *options], said)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_what_cannot_start_is_refused(tmp_path, picture, checkpoint, capsys):
+def test_what_cannot_start_is_refused(tmp_path, image, checkpoint, capsys):
     other, file = cut_out(tmp_path / "other.png"), tmp_path / "file"
     file.touch()
     (tmp_path / "empty").mkdir()
     ready = quick(checkpoint, tmp_path / "out")
     missing = tmp_path / "none.safetensors"
     cases = [
-        ([picture, *quick(missing, tmp_path / "out")], missing, "gamba train"),
-        ([picture, *quick(file, tmp_path / "out")], file, "safetensors"),
-        ([picture, *quick(checkpoint, file)], "cannot write into", file),
-        ([picture, *quick(checkpoint, "/dev/null/x")], "cannot write into /dev/null/x"),
-        (ready, "give at least one picture or folder"),
-        ([tmp_path / "empty", *ready], "empty: the folder holds no pictures"),
-        ([picture, other, *ready, "--mask", picture], "--mask goes with one picture"),
-        ([picture, *ready, "--sam", missing], "--sam", missing),
+        ([image, *quick(missing, tmp_path / "out")], missing, "gamba train"),
+        ([image, *quick(file, tmp_path / "out")], file, "safetensors"),
+        ([image, *quick(checkpoint, file)], "cannot write into", file),
+        ([image, *quick(checkpoint, "/dev/null/x")], "cannot write into /dev/null/x"),
+        (ready, "give at least one image or folder"),
+        ([tmp_path / "empty", *ready], "empty: the folder holds no images"),
+        ([image, other, *ready, "--mask", image], "--mask goes with one image"),
+        ([image, *ready, "--sam", missing], "--sam", missing),
     ]
     if not torch.cuda.is_available():
-        cases.append(([picture, *ready, "--device", "cuda"], "no CUDA device"))
+        cases.append(([image, *ready, "--device", "cuda"], "no CUDA device"))
     for words, *reasons in cases:
         refused_command(capsys, "reconstruct", words, *reasons)
     assert not (tmp_path / "out" / "thing.ply").exists()
 
 
-def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeypatch, capsys):
+def test_the_starter_model_is_the_default(tmp_path, image, checkpoint, monkeypatch, capsys):
     monkeypatch.setattr(checkpoints, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
-    arguments = [picture, "--out", tmp_path / "out", "--turntable", "none", "--no-page"]
+    arguments = [image, "--out", tmp_path / "out", "--turntable", "none", "--no-page"]
     refused_command(capsys, "reconstruct", arguments, "tiny.safetensors", "--checkpoint FILE")
     (tmp_path / "tiny.safetensors").write_bytes(checkpoint.read_bytes())
     assert run_reconstruct(*arguments) == 0
 
 
-def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):
+def test_a_model_that_diverged_is_a_failure(tmp_path, image, checkpoint, monkeypatch, capsys):
     gaussians = some(9)
     gaussians.means[3] = float("nan")
     monkeypatch.setattr(pipeline, "reconstruct", lambda *_: gaussians)
-    assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
+    assert run_reconstruct(image, *quick(checkpoint, tmp_path / "out")) == 1
     assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err

@@ -37,12 +37,12 @@ def test_the_text_counts_inputs_and_failures():
 
 def test_one_file_on_the_standard_output(tmp_path, checkpoint, splats, capfdbinary, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    picture = cut_out(tmp_path / "thing.png")
-    assert run_reconstruct(picture, "--checkpoint", checkpoint, "-o", "-") == 0
+    image = cut_out(tmp_path / "thing.png")
+    assert run_reconstruct(image, "--checkpoint", checkpoint, "-o", "-") == 0
     made = capfdbinary.readouterr()
     (tmp_path / "made.ply").write_bytes(made.out)
     assert load_ply(tmp_path / "made.ply").num == 64
-    assert b"thing: 64 Gaussians." in made.err and made.err.endswith(b"1 picture, 0 failures\n")
+    assert b"thing: 64 Gaussians." in made.err and made.err.endswith(b"1 image, 0 failures\n")
     options = ["--mesh", "stl", "--voxels", "24", "--views", "8", "--pixels", "48", "--out", "-"]
     assert run("export", [splats, *options]) == 0
     made = capfdbinary.readouterr()
@@ -65,9 +65,9 @@ def test_a_terminal_gets_no_file(splats, monkeypatch, capsys):
 
 
 def test_results_as_json(tmp_path, checkpoint, splats, capsys):
-    picture, missing, out = cut_out(tmp_path / "thing.png"), tmp_path / "no.png", tmp_path / "out"
+    image, missing, out = cut_out(tmp_path / "thing.png"), tmp_path / "no.png", tmp_path / "out"
     options = quick(checkpoint, out)
-    assert run_reconstruct(picture, missing, *options, "--save-inputs", "--json") == 1
+    assert run_reconstruct(image, missing, *options, "--save-inputs", "--json") == 1
     texts = capsys.readouterr()
     made = json.loads(texts.out)
     assert "thing: 64 Gaussians." in texts.err and "no such file" in texts.err
@@ -82,7 +82,7 @@ def test_results_as_json(tmp_path, checkpoint, splats, capsys):
         and (doubt is None or doubt[0] <= elevation <= doubt[1])
         and result
         == {
-            "input": str(picture),
+            "input": str(image),
             "name": "thing",
             "warning": "",
             "gaussians": 64,

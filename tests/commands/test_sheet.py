@@ -1,4 +1,4 @@
-"""``gamba reconstruct --sheet``: every result in one picture."""
+"""``gamba reconstruct --sheet``: every result in one image."""
 
 from pathlib import Path
 
@@ -23,15 +23,15 @@ def test_a_row_is_the_input_and_views_around(tmp_path):
     view = Viewpoint(20.0, SMALLEST.distance, SMALLEST.fov)
     sheet.add("first", rgba, gaussians, view)
     sheet.write()
-    picture = load_rgba(tmp_path / "s.png")[..., :3]
-    assert picture.shape == (18 + 128, 6 * 128, 3)
-    tiles = picture[18:].reshape(128, 1 + VIEWS, 128, 3).transpose(1, 0, 2, 3)
+    image = load_rgba(tmp_path / "s.png")[..., :3]
+    assert image.shape == (18 + 128, 6 * 128, 3)
+    tiles = image[18:].reshape(128, 1 + VIEWS, 128, 3).transpose(1, 0, 2, 3)
     assert np.abs(tiles[0][64, 64] - (1, 0, 0)).max() < 0.01
     assert np.abs(tiles[0][4, 4] - 0.5).max() < 0.01
     want = turntable_frames(gaussians, view, size=128, frames=VIEWS) / 255
     np.testing.assert_array_equal(tiles[1][:, 1:], want[0].astype(np.float32)[:, 1:])  # and a line
     np.testing.assert_array_equal(tiles[2:], want[1:].astype(np.float32))
-    assert picture[:18, 128:].min() == 1 and picture[:18, :128].min() < 0.6  # the name
+    assert image[:18, 128:].min() == 1 and image[:18, :128].min() < 0.6  # the name
 
 
 def sheet_of(path, count):
@@ -44,8 +44,8 @@ def sheet_of(path, count):
 @pytest.mark.parametrize(("count", "size"), [(12, (768, 12 * 146)), (13, (2 * 768 + 12, 7 * 146))])
 def test_many_rows_stand_in_two_columns(tmp_path, count, size):
     sheet_of(tmp_path / "s.webp", count)
-    with Image.open(tmp_path / "s.webp") as picture:
-        assert picture.size == size and picture.format == "WEBP"
+    with Image.open(tmp_path / "s.webp") as image:
+        assert image.size == size and image.format == "WEBP"
 
 
 def test_the_command_writes_a_sheet_of_what_went_well(tmp_path, checkpoint, capsys):

@@ -40,7 +40,7 @@ def fork():
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_pictures_and_gradients(name, seed):
+def test_images_and_gradients(name, seed):
     torch.manual_seed(seed)
     compare(name)
 
@@ -60,7 +60,7 @@ def test_results_of_forks(fork, name):
     torch.autograd.backward([want[kind] for kind in kinds], [x.double() for x in v])
     for kind, layer in zip(kinds, layers):
         assert layer.shape == (1, first.HEIGHT, first.WIDTH)
-        assert_rel_rms(layer[:, clear], want[kind][:, clear], first.PICTURE, kind)
+        assert_rel_rms(layer[:, clear], want[kind][:, clear], first.IMAGE, kind)
     for key in set(leaves) - {"colors"}:
         assert_rel_rms(leaves[key].grad, expected[key].grad, first.GRADIENT, key)
     flat = {**scene, "opacities": scene["opacities"][:, 0]}
@@ -75,7 +75,7 @@ def test_gradients_of_the_pose(fork, degree):
     """Compare with rendering in float64, the camera moved by exp(rho, theta); differences too."""
     fork("monogs")
     settings, scene = settings_of(degree), scene_of(60, shs=9)
-    scene["means3D"] *= 0.2  # beside the picture and past the clamp gradients are not derivatives
+    scene["means3D"] *= 0.2  # beside the image and past the clamp gradients are not derivatives
     scene["opacities"] *= 0.98
     rho, theta, twist = (torch.zeros(n, requires_grad=True) for n in (3, 3, 6))
     color, _, depth, alpha, _ = draw({**scene, "rho": rho, "theta": theta}, settings)

@@ -124,14 +124,14 @@ def test_harmonics(degree):
 @pytest.mark.parametrize("compensated", [False, True])
 def test_projection(by, compensated):
     scene = scene_of()
-    scene["means"][..., :9, :] *= 9  # beside the picture and behind the camera
+    scene["means"][..., :9, :] *= 9  # beside the image and behind the camera
     got, want = twice(scene)
     found = project(got, by, calc_compensations=compensated)
     expected = project_there(want, calc_compensations=compensated)
     seen, theirs = ((x[0] > 0).all(-1) for x in (found, expected))
     assert 0.5 < seen.float().mean() < 1
     assert not (seen & ~theirs).any()
-    assert (theirs & ~seen).sum() <= 2, "culled where the rounded box alone meets the picture"
+    assert (theirs & ~seen).sum() <= 2, "culled where the rounded box alone meets the image"
     assert found[0].dtype == torch.int32 and (found[0] - expected[0])[seen].abs().max() <= 1
     ours, theirs = ([x[seen] for x in side[1:] if x is not None] for side in (found, expected))
     assert len(ours) == 3 + compensated
@@ -231,7 +231,7 @@ def lists_of(projected, tile):
 
 
 def blended(monkeypatch, scene, channels):
-    """Return float64 leaves of the picture's parts, and gsplat's accumulate of them."""
+    """Return float64 leaves of the image's parts, and gsplat's accumulate of them."""
     monkeypatch.setitem(sys.modules, "nerfacc", nerfacc())
     projected = project(scene)
     num = scene["means"].shape[-2]
@@ -247,9 +247,9 @@ def blended(monkeypatch, scene, channels):
     seen = ((projected[0] > 0).all(-1)).flatten()[pairs[2] * num + pairs[0]]
     pairs = tuple(x[seen] for x in pairs)
     names = ("means2d", "conics", "opacities", "colors")
-    picture, alphas = gsplat.accumulate(*(want[k] for k in names), *pairs, WIDTH, HEIGHT)
-    picture = picture + (1 - alphas) * want["backgrounds"][..., None, None, :]
-    return projected, got, want, picture, alphas
+    image, alphas = gsplat.accumulate(*(want[k] for k in names), *pairs, WIDTH, HEIGHT)
+    image = image + (1 - alphas) * want["backgrounds"][..., None, None, :]
+    return projected, got, want, image, alphas
 
 
 @pytest.mark.parametrize("tile, channels", [(16, 3), (5, 2), (20, 7), (32, 3)])
@@ -375,7 +375,7 @@ def test_gradients_of_small_factors_are_those_of_gsplat(kind):
 
 
 @pytest.mark.parametrize("by", ["quats", "covars"])
-def test_pictures_cull_by_the_true_factor(by):
+def test_images_cull_by_the_true_factor(by):
     """Opaque needles with a factor below 1 / 255 are not drawn."""
     scene = tiny_of("needle")
     scene["opacities"][:] = 0.99
@@ -384,7 +384,7 @@ def test_pictures_cull_by_the_true_factor(by):
     if by == "covars":
         covars = compat.quat_scale_to_covar_preci(got["quats"], got["scales"])[0]
         shape = dict(quats=None, scales=None, covars=covars)
-    picture, alphas, meta = compat.rasterization(
+    image, alphas, meta = compat.rasterization(
         means=got["means"], opacities=got["opacities"], colors=got["colors"], width=WIDTH,
         viewmats=got["viewmats"], Ks=got["Ks"], height=HEIGHT, packed=False,
         rasterize_mode="antialiased", **shape,
@@ -404,7 +404,7 @@ def test_pictures_cull_by_the_true_factor(by):
     cut = (2 * (shown / ALPHA_MIN).log()).sqrt()  # of the box around alpha >= 1 / 255, rounded up
     limit = torch.minimum(radii, (radii / 3.33 * cut[..., None]).ceil() + 1)
     assert (meta["radii"] <= limit)[drawn & (factor < 0.02)].all()
-    torch.autograd.backward([picture, alphas], [torch.randn_like(x) for x in (picture, alphas)])
+    torch.autograd.backward([image, alphas], [torch.randn_like(x) for x in (image, alphas)])
     for name in (*GEOMETRY, "opacities"):
         assert got[name].grad.isfinite().all() and got[name].grad.abs().max() > 0, name
 

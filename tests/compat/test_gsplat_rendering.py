@@ -1,4 +1,4 @@
-"""``rasterization`` with gsplat's signature: pictures, ``meta``, options, refusals."""
+"""``rasterization`` with gsplat's signature: images, ``meta``, options, refusals."""
 
 import inspect
 
@@ -37,7 +37,7 @@ def asking(scene):
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
 @pytest.mark.parametrize("lead, kind", [((), "classic"), ((2,), "antialiased")])
-def test_pictures_and_gradients(packed, mode, lead, kind):
+def test_images_and_gradients(packed, mode, lead, kind):
     """Ours with gsplat's clamp of alpha, which the gsplat tests of ours hold to gsplat's code."""
     scene = scene_of(lead)
     if mode in ("D", "ED"):
@@ -69,8 +69,8 @@ def test_the_background_behind_almost_opaque_pixels():
     splats = (meta[name].detach() for name in ("means2d", "conics"))
     colors = scene["colors"][:, None]
     other = rasterize_to_pixels(*splats, colors, meta["opacities"].detach(), *lists, again)[0]
-    for picture in (renders, other, ours(**want, alpha_max=0.999)[0]):
-        picture.sum().backward()
+    for image in (renders, other, ours(**want, alpha_max=0.999)[0]):
+        image.sum().backward()
     for found in (got["backgrounds"], again):
         assert_rel_rms(found.grad, want["backgrounds"].grad, 1e-6, "backgrounds")
 
@@ -88,8 +88,8 @@ def test_harmonics(per_view, degree):
     for view in range(3 if degree < 4 else 0):
         one = {k: scene[k][:, [view]] for k in ("viewmats", "Ks", "backgrounds")}
         one["colors"] = (scene["colors"][:, view] if per_view else scene["colors"])[..., :16, :]
-        picture = ours(**{**scene, **one}, sh_degree=degree, alpha_max=0.999)[0]
-        assert (picture[:, 0] - renders[:, view]).abs().max() < 1e-5
+        image = ours(**{**scene, **one}, sh_degree=degree, alpha_max=0.999)[0]
+        assert (image[:, 0] - renders[:, view]).abs().max() < 1e-5
     assert (got["colors"].grad[..., : (degree + 1) ** 2, :] != 0).any()
     assert (got["colors"].grad[..., (degree + 1) ** 2 :, :] == 0).all()
     assert (got["viewmats"].grad != 0).any()

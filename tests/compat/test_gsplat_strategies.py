@@ -53,7 +53,7 @@ def test_relocation_to_a_smallest_opacity():
 
 
 def fitted(strategy, state, rendering, steps=31, size=(29, 23), **more):
-    """Fits a smooth picture; returns the numbers of Gaussians and the losses, step by step."""
+    """Fits a smooth image; returns the numbers of Gaussians and the losses, step by step."""
     torch.manual_seed(2)
     width, height = size
     x, y = torch.meshgrid(torch.arange(width), torch.arange(height), indexing="xy")
@@ -74,8 +74,8 @@ def fitted(strategy, state, rendering, steps=31, size=(29, 23), **more):
     for step in range(steps):
         shown = [params[name].sigmoid() for name in ("opacities", "colors")]
         gaussians = params["means"], params["quats"], params["scales"].exp(), *shown
-        picture = viewmat[None], K[None], width, height
-        renders, _, info = rasterization(*gaussians, *picture, **rendering)
+        image = viewmat[None], K[None], width, height
+        renders, _, info = rasterization(*gaussians, *image, **rendering)
         strategy.step_pre_backward(params, optimizers, state, step, info)
         loss = (renders[0] - target).square().mean()
         loss.backward()
@@ -149,7 +149,7 @@ def test_example(name, capsys):
     example = runpy.run_path(str(ROOT / "docs/examples/fit_photograph.py"))
     target = example["photograph"]("astronaut", 24)
     assert target.shape == (24, 24, 3)
-    picture, psnr, count = example["fit"](target, name, steps=60, count=150, most=200)
+    image, psnr, count = example["fit"](target, name, steps=60, count=150, most=200)
     assert count != 150
-    assert picture.shape == target.shape and psnr > 15  # a grey picture has 11
+    assert image.shape == target.shape and psnr > 15  # a grey image has 11
     assert f"{name}: {count} Gaussians, 60 steps, PSNR {psnr:.2f} dB" in capsys.readouterr().out

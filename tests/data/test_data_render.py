@@ -27,7 +27,7 @@ from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample
 from gamba_warp.train.data.raycast import Lights, RayCaster
 
 FOV = 49.1
-# even light from all directions: the picture shows the surface's own colour
+# even light from all directions: the image shows the surface's own colour
 FLAT = Lights(np.full(3, 1.0), np.zeros((1, 3)), np.zeros((1, 3)), head=0.0)
 
 
@@ -121,8 +121,8 @@ def test_pixels_colours_and_depth_agree_with_the_cameras(tmp_path):
 
 
 def test_texture_is_upright_and_not_mirrored(tmp_path):
-    picture, _ = caster(write_quad(tmp_path), "y").render(look_at_origin(0, 0, 1.5), 32, FOV)
-    rows, columns = np.nonzero(picture[..., 3] == 1)
+    image, _ = caster(write_quad(tmp_path), "y").render(look_at_origin(0, 0, 1.5), 32, FOV)
+    rows, columns = np.nonzero(image[..., 3] == 1)
     top, bottom, left, right = rows.min() + 2, rows.max() - 2, columns.min() + 2, columns.max() - 2
     # as in the texture's file: red, green / blue, yellow
     for row, column, want in (
@@ -131,7 +131,7 @@ def test_texture_is_upright_and_not_mirrored(tmp_path):
         (bottom, left, [0, 0, 1]),
         (bottom, right, [1, 1, 0]),
     ):
-        np.testing.assert_array_equal(picture[row, column, :3] > 0.5, want)
+        np.testing.assert_array_equal(image[row, column, :3] > 0.5, want)
 
 
 def test_cut_out_and_glass_let_rays_pass(tmp_path):
@@ -142,34 +142,34 @@ def test_cut_out_and_glass_let_rays_pass(tmp_path):
     holes[:, :8, 3] = 255  # left half opaque green, right half a hole
     Image.fromarray(holes).save(tmp_path / "paint.png")
     pose = look_at_origin(0, 0, 2.0)
-    picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
-    np.testing.assert_array_equal(picture[16, 12, :3] > 0.5, [0, 1, 0])
-    np.testing.assert_array_equal(picture[16, 20, :3] > 0.5, [1, 0, 0])
+    image, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
+    np.testing.assert_array_equal(image[16, 12, :3] > 0.5, [0, 1, 0])
+    np.testing.assert_array_equal(image[16, 20, :3] > 0.5, [1, 0, 0])
     # the square's front is at y = -0.25 of the cube, the red one half a unit behind
     assert depth[16, 12] == pytest.approx(1.75) and depth[16, 20] == pytest.approx(2.25)
 
     write_quad(tmp_path, mtl="newmtl paint\nKd 1 1 1\nd 0.25\n")
-    picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
-    assert picture[16, 16, 3] == pytest.approx(0.25, abs=1e-6) and depth[16, 16] == 0
+    image, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
+    assert image[16, 16, 3] == pytest.approx(0.25, abs=1e-6) and depth[16, 16] == 0
     glass = "newmtl paint\nKd 1 1 1\nd 0.25\nnewmtl red\nKd 1 0 0\nd 0.5\n"
     write_quad(tmp_path, obj=QUAD + back, mtl=glass)
-    picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
-    assert picture[16, 16, 3] == pytest.approx(1 - 0.75 * 0.5, abs=1e-6)
+    image, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
+    assert image[16, 16, 3] == pytest.approx(1 - 0.75 * 0.5, abs=1e-6)
     # red gets 1/4 of white and 3/8 of red, green only the white; mixed in linear light
-    mixed = to_linear(picture[16, 16, :2])
+    mixed = to_linear(image[16, 16, :2])
     assert mixed[1] / mixed[0] == pytest.approx(0.25 / (0.25 + 0.375), abs=0.02)
     assert depth[16, 16] == pytest.approx(2.25)  # where half the light is blocked
 
 
 def test_edges_are_smooth_and_keep_their_colour(tmp_path):
     path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.8 0.4 0.2\n")
-    picture, _ = caster(path, "y").render(look_at_origin(20, 10, 1.6), 40, FOV)
-    alpha = picture[..., 3]
+    image, _ = caster(path, "y").render(look_at_origin(20, 10, 1.6), 40, FOV)
+    alpha = image[..., 3]
     edge = (alpha > 0) & (alpha < 1)
     assert edge.sum() > 40
-    spread = picture[alpha > 0][:, :3]
+    spread = image[alpha > 0][:, :3]
     np.testing.assert_allclose(spread, np.broadcast_to(spread.mean(0), spread.shape), atol=1e-3)
-    assert (picture[alpha == 0] == 0).all()
+    assert (image[alpha == 0] == 0).all()
 
 
 def test_light_is_two_sided(tmp_path):
@@ -260,7 +260,7 @@ def test_catalogue_names_and_groups(meshes, tmp_path):
     np.testing.assert_allclose(np.array(stored["applied_transform"])[:, :3], entry["rotation"])
     parts = json.loads((out / "split.json").read_text())
     assert sum({"box-1", "box-2"} <= set(parts[name]) for name in ("train", "val", "test")) == 1
-    # A catalogue with better groups needs no new pictures.
+    # A catalogue with better groups needs no new images.
     better = {"objects": [{**entry, "group": "g5"}, {**twin, "group": "g3"}]}
     (meshes / "catalogue.json").write_text(json.dumps(better))
     render_views(meshes, out, views=1, size=16, workers=1, format="png")

@@ -44,8 +44,8 @@ def test_icons_are_cut_out_and_never_of_a_training_object():
     assert len(icons) >= 10
     train = open_dataset(STARTER / "data", "train").uids
     for path in icons:
-        picture = load_rgba(path)
-        assert picture.shape == (128, 128, 4) and picture[..., 3].min() == 0, path.name
+        image = load_rgba(path)
+        assert image.shape == (128, 128, 4) and image[..., 3].min() == 0, path.name
         assert path.stem not in train
 
 
@@ -60,7 +60,7 @@ def test_views_are_neither_empty_nor_cropped():
 
 @pytest.mark.parametrize("uid", HELD_OUT)
 def test_geometry_lies_in_the_views_frame(uid):
-    """Open3D's pinhole camera projects the stored mesh onto the stored pictures."""
+    """Open3D's pinhole camera projects the stored mesh onto the stored images."""
     o3d = import_open3d()
     mesh = trimesh.load_mesh(STARTER / "meshes" / f"{uid}.ply")
     assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(1, abs=1e-5)

@@ -31,7 +31,7 @@ def viewmats(count):
     return orbit(torch.arange(count) * 40.0, 15.0, 1.7)
 
 
-def write_picture(path, width=14, height=10, mark=0):
+def write_image(path, width=14, height=10, mark=0):
     """Left half opaque in the colour (mark, 100, 50); right half transparent red."""
     pixels = np.zeros((height, width, 4), np.uint8)
     pixels[:, : width // 2] = (mark, 100, 50, 255)
@@ -45,7 +45,7 @@ def write_transforms(folder, count=3, suffix=".png", width=14, height=10, depth=
     frames = []
     for i in range(count):
         name = f"images/{i:03d}{suffix}"
-        write_picture(folder / name, width, height, mark=i)
+        write_image(folder / name, width, height, mark=i)
         frames.append({"file_path": name, "transform_matrix": poses[i]})
         if depth:
             frames[-1]["depth_file_path"] = f"depth/{i}.png"
@@ -91,11 +91,11 @@ def test_three_layouts_agree(tmp_path):
     for i, viewmat in enumerate(viewmats(3).double()):
         c2w = torch.linalg.inv(viewmat).numpy()  # OpenCV axes
         view = tmp_path / "b" / "0" / "10010" / "campos_512_v4" / f"{i:05d}"
-        write_picture(view / f"{i:05d}.png", 12, 12, mark=i)
+        write_image(view / f"{i:05d}.png", 12, 12, mark=i)
         axes = {k: c2w[:3, n].tolist() for n, k in enumerate(["x", "y", "z", "origin"])}
         axes |= {"x_fov": FOV, "y_fov": FOV}
         (view / f"{i:05d}.json").write_text(json.dumps(axes))
-        write_picture(tmp_path / "c" / "uid" / "rgba" / f"{i:03d}.png", 12, 12, mark=i)
+        write_image(tmp_path / "c" / "uid" / "rgba" / f"{i:03d}.png", 12, 12, mark=i)
         c2w = to_opengl(viewmat).numpy()[:3].copy()
         c2w[:, 3] *= 2  # its cube has side 2
         (tmp_path / "c" / "uid" / "pose").mkdir(exist_ok=True)
@@ -133,7 +133,7 @@ def test_linked_objects_are_found_once(tmp_path):
     assert open_dataset(tmp_path / "link").uids == found.uids
 
 
-def test_an_angle_alone_of_a_picture_that_is_not_square(tmp_path):
+def test_an_angle_alone_of_a_image_that_is_not_square(tmp_path):
     """Pixels are square: the vertical focal length is the horizontal one, in pixels."""
     path = write_transforms(tmp_path, count=1, width=8, height=6)
     frame = json.loads(path.read_text())["frames"][0]
@@ -144,15 +144,15 @@ def test_an_angle_alone_of_a_picture_that_is_not_square(tmp_path):
     path.write_text(json.dumps(angles))
     K = open_dataset(tmp_path).load(0).cameras.Ks[0]
     assert K[1, 1] == pytest.approx(3 / math.tan(FOV))
-    # Numbers in pixels apply to the picture, whose size the file need not repeat.
+    # Numbers in pixels apply to the image, whose size the file need not repeat.
     path.write_text(json.dumps({"fl_x": 9, "fl_y": 7, "cx": 3, "cy": 2, "frames": [frame]}))
     K = open_dataset(tmp_path).load(0).cameras.Ks[0]
     assert K.tolist() == [[9, 0, 3], [0, 7, 2], [0, 0, 1]]
 
 
-def test_gobjaverse_of_pictures_that_are_not_square(tmp_path):
+def test_gobjaverse_of_images_that_are_not_square(tmp_path):
     view = tmp_path / "campos_512_v4" / "00000"  # one object's folder
-    write_picture(view / "00000.png", 16, 8)
+    write_image(view / "00000.png", 16, 8)
     axes = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1], "origin": [0, 0, -2]}
     both = {"x_fov": 0.8, "y_fov": 0.6}, (8 / math.tan(0.4), 4 / math.tan(0.3))
     published = {}, (8 * 1422.222 / 1024,) * 2
@@ -180,11 +180,11 @@ def test_masks_are_the_alpha(tmp_path):
     for frame in values["frames"]:
         del frame["mask_path"]
     path.write_text(json.dumps(values))
-    assert "no picture has an alpha channel or a mask" in background_note(open_dataset(tmp_path))
+    assert "no image has an alpha channel or a mask" in background_note(open_dataset(tmp_path))
     values["frames"] = frames
     path.write_text(json.dumps(values))
     Image.new("L", (4, 6)).save(tmp_path / "mask0.png")
-    refused("mask0.png: the mask is 4x6, its picture 8x6", open_dataset(tmp_path).load, 0)
+    refused("mask0.png: the mask is 4x6, its image 8x6", open_dataset(tmp_path).load, 0)
     (tmp_path / "mask0.png").unlink()
     assert "mask0.png: no such file" in next(iter(open_dataset(tmp_path).check().values()))
 
@@ -195,10 +195,10 @@ def test_nerfs_own_layout(tmp_path):
     frames = json.loads(path.read_text())["frames"]
     path.unlink()
     for part, frame in zip(("train", "val", "test"), frames):
-        picture = tmp_path / frame["file_path"]
+        image = tmp_path / frame["file_path"]
         frame["file_path"] = f"./{part}/r_0.5"
         (tmp_path / part).mkdir()
-        picture.rename(tmp_path / part / "r_0.5.png")
+        image.rename(tmp_path / part / "r_0.5.png")
         values = {"camera_angle_x": FOV, "frames": [frame]}
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps(values))
     data = open_dataset(tmp_path)
@@ -260,7 +260,7 @@ def test_split(tmp_path):
         (lambda p: edit(p, w=15), "000.png: is 14x10, but its cameras are for 15x10"),
         (lambda p: (p.parent / "images/002.png").unlink(), "002.png: no such file"),
         (lambda p: (p.parent / "images/002.png").write_bytes(b""), "002.png: the file is empty"),
-        (lambda p: write_picture(p.parent / "images/002.png", 8, 8), "002.png: is 8x8"),
+        (lambda p: write_image(p.parent / "images/002.png", 8, 8), "002.png: is 8x8"),
         (lambda p: (p.parent / "depth/1.png").unlink(), "1.png: no such file"),
     ],
 )
@@ -287,14 +287,14 @@ def test_bad_requests(tmp_path):
 
 
 @pytest.mark.parametrize("stated", [{"w": 40, "h": 30, "fl_x": 43.75, "cx": 20, "cy": 15}, {}])
-def test_pictures_of_posed_sets_are_not_turned_by_exif(tmp_path, stated):
+def test_images_of_posed_sets_are_not_turned_by_exif(tmp_path, stated):
     """As COLMAP takes them; by an angle alone the focal length is that of the stored width."""
     folder = tmp_path / "obj"
     (folder / "images").mkdir(parents=True)
     exif = Image.Exif()
     exif[0x0112] = 6
-    picture = Image.fromarray(np.arange(3600, dtype=np.uint8).reshape(30, 40, 3))
-    picture.save(folder / "images" / "0.png", exif=exif)
+    image = Image.fromarray(np.arange(3600, dtype=np.uint8).reshape(30, 40, 3))
+    image.save(folder / "images" / "0.png", exif=exif)
     pose = np.eye(4)
     pose[2, 3] = 2
     about = stated or {"camera_angle_x": 2 * math.atan(20 / 43.75)}
@@ -302,7 +302,7 @@ def test_pictures_of_posed_sets_are_not_turned_by_exif(tmp_path, stated):
     (folder / "transforms.json").write_text(json.dumps({**about, "frames": frames}))
     views = open_dataset(tmp_path).load("obj")
     assert views.images.shape == (1, 30, 40, 4)
-    np.testing.assert_array_equal((255 * views.images[0, ..., :3]).round(), np.asarray(picture))
+    np.testing.assert_array_equal((255 * views.images[0, ..., :3]).round(), np.asarray(image))
     assert views.cameras.Ks[0, 0].tolist() == pytest.approx([43.75, 0, 20])
 
 

@@ -19,7 +19,7 @@ SIZE = 8
 POSE = to_opengl(orbit(torch.tensor([30.0]), 15.0, 1.7)[0].double()).tolist()
 
 
-def picture(path, size=(SIZE, SIZE)):
+def image(path, size=(SIZE, SIZE)):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.full((size[1], size[0], 4), 200, np.uint8)).save(path)
 
@@ -29,20 +29,20 @@ def transforms(folder, frame=None, **top):
     frames = [{"file_path": f"{i}.png", "transform_matrix": POSE} for i in range(2)]
     frames[1] |= frame or {}
     for i in range(2):
-        picture(folder / f"{i}.png")
+        image(folder / f"{i}.png")
     values = {"w": SIZE, "h": SIZE, "fl_x": 9.0, "frames": frames, **top}
     (folder / "transforms.json").write_text(json.dumps(values))
 
 
 def gobjaverse(folder, **camera):
     view = folder / "campos_512_v4" / "00000"
-    picture(view / "00000.png")
+    image(view / "00000.png")
     axes = {key: [row[n] for row in POSE[:3]] for n, key in enumerate(("x", "y", "z", "origin"))}
     (view / "00000.json").write_text(json.dumps({**axes, **camera}))
 
 
 def openlrm(folder, intrinsics=((9, 9), (4, 4), (SIZE, SIZE)), pose=POSE[:3]):
-    picture(folder / "rgba" / "000.png")
+    image(folder / "rgba" / "000.png")
     (folder / "pose").mkdir()
     np.save(folder / "pose" / "000.npy", np.array(pose))
     np.save(folder / "intrinsics.npy", np.array(intrinsics, float))
@@ -62,15 +62,15 @@ def reason(folder):
     "name",
     ["../secret.png", "/etc/passwd.png", "a\0.png", "a" * 300, "..\\secret.png", "link.png", 7],
 )
-def test_names_of_pictures_stay_inside(tmp_path, key, name):
-    picture(tmp_path / "secret.png")
+def test_names_of_images_stay_inside(tmp_path, key, name):
+    image(tmp_path / "secret.png")
     transforms(tmp_path / "x", {key: name})
     (tmp_path / "x" / "link.png").symlink_to(tmp_path / "secret.png")
     assert "frame 1" in reason(tmp_path / "x")
 
 
 def test_links_of_the_other_layouts_stay_inside(tmp_path):
-    picture(tmp_path / "secret.png")
+    image(tmp_path / "secret.png")
     for write, name in ((gobjaverse, "campos_512_v4/00000/00000.png"), (openlrm, "rgba/000.png")):
         folder = tmp_path / write.__name__ / "x"
         write(folder)
@@ -113,7 +113,7 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"frames": {"0": {}}}, "no frames"),
         ({"frames": [7]}, "frame 0: no transform_matrix"),
         ({"frames": [{}] * 10_001}, "10001 views, at most 10000"),
-        ({"frame": {"file_path": "0.png"}}, "two frames name the picture 0.png"),
+        ({"frame": {"file_path": "0.png"}}, "two frames name the image 0.png"),
         ({"frame": {"file_path": None}}, "frame 1"),
         ({"frame": {"transform_matrix": [[1, 2], [3]]}}, "not a matrix of numbers"),
         ({"frame": {"transform_matrix": {"a": 1}}}, "not a matrix of numbers"),
@@ -224,12 +224,12 @@ def test_depth_is_finite_and_not_negative(tmp_path):
         assert "d1.tiff: a depth is negative or not finite" in reason(path.parent)
 
 
-def test_pictures_that_would_fill_the_memory(tmp_path, monkeypatch):
+def test_images_that_would_fill_the_memory(tmp_path, monkeypatch):
     transforms(tmp_path / "x")
     frames = [{"file_path": "wide.png", "transform_matrix": POSE}]
     values = {"camera_angle_x": 1.0, "camera_angle_y": 1.0, "frames": frames}
     (tmp_path / "x" / "transforms.json").write_text(json.dumps(values))
-    picture(tmp_path / "x" / "wide.png", (20_000, 1))
+    image(tmp_path / "x" / "wide.png", (20_000, 1))
     data = open_dataset(tmp_path)
     assert data.load("x").images.shape == (1, 1, 20_000, 4)
     refused("wide.png: at height 128: 2560000x128 is over", data.load, "x", size=128)

@@ -11,7 +11,7 @@ from gamba_warp.data.dataset import open_dataset
 
 
 def project(point, views, number):
-    """Project a point of the world into a picture, in shares of its side."""
+    """Project a point of the world into an image, in shares of its side."""
     local = views.cameras.viewmats[number, :3] @ torch.tensor([*point, 1.0])
     pixel = views.cameras.Ks[number] @ local
     return (pixel[:2] / pixel[2] / views.cameras.width).tolist()
@@ -25,7 +25,7 @@ def test_the_published_layout_is_read_where_it_is(tmp_path):
     assert views.images.shape == (VIEWS, 32, 32, 4)
     # The camera's focal length is that of the published example: 1422.222 of 1024 pixels.
     assert views.cameras.Ks[0, 0, 0].item() == pytest.approx(32 * 1422.222 / 1024, rel=1e-5)
-    # The origin is the middle of every picture; z is up; the first orbit goes around it.
+    # The origin is the middle of every image; z is up; the first orbit goes around it.
     for number in range(VIEWS):
         assert project((0, 0, 0), views, number) == pytest.approx([0.5, 0.5], abs=1e-6)
     for number in (0, 7, 24, 27):
@@ -48,4 +48,4 @@ def test_views_that_lack_a_file_are_passed_over(tmp_path, suffix):
     for view in views.iterdir():
         for path in view.glob("?????.png"):
             path.unlink()
-    refused("no views with both picture and camera", open_dataset(tmp_path).load, 0)
+    refused("no views with both image and camera", open_dataset(tmp_path).load, 0)

@@ -18,7 +18,7 @@ from gamba_warp.untrusted.names import Within, inside
 
 @pytest.fixture
 def data(tmp_path):
-    """Three clouds in two folders, of which one lacks a picture; with its manifest."""
+    """Three clouds in two folders, of which one lacks an image; with its manifest."""
     root = micro.write_dataset(tmp_path / "set", 4)
     (root / "more").mkdir()
     (root / "cloudb").rename(root / "more" / "cloudb")
@@ -64,7 +64,7 @@ CHANGES = {
     "a folder": lambda root: (root / "new").mkdir(),
     "a camera file": lambda root: os.utime(root / "clouda" / "transforms.json", ns=(1, 1)),
     "its size": lambda root: (root / "clouda" / "transforms.json").open("a").write(" "),
-    "a picture": lambda root: (root / "clouda" / "001.png").unlink(),
+    "an image": lambda root: (root / "clouda" / "001.png").unlink(),
     "a repair": lambda root: shutil.copy(root / "clouda/001.png", root / "cloudc/003.png"),
 }
 
@@ -73,13 +73,13 @@ CHANGES = {
 def test_an_old_manifest_is_refused_and_made_anew(data, change, capsys):
     times = [os.stat(data / uid).st_mtime_ns for uid in ("clouda", "cloudc")]
     CHANGES[change](data)
-    if change in ("a picture", "a repair"):  # the clock of some systems ticks every 10 ms
+    if change in ("an image", "a repair"):  # the clock of some systems ticks every 10 ms
         for uid, time in zip(("clouda", "cloudc"), times):
             if os.stat(data / uid).st_mtime_ns == time:
                 os.utime(data / uid, ns=(time + 1, time + 1))
     line = refused("older than its dataset, .* has changed", open_dataset, data)
     assert f"gamba data index {data} writes it again" in line
-    bad = 0 if change == "a repair" else 2 if change == "a picture" else 1
+    bad = 0 if change == "a repair" else 2 if change == "an image" else 1
     assert cli.run("data index", [str(data)]) == min(1, bad)
     assert f", {bad} left out, listed in {data / MANIFEST}" in capsys.readouterr().out
     assert len(open_dataset(data).check()) == bad

@@ -1,4 +1,4 @@
-"""Pictures to model input: mattes, masks, recentring, and pictures without an object."""
+"""Images to model input: mattes, masks, recentring, and images without an object."""
 
 import importlib.util
 
@@ -27,8 +27,8 @@ def scene(alpha, colour, background):
     return (alpha * np.asarray(colour) + (1 - alpha) * np.asarray(background)).astype(np.float32)
 
 
-def write(path, picture):
-    save_image(path, picture)
+def write(path, image):
+    save_image(path, image)
     return path
 
 
@@ -105,7 +105,7 @@ def test_a_mask_wins_over_all(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "picture",
+    "image",
     [
         np.zeros((20, 30, 4)),
         np.dstack([np.ones((20, 30, 3)), np.full((20, 30), 0.02)]),
@@ -116,13 +116,13 @@ def test_a_mask_wins_over_all(tmp_path):
     ],
     ids=["transparent", "nearly transparent", "white", "one pixel", "one row", "one of many"],
 )
-def test_pictures_without_an_object(tmp_path, picture):
-    path = write(tmp_path / "a.png", picture)
+def test_images_without_an_object(tmp_path, image):
+    path = write(tmp_path / "a.png", image)
     refused(r"a\.png: no object found", prepare, path)
 
 
 @pytest.mark.parametrize("mode", ["P", "L", "I;16", "1"])
-def test_other_kinds_of_pictures(tmp_path, mode):
+def test_other_kinds_of_images(tmp_path, mode):
     alpha = disc(soft=False)
     grey = (255 - 200 * alpha).astype(np.uint8)
     image = Image.fromarray(grey)

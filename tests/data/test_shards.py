@@ -101,13 +101,13 @@ def test_shards_give_the_bits_of_the_files(data, tmp_path, size):
         for views in (None, [2, 0], [1, 1]):
             assert_same(load(uid, views, size), files.load(uid, views, size))
         assert_same(load(uid, [1, 2], size, 1), files.load(uid, [1, 2], size, 1))
-        if size is None:  # other sizes are made from the same pictures
+        if size is None:  # other sizes are made from the same images
             assert_same(load(uid, [1, 2], 7), files.load(uid, [1, 2], 7))
     assert shards_at(tmp_path / "pack") == str(tmp_path / "pack") and not shards_at(data)
     refused("shards, which only gamba train reads", open_dataset, tmp_path / "pack")
 
 
-def test_shards_keep_the_bytes_of_the_pictures(data, tmp_path, monkeypatch):
+def test_shards_keep_the_bytes_of_the_images(data, tmp_path, monkeypatch):
     packed(data, tmp_path / "pack")
     content = {path.name: path.read_bytes() for path in (tmp_path / "pack").iterdir()}
     monkeypatch.setattr(time, "time", lambda: 2e9)
@@ -154,11 +154,11 @@ def test_views_without_alpha_are_packed_and_told(data, tmp_path, capsys):
         Image.open(path).convert("RGB").save(path)
     assert cli.run("data pack", [str(data), str(tmp_path / "pack"), "--size", "6"]) == 0
     said = capsys.readouterr().err
-    assert f"warning: {data}: no picture has an alpha channel or a mask" in said
+    assert f"warning: {data}: no image has an alpha channel or a mask" in said
 
 
 def test_objects_that_cannot_be_read_are_left_out_and_told(data, tmp_path, capsys):
-    (data / "b/c.v2/1.png").write_bytes(b"no picture")
+    (data / "b/c.v2/1.png").write_bytes(b"no image")
     out = tmp_path / "pack"
     assert cli.run("data pack", [str(data), str(out)]) == 1
     said = capsys.readouterr()
@@ -217,7 +217,7 @@ def in_document(change):
             "not a rotation",
         ),
         (changed("000.png", bytes_of(Image.new("1", (20000, 20000)))), "megapixels"),
-        (changed("000.png", b"no picture"), "a.000.png: "),
+        (changed("000.png", b"no image"), "a.000.png: "),
         (lambda all: [m for m in all if m[0].name != "a.json"], "not valid JSON"),
     ],
 )

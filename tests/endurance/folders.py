@@ -57,10 +57,10 @@ def is_whole(name: str, data: bytes) -> bool:
     suffix = Path(name).suffix
     try:
         if suffix in (".png", ".gif", ".webp"):
-            with Image.open(io.BytesIO(data)) as picture:
-                for index in range(getattr(picture, "n_frames", 1)):
-                    picture.seek(index)
-                    picture.load()
+            with Image.open(io.BytesIO(data)) as image:
+                for index in range(getattr(image, "n_frames", 1)):
+                    image.seek(index)
+                    image.load()
         elif suffix in (".json", ".jsonl"):
             for text in data.splitlines() if suffix == ".jsonl" else [data]:
                 json.loads(text)

@@ -46,7 +46,7 @@ SMALL = "--size 16 --frames 2 --device cpu"
 MODEL = "image_size=16 patch_size=4 width=16 depth=1 state_size=4 scale_init=0.06"
 JOBS = {
     "reconstruct": Job(
-        "reconstruct {world}/pictures --out {out} --checkpoint {world}/run/model.safetensors "
+        "reconstruct {world}/images --out {out} --checkpoint {world}/run/model.safetensors "
         f"--splats ply splat spz {SMALL}",
         "--elevation 20",
     ),
@@ -105,9 +105,9 @@ def undisturbed(*words: object):
 
 
 def make_world(folder: Path, commands: list[str]) -> None:
-    """Make data, a model, pictures, meshes and all other inputs of the commands."""
+    """Make data, a model, images, meshes and all other inputs of the commands."""
     rng = np.random.default_rng(0)
-    for name in ("meshes", "pictures", "gaussians"):
+    for name in ("meshes", "images", "gaussians"):
         (folder / name).mkdir()
     solids = {"ball": trimesh.creation.icosphere(1), "box": trimesh.creation.box()}
     for name, mesh in (solids | {"cone": trimesh.creation.cone(1, 2)}).items():
@@ -120,14 +120,14 @@ def make_world(folder: Path, commands: list[str]) -> None:
     rgba = np.zeros((20, 30, 4))
     rgba[4:16, 8:24] = (0.8, 0.3, 0.1, 1)
     for name in ("a", "b"):
-        save_image(folder / "pictures" / f"{name}.png", rgba)
+        save_image(folder / "images" / f"{name}.png", rgba)
     points = rng.normal(size=(200, 3))
     points *= 0.4 / np.linalg.norm(points, axis=1, keepdims=True)
     save_ply(folder / "gaussians" / "ball.ply", cloud_of(points, 0.08, 0.95, rng.random((200, 3))))
     if "ablate" in commands:
         write_json(folder / "plan.json", PLAN)
     if "data furniture" in commands:
-        make_library(folder / "libraries", folder / "pictures" / "a.png")
+        make_library(folder / "libraries", folder / "images" / "a.png")
     if "import-released" in commands:
         make_released(folder / "released")
 

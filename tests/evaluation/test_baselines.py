@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def truth_at(azimuths, elevation=0.0, distance=1.5, image=None):
-    """Return a truth whose input picture is ``image``, with further cameras."""
+    """Return a truth whose input image is ``image``, with further cameras."""
     viewmats = torch.cat(
         [orbit(torch.zeros(1)), orbit(torch.tensor(azimuths), elevation, distance)]
     )
@@ -44,13 +44,13 @@ def test_billboard_reproduces_the_input():
     truth.cameras.Ks[:, 0, 2] += 3.3
     truth.cameras.viewmats[0, :2, 3] = torch.tensor([0.1, -0.07])
     rgb, alpha = billboard(truth)
-    # float32 poses and pictures
+    # float32 poses and images
     assert (rgb[0] - truth.rgb[0]).abs().max() < 2e-5
     assert (alpha[0] - truth.images[0, ..., 3]).abs().max() < 2e-5
 
 
 def test_billboard_is_what_a_camera_sees_of_the_plane():
-    """Each picture against single ray-plane intersections, and an analytic picture."""
+    """Each image against single ray-plane intersections, and an analytic image."""
     x = (torch.arange(WIDTH) + 0.5)[None, :].expand(HEIGHT, WIDTH)
     y = (torch.arange(HEIGHT) + 0.5)[:, None].expand(HEIGHT, WIDTH)
     image = torch.stack([x / WIDTH, y / HEIGHT, 0 * x, torch.ones_like(x)], -1)
@@ -153,9 +153,9 @@ def test_retrieval_takes_the_objects_of_other_datasets(data, tmp_path):
 def test_retrieval_leaves_out_the_object_itself(data):
     dataset = open_dataset(data, "train")
     retrieval = Retrieval(dataset)
-    picture = dataset.load("seen", [2]).images[0]
-    assert retrieval.nearest(picture, "twin")[:2] == ("seen", 2)
-    assert retrieval.nearest(picture, "seen")[0] in ("flat", "other")
+    image = dataset.load("seen", [2]).images[0]
+    assert retrieval.nearest(image, "twin")[:2] == ("seen", 2)
+    assert retrieval.nearest(image, "seen")[0] in ("flat", "other")
 
 
 def test_retrieval_is_by_both_terms_not_by_shape_alone(data, monkeypatch):
@@ -166,17 +166,17 @@ def test_retrieval_is_by_both_terms_not_by_shape_alone(data, monkeypatch):
     write_object(data / "dyed", dyed, 125.0)  # nearly the twin's shape, not its colour
     write_split(data, train=["dyed", "other", "seen"], val=["flat"], test=["twin"])
     retrieval = Retrieval(open_dataset(data, "train"))
-    pictures = torch.cat([retrieval.training.load(uid).images for uid in retrieval.training.uids])
+    images = torch.cat([retrieval.training.load(uid).images for uid in retrieval.training.uids])
     found = set()
-    for image in load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu").images:
-        for query in (image, torch.cat([1 - image[..., :3], image[..., 3:]], -1)):
+    for made in load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu").images:
+        for query in (made, torch.cat([1 - made[..., :3], made[..., 3:]], -1)):
             uid, _, best = retrieval.nearest(query, "")
             found.add(uid)
             distances = []
-            for picture in pictures:
-                low = torch.minimum(picture[..., 3], query[..., 3])
-                high = torch.maximum(picture[..., 3], query[..., 3])
-                apart = (picture[..., :3] - query[..., :3]).abs().mean(-1)
+            for image in images:
+                low = torch.minimum(image[..., 3], query[..., 3])
+                high = torch.maximum(image[..., 3], query[..., 3])
+                apart = (image[..., :3] - query[..., :3]).abs().mean(-1)
                 distances.append(1 - low.sum() / high.sum() + (low * apart).sum() / low.sum())
             assert best == pytest.approx(min(distances).item(), abs=0.01)  # 8-bit thumbnails
     assert found == {"seen", "dyed"}
@@ -205,7 +205,7 @@ def test_a_whole_report(data, tmp_path, capsys):
 
 
 def test_what_cannot_be_had_is_listed(data, tmp_path, capsys):
-    """A bad training picture: the retrieval goes on. No training split: it is left out."""
+    """A bad training image: the retrieval goes on. No training split: it is left out."""
     (data / "flat" / "3.png").write_bytes(b"nothing")
     code, report = evaluate(data, tmp_path / "out")
     assert code == 1 and report["num_failed"] == 0

@@ -82,7 +82,7 @@ def test_a_set_says_its_names_and_axes(tmp_path, capsys):
     assert flat[0] == nested[0] == list(NAMES)
     read = [open_dataset(tmp_path / n / "data").load("table", [0]).name for n in "12"]
     assert read == ["table", "table"]
-    for key in ("psnr", "mask_iou"):  # the same pictures, so the same bits
+    for key in ("psnr", "mask_iou"):  # the same images, so the same bits
         assert nested[1]["mean"][key] == flat[1]["mean"][key]
         retrieval, other = (r["baselines"]["retrieval"][key] for r in (nested[1], flat[1]))
         assert retrieval == other

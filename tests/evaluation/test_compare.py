@@ -27,7 +27,7 @@ def views_report(offset=0.0, uids=UIDS):
         if uid in uids
     ]
     protocol = {"max_psnr": 100.0, "reference": 0, "split": "test", "lpips": None}
-    return {"protocol": protocol | {"source": {"kind": "pictures"}}, "objects": objects}
+    return {"protocol": protocol | {"source": {"kind": "images"}}, "objects": objects}
 
 
 def shapes_report(offset=0.0, kind="mesh", voxels=128):
@@ -116,16 +116,16 @@ def test_methods_are_compared_by_their_shapes_alone(files):
 
 def test_what_a_method_lacks_counts_for_none_and_is_named(files):
     lacking = views_report(1.0, uids=("a", "b", "c"))
-    lacking["objects"].append({"name": "d", "status": "failed", "reason": "no picture of view 3"})
+    lacking["objects"].append({"name": "d", "status": "failed", "reason": "no image of view 3"})
     first = files.add("one", views_report(uids=("b", "c", "d")))
     code, said, joined = files.run(f"x={first}", f"y={files.add('two', lacking)}")
     assert code == 0 and joined["common"]["psnr"] == ["b", "c"]
     assert joined["rows"][0]["psnr"]["mean"] == 21.5
     assert joined["missing"]["eval-views"] == {
         "x": {"a": "not in its report"},
-        "y": {"d": "no picture of view 3"},
+        "y": {"d": "no image of view 3"},
     }
-    assert "y lacks 1 object (d: no picture of view 3)" in said.out
+    assert "y lacks 1 object (d: no image of view 3)" in said.out
 
 
 def change(report, **values):
@@ -141,7 +141,7 @@ def other_truth(report):
 
 
 def test_other_grounds_are_further_metrics(files):
-    """Pictures without alpha have no such figures, and an older report lacks them too."""
+    """Images without alpha have no such figures, and an older report lacks them too."""
     hazy = change(views_report(1.0), grounds={"black": 0.0, "grey": 0.5})
     for record in hazy["objects"]:
         record |= {"psnr_black": record["psnr"] - 4, "psnr_grey": None, "lpips_black": 0.25}
@@ -185,7 +185,7 @@ def test_what_cannot_stand_in_one_table_is_refused(files, one, other, said):
 
 def test_what_only_places_a_methods_files_may_differ(files):
     gaussians = change(shapes_report(kind="gaussians", voxels=64), frame="reference")
-    views = change(V, lpips="VGG16", split="all", distance=2.0, resize_pictures=True)
+    views = change(V, lpips="VGG16", split="all", distance=2.0, resize_images=True)
     code, said, joined = files.run(
         *(f"{name}={files.add(name + kind, report)}"
           for name, kind, report in (
@@ -193,7 +193,7 @@ def test_what_only_places_a_methods_files_may_differ(files):
               ("y", "shapes", gaussians),
           ))
     )  # fmt: skip
-    assert code == 0 and "Pictures of y were resized" in said.out
+    assert code == 0 and "Images of y were resized" in said.out
 
 
 @pytest.mark.parametrize(
@@ -239,5 +239,5 @@ def test_the_worked_example(tmp_path, capsys):
         expected = report["baselines"][name]["psnr"]
         assert abs(rows[name]["psnr"]["mean"] - expected) < 0.01  # roundings to 8 bits
     hull = json.loads((tmp_path / "hull-views" / "report.json").read_text())
-    assert hull["objects"][0]["pictures"]["matched_by"] == "camera"
+    assert hull["objects"][0]["images"]["matched_by"] == "camera"
     capsys.readouterr()

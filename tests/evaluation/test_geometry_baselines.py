@@ -19,7 +19,7 @@ from gamba_warp.eval.views.baselines import NearestView, TrainingMeshes
 from gamba_warp.formats.meshes import Y_TO_Z_UP, load_mesh
 from gamba_warp.formats.ply import save_ply
 
-SIZE = 32  # that of the thumbnails: the pictures are compared as they are
+SIZE = 32  # that of the thumbnails: the images are compared as they are
 # A quarter turn about the vertical axis of ``orbit``: bounding boxes stay bounding boxes.
 TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 ON_ITS_SIDE = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # what the catalogue turns back
@@ -39,7 +39,7 @@ def stairs():
 
 
 def write_mesh_views(folder, mesh, azimuths):
-    """Pictures of Gaussians all over the mesh, whose colours follow the place in the file."""
+    """Images of Gaussians all over the mesh, whose colours follow the place in the file."""
     points, _ = trimesh.sample.sample_surface(mesh, 400, seed=1)
     cloud = cloud_of(np.array(points), 0.04, 0.95, torch.linspace(0, 1, 400)[:, None])
     cameras = around(azimuths, 20.0, 1.6, SIZE)

@@ -53,7 +53,7 @@ def test_shapes_must_agree(metric):
         metric(torch.rand(12, 12, 3), torch.rand(12, 13, 3))
 
 
-def test_small_pictures_have_no_ssim():
+def test_small_images_have_no_ssim():
     with pytest.raises(ValueError, match="10x12"):
         ssim(torch.rand(12, 10, 3), torch.rand(12, 10, 3))
 
@@ -150,7 +150,7 @@ def test_one_rendering_serves_all_grounds():
 
 
 def test_known_values_on_each_ground():
-    """A flat half-covered picture, off by known amounts: by colour on white, by alpha elsewhere."""
+    """A flat half-covered image, off by known amounts: by colour on white, by alpha elsewhere."""
     images = torch.tensor([1.0, 1.0, 1.0, 0.5]).expand(2, SIZE, SIZE, 4).clone()
     truth = Truth("a", images, cameras(), [0, 1])
     # White at a lesser alpha: nothing is wrong on white, (1 - grey) * 0.25 elsewhere.

@@ -56,7 +56,7 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
         return int(command == "eval-views")
 
     monkeypatch.setattr(scanned.cli, "run", run)
-    (tmp_path / "pictures").mkdir()
+    (tmp_path / "images").mkdir()
     page = tmp_path / "page.md"
     parts = "\n".join(marks("make scanned", "figures"))
     page.write_text(f"before\n{parts}\nafter\n")
@@ -67,7 +67,7 @@ def test_one_command_renders_evaluates_and_writes_the_page(tmp_path, monkeypatch
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n")
     assert "**this project**" in text
-    assert Image.open(tmp_path / "pictures" / "scanned.webp").size == (5, 7)
+    assert Image.open(tmp_path / "images" / "scanned.webp").size == (5, 7)
 
 
 @pytest.mark.parametrize("code", [2, 130])

@@ -7,7 +7,7 @@ from PIL import Image
 
 from gamba_warp import cli
 from gamba_warp.eval.shapes.shape import Mesh, Points
-from gamba_warp.eval.shapes.sheet import SIDE, picture_of
+from gamba_warp.eval.shapes.sheet import SIDE, image_of
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def test_the_worst_pair_comes_first(folders, tmp_path):
     sheet = np.asarray(Image.open(tmp_path / "out" / "sheet.png"))
     assert sheet.shape[1] == 4 * SIDE
     box = trimesh.creation.box((0.6, 0.8, 1.0))
-    want = picture_of(Mesh(box.vertices, box.faces))
+    want = image_of(Mesh(box.vertices, box.faces))
     first, second = (sheet[top + 40 : top + 40 + SIDE] for top in (0, SIDE + 26))
     for row, same in ((first, False), (second, True)):
         assert np.array_equal(row[:, 2 * SIDE :], want)  # the truth
@@ -37,8 +37,8 @@ def test_the_worst_pair_comes_first(folders, tmp_path):
 
 
 def test_points_are_drawn_where_they_are():
-    picture = picture_of(Points(np.array([[0.0, 0, 0], [0, 0, 0.4]])))
-    for view in np.hsplit(picture, 2):
+    image = image_of(Points(np.array([[0.0, 0, 0], [0, 0, 0.4]])))
+    for view in np.hsplit(image, 2):
         row, column = np.nonzero(view < 255)
         assert len(row) == 2 and abs(column - SIDE / 2).max() < 1  # upright
         assert row.min() < 0.35 * SIDE and abs(row.max() - SIDE / 2) <= 1

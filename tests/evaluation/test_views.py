@@ -170,7 +170,7 @@ def test_lpips_with_weights(data, painted):
         pytest.skip("the LPIPS weights are not in the cache (gamba weights lpips)")
     _, report = evaluate(data, "--limit", "1", "--views", "2", lpips="auto")
     assert report["protocol"]["lpips"] == "VGG16, version 0.1"
-    # a prediction that differs by rounding, against an empty picture
+    # a prediction that differs by rounding, against an empty image
     for key in ("lpips", "lpips_black", "lpips_grey"):
         assert report["mean"][key] < 1e-3 < report["baselines"]["background"][key]
 
@@ -257,7 +257,7 @@ def test_bad_files_stop_no_other_object(data, painted, monkeypatch):
         if uid == "c":
             raise OSError(5, "Input/output error")
         record = module_evaluate(job, uid, *rest)
-        (data / "data" / uid / "0.png").write_bytes(b"not a picture")
+        (data / "data" / uid / "0.png").write_bytes(b"not an image")
         return record
 
     module_evaluate = module.evaluate_object

@@ -16,7 +16,7 @@ CELLS = 24
 
 
 def write_model(path, **changes):
-    """An untrained one, whose front is a plane with the colours of the picture: 24 x 24 cells."""
+    """An untrained one, whose front is a plane with the colours of the image: 24 x 24 cells."""
     torch.manual_seed(4)
     wanted = {"decoder": "rays", "encoder": "none", "ray_cells": 8, "ray_layers": 3}
     wanted |= {"ray_features": 5, "image_size": CELLS, "patch_size": 8}
@@ -48,7 +48,7 @@ def dataset(folder, size: int, fov: float = 49.1):
 
 @pytest.mark.parametrize("detail", [None, 1, 2])
 def test_the_figures_are_those_of_the_file_that_reconstruct_writes(tmp_path, detail):
-    # It sees all pixels, so that nothing depends on the filter by which a picture is made smaller.
+    # It sees all pixels, so that nothing depends on the filter by which an image is made smaller.
     model = write_model(tmp_path / "rays.safetensors", image_size=4 * CELLS, patch_size=32)
     data = dataset(tmp_path / "data", 4 * CELLS)
     words = [] if detail is None else ["--detail", str(detail)]
@@ -67,7 +67,7 @@ def test_the_figures_are_those_of_the_file_that_reconstruct_writes(tmp_path, det
         for own, other in ((mine, theirs), (mine["input"], theirs["input"])):
             assert own[metric] == pytest.approx(other[metric], abs=1e-3), metric
     said = report["protocol"]["source"]["detail"]
-    assert said == ("as the picture has pixels" if detail is None else str(detail))
+    assert said == ("as the image has pixels" if detail is None else str(detail))
 
 
 def number_and_psnr(model, data, out, *words):

@@ -29,7 +29,7 @@ from gamba_warp.files import (
     write_text,
 )
 from gamba_warp.formats.read import find_gaussians
-from gamba_warp.images import find_pictures, save_image
+from gamba_warp.images import find_images, save_image
 from gamba_warp.trajectories.movies import save_turntable
 
 
@@ -181,7 +181,7 @@ def test_what_begins_with_a_dot_is_no_input(tmp_path):
     for folder in (tmp_path, part):
         for name in ("a.png", "a.ply", ".b.png", ".b.ply"):
             (folder / name).write_bytes(b"x")
-    assert find_pictures([tmp_path])[0] == [tmp_path / "a.png"]
+    assert find_images([tmp_path])[0] == [tmp_path / "a.png"]
     assert find_gaussians([tmp_path])[0] == [tmp_path / "a.ply"]
     assert list(visible(tmp_path, "*.ply")) == [tmp_path / "a.ply"]
     pairs, failures = find_pairs(tmp_path, tmp_path)

@@ -15,7 +15,7 @@ from gamba_warp.formats.meshes import load_mesh
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
 CORNERS = np.array([0, 1, 2, 0, 2, 3], "<u2")
-UVS = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")  # the picture upright
+UVS = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")  # the image upright
 # Rows from the top: red, green; blue, white.
 PAINT = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
@@ -520,17 +520,17 @@ UNREAD = {
     "scenes": (lambda d: d.tree["scenes"].append({}), "one of 2 scenes is read"),
     "KTX2": (
         changed(("textures", 0), {"extensions": {"KHR_texture_basisu": {"source": 0}}}),
-        "a texture's picture is named by KHR_texture_basisu, which is not supported",
+        "a texture's image is named by KHR_texture_basisu, which is not supported",
     ),
     "DDS": (
         changed(("textures", 0), {"extensions": {"MSFT_texture_dds": {"source": 0}}}),
-        "a texture's picture is named by MSFT_texture_dds, which is not supported",
+        "a texture's image is named by MSFT_texture_dds, which is not supported",
     ),
     "no source": (
         changed(("textures", 0), {}),
-        "a texture's picture is named by nothing, which is not supported",
+        "a texture's image is named by nothing, which is not supported",
     ),
-    "no picture": (changed(("images", 0), {"uri": "a.png"}), "a.png: not found"),
+    "no image": (changed(("images", 0), {"uri": "a.png"}), "a.png: not found"),
     "clamp": (
         lambda d: (
             changed(("samplers",), [{"wrapS": 33071}])(d),

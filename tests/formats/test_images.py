@@ -1,4 +1,4 @@
-"""Pictures in files: all common kinds, damaged ones, and atomic writes."""
+"""Images in files: all common kinds, damaged ones, and atomic writes."""
 
 import io
 import os
@@ -14,10 +14,10 @@ from PIL import EpsImagePlugin, Image, ImageOps
 from gamba_warp.errors import FileWarning, UserError
 from gamba_warp.files import output_folder, write_json
 from gamba_warp.images import (
+    image_size,
     load_rgba,
     load_rgba8,
-    open_picture,
-    picture_size,
+    open_image,
     save_image,
     to_uint8,
 )
@@ -254,7 +254,7 @@ def test_a_profile_of_srgb_leaves_every_bit(tmp_path):
 @pytest.mark.parametrize("columns", [None, ADOBE_RGB], ids=["grey", "rgb"])
 @pytest.mark.parametrize("mode", ["L", "LA", "I;16"])
 def test_grey_has_profiles_too(tmp_path, mode, columns):
-    """A grey picture stays grey, as masks must."""
+    """A grey image stays grey, as masks must."""
     values = np.arange(256, dtype=np.uint8).reshape(16, 16)
     grey = Image.fromarray(257 * values.astype(np.uint16)) if mode == "I;16" else None
     if mode != "I;16":
@@ -282,8 +282,8 @@ def test_cmyk_goes_by_its_profile(tmp_path):
     [
         ("RGB", b"no profile", ""),
         ("RGBA", colour_profile(ADOBE_RGB)[:200], ""),
-        ("RGB", colour_profile("CMYK"), "it is for CMYK, but the picture is RGB"),
-        ("CMYK", colour_profile(SRGB), "it is for RGB, but the picture is CMYK"),
+        ("RGB", colour_profile("CMYK"), "it is for CMYK, but the image is RGB"),
+        ("CMYK", colour_profile(SRGB), "it is for RGB, but the image is CMYK"),
         ("L", bytes(5 << 20), "damaged or too large"),
     ],
 )
@@ -323,8 +323,8 @@ def test_one_pixel_and_extreme_shapes(tmp_path):
         assert load_rgba(tmp_path / "a.png").shape == (size[1], size[0], 4)
 
 
-def test_a_phone_picture_with_a_preview_is_one_picture(tmp_path):
-    """Many cameras append a second picture to a JPEG (MPO); it is not an animation."""
+def test_a_phone_image_with_a_preview_is_one_image(tmp_path):
+    """Many cameras append a second image to a JPEG (MPO); it is not an animation."""
     content = io.BytesIO()
     colours().save(content, "MPO", save_all=True, append_images=[colours(size=(3, 3))])
     (tmp_path / "a.jpg").write_bytes(content.getvalue())
@@ -336,12 +336,12 @@ def test_bad_files_are_named_with_the_reason(tmp_path):
         refused_at(path, reason, load_rgba, path)
 
 
-def test_saved_pictures_come_back(tmp_path):
+def test_saved_images_come_back(tmp_path):
     for shape in [(5, 7), (5, 7, 1), (5, 7, 3), (5, 7, 4)]:
-        picture = np.random.default_rng(1).random(shape).astype(np.float32)
-        save_image(tmp_path / "a.png", picture)
+        image = np.random.default_rng(1).random(shape).astype(np.float32)
+        save_image(tmp_path / "a.png", image)
         got = load_rgba(tmp_path / "a.png")
-        want = np.broadcast_to(picture.reshape(5, 7, -1), (5, 7, max(3, picture.shape[-1] % 7)))
+        want = np.broadcast_to(image.reshape(5, 7, -1), (5, 7, max(3, image.shape[-1] % 7)))
         np.testing.assert_allclose(got[..., : want.shape[2]], want, atol=0.501 / 255)
 
 
@@ -374,7 +374,7 @@ def test_sizes_are_refused_by_the_header_without_a_warning(
 ):
     path = tmp_path / "a.png"
     path.write_bytes(bare_png(width, height))
-    for function in (load_rgba, load_rgba8, picture_size):
+    for function in (load_rgba, load_rgba8, image_size):
         refused_at(path, reason, function, path)
     assert not recwarn.list
 
@@ -385,23 +385,23 @@ def test_only_a_few_formats_are_ever_opened(tmp_path, monkeypatch):
     postscript = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n"
     for suffix in ("png", "eps", "jpg"):
         (tmp_path / f"a.{suffix}").write_bytes(postscript)
-        assert "not a picture" in refused(None, load_rgba, tmp_path / f"a.{suffix}")
+        assert "not an image" in refused(None, load_rgba, tmp_path / f"a.{suffix}")
     for form in ("ICO", "TGA", "PCX", "SGI", "DDS", "JPEG2000", "PDF", "ICNS"):
         content = io.BytesIO()
         colours("RGBA" if form == "ICNS" else "RGB", (16, 16)).save(content, form)
         (tmp_path / "a.png").write_bytes(content.getvalue())
-        assert "not a picture" in refused(None, load_rgba, tmp_path / "a.png"), form
+        assert "not an image" in refused(None, load_rgba, tmp_path / "a.png"), form
 
 
-def test_a_picture_in_memory(tmp_path):
-    with open_picture(io.BytesIO(encoded("PNG")), "wood.png in a.glb") as image:
+def test_a_image_in_memory(tmp_path):
+    with open_image(io.BytesIO(encoded("PNG")), "wood.png in a.glb") as image:
         assert image.size == (40, 30)
-    for content, reason in ((b"", "not a picture"), (encoded("PNG")[:900], "cannot be decoded")):
+    for content, reason in ((b"", "not an image"), (encoded("PNG")[:900], "cannot be decoded")):
         with pytest.raises(UserError, match=f"wood: .*{reason}"):
-            with open_picture(io.BytesIO(content), "wood") as image:
+            with open_image(io.BytesIO(content), "wood") as image:
                 image.load()
     with pytest.raises(UserError, match="wood: 40x30 is over"):
-        with open_picture(io.BytesIO(encoded("PNG")), "wood", max_pixels=1199):
+        with open_image(io.BytesIO(encoded("PNG")), "wood", max_pixels=1199):
             pass
 
 
@@ -413,45 +413,45 @@ def test_what_is_no_plain_file(tmp_path):
         assert refused(None, load_rgba, tmp_path / name).startswith(str(tmp_path))
 
 
-def test_absurd_exif_does_not_hide_the_picture(tmp_path, recwarn):
-    picture = colours()
-    want = np.asarray(picture) / 255
+def test_absurd_exif_does_not_hide_the_image(tmp_path, recwarn):
+    image = colours()
+    want = np.asarray(image) / 255
     exifs = [b"Exif\0\0" + bytes(rng) for rng in ([], [255] * 20, range(200))]
     exifs += [b"Exif\0\0II*\0\x08\0\0\0" + b"\xff" * size for size in (1, 2, 9, 400)]
     exifs.append(b"Exif\0\0MM\0\x2a\xff\xff\xff\xff")
     for exif in exifs:
-        picture.save(tmp_path / "a.png", exif=exif)
+        image.save(tmp_path / "a.png", exif=exif)
         np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
-    exif = picture.getexif()
+    exif = image.getexif()
     for value in (0, 9, 60_000):
         exif[0x0112] = value
-        picture.save(tmp_path / "a.png", exif=exif)
+        image.save(tmp_path / "a.png", exif=exif)
         np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
     assert not recwarn.list
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_every_exif_orientation(tmp_path, orientation):
-    picture = colours()
-    exif = picture.getexif()
+    image = colours()
+    exif = image.getexif()
     exif[0x0112] = orientation
-    picture.save(tmp_path / "a.png", exif=exif)
+    image.save(tmp_path / "a.png", exif=exif)
     want = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png"))) / 255
     np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
-    assert picture_size(tmp_path / "a.png") == (want.shape[1], want.shape[0])
+    assert image_size(tmp_path / "a.png") == (want.shape[1], want.shape[0])
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P", "1", "I;16", "F"])
-def test_large_pictures_are_reduced_by_whole_factors(tmp_path, mode):
-    """The result has at least twice the requested length, and the mean of the whole picture."""
+def test_large_images_are_reduced_by_whole_factors(tmp_path, mode):
+    """The result has at least twice the requested length, and the mean of the whole image."""
     pixels = np.zeros((120, 160), np.uint16 if mode == "I;16" else np.float32)
     pixels[:, :80] = 65535 if mode == "I;16" else 1
     if mode in ("I;16", "F"):
-        picture = Image.fromarray(pixels)
+        image = Image.fromarray(pixels)
     else:
-        picture = Image.fromarray((255 * pixels).astype(np.uint8)).convert(mode)
+        image = Image.fromarray((255 * pixels).astype(np.uint8)).convert(mode)
     path = tmp_path / ("a.tiff" if mode == "F" else "a.png")
-    picture.save(path)
+    image.save(path)
     assert load_rgba(path, 41).shape == (120, 160, 4)
     got = load_rgba(path, 20)
     assert got.shape == (30, 40, 4) and (got[..., 3] == 1).all()
@@ -470,7 +470,7 @@ def test_reducing_lets_no_background_in(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "L", "LA", "CMYK"])
-def test_8_bits_are_the_same_picture(tmp_path, mode):
+def test_8_bits_are_the_same_image(tmp_path, mode):
     path = tmp_path / ("a.tiff" if mode == "CMYK" else "a.png")
     colours(mode).save(path)
     got = load_rgba8(path)
@@ -478,13 +478,13 @@ def test_8_bits_are_the_same_picture(tmp_path, mode):
     np.testing.assert_array_equal(got, to_uint8(load_rgba(path)))
 
 
-def test_bands_of_large_pictures_meet(tmp_path, monkeypatch):
+def test_bands_of_large_images_meet(tmp_path, monkeypatch):
     colours("RGBA", (50, 40)).save(tmp_path / "a.png")
     Image.fromarray(np.arange(2000, dtype=np.uint16).reshape(40, 50) * 30).save(tmp_path / "b.png")
     want = [load_rgba(tmp_path / f"{name}.png") for name in "ab"]
     monkeypatch.setattr("gamba_warp.images._BAND", 170)
-    for name, picture in zip("ab", want):
-        np.testing.assert_array_equal(load_rgba(tmp_path / f"{name}.png"), picture)
+    for name, image in zip("ab", want):
+        np.testing.assert_array_equal(load_rgba(tmp_path / f"{name}.png"), image)
 
 
 def test_to_uint8_rounds_and_clips():

@@ -139,7 +139,7 @@ def test_textures_of_a_sister_folder_are_read_below_the_given_one(tmp_path, name
     assert load_mesh(path).materials[0].texture is None
 
 
-def test_what_is_no_picture_is_not_opened(tmp_path, monkeypatch):
+def test_what_is_no_image_is_not_opened(tmp_path, monkeypatch):
     def run(*_, **__):
         raise AssertionError("another program was started")
 
@@ -149,10 +149,10 @@ def test_what_is_no_picture_is_not_opened(tmp_path, monkeypatch):
         mtl = MTL.replace("paint.png", name) + f"map_d {name}\n"
         mesh = load_mesh(write_quad(tmp_path, mtl=mtl, texture=None))
         assert mesh.materials[0].texture is None
-        assert f"{name}: not a picture that can be read" in mesh.warnings
+        assert f"{name}: not an image that can be read" in mesh.warnings
     mesh = load_mesh(write_quad(tmp_path, mtl=MTL + "map_d paint.eps\n", texture="paint.png"))
     assert mesh.materials[0].texture is not None
-    assert "paint.eps: not a picture that can be read" in mesh.warnings
+    assert "paint.eps: not an image that can be read" in mesh.warnings
 
 
 def test_sizes_beside_a_mesh_have_a_limit(tmp_path, monkeypatch):
@@ -286,7 +286,7 @@ def test_small_files_cost_little(tmp_path, name):
 
 @pytest.mark.parametrize("limit", ["texels", "pixels"])
 def test_textures_over_the_limit_are_left_out(tmp_path, monkeypatch, limit):
-    """Pictures beyond the memory of all textures are named; those before them stay."""
+    """Images beyond the memory of all textures are named; those before them stay."""
     monkeypatch.setattr(materials, "PIXELS_PER_BYTE", 0)
     sides = materials.SideFiles(tmp_path / "a.glb", **{limit: 2 * 4 * 6 * 5})
     file = io.BytesIO()

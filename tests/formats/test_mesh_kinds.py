@@ -113,7 +113,7 @@ def test_concave_polygons_of_files(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "ply"])
 def test_vertices_of_no_visible_face_are_left_out(tmp_path, suffix):
-    """Otherwise they move and shrink the object in every picture."""
+    """Otherwise they move and shrink the object in every image."""
     rows = ["9 3 1", *FOUR, "nan 0 0", "8.1 2.7 0.9"]
     line = "3 0 1 6"  # the third corner lies between the others up to rounding
     text = {

@@ -62,7 +62,7 @@ def test_missing_parts_are_grey_and_named(tmp_path, changes, warning):
 
 def test_broken_texture_becomes_the_plain_colour(tmp_path):
     path = write_quad(tmp_path)
-    for content in ((tmp_path / "paint.png").read_bytes()[:60], b"no picture", None):
+    for content in ((tmp_path / "paint.png").read_bytes()[:60], b"no image", None):
         (tmp_path / "paint.png").unlink()
         if content is not None:
             (tmp_path / "paint.png").write_bytes(content)

@@ -47,12 +47,12 @@ class Page(html.parser.HTMLParser):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def pictures(*shape):
+def images(*shape):
     return np.random.default_rng(0).random(shape).astype(np.float32)
 
 
 def frames(count=5, size=24):
-    return (pictures(count, size, size, 3) * 255).astype(np.uint8)
+    return (images(count, size, size, 3) * 255).astype(np.uint8)
 
 
 def decoded(source):
@@ -63,10 +63,10 @@ def decoded(source):
 def full(title="A chair", **changes):
     values = dict(
         text="Seen once.",
-        picture=pictures(9, 9, 4),
+        image=images(9, 9, 4),
         turntable=frames(),
         gaussians=some(11),
-        views={"Predicted": pictures(3, 8, 8, 3), "Truth": pictures(2, 8, 8, 3)},
+        views={"Predicted": images(3, 8, 8, 3), "Truth": images(2, 8, 8, 3)},
         header=("", "PSNR"),
         table=[("input", 24.3456), ("novel", 19), ("note", "n/a")],
     )
@@ -112,16 +112,16 @@ def test_the_viewer_gets_the_gaussians_and_the_camera(tmp_path):
         # the turntable is there once: beside a running viewer, under a waiting one
         sources = [image["src"] for image in page.all("img")]
         assert sum(source.startswith("data:image/webp") for source in sources) == 1
-        assert about["picture"].startswith("data:image/webp;base64,")
+        assert about["image"].startswith("data:image/webp;base64,")
 
 
-def test_pictures_come_back_from_the_page(tmp_path):
+def test_images_come_back_from_the_page(tmp_path):
     section = full(gaussians=None)
     write_page(tmp_path / "a.html", "", [section])
     images = [decoded(a["src"]) for a in Page(tmp_path / "a.html").all("img")]
     (tmp_path / "input.png").write_bytes(images[0][1])
     with Image.open(tmp_path / "input.png") as image:
-        np.testing.assert_allclose(np.asarray(image) / 255, section.picture, atol=0.501 / 255)
+        np.testing.assert_allclose(np.asarray(image) / 255, section.image, atol=0.501 / 255)
     (tmp_path / "turn.webp").write_bytes(images[1][1])
     with Image.open(tmp_path / "turn.webp") as image:
         assert image.n_frames == 5 and image.size == (24, 24)
@@ -132,7 +132,7 @@ def test_text_is_escaped(tmp_path):
     nasty = '</script><b onload="x">&'
     section = Section(nasty, text=nasty, header=(nasty, nasty))
     section.table, section.details = [(nasty, 1), (1.5, nasty)], {nasty: nasty}
-    section.views, section.files = {nasty: pictures(1, 4, 4, 3)}, [nasty]
+    section.views, section.files = {nasty: images(1, 4, 4, 3)}, [nasty]
     section.links = {nasty: frames(1)[0]}
     write_page(tmp_path / "a.html", nasty, [section], nasty)
     page = Page(tmp_path / "a.html")
@@ -156,7 +156,7 @@ def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):
     path, names = tmp_path / "a.html", ["a b#1.ply", "a<b>.gif"]
     for name in names:
         (tmp_path / name).write_bytes(b"ply\nformat binary_little_endian 1.0\n" + bytes(range(256)))
-    section = Section("a", picture=pictures(9, 9, 4), gaussians=some(20), files=names)
+    section = Section("a", image=images(9, 9, 4), gaussians=some(20), files=names)
     write_page(path, "a", [section], auto=True)
     links = [link for link in Page(path).all("a") if "download" in link]
     assert [urllib.parse.unquote(link["href"]) for link in links] == names

@@ -329,8 +329,8 @@ def test_a_textured_obj_stays_closed(tmp_path):
 
     box = trimesh.creation.box()
     uvs = np.random.default_rng(4).random((len(box.faces), 3, 2))
-    picture = Texture(uvs, np.full((8, 8, 3), 0.5, np.float32))
-    save_mesh(tmp_path / "a.obj", Surface(np.array(box.vertices), box.faces, texture=picture))
+    image = Texture(uvs, np.full((8, 8, 3), 0.5, np.float32))
+    save_mesh(tmp_path / "a.obj", Surface(np.array(box.vertices), box.faces, texture=image))
     meshes = pymeshlab.MeshSet()
     meshes.load_new_mesh(str(tmp_path / "a.obj"))
     found = meshes.get_topological_measures()

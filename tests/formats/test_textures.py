@@ -1,4 +1,4 @@
-"""Textures of surfaces: an atlas whose picture shows what vertex colours of few faces cannot."""
+"""Textures of surfaces: an atlas whose image shows what vertex colours of few faces cannot."""
 
 import numpy as np
 import pytest
@@ -79,14 +79,14 @@ def test_faces_do_not_overlap_and_each_has_its_texels():
 
 
 def test_texels_of_one_triangle():
-    """By hand: the lower left half of a picture of 4 x 4; v is up, rows go down."""
+    """By hand: the lower left half of an image of 4 x 4; v is up, rows go down."""
     texels, owner, weights = covered_texels(np.array([[[0, 0], [1, 0], [0, 1.0]]]), 4)
     assert sorted(texels) == [0, 4, 5, 8, 9, 10, 12, 13, 14, 15] and not owner.any()
     (corner,) = np.flatnonzero(texels == 12)  # the centre of the lowest left texel
     np.testing.assert_allclose(weights[corner], [0.75, 0.125, 0.125])
 
 
-def test_a_picture_that_is_too_small(ball, monkeypatch):
+def test_a_image_that_is_too_small(ball, monkeypatch):
     """xatlas leaves each face some room; where no centre of a texel falls into it, that is said."""
     views = look_around(ball, SurfaceOptions(views=8, pixels=32))
     mesh = trimesh.creation.icosphere(1, RADIUS)

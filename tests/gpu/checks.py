@@ -23,9 +23,9 @@ from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 from gamba_warp.measure.models import captured
 
 # Allowed relative rms errors: of float32 sums over a few hundred terms; for the scan plus the error
-# of a GPU's exponential; of half precision, which rounds inputs and outputs; and of pictures, where
+# of a GPU's exponential; of half precision, which rounds inputs and outputs; and of images, where
 # a few pixels may cross the threshold of alpha.
-LIMIT, HALF_LIMIT, PICTURE_LIMIT = 2e-6, 3e-2, 1e-3
+LIMIT, HALF_LIMIT, IMAGE_LIMIT = 2e-6, 3e-2, 1e-3
 # Each is batch, tokens, channels, states and groups.
 SCANS = [
     (2, 139, 37, 3, 1), (1, 65, 40, 3, 2), (1, 1, 1, 1, 1), (1, 577, 70, 16, 1),
@@ -40,7 +40,7 @@ TUNINGS = [
 ]
 # Each is batch, tokens, channels and taps.
 CONVS = [(2, 300, 19, 4), (1, 1, 1, 2), (1, 33, 130, 3), (3, 257, 64, 4)]
-# Each is Gaussians, side of the picture, views and options; tiles of few views are cut into parts.
+# Each is Gaussians, side of the image, views and options; tiles of few views are cut into parts.
 RASTERS = [
     (300, 75, 3, {}), (1, 33, 1, {}), (2000, 130, 1, {"rasterize_mode": "antialiased"}),
     (700, 61, 40, {}), (500, 48, 2, {"quats": None}), (4000, 257, 12, {}),
@@ -99,11 +99,11 @@ def scene_of(count: int, size: int, views: int, options: dict, device: torch.dev
 
 
 def check_raster(count: int, size: int, views: int, options: dict, device: torch.device) -> None:
-    """Check picture, alphas and all gradients on a crop of the first view."""
+    """Check image, alphas and all gradients on a crop of the first view."""
     scene = scene_of(count, size, views, options, device)
-    picture, alphas, _ = scene.forward()
-    assert picture.isfinite().all() and alphas.max() <= 1
-    assert_within(scene.check(BOTH), PICTURE_LIMIT)
+    image, alphas, _ = scene.forward()
+    assert image.isfinite().all() and alphas.max() <= 1
+    assert_within(scene.check(BOTH), IMAGE_LIMIT)
 
 
 # All of these, for each of the shapes; they are given the device.

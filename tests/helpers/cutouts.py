@@ -23,13 +23,13 @@ from gamba_warp.images import to_uint8
 if TYPE_CHECKING:
     from gamba_warp.photo.plain import Plain
 
-SIZE = 256  # side of a picture, pixels
+SIZE = 256  # side of an image, pixels
 KEPT = Path(__file__).parents[1] / "photo" / "objects"
 
 
 @dataclass(frozen=True)
 class Case:
-    """A picture and its right mask.
+    """An image and its right mask.
 
     Attributes:
         name: of the object and its background.

@@ -20,7 +20,7 @@ from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
 from helpers import assert_rel_rms
 from helpers.gaussians import rotations
 
-PICTURE, GRADIENT = 1e-6, 1e-5
+IMAGE, GRADIENT = 1e-6, 1e-5
 WIDTH, HEIGHT = 37, 53
 NEAR, DILATION, ALPHA_MAX, ALPHA_MIN, STOP, TILE = 0.2, 0.3, 0.99, 1 / 255, 1e-4, 16
 
@@ -75,7 +75,7 @@ def render(
     Args:
         means: ``[N, 3]``, float64 as all.
         means2d: ``[N, 3]`` zeros, or ``[H * W, N, 3]`` for each pixel, which are added in units of
-            half the picture.
+            half the image.
         opacities: ``[N]``.
         colors: ``[N, C]``.
         covars: ``[N, 3, 3]``.
@@ -199,7 +199,7 @@ def moved_by(settings, twist):
 
 
 def scene_of(num=150, shs=None):
-    """Gaussians around the camera's axis, beside the picture, near the camera and behind it."""
+    """Gaussians around the camera's axis, beside the image, near the camera and behind it."""
     means = torch.randn(num, 3) * torch.tensor([0.7, 0.7, 1.0])
     scales = torch.exp(torch.randn(num, 3) - 2.5)
     scales[:10] *= 10
@@ -256,7 +256,7 @@ CASES = {
 
 
 def compare(name: str) -> None:
-    """Fail unless pictures, gradients and radii of a case are the reference's."""
+    """Fail unless images, gradients and radii of a case are the reference's."""
     case = CASES[name]
     settings = settings_of(**case.get("settings", {}))
     scene = scene_of(shs=case.get("shs"))
@@ -268,11 +268,11 @@ def compare(name: str) -> None:
     clear = ~want["close"]
     assert clear.float().mean() > 0.97
     assert color.shape == (3, HEIGHT, WIDTH) and radii.dtype == torch.int32
-    assert_rel_rms(color.detach()[:, clear], want["color"][:, clear], PICTURE, "colour")
+    assert_rel_rms(color.detach()[:, clear], want["color"][:, clear], IMAGE, "colour")
     v = torch.randn_like(color) * clear
     outputs, cotangents = [(color, want["color"])], [v]
     if inverse:
-        assert_rel_rms(inverse[0].detach()[:, clear], want["inverse"][:, clear], PICTURE, "inverse")
+        assert_rel_rms(inverse[0].detach()[:, clear], want["inverse"][:, clear], IMAGE, "inverse")
         outputs.append((inverse[0], want["inverse"]))
         cotangents.append(torch.randn(1, HEIGHT, WIDTH) * clear)
     torch.autograd.backward([x for x, _ in outputs], cotangents)

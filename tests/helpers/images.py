@@ -1,4 +1,4 @@
-"""Pictures for tests: random ones, their files in memory, and files that are not pictures."""
+"""Images for tests: random ones, their files in memory, and files that are not images."""
 
 import io
 import struct
@@ -11,22 +11,22 @@ from gamba_warp.images import save_image
 
 
 def colours(mode="RGB", size=(7, 5)):
-    """Make a PIL picture of random colours, the same on each call; ``size`` is (width, height)."""
+    """Make a PIL image of random colours, the same on each call; ``size`` is (width, height)."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
     image = Image.fromarray(pixels, "RGBA")
     return image.convert(mode) if "A" in mode else image.convert("RGB").convert(mode)
 
 
-def bytes_of(picture, form="PNG", **options):
-    """Return the bytes of a picture in a format of PIL."""
+def bytes_of(image, form="PNG", **options):
+    """Return the bytes of an image in a format of PIL."""
     content = io.BytesIO()
-    picture.save(content, form, **options)
+    image.save(content, form, **options)
     return content.getvalue()
 
 
 def encoded(form):
-    """Return the bytes of a 40 x 30 picture in a format of PIL."""
+    """Return the bytes of a 40 x 30 image in a format of PIL."""
     return bytes_of(colours(size=(40, 30)), form)
 
 
@@ -86,14 +86,14 @@ def colour_profile(columns=None, gamma=2.2):
 
 
 def bad_files(folder):
-    """Write files that cannot be read as a picture; yield name, path and the expected reason."""
+    """Write files that cannot be read as an image; yield name, path and the expected reason."""
     first, second = colours("P"), colours("P", (7, 5)).transpose(Image.Transpose.ROTATE_180)
     yield "missing", folder / "none.png", "no such file"
     yield "folder", folder, "is a folder"
     for name, content, reason in [
         ("empty.png", b"", "the file is empty"),
-        ("text.jpg", b"hello", "not a picture"),
-        ("noise.png", bytes(range(256)), "not a picture"),
+        ("text.jpg", b"hello", "not an image"),
+        ("noise.png", bytes(range(256)), "not an image"),
         ("cut.png", encoded("PNG")[:1500], "cannot be decoded"),
         ("cut.jpg", encoded("JPEG")[:800], "cannot be decoded"),
         ("head.png", encoded("PNG")[:20], ""),
@@ -110,7 +110,7 @@ def bad_files(folder):
 
 
 def cut_out(path, colour=(0.8, 0.3, 0.1)):
-    """Write a picture of one square, cut out; return its path."""
+    """Write an image of one square, cut out; return its path."""
     rgba = np.zeros((20, 30, 4))
     rgba[4:16, 8:24] = (*colour, 1)
     save_image(path, rgba)
@@ -127,5 +127,5 @@ def disc_on_noise(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.
     far = np.hypot(y - height / 2 + 0.5, x - width / 2 + 0.5)
     alpha = np.clip(0.3 * min(size) + 0.5 - far, 0, 1)[..., None]
     red = np.array([0.9, 0.15, 0.1]) + rng.normal(0, 0.03, (height, width, 3))
-    picture = alpha * red + (1 - alpha) * rgb
-    return picture.clip(0, 1).astype(np.float32), alpha[..., 0].astype(np.float32)
+    image = alpha * red + (1 - alpha) * rgb
+    return image.clip(0, 1).astype(np.float32), alpha[..., 0].astype(np.float32)

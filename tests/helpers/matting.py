@@ -23,7 +23,7 @@ def _field(number: int, value: int | str | bytes) -> bytes:
     return _number(number << 3 | _BYTES) + _number(len(data)) + data
 
 
-def _picture(name: str, shape: tuple[int, ...]) -> bytes:
+def _image(name: str, shape: tuple[int, ...]) -> bytes:
     """An input or an output: name, element type and shape."""
     sides = b"".join(_field(1, _field(1, side)) for side in shape)
     return _field(1, name) + _field(2, _field(1, _field(1, _FLOAT) + _field(2, sides)))
@@ -57,10 +57,10 @@ def matting_network(
         The bytes of an ONNX file.
     """
     kernel = np.asarray(weights, np.float32).reshape(1, 3, 1, 1)
-    graph = _field(1, _node("Conv", ("picture", "kernel", "bias"), "sum"))
+    graph = _field(1, _node("Conv", ("image", "kernel", "bias"), "sum"))
     graph += _field(1, _node(last, ("sum",), "alpha"))
     graph += _field(2, "matte")
     graph += _field(5, _tensor("kernel", kernel)) + _field(5, _tensor("bias", np.array([bias])))
-    graph += _field(11, _picture("picture", (1, 3, size, size)))
-    graph += _field(12, _picture("alpha", (1, 1, size, size)))
+    graph += _field(11, _image("image", (1, 3, size, size)))
+    graph += _field(12, _image("alpha", (1, 1, size, size)))
     return _field(1, _IR) + _field(7, graph) + _field(8, _field(2, _OPSET))

@@ -58,8 +58,8 @@ def views_around(count: int, width: int = 32, height: int = 32) -> Cameras:
 
 def photograph(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
     """Render straight RGBA, as in files."""
-    picture = render(gaussians, cameras)
-    return torch.cat([picture.rgb / picture.alpha.clamp_min(1e-3), picture.alpha], -1).clamp(0, 1)
+    image = render(gaussians, cameras)
+    return torch.cat([image.rgb / image.alpha.clamp_min(1e-3), image.alpha], -1).clamp(0, 1)
 
 
 def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None:

@@ -38,18 +38,18 @@ def micro(**changes) -> GambaConfig:
 
 
 def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
-    """Draw pictures ``[batch, size, size, 3]`` and make a camera for each."""
+    """Draw images ``[batch, size, size, 3]`` and make a camera for each."""
     viewmats = orbit(torch.linspace(-30, 200, batch), 11.0)
     cameras = Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
     return torch.rand(batch, size, size, 3), cameras
 
 
 def cut_outs(boxes=BOXES) -> tuple[torch.Tensor, Cameras]:
-    """Draw noise in some boxes of transparent pictures, and make a camera for each."""
+    """Draw noise in some boxes of transparent images, and make a camera for each."""
     images, cameras = inputs(len(boxes))
     rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
-    for picture, (rows, columns) in zip(rgba, boxes):
-        picture[rows, columns, 3] = 0.25 + 0.75 * torch.rand_like(picture[rows, columns, 3])
+    for image, (rows, columns) in zip(rgba, boxes):
+        image[rows, columns, 3] = 0.25 + 0.75 * torch.rand_like(image[rows, columns, 3])
     return rgba, cameras
 
 
@@ -69,7 +69,7 @@ def moved_blocks(config: GambaConfig, camera: int, image: int) -> torch.nn.Modul
 def assert_plain_form(plain, blocks, length: int, camera: int, image, tolerance: float) -> None:
     """Assert that blocks give what a plain form does, and every gradient by its name.
 
-    ``camera`` is the channels of the camera's token, ``image`` the shape of the picture's.
+    ``camera`` is the channels of the camera's token, ``image`` the shape of the image's.
     """
     width = blocks[0].norm.weight.numel()
     tokens = torch.randn(2, length, width)
@@ -96,7 +96,7 @@ def assert_plain_form(plain, blocks, length: int, camera: int, image, tolerance:
 
 
 def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, cells) -> Gaussians:
-    """Assert that a batch gives each picture's own Gaussians, with known cells; return them."""
+    """Assert that a batch gives each image's own Gaussians, with known cells; return them."""
     together = model(rgba, cameras)
     for index, count in enumerate(cells):
         alone = model(rgba[index : index + 1], cameras[[index]])

@@ -16,7 +16,7 @@ from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from helpers import assert_rel_rms
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
-PICTURE = 1e-5  # float32 sums of some hundred terms in [0, 1]
+IMAGE = 1e-5  # float32 sums of some hundred terms in [0, 1]
 GRADIENT = 1e-4  # as above, with factors up to 1 / (1 - alpha_max)
 
 
@@ -86,19 +86,19 @@ def rendered(scene, mode="RGB", antialiased=False, **options):
         depth = depth / alpha.clamp_min(1e-10)
     parts = {"RGB": [color], "D": [depth], "ED": [depth]}.get(mode, [color, depth])
     expected = torch.cat(parts, -1)
-    assert alpha.mean() > 0.1 and expected.std() > 0.01, "the picture is empty"
+    assert alpha.mean() > 0.1 and expected.std() > 0.01, "the image is empty"
     return (got, renders, alphas), (want, expected, alpha), meta
 
 
 def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
-    """Pictures and gradients under a random cotangent, against the oracle in float64; the meta."""
+    """Images and gradients under a random cotangent, against the oracle in float64; the meta."""
     flip = near_a_cut(scene, {**options, "antialiased": antialiased})
     assert flip.float().mean() < 0.05
     (got, renders, alphas), theirs, meta = rendered(scene, mode, antialiased, **options)
     want, expected, alpha = theirs
     keep = ~flip[..., None]
-    assert ((renders - expected) * keep).abs().max() <= PICTURE * max(1.0, expected.max().item())
-    assert ((alphas - alpha) * keep).abs().max() <= PICTURE
+    assert ((renders - expected) * keep).abs().max() <= IMAGE * max(1.0, expected.max().item())
+    assert ((alphas - alpha) * keep).abs().max() <= IMAGE
     v_renders = torch.randn_like(renders) * keep
     v_alphas = torch.randn_like(alphas) * keep
     ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()

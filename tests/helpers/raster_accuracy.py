@@ -11,7 +11,7 @@ import torch
 from gamba_warp.kernels.rasterize import reference
 from gamba_warp.kernels.rasterize.constants import T_MIN
 from helpers import assert_rel_rms
-from helpers.raster import GRADIENT, NAMES, PICTURE, rendered
+from helpers.raster import GRADIENT, IMAGE, NAMES, rendered
 
 ROW = 1e-3  # of one Gaussian's gradient: a sum over few pixels, some of which cancel
 ROWS = 0.999  # the share of Gaussians that must keep to it
@@ -72,7 +72,7 @@ class Cuts:
         return blended, alpha
 
     def distances(self, like):
-        """Distance of each pixel from its nearest cut, shaped as a picture without channels."""
+        """Distance of each pixel from its nearest cut, shaped as an image without channels."""
         return torch.stack(self.views).view(like.shape[:-1])
 
 
@@ -81,7 +81,7 @@ def cuts(monkeypatch, one_thread):
     """Make the oracle blend by blocks and record the cuts."""
     recorder = Cuts()
     monkeypatch.setattr(reference, "_blend", recorder)
-    monkeypatch.setattr(reference, "_CHUNK", 10**9)  # the recorder cuts the picture itself
+    monkeypatch.setattr(reference, "_CHUNK", 10**9)  # the recorder cuts the image itself
     return recorder
 
 
@@ -94,7 +94,7 @@ def both(scene, cuts, mode="RGB", antialiased=False, **options):
     error = torch.maximum(
         ((renders - expected).abs() / scale).amax(-1), (alphas - alpha).abs()[..., 0]
     )
-    flipped = error > PICTURE
+    flipped = error > IMAGE
     distance = cuts.distances(alpha)
     assert (distance[flipped] <= BAND).all(), (
         f"{(flipped & (distance > BAND)).sum()} pixels differ without a cut in reach, by up to "

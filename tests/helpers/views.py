@@ -51,11 +51,11 @@ def transforms(names, cameras: Cameras) -> str:
 
 
 def write_views(folder: Path, rgba: Tensor, cameras: Cameras) -> None:
-    """Write an object: pictures ``0.png`` and so on, and their cameras."""
+    """Write an object: images ``0.png`` and so on, and their cameras."""
     folder.mkdir(parents=True)
     names = [f"{v}.png" for v in range(len(rgba))]
-    for name, picture in zip(names, rgba):
-        save_image(folder / name, picture.numpy())
+    for name, image in zip(names, rgba):
+        save_image(folder / name, image.numpy())
     (folder / "transforms.json").write_text(transforms(names, cameras))
 
 

@@ -68,23 +68,23 @@ def _as_json(what, value, **options):
         raise AssertionError(f"{what} that is no JSON ({problem})") from problem
 
 
-def picture(result, path, out):
+def image(result, path, out):
     """``[H, W, 4]`` float32 in [0, 1]."""
     right = result.ndim == 3 and result.shape[2] == 4 and result.dtype == np.float32
-    assert right, f"a picture of shape {result.shape} and {result.dtype}"
-    assert 0 < result.shape[0] * result.shape[1] <= _PIXELS, f"a picture of {result.shape}"
+    assert right, f"an image of shape {result.shape} and {result.dtype}"
+    assert 0 < result.shape[0] * result.shape[1] <= _PIXELS, f"an image of {result.shape}"
     _in_unit("pixels", result)
 
 
 def cut_out(result, path, out):
-    """A square picture of at most 1280 pixels a side."""
+    """A square image of at most 1280 pixels a side."""
     square = result.shape[0] == result.shape[1] <= 1280
     assert square, f"a cut-out of {result.shape}"
-    picture(result, path, out)
+    image(result, path, out)
 
 
 def alpha(result, path, out):
-    """``[24, 24]`` in [0, 1], for the picture that the reader gives."""
+    """``[24, 24]`` in [0, 1], for the image that the reader gives."""
     assert result.shape == (24, 24), f"an alpha of {result.shape}"
     _in_unit("an alpha", result)
 
@@ -276,7 +276,7 @@ def pages(result, path, out):
 
 
 def cameras(result, path, out):
-    """Finite cameras with rotations, focal lengths above 0 and pictures of bounded size."""
+    """Finite cameras with rotations, focal lengths above 0 and images of bounded size."""
     cameras, rate = result.cameras, result.fps
     _finite(poses=cameras.viewmats, Ks=cameras.Ks)
     rotations = cameras.viewmats[:, :3, :3]
@@ -285,8 +285,8 @@ def cameras(result, path, out):
     focal = float(cameras.Ks[:, [0, 1], [0, 1]].min())
     assert focal > 0, "a focal length that is not above 0"
     for side in (cameras.width, cameras.height):
-        assert 1 <= side <= 16_384, f"pictures of {cameras.width}x{cameras.height}"
-    assert rate is None or 0 < rate <= 1000, f"{rate} pictures a second"
+        assert 1 <= side <= 16_384, f"images of {cameras.width}x{cameras.height}"
+    assert rate is None or 0 < rate <= 1000, f"{rate} images a second"
 
 
 def plan(result, path, out):

@@ -176,8 +176,8 @@ def _faulty(path: Path, out: Path) -> Any:
 
 
 READERS = {
-    "picture": Reader(alone(load_rgba), checks.picture, seeds.pictures),
-    "cut-out": Reader(_prepare, checks.cut_out, seeds.masked_pictures, 4),
+    "image": Reader(alone(load_rgba), checks.image, seeds.images),
+    "cut-out": Reader(_prepare, checks.cut_out, seeds.masked_images, 4),
     "gaussians": Reader(_thinned, checks.thinned, seeds.thinned_splats),
     "view": Reader(_view, checks.page, seeds.splats, 2),
     "cameras": Reader(_cameras, checks.cameras, seeds.cameras),
@@ -195,4 +195,4 @@ READERS = {
     "faulty": Reader(_faulty, checks.faulty, lambda: {"text": {"a.txt": b"valid text"}}, 0),
 }
 # Valid files that a reader rejects on purpose: EPS under another name, and stand-ins of weights.
-REFUSED = {("picture", "eps-as-png")}
+REFUSED = {("image", "eps-as-png")}

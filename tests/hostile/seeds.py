@@ -62,12 +62,12 @@ def rgba(size: int = 24) -> np.ndarray:
 
 
 def png(size: int = _SIZE) -> bytes:
-    """A small RGBA picture."""
+    """A small RGBA image."""
     return bytes_of(Image.fromarray(rgba(size)))
 
 
-def pictures() -> Kinds:
-    """Single pictures."""
+def images() -> Kinds:
+    """Single images."""
     cut, grey = Image.fromarray(rgba()), Image.fromarray(rgba()[..., 0])
     on_white = Image.new("RGBA", cut.size, "white")
     on_white.alpha_composite(cut)
@@ -100,8 +100,8 @@ def pictures() -> Kinds:
     }
 
 
-def masked_pictures() -> Kinds:
-    """Pictures with ``mask.png`` beside them; and one that needs no mask."""
+def masked_images() -> Kinds:
+    """Images with ``mask.png`` beside them; and one that needs no mask."""
     cut = rgba()
     plain = Image.fromarray(np.where(cut[..., 3:] > 0, cut[..., :3], 255).astype(np.uint8))
     mask = bytes_of(Image.fromarray(cut[..., 3]))
@@ -208,8 +208,8 @@ def meshes() -> Kinds:
     """Meshes with their side files; the first file is the mesh."""
     ball = trimesh.creation.icosphere(0)
     points, faces = ball.vertices.round(4), ball.faces.tolist()
-    picture = Image.fromarray(rgba(_SIZE))
-    material = trimesh.visual.material.SimpleMaterial(picture)
+    image = Image.fromarray(rgba(_SIZE))
+    material = trimesh.visual.material.SimpleMaterial(image)
     visual = trimesh.visual.TextureVisuals(points[:, :2] / 2 + 0.5, material)
     painted = trimesh.Trimesh(points, faces, visual=visual, process=False)
     text, sides = trimesh.exchange.obj.export_obj(painted, return_texture=True, mtl_name="a.mtl")

@@ -164,7 +164,7 @@ def test_what_was_found_once_stays_mended(base, path):
 @pytest.mark.parametrize("name", ["../x", "/etc/x", "a/../../x", ""])
 def test_a_case_stays_in_its_folder(tmp_path, name):
     with pytest.raises(UserError):
-        place_case(Case("picture", "png", "", {name: Entry(b"x")}), tmp_path)
+        place_case(Case("image", "png", "", {name: Entry(b"x")}), tmp_path)
 
 
 @pytest.mark.parametrize("text", ["a\nb", "a\x1b[31mb", "\ud800", "x" * 10**6, "\r\n", "a\u2028b"])

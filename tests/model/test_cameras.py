@@ -87,7 +87,7 @@ def test_orbit_looks_at_the_origin_from_where_it_says():
     want = 2.5 * torch.stack([a.sin() * e.cos(), -e.sin(), -a.cos() * e.cos()], -1)
     assert_close(centres, want, atol=1e-6, rtol=0)
     assert rotation[:, 0, 1].abs().max() < 1e-6  # right stays horizontal
-    assert (rotation[:, 1, 1] > 0).all()  # the picture's down is the world's
+    assert (rotation[:, 1, 1] > 0).all()  # the image's down is the world's
 
 
 def test_relative_to_reference():

@@ -1,4 +1,4 @@
-"""Splitting of the front to the picture's resolution: cells, children, and errors."""
+"""Splitting of the front to the image's resolution: cells, children, and errors."""
 
 import math
 from dataclasses import replace
@@ -37,7 +37,7 @@ def rays(**changes) -> GambaConfig:
 
 
 def fresh(**changes) -> Gamba:
-    """Untrained model, whose front is an opaque plane with the colours of the picture."""
+    """Untrained model, whose front is an opaque plane with the colours of the image."""
     torch.manual_seed(4)
     return Gamba(rays(**changes)).eval()
 
@@ -81,7 +81,7 @@ def test_detail_1_is_what_the_network_gave_bit_for_bit():
     assert reconstruct(model, rgba, detail=2).num > want.num
 
 
-def test_the_default_is_what_the_picture_has_the_pixels_for():
+def test_the_default_is_what_the_image_has_the_pixels_for():
     sides = {23: 1, 47: 1, 48: 2, 95: 2, 96: 4, 5000: 4}
     assert {side: checked_detail(None, rays(), side) for side in sides} == sides
     halves = rays(ray_cells=4)  # cells of 2 x 2 pixels
@@ -92,7 +92,7 @@ def test_the_default_is_what_the_picture_has_the_pixels_for():
 
 
 @pytest.mark.parametrize("size, changes", [(24, {}), (96, {}), (24, {"predict_rotation": True})])
-def test_a_plain_picture_has_no_gaps_when_it_is_drawn_large(size, changes):
+def test_a_plain_image_has_no_gaps_when_it_is_drawn_large(size, changes):
     """Four pixels a cell; the network's own Gaussians let the background through between them.
 
     Along the view, where no gap can be, they stay as they are.
@@ -148,14 +148,14 @@ def test_what_lies_behind_a_faint_front_does_not_show_through():
     model, rgba = fresh(ray_layers=2, ray_back="opaque"), board(96, 8)
     with torch.inference_mode():
         model.decoder.opacity_bias[0] = -1.0
-        image = model_input(rgba, model.config)
-        made = model(image, reference_cameras(model.config, 1))[0]
+        given = model_input(rgba, model.config)
+        made = model(given, reference_cameras(model.config, 1))[0]
         made.colors[1::2] = 0.0  # a black back
         camera = reference_cameras(model.config, 1)
-        sharp = split_front(made, image[0], rgba, model.config, 4, camera)
-        picture = render(sharp, camera.resized(96, 96)).rgb[0]
+        sharp = split_front(made, given[0], rgba, model.config, 4, camera)
+        image = render(sharp, camera.resized(96, 96)).rgb[0]
     inside = minimum_filter(rgba[..., 3], 9) > 0  # without the outline, which is soft
-    error = (picture.numpy() - rgba[..., :3])[inside]
+    error = (image.numpy() - rgba[..., :3])[inside]
     assert -10 * np.log10((error**2).mean()) > 17  # dB; 14.2 if it did
 
 
@@ -213,14 +213,14 @@ def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
     torch.testing.assert_close(
         children.scales.mean(0) / parents, torch.tensor([0.5, 0.5, 1.0]), rtol=0.02, atol=0
     )
-    # Children of small parents are still wide enough to cover the picture.
+    # Children of small parents are still wide enough to cover the image.
     model.decoder.scale_bias.data[0] = math.log(0.1)
     small = reconstruct(model, rgba, detail=2).scales[-200:]
     side = 0.5 * parents[:2].max() / 0.9
     torch.testing.assert_close(small[:, :2], (MIN_SIZE[2] * side).expand(200, 2), rtol=0.02, atol=0)
 
 
-def test_two_rounds_correct_colours_in_one_picture_and_opacities_in_two_smaller_ones(monkeypatch):
+def test_two_rounds_correct_colours_in_one_image_and_opacities_in_two_smaller_ones(monkeypatch):
     model, sizes = fresh(), []
 
     def counted(gaussians, camera):
@@ -319,8 +319,8 @@ def test_three_pixels_and_none():
     assert red[0] > 0.6 and red[1:].max() < 0.3
 
 
-def test_a_picture_of_8000_pixels_a_side(tmp_path, capsys):
-    """The picture is reduced when it is read, so only a small one takes memory."""
+def test_a_image_of_8000_pixels_a_side(tmp_path, capsys):
+    """The image is reduced when it is read, so only a small one takes memory."""
     save_model(tmp_path / "model.safetensors", fresh())
     large = Image.new("L", (8000, 8000), 255)
     large.paste(Image.linear_gradient("L").resize((5000, 5000)), (1500, 1500))
@@ -330,7 +330,7 @@ def test_a_picture_of_8000_pixels_a_side(tmp_path, capsys):
     assert load_ply(tmp_path / "out" / "large.ply").num > 24 * 24
 
 
-def test_the_option_reaches_the_network_and_its_default_is_the_pictures(tmp_path, capsys):
+def test_the_option_reaches_the_network_and_its_default_is_the_images(tmp_path, capsys):
     model = tmp_path / "model.safetensors"
     save_model(model, fresh())
     save_image(tmp_path / "a.png", board(120, 4))

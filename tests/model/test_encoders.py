@@ -81,12 +81,12 @@ def test_class_token_comes_first(tmp_path):
     assert full.shape == (1, 10, 24) and torch.equal(full[:, 1:], plain)
 
 
-def test_another_picture_size_resizes_pictures_and_positions(tmp_path):
+def test_another_image_size_resizes_images_and_positions(tmp_path):
     vit = _random_vit(size=70)
     save_file(vit.state_dict(), tmp_path / "vit.safetensors")
     encoder = build_encoder(_config(), tmp_path / "vit.safetensors")
     assert encoder(torch.rand(2, 60, 60, 3)).shape == (2, 9, 24)
-    grey = torch.full((1, 60, 60, 3), 0.25)  # resizing must not change a plain picture
+    grey = torch.full((1, 60, 60, 3), 0.25)  # resizing must not change a plain image
     assert torch.allclose(encoder(grey), encoder(grey[:, :42, :42]), atol=1e-5)
 
 

@@ -107,7 +107,7 @@ def test_rigid_motion_of_a_batch_with_gradients():
 
 
 @pytest.mark.parametrize("count", [3, 8, 15])
-def test_an_object_that_turns_with_the_camera_keeps_its_picture(count):
+def test_an_object_that_turns_with_the_camera_keeps_its_image(count):
     """The harmonics rotate with the object; otherwise the colours would be of another side."""
     torch.manual_seed(3)
     gaussians = some(7)

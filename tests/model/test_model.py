@@ -11,7 +11,7 @@ from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
 
 
-def test_pictures_of_a_batch_do_not_mix():
+def test_images_of_a_batch_do_not_mix():
     model = Gamba(micro(), "random")
     images, cameras = inputs(3)
     together = model(images, cameras)
@@ -20,7 +20,7 @@ def test_pictures_of_a_batch_do_not_mix():
     assert torch.allclose(together.means[1], alone.means[0], atol=1e-5)
 
 
-def test_picture_and_camera_reach_the_output_by_the_prefix_alone():
+def test_image_and_camera_reach_the_output_by_the_prefix_alone():
     model = Gamba(micro(additive_image_tokens=False), "random")
     images, cameras = inputs(1)
     base = model(images, cameras).means
@@ -29,7 +29,7 @@ def test_picture_and_camera_reach_the_output_by_the_prefix_alone():
     assert (model(images, other).means - base).abs().max() > 1e-6
 
 
-def test_without_prefix_and_image_tokens_the_picture_is_ignored():
+def test_without_prefix_and_image_tokens_the_image_is_ignored():
     model = Gamba(micro(additive_image_tokens=False, prepend=False))
     images, cameras = inputs(1)
     assert torch.equal(model(images, cameras).means, model(1 - images, cameras).means)
@@ -131,8 +131,8 @@ def test_wrong_shapes_are_named(name, value):
 def test_positions_start_spread_inside_the_object():
     config = micro(image_size=32, width=96, depth=4, encoder="none")
     images, cameras = inputs(2, 32)
-    for picture in (images, torch.ones_like(images)):
-        means = Gamba(config)(picture, cameras).means
+    for image in (images, torch.ones_like(images)):
+        means = Gamba(config)(image, cameras).means
         spread = means.std(dim=1)
         assert (spread > 0.04).all() and (spread < 0.2).all(), spread
         assert means.abs().max() < 0.49

@@ -57,7 +57,7 @@ def test_the_input_lies_on_the_model_s_background(dataset):
 
 
 def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypatch):
-    """Bit-identical, for any other views and any size of the target pictures."""
+    """Bit-identical, for any other views and any size of the target images."""
     uid = dataset.uids[0]
     want = posed_input(dataset.load(uid, views=[4], size=16), CONFIG)
     for size in (16, 24):

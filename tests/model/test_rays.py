@@ -36,8 +36,8 @@ def trained(config: GambaConfig) -> Gamba:
 
 
 @pytest.mark.parametrize("segment", [4096, 7])
-def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
-    """Also if the batch's row of tokens is cut inside pictures."""
+def test_a_batch_of_different_sizes_is_each_image_alone(monkeypatch, segment):
+    """Also if the batch's row of tokens is cut inside images."""
     monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", segment)
     model, (rgba, cameras) = trained(rays()), cut_outs([*BOXES, NOTHING])
     cells = 9, 1, 24, 0
@@ -49,8 +49,8 @@ def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
 
 
 @pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])
-def test_gradients_of_a_batch_are_those_of_its_pictures(encoder):
-    """Of four pictures in one row of tokens, one of them empty."""
+def test_gradients_of_a_batch_are_those_of_its_images(encoder):
+    """Of four images in one row of tokens, one of them empty."""
     model = trained(rays(encoder=encoder))
     rgba, cameras = cut_outs([*BOXES, NOTHING])
     weights = {name: p for name, p in model.named_parameters() if p.requires_grad}
@@ -71,20 +71,20 @@ def test_gradients_of_a_batch_are_those_of_its_pictures(encoder):
 
 @pytest.mark.parametrize("cells", [1, 2, 4])
 def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
-    """The object's patches, an empty picture, and one that touches three sides."""
+    """The object's patches, an empty image, and one that touches three sides."""
     torch.manual_seed(6)
     model = Gamba(rays(ray_cells=cells, image_size=40))
     decoder = model.decoder
     boxes = [(slice(21, 22), slice(17, 18)), NOTHING, (slice(9, 40), slice(0, 40))]
     rgba = torch.rand(3, 40, 40, 4)
-    for picture, (rows, columns) in zip(rgba, boxes):
-        picture[..., 3] = 0
-        picture[rows, columns, 3] = 1
+    for image, (rows, columns) in zip(rgba, boxes):
+        image[..., 3] = 0
+        image[rows, columns, 3] = 1
     pixels = torch.rand(3, model.config.pixel_channels, 40, 40)
     seen = find_foreground(rgba[..., 3], model.config)
-    picture, row, column = seen.cell
+    image, row, column = seen.cell
     got = decoder._stem(pixels, seen)
-    want = decoder.stem(pixels).permute(0, 2, 3, 1)[picture, row, column]
+    want = decoder.stem(pixels).permute(0, 2, 3, 1)[image, row, column]
     assert seen.counts[1] == 0 and sum(seen.counts) == len(got)
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
     grads = [
@@ -103,18 +103,18 @@ def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive, order
     whole = tokens(rgba, cameras)
     seen = find_foreground(rgba[..., 3], model.config)
     got = tokens.of_patches(tokens.pixels(rgba, cameras), seen)
-    picture, row, column = seen.patch
+    image, row, column = seen.patch
     inside = torch.zeros(len(rgba), 9, dtype=torch.bool)
-    inside[picture, 3 * row + column] = True
+    inside[image, 3 * row + column] = True
     assert (seen.cu_seqlens.diff() == orders * inside.sum(1)).all()
     torch.testing.assert_close(got, whole[inside[:, tokens.orders]])
-    for place, index, patch in zip(seen.positions, picture, 3 * row + column):
+    for place, index, patch in zip(seen.positions, image, 3 * row + column):
         for order in range(orders):
             number = 9 * order + tokens.orders.view(orders, 9)[order].tolist().index(patch)
             torch.testing.assert_close(got[place[order]], whole[index, number])
 
 
-def test_a_picture_without_background_keeps_every_token():
+def test_a_image_without_background_keeps_every_token():
     seen = find_foreground(torch.ones(2, 12, 12), rays())
     assert seen.tokens.tolist() == [*range(36)] * 2 and seen.cu_seqlens.tolist() == [0, 36, 72]
 
@@ -131,7 +131,7 @@ def test_gaussians_follow_the_formulas(rotation):
         decoder.head.weight.zero_()
         decoder.head.bias.copy_(torch.tensor(numbers).repeat(3))
     made = model(rgba, cameras)
-    place = (3 * 1 + 1) * 3 + 2  # picture 0: the middle one of 3 x 3 cells, the last layer
+    place = (3 * 1 + 1) * 3 + 2  # image 0: the middle one of 3 x 3 cells, the last layer
     square = rgba[0, 6:8, 2:4].double().numpy()
     alpha = square[..., 3].mean()
     color = (square[..., :3] * square[..., 3:]).mean((0, 1)) / alpha
@@ -173,7 +173,7 @@ def test_wild_sizes_and_almost_empty_cells_have_limits():
 
 
 def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
-    """Coloured disc with a soft rim, as a flat picture seen by five cameras around it."""
+    """Coloured disc with a soft rim, as a flat image seen by five cameras around it."""
     x = torch.linspace(-1, 1, size)
     radius = (x[:, None] ** 2 + x**2).sqrt()
     alpha = ((0.7 - radius) * size / 2 + 0.5).clamp(0, 1)
@@ -183,8 +183,8 @@ def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
     return rgba, Cameras(viewmats, intrinsics(size, size).expand(5, 3, 3), size, size)
 
 
-def test_at_the_start_the_picture_is_the_billboard():
-    """The flat picture is the truth: only the blur of one Gaussian at the edges differs."""
+def test_at_the_start_the_image_is_the_billboard():
+    """The flat image is the truth: only the blur of one Gaussian at the edges differs."""
     rgba, cameras = disc()
     truth = Truth("disc", rgba.expand(5, -1, -1, -1), cameras, [*range(5)])
     flat, alpha = billboard(truth)
@@ -218,7 +218,7 @@ def test_an_opaque_back_is_as_opaque_as_its_cell_whatever_the_head_says():
     refused("ray_back opaque needs two ray_layers", rays, ray_back="opaque", ray_layers=1)
 
 
-def test_an_empty_picture_has_no_gaussians_and_may_stand_in_a_batch():
+def test_an_empty_image_has_no_gaussians_and_may_stand_in_a_batch():
     model, (rgba, cameras) = Gamba(rays()), cut_outs()
     empty = torch.zeros_like(rgba[:1])
     made = model(empty, cameras[[0]])

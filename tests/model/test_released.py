@@ -161,7 +161,7 @@ def test_the_command_makes_a_folder_that_loads(golden, tmp_path, wide, capsys):
     with torch.no_grad():
         got, again = model(images, cameras), want(images, cameras)
         tokens = model.encoder(images)
-        # Theirs: class token and patches of the picture between its pixels, not normalised.
+        # Theirs: class token and patches of the image between its pixels, not normalised.
         seen = F.interpolate(images.permute(0, 3, 1, 2), (336, 336), mode="bilinear")
         plain = model.encoder.network.vit.forward_features(seen)
     assert tokens.shape == (1, 577, 768)

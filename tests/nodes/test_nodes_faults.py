@@ -35,8 +35,8 @@ def ends(data, tmp_path_factory):
     later.mkdir(parents=True)
     spoilt = root / "clouds"
     shutil.copytree(data, spoilt)
-    picture = spoilt / "cloudb" / "003.png"  # the second process's alone; sizes are compared
-    picture.write_bytes(b"no picture".ljust(picture.stat().st_size))
+    image = spoilt / "cloudb" / "003.png"  # the second process's alone; sizes are compared
+    image.write_bytes(b"no image".ljust(image.stat().st_size))
     plan = []
 
     def step(name, out, steps, *, data=(data, data), outs=None, limits=(None, None), more=()):
@@ -109,7 +109,7 @@ def test_a_newer_checkpoint_elsewhere_is_not_thrown_away(ends):
     assert f"sees {root}/later/checkpoints/step_000009, process 0 on" in main[1]
 
 
-def test_pictures_that_only_another_process_cannot_read_are_named(ends):
+def test_images_that_only_another_process_cannot_read_are_named(ends):
     root, found = ends
     assert found["spoilt"] == [[1, ""], [1, ""]]
     (end,) = lines(root / "spoilt", "end")

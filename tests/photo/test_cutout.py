@@ -103,7 +103,7 @@ def test_masks_of_any_two_values(tmp_path, busy, name):
         return refused("has 3 labels; a mask is bright on the object alone", cut_out, path, options)
     found = cut_out(path, options)
     if name == "inverted":
-        assert "the picture's border (is the mask inverted?)" in found.warning
+        assert "the image's border (is the mask inverted?)" in found.warning
     else:
         assert iou(found.mask, alpha > 0.5) == 1 and not found.warning
 
@@ -152,7 +152,7 @@ def box(top, bottom, left, right, value=1.0):
     "alpha, color, reason",
     [
         (box(20, 80, 20, 100), 0.2, None),
-        (box(0, 80, 20, 100), 0.2, "touches the picture's border"),
+        (box(0, 80, 20, 100), 0.2, "touches the image's border"),
         (box(20, 80, 20, 50) + box(20, 80, 70, 100), 0.2, "2 separate parts"),
         (box(20, 80, 20, 100), 0.77, "along 100% of its outline it looks like"),
         (box(20, 80, 20, 100) - box(30, 70, 30, 60, 0.4), 0.2, "half transparent"),
@@ -176,9 +176,7 @@ def test_a_doubt_names_the_way_to_a_network_unless_it_is_refused(tmp_path, monke
     assert advice in cut_out(tmp_path / "post.png", options).warning
     assert options.matte() is None
     found = cut_out(tmp_path / "post.png", options)
-    assert (
-        found.warning.endswith("it touches the picture's border.") and found.warning in found.note
-    )
+    assert found.warning.endswith("it touches the image's border.") and found.warning in found.note
 
 
 def test_a_matte_without_an_object_gives_way(tmp_path, busy):
@@ -186,7 +184,7 @@ def test_a_matte_without_an_object_gives_way(tmp_path, busy):
     path, alpha = busy
     for name, network, reason in (
         ("none", dict(bias=-60.0), "nothing stands out"),
-        ("all", dict(bias=60.0), "all of the picture would be the object"),
+        ("all", dict(bias=60.0), "all of the image would be the object"),
         ("vague", dict(weights=(0.1, 0, 0), bias=0.05), "it has no clear border"),
     ):
         file = tmp_path / f"{name}.onnx"
@@ -291,7 +289,7 @@ def test_no_fringe_of_the_background_is_left():
     "box, fault",
     [
         ((0, 0, 0, 0), "nothing stands out"),
-        ((0, 100, 0, 100), "all of the picture"),
+        ((0, 100, 0, 100), "all of the image"),
         ((0, 92, 0, 100), "touch"),
         ((0, 100, 0, 40), None),
         ((40, 47, 40, 47), None),
@@ -350,7 +348,7 @@ def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypat
         address == models.PUBLISHED[0].address and digest == f"sha256:{models.PUBLISHED[0].sha256}"
     )
     assert len(before) == 1 and address in before[0] and "179 MB" in before[0]
-    assert len(said) == 2 and "github.com cannot be reached" in said[1]  # once, of two pictures
+    assert len(said) == 2 and "github.com cannot be reached" in said[1]  # once, of two images
 
 
 class _Host(SimpleHTTPRequestHandler):
@@ -500,8 +498,8 @@ def test_a_small_object_stays_the_one_that_was_found(tmp_path, monkeypatch, seco
 
 
 @pytest.mark.parametrize("way", ["plain", "alpha", "mask", "matte"])
-def test_a_small_object_of_a_large_picture_keeps_its_pixels(tmp_path, network, way):
-    """As sharp as in a part of the same picture."""
+def test_a_small_object_of_a_large_image_keeps_its_pixels(tmp_path, network, way):
+    """As sharp as in a part of the same image."""
     y, x = np.mgrid[:960, :1280]
     inside = ((x - 800) / 90) ** 2 + ((y - 500) / 60) ** 2 < 1
     stripes = np.where((x // 4 + y // 4) % 2, 250, 170).astype(np.uint8)
@@ -511,8 +509,8 @@ def test_a_small_object_of_a_large_picture_keeps_its_pixels(tmp_path, network, w
     part = slice(400, 600), slice(650, 950)
     names = []
     for name, at in (("whole", (slice(None), slice(None))), ("part", part)):
-        picture = np.dstack([rgb, alpha])[at] if way == "alpha" else rgb[at]
-        Image.fromarray(np.ascontiguousarray(picture)).save(tmp_path / f"{name}.png")
+        image = np.dstack([rgb, alpha])[at] if way == "alpha" else rgb[at]
+        Image.fromarray(np.ascontiguousarray(image)).save(tmp_path / f"{name}.png")
         Image.fromarray(np.ascontiguousarray(alpha[at])).save(tmp_path / f"{name}-mask.png")
         names.append(tmp_path / f"{name}.png")
     found = []

@@ -36,7 +36,7 @@ def test_white_and_black_go(name, background, color):
 
 
 @pytest.mark.parametrize(
-    "picture",
+    "image",
     [
         disc((0.3, 0.4, 0.5)),  # clean
         disc((0.97, 0.97, 0.97)),  # white itself
@@ -46,9 +46,9 @@ def test_white_and_black_go(name, background, color):
     ],
     ids=["clean", "white", "unseen", "coloured", "half transparent"],
 )
-def test_other_edges_stay(picture):
-    found, which = without_matte(picture)
-    assert which is None and found is picture
+def test_other_edges_stay(image):
+    found, which = without_matte(image)
+    assert which is None and found is image
 
 
 def test_solid_pixels_keep_their_colours():
@@ -130,12 +130,12 @@ def shaded(color):
 
 def outlined(color):
     """A disc in a drawing, with an outline of two pixels."""
-    picture, _ = rimmed((0.7, 0.6, 0.2), np.array(color))
-    return picture
+    image, _ = rimmed((0.7, 0.6, 0.2), np.array(color))
+    return image
 
 
 @pytest.mark.parametrize(
-    "picture",
+    "image",
     [
         shaded((0.6, 0.7, 0.3)),
         outlined((0, 0, 0)),
@@ -144,20 +144,20 @@ def outlined(color):
     ],
     ids=["shaded", "black outline", "red outline", "nearly white"],
 )
-def test_an_edge_of_the_object_itself_stays(picture):
-    found, which = without_matte(picture)
-    assert which is None and found is picture
+def test_an_edge_of_the_object_itself_stays(image):
+    found, which = without_matte(image)
+    assert which is None and found is image
 
 
 @pytest.mark.parametrize("blur", [0, 1])
 def test_a_right_mask_stays(blur):
-    """Also one of a picture that is a little blurred, as photographs are."""
+    """Also one of an image that is a little blurred, as photographs are."""
     clean = disc((0.7, 0.3, 0.1))
     photo = gaussian_filter(mixed(clean, GROUND)[..., :3], (0.6 * blur, 0.6 * blur, 0))
     assert (without_background(photo, clean[..., 3])[..., 3] == clean[..., 3]).all()
 
 
-def test_a_picture_keeps_no_fringe_of_its_background(tmp_path):
+def test_a_image_keeps_no_fringe_of_its_background(tmp_path):
     clean = disc((0.7, 0.0, 0.1))
     save_image(tmp_path / "icon.png", mixed(clean, 1.0))
     icon = cut_out(tmp_path / "icon.png", CutoutOptions(recenter=False))

@@ -9,8 +9,8 @@ from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp import cli
-from gamba_warp import images as pictures
-from gamba_warp.images import load_rgba, picture_size, to_uint8
+from gamba_warp import images as images
+from gamba_warp.images import image_size, load_rgba, to_uint8
 from gamba_warp.photo.cutout import cut_out
 
 
@@ -61,7 +61,7 @@ def test_other_colours_are_the_same_object(tmp_path, mode):
     assert np.minimum(found.mask, alpha).sum() / np.maximum(found.mask, alpha).sum() > 0.93
 
 
-def test_pictures_of_telephones(tmp_path):
+def test_images_of_telephones(tmp_path):
     heif = pytest.importorskip("pillow_heif")
     heif.register_heif_opener()
     upright = photo((64, 96))
@@ -69,12 +69,12 @@ def test_pictures_of_telephones(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     turned.save(tmp_path / "a.heic", exif=exif.tobytes(), quality=95)
-    assert picture_size(tmp_path / "a.heic") == (96, 64)
+    assert image_size(tmp_path / "a.heic") == (96, 64)
     want = np.asarray(upright, np.float32) / 255
     assert np.abs(load_rgba(tmp_path / "a.heic")[..., :3] - want).mean() < 0.03
     (tmp_path / "b.jpg").write_bytes((tmp_path / "a.heic").read_bytes())  # by content, not by name
     assert load_rgba(tmp_path / "b.jpg").shape == (64, 96, 4)
-    found, failures = pictures.find_pictures([tmp_path])
+    found, failures = images.find_images([tmp_path])
     assert [p.name for p in found] == ["a.heic", "b.jpg"] and not failures
     data = (tmp_path / "a.heic").read_bytes()
     for count in (11, 12, 40, len(data) // 2):
@@ -83,7 +83,7 @@ def test_pictures_of_telephones(tmp_path):
 
 
 def test_avif(tmp_path):
-    if not pictures.features.check("avif"):
+    if not images.features.check("avif"):
         pytest.skip("this Pillow has no AVIF")
     photo().save(tmp_path / "a.avif", quality=90)
     want = np.asarray(photo(), np.float32) / 255

@@ -39,7 +39,7 @@ def network(folder, name="net.onnx", **options):
     return path
 
 
-def test_a_networks_alpha_lies_on_the_picture(tmp_path):
+def test_a_networks_alpha_lies_on_the_image(tmp_path):
     rgb, alpha = disc_on_noise((90, 133))
     for options in (dict(size=352), dict(size=512, last="Identity")):
         found = Matte(network(tmp_path, **options))(rgb)

@@ -87,7 +87,7 @@ def test_a_public_name_can_be_replaced(monkeypatch):
     assert gamba_warp.render is render
 
 
-def test_a_picture_may_be_a_file_or_an_array(tmp_path):
+def test_a_image_may_be_a_file_or_an_array(tmp_path):
     rgba = np.zeros((30, 30, 4), np.float32)
     rgba[3:27, 3:27] = (0.8, 0.3, 0.1, 1)  # as ``prepare`` leaves it
     save_image(tmp_path / "a.png", rgba)
@@ -97,7 +97,7 @@ def test_a_picture_may_be_a_file_or_an_array(tmp_path):
         got = reconstruct(model, path)
         assert np.array_equal(got.means.numpy(), want.means.numpy())
     for shape in ((30, 30, 3), (30, 20, 4), (30, 30)):
-        with pytest.raises(ValueError, match=re.escape(f"picture has shape {shape}")):
+        with pytest.raises(ValueError, match=re.escape(f"image has shape {shape}")):
             reconstruct(model, np.zeros(shape))
 
 

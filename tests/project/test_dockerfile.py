@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
 STEPS = [line.split(maxsplit=1) for line in TEXT.split("\n") if line and line[0] != "#"]
-PICTURE = ROOT / "starter" / "icons" / "scopia-toaster.png"
+IMAGE = ROOT / "starter" / "icons" / "scopia-toaster.png"
 SMALL = ("--size", "16", "--frames", "2", "--out")
 
 
@@ -72,7 +72,7 @@ def test_the_steps_make_a_program_that_reconstructs(tmp_path):
     here = Path(pytest.__file__).parents[1]
     (site / "here.pth").write_text(f"{here}\n")
     out = tmp_path / "out"
-    command = [place / "bin" / "gamba", "reconstruct", PICTURE, *SMALL, out]
+    command = [place / "bin" / "gamba", "reconstruct", IMAGE, *SMALL, out]
     alone = {
         "cwd": tmp_path,
         "text": True,
@@ -91,7 +91,7 @@ def test_the_image_is_built_and_reconstructs(tmp_path):
     if not daemon():
         pytest.skip("no Docker runs here")
     subprocess.run(["docker", "build", "--tag", "gamba-test", ROOT], check=True, timeout=1800)
-    shutil.copy(PICTURE, tmp_path / "photo.png")
+    shutil.copy(IMAGE, tmp_path / "photo.png")
     tmp_path.chmod(0o777)
     mount = ["docker", "run", "--rm", "-v", f"{tmp_path}:/work", "gamba-test"]
     subprocess.run([*mount, "reconstruct", "photo.png", *SMALL, "out"], check=True, timeout=600)

@@ -143,10 +143,10 @@ def test_training_loads_without_what_makes_objects(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_picture_becomes_gaussians_and_a_page_with_the_core_alone(tmp_path):
-    picture = cut_out(tmp_path / "thing.png")
+def test_a_image_becomes_gaussians_and_a_page_with_the_core_alone(tmp_path):
+    image = cut_out(tmp_path / "thing.png")
     small = ("--size", 16, "--frames", 2, "--out", tmp_path / "out")
-    done = in_the_core("reconstruct", picture, *small, "--sheet", tmp_path / "sheet.png")
+    done = in_the_core("reconstruct", image, *small, "--sheet", tmp_path / "sheet.png")
     assert done.returncode == 0, done.stderr
     assert {"thing.ply", "thing.gif", "thing.html"} <= {
         p.name for p in (tmp_path / "out").iterdir()
@@ -194,10 +194,10 @@ def test_what_an_option_needs_is_said_before_any_work(arguments, library, extra,
 
 @pytest.mark.slow
 def test_what_only_an_option_needs(tmp_path):
-    picture = cut_out(tmp_path / "thing.png")
+    image = cut_out(tmp_path / "thing.png")
     save_image(tmp_path / "busy.png", disc_on_noise((60, 80))[0])
     quick = ("--turntable", "none", "--no-page", "--out", tmp_path / "out")
-    done = in_the_core("reconstruct", picture, "--matte-model", "model.onnx", *quick)
+    done = in_the_core("reconstruct", image, "--matte-model", "model.onnx", *quick)
     assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].endswith(
         f"needs onnxruntime, which is not installed: {versions.to_install('photo')}"
     ), done.stderr

@@ -177,8 +177,8 @@ def test_marked_python_runs(block, workplace):
     exec(compile(block.text, str(block), "exec"), {})
     if "view.png" in block.text:
         assert load_ply("photo.ply").num > 1000
-        picture = load_rgba("view.png")
-        assert picture.shape == (256, 256, 4) and (picture[..., :3] < 0.9).any()
+        image = load_rgba("view.png")
+        assert image.shape == (256, 256, 4) and (image[..., :3] < 0.9).any()
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])

@@ -103,10 +103,10 @@ def test_links_keep_their_anchors_and_blocks_of_code_are_left():
 def test_the_readme_is_short_and_its_links_lead_somewhere():
     assert README.count("\n") <= 100
     first = README[: README.index("\n## ")]
-    moving = re.search(r"!\[[^\]]+\]\((docs/pictures/[^)]+)\)", first)
+    moving = re.search(r"!\[[^\]]+\]\((docs/images/[^)]+)\)", first)
     assert moving is not None
-    picture = ROOT / moving[1]
-    assert picture.stat().st_size < 1.5e6
+    image = ROOT / moving[1]
+    assert image.stat().st_size < 1.5e6
     for path in targets(README, "README.md"):
         assert (ROOT / path).exists(), path
 

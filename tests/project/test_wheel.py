@@ -1,4 +1,4 @@
-"""The wheel has everything for a first picture, and needs no checkout."""
+"""The wheel has everything for a first image, and needs no checkout."""
 
 import json
 import os
@@ -76,9 +76,9 @@ def fresh(wheel, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_an_installed_wheel_reconstructs_its_own_picture(fresh, tmp_path):
+def test_an_installed_wheel_reconstructs_its_own_image(fresh, tmp_path):
     folder, site = fresh
-    picture = site / "gamba_warp" / "starter" / "icons" / "scopia-toaster.png"
+    image = site / "gamba_warp" / "starter" / "icons" / "scopia-toaster.png"
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
 
     def run(*words):
@@ -91,13 +91,13 @@ def test_an_installed_wheel_reconstructs_its_own_picture(fresh, tmp_path):
     assert where.returncode == 0, where.stderr
     assert all(Path(place).is_relative_to(site) for place in where.stdout.split())
     quick = ("--size", 32, "--frames", 3, "--out", tmp_path / "out")
-    done = run("gamba", "reconstruct", picture, *quick)
+    done = run("gamba", "reconstruct", image, *quick)
     assert done.returncode == 0, done.stderr
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names >= {f"scopia-toaster.{end}" for end in ("ply", "gif", "html")}
     none = run("gamba", "reconstruct")
     assert none.returncode == 2 and f"such as {site}" in none.stderr
-    mesh = run("gamba", "reconstruct", picture, "--mesh", "obj", *quick)
+    mesh = run("gamba", "reconstruct", image, "--mesh", "obj", *quick)
     assert mesh.returncode == 2 and "pip install '.[" in mesh.stderr, mesh.stderr
     demo = run("gamba", "demo")
     assert demo.returncode == 2 and demo.stderr.count("\n") == 1
@@ -115,7 +115,7 @@ def test_the_demo_of_an_installed_wheel_asks_for_a_checkout(fresh, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_the_model_its_card_two_pictures_and_whose_they_are(wheel):
+def test_the_wheel_holds_the_model_its_card_two_images_and_whose_they_are(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         card = json.loads(archive.read("gamba_warp/starter/rays.json"))

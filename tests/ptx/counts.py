@@ -55,9 +55,9 @@ def _raster(multiprocessors: int) -> tuple[Counts, Units]:
     meta: dict = {}
 
     def run():
-        *pictures, found = rasterization(**leaves, **cameras)
+        *images, found = rasterization(**leaves, **cameras)
         meta.update(pairs_traversed=found["pairs_traversed"])
-        return pictures
+        return images
 
     counted = counting.count(run, [leaves[name] for name in LEAVES], multiprocessors)
     each = [("pair, of a warp", float(meta["pairs_traversed"]))]

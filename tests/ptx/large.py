@@ -71,22 +71,22 @@ def test_the_papers_scan():
         assert_rel_rms(*pair, limit + more[name], str(name))
 
 
-def test_the_papers_picture():
+def test_the_papers_image():
     scene = rasters.make(1, 1, num=16_384, width=512, height=512, size=0.02)
     rest = {k: scene.pop(k) for k in ("Ks", "width", "height")}
 
-    def picture(**x):
+    def image(**x):
         return rasterization(**x, **rest)[:2]
 
     with not_simulated():
-        renders, alphas = picture(**scene)
+        renders, alphas = image(**scene)
     # where a Gaussian is at its faintest to within rounding, a pixel may have it or not
-    alike = (picture(**scene)[0] - renders).abs().amax(-1, keepdim=True) < rasters.PICTURE
+    alike = (image(**scene)[0] - renders).abs().amax(-1, keepdim=True) < rasters.IMAGE
     assert alike.float().mean() > 0.999
-    got, want = on_both(picture, scene, [torch.randn_like(x) * alike for x in (renders, alphas)])
+    got, want = on_both(image, scene, [torch.randn_like(x) * alike for x in (renders, alphas)])
     for name, x in got.items():
         x, y = (x * alike, want[name] * alike) if isinstance(name, int) else (x, want[name])
-        assert_rel_rms(x, y, rasters.GRADIENT if name else rasters.PICTURE, str(name))
+        assert_rel_rms(x, y, rasters.GRADIENT if name else rasters.IMAGE, str(name))
 
 
 def far(x, dim, path):

@@ -199,7 +199,7 @@ STAGES = {
 }
 
 
-def our_picture(leaves: dict, cameras: dict, multiprocessors: int) -> dict[str, Kernels]:
+def our_image(leaves: dict, cameras: dict, multiprocessors: int) -> dict[str, Kernels]:
     """Count one view, stage by stage; on few multiprocessors by whole tiles."""
     run = partial(rasterization, **leaves, **cameras)
     counted = counting.count(lambda: run()[:2], leaves.values(), multiprocessors)
@@ -255,7 +255,7 @@ def gsplat_kernel(peers: Peers, file: str, entry: str, values: Sequence, sizes, 
     return execute(compiled, packed(compiled[0], values), tensors, *sizes)
 
 
-def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> dict[str, Kernels]:
+def gsplat_image(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> dict[str, Kernels]:
     """Count the same view by gsplat."""
     n, x = GAUSSIANS, {name: value.detach() for name, value in leaves.items()}
 
@@ -290,10 +290,10 @@ def gsplat_picture(peers: Peers, leaves: dict[str, Tensor], cameras: dict) -> di
     values = [*of_scene, *of_camera, 0, *of_forward, back[0], None, back[1], back[2], None]
     projection["gradient"] = project("bwd", values)
     renders, ours, _ = rasterization(**leaves, **cameras)
-    pictures = [renders[0], ours[0, ..., 0]]
-    wanted = torch.autograd.grad(pictures, [leaves[name] for name in LEAVES], cotangents)
+    images = [renders[0], ours[0, ..., 0]]
+    wanted = torch.autograd.grad(images, [leaves[name] for name in LEAVES], cotangents)
     # it cuts Gaussians off at another distance, and alphas at .999
-    agree("gsplat, forward", [y.detach() for y in pictures], [colors, alphas], 1e-3)
+    agree("gsplat, forward", [y.detach() for y in images], [colors, alphas], 1e-3)
     agree("gsplat, gradient", wanted, [*back, grads[3], grads[2]], 1e-2)
     return {"projection": projection, "tile lists": {"forward": lists}, "drawing": drawing}
 
@@ -339,9 +339,9 @@ def cases(peers: Peers) -> Iterator[tuple[str, str, Kernels, Kernels]]:
             layout = "channels last" if last else "tokens last"
             yield "convolution", f"16 x {length:,}, {str(dtype)[6:]}, theirs {layout}", ours, theirs
     leaves, cameras = counting.scene()
-    theirs = gsplat_picture(peers, leaves, cameras)
+    theirs = gsplat_image(peers, leaves, cameras)
     for multiprocessors, text in ((0, "whole tiles"), (MULTIPROCESSORS, "quarters of tiles")):
-        ours = our_picture(leaves, cameras, multiprocessors)
+        ours = our_image(leaves, cameras, multiprocessors)
         for stage in ours:
             if stage == "drawing":
                 yield "rasterizer", f"{stage}, {text}", ours[stage], theirs[stage]

@@ -21,7 +21,7 @@ def scan(states):
     torch.autograd.grad(out.sum() + last.sum(), [*mine.values()])
 
 
-def picture():
+def image():
     """Both directions."""
     mine = rasters.leaves(rasters.crowded(), torch.float32)
     renders, alphas, _ = rasterization(**mine)
@@ -31,8 +31,8 @@ def picture():
 CASES = {
     "scan": (lambda: scan(16), 132),
     "scan of many states": (lambda: scan(70), 132),
-    "picture": (picture, 0),
-    "picture of tiles in quarters": (picture, 132),
+    "image": (image, 0),
+    "image of tiles in quarters": (image, 132),
 }
 
 

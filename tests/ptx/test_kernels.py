@@ -30,7 +30,7 @@ from .launch import interpreted
 from .simulated import not_simulated
 
 HALF = 4e-3  # of numbers of 8 bits, rounded in the inputs' gradients and in the output
-# Multiprocessors for which the tiles of two pictures, 24 or 12, are cut into so many parts.
+# Multiprocessors for which the tiles of two images, 24 or 12, are cut into so many parts.
 PARTS = {4: 132, 2: 1, 1: 0}
 
 
@@ -85,8 +85,8 @@ def test_convolution(dtype):
     check(run)
 
 
-def pictures(scene, mode):
-    """A comparison of pictures, and of the depth at which half of the light is gone."""
+def images(scene, mode):
+    """A comparison of images, and of the depth at which half of the light is gone."""
     meta = rasters.compare(scene, mode)
     got = depth_quantile(meta)
     with not_simulated():
@@ -102,8 +102,8 @@ def pictures(scene, mode):
 )
 def test_rasterizer(channels, mode, parts):
     def run():
-        pictures(rasters.make(1, 2, channels=channels), mode)
-        pictures(rasters.crowded(channels), mode)
+        images(rasters.make(1, 2, channels=channels), mode)
+        images(rasters.crowded(channels), mode)
 
     check(run, PARTS[parts])
 
@@ -174,7 +174,7 @@ def test_only_one_kernel_contracts():
 
 
 def test_a_training_step():
-    """Network, pictures, losses and all gradients, beside those of the CPU's kernels."""
+    """Network, images, losses and all gradients, beside those of the CPU's kernels."""
     size, config = 32, replace(SMALLEST, image_size=32, encoder_size=32, depth=2)
     images, lone = inputs(2, size)
     poses, Ks = rasters.look(2, 3, size, size)
@@ -197,7 +197,7 @@ def test_a_training_step():
         assert got.keys() == want.keys()
         for name, value in got.items():
             # measured 3e-6: both sum in float32, each in its own order
-            limit = rasters.PICTURE if name == "loss" else rasters.GRADIENT
+            limit = rasters.IMAGE if name == "loss" else rasters.GRADIENT
             assert_rel_rms(value, want[name], limit, name)
 
     check(run)

@@ -74,7 +74,7 @@ def test_views_and_meshes_of_a_copy_of_the_set(tmp_path, capsys):
     with pytest.raises(UserError, match="none of its 2 objects is in the train split"):
         open_dataset(tmp_path / "out" / "views", "train")
     views = data.load(0)
-    # The model's box is 2 x 1 x 4 with z up in its file: upright in the picture, from the front.
+    # The model's box is 2 x 1 x 4 with z up in its file: upright in the image, from the front.
     rows = views.images[0, ..., 3].amax(1) > 0.5
     columns = views.images[0, ..., 3].amax(0) > 0.5
     assert rows.sum() > 1.5 * columns.sum()

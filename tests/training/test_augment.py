@@ -25,7 +25,7 @@ def gaussians(seed: int):
     return some(9)
 
 
-def test_a_mirrored_object_seen_by_mirrored_cameras_is_the_mirrored_picture():
+def test_a_mirrored_object_seen_by_mirrored_cameras_is_the_mirrored_image():
     made, object_ = mirrored(views()), gaussians(0)
     object_.means = object_.means * torch.tensor([-1.0, 1.0, 1.0])
     # M R(q) M: a rotation about an axis with the same x and negated y and z.

@@ -19,7 +19,7 @@ def root(tmp_path):
 def spoil(root, *names):
     for name in names:
         for path in (root / f"cloud{name}").glob("*.png"):
-            path.write_bytes(b"not a picture")
+            path.write_bytes(b"not an image")
 
 
 def source_of(root):
@@ -36,7 +36,7 @@ def test_objects_that_go_bad_during_a_run_are_passed_over(root):
     after = [take(source, n).uids[0] for n in range(12)]
     assert set(after) == {"cloudd", "cloude", "cloudf"}
     assert set(source.failures) == {"clouda", "cloudb", "cloudc"}
-    assert "not a picture" in source.failures["clouda"]
+    assert "not an image" in source.failures["clouda"]
     again = source_of(root)  # a resumed run draws the same batches
     assert [take(again, n).uids[0] for n in range(12)] == after
 

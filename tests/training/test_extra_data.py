@@ -85,6 +85,6 @@ def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, share):
 
 
 @pytest.mark.parametrize("crop", [8, 17])
-def test_crops_that_lpips_cannot_see_or_no_picture_has_are_refused(roots, tmp_path, crop):
+def test_crops_that_lpips_cannot_see_or_no_image_has_are_refused(roots, tmp_path, crop):
     with pytest.raises(UserError, match=f"--lpips-crop {crop}: must be 0, or 16 to --size 16"):
         micro.options(roots[0], tmp_path, loss={"lpips_crop": crop})

@@ -78,7 +78,7 @@ def test_tensorboard_never_stops_a_run(tmp_path, capsys):
     assert capsys.readouterr().out.count("tensorboard cannot be written") == 1
 
 
-def test_sample_pictures_never_stop_a_run(tmp_path, capsys):
+def test_sample_images_never_stop_a_run(tmp_path, capsys):
     log = RunLog(tmp_path)
     log.sample(7, tmp_path / "none" / "a.png", [torch.rand(2, 4, 4, 3)])
     assert "cannot write" in capsys.readouterr().out

@@ -21,9 +21,9 @@ from gamba_warp.train.objective.losses import (
 
 
 def test_composite_is_straight_alpha():
-    pictures = torch.tensor([0.5, 1.0, 0.0, 0.25]).expand(2, 1, 3, 5, 4)
+    images = torch.tensor([0.5, 1.0, 0.0, 0.25]).expand(2, 1, 3, 5, 4)
     background = torch.tensor([[[1.0, 0.0, 1.0]], [[0.0, 0.0, 0.0]]])  # [2, 1, 3]
-    got = over_background(pictures, background[..., None, None, :])
+    got = over_background(images, background[..., None, None, :])
     assert got.shape == (2, 1, 3, 5, 3)
     torch.testing.assert_close(got[0, 0, 1, 2], torch.tensor([0.875, 0.25, 0.75]))
     torch.testing.assert_close(got[1, 0, 1, 2], torch.tensor([0.125, 0.25, 0.0]))
@@ -68,7 +68,7 @@ def test_loss_terms_and_weights():
     assert all(term.abs().max() < 1e-6 for term in terms.values())
 
 
-def test_non_finite_pictures_are_not_hidden():
+def test_non_finite_images_are_not_hidden():
     rgb = torch.full((1, 4, 4, 3), math.nan)
     loss = total_loss({"rgb": mse(rgb, torch.zeros(1, 4, 4, 3))}, {"rgb": 1.0})
     assert not torch.isfinite(loss)

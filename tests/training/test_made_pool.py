@@ -68,7 +68,7 @@ def test_every_object_is_used_as_often_as_told_in_rounds_that_differ(slots):
     assert not {other._object(n) for n in range(60)} & {number * 2 for number in uses}
 
 
-def test_a_pool_that_begins_later_goes_on_with_the_same_pictures(slots, opened, in_process):
+def test_a_pool_that_begins_later_goes_on_with_the_same_images(slots, opened, in_process):
     whole, late = opened(), opened(first=6)
     for sample in range(12):
         before = whole.take(sample)
@@ -79,7 +79,7 @@ def test_a_pool_that_begins_later_goes_on_with_the_same_pictures(slots, opened, 
     assert len(whole._ready) <= 5 + 2 * 2 + pools.AHEAD  # those of older rounds are dropped
 
 
-def test_other_processes_make_the_same_pictures(slots, opened):
+def test_other_processes_make_the_same_images(slots, opened):
     made = opened().take(0)
     number = int(made.uids[0].removeprefix("made-3-"))
     expected = pools._files(views_of(number, 3, VIEWS), made.uids[0])

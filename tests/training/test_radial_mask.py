@@ -32,7 +32,7 @@ def mean_at(distance: float, angle: float, depth: float = 1.5) -> torch.Tensor:
 
 def square() -> torch.Tensor:
     mask = torch.zeros(SIZE, SIZE)
-    mask[24:72, 24:72] = 1  # half a picture wide: sides at 0.5
+    mask[24:72, 24:72] = 1  # half an image wide: sides at 0.5
     return mask
 
 
@@ -47,7 +47,7 @@ ANGLES = torch.arange(256) * (2 * math.pi / 256)
         (disc(0.8) - disc(0.4), 0.8),
         (square(), 0.5 / torch.maximum(ANGLES.cos().abs(), ANGLES.sin().abs())),
     ],
-    ids=["disc", "disc in a wide picture", "the outermost of a ring", "square"],
+    ids=["disc", "disc in a wide image", "the outermost of a ring", "square"],
 )
 def test_contours(mask, want):
     contours = contour_distances(mask)
@@ -55,7 +55,7 @@ def test_contours(mask, want):
     assert (contours - want).abs().max() < CONTOUR
 
 
-def test_full_picture_ends_at_its_border():
+def test_full_image_ends_at_its_border():
     got = contour_distances(torch.ones(32, 48), rays=4)
     torch.testing.assert_close(got, torch.tensor([1.5, 1.0, 1.5, 1.0]), atol=1e-5, rtol=0)
 

@@ -56,7 +56,7 @@ def data(tmp_path_factory):
     for path in root.glob("*/transforms.json"):
         names = [frame["file_path"] for frame in json.loads(path.read_text())["frames"]]
         path.with_name("orbit.json").write_text(
-            json.dumps({"distance": 1.8, "focal": 1.2, "pictures": names})
+            json.dumps({"distance": 1.8, "focal": 1.2, "images": names})
         )
         path.unlink()
     return root

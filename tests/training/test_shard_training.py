@@ -139,7 +139,7 @@ def test_a_damaged_object_is_skipped_and_a_damaged_tar_ends_the_run(data, tmp_pa
     assert run(out, tmp_path / "run") == 1
     said = capsys.readouterr().out
     assert said.count("is skipped") == 1 and "no transform_matrix" in said
-    path.write_bytes(content[: len(content) // 2 + 700])  # within a picture
+    path.write_bytes(content[: len(content) // 2 + 700])  # within an image
     message = refused("the shards cannot be read: ", run, out, tmp_path / "short")
     assert len(message) < 200
     assert list_checkpoints(tmp_path / "short"), "nothing is lost"

@@ -195,7 +195,7 @@ def test_a_run_learns_and_writes_everything(tmp_path):
     assert lines(tmp_path, "start")[0]["config"]["model"]["width"] == 16
     assert json.loads((tmp_path / "latest.json").read_text())["step"] == 120
     board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    assert board.Images("val/pictures")[-1].height == 2 * micro.SIZE
+    assert board.Images("val/images")[-1].height == 2 * micro.SIZE
 
 
 def test_validation_is_on_training_and_held_out_objects(data, tmp_path, monkeypatch):
@@ -214,7 +214,7 @@ def test_validation_is_on_training_and_held_out_objects(data, tmp_path, monkeypa
     assert [uids for training, uids in seen if not training] == 2 * validated
 
 
-def test_a_validation_is_of_pictures_in_range(monkeypatch):
+def test_a_validation_is_of_images_in_range(monkeypatch):
     target = torch.ones(1, 2, 4, 4, 3)
     shown = SimpleNamespace(rgb=target + 5, alpha=target[..., :1])
     front = Cameras(orbit(torch.zeros(2)), intrinsics(4, 4).expand(2, 3, 3), 4, 4)[None]

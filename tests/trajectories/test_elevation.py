@@ -96,7 +96,7 @@ def run_json(capsys, *words) -> dict:
 
 
 def test_the_app_begins_with_the_estimate():
-    cut = cutting.cut_picture(ICON, "thing.png", CutoutOptions())
+    cut = cutting.cut_image(ICON, "thing.png", CutoutOptions())
     made = work.run_model(load_model(), cut)
     assert made.view.elevation == made.estimate.degrees > 10
     assert work.run_model(load_model(), cut, 3.0).view.elevation == 3.0

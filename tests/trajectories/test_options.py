@@ -40,7 +40,7 @@ def model(tmp_path_factory):
     return path
 
 
-def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
+def test_a_image_from_above_stands_upright(tmp_path, model, monkeypatch):
     meshed = []
 
     def extracted(gaussians, *_):
@@ -48,9 +48,9 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
         return Surface(np.eye(4, 3), np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))
 
     monkeypatch.setattr(pipeline, "surface_of", extracted)
-    picture = cut_out(tmp_path / "thing.png")
+    image = cut_out(tmp_path / "thing.png")
     plain, turned = tmp_path / "plain", tmp_path / "turned"
-    common = [picture, "--checkpoint", model, "--size", 48, "--frames", 4]
+    common = [image, "--checkpoint", model, "--size", 48, "--frames", 4]
     assert run_reconstruct(*common, "--out", plain, "--elevation", 0) == 0
     options = ["--elevation", 30, "--mesh", "ply"]
     assert run_reconstruct(*common, "--out", turned, *options) == 0
@@ -71,8 +71,8 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
 
 
 def test_field_of_view_and_distance_are_those_of_what_is_rendered(tmp_path, model):
-    picture = cut_out(tmp_path / "thing.png")
-    common = [picture, "--checkpoint", model, "--size", 48, "--frames", 2, "--elevation", 0]
+    image = cut_out(tmp_path / "thing.png")
+    common = [image, "--checkpoint", model, "--size", 48, "--frames", 2, "--elevation", 0]
     assert run_reconstruct(*common, "--out", tmp_path / "a", "--fov", 20, "--distance", 4) == 0
     assert run_reconstruct(*common, "--out", tmp_path / "b") == 0
     same = load_ply(tmp_path / "a" / "thing.ply"), load_ply(tmp_path / "b" / "thing.ply")

@@ -50,7 +50,7 @@ def test_a_turntable_begins_in_front_and_turns_once():
     torch.testing.assert_close(cameras.viewmats, orbit(torch.arange(5) * 72.0, 20.0, 2.5))
     torch.testing.assert_close(cameras.Ks, intrinsics(70, 50, 30.0).expand(5, 3, 3))
     assert (cameras.width, cameras.height) == (70, 50)
-    # The field of view is that of the shorter side, so a tall picture shows a ball whole as well.
+    # The field of view is that of the shorter side, so a tall image shows a ball whole as well.
     tall = turntable(1, Viewpoint(0.0, 2.5, 30.0), (50, 70))
     assert float(tall.Ks[0, 0, 0]) == pytest.approx(25 / math.tan(math.radians(15)))
     assert float(tall.Ks[0, 1, 1]) == pytest.approx(25 / math.tan(math.radians(15)))
@@ -73,7 +73,7 @@ def test_a_spiral_rises_falls_and_closes():
 def test_another_field_of_view_keeps_the_object_as_large():
     before, after = Viewpoint(), Viewpoint().changed(fov=20.0, elevation=12.0)
     assert after.elevation == 12.0 and after.fov == 20.0
-    for point in (before, after):  # the half height of the picture at the object's centre
+    for point in (before, after):  # the half height of the image at the object's centre
         assert point.distance * math.tan(math.radians(point.fov / 2)) == pytest.approx(
             1.5 * math.tan(math.radians(49.1 / 2))
         )
@@ -81,7 +81,7 @@ def test_another_field_of_view_keeps_the_object_as_large():
 
 
 def test_upright_puts_the_camera_where_it_stood():
-    """The picture of a camera at 35 degrees does not change."""
+    """The image of a camera at 35 degrees does not change."""
     gaussians = some(30, rotated=True)
     seen = orbit(torch.zeros(1), 0.0, 2.0)
     plain = render(gaussians, Cameras(seen, intrinsics(41, 41)[None], 41, 41)).rgb

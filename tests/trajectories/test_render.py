@@ -34,11 +34,11 @@ def shoot(*arguments):
     return run("render", [str(a) for a in arguments])
 
 
-def pictures(folder):
+def images(folder):
     return [np.asarray(Image.open(p)) for p in sorted(folder.glob("[0-9]???.png"))]
 
 
-def test_a_turntable_of_pictures_with_its_cameras(thing, tmp_path, capsys):
+def test_a_turntable_of_images_with_its_cameras(thing, tmp_path, capsys):
     path, gaussians = thing
     options = ["--kind", "png", "--size", "40x24", "--frames", 3, "--elevation", 20, "--depth"]
     assert shoot(path, "--out", tmp_path / "out", *options) == 0
@@ -47,7 +47,7 @@ def test_a_turntable_of_pictures_with_its_cameras(thing, tmp_path, capsys):
     moved = gaussians.in_unit(*unit_frame(gaussians))
     cameras = turntable(3, Viewpoint(20.0), (40, 24))
     seen = render(moved, cameras, torch.ones(3), depth=True)
-    made = np.stack(pictures(folder))
+    made = np.stack(images(folder))
     # rounding to 8 bits
     np.testing.assert_allclose(made / 255, seen.rgb.numpy(), atol=0.51 / 255)
     # transforms.json has the same cameras in the file's frame, where depths are as long as there
@@ -72,7 +72,7 @@ def test_cameras_of_a_file_are_in_the_frame_of_the_gaussians(thing, tmp_path):
     save_path(tmp_path / "transforms.json", cameras, fps=7)
     options = ["--trajectory", tmp_path / "transforms.json", "--kind", "png"]
     assert shoot(path, "--out", tmp_path / "out", *options, "--background", "none") == 0
-    made = np.stack(pictures(tmp_path / "out" / "thing")) / 255
+    made = np.stack(images(tmp_path / "out" / "thing")) / 255
     seen = render(gaussians, cameras)
     np.testing.assert_allclose(made[..., 3:], seen.alpha.numpy(), atol=0.01)
     np.testing.assert_allclose(made[..., :3] * made[..., 3:], seen.rgb.numpy(), atol=0.01)
@@ -81,7 +81,7 @@ def test_cameras_of_a_file_are_in_the_frame_of_the_gaussians(thing, tmp_path):
     assert torch.allclose(again.cameras.viewmats, cameras.viewmats.double()) and again.fps == 7
 
 
-def test_movies_and_a_single_picture(thing, tmp_path):
+def test_movies_and_a_single_image(thing, tmp_path):
     path, _ = thing
     out = tmp_path / "out"
     common = [path, "--size", "32", "--background", "#204060"]
@@ -114,8 +114,8 @@ REFUSED = {
     "--size 10x": "--size 10x: give a width such as 512",
     "--size 5000": "--size 5000: must be at least 16 and at most 4,096",
     "--background blue": "--background blue: one of white",
-    "--background none": "--background none needs pictures",
-    "--depth": "--depth needs pictures",
+    "--background none": "--background none needs images",
+    "--depth": "--depth needs images",
     "--trajectory {ply}": "not valid JSON",
     "--trajectory none.json": "none.json: No such file",
     "--trajectory {cameras} --frames 3": "--frames applies to a turntable or a spiral",

@@ -173,12 +173,12 @@ def test_what_was_removed_before_is_not_shown_and_can_be_undone(edited):
 def canvas(opened):
     """The pixels at rest."""
     text = opened.promised("gambaViewer.png()").partition(",")[2]
-    with Image.open(io.BytesIO(base64.b64decode(text))) as picture:
-        return np.asarray(picture.convert("RGB")).astype(float) / 255
+    with Image.open(io.BytesIO(base64.b64decode(text))) as image:
+        return np.asarray(image.convert("RGB")).astype(float) / 255
 
 
 def test_the_object_is_rotated_at_once_for_another_elevation(edited, browser_page, tmp_path):
-    """The view stays; the first view is the input's; the picture is that of a rotated object."""
+    """The view stays; the first view is the input's; the image is that of a rotated object."""
     opened = edited(y=0.3)
     page, camera = opened.page, "JSON.stringify(gambaViewer.camera.copyOf(gambaViewer.camera))"
     first = canvas(opened)
@@ -195,7 +195,7 @@ def test_the_object_is_rotated_at_once_for_another_elevation(edited, browser_pag
     other = browser_page(path, SIDE, 600, reduced_motion="reduce")
     other.promised("gambaViewer.rest()")
     other.page.evaluate("gambaViewer.setCamera({ azimuth: 0.7, elevation: 0.3 })")
-    # The brush's page has no slider of the input either, so both pictures have one size.
+    # The brush's page has no slider of the input either, so both images have one size.
     assert np.abs(canvas(other) - seen).max() < 3 / 255 < 0.3 < np.abs(first - seen).max()
     page.keyboard.press("r")
     assert np.abs(canvas(opened) - first).max() < 2 / 255, "the input's view"

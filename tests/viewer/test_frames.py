@@ -63,7 +63,7 @@ def test_viewers_of_a_page_start_when_asked(browser_page, tmp_path):
     assert not any(frame.evaluate("gambaViewer.about.input") for frame in both)
 
 
-def test_the_first_of_many_viewers_goes_back_to_its_picture(browser_page, tmp_path):
+def test_the_first_of_many_viewers_goes_back_to_its_image(browser_page, tmp_path):
     sections = [Section(f"Chair {i}", gaussians=some(5)) for i in range(7)]
     write_page(tmp_path / "a.html", "", sections)
     opened = browser_page(tmp_path / "a.html", 800, 600)
@@ -77,10 +77,8 @@ def test_the_first_of_many_viewers_goes_back_to_its_picture(browser_page, tmp_pa
 def test_the_viewer_of_a_reconstruction_starts_by_itself(browser_page, tmp_path):
     vertices = 0.4 * torch.eye(3).numpy()
     mesh = Surface(vertices, np.array([[0, 1, 2]]), None)
-    picture = np.ones((9, 9, 4), np.float32)
-    section = Section(
-        "A chair", gaussians=some(40), picture=picture, mesh=mesh, view=Viewpoint(20.0)
-    )
+    image = np.ones((9, 9, 4), np.float32)
+    section = Section("A chair", gaussians=some(40), image=image, mesh=mesh, view=Viewpoint(20.0))
     write_page(tmp_path / "a.html", section.title, [section], auto=True)
     opened = browser_page(tmp_path / "a.html", 800, 600)
     (frame,) = frames(opened, 1)

@@ -1,4 +1,4 @@
-"""The viewer in a browser: pictures like our rasterizer's, controls, and no errors."""
+"""The viewer in a browser: images like our rasterizer's, controls, and no errors."""
 
 import base64
 import gzip
@@ -50,13 +50,11 @@ def tetrahedron():
 
 @pytest.fixture
 def viewer(browser_page, tmp_path):
-    """Opens the page of some Gaussians, and waits for its first picture."""
+    """Opens the page of some Gaussians, and waits for its first image."""
 
-    def opened(
-        gaussians, width=WIDE, height=HIGH, mesh=None, camera=CAMERA, picture=None, **options
-    ):
+    def opened(gaussians, width=WIDE, height=HIGH, mesh=None, camera=CAMERA, image=None, **options):
         path = tmp_path / "view.html"
-        write_viewer(path, "A chair", gaussians, mesh=mesh, camera=camera, picture=picture)
+        write_viewer(path, "A chair", gaussians, mesh=mesh, camera=camera, image=image)
         options = {"color_scheme": "light", "reduced_motion": "reduce", **options}
         found = browser_page(path, width, height, **options)
         found.promised("gambaViewer.rest()")
@@ -68,8 +66,8 @@ def viewer(browser_page, tmp_path):
 def canvas(opened) -> np.ndarray:
     """The canvas at rest, ``[H, W, 3]`` in [0, 1]."""
     address = opened.promised("gambaViewer.png()")
-    with Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))) as picture:
-        return np.asarray(picture.convert("RGB")) / 255
+    with Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))) as image:
+        return np.asarray(image.convert("RGB")) / 255
 
 
 def look_from(page, azimuth, elevation, distance):
@@ -92,7 +90,7 @@ def psnr(one, other) -> float:
 
 
 @pytest.mark.parametrize("coefficients", [None, 3, 8, 15])
-def test_its_picture_is_that_of_the_rasterizer(viewer, one_thread, coefficients):
+def test_its_image_is_that_of_the_rasterizer(viewer, one_thread, coefficients):
     gaussians = colourful(coefficients=coefficients)
     opened = viewer(gaussians)
     for azimuth, elevation, distance in ((0, 0, 1.5), (40, 20, 1.2), (200, -35, 1.9)):
@@ -106,7 +104,7 @@ def test_its_picture_is_that_of_the_rasterizer(viewer, one_thread, coefficients)
 
 
 def test_its_limits_are_those_of_the_rasterizer(viewer, one_thread):
-    """An opaque Gaussian lets a hundredth through; one beside the picture reaches into it."""
+    """An opaque Gaussian lets a hundredth through; one beside the image reaches into it."""
     gaussians = Gaussians(
         means=torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, -1.1]]),
         quats=None,
@@ -236,9 +234,9 @@ def test_a_slider_compares_the_object_with_the_input_and_the_mesh(viewer):
     page = (opened := viewer(colourful())).page
     assert not page.is_visible("#wipe")
     splats = canvas(opened)
-    picture = np.zeros((40, 40, 4))
-    picture[10:30, 10:30] = 1, 0, 0, 1
-    page = (opened := viewer(colourful(), 700, HIGH + 300, tetrahedron(), picture=picture)).page
+    image = np.zeros((40, 40, 4))
+    image[10:30, 10:30] = 1, 0, 0, 1
+    page = (opened := viewer(colourful(), 700, HIGH + 300, tetrahedron(), image=image)).page
     slide = "value => { const s = document.querySelector('#wipe input');"
     slide += "s.value = value; s.dispatchEvent(new Event('input', { bubbles: true })); }"
     splats = canvas(opened)
@@ -256,7 +254,7 @@ def test_a_slider_compares_the_object_with_the_input_and_the_mesh(viewer):
     assert state(page)["azimuth"] == 0  # the input's camera
     with Image.open(io.BytesIO(page.screenshot())) as seen:
         rgb = np.asarray(seen.convert("RGB")).astype(int)
-    side = page.locator("#canvas").bounding_box()["height"]  # the picture's, in the middle
+    side = page.locator("#canvas").bounding_box()["height"]  # the image's, in the middle
     column, row = round(350 - side / 8), round(side / 2)
     assert rgb[row, column, 0] > 240 > 20 > rgb[row, column, 1]
     assert rgb[row, round(350 - 3 * side / 8)].min() > 250 < rgb[row, 20].min()
@@ -265,40 +263,40 @@ def test_a_slider_compares_the_object_with_the_input_and_the_mesh(viewer):
     assert not opened.messages
 
 
-def test_a_picture_is_saved(viewer, tmp_path):
+def test_a_image_is_saved(viewer, tmp_path):
     opened = viewer(colourful())
     shown = canvas(opened)
     with opened.page.expect_download() as download:
         opened.page.keyboard.press("s")
     download.value.save_as(tmp_path / "saved.png")
     assert download.value.suggested_filename == "A-chair.png"
-    with Image.open(tmp_path / "saved.png") as picture:
-        np.testing.assert_array_equal(np.asarray(picture.convert("RGB")) / 255, shown)
+    with Image.open(tmp_path / "saved.png") as image:
+        np.testing.assert_array_equal(np.asarray(image.convert("RGB")) / 255, shown)
 
 
-def test_a_picture_has_the_asked_size_and_an_alpha(viewer, tmp_path):
+def test_a_image_has_the_asked_size_and_an_alpha(viewer, tmp_path):
     opened = viewer(colourful(), 600, 500)
     page = opened.page
     for _ in range(3):
         page.keyboard.press("l")
     assert page.evaluate("document.documentElement.dataset.ground") == "clear"
     page.evaluate("gambaViewer.about.title = 'chair.ply'")
-    page.click("#do-picture")
+    page.click("#do-image")
     with page.expect_download() as download:
         page.click("[data-side='1024']")
-    assert download.value.suggested_filename == "chair.png" and not page.is_visible("#picture")
+    assert download.value.suggested_filename == "chair.png" and not page.is_visible("#image")
     download.value.save_as(tmp_path / "saved.png")
-    with Image.open(tmp_path / "saved.png") as picture:
-        assert max(picture.size) == 1024 and picture.mode == "RGBA"
-        alpha = np.asarray(picture)[..., 3]
+    with Image.open(tmp_path / "saved.png") as image:
+        assert max(image.size) == 1024 and image.mode == "RGBA"
+        alpha = np.asarray(image)[..., 3]
     assert alpha[0, 0] == 0 and alpha.max() > 250 and not opened.messages
 
 
-def test_the_tools_cover_no_part_of_the_picture_and_can_be_left_out(viewer, tmp_path):
+def test_the_tools_cover_no_part_of_the_image_and_can_be_left_out(viewer, tmp_path):
     opened = viewer(colourful(), 900, 600)
     page = opened.page
-    picture, bar = (page.query_selector(name).bounding_box() for name in ("#canvas", "#bar"))
-    assert picture["y"] + picture["height"] <= bar["y"]
+    image, bar = (page.query_selector(name).bounding_box() for name in ("#canvas", "#bar"))
+    assert image["y"] + image["height"] <= bar["y"]
     page.goto((tmp_path / "view.html").as_uri() + "?controls=0&ground=grey")
     opened.promised("gambaViewer.rest()")
     assert not page.is_visible("#bar") and not page.is_visible("header")
@@ -311,7 +309,7 @@ def test_it_turns_until_it_is_touched(viewer, slow):
     opened = viewer(colourful(40), reduced_motion="no-preference")
     page = opened.page
     page.reload()
-    if slow:  # the coarsest picture
+    if slow:  # the coarsest image
         page.evaluate("Object.assign(gambaViewer, { adapt() {}, coarse: SIZES.length - 1 })")
     for _ in range(100):
         page.wait_for_timeout(100)
@@ -531,7 +529,7 @@ def test_it_draws_less_while_it_moves_and_all_at_rest(viewer):
     assert page.evaluate("gambaViewer.renderer.ordered") == 600 and not opened.messages
 
 
-def test_a_slow_machine_gets_coarser_pictures_and_a_fast_one_sharper(viewer):
+def test_a_slow_machine_gets_coarser_images_and_a_fast_one_sharper(viewer):
     opened = viewer(colourful(50))
     found = opened.page.evaluate("""() => {
       const v = Object.assign(gambaViewer, { coarse: 0, quick: 0, some: 1e6 }), seen = [];

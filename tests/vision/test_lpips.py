@@ -89,10 +89,10 @@ def test_real_weights_equal_the_lpips_package_and_rank_distortions():
     distance = load_lpips()
     ramp = torch.linspace(0, 1, 64).expand(64, 64)[..., None].expand(64, 64, 3)
     board = ((torch.arange(64)[:, None] // 8 + torch.arange(64) // 8) % 2).float()
-    picture = 0.5 * ramp + 0.5 * board[..., None]
-    noise = torch.randn_like(picture)
-    small, large = (distance(picture, (picture + s * noise).clamp(0, 1)) for s in (0.02, 0.2))
-    assert distance(picture, picture) == 0
+    image = 0.5 * ramp + 0.5 * board[..., None]
+    noise = torch.randn_like(image)
+    small, large = (distance(image, (image + s * noise).clamp(0, 1)) for s in (0.02, 0.2))
+    assert distance(image, image) == 0
     assert 0 < small < large < 1.5
 
 
@@ -104,7 +104,7 @@ def test_gradient_is_finite_without_features(state):
     assert distance == 0 and torch.isfinite(a.grad).all()
 
 
-def test_gradient_reaches_the_picture_alone(state):
+def test_gradient_reaches_the_image_alone(state):
     net = LPIPS(state)
     a = torch.rand(17, 18, 3, requires_grad=True)
     net(a, torch.rand(17, 18, 3)).backward()
@@ -244,7 +244,7 @@ def test_bfloat16_products_keep_the_value_and_the_gradients_direction(state):
     assert 0 < 1 - cosine < 1e-3
     assert (net(want, want, torch.bfloat16) == 0).all()
     assert all(p.grad is None for p in net.parameters()) and len(net.state_dict()) == 31
-    # The gradient of the other picture, and of both at once, by symmetry.
+    # The gradient of the other image, and of both at once, by symmetry.
     got, other = got.detach(), want.clone().requires_grad_()
     (mirrored,) = torch.autograd.grad(net(other, got, torch.bfloat16).sum(), other)
     (second,) = torch.autograd.grad(net(got, other, torch.bfloat16).sum(), other)

@@ -104,13 +104,13 @@ def test_the_trial_is_made_once_and_leaves_chance_alone():
     assert (info.misses, info.hits) == (1, 1)
 
 
-def test_a_picture_in_bfloat16_is_near_that_in_float32_and_no_more():
+def test_a_image_in_bfloat16_is_near_that_in_float32_and_no_more():
     torch.manual_seed(0)
     model = Gamba(micro(encoder="none")).eval()
     size = model.config.image_size
-    picture = np.random.default_rng(0).uniform(size=(size, size, 4)).astype(np.float32)
-    full, again = reconstruct(model, picture), reconstruct(model, picture, "float32")
-    lower = reconstruct(model, picture, "bfloat16")
+    image = np.random.default_rng(0).uniform(size=(size, size, 4)).astype(np.float32)
+    full, again = reconstruct(model, image), reconstruct(model, image, "float32")
+    lower = reconstruct(model, image, "bfloat16")
     assert torch.equal(full.means, again.means)
     gap = (lower.means - full.means).norm() / full.means.norm()
     assert lower.means.dtype == torch.float32 and 0 < gap < 0.02  # 8 digits, a few products

@@ -155,13 +155,13 @@ def unpack_library(path: Path, out: Path) -> list[dict]:
         numbers = [key.partition("#")[2] for key in catalogue if key.startswith("model#")]
         try:
             entries = [_entry(library, catalogue, number, path) for number in numbers]
-            pictures = [catalogue[f"icon#{number}"].lstrip("/") for number in numbers]
+            images = [catalogue[f"icon#{number}"].lstrip("/") for number in numbers]
         except KeyError as error:
             raise UserError(f"{path}: not a furniture library (no {error})") from error
         missing = {e["model"].removeprefix(f"{library}/") for e in entries} - {*members}
         if missing:
             raise UserError(f"{path}: not a furniture library ({min(missing)!r} is missing)")
-        icons = [archive.read(picture, _MAX_ICON) for picture in pictures]
+        icons = [archive.read(image, _MAX_ICON) for image in images]
         if not (out / library).exists():
             with atomic_folder(out / library) as part:
                 for member in progress_bar(members, desc=library, unit="file", leave=False):

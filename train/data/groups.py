@@ -7,7 +7,7 @@ Two objects belong to one group if
 - both names are only the kind, in any library ("Chair");
 - they are of one library and one name begins with all words of the other, at least two ("Arrow turn
   right", "Arrow turn right and ahead");
-- they use a picture file with the same content.
+- they use an image file with the same content.
 
 The relation is transitive.
 """
@@ -32,7 +32,7 @@ class ObjectInfo(NamedTuple):
         uid: its name in the dataset.
         library: its library.
         name: its readable name.
-        textures: SHA-256 of each picture file of its material.
+        textures: SHA-256 of each image file of its material.
     """
 
     uid: str
@@ -83,14 +83,14 @@ def split_groups(objects: Sequence[ObjectInfo]) -> dict[str, str]:
 
 
 def textures_of(model: Path) -> frozenset[str]:
-    """SHA-256 of each picture file named by the materials of an unpacked ``.obj`` model.
+    """SHA-256 of each image file named by the materials of an unpacked ``.obj`` model.
 
     Missing files, and names that leave the model's folder, are skipped.
     """
     found = set()
     for library in _named_files(model, rb"(?m)^mtllib\s+(.+?)\s*$"):
-        for picture in _named_files(library, rb"(?m)^\s*map_\w+\s+(?:.*\s)?(\S+)\s*$"):
-            found.add(sha256(picture))
+        for image in _named_files(library, rb"(?m)^\s*map_\w+\s+(?:.*\s)?(\S+)\s*$"):
+            found.add(sha256(image))
     return frozenset(found)
 
 

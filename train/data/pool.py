@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from gamba_warp.data.dataset import ViewDataset
-from gamba_warp.data.layouts import DecodedPicture, ObjectFiles
+from gamba_warp.data.layouts import DecodedImage, ObjectFiles
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.children import Failed, end_idle, run_each
@@ -41,7 +41,7 @@ class PoolOptions:
         seed: seed of all objects, their cameras and lights.
         rank: rank of this training process; each has its own objects.
         world: number of training processes.
-        views: options of the pictures.
+        views: options of the images.
     """
 
     seed: int
@@ -170,8 +170,8 @@ def _make_views(number: int, seed: int, settings: Settings) -> Views:
     return draw_views(make_object(np.random.default_rng([seed, number])), str(number), settings)
 
 
-class _Picture(DecodedPicture):
-    """Picture in memory."""
+class _Image(DecodedImage):
+    """Image in memory."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.values = values
@@ -183,11 +183,11 @@ class _Picture(DecodedPicture):
 def _files(views: Views, uid: str) -> ObjectFiles:
     number, size = views.images.shape[:2]
     near, far = (
-        None if steps is None else [_Picture(each.astype(np.float32)) for each in steps]
+        None if steps is None else [_Image(each.astype(np.float32)) for each in steps]
         for steps in (views.depths, views.backs)
     )
     return ObjectFiles(
-        images=[_Picture(image) for image in views.images],
+        images=[_Image(image) for image in views.images],
         camera_to_world=views.poses,
         Ks=np.broadcast_to(views.K, (number, 3, 3)),
         sizes=[(size, size)] * number,

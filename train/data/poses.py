@@ -1,4 +1,4 @@
-"""Cameras of rendered views: around an object, each with all of it in the picture."""
+"""Cameras of rendered views: around an object, each with all of it in the image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from .settings import SPREAD
 
-MARGIN = 0.96  # share of the picture's half size that the object may reach
+MARGIN = 0.96  # share of the image's half size that the object may reach
 NEAREST = 3.0  # least distance, in half sizes of the object along the camera's axes
 FRONT = (35.0, 0.0, 20.0)  # degrees: largest azimuth, least and largest elevation of a front view
 
@@ -36,19 +36,19 @@ def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndar
 def nearest_distance(points: np.ndarray, pose: np.ndarray, fov: float) -> float:
     """Return the least camera distance along the pose's axis.
 
-    At this distance all points are in a square picture, with a margin. A reference view is rescaled
+    At this distance all points are in a square image, with a margin. A reference view is rescaled
     to distance 1.5; the object then lies within [-0.5, 0.5] on each camera axis, where the model
     can place Gaussians.
 
     Args:
         points: ``[P, 3]`` in the object's frame.
         pose: ``[4, 4]`` camera to world; only its rotation matters.
-        fov: degrees, of the picture's side.
+        fov: degrees, of the image's side.
     """
     local = points @ pose[:3, :3]
     slope = MARGIN * math.tan(math.radians(fov) / 2)
-    in_picture = (np.abs(local[:, :2]).max(1) / slope + local[:, 2]).max()
-    return float(max(in_picture, NEAREST * np.abs(local).max()))
+    in_image = (np.abs(local[:, :2]).max(1) / slope + local[:, 2]).max()
+    return float(max(in_image, NEAREST * np.abs(local).max()))
 
 
 def sample_poses(
@@ -68,7 +68,7 @@ def sample_poses(
     Args:
         points: ``[P, 3]`` vertices of the object, which is centred at the origin.
         views: number of views.
-        fov: degrees, of the picture's side.
+        fov: degrees, of the image's side.
         rng: random generator.
         fronts: number of views from the front.
         spread: largest share by which a camera stands further away than necessary.
@@ -93,11 +93,11 @@ def ring_poses(
 ) -> np.ndarray:
     """Return ``[V, 4, 4]`` camera-to-world matrices, OpenGL frame, on rings about the object.
 
-    All views of an object have one distance: the least that keeps it inside each picture.
+    All views of an object have one distance: the least that keeps it inside each image.
 
     Args:
         points: ``[P, 3]`` vertices of the object, which is centred at the origin.
-        fov: degrees, of the picture's side.
+        fov: degrees, of the image's side.
         elevations: of the rings, degrees; the first ring's views come first.
         azimuths: of each ring's views, degrees.
     """

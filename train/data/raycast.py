@@ -273,9 +273,9 @@ class RayCaster:
         sizes = np.zeros((3, len(chains), max(1, *map(len, chains))), np.int64)
         start, texels = 0, [np.zeros((0, 4), np.uint8)]
         for row, chain in enumerate(chains):
-            for level, picture in enumerate(chain):
-                sizes[:, row, level] = start, picture.shape[1], picture.shape[0]
-                texels.append(picture.reshape(-1, 4))
+            for level, image in enumerate(chain):
+                sizes[:, row, level] = start, image.shape[1], image.shape[0]
+                texels.append(image.reshape(-1, 4))
                 start += len(texels[-1])
         plain = np.stack([m.color for m in mesh.materials]).astype(np.float32)
         plain[:, :3] *= plain[:, 3:]
@@ -305,8 +305,8 @@ class RayCaster:
 
         Args:
             pose: ``[4, 4]`` camera to world, OpenGL frame.
-            size: side of the picture, pixels.
-            fov: degrees, of the picture's side.
+            size: side of the image, pixels.
+            fov: degrees, of the image's side.
 
         Returns:
             ``[size, size, 4]`` float32 display RGBA in [0, 1], colour not premultiplied; and
@@ -330,8 +330,8 @@ class RayCaster:
         straight = np.divide(
             mean[..., :3], alpha, out=np.zeros_like(mean[..., :3]), where=alpha > 0
         )
-        picture = np.concatenate([to_display(np.clip(straight, 0, 1)) * (alpha > 0), alpha], -1)
-        return picture, full_depth[SAMPLES // 2 :: SAMPLES, SAMPLES // 2 :: SAMPLES]
+        image = np.concatenate([to_display(np.clip(straight, 0, 1)) * (alpha > 0), alpha], -1)
+        return image, full_depth[SAMPLES // 2 :: SAMPLES, SAMPLES // 2 :: SAMPLES]
 
     def last_depth(self, pose: np.ndarray, size: int, fov: float) -> np.ndarray:
         """Depth of the last surface along each ray, ignoring transparency.

@@ -45,7 +45,7 @@ DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
 
 @dataclass
 class Views:
-    """Pictures of one object, with their cameras.
+    """Images of one object, with their cameras.
 
     Attributes:
         images: ``[V, S, S, 4]`` uint8 RGBA, colour not premultiplied.
@@ -75,7 +75,7 @@ def draw_views(
     Args:
         model: the object in the file's frame; ``settings.up`` is "y" or "z".
         uid: name of the object; with the settings' seed it seeds cameras and lights.
-        settings: options of the pictures.
+        settings: options of the images.
         rotation: ``[3, 3]``, applied to the file's points first; None: not rotated.
     """
     digest = hashlib.sha256(f"{settings.seed} {uid}".encode()).digest()
@@ -92,8 +92,8 @@ def draw_views(
         poses = sample_poses(used, settings.views, fov, rng, settings.fronts, settings.spread)
     size, images, depths, backs = settings.size, [], [], []
     for pose in poses:
-        picture, depth = caster.render(pose, size, fov)
-        images.append(to_uint8(picture))
+        image, depth = caster.render(pose, size, fov)
+        images.append(to_uint8(image))
         if settings.depth:
             depths.append(_steps(depth))
             backs.append(_steps(caster.last_depth(pose, size, fov)))
@@ -103,7 +103,7 @@ def draw_views(
 
 
 def _steps(depth: np.ndarray) -> np.ndarray:
-    """Convert depth in object units to the 16-bit steps of depth pictures."""
+    """Convert depth in object units to the 16-bit steps of depth images."""
     return np.clip(np.rint(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
 
 
@@ -116,7 +116,7 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
         Warnings about missing parts of the mesh's files that were replaced.
 
     Raises:
-        UserError: the mesh cannot be read, no picture shows it, or the folder cannot be written.
+        UserError: the mesh cannot be read, no image shows it, or the folder cannot be written.
     """
     up = default_up(mesh.path) if settings.up == "auto" else settings.up
     plain_name(mesh.uid, str(mesh.path))
@@ -211,7 +211,7 @@ def render_meshes(
     Args:
         meshes: the objects.
         out: the dataset's existing folder.
-        settings: options of the pictures.
+        settings: options of the images.
         workers: processes; 0 means one per core.
         groups: new groups of objects rendered earlier, by uid; None to keep the stored ones.
 

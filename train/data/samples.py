@@ -1,4 +1,4 @@
-"""Training samples: an input picture, and the pictures to match, with their cameras."""
+"""Training samples: an input image, and the images to match, with their cameras."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def draw_change(rng: np.random.Generator, mirror: float, recolor: float) -> Chan
 
 
 def mirrored(views: ObjectViews) -> ObjectViews:
-    """Views of the object's mirror image: x of the world and of every picture is flipped.
+    """Views of the object's mirror image: x of the world and of every image is flipped.
 
     A point p at the pixel (x, y) becomes M p at (W - x, y), M = diag(-1, 1, 1): with the viewmat
     M R M, M t and the principal point W - cx. Both R and M R M are rotations.
@@ -79,7 +79,7 @@ def mirrored(views: ObjectViews) -> ObjectViews:
 
 @dataclass
 class Batch:
-    """B objects, each with one input picture and V+1 pictures to match, the input view first.
+    """B objects, each with one input image and V+1 images to match, the input view first.
 
     Attributes:
         uids: names of the objects, B.
@@ -88,7 +88,7 @@ class Batch:
         input_cameras: ``[B]``, in the model's world.
         targets: ``[B, V+1, H, W, 4]`` RGBA in [0, 1], straight alpha.
         cameras: ``[B, V+1]``.
-        background: ``[B, 1, 3]`` RGB that pictures are rendered and composited on.
+        background: ``[B, 1, 3]`` RGB that images are rendered and composited on.
         surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface behind each pixel of
             the inputs, in the model's world, 0 where unknown; None unless requested.
         foreground: of the inputs, for the decoder ``rays``; None if not made yet.
@@ -173,14 +173,14 @@ def load_sample(
         dataset: the dataset.
         index: number of the object.
         views: the input view, then the novel ones.
-        size: side of the pictures to match, pixels.
+        size: side of the images to match, pixels.
         config: the model's configuration.
         background: RGB ``[3]``.
         change: augmentation of the views; None: not augmented.
-        surfaces: also load them, if the object has depth pictures.
+        surfaces: also load them, if the object has depth images.
 
     Raises:
-        UserError: the object cannot be read or its pictures are not square.
+        UserError: the object cannot be read or its images are not square.
     """
     depths = int(surfaces)  # only of the input view
     target = dataset.load(index, views, size, depths)
@@ -193,7 +193,7 @@ def load_sample(
     for cameras in (target.cameras, source.cameras):
         if cameras.width != cameras.height:
             sides = f"{cameras.width}x{cameras.height}"
-            raise UserError(f"{target.uid}: pictures are {sides}, training needs square ones")
+            raise UserError(f"{target.uid}: images are {sides}, training needs square ones")
     inputs, input_cameras = posed_input(source, config)
     found = None
     if surfaces:

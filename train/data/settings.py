@@ -28,8 +28,8 @@ class Settings:
         size: Pixels a side.
         fov: Vertical field of view, degrees.
         seed: Seed of cameras and lights, which also depend on the object's uid.
-        depth: Also write 16-bit depth pictures, of the first and of the last surface.
-        format: Format of the pictures; both are lossless.
+        depth: Also write 16-bit depth images, of the first and of the last surface.
+        format: Format of the images; both are lossless.
         up: The axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
         fronts: Number of views from the front, the first ones.
         spread: Largest share by which a camera stands further away than necessary.

@@ -2,7 +2,7 @@
 
 A folder of shards, here or on a server, has an index of each split, ``shards-train.json``: names
 of tars and numbers of their objects. An object is one sample: ``KEY.json`` with the content of
-``transforms.json``, and its pictures, ``KEY.000.webp``, by their names without ``KEY.``. ``KEY`` is
+``transforms.json``, and its images, ``KEY.000.webp``, by their names without ``KEY.``. ``KEY`` is
 the quoted uid; as WebDataset ends a key at the first dot, a dot is written as ``%2E``.
 """
 
@@ -26,12 +26,12 @@ from msgspec import Meta
 
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.data.gso import scanned
-from gamba_warp.data.layouts import EncodedPicture, ObjectFiles, object_of
+from gamba_warp.data.layouts import EncodedImage, ObjectFiles, object_of
 from gamba_warp.errors import FileWarning, UserError, first_line
 from gamba_warp.untrusted.documents import MAX_BYTES, parse_document, read_bytes
 
 INDEX = "shards-{}.json"  # of a split
-BUFFER = 100  # objects mixed at a time, with the bytes of their pictures
+BUFFER = 100  # objects mixed at a time, with the bytes of their images
 SILENCE = 60.0  # seconds without a byte that end a transfer
 _ADDRESS = re.compile("https?://[A-Za-z0-9][A-Za-z0-9_.:/@%~+-]{0,999}")
 
@@ -166,13 +166,13 @@ def _read_object(sample: dict[str, Any], uid: str) -> ObjectFiles:
         raise UserError(f"{source}: one of Google Scanned Objects, which are for evaluation")
     contents = {name: value for name, value in sample.items() if isinstance(value, bytes)}
     document = parse_document(contents.pop("json", b""), object, source)
-    pictures = {name: EncodedPicture(f"{source}.{name}", c) for name, c in contents.items()}
+    images = {name: EncodedImage(f"{source}.{name}", c) for name, c in contents.items()}
 
-    def find(name: object, where: str) -> EncodedPicture:
-        if not isinstance(name, str) or name not in pictures:
+    def find(name: object, where: str) -> EncodedImage:
+        if not isinstance(name, str) or name not in images:
             raise UserError(f"{where}: the shard has no {repr(name)[:80]} of this object")
         contents.pop(name, None)
-        return pictures[name]
+        return images[name]
 
     files = object_of([(source, document, find)])
     if contents:

@@ -48,7 +48,7 @@ def structure(got: Tensor, want: Tensor) -> Tensor:
         want: the same shape, values in [0, 1].
 
     Returns:
-        ``[..]``, mean over channels and whole windows, in the dtype of the pictures.
+        ``[..]``, mean over channels and whole windows, in the dtype of the images.
     """
     return _Structure.apply(got, want)
 
@@ -56,7 +56,7 @@ def structure(got: Tensor, want: Tensor) -> Tensor:
 class _Structure(torch.autograd.Function):
     """Autograd function of ``structure``; the forward pass also computes the slope.
 
-    A picture's value depends on no other picture, so its gradient is a factor times its slope.
+    An image's value depends on no other image, so its gradient is a factor times its slope.
     """
 
     @staticmethod
@@ -75,7 +75,7 @@ class _Structure(torch.autograd.Function):
 
 
 def rendered_psnr(got: Tensor, want: Tensor) -> Tensor:
-    """PSNR of rendered pictures, clamped to [0, 1] first.
+    """PSNR of rendered images, clamped to [0, 1] first.
 
     Args:
         got: ``[.., H, W, C]``, rendered.
@@ -101,7 +101,7 @@ def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Te
         layers: number of layers.
         cameras: ``[B]`` of the inputs.
         surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface, 0 where unknown, at
-            the size of the cameras' pictures.
+            the size of the cameras' images.
 
     Returns:
         ``[B]``, the sum over both layers of the mean distance and ``SLOPE_WEIGHT`` times the mean
@@ -239,7 +239,7 @@ class LossInputs(NamedTuple):
     config: Any = None
 
     def compared(self) -> tuple[Tensor, Tensor]:
-        """Return the rendered and true pictures for LPIPS; each call draws new crops."""
+        """Return the rendered and true images for LPIPS; each call draws new crops."""
         if not self.lpips_crop:
             return self.rgb, self.target
         return random_crops(self.rgb, self.target, self.target_alpha, self.lpips_crop)
@@ -362,7 +362,7 @@ def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, Any]) -> Tenso
 
 # Measured in docs/train-your-own.md, with the command.
 COST = (
-    "LPIPS of whole pictures makes a step on a CPU 5 to 15 times as long: --lpips off leaves "
+    "LPIPS of whole images makes a step on a CPU 5 to 15 times as long: --lpips off leaves "
     "it out, --lpips-crop 64 compares a part"
 )
 

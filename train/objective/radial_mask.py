@@ -3,7 +3,7 @@
 A mask becomes U distances, one per ray, from the image centre to the outermost contour. A Gaussian
 whose projected centre is farther out than the contour at its angle is pulled back.
 
-Distances are in units of half the image height, so the loss is independent of the picture size.
+Distances are in units of half the image height, so the loss is independent of the image size.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -
     """Find the distance from the image centre to the outermost contour along each ray.
 
     Ray k has the angle 2πk/U, from +x (right) towards +y (down). At the contour the bilinearly
-    interpolated mask crosses ``threshold``; outside the picture the mask is 0.
+    interpolated mask crosses ``threshold``; outside the image the mask is 0.
 
     Args:
         masks: ``[.., H, W]`` in [0, 1].
@@ -89,7 +89,7 @@ def radial_mask_loss(means: Tensor, cameras: Cameras, contours: Tensor) -> Tenso
 
     Args:
         means: ``[.., N, 3]``, object units.
-        cameras: cameras of the masks' pictures, ``viewmats [.., V, 4, 4]``.
+        cameras: cameras of the masks' images, ``viewmats [.., V, 4, 4]``.
         contours: result of ``contour_distances``, ``[.., V, U]``.
 
     Returns:

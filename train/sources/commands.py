@@ -135,7 +135,7 @@ def data_render_command(
     Args:
         folder: folder of meshes, at any depth; its catalogue.json may give names and attribution.
         out: the dataset to make or to continue.
-        settings: options of the pictures.
+        settings: options of the images.
         share: selection of objects.
         split: render only the objects of this part of the set.
         workers: number of processes; 0 means one per core.
@@ -177,7 +177,7 @@ def data_pack_command(
     Args:
         data: the dataset.
         out: folder of the shards; older ones are replaced.
-        size: height of the pictures, pixels: they are resized once, and are lossless WebP; without
+        size: height of the images, pixels: they are resized once, and are lossless WebP; without
             it they keep their bytes.
         shard_mb: a shard ends with the object that exceeds this size, megabytes.
         workers: number of threads that read; 0 means one per core.

@@ -35,7 +35,7 @@ def write_pack(
     Args:
         data: the dataset.
         out: folder of the shards; older ones are replaced.
-        size: height of the pictures, pixels; None keeps the bytes of the files.
+        size: height of the images, pixels; None keeps the bytes of the files.
         shard_mb: a tar ends with the object that exceeds this size.
         workers: number of reading threads.
 
@@ -83,12 +83,12 @@ def write_pack(
 
 
 def _sample(dataset: ViewDataset, size: int | None, uid: str) -> dict[str, Any] | str:
-    """Read one object, or return why it is unreadable; each picture is decoded, to check it."""
+    """Read one object, or return why it is unreadable; each image is decoded, to check it."""
     sample: dict[str, Any] = {"__key__": quote(uid, safe="/").replace(".", "%2E")}
     try:
         found, frames = dataset.files(uid), list[dict[str, Any]]()
         for view, pose in enumerate(found.camera_to_world):
-            (pixels,), (K,) = dataset.pictures(uid, [view], size)
+            (pixels,), (K,) = dataset.images(uid, [view], size)
             lens = dict(zip(("fl_x", "fl_y", "cx", "cy"), K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()))
             frame = lens | {"w": pixels.shape[1], "h": pixels.shape[0]}
             kinds = {"depth_file": found.depths, "back_file": found.backs}
@@ -100,7 +100,7 @@ def _sample(dataset: ViewDataset, size: int | None, uid: str) -> dict[str, Any] 
                 sample[frame["file_path"]] = stream.getvalue()
             for kind, paths in kinds.items():
                 if paths is not None:
-                    path = Path(str(paths[view]))  # a folder's pictures are files
+                    path = Path(str(paths[view]))  # a folder's images are files
                     part = f"{view:03d}.{kind.removesuffix('_file')}".removesuffix(".file")
                     name = part + path.suffix.lower()
                     frame[f"{kind}_path"], sample[name] = name, read_bytes(path, 1 << 30)

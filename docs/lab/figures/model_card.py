@@ -23,7 +23,7 @@ from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
 from gamba_warp.pages.card import (
     METRICS,
     OF_GROUNDS,
-    OF_PICTURES,
+    OF_IMAGES,
     ModelCard,
     Row,
     card_path,
@@ -104,7 +104,7 @@ def readme_of(text: str, card: ModelCard) -> str:
     """
     novel = [row for row in card.figures if row.views == "novel"]
     shapes = {row.name: row for row in card.figures if row.views == "shape"}
-    of_views, of_shapes = tuple(OF_PICTURES), ("chamfer", "iou")
+    of_views, of_shapes = tuple(OF_IMAGES), ("chamfer", "iou")
     heads = [METRICS[key][0] for key in (*of_views, *of_shapes)]
     rows = []
     for row in novel:

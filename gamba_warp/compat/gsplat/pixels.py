@@ -26,9 +26,9 @@ def pair_ids(images: Tensor, tiles: Tensor, depths: Tensor, count: int) -> Tenso
 
     Args:
         images: ``[P]`` int64.
-        tiles: ``[P]`` int64, index of the tile in the picture.
+        tiles: ``[P]`` int64, index of the tile in the image.
         depths: ``[P]`` float32.
-        count: tiles per picture.
+        count: tiles per image.
 
     Returns:
         ``[P]`` int64; the lower half holds the bits of the depth.
@@ -119,7 +119,7 @@ def isect_offset_encode(
 
     Args:
         isect_ids: ``[n_isects]`` int64, sorted, from ``isect_tiles``.
-        n_images: pictures.
+        n_images: images.
         tile_width: tiles in a row.
         tile_height: rows of tiles.
 
@@ -147,15 +147,15 @@ def blend(
     views: int = 1,
     keep: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Composite I pictures ``[I, H, W, C]``, with their transmittances ``[I, H, W, 1]``.
+    """Composite I images ``[I, H, W, C]``, with their transmittances ``[I, H, W, 1]``.
 
     Args:
-        layers: R rows of each picture: means2d ``[I, R, 2]`` pixels, conics ``[I, R, 3]`` (a, k, e
+        layers: R rows of each image: means2d ``[I, R, 2]`` pixels, conics ``[I, R, 3]`` (a, k, e
             of ``a (dx + k dy)² + e dy²``), opacities ``[I, R]``, and colors ``[I * R, C]``, or
             ``[I / views * R, C]`` if an object's views share them. The lists index rows of all.
         bins: the tile lists.
         tiling: the division into tiles.
-        views: pictures per object that share the colours; 1 if none do.
+        views: images per object that share the colours; 1 if none do.
         keep: called in backward with the absolute gradients ``[I * R, 2]`` of the centres, summed
             over the pixels (Ye et al. 2024, "AbsGS"), if these need a gradient; or None.
     """
@@ -196,7 +196,7 @@ def rasterize_to_pixels(
         image_width: pixels.
         image_height: pixels.
         tile_size: side of a tile, pixels. Unless a multiple of 16, each tile has copies of its
-            Gaussians: slower, with the same picture.
+            Gaussians: slower, with the same image.
         isect_offsets: ``[.., tile_height, tile_width]`` int32.
         flatten_ids: ``[n_isects]`` int32.
         backgrounds: ``[.., D]`` or ``[D]``, or None: black.
@@ -272,7 +272,7 @@ def rasterize_to_pixels(
     pairs = pairs + (begins[around] - starts[:-1]).repeat_interleave(counts)
     pairs = pairs if moved else ids[pairs]
 
-    # Rows are split evenly among the pictures, with a few spare ones.
+    # Rows are split evenly among the images, with a few spare ones.
     each = -(-len(layers[0]) // max(images, 1))
     spare = each * images - len(layers[0])
     layers = [F.pad(x.float(), (0, 0) * (x.dim() - 1) + (0, spare)) for x in layers]
@@ -290,8 +290,8 @@ def rasterize_to_pixels(
     )
     tiling = Tiling(grid_x * parts * TILE, grid_y * parts * TILE)
     found = []
-    for picture in blend(layers, bins, tiling, keep=keep if absgrad else None):
-        apart = picture.unflatten(2, (grid_x, -1)).unflatten(1, (grid_y, -1))
+    for image in blend(layers, bins, tiling, keep=keep if absgrad else None):
+        apart = image.unflatten(2, (grid_x, -1)).unflatten(1, (grid_y, -1))
         whole = apart[:, :, :tile_size, :, :tile_size].flatten(3, 4).flatten(1, 2)
         whole = whole[:, :image_height, :image_width]
         found.append(whole.reshape(*lead, *whole.shape[1:]))

@@ -145,7 +145,7 @@ def proj(
     height: int,
     camera_model: str = "pinhole",
 ) -> tuple[Tensor, Tensor]:
-    """Project means and covariances from camera frames to the picture (EWA, pinhole).
+    """Project means and covariances from camera frames to the image (EWA, pinhole).
 
     Args:
         means: ``[.., C, N, 3]``.
@@ -296,7 +296,7 @@ def fully_fused_projection(
         Ks: ``[.., C, 3, 3]`` pixels; skew is ignored.
         width: pixels.
         height: pixels.
-        eps2d: added to the diagonal of the covariance in the picture; >= 0.
+        eps2d: added to the diagonal of the covariance in the image; >= 0.
         near_plane: nearer Gaussians are culled; > 0.
         far_plane: farther ones are culled.
         radius_clip: ones with both radii up to this many pixels are culled.

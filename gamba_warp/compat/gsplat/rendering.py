@@ -113,7 +113,7 @@ def rasterization(
         near_plane: nearer Gaussians are culled; > 0.
         far_plane: farther ones are culled.
         radius_clip: ones with both radii up to this many pixels are culled.
-        eps2d: added to the diagonal of the covariance in the picture; >= 0.
+        eps2d: added to the diagonal of the covariance in the image; >= 0.
         sh_degree: None, or 0 to 4.
         packed: ``meta`` has one row for each visible Gaussian of a view.
         tile_size: no effect; ``meta["tile_size"]`` is the side of the tiles used.

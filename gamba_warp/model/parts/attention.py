@@ -67,12 +67,12 @@ class AttentionBlock(Block):
         keys, values, queries = (_by_head(part, self.heads) for part in parts)
         if packed is None:
             hidden = _attention(keys, values, queries, state)
-        else:  # one picture after the other, each over its own tokens
+        else:  # one image after the other, each over its own tokens
             counts = packed.cu_seqlens.diff().tolist()
-            pictures = zip(*(part.split(counts, 2) for part in (keys, values, queries)))
+            images = zip(*(part.split(counts, 2) for part in (keys, values, queries)))
             hidden = torch.cat([
                 _attention(k, v, q, state and Memory(*(x[i : i + 1] for x in state)))
-                for i, (k, v, q) in enumerate(pictures)
+                for i, (k, v, q) in enumerate(images)
             ], 2)  # fmt: skip
         tokens = tokens + self.out_proj(hidden.transpose(1, 2).flatten(2))
         return tokens + self.mlp(self.mlp_norm(tokens)), None
@@ -97,7 +97,7 @@ def _by_head(tokens: Tensor, heads: int) -> Tensor:
 
 
 def _attention(keys: Tensor, values: Tensor, queries: Tensor, memory: Memory | None) -> Tensor:
-    """Attend from each token to the prefix and to all tokens of its picture."""
+    """Attend from each token to the prefix and to all tokens of its image."""
     if memory is not None:
         keys = torch.cat([memory.keys.to(keys.dtype), keys], dim=2)
         values = torch.cat([memory.values.to(values.dtype), values], dim=2)

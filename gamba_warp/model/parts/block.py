@@ -55,9 +55,9 @@ class Block(nn.Module):
         """Refine the 3DGS tokens, all of them or the next segment.
 
         Args:
-            tokens: ``[B, L, width]``, or the tokens of all pictures in one row.
+            tokens: ``[B, L, width]``, or the tokens of all images in one row.
             state: this block's entry of ``prefix_states``, or its state after the previous segment.
-            packed: the B pictures' tokens in such a row.
+            packed: the B images' tokens in such a row.
             keep: return the state after the last token, for a further segment.
 
         Returns:
@@ -129,11 +129,11 @@ def run_blocks(
 
     Args:
         blocks: the network's blocks, all of one kind, in their order.
-        tokens: ``[B, L, width]``; with ``packed`` ``[1, T, width]``, all pictures' tokens.
+        tokens: ``[B, L, width]``; with ``packed`` ``[1, T, width]``, all images' tokens.
         states: the result of ``prefix_states``, one entry per block.
         recompute: with gradients, keep only each block's input and recompute the block in the
             backward pass.
-        packed: each picture's tokens in one row.
+        packed: each image's tokens in one row.
 
     Returns:
         The shape of ``tokens``.
@@ -146,7 +146,7 @@ def run_blocks(
     for s, segment in enumerate(segments):
         own, keep = packed, s + 1 < len(segments)
         if packed is not None and len(segments) > 1:
-            # The state of a picture without tokens in this segment is unchanged.
+            # The state of an image without tokens in this segment is unchanged.
             own = Packed.of((packed.cu_seqlens - start).clamp(0, segment.shape[1]))
         start += segment.shape[1]
         for i, block in enumerate(blocks):

@@ -28,7 +28,7 @@ def run_mixed(mamba: Mamba, tokens: Tensor, mixed: Tensor, packed: Packed | None
         mamba: the layer.
         tokens: ``[B, L, width]``, or all tokens in one row.
         mixed: of ``Mixed``.
-        packed: the pictures' tokens in such a row.
+        packed: the images' tokens in such a row.
     """
     count, length = mixed.shape[1], tokens.shape[1]
     if packed is None:
@@ -46,17 +46,17 @@ def run_mixed(mamba: Mamba, tokens: Tensor, mixed: Tensor, packed: Packed | None
 def mixed_positions(count: int, cu_seqlens: Tensor) -> Tensor:
     """Position of each token in the common row, if condition tokens are mixed in.
 
-    Of K such tokens and a picture's L 3DGS tokens, token k = 0 .. K-1 comes before the 3DGS token
+    Of K such tokens and an image's L 3DGS tokens, token k = 0 .. K-1 comes before the 3DGS token
     number floor((k + 1) L / (K + 1)), so that they cut the 3DGS tokens into K + 1 pieces of nearly
     equal length. A Mamba block then runs over all K + L tokens, and the outputs of the K are
     dropped.
 
     Args:
         count: K.
-        cu_seqlens: ``[B + 1]`` int64, borders of each picture's 3DGS tokens.
+        cu_seqlens: ``[B + 1]`` int64, borders of each image's 3DGS tokens.
 
     Returns:
-        ``[B K + T]`` int64, a permutation: the positions of each picture's K tokens, then those of
+        ``[B K + T]`` int64, a permutation: the positions of each image's K tokens, then those of
         all 3DGS tokens.
     """
     steps = torch.arange(1, count + 1, device=cu_seqlens.device)

@@ -1,6 +1,6 @@
-"""Foreground of pictures: the patches and cells that are not fully transparent.
+"""Foreground of images: the patches and cells that are not fully transparent.
 
-Only these are computed. Their lists are made on the CPU, from the pictures' alpha, so that no GPU
+Only these are computed. Their lists are made on the CPU, from the images' alpha, so that no GPU
 is asked for their numbers; a training makes them while it loads the data.
 """
 
@@ -18,8 +18,8 @@ from torch.nn import functional as F
 from ...kernels.runtime.packed import Packed
 from ..config import GambaConfig, Orders
 
-# Of ``Foreground.padded``: significant bits of its numbers of patches, and of rows of a picture;
-# share of a patch's cells that have an object, in the mean over 1,120 pictures of training data.
+# Of ``Foreground.padded``: significant bits of its numbers of patches, and of rows of an image;
+# share of a patch's cells that have an object, in the mean over 1,120 images of training data.
 _FINE, _COARSE = 5, 2
 _FILLED = 0.72
 # Patches by which the sides of ``Foreground.boxes`` grow: oneDNN compiles a kernel for each shape
@@ -45,26 +45,26 @@ def scan_orders(height: int, width: int, orders: Orders = "backward", count: int
 
 @dataclass
 class Foreground:
-    """Index lists of B pictures, with P foreground patches and T foreground cells in all.
+    """Index lists of B images, with P foreground patches and T foreground cells in all.
 
-    Patches and cells are sorted by picture, then row by row. Each patch has O tokens, one in each
+    Patches and cells are sorted by image, then row by row. Each patch has O tokens, one in each
     scan order. Tensors are int64 unless stated otherwise.
 
     Attributes:
-        patch: ``[3, P]``: picture, row and column of each patch.
-        tokens: ``[P O]``, indices of the tokens among all of a picture, picture by picture in the
+        patch: ``[3, P]``: image, row and column of each patch.
+        tokens: ``[P O]``, indices of the tokens among all of an image, image by image in the
             order in which the network reads them.
         patch_of: ``[P O]``, the patch of each of these tokens.
         positions: ``[P, O]``, indices into ``tokens`` of each patch's tokens.
-        cu_seqlens: ``[B + 1]``, borders of each picture's tokens.
+        cu_seqlens: ``[B + 1]``, borders of each image's tokens.
         rows: ``[B, 3]`` int32, as of ``Packed``.
-        cell: ``[3, T]``: picture, row and column of each cell.
+        cell: ``[3, T]``: image, row and column of each cell.
         number: ``[T]``, index of each cell among all cells of all patches, patch by patch.
         slot: ``[T]``, row of each cell among B times ``most`` rows.
-        most: rows of a picture, at least its number of cells.
-        counts: number of cells of each picture.
-        boxes: for each picture the first row and column of a box with its patches, and those behind
-            the last; empty if whole pictures are to be computed, as on a GPU.
+        most: rows of an image, at least its number of cells.
+        counts: number of cells of each image.
+        boxes: for each image the first row and column of a box with its patches, and those behind
+            the last; empty if whole images are to be computed, as on a GPU.
         void: ``[T, 1]`` float32, 0, or -inf for padding; None without padding.
     """
 
@@ -84,7 +84,7 @@ class Foreground:
 
     @property
     def packed(self) -> Packed | None:
-        """The pictures' tokens as sequences in one row; None for a single picture."""
+        """The images' tokens as sequences in one row; None for a single image."""
         return Packed(self.cu_seqlens, self.rows) if len(self.counts) != 1 else None
 
     def to(self, device: torch.device) -> Foreground:
@@ -98,9 +98,9 @@ class Foreground:
         A CUDA graph of one batch then fits many. On a CPU a step takes 6 % less: oneDNN compiles
         few kernels, and the allocator reuses blocks of the same sizes (docs/lab/step.md).
 
-        Added tokens follow the last picture's tokens, so no other token depends on them. Added
-        patches and cells repeat the first of picture 0; these cells are transparent, and share a
-        row behind the cells of picture 0.
+        Added tokens follow the last image's tokens, so no other token depends on them. Added
+        patches and cells repeat the first of image 0; these cells are transparent, and share a
+        row behind the cells of image 0.
 
         Args:
             cells: number of cells of a patch.
@@ -139,7 +139,7 @@ def _rounded_up(number: float, bits: int) -> int:
 
 
 def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Foreground:
-    """Find the patches and cells in which a picture is not fully transparent.
+    """Find the patches and cells in which an image is not fully transparent.
 
     Args:
         alpha: ``[B, S, S]`` in [0, 1], on the CPU.
@@ -147,7 +147,7 @@ def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Fore
         margin: number of further patches around the object's, >= 0; they have no cells.
 
     Returns:
-        The lists on the CPU; a picture may have no patch.
+        The lists on the CPU; an image may have no patch.
 
     Raises:
         ValueError: a negative margin.
@@ -155,23 +155,23 @@ def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Fore
     size, count = config.patch_size, config.ray_cells
     mask, side = alpha > 0, alpha.shape[-1] // size
     near = near_patches(mask, size, margin)
-    picture, position = near.nonzero().unbind(1)
+    image, position = near.nonzero().unbind(1)
     row, column = position // side, position % side
     scan, inverse = _tokens_of(side, config.scan_orders, config.num_orders)
     inside = near[:, scan]
     number = (inside.flatten().cumsum(0) - 1).view_as(inside)
-    positions = number[picture[:, None], inverse[:, position].T]
+    positions = number[image[:, None], inverse[:, position].T]
     patch_of = torch.empty(positions.numel(), dtype=torch.int64)
     patch_of[positions] = torch.arange(len(positions))[:, None]
     borders = F.pad(config.num_orders * near.sum(1).cumsum(0), (1, 0))
     cell = (F.max_pool2d(mask.float()[:, None], size // count)[:, 0] > 0).nonzero().T
     own = torch.zeros(near.shape, dtype=torch.int64)
-    own[picture, position] = torch.arange(len(position))
+    own[image, position] = torch.arange(len(position))
     among = own[cell[0], cell[1] // count * side + cell[2] // count]
     counts = torch.bincount(cell[0], minlength=len(alpha))
     first = counts.max() * torch.arange(len(counts)) - counts.cumsum(0) + counts
     return Foreground(
-        patch=torch.stack([picture, row, column]),
+        patch=torch.stack([image, row, column]),
         tokens=inside.nonzero()[:, 1],
         patch_of=patch_of,
         positions=positions,
@@ -216,9 +216,9 @@ def patch_pixels(maps: Tensor, patch: Tensor, size: int) -> Tensor:
     Returns:
         ``[P, size², C]``, the pixels of a patch row by row.
     """
-    picture, row, column = patch
+    image, row, column = patch
     maps = maps.unflatten(3, (-1, size)).unflatten(2, (-1, size))
-    return maps[picture, :, row, :, column].flatten(2).mT
+    return maps[image, :, row, :, column].flatten(2).mT
 
 
 def cell_colors(rgba: Tensor, side: int, cell: Tensor) -> tuple[Tensor, Tensor]:
@@ -232,8 +232,8 @@ def cell_colors(rgba: Tensor, side: int, cell: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Colours ``[T, 3]``, weighted by alpha, and alpha ``[T, 1]``.
     """
-    picture, row, column = cell
-    values = F.avg_pool2d(premultiplied(rgba), side)[picture, :, row, column]
+    image, row, column = cell
+    values = F.avg_pool2d(premultiplied(rgba), side)[image, :, row, column]
     return values[:, :3] / values[:, 3:].clamp_min(1e-3), values[:, 3:]
 
 

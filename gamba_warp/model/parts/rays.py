@@ -1,4 +1,4 @@
-"""Gaussians on the rays of the input picture's pixels: the decoder ``rays``.
+"""Gaussians on the rays of the input image's pixels: the decoder ``rays``.
 
 A patch of p x p pixels has k x k cells, and each cell has one Gaussian in each of several layers.
 The first layer is the visible surface: it starts opaque, in the plane through the object's centre,
@@ -101,14 +101,14 @@ class RayDecoder(nn.Module):
 
         Args:
             tokens: ``[P, O, width]``, the token of each patch in each of the O orders.
-            pixels: ``[B, pixel_channels, H, W]``, the network's input channels of the pictures.
+            pixels: ``[B, pixel_channels, H, W]``, the network's input channels of the images.
             foreground: the P patches and their cells.
             rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha.
-            cameras: ``[B]`` of the pictures.
+            cameras: ``[B]`` of the images.
 
         Returns:
             ``[B, N]``, float32, in the world of ``cameras``: the cells row by row, the layers of a
-            cell adjacent. N belongs to the picture with the most cells; the others are padded with
+            cell adjacent. N belongs to the image with the most cells; the others are padded with
             Gaussians of opacity 0.
         """
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
@@ -132,21 +132,21 @@ class RayDecoder(nn.Module):
     def _stem(self, pixels: Tensor, foreground: Foreground) -> Tensor:
         """Apply ``stem`` to ``pixels``, at the cells: ``[T, C]``.
 
-        A CPU only computes each picture's box with cells; a GPU is faster with all pictures at
+        A CPU only computes each image's box with cells; a GPU is faster with all images at
         once. The result of padding is arbitrary.
         """
         if pixels.device.type != "cpu" or not foreground.boxes:
-            picture, row, column = foreground.cell
-            return self.stem(pixels).permute(0, 2, 3, 1)[picture, row, column]
+            image, row, column = foreground.cell
+            return self.stem(pixels).permute(0, 2, 3, 1)[image, row, column]
         count, found = self.config.ray_cells, []
         step, side = self.config.patch_size // count, self.config.grid_size * count
         cells = foreground.cell[1:, : sum(foreground.counts)]
         positions = (each.split(foreground.counts) for each in cells)
-        for picture, box, row, column in zip(pixels.split(1), foreground.boxes, *positions):
+        for image, box, row, column in zip(pixels.split(1), foreground.boxes, *positions):
             (top, bottom), (left, right) = (
                 _with_reach(count * box[axis], count * box[axis + 2], side) for axis in (0, 1)
             )
-            cut = picture[..., top * step : bottom * step, left * step : right * step]
+            cut = image[..., top * step : bottom * step, left * step : right * step]
             rows = self.stem(cut)[0].flatten(1).T
             found.append(rows.index_select(0, (row - top) * (right - left) + column - left))
         return F.pad(torch.cat(found), (0, 0, 0, len(foreground.number) - cells.shape[1]))
@@ -155,13 +155,13 @@ class RayDecoder(nn.Module):
         self, out: Tensor, colors: Tensor, alpha: Tensor, cell: Tensor, cameras: Cameras
     ) -> Gaussians:
         """Apply the formulas above to ``out [T, layers, ·]``; return Gaussians ``[T, layers]``."""
-        picture, row, column = cell
+        image, row, column = cell
         depth, offset, opacity, scale, color, *rotation = out.split(self._parts(), -1)
         opacity = opacity[..., 0]
         if self.config.ray_back == "opaque":
             opacity = F.pad(opacity[..., :-1], (0, 1))
         base = torch.logit(colors.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
-        Ks, viewmats = cameras.Ks[picture], cameras.viewmats[picture]
+        Ks, viewmats = cameras.Ks[image], cameras.viewmats[image]
         side = self.config.patch_size // self.config.ray_cells
         x = (side * (column.to(Ks) + 0.5) - Ks[:, 0, 2]) / Ks[:, 0, 0]
         y = (side * (row.to(Ks) + 0.5) - Ks[:, 1, 2]) / Ks[:, 1, 1]
@@ -186,7 +186,7 @@ class RayDecoder(nn.Module):
 def _with_reach(first: int, end: int, side: int) -> tuple[int, int]:
     """Return the range of cells that the stem needs for those from ``first`` to ``end``.
 
-    Its length depends on theirs alone, also at the picture's edge.
+    Its length depends on theirs alone, also at the image's edge.
     """
     length = min(side, end - first + 2 * STEM_REACH)
     begin = min(max(0, first - STEM_REACH), side - length)

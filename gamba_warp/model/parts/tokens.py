@@ -34,7 +34,7 @@ class CameraToken(nn.Module):
 def camera_numbers(cameras: Cameras) -> Tensor:
     """Return ``[B, 16]``: the world-to-camera matrix's 12 numbers row by row, then fx, fy, cx, cy.
 
-    The intrinsics are divided by the picture's width or height, so they do not depend on its size.
+    The intrinsics are divided by the image's width or height, so they do not depend on its size.
     """
     extrinsics = cameras.viewmats[:, :3, :].flatten(1)
     x, y = cameras.Ks[:, 0] / cameras.width, cameras.Ks[:, 1] / cameras.height
@@ -91,7 +91,7 @@ class SplatTokens(nn.Module):
         Args:
             images: ``[B, H, W, 3]`` RGB in [0, 1] on the model's background, or RGBA with straight
                 alpha, composited on that background.
-            cameras: ``[B]`` of the pictures.
+            cameras: ``[B]`` of the images.
 
         Returns:
             ``[B, 9 or 10, H, W]`` float32.
@@ -130,7 +130,7 @@ class SplatTokens(nn.Module):
         Tokens without a patch (``mixed_tokens``) are included.
 
         Args:
-            images: ``[B, H, W, 3]``; a patch is plain background if it is so in all pictures.
+            images: ``[B, H, W, 3]``; a patch is plain background if it is so in all images.
             background: grey value; a pixel that differs by more than half of 1/255 is not
                 background.
             margin: number of further patches around the object, >= 0.

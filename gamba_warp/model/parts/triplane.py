@@ -41,11 +41,11 @@ class PlaneBranch(nn.Module):
         nn.init.zeros_(self.features.bias)
 
     def forward(self, batch: int, states: Sequence[Any], recompute: bool = False) -> Tensor:
-        """Make the planes of ``batch`` pictures: ``[B, 3, features, n, n]``.
+        """Make the planes of ``batch`` images: ``[B, 3, features, n, n]``.
 
         Args:
             batch: B.
-            states: of ``blocks``, after the prefix of these pictures.
+            states: of ``blocks``, after the prefix of these images.
             recompute: as for ``run_blocks``.
         """
         tokens = self.embedding.expand(batch, -1, -1)

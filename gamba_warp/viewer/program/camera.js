@@ -36,7 +36,7 @@ class OrbitCamera {
     return this.target.map((value, k) => value - this.distance * forward[k]);
   }
 
-  // The unit ray through a point of the picture, in pixels from its middle.
+  // The unit ray through a point of the image, in pixels from its middle.
   ray(x, y, focal) {
     const [right, down, forward] = this.rotation(), norm = Math.hypot(x, y, focal);
     return [0, 1, 2].map((k) => (x * right[k] + y * down[k] + focal * forward[k]) / norm);
@@ -48,7 +48,7 @@ class OrbitCamera {
     this.elevation = Math.max(-1.55, Math.min(1.55, this.elevation + dy));
   }
 
-  // By pixels of a picture of this focal length, so that the target follows the pointer.
+  // By pixels of an image of this focal length, so that the target follows the pointer.
   pan(dx, dy, focal) {
     this.goal = null;
     const [right, down] = this.rotation(), unit = this.distance / focal;

@@ -1,6 +1,6 @@
 "use strict";
 // Starts the viewers of a page, each in its own frame. A browser keeps only a few 3D contexts
-// alive, so the oldest viewer returns to its picture when there are many.
+// alive, so the oldest viewer returns to its image when there are many.
 const MOST_VIEWERS = 6;
 const viewers = [];
 

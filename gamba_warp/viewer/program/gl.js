@@ -1,4 +1,4 @@
-// Drawing of the object into a texture of any size, and of that onto the canvas. A picture that
+// Drawing of the object into a texture of any size, and of that onto the canvas. An image that
 // is drawn in several pieces, over several frames, is shown once it is complete.
 
 const ROW = 1024; // Gaussians in a row of the texture: pack.py's records, two texels each
@@ -51,7 +51,7 @@ class Renderer {
   // Frees the memory on the graphics card, all but that of a mesh, which goes with this object.
   free() {
     const { gl } = this;
-    for (const texture of [this.records, this.harmonics, this.order, this.picture]) gl.deleteTexture(texture);
+    for (const texture of [this.records, this.harmonics, this.order, this.image]) gl.deleteTexture(texture);
     gl.deleteRenderbuffer(this.depth);
     gl.deleteFramebuffer(this.frame);
   }
@@ -81,9 +81,9 @@ class Renderer {
     const { gl } = this;
     this.frame = gl.createFramebuffer();
     this.depth = gl.createRenderbuffer();
-    this.picture = gl.createTexture();
+    this.image = gl.createTexture();
     gl.activeTexture(gl.TEXTURE3);
-    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.bindTexture(gl.TEXTURE_2D, this.image);
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
       gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
   }
@@ -126,7 +126,7 @@ class Renderer {
     this.corners = faces.length;
   }
 
-  // Allocates the largest picture, of which smaller ones use a part. Returns true if it changed.
+  // Allocates the largest image, of which smaller ones use a part. Returns true if it changed.
   resize(width, height) {
     if (width === this.width && height === this.height) return false;
     const { gl } = this;
@@ -134,7 +134,7 @@ class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.activeTexture(gl.TEXTURE3);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.image, 0);
     gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
     gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
@@ -142,7 +142,7 @@ class Renderer {
   }
 
   // Draws one piece: Gaussians `from` to `to` of the order, or all of the centres or of the mesh,
-  // in the left `share` of the picture.
+  // in the left `share` of the image.
   draw(mode, camera, background, scale, from, to, share = 1) {
     const { gl } = this;
     const width = Math.max(1, Math.round(this.width * scale)), height = Math.max(1, Math.round(this.height * scale));
@@ -203,14 +203,14 @@ class Renderer {
     gl.disable(gl.DEPTH_TEST);
   }
 
-  // Copies the picture to the canvas, which takes the picture's size; the page scales it.
+  // Copies the image to the canvas, which takes the image's size; the page scales it.
   present() {
     const { gl } = this, { canvas } = gl, [width, height] = this.part;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
     gl.useProgram(this.shown.program);
-    this.shown.set("picture", "1i", 3);
+    this.shown.set("image", "1i", 3);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);

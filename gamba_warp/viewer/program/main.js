@@ -126,7 +126,7 @@ class Viewer {
   }
 
   moving(change) {
-    if (this.wipe < 0) this.setWipe(0); // the picture is of the first view only
+    if (this.wipe < 0) this.setWipe(0); // the image is of the first view only
     change();
     this.redraw();
   }
@@ -216,7 +216,7 @@ class Viewer {
     return true;
   }
 
-  // One more piece of the picture at full size.
+  // One more piece of the image at full size.
   drawRest(now) {
     const { renderer } = this, all = this.mode === "gaussians" ? renderer.ordered : 1;
     const to = Math.min(all, this.progress + PIECE);
@@ -265,7 +265,7 @@ class Viewer {
     this.redraw();
   }
 
-  // Compares with the input's picture (to -1), from its camera, or with the mesh (to 1).
+  // Compares with the input's image (to -1), from its camera, or with the mesh (to 1).
   setWipe(wipe) {
     if (wipe < 0 && !(this.wipe < 0)) this.goHome();
     this.wipe = wipe;
@@ -303,7 +303,7 @@ class Viewer {
     this.travel({ target: origin.map((value, k) => value + depth * ray[k]), distance: Math.max(0.1, 0.8 * camera.distance) });
   }
 
-  // Resolves when the picture of the current camera is complete.
+  // Resolves when the image of the current camera is complete.
   rest() {
     this.turning = false;
     this.schedule();
@@ -313,19 +313,19 @@ class Viewer {
     });
   }
 
-  // Saves the picture, with its longer side of that many pixels, or as shown.
+  // Saves the image, with its longer side of that many pixels, or as shown.
   async save(side) {
     const shown = this.shownSize(), scale = side / Math.max(...shown);
     this.fixed = side ? shown.map((length) => Math.max(1, Math.round(length * scale))) : null;
     if (side) this.redraw();
     await this.rest();
     this.renderer.present();
-    savePicture(this.canvas, this.about.title);
+    saveImage(this.canvas, this.about.title);
     this.fixed = null;
     if (side) this.redraw();
   }
 
-  // For programs: a picture of the canvas, as a data URL.
+  // For programs: an image of the canvas, as a data URL.
   async png() {
     await this.rest();
     this.renderer.present();

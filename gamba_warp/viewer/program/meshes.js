@@ -88,7 +88,7 @@ async function readGlb(buffer) {
 // The colours of a texture, a function (u, v) of three bytes.
 async function pixelsOf(tree, buffer, start, index) {
   const { bufferView, mimeType } = tree.images[tree.textures[index].source] || {}, part = tree.bufferViews[bufferView];
-  if (!part) throw unread("pictures in other files");
+  if (!part) throw unread("images in other files");
   const at = start + (part.byteOffset || 0), content = new Blob([buffer.slice(at, at + part.byteLength)], { type: mimeType });
   const image = await createImageBitmap(content), { width, height } = image;
   const context = new OffscreenCanvas(width, height).getContext("2d");

@@ -82,7 +82,7 @@ void main() {
   vec3 p = vec3(unpackSnorm2x16(far_words.z).y, unpackSnorm2x16(far_words.w));
   float k = 2.0 / (1.0 + dot(p, p)), w = k - 1.0, f = focal / m.z;
   vec3 q = k * p;
-  // For centres far outside the picture, the Jacobian is clamped to the margin.
+  // For centres far outside the image, the Jacobian is clamped to the margin.
   vec2 slope = clamp(m.xy / m.z, -0.65 * size / focal, 0.65 * size / focal);
   vec3 u = vec3(f, 0.0, -f * slope.x) * view, v = vec3(0.0, f, -f * slope.y) * view;
   // Into the Gaussian's own axes: the inverse rotation.
@@ -168,7 +168,7 @@ void main() {
   result = vec4(min(vec3(1.0), colour.rgb * light), 1.0);
 }`;
 
-// The picture onto the canvas, pixel by pixel. (Software browsers sometimes show black after a
+// The image onto the canvas, pixel by pixel. (Software browsers sometimes show black after a
 // blitFramebuffer onto a canvas.)
 const PRESENT_VERTEX = `${SHADER_HEAD}
 void main() {
@@ -176,8 +176,8 @@ void main() {
 }`;
 
 const PRESENT_FRAGMENT = `${SHADER_HEAD}
-uniform sampler2D picture;
+uniform sampler2D image;
 out vec4 result;
 void main() {
-  result = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
+  result = texelFetch(image, ivec2(gl_FragCoord.xy), 0);
 }`;

@@ -19,17 +19,17 @@ function dressPage(about) {
     button.hidden = !about[button.dataset.mode === "mesh" ? "faces" : "count"];
   byId("do-input").hidden = !about.input;
   const wipe = byId("wipe"), [left, right] = wipe.querySelectorAll("span"), slider = wipe.querySelector("input");
-  wipe.hidden = !about.picture && !(about.faces && about.count);
+  wipe.hidden = !about.image && !(about.faces && about.count);
   document.documentElement.classList.toggle("wipes", !wipe.hidden);
-  left.textContent = about.picture ? "Input" : "Gaussians";
+  left.textContent = about.image ? "Input" : "Gaussians";
   right.textContent = about.faces ? "Mesh" : "Gaussians";
-  Object.assign(slider, { min: about.picture ? -1 : 0, max: about.faces ? 1 : 0 });
-  if (about.picture) byId("seen").src = about.picture;
+  Object.assign(slider, { min: about.image ? -1 : 0, max: about.faces ? 1 : 0 });
+  if (about.image) byId("seen").src = about.image;
   byId("do-full").hidden = !document.fullscreenEnabled;
   document.documentElement.classList.toggle("bare", asked("controls") === "0");
 }
 
-// Shows `wipe`: to -1 the input's picture covers the left of the view, to 1 the mesh does.
+// Shows `wipe`: to -1 the input's image covers the left of the view, to 1 the mesh does.
 function showWipe(wipe) {
   const share = 100 * Math.abs(wipe), seen = byId("seen"), edge = byId("edge");
   byId("wipe").querySelector("input").value = wipe;
@@ -79,7 +79,7 @@ function toggleDialog(name) {
 
 const toggleHelp = () => toggleDialog("help");
 
-// The input's camera as an SVG path: its centre, and the rectangle of its picture.
+// The input's camera as an SVG path: its centre, and the rectangle of its image.
 function inputLines(input, camera, width, height) {
   const rows = axesOf(input.azimuth, input.elevation), half = Math.tan((input.fov * Math.PI) / 360), depth = 0.3 * input.distance;
   const eye = [0, 1, 2].map((k) => input.target[k] - input.distance * rows[2][k]);
@@ -104,7 +104,7 @@ function projectedLine(p, q, camera, width, height) {
   return `M${a}L${b}`;
 }
 
-function savePicture(canvas, name) {
+function saveImage(canvas, name) {
   canvas.toBlob((blob) => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(blob);
@@ -119,7 +119,7 @@ function startButtons(viewer) {
   const nextGround = startGround(() => viewer.redraw());
   const press = {
     home: () => viewer.goHome(), input: () => viewer.toggleInput(), theme: nextGround,
-    picture: () => toggleDialog("picture"), help: toggleHelp, full: toggleFull,
+    image: () => toggleDialog("image"), help: toggleHelp, full: toggleFull,
   };
   for (const [name, action] of Object.entries(press)) byId(`do-${name}`).onclick = action;
   const modes = [...document.querySelectorAll("[data-mode]")];

@@ -6,7 +6,7 @@ namespace gamba::raster {
 // Columns of a row, of a launch's channels: the six moments of h (eq. 11), with ABSOLUTE the two
 // sums of absolute values (eq. 14), and the colours. The first HEAD of them are in ``heads``, the
 // others in ``tails``. Without GEOMETRY only the colours are summed. Without CHANNELS only the
-// moments are, for all channels of the picture.
+// moments are, for all channels of the image.
 template<class K>
 struct Row {
     static constexpr int COLOR = K::ABSOLUTE ? 8 : 6;  // column of the first colour

@@ -1,4 +1,4 @@
-"""Gaussians that are never drawn are left out of files, and no picture changes by a bit."""
+"""Gaussians that are never drawn are left out of files, and no image changes by a bit."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def faint(count=3000):
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_pictures_keep_every_bit(mode):
+def test_images_keep_every_bit(mode):
     gaussians = faint()
     kept, said = to_be_written(gaussians)
     assert kept.num == 2000
@@ -96,8 +96,8 @@ def test_export_leaves_them_out_and_says_so(tmp_path, capsys):
             if "ply" in kind:
                 assert b"comment from a chair by tiny.safetensors\n" in (out / name).read_bytes()
     # Formats of 8 bits round other opacities up to 1/255.
-    pictures = [
+    images = [
         turntable_frames(read_gaussians(out / "a.ply"), size=48, frames=3) for out in (few, all_)
     ]
-    assert np.array_equal(*pictures)
+    assert np.array_equal(*images)
     assert load_ply(few / "a.ply").num == 2000

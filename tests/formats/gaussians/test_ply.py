@@ -76,7 +76,7 @@ def test_files_of_other_programs_are_read(tmp_path):
 
 
 def test_colours_out_of_range_are_kept_and_cut_below_0_alone(tmp_path):
-    """A picture of half an opacity has half the light of a colour over 1."""
+    """An image of half an opacity has half the light of a colour over 1."""
     colors = torch.tensor([[1.5, 0.5, -0.4]])
     one = Gaussians(torch.zeros(1, 3), None, torch.ones(1, 3), torch.full((1,), 0.5), colors)
     save_ply(tmp_path / "a.ply", one)
@@ -201,7 +201,7 @@ def test_extremes_stay_finite(tmp_path):
 GOOD = np.ones((2, 14), "<f4").tobytes()
 BAD_FILES = {
     "empty": (b"", "not a .ply"),
-    "picture": (b"\x89PNG\r\n\x1a\n" + bytes(50), "not a .ply"),
+    "image": (b"\x89PNG\r\n\x1a\n" + bytes(50), "not a .ply"),
     "no end": (b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n", "has no end"),
     "endless": (b"ply\n" + b"comment x\n" * 10000 + b"end_header\n", "has no end"),
     "no format": (["element vertex 2", "property float x"], "format is none"),

@@ -15,7 +15,7 @@ ELEVATION = {number: 20.0 for number in range(25)} | {25: 89.9, 26: -89.9}
 ELEVATION |= {number: 2.0 for number in range(27, 40)}
 SIZE = 32  # those of the set have 512
 FOV = 2 * math.atan(0.5 * 1024 / 1422.222)
-# Unused files beside a view's picture and camera.
+# Unused files beside a view's image and camera.
 OTHERS = ("_albedo.png", "_hdr.exr", "_mr.png", "_nd.exr", "_ng.exr")
 
 
@@ -50,9 +50,9 @@ def files_of(number: int) -> dict[str, bytes]:
     values["bbox"] = [[-0.5, -0.31, -0.5], [0.5, 0.31, 0.5]]
     pixels = np.zeros((SIZE, SIZE, 4), np.uint8)
     pixels[8:24, 8:24] = (200, number, 50, 255)
-    picture = bytes_of(Image.fromarray(pixels))
+    image = bytes_of(Image.fromarray(pixels))
     others = {suffix: b"not read" for suffix in OTHERS}
-    return {".json": json.dumps(values).encode(), ".png": picture, **others}
+    return {".json": json.dumps(values).encode(), ".png": image, **others}
 
 
 def write_object(folder: Path, views: int = VIEWS) -> None:

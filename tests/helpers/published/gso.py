@@ -62,7 +62,7 @@ def obj() -> str:
 
 
 def texture() -> bytes:
-    """A picture, red on the left and blue on the right."""
+    """An image, red on the left and blue on the right."""
     pixels = np.zeros((8, 8, 3), np.uint8)
     pixels[:, :4, 0] = pixels[:, 4:, 2] = 255
     return bytes_of(Image.fromarray(pixels))
@@ -77,7 +77,7 @@ def files() -> dict[str, bytes]:
         "meshes/model.obj": obj().encode(),
         "meshes/model.mtl": MTL.encode(),
         "materials/textures/texture.png": texture(),
-        **{f"thumbnails/{number}.jpg": b"a picture" for number in range(5)},
+        **{f"thumbnails/{number}.jpg": b"an image" for number in range(5)},
     }
 
 

@@ -42,7 +42,7 @@ def _linear(layer: torch.nn.Linear, x: torch.Tensor) -> torch.Tensor:
 
 
 def _plain_block(block, tokens, prefix):
-    """Plain form of a transformer block, head by head and picture by picture."""
+    """Plain form of a transformer block, head by head and image by image."""
     found = []
     for sequence, before in zip(tokens, prefix):
         whole = _norm(block.norm, torch.cat([before, sequence]))
@@ -97,13 +97,13 @@ def test_every_token_sees_every_other_and_is_not_cut_into_segments(monkeypatch):
     assert (moved > 1e-5).all()
 
 
-def test_pictures_of_a_row_do_not_see_each_other():
+def test_images_of_a_row_do_not_see_each_other():
     blocks, tokens = make_blocks(2, 7, 0), torch.randn(1, 14, 24)
     cuts = torch.tensor([0, 5, 14, 14])
     states = prefix_states(blocks, torch.randn(3, 1, 7), None)
     got = run_blocks(blocks, tokens, states, packed=Packed.of(cuts))
-    for picture, (i, j) in enumerate(zip(cuts, cuts[1:])):
-        own = slice(picture, picture + 1)
+    for image, (i, j) in enumerate(zip(cuts, cuts[1:])):
+        own = slice(image, image + 1)
         given = [state._make(x[own] for x in state) for state in states]
         torch.testing.assert_close(got[:, i:j], run_blocks(blocks, tokens[:, i:j], given))
     nothing = run_blocks(make_blocks(2, 0, 0), tokens, [None, None], packed=Packed.of(cuts))
@@ -111,7 +111,7 @@ def test_pictures_of_a_row_do_not_see_each_other():
 
 
 @pytest.mark.parametrize("gradients", [True, False])
-def test_a_batch_on_rays_is_each_picture_alone(gradients):
+def test_a_batch_on_rays_is_each_image_alone(gradients):
     changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
     model = Gamba(micro(mixer="attention", attention_heads=2, encoder="none", **changes))
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)

@@ -27,7 +27,7 @@ def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
 
 
 def plain(blocks, tokens, camera, image):
-    """Plain form: picture by picture, with each token inserted into a list."""
+    """Plain form: image by image, with each token inserted into a list."""
     for block in blocks:
         pairs = ((block.project_camera, camera), (block.project_image, image))
         extra = torch.cat([project(x) for project, x in pairs if x is not None], 1)
@@ -76,7 +76,7 @@ def test_a_token_is_seen_by_those_behind_it_alone(monkeypatch):
     assert (moved[0, :6] == 0).all() and (moved[0, 6:].abs().amax(-1) > 1e-5).all()
 
 
-def test_a_batch_on_rays_is_each_picture_alone():
+def test_a_batch_on_rays_is_each_image_alone():
     changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
     model = Gamba(micro(image_tokens="mixed", **changes), "random")
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)

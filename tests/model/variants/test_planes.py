@@ -37,8 +37,8 @@ def test_points_are_looked_up_between_four_cells():
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 0.8, 1.0], dtype=torch.float64)] * 3)
     points = torch.cat([points, corners.expand(2, -1, -1)], 1)
     got = query_planes(planes, points)
-    for picture in range(2):
-        torch.testing.assert_close(got[picture], looked_up(planes[picture], points[picture]))
+    for image in range(2):
+        torch.testing.assert_close(got[image], looked_up(planes[image], points[image]))
     # The corner itself has the outermost cell's features, and so have points beyond it.
     torch.testing.assert_close(got[0, 40, :4], planes[0, 0, :, 0, 0])
     far = query_planes(planes, torch.full((2, 1, 3), 7.0, dtype=torch.float64))
@@ -64,15 +64,15 @@ def test_colours_are_an_mlp_of_what_the_positions_find(changes):
     decoder, tokens, planes = decoded(**changes)
     made = decoder(tokens, planes)
     p = {name: value.double() for name, value in decoder.state_dict().items()}
-    for picture in range(2):
-        points = made.means[picture].detach().double() / decoder.config.position_range
-        hidden = looked_up(planes[picture].double(), points)
+    for image in range(2):
+        points = made.means[image].detach().double() / decoder.config.position_range
+        hidden = looked_up(planes[image].double(), points)
         for layer in (0, 2):
             hidden = hidden @ p[f"plane_mlp.{layer}.weight"].T + p[f"plane_mlp.{layer}.bias"]
             hidden = hidden / (1 + torch.exp(-hidden))
         logits = hidden @ p["plane_color.weight"].T + p["plane_color.bias"]
         # Float32 against float64.
-        assert_rel_rms(made.colors[picture], 1 / (1 + torch.exp(-logits)), 2e-6, "colours")
+        assert_rel_rms(made.colors[image], 1 / (1 + torch.exp(-logits)), 2e-6, "colours")
 
 
 def test_other_attributes_are_those_of_the_paper_s_decoder():

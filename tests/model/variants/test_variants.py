@@ -110,8 +110,8 @@ def test_files_hold_the_bits(tmp_path, changes, weights):
     loaded = load_model(path, encoder_weights="random" if frozen else None)
     assert loaded.config == model.config and not loaded.training
     size = model.config.image_size
-    picture = torch.rand(size, size, 4).numpy()
-    want, got = reconstruct(model, picture), reconstruct(loaded, picture)
+    image = torch.rand(size, size, 4).numpy()
+    want, got = reconstruct(model, image), reconstruct(loaded, image)
     for name in FIELDS:
         assert torch.equal(getattr(got, name), getattr(want, name)), name
         assert getattr(got, name).isfinite().all()

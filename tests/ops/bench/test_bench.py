@@ -337,7 +337,7 @@ def test_cuda_has_its_own_cases():
 
 
 def test_every_preset_can_be_measured_without_its_encoder():
-    """``one picture`` at the normal level takes all of them; "released" prepends no camera."""
+    """``one image`` at the normal level takes all of them; "released" prepends no camera."""
     for name, config in PRESETS.items():
         made = models.without_encoder(config)
         assert made.encoder == "none" and made.num_gaussians == config.num_gaussians, name

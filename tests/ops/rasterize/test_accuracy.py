@@ -1,7 +1,7 @@
 """The rasterizer at realistic size against the float64 oracle: row by row, and pixels at the cuts.
 
 Image and gradient are compared pixel by pixel and Gaussian by Gaussian, with both cuts on. Where
-float32 decides a cut otherwise than float64 the picture jumps: such pixels are counted, bounded,
+float32 decides a cut otherwise than float64 the image jumps: such pixels are counted, bounded,
 and each must lie within rounding of a cut.
 """
 
@@ -34,7 +34,7 @@ def flat():
 
 
 def wide():
-    """Most Gaussians beside the picture or behind the camera, the Jacobian clamped for many."""
+    """Most Gaussians beside the image or behind the camera, the Jacobian clamped for many."""
     scene = ordinary(size=0.1)
     scene["means"] = scene["means"] * 4
     scene["Ks"][..., 0, 0] *= 0.3
@@ -107,10 +107,10 @@ def test_oracle_by_finite_differences(one_thread, antialiased, focal):
     K = scene["Ks"][0, 0].clone()
     K[0, 0] = focal * 7
 
-    def picture(means, quats, scales, opacities, colors, viewmat):
+    def image(means, quats, scales, opacities, colors, viewmat):
         inputs = (means, quats, scales, opacities, colors, viewmat, K, 7, 5)
         parts = reference.render_view(*inputs, alpha_min=1e-12, antialiased=antialiased)
         return torch.cat(parts, -1)
 
-    assert picture(*tensors)[..., -1].mean() > 0.2
-    assert torch.autograd.gradcheck(picture, tensors, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert image(*tensors)[..., -1].mean() > 0.2
+    assert torch.autograd.gradcheck(image, tensors, eps=1e-6, atol=1e-6, rtol=1e-5)

@@ -15,7 +15,7 @@ from gamba_warp.kernels.rasterize.cuda import capacity
 
 
 def render(scene, mode="RGB", **options):
-    """Pictures, gradients and depth quantiles by name, and meta."""
+    """Images, gradients and depth quantiles by name, and meta."""
     g = torch.Generator().manual_seed(5)
     tensors = leaves(scene, torch.float32)
     renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers.raster import NAMES, PICTURE, leaves, make, mapped
+from helpers.raster import IMAGE, NAMES, leaves, make, mapped
 from helpers.raster_accuracy import assert_gradients, both
 
 from gamba_warp.kernels.rasterize import rasterization
@@ -83,7 +83,7 @@ def test_length_of_quaternions(length):
     scene["quats"] = scene["quats"] * length
     renders, _, grads, _ = survives(scene)
     assert (grads["quats"] == 0).all() == (length == 0)
-    assert ((renders[..., :3] - want).abs().max() < PICTURE) == (length > 0)
+    assert ((renders[..., :3] - want).abs().max() < IMAGE) == (length > 0)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-9, 1e-3, 1.0, 1e3, 1e6, 1e12, 1e30])

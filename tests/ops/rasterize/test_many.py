@@ -50,7 +50,7 @@ def assert_lists(monkeypatch, scene, **options):
 
 @pytest.mark.parametrize("size", [0.004, 0.03, 0.5])  # from a pixel to most rows of tiles
 @pytest.mark.parametrize("shape", [(33, 41), (300, 17), (19, 600)])
-def test_same_lists_pictures_and_gradients(monkeypatch, size, shape):
+def test_same_lists_images_and_gradients(monkeypatch, size, shape):
     scene = make(2, 2, 333, *shape, size=size)
     scene["opacities"][0, :50] = 1e-3  # culled
     scene["means"][1, :50, 2] = torch.nan
@@ -62,7 +62,7 @@ def test_same_with_options(monkeypatch, options):
     assert_lists(monkeypatch, make(1, 2, 200, 50, 70), **options)
 
 
-def test_lists_of_a_wide_picture():
+def test_lists_of_a_wide_image():
     """CUDA keeps columns in 16 bits where they have room, and finds them again elsewhere."""
     num, width, height = 60, (1 << 19) + 100, 200
     sides = torch.tensor([3e5, 60.0]) * torch.rand(1, num, 2)  # of the box, at alpha_min
@@ -223,7 +223,7 @@ def test_sums_of_rows(monkeypatch, channels):
 def test_gradient_of_the_projection_on_lanes(monkeypatch, rotated, unused, mode):
     """To the bit that on threads, also by viewmats."""
     scene = make(2, 3, 331, 45, 60, size=0.03)
-    scene["means"][0, :40] *= 6  # beside the picture, where the slopes are clamped, or behind
+    scene["means"][0, :40] *= 6  # beside the image, where the slopes are clamped, or behind
     scene["means"][1, :9, 0] = torch.nan
     scene["quats"][0, 50:60] = 0
     scene["quats"][1, 50:90] *= 1e20

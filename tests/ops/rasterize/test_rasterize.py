@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.raster import GRADIENT, NAMES, PICTURE, compare, leaves, make, near_a_cut
+from helpers.raster import GRADIENT, IMAGE, NAMES, compare, leaves, make, near_a_cut
 
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_from_harmonics
@@ -75,8 +75,8 @@ def test_without_rotation():
     identity = dict(scene, quats=torch.tensor([1.0, 0, 0, 0]).expand(2, 60, 4).contiguous())
     none = dict(scene, quats=None)
     compare(none)
-    pictures = [rasterization(**s)[0] for s in (identity, none)]
-    assert torch.equal(*pictures)
+    images = [rasterization(**s)[0] for s in (identity, none)]
+    assert torch.equal(*images)
 
 
 def test_zero_quaternion_is_no_rotation():
@@ -98,7 +98,7 @@ def test_harmonics(degree=2):
     flat = colors_from_harmonics(degree, want["colors"], want["means"], want["viewmats"])
     expected, _, _ = rasterization_reference(**dict(want, colors=flat))
     keep = ~near_a_cut(dict(scene, colors=flat.detach().float()), {})[..., None]
-    assert ((renders - expected) * keep).abs().max() <= PICTURE * expected.max()
+    assert ((renders - expected) * keep).abs().max() <= IMAGE * expected.max()
     v = torch.randn_like(renders) * keep
     (renders * v).sum().backward()
     (expected * v).sum().backward()

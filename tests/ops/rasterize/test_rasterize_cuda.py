@@ -25,7 +25,7 @@ SAME = 2e-6  # the two sum in another order
 
 
 def upstream(channels=3):
-    """Gradients of two pictures of 37 x 21 and of their alphas."""
+    """Gradients of two images of 37 x 21 and of their alphas."""
     return torch.randn(1, 2, 21, 37, channels), torch.randn(1, 2, 21, 37, 1)
 
 
@@ -37,7 +37,7 @@ def assert_same(got, want):
 
 
 def run(scene, v_renders, v_alphas, mode="RGB", needs=None, **options):
-    """Pictures and gradients by name, and counts; only ``needs`` get gradients, or all."""
+    """Images and gradients by name, and counts; only ``needs`` get gradients, or all."""
     tensors = leaves(scene, torch.float32)
     for name, value in tensors.items():
         if needs is not None and isinstance(value, torch.Tensor) and name not in needs:
@@ -80,7 +80,7 @@ def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
     blocks, block_counts = run(scene, v_renders, v_alphas, mode)
     assert lanes["alphas"].mean() > 0.3
     assert_same(blocks, lanes)
-    # the CPU counts blocks of which only pixels outside the picture are covered
+    # the CPU counts blocks of which only pixels outside the image are covered
     used, lanes_used = block_counts.pop("blocks_used"), lane_counts.pop("blocks_used")
     assert 0.99 * lanes_used <= used <= lanes_used
     # a sub-tile is two blocks
@@ -171,7 +171,7 @@ def test_without_dilation(on_cuda):
 
 
 def test_a_first_gaussian_may_stop_a_pixel(on_cuda):
-    """Then its transmittance is still 1, as that of no pixel outside the picture may be."""
+    """Then its transmittance is still 1, as that of no pixel outside the image may be."""
     scene = make(1, 1, num=40, width=21, height=19, channels=3, size=60.0)
     scene["opacities"][:] = 0.999999
     options = dict(alpha_max=0.999999)
@@ -195,7 +195,7 @@ def test_a_gradient_of_nan_is_not_zero(on_cuda):
 
 
 def test_two_runs_and_any_parts(on_cuda):
-    """The same bits twice; pictures do not depend on the parts, gradients by rounding only."""
+    """The same bits twice; images do not depend on the parts, gradients by rounding only."""
     scene = crowded(3)
     v_renders, v_alphas = upstream()
     results = []

@@ -1,4 +1,4 @@
-"""Every skip of the rasterizer, on and off: the same picture, the same gradients, its own count."""
+"""Every skip of the rasterizer, on and off: the same image, the same gradients, its own count."""
 
 from dataclasses import fields, replace
 
@@ -33,7 +33,7 @@ def render(skip=None, wanted=LEAVES, mode="classic"):
     v, w = torch.randn_like(renders), torch.randn_like(alphas)
     v[:, :, 64:] = w[:, :, 64:] = 0
     gradients = torch.autograd.grad([renders, alphas], [inputs[k] for k in wanted], [v, w])
-    return dict(zip(("picture", "alpha", *wanted), (renders, alphas, *gradients))), meta
+    return dict(zip(("image", "alpha", *wanted), (renders, alphas, *gradients))), meta
 
 
 def close(got, want):
@@ -54,7 +54,7 @@ def test_default_is_every_skip():
 @pytest.mark.parametrize("name", [*NAMES, "all of them"])
 def test_same_with_and_without(name, mode):
     want, counts = render(mode=mode)
-    assert want["picture"].mean() > 0.1 and counts["tiles_empty"] > 5
+    assert want["image"].mean() > 0.1 and counts["tiles_empty"] > 5
     off = {name: False} if name in NAMES else dict.fromkeys(NAMES, False)
     got, _ = render(replace(Skip(), **off), mode=mode)
     errors = close(got, want)

@@ -24,7 +24,7 @@ def calls():
     viewmats, Ks = torch.eye(4)[None], torch.tensor([[[9.0, 0, 8], [0, 9, 6], [0, 0, 1]]])
     rest = torch.randn(3, 4), torch.rand(3, 3), torch.rand(3)
     means, colors = torch.rand(3, 3) + 1, torch.rand(3, 3)
-    picture = torch.rand(1, 16, 16, 3)
+    image = torch.rand(1, 16, 16, 3)
 
     def drawn(means, colors):
         return rasterization(means, *rest, colors, viewmats, Ks, 16, 12)[0]
@@ -41,7 +41,7 @@ def calls():
             lambda c: colors_seen_from(1, c, means[None], torch.zeros(1, 1, 3)),
             torch.randn(1, 3, 4, 3),
         ),
-        "structure": (lambda got: structure(got, picture), torch.rand(1, 16, 16, 3)),
+        "structure": (lambda got: structure(got, image), torch.rand(1, 16, 16, 3)),
     }  # fmt: skip
 
 

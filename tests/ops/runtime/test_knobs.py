@@ -54,7 +54,7 @@ def results(of):
 
 @pytest.mark.parametrize("t_min", [0.3, 1e-2, 1e-30])
 def test_the_limit_of_transmittance(t_min):
-    """Against the oracle with the same limit; the default's picture is another one."""
+    """Against the oracle with the same limit; the default's image is another one."""
     made = scene(t_min=t_min)
     got, _ = results(made)
     x = {k: v.double() for k, v in made.inputs.items() if k != "pixels"}
@@ -82,8 +82,8 @@ def model():
     return Gamba(config).eval()
 
 
-def pictures(*squares):
-    """White pictures with a grey pixel each, at row and column."""
+def images(*squares):
+    """White images with a grey pixel each, at row and column."""
     images = torch.ones(len(squares), 32, 32, 3)
     for image, (y, x) in zip(images, squares):
         image[y, x] = 0.9
@@ -94,21 +94,21 @@ def pictures(*squares):
 
 @torch.no_grad()
 def test_background_tokens_are_dropped(model):
-    full = model(*pictures((5, 9)))
+    full = model(*images((5, 9)))
     assert full.means.shape == (1, 4 * 64, 3)
     for margin, patches in ((0, 1), (1, 9), (2, 4 * 5), (100, 64)):  # row 1, column 2 of 8 x 8
-        made = model(*pictures((5, 9)), background_margin=margin)
+        made = model(*images((5, 9)), background_margin=margin)
         assert made.means.shape == (1, 4 * patches, 3)
     assert torch.equal(made.means, full.means) and torch.equal(made.scales, full.scales)
-    kept = model.tokens.foreground(pictures((5, 9))[0], 1.0, 0)
+    kept = model.tokens.foreground(images((5, 9))[0], 1.0, 0)
     first = 1 * 8 + 2, 64 + 2 * 8 + 1  # by rows, then by columns; then each backward
     assert kept.tolist() == [first[0], first[1], 191 - first[0], 255 - (first[1] - 64)]
 
 
 @torch.no_grad()
-def test_a_token_is_kept_if_any_picture_of_the_batch_needs_it(model):
-    images, cameras = pictures((5, 9), (30, 30))
-    assert model(images, cameras, background_margin=0).means.shape == (2, 8, 3)
-    assert model(torch.ones_like(images), cameras, background_margin=3).means.shape == (2, 0, 3)
+def test_a_token_is_kept_if_any_image_of_the_batch_needs_it(model):
+    both, cameras = images((5, 9), (30, 30))
+    assert model(both, cameras, background_margin=0).means.shape == (2, 8, 3)
+    assert model(torch.ones_like(both), cameras, background_margin=3).means.shape == (2, 0, 3)
     with pytest.raises(ValueError, match="background_margin is -1"):
-        model(images, cameras, background_margin=-1)
+        model(both, cameras, background_margin=-1)

@@ -120,7 +120,7 @@ def _scan(x):
     return selective_scan_fn(x.transpose(1, 2), x.detach().abs().transpose(1, 2), A, B, B)
 
 
-def _picture(x):
+def _image(x):
     means = torch.tensor([[0.0, 0, 0], [0.3, 0.2, 0.1]])
     colors = x[0, :2, :5]
     camera = torch.eye(4).index_put((torch.tensor(2), torch.tensor(3)), torch.tensor(3.0))[None]
@@ -129,7 +129,7 @@ def _picture(x):
     return rasterization(means, None, scales, opacities, colors, camera, K, 512, 512)[0]
 
 
-@pytest.mark.parametrize("call", [_convolution, _scan, _picture])
+@pytest.mark.parametrize("call", [_convolution, _scan, _image])
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_large_result_can_be_changed_in_place(call, compiled):
     """With torch's own results it can; autograd refuses it of a view that an operator made."""

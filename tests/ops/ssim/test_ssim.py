@@ -11,7 +11,7 @@ from gamba_warp.kernels.ssim.reference import dissimilarity_reference
 every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 
 
-def pictures(shape, seed=0):
+def images(shape, seed=0):
     """Noise within a frame of white, and a smoother, noisier copy."""
     g = torch.Generator().manual_seed(seed)
     want = torch.ones(shape)
@@ -32,7 +32,7 @@ def truth(got, want):
 @pytest.mark.parametrize("together", [1, 1 << 20])
 def test_value_and_gradient_are_those_of_the_definition(monkeypatch, shape, together):
     monkeypatch.setattr(lanes, "_TOGETHER", together)
-    got, want = pictures(shape)
+    got, want = images(shape)
     value, slope = dissimilarity(got, want, True)
     wanted, gradient = truth(got, want)
     torch.testing.assert_close(value.double(), wanted, rtol=0, atol=1e-6)
@@ -46,9 +46,9 @@ def test_value_and_gradient_are_those_of_the_definition(monkeypatch, shape, toge
 @pytest.mark.parametrize("together", [1, 2 * 37 * 75 * 2, 1 << 20])
 @pytest.mark.parametrize("shape", [(1, 11, 11, 1), (3, 11, 43, 3), (5, 37, 75, 2)])
 def test_products_in_float64(monkeypatch, shape, together):
-    """Pictures of up to three tiles of columns, one at a time, two and all together."""
+    """Images of up to three tiles of columns, one at a time, two and all together."""
     monkeypatch.setattr(products, "_TOGETHER", together)
-    got, want = (x.double() for x in pictures(shape))
+    got, want = (x.double() for x in images(shape))
     value, slope = dissimilarity(got, want, True)
     wanted, gradient = truth(got, want)
     torch.testing.assert_close(value, wanted, rtol=0, atol=1e-13)
@@ -57,7 +57,7 @@ def test_products_in_float64(monkeypatch, shape, together):
     assert dissimilarity(got, want, False)[1] is None
 
 
-def test_flat_pictures_keep_their_digits():
+def test_flat_images_keep_their_digits():
     """A variance is the difference of two means; without the corner's colour it would be noise."""
     g = torch.Generator().manual_seed(2)
     want = torch.full((1, 24, 24, 3), 0.9)
@@ -84,21 +84,21 @@ def test_one_differing_pixel_is_found_anywhere(place, dtype):
 
 
 def test_threads_and_runs_change_no_bit():
-    got, want = pictures((6, 40, 50, 3))
+    got, want = images((6, 40, 50, 3))
     assert_same_on_threads(lambda: dissimilarity(got, want, True), 1, 2, 3, 1)
 
 
 @every_dtype
-def test_nan_stays_in_its_picture(dtype):
-    got, want = (x.to(dtype) for x in pictures((3, 20, 20, 3)))
+def test_nan_stays_in_its_image(dtype):
+    got, want = (x.to(dtype) for x in images((3, 20, 20, 3)))
     got[1, 5, 5] = torch.nan
     value, slope = dissimilarity(got, want, True)
     assert value[1].isnan() and value[[0, 2]].isfinite().all()
     assert slope[1].isnan().any() and slope[[0, 2]].isfinite().all()
 
 
-def test_none_and_equal_pictures():
-    got, want = pictures((2, 12, 12, 3))
+def test_none_and_equal_images():
+    got, want = images((2, 12, 12, 3))
     value, slope = dissimilarity(want, want, True)
     assert value.eq(0).all() and slope.eq(0).all()
     value, slope = dissimilarity(got[:0], want[:0], True)
@@ -115,6 +115,6 @@ def test_none_and_equal_pictures():
         (torch.ones(1, 11, 11, 3).int(), torch.ones(1, 11, 11, 3).int(), TypeError),
     ],
 )
-def test_bad_pictures_are_refused_by_name(got, want, error):
+def test_bad_images_are_refused_by_name(got, want, error):
     with pytest.raises(error, match="got|want"):
         dissimilarity(got, want, False)

@@ -125,15 +125,15 @@ def test_raster_oracle_is_the_reference(antialiased):
     ))  # fmt: skip
     x = raster.build(case, CPU)
     leaves = {k: t.double().detach().requires_grad_(k != "Ks") for k, t in x.items()}
-    samples, picture = raster.truth(case, x)
-    renders, alphas = picture.blended.split([4, 1], -1)
+    samples, image = raster.truth(case, x)
+    renders, alphas = image.blended.split([4, 1], -1)
     color, depth, alpha = rasterization_reference(
         **leaves, width=13, height=9, antialiased=antialiased
     )
     want = torch.cat([color, depth], -1)
     assert_rel_rms(renders[0], want, 1e-12, "renders")
     assert_rel_rms(alphas[0], alpha, 1e-12, "alphas")
-    assert alphas[0].mean() > 0.1 and picture.undecided.double().mean() < 0.02
+    assert alphas[0].mean() > 0.1 and image.undecided.double().mean() < 0.02
     v, v_alpha = torch.randn_like(want), torch.randn_like(alpha)
     del leaves["Ks"]
     total = (renders * v).sum() + (alphas * v_alpha).sum()
@@ -145,7 +145,7 @@ def test_raster_oracle_is_the_reference(antialiased):
         assert 1e-8 < spread < 1e-4, f"{name}: the samples are {spread:.1e} off"
 
 
-def test_an_error_of_the_picture_is_caught_and_a_flip_is_not(monkeypatch):
+def test_an_error_of_the_image_is_caught_and_a_flip_is_not(monkeypatch):
     """A thousandth more of one Gaussian's colour fails; a cut moved within rounding passes."""
     right = raster.rasterization
     case = RandomCase("raster", "uniform", 1, raster.OP.plain | dict(

@@ -46,7 +46,7 @@ class Look:
 
 
 def material(pixels: np.ndarray) -> Material:
-    """A material with a picture ``[h, w, 3]`` uint8."""
+    """A material with an image ``[h, w, 3]`` uint8."""
     full = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     full[..., :3] = pixels
     return Material(np.ones(4, np.float32), full)
@@ -103,8 +103,8 @@ class Maker:
         name = self.pick(*patterns.split())
         first = self.color(kinds)
         second = self.color() if self.chance(contrast) else first * self.u(0.45, 0.85)
-        picture = textures.mixed(textures.PATTERNS[name](self.rng), first, second)
-        return self.add(Look(material(picture), repeats=self.u(0.8, 2.5)))
+        image = textures.mixed(textures.PATTERNS[name](self.rng), first, second)
+        return self.add(Look(material(image), repeats=self.u(0.8, 2.5)))
 
     def surface(self, kinds: str = "any") -> int:
         """A look for anything: mostly one colour, sometimes a pattern."""

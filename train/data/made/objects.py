@@ -88,9 +88,9 @@ def _glb(mesh: TexturedMesh) -> bytes:
             vertex_normals=mesh.normals[mine].reshape(-1, 3),
             process=False,
         )
-        picture = None if look.texture is None else Image.fromarray(look.texture[..., :3])
+        image = None if look.texture is None else Image.fromarray(look.texture[..., :3])
         factor = np.rint(255 * look.color).astype(np.uint8)
-        surface = PBRMaterial(baseColorTexture=picture, baseColorFactor=factor, metallicFactor=0.0)
+        surface = PBRMaterial(baseColorTexture=image, baseColorFactor=factor, metallicFactor=0.0)
         part.visual = TextureVisuals(uv=mesh.uvs[mine].reshape(-1, 2), material=surface)
         scene.add_geometry(part)
     return export_glb(scene)

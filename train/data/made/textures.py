@@ -1,7 +1,7 @@
 """Procedural textures: patterns of materials, and printed matter with letter-like marks.
 
 A pattern is a mix ``[SIDE, SIDE]`` in [0, 1] of two colours, and repeats without a seam. Printed
-matter is a whole picture ``[PRINT, PRINT, 3]``. Colours are display values in [0, 1].
+matter is a whole image ``[PRINT, PRINT, 3]``. Colours are display values in [0, 1].
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def color(rng: np.random.Generator, kind: str = "any") -> np.ndarray:
 
 
 def mixed(mix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Mix two colours to a picture ``[h, w, 3]`` uint8."""
+    """Mix two colours to an image ``[h, w, 3]`` uint8."""
     m = mix[..., None]
     return np.rint(255 * np.clip(first * (1 - m) + second * m, 0, 1)).astype(np.uint8)
 
@@ -133,7 +133,7 @@ def _polygon(points: np.ndarray) -> list[tuple[float, ...]]:
 
 
 def _photo(rng: np.random.Generator) -> Image.Image:
-    """A picture like a photograph: a soft ground, and shaded things before it."""
+    """An image like a photograph: a soft ground, and shaded things before it."""
     pixels = mixed(noise(rng, (1, 5), side=64), color(rng), color(rng))
     part = Image.fromarray(pixels)
     draw = ImageDraw.Draw(part)

@@ -1,13 +1,13 @@
-"""Reading and writing pictures rendered by any method, matched with the true views.
+"""Reading and writing images rendered by any method, matched with the true views.
 
 Format (for users in docs/evaluate.md): one folder for each object, named as in the dataset,
-with pictures,
+with images,
 
-- with a ``transforms.json``: a picture belongs to the true view with the same camera;
-- without one: a picture belongs to the true view whose file has the same stem, or, if no stem
+- with a ``transforms.json``: an image belongs to the true view with the same camera;
+- without one: an image belongs to the true view whose file has the same stem, or, if no stem
   matches, to the view of that number.
 
-Pictures are not moved, rotated or cropped.
+Images are not moved, rotated or cropped.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from torch import Tensor
 
 from gamba_warp.conventions import WHITE, over_another
 from gamba_warp.data.dataset import ViewDataset
-from gamba_warp.data.layouts import LAYOUTS, PICTURES, ObjectFiles
+from gamba_warp.data.layouts import IMAGES, LAYOUTS, ObjectFiles
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256_of_all, visible
-from gamba_warp.images import load_rgba8, open_picture, save_image
+from gamba_warp.images import load_rgba8, open_image, save_image
 
 from .compare import Shown, Truth, shown
 
 TRANSFORMS = "transforms.json"
-CAMERA = 1e-3  # radians; share of the camera's distance; share of the picture's side
+CAMERA = 1e-3  # radians; share of the camera's distance; share of the image's side
 FLAT = 8 / 255  # tolerance of a white background, and of a flat one
 _MAX_NAMED = 5  # views named in a message
 MEANING = (
-    f"files of 8 bits; a picture at a camera of its own belongs to the true view whose camera is "
+    f"files of 8 bits; an image at a camera of its own belongs to the true view whose camera is "
     f"turned by at most {CAMERA:g} radians against it, moved by at most {CAMERA:g} of its distance "
-    f"and has focal lengths and centre within {CAMERA:g} of the picture's side; any other one to "
-    f"the view of its name or number; alpha of the file, none where all pictures of an object are "
+    f"and has focal lengths and centre within {CAMERA:g} of the image's side; any other one to "
+    f"the view of its name or number; alpha of the file, none where all images of an object are "
     f"opaque"
 )
 
 
 @dataclass
-class Pictures:
-    """Pictures under test of one object.
+class Images:
+    """Images under test of one object.
 
     Attributes:
-        shown: the pictures.
-        has_input: True if view 0 has a picture; else it is white.
+        shown: the images.
+        has_input: True if view 0 has an image; else it is white.
         record: details of the matching, for the object's record.
     """
 
@@ -59,45 +59,45 @@ class Pictures:
     record: dict[str, Any] = field(default_factory=dict)
 
 
-class PicturePredictions:
-    """A folder with a folder of pictures for each object.
+class ImagePredictions:
+    """A folder with a folder of images for each object.
 
     Attributes:
         distance: of the input camera; only the unit of the report's cameras.
-        source: kind, name, and the SHA-256 of the names and SHA-256s of all pictures and cameras.
+        source: kind, name, and the SHA-256 of the names and SHA-256s of all images and cameras.
     """
 
     def __init__(self, folder: Path, distance: float, device: str, resize: bool = False) -> None:
-        """Open the folder, without decoding pictures.
+        """Open the folder, without decoding images.
 
         Args:
             folder: the folder.
             distance: as the attribute.
             device: torch device of the results.
-            resize: resize pictures to the size of the true ones.
+            resize: resize images to the size of the true ones.
         """
         self.folder, self.distance, self.device, self.resize = folder, distance, device, resize
-        files = (p for p in visible(folder, "*") if _is_picture(p) or p.name == TRANSFORMS)
+        files = (p for p in visible(folder, "*") if _is_image(p) or p.name == TRANSFORMS)
         content = sha256_of_all(files, folder)
-        self.source = {"kind": "pictures", "path": folder.name, "sha256": content}
+        self.source = {"kind": "images", "path": folder.name, "sha256": content}
 
     def check(self, uids: Sequence[str]) -> None:
         """Raise UserError if no object has a folder, before any work."""
         if not any((self.folder / uid).is_dir() for uid in uids):
             raise UserError(
-                f"{self.folder}: has no folder of pictures for any of the {len(uids)} objects; "
+                f"{self.folder}: has no folder of images for any of the {len(uids)} objects; "
                 f"the first would be {self.folder / uids[0]}"
             )
 
-    def pictures(self, dataset: ViewDataset, truth: Truth) -> Pictures:
-        """Read the pictures of one object.
+    def images(self, dataset: ViewDataset, truth: Truth) -> Images:
+        """Read the images of one object.
 
         Args:
             dataset: that the object belongs to.
-            truth: the views to compare with; all but the input (the first) must have a picture.
+            truth: the views to compare with; all but the input (the first) must have an image.
 
         Raises:
-            UserError: the folder is missing, a view lacks its picture or has two, or a picture
+            UserError: the folder is missing, a view lacks its image or has two, or an image
                 cannot be read, has another size, or a background that is not white.
         """
         folder = self.folder / truth.uid
@@ -116,11 +116,11 @@ class PicturePredictions:
         alphas, resized = {}, 0
         for row, view in enumerate(views):
             if view in found:
-                with open_picture(found[view]) as image:
-                    alphas[view] = image.has_transparency_data
-                picture = load_rgba8(found[view])
-                fitted = self._resized(found[view], picture, truth, files, view)
-                resized += fitted is not picture
+                with open_image(found[view]) as file:
+                    alphas[view] = file.has_transparency_data
+                image = load_rgba8(found[view])
+                fitted = self._resized(found[view], image, truth, files, view)
+                resized += fitted is not image
                 rgba[row] = torch.from_numpy(fitted.astype(np.float32) / 255)
         if len(set(alphas.values())) > 1:
             odd = next(view for view, alpha in alphas.items() if not alpha)
@@ -130,47 +130,47 @@ class PicturePredictions:
             _check_white(folder, rgba[..., :3], truth, there)
         unused = given - len(found)
         record = {"matched_by": by, "unused": unused, "resized": resized, "alpha": not opaque}
-        pictures = shown(rgba.to(self.device))
+        images = shown(rgba.to(self.device))
         if opaque:
-            pictures = Shown(pictures.rgb, None)
-        return Pictures(pictures, there[0], record)
+            images = Shown(images.rgb, None)
+        return Images(images, there[0], record)
 
     def _resized(
-        self, path: Path, picture: np.ndarray, truth: Truth, files: ObjectFiles, view: int
+        self, path: Path, image: np.ndarray, truth: Truth, files: ObjectFiles, view: int
     ) -> np.ndarray:
-        """Return the picture at the compared size, resized like the true picture if needed."""
-        (height, width), (tall, wide) = picture.shape[:2], truth.rgb.shape[1:3]
+        """Return the image at the compared size, resized like the true image if needed."""
+        (height, width), (tall, wide) = image.shape[:2], truth.rgb.shape[1:3]
         if (width, height) == (wide, tall):
-            return picture
+            return image
         true, size = files.images[view], files.sizes[view]  # a pack may not state the size
         if size is None and isinstance(true, Path):
-            with open_picture(true) as image:
-                size = image.size
+            with open_image(true) as file:
+                size = file.size
         if not self.resize and (width, height) != size:
             raise UserError(
-                f"{path}: is {width}x{height}, the pictures compared are {wide}x{tall}; "
-                "render it at this size, or give --resize-pictures"
+                f"{path}: is {width}x{height}, the images compared are {wide}x{tall}; "
+                "render it at this size, or give --resize-images"
             )
         if abs(width * tall - height * wide) > max(width, height) / 2:
             raise UserError(f"{path}: {width}x{height} has another aspect ratio than {wide}x{tall}")
         # Like the dataset: PIL premultiplies RGBA, and its box filter is the area average.
         kind = Image.Resampling.BOX if tall < height else Image.Resampling.BILINEAR
-        return np.asarray(Image.fromarray(picture).resize((wide, tall), kind))
+        return np.asarray(Image.fromarray(image).resize((wide, tall), kind))
 
 
-def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in PICTURES
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGES
 
 
-def holds_pictures(folder: Path) -> bool:
-    """True if a sub-folder holds a picture."""
-    return any(_is_picture(p) and p.parent != folder for p in visible(folder, "*"))
+def holds_images(folder: Path) -> bool:
+    """True if a sub-folder holds an image."""
+    return any(_is_image(p) and p.parent != folder for p in visible(folder, "*"))
 
 
 def _match_by_camera(
     folder: Path, files: ObjectFiles, views: Sequence[int]
 ) -> tuple[dict[int, Path], int]:
-    """Match pictures by their cameras; return them by view, and their number.
+    """Match images by their cameras; return them by view, and their number.
 
     Raises:
         UserError: the cameras cannot be read, or a view matches two or none; the message gives the
@@ -185,7 +185,7 @@ def _match_by_camera(
         chord = np.linalg.norm(poses[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(8)
         angle = 2 * np.arcsin(np.clip(chord, 0, 1))
         shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.linalg.norm(pose[:3, 3])
-        # radians; distances of the true camera from the origin; sides of the picture
+        # radians; distances of the true camera from the origin; sides of the image
         off = np.stack([angle, shift, np.abs(lenses - _lens(files, view)).max(1)], 1)
         near = np.flatnonzero((off <= CAMERA).all(1))
         if len(near) > 1:
@@ -202,13 +202,13 @@ def _match_by_camera(
             f"{_missing_message(folder, lacking, views, 'camera')}; the nearest to view "
             f"{lacking[0]} is rotated by {np.degrees(turn):.3g} degrees, "
             f"moved by {move:.3g} of the distance, and "
-            f"its lens differs by {lens:.3g} of the picture"
+            f"its lens differs by {lens:.3g} of the image"
         )
     return found, len(given.images)
 
 
 def _lens(files: ObjectFiles, view: int) -> np.ndarray:
-    """Return focal lengths and centre in units of the picture's sides, ``[4]``."""
+    """Return focal lengths and centre in units of the image's sides, ``[4]``."""
     size = np.array(files.sizes[view] or (1, 1), np.float64)
     K = files.Ks[view]
     return np.concatenate([np.diag(K)[:2] / size, K[:2, 2] / size])
@@ -217,13 +217,13 @@ def _lens(files: ObjectFiles, view: int) -> np.ndarray:
 def _match_by_name(
     folder: Path, files: ObjectFiles, views: Sequence[int]
 ) -> tuple[str, dict[int, Path], int]:
-    """Match pictures by name or number; return which, the pictures by view, and their number.
+    """Match images by name or number; return which, the images by view, and their number.
 
     Raises:
-        UserError: two pictures match one view.
+        UserError: two images match one view.
     """
     given: dict[str, Path] = {}
-    for path in sorted(filter(_is_picture, folder.iterdir())):
+    for path in sorted(filter(_is_image, folder.iterdir())):
         if not path.name.startswith(".") and given.setdefault(path.stem, path) is not path:
             raise UserError(f"{path}: {given[path.stem].name} has the same name; keep one")
     stems = [path.stem for path in files.images]
@@ -244,18 +244,18 @@ def _missing_message(folder: Path, lacking: Sequence[int], views: Sequence[int],
     word = {"camera": "at the camera", "name": "of the name", "number": "of the number"}[by]
     plural = "" if len(lacking) == 1 else "s"
     return (
-        f"{folder}: no picture {word} of view{plural} {some} "
+        f"{folder}: no image {word} of view{plural} {some} "
         f"({len(lacking)} of the {len(views)} compared)"
     )
 
 
 def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> None:
-    """Refuse opaque pictures on a flat background that is not white.
+    """Refuse opaque images on a flat background that is not white.
 
     Fog is not flat, so it still counts against the method.
 
     Raises:
-        UserError: over half of the empty pixels of the true pictures have one such colour.
+        UserError: over half of the empty pixels of the true images have one such colour.
     """
     empty = (truth.images[..., 3] == 0).cpu() & torch.tensor(found)[:, None, None]
     pixels = rgb[empty]
@@ -266,19 +266,19 @@ def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> 
     if flat > 0.5 and (colour - WHITE).abs().amax() > FLAT:
         named = ", ".join(str(round(255 * c)) for c in colour.tolist())
         raise UserError(
-            f"{folder}: its pictures have no alpha and the background rgb({named}); "
+            f"{folder}: its images have no alpha and the background rgb({named}); "
             "render them with alpha, or on white"
         )
 
 
-def save_pictures(folder: Path, files: ObjectFiles, views: Sequence[int], pictures: Shown) -> None:
-    """Write pictures as ``PicturePredictions`` reads them, named like the true files.
+def save_images(folder: Path, files: ObjectFiles, views: Sequence[int], images: Shown) -> None:
+    """Write images as ``ImagePredictions`` reads them, named like the true files.
 
     Args:
         folder: of one object; made if need be.
         files: of the true views, which give the names; numbers if two have the same stem.
         views: numbers of the views.
-        pictures: with alpha.
+        images: with alpha.
 
     Raises:
         UserError: a file cannot be written.
@@ -286,9 +286,9 @@ def save_pictures(folder: Path, files: ObjectFiles, views: Sequence[int], pictur
     folder.mkdir(parents=True, exist_ok=True)
     stems = [path.stem for path in files.images]
     names = stems if len(set(stems)) == len(stems) else [str(i) for i in range(len(stems))]
-    assert pictures.alpha is not None
-    alpha = pictures.alpha[..., None].cpu()
-    premultiplied = over_another(pictures.rgb.cpu(), alpha, WHITE, 0.0)
+    assert images.alpha is not None
+    alpha = images.alpha[..., None].cpu()
+    premultiplied = over_another(images.rgb.cpu(), alpha, WHITE, 0.0)
     straight = torch.where(alpha > 0, premultiplied / alpha.clamp(min=1e-6), 1.0)
-    for view, picture in zip(views, torch.cat([straight.clamp(0, 1), alpha], -1)):
-        save_image(folder / f"{names[view]}.png", picture.numpy())
+    for view, image in zip(views, torch.cat([straight.clamp(0, 1), alpha], -1)):
+        save_image(folder / f"{names[view]}.png", image.numpy())

@@ -1,4 +1,4 @@
-"""Odd pictures through ``gamba reconstruct``, by both decoders: a sensible result, or one line."""
+"""Odd images through ``gamba reconstruct``, by both decoders: a sensible result, or one line."""
 
 import numpy as np
 import pytest
@@ -32,8 +32,8 @@ def checkpoints(tmp_path_factory):
     return folder
 
 
-def pictures():
-    """Alpha of each picture that has a result; the colour runs from side to side."""
+def images():
+    """Alpha of each image that has a result; the colour runs from side to side."""
     y, x = np.mgrid[:SIDE, :SIDE] / (SIDE - 1)
     disc = (x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.16
     corner = np.ones((SIDE, SIDE))
@@ -62,7 +62,7 @@ def reconstruct(*words):
 
 @pytest.mark.parametrize("decoder", MODELS)
 def test_odd_objects_are_reconstructed(tmp_path, checkpoints, decoder):
-    paths = [save(tmp_path, name, alpha) for name, alpha in pictures().items()]
+    paths = [save(tmp_path, name, alpha) for name, alpha in images().items()]
     out = tmp_path / "out"
     model = checkpoints / f"{decoder}.safetensors"
     assert reconstruct(*paths, "--checkpoint", model, "--out", out, "--no-page") == 0
@@ -74,8 +74,8 @@ def test_odd_objects_are_reconstructed(tmp_path, checkpoints, decoder):
 
 
 def test_a_white_object_on_white_is_seen_by_its_alpha(tmp_path, checkpoints):
-    """Fresh weights of the decoder rays reproduce the picture, on any background."""
-    paths = [save(tmp_path, name, pictures()[name]) for name in ("white", "side")]
+    """Fresh weights of the decoder rays reproduce the image, on any background."""
+    paths = [save(tmp_path, name, images()[name]) for name in ("white", "side")]
     model = checkpoints / "rays.safetensors"
     assert reconstruct(*paths, "--checkpoint", model, "--out", tmp_path, "--no-page") == 0
     camera = reference_cameras(MODELS["rays"], 1)
@@ -83,7 +83,7 @@ def test_a_white_object_on_white_is_seen_by_its_alpha(tmp_path, checkpoints):
         seen = render(load_ply(tmp_path / f"{path.stem}.ply"), camera, background=torch.zeros(3))
         inside = seen.alpha[0, ..., 0] > 0.5
         box = inside.nonzero()
-        # the longer side of the object is 0.8 of the picture, as for every other object
+        # the longer side of the object is 0.8 of the image, as for every other object
         longest = (box.max(0).values - box.min(0).values + 1).max().item()
         assert abs(longest - 0.8 * 32) <= 2
         if path.stem == "white":  # and no black comes through from behind

@@ -1,4 +1,4 @@
-"""Folders of pictures rendered by any method: matching, refusals and messages."""
+"""Folders of images rendered by any method: matching, refusals and messages."""
 
 import shutil
 
@@ -10,7 +10,7 @@ from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views.compare import Shown, ViewsProtocol, load_truth, shown
-from gamba_warp.eval.views.pictures import PicturePredictions, save_pictures
+from gamba_warp.eval.views.images import ImagePredictions, save_images
 
 SIZE, VIEWS = 24, 4
 UIDS = ("a", "group/b")
@@ -21,15 +21,15 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def rgba(seed, alpha=True):
     """A noisy blob on nothing; without alpha on white."""
     rng = np.random.default_rng(seed)
-    picture = np.zeros((SIZE, SIZE, 4), np.uint8)
+    image = np.zeros((SIZE, SIZE, 4), np.uint8)
     top, left = rng.integers(2, 8, 2)
-    picture[top : top + 12, left : left + 13, :3] = rng.integers(0, 200, (12, 13, 3))
-    picture[top : top + 12, left : left + 13, 3] = 255
+    image[top : top + 12, left : left + 13, :3] = rng.integers(0, 200, (12, 13, 3))
+    image[top : top + 12, left : left + 13, 3] = 255
     if alpha:
-        return picture
-    empty = picture[..., 3] == 0
-    picture[empty] = 255
-    return picture[..., :3]
+        return image
+    empty = image[..., 3] == 0
+    image[empty] = 255
+    return image[..., :3]
 
 
 def poses(names, azimuths):
@@ -41,7 +41,7 @@ AZIMUTHS = torch.arange(VIEWS) * 60.0
 
 @pytest.fixture
 def data(tmp_path):
-    """Two objects of four views in data/, and copies of their pictures in pred/."""
+    """Two objects of four views in data/, and copies of their images in pred/."""
     for number, uid in enumerate(UIDS):
         folder = tmp_path / "data" / uid
         folder.mkdir(parents=True)
@@ -60,7 +60,7 @@ def test_true_views_without_alpha_are_told(data, capsys):
     for path in (data / "data").rglob("*.png"):
         Image.open(path).convert("RGB").save(path)
     evaluate(data)
-    line = f"warning: {data / 'data'}: no picture has an alpha channel or a mask"
+    line = f"warning: {data / 'data'}: no image has an alpha channel or a mask"
     assert capsys.readouterr().err.count(line) == 1
 
 
@@ -73,13 +73,13 @@ def test_by_name_by_number_and_by_camera_is_the_same(data):
     code, named = evaluate(data)
     assert code == 0 and named["num_ok"] == 2
     assert all(record["psnr"] == 100 and record["mask_iou"] == 1 for record in named["objects"])
-    assert named["objects"][0]["pictures"]["matched_by"] == "name"
+    assert named["objects"][0]["images"]["matched_by"] == "name"
     for uid in UIDS:
         folder = data / "pred" / uid
         for v in range(VIEWS):
             (folder / f"view{v}.png").rename(folder / f"{v:04d}.png")
-    assert evaluate(data)[1]["objects"][1]["pictures"]["matched_by"] == "number"
-    # In another order, with a picture more, and cameras rounded as a text holds them.
+    assert evaluate(data)[1]["objects"][1]["images"]["matched_by"] == "number"
+    # In another order, with an image more, and cameras rounded as a text holds them.
     for uid in UIDS:
         folder = data / "pred" / uid
         shutil.copy(folder / "0001.png", folder / "extra.png")
@@ -88,7 +88,7 @@ def test_by_name_by_number_and_by_camera_is_the_same(data):
         (folder / "transforms.json").write_text(poses(names, azimuths))
     code, found = evaluate(data)
     assert code == 0
-    assert found["objects"][0]["pictures"] == {
+    assert found["objects"][0]["images"] == {
         **{"matched_by": "camera", "unused": 1, "resized": 0, "alpha": True}
     }
     assert found["mean"]["psnr"] == named["mean"]["psnr"] == 100
@@ -108,19 +108,19 @@ def test_views_of_one_name_in_several_folders_go_by_number(data):
             path = data / "pred" / uid / f"view{v}.png"
             path.rename(path.with_name(f"{v:03d}.png"))
     code, report = evaluate(data)
-    assert code == 0 and report["objects"][1]["pictures"]["matched_by"] == "number"
+    assert code == 0 and report["objects"][1]["images"]["matched_by"] == "number"
     assert report["mean"]["psnr"] == 100
     files = open_dataset(data / "data").files("a")
     rgb = torch.from_numpy(rgba(0)[..., :3] / np.float32(255))[None]
-    save_pictures(data / "saved", files, [2], Shown(rgb, torch.ones(1, SIZE, SIZE)))
+    save_images(data / "saved", files, [2], Shown(rgb, torch.ones(1, SIZE, SIZE)))
     assert [path.name for path in (data / "saved").iterdir()] == ["2.png"]
 
 
-def test_pictures_without_alpha_have_no_mask(data):
+def test_images_without_alpha_have_no_mask(data):
     for number, uid in enumerate(UIDS):
         for v in range(VIEWS):
-            picture = Image.fromarray(rgba(10 * number + v, alpha=False))
-            picture.save(data / "pred" / uid / f"view{v}.png")
+            image = Image.fromarray(rgba(10 * number + v, alpha=False))
+            image.save(data / "pred" / uid / f"view{v}.png")
     code, report = evaluate(data)
     assert code == 0
     assert report["mean"]["psnr"] == 100 and report["mean"]["mask_iou"] is None
@@ -155,8 +155,8 @@ def shrink(folder):
 
 def on_black(folder):
     for path in folder.glob("*.png"):
-        picture = np.array(Image.open(path))
-        Image.fromarray(picture[..., :3] * (picture[..., 3:] > 0)).save(path)
+        image = np.array(Image.open(path))
+        Image.fromarray(image[..., :3] * (image[..., 3:] > 0)).save(path)
 
 
 def turned_cameras(folder):
@@ -181,11 +181,11 @@ def two_at_one_camera(folder):
     [
         (
             lambda folder: (folder / "view2.png").unlink(),
-            "no picture of the name of view 2 (1 of",
+            "no image of the name of view 2 (1 of",
         ),
         (lambda x: shutil.copy(x / "view2.png", x / "view2.webp"), "view2.png has the same name"),
         (double_a_number, "has the same number"),
-        (shrink, "is 12x12, the pictures compared are 24x24"),
+        (shrink, "is 12x12, the images compared are 24x24"),
         (on_black, "background rgb(0, 0, 0)"),
         (turned_cameras, "rotated by 3 degrees"),
         (other_lens, "its lens differs by"),
@@ -206,16 +206,16 @@ def test_resizing_is_asked_for_and_stated(data):
     for path in (data / "pred").rglob("*.png"):
         Image.open(path).resize((48, 48), Image.Resampling.NEAREST).save(path)
     assert evaluate(data)[1]["num_failed"] == 2
-    code, report = evaluate(data, "--resize-pictures")
+    code, report = evaluate(data, "--resize-images")
     assert code == 0 and report["mean"]["psnr"] > 50  # an area average of four equal pixels
-    assert report["protocol"]["resize_pictures"] is True
-    assert report["objects"][0]["pictures"]["resized"] == VIEWS
+    assert report["protocol"]["resize_images"] is True
+    assert report["objects"][0]["images"]["resized"] == VIEWS
     Image.fromarray(np.zeros((20, 48, 4), np.uint8)).save(data / "pred" / "a" / "view1.png")
-    reason = evaluate(data, "--resize-pictures")[1]["failures"][0]["reason"]
+    reason = evaluate(data, "--resize-images")[1]["failures"][0]["reason"]
     assert "48x20 has another aspect ratio than 24x24" in reason
 
 
-def test_pictures_of_the_files_size_are_resized_as_the_truth_is(data):
+def test_images_of_the_files_size_are_resized_as_the_truth_is(data):
     code, report = evaluate(data, "--size", "16")
     assert code == 0 and report["mean"]["psnr"] == 100
 
@@ -223,7 +223,7 @@ def test_pictures_of_the_files_size_are_resized_as_the_truth_is(data):
 @pytest.mark.parametrize(
     "case, said",
     [
-        ("none", "no folder of pictures for any of the 2 objects"),
+        ("none", "no folder of images for any of the 2 objects"),
         ("gaussians", "--save-gaussians"),
         ("over", "would be overwritten"),
     ],
@@ -237,9 +237,9 @@ def test_what_cannot_start(data, case, said, capsys):
         options = ["--save-gaussians"]
     if case == "over":
         (data / "out").mkdir()
-        (data / "pred").rename(data / "out" / "pictures")
-        (data / "pred").symlink_to(data / "out" / "pictures")
-        options = ["--save-pictures"]
+        (data / "pred").rename(data / "out" / "images")
+        (data / "pred").symlink_to(data / "out" / "images")
+        options = ["--save-images"]
     code, report = evaluate(data, *options)
     assert code == 2 and report is None
     said_there = capsys.readouterr().err
@@ -255,8 +255,8 @@ def test_what_is_written_is_read_as_it_was(data, tmp_path):
     images = torch.rand(VIEWS, SIZE, SIZE, 4, generator=generator)
     images[:, :4, :, 3] = 0.0
     there = shown(images)
-    save_pictures(tmp_path / "saved" / "a", dataset.files("a"), truth.views, there)
-    found = PicturePredictions(tmp_path / "saved", 1.5, "cpu").pictures(dataset, truth).shown
+    save_images(tmp_path / "saved" / "a", dataset.files("a"), truth.views, there)
+    found = ImagePredictions(tmp_path / "saved", 1.5, "cpu").images(dataset, truth).shown
     clear = (images[..., 3] - 0.5).abs() > 1 / 255
     assert torch.equal(found.mask()[clear], there.mask()[clear])
     for ground in (1.0, 0.5, 0.0):
