@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-LEVEL = 0.95  # share of the resampled means within an interval
+LEVEL = 0.95  # fraction of the resampled means within an interval
 RESAMPLES = 10_000
 BOOTSTRAP = {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"}
 _BATCH = 1_000_000  # numbers drawn at once; bounds the memory
@@ -43,7 +43,7 @@ def intervals_of(
 
     Args:
         records: records with the same keys, one for each object.
-        level: share of the resampled means within the interval.
+        level: fraction of the resampled means within the interval.
         resamples: number of draws.
         seed: of the draws, which are the same for every number.
         statistic: of the objects drawn; by default the mean.
@@ -70,7 +70,7 @@ def bootstrap(
     Args:
         values: ``[.., n]`` float64, of n objects; all values of an object are drawn together.
         statistic: maps ``[.., draws, n]`` to ``[draws]``.
-        level: share of the resampled statistics within the interval.
+        level: fraction of the resampled statistics within the interval.
         resamples: number of draws.
         seed: of the draws.
 

@@ -25,7 +25,7 @@ from .kernels.bench.report import markdown
 from .measure import models
 
 MINUTES = 10.0  # of the whole run, kernels compiled included
-_SHARE = 0.5  # of the time for the tests
+_FRACTION = 0.5  # of the time for the tests
 _GRACE = 20.0  # seconds that an interrupted part has to write its results
 _BENCH = "import sys; from gamba_warp.gpu_check import bench; sys.exit(bench(*sys.argv[1:]))"
 ROOT = Path(__file__).resolve().parents[1]
@@ -124,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ends, passed = time.monotonic() + 60 * o.minutes, True
     if files := test_files():
         words = ["-m", "pytest", "-m", "gpu", *map(str, files)]
-        passed &= run_part("tests", words, out / "tests.txt", 60 * o.minutes * _SHARE)
+        passed &= run_part("tests", words, out / "tests.txt", 60 * o.minutes * _FRACTION)
     else:
         print("tests: not run, because they are only in a checkout")
     words = ["-c", _BENCH, o.device, str(out)]

@@ -18,8 +18,8 @@ from gamba_warp.model.gamba import Gamba
 
 from .config import OptimConfig
 
-# By name: the rate after the warm-up as a share of its peak. Arguments: the options, the step, the
-# steps of the warm-up and of the run. A script may add to it (docs/train-your-own.md).
+# By name: the rate after the warm-up as a fraction of its peak. Arguments: the options, the step,
+# the steps of the warm-up and of the run. A script may add to it (docs/train-your-own.md).
 SCHEDULES: dict[str, Callable[[OptimConfig, float, float, float], float]] = {
     "cosine": lambda optim, step, warmup, total: _half_cosine(
         (step - warmup) / max(1e-12, total - warmup)
@@ -116,7 +116,7 @@ class Ema:
             average.requires_grad_(False)
 
     def next_share(self) -> float:
-        """Count an update, and return the share of the way that it takes, 1 - the decay."""
+        """Count an update, and return the fraction of the way that it takes, 1 - the decay."""
         share = 1 - ema_decay(self.updates, self.decay)
         self.updates += 1
         return share
@@ -126,7 +126,7 @@ class Ema:
         """Move the average towards the model's current weights.
 
         Args:
-            share: scalar on their device, the share of the way.
+            share: scalar on their device, the fraction of the way.
         """
         averages, weights = map(list, zip(*self._pairs))
         torch_ops: Any = torch  # the names of its optimizers' own products
@@ -139,7 +139,7 @@ def novel_views(progress: float) -> int:
     """Return the number of novel views per object, which grows evenly over the run.
 
     Args:
-        progress: share of the run that is done, 0 to 1.
+        progress: fraction of the run that is done, 0 to 1.
     """
     return min(LAST_VIEWS, FIRST_VIEWS + int(progress * (LAST_VIEWS - FIRST_VIEWS + 1)))
 
@@ -156,7 +156,7 @@ class NewLength:
     Attributes:
         step: optimizer steps done; 0 if the length never changed.
         elapsed: seconds of training done.
-        share: the learning rate then, as a share of its peak.
+        share: the learning rate then, as a fraction of its peak.
         rises: True if the rate first moves to the new length's own schedule.
     """
 
@@ -187,14 +187,14 @@ class Schedule:
             raise UserError(f"--schedule {name[:60]}: expected one of {', '.join(SCHEDULES)}")
 
     def progress(self, step: int, elapsed: float) -> float:
-        """Return the share of the run that is done, 0 to 1, by steps or else by the clock."""
+        """Return the fraction of the run that is done, 0 to 1, by steps or else by the clock."""
         if self.total is not None:
             return min(1.0, step / self.total)
         assert self.minutes is not None  # a run without steps and epochs has minutes
         return min(1.0, elapsed / (60 * self.minutes))
 
     def share(self, step: int, elapsed: float) -> float:
-        """Return the learning rate of the next step, as a share of its peak.
+        """Return the learning rate of the next step, as a fraction of its peak.
 
         Args:
             step: optimizer steps done.

@@ -251,7 +251,7 @@ def make_step(
         (batch,) = batches
         number, key = graphs.number, tuple(sorted(n for n, w in weights.items() if w))
         given = {n: w if n == "novel" else number(n, w) for n, w in weights.items() if w}
-        rest = number("learning rate", rate), number("share of the average", share)
+        rest = number("learning rate", rate), number("fraction of the average", share)
         step = graphs.run(batch, key, lambda own: eager([own], given, *rest))
         return step._replace(stats=step.stats.clone())  # the next step of a graph overwrites it
 
@@ -264,9 +264,9 @@ def health(result: StepResult, batch: Batch) -> dict[str, Tensor]:
 
     Returns:
         ``psnr`` of the batch in dB; ``mean_alpha`` of the rendered and ``target_alpha`` of the true
-        images, both in [0, 1]; ``visible_share``, the share of Gaussians that are not transparent
-        and project into some view; ``spread``, the rms distance of the centres from their mean in
-        object units.
+        images, both in [0, 1]; ``visible_share``, the fraction of Gaussians that are not
+        transparent and project into some view; ``spread``, the rms distance of the centres from
+        their mean in object units.
     """
     means = result.gaussians.means
     positions, depths = project_means(means, batch.cameras)

@@ -104,7 +104,8 @@ class Step:
         return self.step([self.batch], self.weights, _RATE).stats
 
     def work(self) -> dict[str, float]:
-        """Count the samples of a step, and the share of each of ``_PARTS`` in one without a graph.
+        """Count the samples of a step, and the fraction of each of ``_PARTS`` in one without a
+        graph.
 
         Shares are of the time of the GPU's kernels, or of a CPU's operators.
         """
@@ -118,7 +119,7 @@ class Step:
         events = found.key_averages()
         whole = sum(getattr(event, f"self_{kind}") for event in events) or 1
         shares = {
-            f"share of {part}": sum(getattr(e, kind) for e in events if e.key.startswith(names))
+            f"fraction of {part}": sum(getattr(e, kind) for e in events if e.key.startswith(names))
             for part, names in _PARTS.items()
         }
         return {"samples": len(self.batch.uids)} | {k: v / whole for k, v in shares.items()}

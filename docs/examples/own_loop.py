@@ -28,7 +28,7 @@ parser.add_argument("--out", type=Path, default=Path("runs/own"))
 options = parser.parse_args()
 device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 sets = [open_dataset(folder, "train") for folder in options.data]
-shares = np.array(options.weights or [len(each) for each in sets], float)
+fractions = np.array(options.weights or [len(each) for each in sets], float)
 held_out = FixedObjects(open_dataset(options.data[0], "val"), [0])  # its first object
 config = replace(PRESETS["tiny"], image_size=64, depth=2)
 model, rng, best = Gamba(config).to(device).train(), np.random.default_rng(0), -np.inf
@@ -43,7 +43,7 @@ options.out.mkdir(parents=True, exist_ok=True)
 objective = Objective({"rgb": 1.0, "mask": 1.0, "ssim": 0.2})  # the weights of losses.TERMS
 for step in range(1, options.steps + 1):
     samples = []
-    for number in rng.choice(len(sets), 4, p=shares / shares.sum()):
+    for number in rng.choice(len(sets), 4, p=fractions / fractions.sum()):
         index = int(rng.integers(len(dataset := sets[number])))
         views = choose_views(dataset.num_views(index), 3, None, rng)
         samples.append(load_sample(dataset, index, views, config.image_size, config, torch.ones(3)))

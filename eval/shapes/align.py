@@ -50,8 +50,8 @@ def aligned(
         steps: of ``STEPS``.
 
     Returns:
-        The motion; and Open3D's ``fitness`` (share of points with a partner) and ``inlier_rmse`` of
-        the last ICP.
+        The motion; and Open3D's ``fitness`` (fraction of points with a partner) and ``inlier_rmse``
+        of the last ICP.
 
     Raises:
         UserError: the prediction is a single point.
@@ -100,7 +100,8 @@ def icp(predicted: Points, truth: Points, with_scale: bool) -> tuple[Similarity,
         with_scale: the scale is free.
 
     Returns:
-        The motion, and Open3D's ``fitness`` (share of points with a partner) and ``inlier_rmse``.
+        The motion, and Open3D's ``fitness`` (fraction of points with a partner) and
+        ``inlier_rmse``.
     """
     o3d = import_open3d()
     clouds = [

@@ -131,8 +131,8 @@ def shape_iou(
 
     Returns:
         ``iou`` (None without volume), ``iou_error`` (the largest error that the voxels may cause:
-        half the share of those at a surface of either shape), ``iou_voxel`` (the side of a voxel)
-        and, if ``iou`` is None, ``iou_reason``.
+        half the fraction of those at a surface of either shape), ``iou_voxel`` (the side of a
+        voxel) and, if ``iou`` is None, ``iou_reason``.
     """
     if protocol.occupancy == "none":
         return {"iou": None, "iou_reason": "the protocol defines no occupancy"}

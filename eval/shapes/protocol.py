@@ -67,7 +67,7 @@ DEFINITIONS = {
     "accuracy": "mean nearest distance from predicted to true points",
     "completeness": "mean nearest distance from true to predicted points",
     "hausdorff": "largest nearest distance, of either way, between the points",
-    "fscore": "harmonic mean of the shares of predicted and of true points within the threshold",
+    "fscore": "harmonic mean of the fractions of predicted and of true points within the threshold",
     "normal_consistency": "mean absolute cosine at nearest points, mean of both ways",
     "noise_floor": "chamfer between two samples of the truth itself, one way; of a point cloud "
     "between two halves that share no point",

@@ -191,13 +191,15 @@ def _page(rows: dict[str, dict[str, Any]], count: int) -> str:
     for label, row in rows.items():
         mean = row["mean"]
         values = [mean[key] if mean else None for key in ("chamfer", "fscore")]
-        share = values[0] / base["chamfer"] if values[0] is not None and base["chamfer"] else None
+        fraction = (
+            values[0] / base["chamfer"] if values[0] is not None and base["chamfer"] else None
+        )
         shown = [None if v is None else f"{v:.4f}" for v in values]
         more = [mean.get(key) if mean else None for key in ("normal_consistency", "iou")]
         lines.append(
             [
                 *(label, str(row["objects"]), shown[0] or "-"),
-                "-" if share is None else f"{share:.2f}",
+                "-" if fraction is None else f"{fraction:.2f}",
                 *(shown[1] or "-", f"{min(row['thresholds']):g} of {row['unit']:g}"),
                 *("-" if v is None else f"{v:.3f}" for v in more),
             ]

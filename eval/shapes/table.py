@@ -15,8 +15,8 @@ _SHOWN = {
     "chamfer": Column("Chamfer", 4),
     "normal_consistency": Column("normal consistency", 4),
 }
-# Largest shares of the Chamfer distance after a transform for a warning: of one object's, or of the
-# mean over at least MANY.
+# Largest fractions of the Chamfer distance after a transform for a warning: of one object's, or of
+# the mean over at least MANY.
 FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
 AS_IS, MIRRORED = "as it is", "mirrored"  # key of the identity, first word of the mirrors'
 # A mirror counts below this fraction of the best rotation's distance: many shapes are symmetric.

@@ -24,7 +24,7 @@ from gamba_warp.vision.lpips import LPIPS
 from ..averages import mean_of
 
 BATCH = 4  # views compared at once; bounds the memory of LPIPS features
-NEARLY_EMPTY = 0.01  # share of the image; see ViewsProtocol
+NEARLY_EMPTY = 0.01  # fraction of the image; see ViewsProtocol
 
 Values = dict[str, float | None]  # one view's metrics
 
@@ -123,7 +123,7 @@ class Truth:
         shown: the images to compare.
         rgb: ``[V, H, W, 3]``, the images on white.
         mask: ``[V, H, W]`` bool.
-        coverage: V shares of the image covered by the object: means of alpha, in [0, 1].
+        coverage: V fractions of the image covered by the object: means of alpha, in [0, 1].
         digest: SHA-256 of the images, 16 digits.
     """
 
@@ -249,7 +249,7 @@ def summary(views: list[Values], coverage: list[float]) -> dict[str, Any]:
     Returns:
         The metrics, ``input``, and ``without_nearly_empty``: the same without nearly empty views.
     """
-    covered = [None if share < NEARLY_EMPTY else view for view, share in zip(views, coverage)]
+    covered = [None if fraction < NEARLY_EMPTY else view for view, fraction in zip(views, coverage)]
     parts = []
     for chosen in (views, covered):
         novel = mean_of([view for view in chosen[1:] if view is not None])

@@ -346,7 +346,7 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         **({"retrieval": found._asdict()} if found else {}),
         "views": truth.views,
         "coverage": truth.coverage,
-        "num_nearly_empty": sum(share < NEARLY_EMPTY for share in truth.coverage),
+        "num_nearly_empty": sum(fraction < NEARLY_EMPTY for fraction in truth.coverage),
         **({"images": images.record} if images.record else {}),
         **({} if gaussians is None else {"gaussians": gaussians.num}),
         "truth_sha256": truth.digest,

@@ -32,7 +32,7 @@ from gamba_warp.images import load_rgba8, open_image, save_image
 from .compare import Shown, Truth, shown
 
 TRANSFORMS = "transforms.json"
-CAMERA = 1e-3  # radians; share of the camera's distance; share of the image's side
+CAMERA = 1e-3  # radians; fraction of the camera's distance; fraction of the image's side
 FLAT = 8 / 255  # tolerance of a white background, and of a flat one
 _MAX_NAMED = 5  # views named in a message
 MEANING = (

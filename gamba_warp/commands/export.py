@@ -62,7 +62,7 @@ def export_command(
         pixels: Side of these views, pixels.
         colors: Give the vertices colours (.stl has none).
         close_holes: Largest number of edges of holes that are closed.
-        min_component: Remove parts with a smaller share of the faces.
+        min_component: Remove parts with a smaller fraction of the faces.
         largest: Keep the largest part only.
         smooth: Number of smoothing steps.
         elevation: Elevation of the camera of turntable and 3D viewer above the object, degrees.

@@ -18,7 +18,7 @@ from ..errors import UserError, first_line
 from ..images import image_size, load_rgba, to_uint8
 from ..untrusted.torch_files import read_torch
 
-BORDER_RATIO = 0.2  # share of the square left free around the object's longer side
+BORDER_RATIO = 0.2  # fraction of the square left free around the object's longer side
 WORKING_SIZE = 1024  # pixels; larger images are reduced first, since no model uses more
 
 SAM_FILES = (
@@ -28,24 +28,25 @@ SAM_FILES = (
 )
 
 _TRANSPARENT = 0.5  # a pixel of lower alpha is outside of a cut-out object
-# Transparent shares of an image's border or of the whole from which it is a cut-out: the rounded
+# Transparent fractions of an image's border or of the whole from which it is a cut-out: the rounded
 # corners of a screenshot are less.
-_CUT_BORDER, _CUT_SHARE = 0.15, 0.05
+_CUT_BORDER, _CUT_FRACTION = 0.15, 0.05
 PRESENT = 0.05  # least alpha of a pixel within the object's bounds
 _MIN_OBJECT = 16  # least size of an object, pixels
 # A mask holds labels if its channels differ by more than this, or if no grey is brighter.
 _COLORED, _DARK = 0.1, 0.25
 
 
-def has_alpha(rgba: np.ndarray, any_share: bool = False) -> bool:
+def has_alpha(rgba: np.ndarray, any_fraction: bool = False) -> bool:
     """True if the object of an image ``[H, W, 4]`` is cut out.
 
-    A real share of its border or of the whole is transparent; or, with ``any_share``, a pixel.
+    A real fraction of its border or of the whole is transparent; or, with ``any_fraction``, a
+    pixel.
     """
     clear = rgba[..., 3] < _TRANSPARENT
     border = np.concatenate([clear[0], clear[-1], clear[:, 0], clear[:, -1]])
-    shares = border.mean() >= _CUT_BORDER or clear.mean() >= _CUT_SHARE
-    return bool(clear.any() and (any_share or shares))
+    fractions = border.mean() >= _CUT_BORDER or clear.mean() >= _CUT_FRACTION
+    return bool(clear.any() and (any_fraction or fractions))
 
 
 def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
@@ -91,7 +92,7 @@ def recenter(rgba: np.ndarray, border_ratio: float | None = BORDER_RATIO) -> np.
 
     Args:
         rgba: ``[H, W, 4]`` in [0, 1].
-        border_ratio: share of the square's side that the box's longer side leaves free, [0, 1);
+        border_ratio: fraction of the square's side that the box's longer side leaves free, [0, 1);
             None uses the whole image instead of the box.
 
     Returns:

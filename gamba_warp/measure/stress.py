@@ -213,9 +213,9 @@ class _Oracle:
         # The softmax is split into steps, because its gradient cancels where it saturates.
         logits = heads["position"].unflatten(-1, (3, -1))
         powers = r.exp(r(logits - logits.detach().amax(-1, keepdim=True)), EXP_ULPS)
-        share = r(powers / r(powers.sum(-1, keepdim=True)))
+        fraction = r(powers / r(powers.sum(-1, keepdim=True)))
         made = {
-            "means": r(r(share * points.double()).sum(-1)),
+            "means": r(r(fraction * points.double()).sum(-1)),
             "scales": r(r.softplus(heads["scale"], EXP_ULPS) + MIN_SCALE),
             "opacities": r.sigmoid(heads["opacity"], EXP_ULPS)[..., 0],
             "colors": r.sigmoid(heads["color"], EXP_ULPS),

@@ -45,14 +45,14 @@ from .parts.rays import EMPTY
 PLAIN = 6 / 255  # largest contrast of a plain cell, with its neighbours
 MAX_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
 # By detail: the least standard deviation of a child across the view, in sides of its cell, and the
-# share of its parent's offset from the ray.
+# fraction of its parent's offset from the ray.
 MIN_SIZE = {2: 0.4, 4: 0.45}
 WHOLE_MIN_SIZE = 0.45  # the same of a Gaussian that does not split
-OFFSET_SHARE = {2: 0.5, 4: 0.125}
+OFFSET_FRACTION = {2: 0.5, 4: 0.125}
 MIN_OPACITY = 0.5  # logit; least opacity of a child where alpha is 1
 ROUNDS = 2  # of correction
 OPACITY_GAIN = 8.0  # added to the logit of an opacity per missing unit of alpha
-SMALL_SHARE = 0.2  # of that, for the smaller image: a large one loses what a small one gains
+SMALL_FRACTION = 0.2  # of that, for the smaller image: a large one loses what a small one gains
 FAINT = 0.05  # alpha of a rendered pixel below which its colour is unreliable
 
 
@@ -235,7 +235,7 @@ def _children(
     rgba = F.avg_pool2d(image, image.shape[-1] // size)[0][:, row, column].T
     index = parent[row // count * side + column // count]
     detail, K = image.shape[-1] // side, camera.resized(size, size).Ks[0]
-    across = depth * _across(row, column, K) + OFFSET_SHARE[detail] * off
+    across = depth * _across(row, column, K) + OFFSET_FRACTION[detail] * off
     points = torch.cat([across, depth], -1)
     quats = None if front.quats is None else front.quats[index]
     least = MIN_SIZE[detail] * camera.viewmats[0, 2, 3] / K[1, 1]
@@ -301,10 +301,10 @@ def _correct(
         out = render(both, camera.resized(size, size))
         color = want[..., :3] - want[..., 3:] * out.rgb[0] / out.alpha[0].clamp_min(FAINT)
         logits = torch.logit(children.opacities, 1e-4)
-        for step, share in ((detail // 2, 1 - SMALL_SHARE), (detail, SMALL_SHARE)):
+        for step, fraction in ((detail // 2, 1 - SMALL_FRACTION), (detail, SMALL_FRACTION)):
             found = render(both, camera.resized(size // step, size // step)).alpha[0, ..., 0]
             missing = F.avg_pool2d(image[:, 3:], step)[0, 0] - found
-            logits = logits + share * OPACITY_GAIN * missing[row // step, column // step]
+            logits = logits + fraction * OPACITY_GAIN * missing[row // step, column // step]
         children = replace(
             children,
             colors=(children.colors + color[row, column]).clamp(0, 1),

@@ -54,17 +54,17 @@ _HOW: dict[str, str] = {
     "none": "The whole image is the object.",
 }
 _NAMES = {"sam": "Segment Anything", "matte": "matting model", "grabcut": "GrabCut"}
-_LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the image covered by an object
-_MOST_EDGE = 0.7  # share of the image's border that an object may cover
-_UNSURE = 0.4  # largest share of alpha's sum in pixels that are neither object nor background
+_LEAST_FRACTION, _MOST_FRACTION = 0.003, 0.95  # of the image covered by an object
+_MOST_EDGE = 0.7  # fraction of the image's border that an object may cover
+_UNSURE = 0.4  # largest fraction of alpha's sum in pixels that are neither object nor background
 
 # A result is doubted if the object
-_BORDER = 0.02  # covers more than this share of the image's border,
-_PART = 0.15  # has further parts of at least this share of its largest,
+_BORDER = 0.02  # covers more than this fraction of the image's border,
+_PART = 0.15  # has further parts of at least this fraction of its largest,
 _MIN_EDGE_CONTRAST = 0.06  # differs by less than this from the background beside it
-_MAX_WEAK_SHARE = 0.3  # along more than this share of its outline,
-_MAX_SOFT_SHARE = (
-    0.03  # has more than this share of its alpha in wide areas that are neither 0 nor 1
+_MAX_WEAK_FRACTION = 0.3  # along more than this fraction of its outline,
+_MAX_SOFT_FRACTION = (
+    0.03  # has more than this fraction of its alpha in wide areas that are neither 0 nor 1
 )
 
 _LIKE_GROUND = "it is coloured like the background: parts may be lost, or enclosed background kept"
@@ -229,7 +229,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
         method = "alpha"
     elif options.cutout == "alpha":
         raise UserError(f"{path}: has no transparency, which --cutout alpha uses")
-    few = method is None and options.cutout == "auto" and has_alpha(rgba, any_share=True)
+    few = method is None and options.cutout == "auto" and has_alpha(rgba, any_fraction=True)
     if few:
         options.notify(
             f"{path}: its few transparent pixels are no cut-out (--cutout alpha takes them)"
@@ -419,11 +419,11 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
         if outline.any()
         else 0.0
     )
-    if alike > _MAX_WEAK_SHARE:
+    if alike > _MAX_WEAK_FRACTION:
         found.append(f"along {alike:.0%} of its outline it looks like the background")
     unsure = ((planes > 0.1) & (planes < 0.9)).float()
     wide = -torch.nn.functional.max_pool2d(-unsure, 5, 1, 2)
-    if float((wide * planes).sum()) > _MAX_SOFT_SHARE * float(planes.sum()):
+    if float((wide * planes).sum()) > _MAX_SOFT_FRACTION * float(planes.sum()):
         found.append("parts of it are half transparent")
     return found
 
@@ -440,10 +440,10 @@ def fault_of(alpha: np.ndarray) -> str | None:
         alpha: ``[H, W]`` in [0, 1].
     """
     inside = alpha > 0.5
-    share = inside.mean()
-    if share < _LEAST_SHARE:
+    fraction = inside.mean()
+    if fraction < _LEAST_FRACTION:
         return "nothing stands out"
-    if share > _MOST_SHARE:
+    if fraction > _MOST_FRACTION:
         return "all of the image would be the object"
     if (edge := _on_border(inside)) > _MOST_EDGE:
         return f"it would touch {edge:.0%} of the image's border"

@@ -1,7 +1,7 @@
 """Colours along an object's edge, without those of its background.
 
 A pixel of the edge mixes both: c = alpha · object + (1 - alpha) · background. If the background's
-share stays, it is visible as a fringe on any other background, and stretched over the object's
+fraction stays, it is visible as a fringe on any other background, and stretched over the object's
 sides. A mask that is too wide leaves a rim of such pixels, whose alpha is too large.
 """
 
@@ -17,7 +17,7 @@ _EDGE = 0.05, 0.95  # alpha of the edge's pixels
 _REACH = 2  # pixels between these and solid ones
 _LEAST = 20  # number of these
 _FRINGE = 0.1  # least rms difference of their colours from the solid ones beside them
-_UNEXPLAINED = 0.2  # largest share of its square that white or black may leave
+_UNEXPLAINED = 0.2  # largest fraction of its square that white or black may leave
 _WIDTH = 128  # a rim is this part of the image's longer side wide, at least two pixels
 # The same two bounds for a rim, and the least excess of its background over what alpha admits.
 _RIM_FRINGE, _RIM_UNEXPLAINED, _EXCESS = 0.08, 0.3, 0.17
@@ -40,11 +40,11 @@ def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
     solid = alpha > _SOLID
     near, beside = _around(rgba[..., :3], solid, _REACH)
     edge = (alpha > _EDGE[0]) & (alpha < _EDGE[1]) & (beside[0, 0].numpy() > 0)
-    inner, share = near[0].permute(1, 2, 0).numpy()[edge], 1 - alpha[edge, None]
+    inner, fraction = near[0].permute(1, 2, 0).numpy()[edge], 1 - alpha[edge, None]
     added = rgba[edge, :3] - inner
     if len(inner) >= _LEAST and np.sqrt((added**2).mean()) >= _FRINGE:
         for name, color in (("white", 1.0), ("black", 0.0)):
-            left = added - share * (color - inner)
+            left = added - fraction * (color - inner)
             if (left**2).sum() < _UNEXPLAINED * (added**2).sum():
                 return _unmixed(rgba, alpha, color), name
     narrow = _narrowed(rgba[..., :3], alpha, np.ones_like(rgba[..., :3]))
@@ -53,8 +53,8 @@ def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
 
 def _unmixed(rgba: np.ndarray, alpha: np.ndarray, color: float) -> np.ndarray:
     """Return an image of another alpha, without the grey value ``color`` that is mixed into it."""
-    share = alpha[..., None]
-    colors = (rgba[..., :3] - (1 - share) * color) / np.maximum(share, 1e-3)
+    fraction = alpha[..., None]
+    colors = (rgba[..., :3] - (1 - fraction) * color) / np.maximum(fraction, 1e-3)
     return np.dstack([colors.clip(0, 1), alpha]).astype(np.float32)
 
 
@@ -69,10 +69,10 @@ def without_background(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         alpha: ``[H, W]`` in [0, 1].
     """
     alpha = _narrowed(rgb, alpha)
-    image, share = _planes(rgb), _planes(alpha[..., None])
+    image, fraction = _planes(rgb), _planes(alpha[..., None])
     ours, theirs = local_colors(rgb, alpha, max(2, max(rgb.shape[:2]) // 64))
-    colors = ours + share * (image - share * ours - (1 - share) * theirs)
-    colors = torch.where(share > _SOLID, image, colors).clamp(0, 1)
+    colors = ours + fraction * (image - fraction * ours - (1 - fraction) * theirs)
+    colors = torch.where(fraction > _SOLID, image, colors).clamp(0, 1)
     return np.dstack([colors[0].permute(1, 2, 0).numpy(), alpha])
 
 
@@ -81,7 +81,7 @@ def _narrowed(
 ) -> np.ndarray:
     """Return alpha, less along a rim that has more background than alpha admits.
 
-    Each pixel's share of the background is its colour's place between those of the object inside
+    Each pixel's fraction of the background is its colour's place between those of the object inside
     and of the background.
 
     Args:
@@ -101,9 +101,9 @@ def _narrowed(
     else:
         theirs = _planes(background)
     added, full = _planes(rgb) - near, theirs - near
-    share = (_dot(added, full) / _dot(full, full).clamp(min=1e-3)).clamp(0, 1)
-    excess = (share - (1 - own)).clamp(min=0)
-    whole, left = (_dot(x, x)[rim].double() for x in (added, added - share * full))
+    fraction = (_dot(added, full) / _dot(full, full).clamp(min=1e-3)).clamp(0, 1)
+    excess = (fraction - (1 - own)).clamp(min=0)
+    whole, left = (_dot(x, x)[rim].double() for x in (added, added - fraction * full))
     is_mixed = (
         len(whole) >= _LEAST
         and whole.mean() > 3 * _RIM_FRINGE**2
@@ -131,8 +131,8 @@ def local_colors(rgb: np.ndarray, alpha: np.ndarray, radius: int) -> tuple[Tenso
 
 def _around(rgb: np.ndarray, weight: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
     """Return weighted means ``[1, 3, H, W]`` around each pixel, and the mean weight there."""
-    share, size = _planes(weight[..., None]), 2 * radius + 1
-    mean = torch.cat([_planes(rgb) * share, share], 1)
+    fraction, size = _planes(weight[..., None]), 2 * radius + 1
+    mean = torch.cat([_planes(rgb) * fraction, fraction], 1)
     for kernel, pad in (((size, 1), (radius, 0)), ((1, size), (0, radius))):  # first the columns
         mean = F.avg_pool2d(mean, kernel, 1, pad)
     return mean[:, :3] / mean[:, 3:].clamp(min=1e-5), mean[:, 3:]

@@ -24,7 +24,7 @@ _MEANS = 8  # steps of k-means that initialise a mixture
 _SMOOTH = 50.0  # weight of the border, as in the paper
 _LEAST_SPREAD = 2e-4  # added to variances of colours in [0, 1], for plain areas
 _MOST = 12.0  # clamp of the log ratio of two densities
-_MIDDLE = 0.12  # half axes of the ellipse that is always object, share of the sides
+_MIDDLE = 0.12  # half axes of the ellipse that is always object, fraction of the sides
 _OBJECT = 0.38  # half axes of the initial object's ellipse
 _PRIOR = 2.0  # log odds of object in the middle, and of background in the corners
 _OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of a pixel's eight neighbours
@@ -67,13 +67,13 @@ def _cut(colors: np.ndarray) -> np.ndarray:
     prior = _PRIOR * np.clip(1 - 1.6 * radius, -1, 1)
     inside = radius < 2 * _OBJECT
     borders = _Borders(colors)
-    share = inside.astype(np.float32)
+    fraction = inside.astype(np.float32)
     for _ in range(_ROUNDS):
         ratio = _log_density(colors, ~inside) - _log_density(colors, inside)
         price = np.clip(ratio, -_MOST, _MOST) - prior
         price[middle] = np.minimum(price[middle], -1.0)
-        share = borders.cheapest(price.astype(np.float32), share)
-        inside = share > 0.5
+        fraction = borders.cheapest(price.astype(np.float32), fraction)
+        inside = fraction > 0.5
         if not 0 < inside.sum() < inside.size:
             break
     return inside
@@ -137,16 +137,16 @@ class _Borders:
         self._step = 1 / total
         self._flows = [np.zeros_like(weight) for weight in self._weights]
 
-    def cheapest(self, price: np.ndarray, share: np.ndarray) -> np.ndarray:
+    def cheapest(self, price: np.ndarray, fraction: np.ndarray) -> np.ndarray:
         """Return the labelling ``[h, w]`` in [0, 1] with the least cost of pixels and borders.
 
         It converges to 0 or 1, except where costs are equal. The flows are kept for the next call.
 
         Args:
             price: cost of a pixel as object, ``[h, w]``.
-            share: initial labelling, ``[h, w]`` in [0, 1].
+            fraction: initial labelling, ``[h, w]`` in [0, 1].
         """
-        ahead = share
+        ahead = fraction
         for _ in range(_STEPS):
             slope = price.copy()
             for weight, flow, offset in zip(self._weights, self._flows, _OFFSETS, strict=True):
@@ -158,9 +158,9 @@ class _Borders:
                 to, back = _ends(slope, offset)
                 to += flow
                 back -= flow
-            after = np.clip(share - self._step * slope, 0, 1)
-            ahead, share = 2 * after - share, after
-        return share
+            after = np.clip(fraction - self._step * slope, 0, 1)
+            ahead, fraction = 2 * after - fraction, after
+        return fraction
 
 
 def _ends(plane: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -22,28 +22,28 @@ _TOLERANCE = 0.07  # largest colour difference within a plain background
 # Areas within the tolerance are light matter if
 _TIGHT = 0.025  # they differ by more than this and four times the noise, and
 _FRINGE = 3  # are wider than twice this, pixels: JPEG makes narrow ones
-_SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
+_FRACTION = 0.8  # least fraction of border pixels that are background; the object may touch an edge
 _SAMPLES = 20_000  # pixels of a fit
 _FITS = 3
 _RIM = 2  # pixels along the border whose alpha is fractional
 # An enclosed area is background if
-_HOLE = 0.0003  # it has at least this share of the image, and
+_HOLE = 0.0003  # it has at least this fraction of the image, and
 _LEAST_HOLE = 12  # pixels,
 _BIAS = 0.006  # its median differs by at most this, or by a third of the noise, and
-_ISLANDS = 0.03  # at most this share of it is text or images on it, and
-_FAINT, _FAINT_SHARE = 0.15, 0.2  # at most this share of its surroundings differs by less
+_ISLANDS = 0.03  # at most this fraction of it is text or images on it, and
+_FAINT, _FAINT_FRACTION = 0.15, 0.2  # at most this fraction of its surroundings differs by less
 # A pixel may be shadow if it has
-_DARKEST = 0.45  # at least this share of the background's light,
+_DARKEST = 0.45  # at least this fraction of the background's light,
 _HUE = 0.025  # its hue within this, and
 _SLOPE = 0.02  # at most this change from pixel to pixel. Areas of such pixels are shadow if
-_STRIP = 0.001, 0.35  # they have at least this share of the image, at most this of the object,
+_STRIP = 0.001, 0.35  # they have at least this fraction of the image, at most this of the object,
 _FOOT = 0.8  # lie this far down the object (nine of ten pixels), and
-_CONTACT = 0.25  # border on background along this share of their border
+_CONTACT = 0.25  # border on background along this fraction of their border
 # In an image of about this longer side an object may have the background's own colour if
 _SMALL = 256  # pixels,
-_STEP, _STEPLESS = 0.03, 0.15  # over this share of its outline changes by less a pixel, or
+_STEP, _STEPLESS = 0.03, 0.15  # over this fraction of its outline changes by less a pixel, or
 _EXACT, _KEPT = 0.02, 0.05  # enclosed areas with a median within this have more of it than this,
-_LIGHT, _LIGHT_SHARE = 0.3, 0.1  # and over this share of its outline differs by less
+_LIGHT, _LIGHT_FRACTION = 0.3, 0.1  # and over this fraction of its outline differs by less
 
 
 class Plain(NamedTuple):
@@ -67,8 +67,8 @@ class Plain(NamedTuple):
 def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
     """Remove a plain background, which has the colour of most of the image's border.
 
-    Along the edge alpha is fractional, and the background's share is removed from the colour, so no
-    fringe is left on another background.
+    Along the edge alpha is fractional, and the background's fraction is removed from the colour, so
+    no fringe is left on another background.
 
     Args:
         rgb: ``[H, W, 3]`` in [0, 1].
@@ -79,7 +79,7 @@ def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
     """
     edge = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     color = np.median(edge, axis=0)
-    if (np.abs(edge - color).max(-1) < _TOLERANCE).mean() < _SHARE:
+    if (np.abs(edge - color).max(-1) < _TOLERANCE).mean() < _FRACTION:
         return None
     ground, noise = _fitted(rgb, _outer(np.abs(rgb - color).max(-1) < _TOLERANCE)[1])
     residual = rgb - ground
@@ -171,7 +171,7 @@ def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> tuple[list[
         text = ndimage.binary_fill_holes(area) & (difference[wide] > 2 * _TOLERANCE)
         islands = text.sum() / area.sum()
         faint = (widest[wide][ring] < _FAINT).mean()
-        if bias <= max(_BIAS, noise / 3) and islands <= _ISLANDS and faint <= _FAINT_SHARE:
+        if bias <= max(_BIAS, noise / 3) and islands <= _ISLANDS and faint <= _FAINT_FRACTION:
             found.append(number)
         elif bias <= _EXACT:
             others.append(number)
@@ -200,7 +200,7 @@ def _alike(rgb: np.ndarray, residual: np.ndarray, alpha: np.ndarray, exact: np.n
     difference = np.where(inside, np.abs(small(residual)).max(-1), 0)
     light = ndimage.maximum_filter(difference, 5)[outline] < _LIGHT
     kept = small(exact)[inside[..., None]].sum() / inside.sum()
-    return bool(kept > _KEPT and light.mean() > _LIGHT_SHARE)
+    return bool(kept > _KEPT and light.mean() > _LIGHT_FRACTION)
 
 
 def _without(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -211,8 +211,8 @@ def _without(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
     difference = np.abs(rgb - near).max(-1)
     # A rim pixel mixes background and object; the largest difference nearby is the object's.
     full = ndimage.maximum_filter(np.where(background, 0.0, difference), 5)
-    share = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
-    alpha = without_specks(np.where(background, 0.0, np.where(rim, share, 1.0)))
+    fraction = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
+    alpha = without_specks(np.where(background, 0.0, np.where(rim, fraction, 1.0)))
     weight = np.maximum(alpha, 1e-3)[..., None]
     inside = np.clip((rgb - (1 - weight) * near) / weight, 0.0, 1.0)
     return np.dstack([inside, alpha]).astype(np.float32)

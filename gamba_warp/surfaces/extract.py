@@ -186,7 +186,7 @@ def cleaned_mesh(
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``, outside in front.
-        min_component: remove parts with a smaller share of all faces.
+        min_component: remove parts with a smaller fraction of all faces.
         min_diameter: remove parts whose bounding box has a shorter diagonal, in units of the
             whole's.
         largest: keep only the part with the most faces.

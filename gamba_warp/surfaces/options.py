@@ -41,10 +41,10 @@ class SurfaceOptions:
         min_alpha: pixels with less have no depth.
         clear_alpha: pixels with less are empty.
         max_slope: pixels of a steeper surface, depth over width, have no depth.
-        min_support: fused voxels seen by a smaller share of the views are dropped.
+        min_support: fused voxels seen by a smaller fraction of the views are dropped.
         level: the density's value at the surface.
-        min_component: smaller parts are removed, as a share of all faces.
-        min_diameter: shorter parts are removed, as a share of the whole's diagonal.
+        min_component: smaller parts are removed, as a fraction of all faces.
+        min_diameter: shorter parts are removed, as a fraction of the whole's diagonal.
         largest: keep only the largest part.
         close_holes: largest number of edges of holes that are closed.
         smooth: steps of Taubin smoothing.

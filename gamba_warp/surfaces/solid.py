@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _VOTES = 15  # rays of each point; odd
 _MARGIN = 2  # grid points around the object
 _CHUNK = 1 << 20  # points asked at once
-_SHARE = 0.01  # of the volume; smaller parts vanish
+_FRACTION = 0.01  # of the volume; smaller parts vanish
 _TOUCHING = 1e-5  # voxels
 _LEAST = 1e-3  # voxels that a grid point is at least off the surface: on it, corners would coincide
 _EMPTY = "the surface encloses nothing: it has no solid"
@@ -66,7 +66,7 @@ def solid_of(
     depth[beside] *= np.maximum(distance, _LEAST)
     corners, triangles, _, _ = marching_cubes(depth, 0.0, gradient_direction="ascent")
     made = Manifold(Triangles(corners.astype(np.float32), triangles.astype(np.uint32)))
-    large = [part for part in made.decompose() if part.volume() > _SHARE * made.volume()]
+    large = [part for part in made.decompose() if part.volume() > _FRACTION * made.volume()]
     if not large:
         raise UserError(_EMPTY)
     corners, triangles = _decimated(Manifold.compose(large), max_faces)

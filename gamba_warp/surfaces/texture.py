@@ -70,9 +70,9 @@ def point_colors(
         cosines = -(normals * rays).sum(-1) / rays.norm(dim=-1)
         facing = torch.nonzero(cosines > 0)[:, 0]
         visible, color = _seen(points[facing], depth, rgb, viewmat, K, 4.0 / voxels)
-        share = (visible * cosines[facing] ** 2)[:, None]
-        total.index_add_(0, facing, share * color)
-        weight.index_add_(0, facing, share)
+        fraction = (visible * cosines[facing] ** 2)[:, None]
+        total.index_add_(0, facing, fraction * color)
+        weight.index_add_(0, facing, fraction)
     known = weight[:, 0] > 0
     if not known.any():
         raise UserError("no view sees the surface")

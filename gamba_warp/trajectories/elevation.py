@@ -80,8 +80,8 @@ def estimate_elevation(gaussians: Gaussians) -> ElevationEstimate:
     entropy = np.array([_entropy(heights, weights) for heights in up])
     usual = ((ANGLES - USUAL) / SPREAD) ** 2 / 2
     energy = ENTROPY_WEIGHT * entropy + HEIGHT_WEIGHT * height + DEPTH_WEIGHT * length + usual
-    shares = np.exp(energy.min() - energy)
-    below = (np.cumsum(shares) - shares / 2) / shares.sum()
+    fractions = np.exp(energy.min() - energy)
+    below = (np.cumsum(fractions) - fractions / 2) / fractions.sum()
     low, median, high = (round(float(x)) for x in np.interp((0.25, 0.5, 0.75), below, ANGLES))
     return ElevationEstimate(median, low, high)
 

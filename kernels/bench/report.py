@@ -21,11 +21,11 @@ _WORK = {
     "state_history_bytes": "history",
     "saved_bytes": "saved",
     "samples": "",
-    "share of scan": "scan",
-    "share of convolution": "convolution",
-    "share of rasterizer": "rasterizer",
-    "share of products": "products",
-    "share of images' convolutions": "images' convolutions",
+    "fraction of scan": "scan",
+    "fraction of convolution": "convolution",
+    "fraction of rasterizer": "rasterizer",
+    "fraction of products": "products",
+    "fraction of images' convolutions": "images' convolutions",
 }
 _UNSTEADY = 1.3  # ratio of the 80 % and 20 % quantiles from which a time is marked
 _BUSY = 1.2  # wall time over CPU time from which a machine is busy
@@ -58,7 +58,7 @@ def _work_text(r: dict) -> str:
             value = r["work"].get(name)
             if value is None:
                 continue
-            if name == "skipped" or name.startswith("share"):
+            if name == "skipped" or name.startswith("fraction"):
                 text = f"{value:.0%}"
             elif name == "samples":
                 on_cpu = r["device"] == "cpu"

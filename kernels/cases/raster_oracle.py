@@ -224,11 +224,11 @@ def _blend(s: _Splats, pixels: Tensor, options: ViewOptions, r: Rounding) -> Vie
         cut |= s.unsure & (value >= options.alpha_min - band)
         cut &= reached & (s.seen | s.unsure)
         stop = on & reached & ((after[0] - T_MIN).abs() <= _band(after))
-        # a Gaussian that appears or vanishes changes its pixels by its share, and shows or hides
+        # a Gaussian that appears or vanishes changes its pixels by its fraction, and shows or hides
         # those behind it; so does a stop with all the light that is left
-        share = (before[0] * value * cut).sum(-1) + (before[0] * stop).amax(-1)
-        top = torch.cat([s.channels[0].abs().amax(0), torch.ones(1, dtype=share.dtype)])
-        allowance = 2 * share[:, None] * top
+        fraction = (before[0] * value * cut).sum(-1) + (before[0] * stop).amax(-1)
+        top = torch.cat([s.channels[0].abs().amax(0), torch.ones(1, dtype=fraction.dtype)])
+        allowance = 2 * fraction[:, None] * top
         swap, swapped = _order_swaps(
             s, before[0] * value.clamp_max(options.alpha_max), on & reached
         )

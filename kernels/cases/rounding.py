@@ -33,15 +33,15 @@ class Rounding:
     """Rounds an intermediate result and its gradient, differently in each sample.
 
     Dimension 0 of every tensor holds the ``SAMPLES``. Sample 0 stays exact. In samples 1 to 6 each
-    number is off by a random share of its last bit (Monte Carlo arithmetic; Parker 1997); equal
-    numbers get the same share, since equal steps err equally in float32 too. Sample 7 is rounded to
-    float32. Gradients are rounded on their way back in the same way.
+    number is off by a random fraction of its last bit (Monte Carlo arithmetic; Parker 1997); equal
+    numbers get the same fraction, since equal steps err equally in float32 too. Sample 7 is rounded
+    to float32. Gradients are rounded on their way back in the same way.
     """
 
     def __init__(self, seed: int, trial: int = 0) -> None:
         self.generator = torch.Generator().manual_seed((seed + 1_000_003 * trial) % 2**32)
         self.salt = torch.randint(2**31, (SAMPLES - 2,), generator=self.generator)
-        # An approximation always errs to the same side, in each sample by another share.
+        # An approximation always errs to the same side, in each sample by another fraction.
         self.side = torch.tensor([0.0, *torch.linspace(-1, 1, SAMPLES - 2).tolist(), 0.0])
 
     def __call__(self, x: Tensor, ulps: float = 1.0, back: float = 1.0) -> Tensor:
@@ -77,8 +77,8 @@ class Rounding:
 
     def exp(self, x: Tensor, ulps: float) -> Tensor:
         """Computes the exponential of ``x``, with a relative error of |x| times ``ulps``."""
-        share = self.side.double().view(-1, *[1] * (x.dim() - 1))
-        x = x + x.abs() * share * (ulps * UNIT)
+        fraction = self.side.double().view(-1, *[1] * (x.dim() - 1))
+        x = x + x.abs() * fraction * (ulps * UNIT)
         return self._mapped(self(x), torch.exp, lambda _, y: y, 1.0)
 
     def softplus(self, x: Tensor, ulps: float) -> Tensor:

@@ -30,7 +30,7 @@ from .views import laid_as
 
 LARGE = 4 << 20  # bytes from which a tensor is taken from the pool
 _PAGE = 2 << 20  # a huge page
-_SHARE = 8  # the pool keeps this part of the memory at most
+_FRACTION = 8  # the pool keeps this part of the memory at most
 _TOUCHED = 256 << 20  # bytes that are not lent to the system, at most
 _LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of a container, in /sys/fs/cgroup
 
@@ -131,7 +131,7 @@ def _most() -> int:
     for name in _LIMITS:
         with contextlib.suppress(OSError, ValueError):  # "max", or no such file
             memory = min(memory, int((Path("/sys/fs/cgroup") / name).read_text(encoding="ascii")))
-    return memory // _SHARE
+    return memory // _FRACTION
 
 
 pool = Pool(_most()) if sys.platform == "linux" else None

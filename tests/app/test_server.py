@@ -240,7 +240,7 @@ def test_what_is_stated_takes_no_room(tmp_path):
 
 
 def test_what_has_come_in_is_bounded(tmp_path):
-    """Limit uploads per visitor and in total; an ended upload frees its share."""
+    """Limit uploads per visitor and in total; an ended upload frees its fraction."""
     content = form(bytes(500_000))[:-20]
     statuses, layer = dawdled(
         VisitorFiles(tmp_path, per_visitor=700_000), [("a", content), ("a", content)]

@@ -11,7 +11,7 @@ from gamba_warp.data.dataset import open_dataset
 
 
 def project(point, views, number):
-    """Project a point of the world into an image, in shares of its side."""
+    """Project a point of the world into an image, in fractions of its side."""
     local = views.cameras.viewmats[number, :3] @ torch.tensor([*point, 1.0])
     pixel = views.cameras.Ks[number] @ local
     return (pixel[:2] / pixel[2] / views.cameras.width).tolist()

@@ -72,8 +72,8 @@ def test_centers_are_drawn_by_opacity():
     one = shell(0.4, count=2)
     one.opacities = torch.tensor([0.25, 0.75])
     points = sample(one, 4000, 0).positions
-    share = np.mean(np.abs(points - one.means[1].numpy()).max(1) < 1e-6)
-    assert abs(share - 0.75) < 0.03  # four standard deviations of 4000 draws
+    fraction = np.mean(np.abs(points - one.means[1].numpy()).max(1) < 1e-6)
+    assert abs(fraction - 0.75) < 0.03  # four standard deviations of 4000 draws
 
 
 def test_nothing_visible():

@@ -51,20 +51,20 @@ def known_shapes() -> dict[str, Mesh]:
     }
 
 
-def with_hole(mesh: Mesh, share: float, seed: int) -> Mesh:
-    """Cut out the faces nearest to a random point of the surface, up to ``share`` of the area."""
+def with_hole(mesh: Mesh, fraction: float, seed: int) -> Mesh:
+    """Cut out the faces nearest to a random point of the surface, up to ``fraction`` of the area."""
     area = np.linalg.norm(mesh.normals(), axis=1)
     middle = mesh.corners().mean(1)
     at = np.random.default_rng(seed).choice(len(middle), p=area / area.sum())
     order = np.argsort(((middle - middle[at]) ** 2).sum(1), kind="stable")
-    kept = np.cumsum(area[order]) > share * area.sum() * (1 + 1e-9)
+    kept = np.cumsum(area[order]) > fraction * area.sum() * (1 + 1e-9)
     return Mesh(mesh.vertices, mesh.faces[np.sort(order[kept])])
 
 
-def with_flips(mesh: Mesh, share: float, seed: int) -> Mesh:
-    """Turn over about ``share`` of the faces, drawn at random."""
+def with_flips(mesh: Mesh, fraction: float, seed: int) -> Mesh:
+    """Turn over about ``fraction`` of the faces, drawn at random."""
     faces = mesh.faces.copy()
-    chosen = np.random.default_rng(seed).random(len(faces)) < share
+    chosen = np.random.default_rng(seed).random(len(faces)) < fraction
     faces[chosen] = faces[chosen][:, ::-1]
     return Mesh(mesh.vertices, faces)
 
@@ -82,7 +82,7 @@ def drift(mesh, damage=lambda mesh: mesh):
 
 
 SHAPES = known_shapes()
-# IoU of the rule "solid" with the closed original, by the share of the area that is cut out, at
+# IoU of the rule "solid" with the closed original, by the fraction of the area that is cut out, at
 # least: the figures of eval/README.md less 0.02 for other places of the hole and coarser voxels
 LEAST = {0.01: 0.97, 0.05: 0.95, 0.1: 0.89, 0.2: 0.78, 0.5: 0.44}
 
@@ -103,16 +103,16 @@ def test_every_shape_is_closed_and_full(name):
     assert abs(solid(mesh, grid_around(mesh, resolution=24)).sum() / 24**3 / volume - 1) < 0.02
 
 
-@pytest.mark.parametrize("share", LEAST)
-def test_drift_of_the_default_rule(share):
+@pytest.mark.parametrize("fraction", LEAST)
+def test_drift_of_the_default_rule(fraction):
     for name, mesh in SHAPES.items():
         grid = grid_around(mesh, resolution=12)
         truth = solid(mesh, grid)
         for seed in range(2):
-            holed = with_hole(mesh, share, seed)
+            holed = with_hole(mesh, fraction, seed)
             assert not holed.is_closed()
             iou = volume_iou(solid(holed, grid), truth)
-            assert iou >= LEAST[share], f"{name}, hole {share}, seed {seed}: {iou}"
+            assert iou >= LEAST[fraction], f"{name}, hole {fraction}, seed {seed}: {iou}"
 
 
 def test_the_default_rule_does_not_mind_orientation():
@@ -138,8 +138,8 @@ def test_steps_far_from_every_face_need_no_ray(name, monkeypatch):
     mesh = known.get(name) or SHAPES[name]
     grids = grid_around(mesh, resolution=29), syncdreamer_grid(33)
     found = [enclosed(mesh, grid) for grid in grids]
-    share = occupancy._near(mesh, grids[0]).mean()
-    assert 0 < share < 1 or name == "few"
+    fraction = occupancy._near(mesh, grids[0]).mean()
+    assert 0 < fraction < 1 or name == "few"
     monkeypatch.setattr(occupancy, "_near", lambda _, grid: np.ones(grid.shape, bool))
     for ours, grid in zip(found, grids):
         assert (ours == enclosed(mesh, grid)).all()

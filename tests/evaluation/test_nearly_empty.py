@@ -45,7 +45,7 @@ def records(*pairs):
     made = {}
     for name, views, coverage in pairs:
         made[name] = summary(views, coverage) | {
-            "num_nearly_empty": sum(share < NEARLY_EMPTY for share in coverage),
+            "num_nearly_empty": sum(fraction < NEARLY_EMPTY for fraction in coverage),
             "views": list(range(len(views))),
         }
     return made

@@ -82,7 +82,7 @@ def test_a_training_step_waits_for_nothing(on_paper, monkeypatch, preset, weight
         for group in optimizer.param_groups:
             group["lr"] = 1e-3  # torch has no fake of fused AdamW with a tensor
         given = {k: w if k == "novel" else torch.empty(()) for k, w in weights.items()}
-        share = torch.empty(())
+        fraction = torch.empty(())
     objective = Objective(given, lambda got, want: (got - want).abs().mean((-3, -2, -1)), 24)
     with Watch() as watch:
         result = forward(model, batch, objective)
@@ -91,7 +91,9 @@ def test_a_training_step_waits_for_nothing(on_paper, monkeypatch, preset, weight
         for p in parameters:
             p.grad = torch.empty_like(p)
         norm = torch.nn.utils.clip_grad_norm_(parameters, 1.0)
-        update(optimizer, ema, share, Gradients(result.loss.detach(), norm, batch, result), model)
+        update(
+            optimizer, ema, fraction, Gradients(result.loss.detach(), norm, batch, result), model
+        )
     assert watch.found == []
     assert computed <= MOST[preset], computed
     names = [launch.kernel.func.__name__ for launch in on_paper]

@@ -61,8 +61,8 @@ def glb(tree: dict | bytes, binary: bytes) -> bytes:
 def render_views(folder, out, **options):
     """``gamba data render`` with options by their names; returns the exit code."""
     own = {name: options.pop(name) for name in ("split", "workers") if name in options}
-    share = {name: options.pop(name) for name in ("shard", "limit") if name in options}
-    return data_render_command(folder, out, Settings(**options), Share(**share), **own)
+    fraction = {name: options.pop(name) for name in ("shard", "limit") if name in options}
+    return data_render_command(folder, out, Settings(**options), Share(**fraction), **own)
 
 
 def gltf(**changes):

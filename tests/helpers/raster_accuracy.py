@@ -14,7 +14,7 @@ from helpers import assert_rel_rms
 from helpers.raster import GRADIENT, IMAGE, NAMES, rendered
 
 ROW = 1e-3  # of one Gaussian's gradient: a sum over few pixels, some of which cancel
-ROWS = 0.999  # the share of Gaussians that must keep to it
+ROWS = 0.999  # the fraction of Gaussians that must keep to it
 BAND = 5e-5  # relative: rounding of q <= 11.1, of 1e-6 pixels of mean2d over half a pixel of sigma
 COTANGENTS = 2  # one number per Gaussian may cancel under one of them, hardly under both
 
@@ -109,8 +109,10 @@ def assert_rows(got, want, name, least):
     assert torch.equal(size == 0, got.norm(dim=-1) == 0), f"{name}: other rows are zero"
     relative = (error / size)[size > 0]
     assert len(relative) > 100, f"{name}: hardly a row has a gradient"
-    share = (relative <= ROW).double().mean().item()
-    assert share >= least, f"{name}: {share:.5f} of the rows are within {ROW}, {least} must be"
+    fraction = (relative <= ROW).double().mean().item()
+    assert fraction >= least, (
+        f"{name}: {fraction:.5f} of the rows are within {ROW}, {least} must be"
+    )
 
 
 def assert_gradients(got, want, flipped, least=ROWS):

@@ -21,7 +21,13 @@ from gamba_warp.images import save_image
 from gamba_warp.model import detail as subject
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.detail import MIN_SIZE, OFFSET_SHARE, checked_detail, fill_gaps, split_front
+from gamba_warp.model.detail import (
+    MIN_SIZE,
+    OFFSET_FRACTION,
+    checked_detail,
+    fill_gaps,
+    split_front,
+)
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.model.predict import model_input, reconstruct
@@ -196,8 +202,8 @@ def test_children_go_half_of_the_way_that_parents_lie_off_their_rays():
 
 
 def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
-    """Except for the share of their parent's offset from its ray."""
-    monkeypatch.setitem(OFFSET_SHARE, 2, 0.0)
+    """Except for the fraction of their parent's offset from its ray."""
+    monkeypatch.setitem(OFFSET_FRACTION, 2, 0.0)
     model, rgba = fresh(), board(48, 2)
     model.decoder.scale_bias.data[0] = math.log(0.9)  # sides of a cell
     found = reconstruct(model, rgba, detail=2)

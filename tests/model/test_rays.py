@@ -290,6 +290,6 @@ def test_features_between_coarse_cells_are_interpolated():
     weights = RayDecoder(rays(ray_cells=4, ray_coarse=2)).upsampling
     assert weights.shape == (16, 4)
     torch.testing.assert_close(weights.sum(1), torch.ones(16))
-    # The corner of a patch has its own coarse cell alone, the middle a share of all four.
+    # The corner of a patch has its own coarse cell alone, the middle a fraction of all four.
     torch.testing.assert_close(weights[0], torch.tensor([1.0, 0, 0, 0]))
     torch.testing.assert_close(weights[5], torch.tensor([9.0, 3, 3, 1]) / 16)

@@ -95,5 +95,5 @@ def test_tokens_differ_on_a_plain_background():
     # Otherwise the decoder would put the Gaussians of all background patches at one point.
     tokens = SplatTokens(_config(width=64))(torch.ones(1, 12, 12, 3), _cameras(1, 12))[0]
     centred = tokens - tokens.mean(0)
-    share = (centred.square().mean() / tokens.square().mean()).sqrt().item()
-    assert 0.3 < share < 1 and math.isfinite(share)
+    fraction = (centred.square().mean() / tokens.square().mean()).sqrt().item()
+    assert 0.3 < fraction < 1 and math.isfinite(fraction)

@@ -19,7 +19,7 @@ def test_the_border_is_the_minimum_cut(monkeypatch):
     height, width = 9, 13
     borders = cuts._Borders(rng.random((height, width, 3)).astype(np.float32))
     price = rng.normal(0, 200, (height, width)).astype(np.float32)
-    share = borders.cheapest(price, np.zeros((height, width), np.float32))
+    fraction = borders.cheapest(price, np.zeros((height, width), np.float32))
     # Nodes: pixels, then a source (object) and a sink.
     number, scale = np.arange(height * width).reshape(height, width), 1000
     source, sink = height * width, height * width + 1
@@ -37,7 +37,7 @@ def test_the_border_is_the_minimum_cut(monkeypatch):
     size = height * width + 2
     graph = sparse.csr_matrix((np.int32(values), (rows, columns)), (size, size))
     flow = maximum_flow(graph, source, sink).flow_value / scale
-    inside = (share > 0.5).astype(np.float32)
+    inside = (fraction > 0.5).astype(np.float32)
     cost = (price * inside).sum() - price[price < 0].sum()
     for weight, offset in zip(borders._weights, cuts._OFFSETS, strict=True):
         here, there = cuts._ends(inside, offset)

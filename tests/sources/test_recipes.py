@@ -84,15 +84,15 @@ def test_the_recipes_network_is_the_papers(paper, field, value, source):
 
 
 @pytest.mark.parametrize(
-    "processes, words, share",
+    "processes, words, fraction",
     [("", [], 256), ("16", [], 16), ("4", ["--accumulate", "8"], 8), ("2", ["--accumulate=4"], 32)],
 )
-def test_a_batch_of_256_over_all_processes(monkeypatch, processes, words, share):
+def test_a_batch_of_256_over_all_processes(monkeypatch, processes, words, fraction):
     if processes:
         monkeypatch.setenv("WORLD_SIZE", processes)
     views = parse("data", "--recipe", "paper", *words).views
-    assert views.batch_size == share  # §4.1: with a batch size of 256
-    assert share * int(processes or 1) * views.accumulate == 256
+    assert views.batch_size == fraction  # §4.1: with a batch size of 256
+    assert fraction * int(processes or 1) * views.accumulate == 256
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 
 from .settings import SPREAD
 
-MARGIN = 0.96  # share of the image's half size that the object may reach
+MARGIN = 0.96  # fraction of the image's half size that the object may reach
 NEAREST = 3.0  # least distance, in half sizes of the object along the camera's axes
 FRONT = (35.0, 0.0, 20.0)  # degrees: largest azimuth, least and largest elevation of a front view
 
@@ -71,7 +71,7 @@ def sample_poses(
         fov: degrees, of the image's side.
         rng: random generator.
         fronts: number of views from the front.
-        spread: largest share by which a camera stands further away than necessary.
+        spread: largest fraction by which a camera stands further away than necessary.
     """
     golden = (math.sqrt(5) - 1) / 2
     start = rng.uniform()

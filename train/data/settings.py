@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 Up = Literal["auto", "y", "z"]
-SPREAD = 0.2  # default of the largest share by which a distance exceeds the least one
+SPREAD = 0.2  # default of the largest fraction by which a distance exceeds the least one
 # Fields of view of 20° to 70°, one per object, log-uniform.
 VARIED_CAMERAS: dict[str, Any] = {"fov": 37.4, "fov_spread": 1.87, "spread": 0.3}
 
@@ -32,7 +32,7 @@ class Settings:
         format: Format of the images; both are lossless.
         up: The axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
         fronts: Number of views from the front, the first ones.
-        spread: Largest share by which a camera stands further away than necessary.
+        spread: Largest fraction by which a camera stands further away than necessary.
         stretch: Stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
         fov_spread: Draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
         light: varied makes the lights of the objects differ more.

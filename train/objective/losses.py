@@ -27,7 +27,7 @@ from .radial_mask import contour_distances, project_means, radial_mask_loss
 
 DEPTH_BETA = 0.02  # object units; see ``depth_loss``
 # Of the radial mask constraint: its weight at the start and the epochs over which it falls to 0
-# (paper, §4.1), but over this share of a run at most, so that short runs end without it.
+# (paper, §4.1), but over this fraction of a run at most, so that short runs end without it.
 RDIST_WEIGHT, RDIST_EPOCHS, RDIST_SHARE = 0.1, 10.0, 0.25
 SLOPE_STEPS, SLOPE_WEIGHT = (1, 2, 4, 8), 1.0  # pixels; beside the distances
 NEAR_VIEW = 20.0  # degrees; see ``excess_translucency``
@@ -251,7 +251,7 @@ class Progress(NamedTuple):
     Attributes:
         step: optimizer steps done.
         epochs: the same in passes over the objects.
-        done: share of the run that is done, 0 to 1.
+        done: fraction of the run that is done, 0 to 1.
         validates: True for a validation, whose weights are constant: LPIPS from the start, neither
             the radial mask constraint nor depth.
     """

@@ -19,7 +19,7 @@ from ...kernels.runtime.packed import Packed
 from ..config import GambaConfig, Orders
 
 # Of ``Foreground.padded``: significant bits of its numbers of patches, and of rows of an image;
-# share of a patch's cells that have an object, in the mean over 1,120 images of training data.
+# fraction of a patch's cells that have an object, in the mean over 1,120 images of training data.
 _FINE, _COARSE = 5, 2
 _FILLED = 0.72
 # Patches by which the sides of ``Foreground.boxes`` grow: oneDNN compiles a kernel for each shape

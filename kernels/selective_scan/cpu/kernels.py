@@ -76,7 +76,7 @@ class Kind(NamedTuple):
     def header(self, gradient: bool, output: bool = True) -> str:
         """C++ of the kernels, ``forward.h`` or ``backward.h``, and their constants, ``Config``."""
         tuning, rule = self.tuning, DISCRETIZATIONS[self.discretization]
-        share = min(1.0, 64 / tuning.chunk)
+        fraction = min(1.0, 64 / tuning.chunk)
         config = constants(
             "Config",
             MODE=[*DISCRETIZATIONS].index(self.discretization),
@@ -84,8 +84,8 @@ class Kind(NamedTuple):
             SCALE=rule.scale,
             DEGREE=tuning.degree,
             TABLE=tuning.table,
-            SLOWEST=SLOWEST * share,
-            MODERATE=MODERATE * share,
+            SLOWEST=SLOWEST * fraction,
+            MODERATE=MODERATE * fraction,
             GRADIENT=gradient,
             OUTPUT=output,
             TRANSPOSED=self.transposed,

@@ -43,10 +43,10 @@ def sound(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [*SPLAT_FORMATS, "glb"])
-@pytest.mark.parametrize("share", [0.999, 0.5, 0.02])
-def test_cut_short(sound, kind, share):
+@pytest.mark.parametrize("fraction", [0.999, 0.5, 0.02])
+def test_cut_short(sound, kind, fraction):
     path, data = sound(kind)
-    path.write_bytes(data[: int(len(data) * share) | 1])  # a .splat of whole records is whole
+    path.write_bytes(data[: int(len(data) * fraction) | 1])  # a .splat of whole records is whole
     refused(path)
 
 

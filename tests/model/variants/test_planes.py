@@ -24,8 +24,8 @@ def looked_up(planes: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
             value = torch.zeros(plane.shape[0], dtype=planes.dtype)
             for row in range(side):
                 for column in range(side):
-                    share = max(0.0, 1 - abs(row - down)) * max(0.0, 1 - abs(column - across))
-                    value += share * plane[:, row, column]
+                    fraction = max(0.0, 1 - abs(row - down)) * max(0.0, 1 - abs(column - across))
+                    value += fraction * plane[:, row, column]
             parts.append(value)
         found.append(torch.cat(parts))
     return torch.stack(found)

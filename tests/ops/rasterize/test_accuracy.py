@@ -13,7 +13,7 @@ from helpers.raster_accuracy import BAND, assert_gradients, both
 from gamba_warp.kernels.rasterize import rasterization, reference
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 
-FLIPS = 2e-4  # the share of pixels that may fall on the other side of a cut
+FLIPS = 2e-4  # the fraction of pixels that may fall on the other side of a cut
 
 
 def ordinary(num=2000, **changes):

@@ -11,8 +11,8 @@ from gamba_warp.kernels.rasterize import rasterization
 
 ALPHA_MIN = 1 / 255
 GAUSSIAN = NAMES[:5]
-FLIPS = 2e-3  # the share of pixels on the other side of a cut
-HARD_ROWS = 0.99  # the share of Gaussians whose own gradient is right to 1e-3
+FLIPS = 2e-3  # the fraction of pixels on the other side of a cut
+HARD_ROWS = 0.99  # the fraction of Gaussians whose own gradient is right to 1e-3
 
 
 def render(scene, mode="RGB+ED", **options):

@@ -163,8 +163,8 @@ def test_a_state_keeps_what_its_tokens_round():
     samples = states(f.expand(all_tokens), w.expand(all_tokens), first, Rounding(0))[:, 0, ..., 0]
     last = samples[0, -100:]  # two tokens together cancel the input
     mean = lambda h: (h[..., -100:, :] - last).mean(-2).square().mean(-1).sqrt()  # noqa: E731
-    shares = mean(samples)[1:-1] / mean(torch.stack(real))
-    assert ((shares > 0.4) & (shares < 2.5)).all(), shares
+    fractions = mean(samples)[1:-1] / mean(torch.stack(real))
+    assert ((fractions > 0.4) & (fractions < 2.5)).all(), fractions
 
 
 def test_the_slope_of_a_decay_may_lose_a_small_product():

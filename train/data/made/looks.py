@@ -21,7 +21,7 @@ from .solids import extent, joined
 
 SHARP = 40.0  # degrees; sharper edges are not shaded smoothly
 MAX_FACES = 60_000
-THINNEST = 2e-4  # least volume, as a share of a cube of the longest side
+THINNEST = 2e-4  # least volume, as a fraction of a cube of the longest side
 # Of a skin, for faces that look along x, y and z: the axes of u and v, and the signs of u and v
 # where the face looks to the positive side, so that print is never mirrored.
 _ACROSS = np.array([[2, 1], [0, 2], [0, 1]])

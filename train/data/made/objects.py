@@ -18,7 +18,7 @@ from .looks import Maker, finished
 
 GROUP = "made"  # one group, so that all objects are in one part of the split: train
 ATTRIBUTION = {"creator": "made by gamba data made", "licence": "CC0 1.0", "source": ""}
-TURNED = 0.12  # share of objects that are turned about y by any angle
+TURNED = 0.12  # fraction of objects that are turned about y by any angle
 
 
 def make_object(rng: np.random.Generator) -> TexturedMesh:
