@@ -1,4 +1,5 @@
-"""``gamba compare``: reports of several methods with the same protocol and truth in one table.
+"""``gamba compare``: reports of several methods with the same protocol and ground truth in one
+table.
 
 A method has a report of ``eval-views``, one of ``eval-geometry``, or both. The table covers the
 objects that all methods have. It is written as Markdown and JSON.
@@ -77,7 +78,7 @@ class _ShapesRecord(msgspec.Struct):
 
 
 _RECORDS = {VIEWS: _ViewsRecord, SHAPES: _ShapesRecord}
-_TRUTH = ("truth_sha256", "views", "gt_sha256")  # must be equal in two records of an object
+_GT = ("truth_sha256", "views", "gt_sha256")  # must be equal in two records of an object
 
 
 class _Document(msgspec.Struct):
@@ -107,7 +108,7 @@ class Report:
 
 
 def read_reports(arguments: tuple[str, ...]) -> dict[str, dict[str, Report]]:
-    """Read reports, and check that they have the same protocol and truth.
+    """Read reports, and check that they have the same protocol and ground truth.
 
     Args:
         arguments: ``NAME=FILE`` each, or a folder with a report.json.
@@ -117,7 +118,7 @@ def read_reports(arguments: tuple[str, ...]) -> dict[str, dict[str, Report]]:
 
     Raises:
         UserError: an argument is malformed, a file is not a report, a method has two of one kind,
-            or two reports differ in protocol or truth; the message names the difference.
+            or two reports differ in protocol or ground truth; the message names the difference.
     """
     if len(arguments) > MAX_REPORTS:
         raise UserError(f"{len(arguments)} reports, at most {MAX_REPORTS} can be compared")
@@ -193,10 +194,10 @@ def _check_pair(first: Report, report: Report) -> None:
                 f"{key} is {_shown(a)}, not {_shown(b)}"
             )
     for uid in sorted(report.records.keys() & first.records.keys()):
-        one, two = ([getattr(r.records[uid], key, None) for key in _TRUTH] for r in pair)
+        one, two = ([getattr(r.records[uid], key, None) for key in _GT] for r in pair)
         if one != two:
             raise UserError(
-                f"{report.path}: {uid} was compared with a different truth than in {first.path}"
+                f"{report.path}: {uid} was compared with a different ground truth than in {first.path}"
             )
 
 

@@ -238,11 +238,11 @@ def _onednn_is_better() -> bool:
     if amx or not (amd and known.get("avx512_f")) or not torch.backends.mkldnn.is_available():
         return False
     a, b = torch.randn(2, 128, 128, generator=torch.Generator().manual_seed(0))
-    truth = a.double() @ b.double()
+    gt = a.double() @ b.double()
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("medium")
     try:
-        error = (a @ b).double() - truth
+        error = (a @ b).double() - gt
     finally:
         torch.set_float32_matmul_precision(before)
-    return bool(error.norm() <= _FLOAT32_ERROR * truth.norm())
+    return bool(error.norm() <= _FLOAT32_ERROR * gt.norm())

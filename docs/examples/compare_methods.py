@@ -98,14 +98,14 @@ def main(arguments: list[str] | None = None) -> None:
         reports[name] = [place]
 
     # Shapes: a file for each object, named like the true ones.
-    truths = out / "truths"
-    truths.mkdir(exist_ok=True)
+    gts = out / "truths"
+    gts.mkdir(exist_ok=True)
     for uid in uids:
-        shutil.copy(options.meshes / f"{uid}.ply", truths)
+        shutil.copy(options.meshes / f"{uid}.ply", gts)
     points = ["--points", options.points, "--voxels", options.voxels]
     shapes = {
-        "shipped": [out / "shipped" / "gaussians", truths, "--frame", "reference"],
-        "hull": [out / "hull" / "meshes", truths],
+        "shipped": [out / "shipped" / "gaussians", gts, "--frame", "reference"],
+        "hull": [out / "hull" / "meshes", gts],
     }
     for name, words in shapes.items():
         place = out / f"{name}-shapes"

@@ -87,7 +87,7 @@ def main() -> None:
     gaussians = gaussians.in_unit(*unit_frame(gaussians))
     cameras = sphere_cameras(VIEWS, 0.9, PIXELS)
     seen = render(gaussians, cameras)
-    truth, first = seen.rgb + 1 - seen.alpha, None
+    gt, first = seen.rgb + 1 - seen.alpha, None
     print("| mesh | faces | to the Gaussians, dB | to the first mesh, dB |")
     print("| --- | --- | --- | --- |", flush=True)
     for name, voxels, most, side in KINDS:
@@ -97,7 +97,7 @@ def main() -> None:
         first = image if first is None else first
         own = "" if first is image else f"{psnr(image, first):.2f}"
         faces = f"{len(surface.faces):,}"
-        print(f"| {name} | {faces} | {psnr(image, truth):.2f} | {own} |", flush=True)
+        print(f"| {name} | {faces} | {psnr(image, gt):.2f} | {own} |", flush=True)
 
 
 if __name__ == "__main__":

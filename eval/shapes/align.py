@@ -1,4 +1,4 @@
-"""Alignment of a prediction with the truth by the steps of a protocol, in order.
+"""Alignment of a prediction with the ground truth by the steps of a protocol, in order.
 
 The search for a rotation needs no initial guess. It scores thousands of rotations by a lattice of
 nearest points instead of a tree, and refines the best of them.
@@ -40,13 +40,13 @@ ALIKE = 1.2  # times the least Chamfer distance, below which a rotated shape cou
 
 
 def aligned(
-    predicted: Points, truth: Points, steps: Sequence[Step]
+    predicted: Points, gt: Points, steps: Sequence[Step]
 ) -> tuple[Similarity, dict[str, float]]:
     """Compute the motion of the prediction by all steps.
 
     Args:
         predicted: points on the prediction.
-        truth: points on the truth; its longest side is 1.
+        gt: points on the ground truth; its longest side is 1.
         steps: of ``STEPS``.
 
     Returns:
@@ -62,26 +62,26 @@ def aligned(
     for step in steps:
         moved = motion.apply(predicted)
         if step in ("rigid", "icp"):
-            found, residual = icp(moved, truth, with_scale=step == "icp")
+            found, residual = icp(moved, gt, with_scale=step == "icp")
         else:
-            found = _SEARCHES[step](moved, truth)
+            found = _SEARCHES[step](moved, gt)
         motion = found.of(motion)
     return motion, residual
 
 
-def match_boxes(predicted: Points, truth: Points) -> Similarity:
+def match_boxes(predicted: Points, gt: Points) -> Similarity:
     """Return the translation and scale that match centre and longest side of the boxes."""
-    boxes = [(p.positions.min(0), p.positions.max(0)) for p in (predicted, truth)]
+    boxes = [(p.positions.min(0), p.positions.max(0)) for p in (predicted, gt)]
     centers, sides = zip(*(((low + high) / 2, (high - low).max()) for low, high in boxes))
     return _of_size(centers, sides)
 
 
-def match_moments(predicted: Points, truth: Points) -> Similarity:
+def match_moments(predicted: Points, gt: Points) -> Similarity:
     """Return the translation and scale that match centroids and mean square radii."""
-    centers = [points.positions.mean(0) for points in (predicted, truth)]
+    centers = [points.positions.mean(0) for points in (predicted, gt)]
     radii = [
         np.sqrt(((points.positions - center) ** 2).sum(1).mean())
-        for points, center in zip((predicted, truth), centers, strict=True)
+        for points, center in zip((predicted, gt), centers, strict=True)
     ]
     return _of_size(centers, radii)
 
@@ -91,12 +91,12 @@ def _of_size(centers: Sequence[np.ndarray], sizes: Sequence[float]) -> Similarit
     return Similarity(np.eye(3), centers[1] - scale * centers[0], scale)
 
 
-def icp(predicted: Points, truth: Points, with_scale: bool) -> tuple[Similarity, dict[str, float]]:
+def icp(predicted: Points, gt: Points, with_scale: bool) -> tuple[Similarity, dict[str, float]]:
     """Find a small rotation, a translation and optionally a scale by Open3D's ICP.
 
     Args:
         predicted: points to move.
-        truth: target points.
+        gt: target points.
         with_scale: the scale is free.
 
     Returns:
@@ -106,7 +106,7 @@ def icp(predicted: Points, truth: Points, with_scale: bool) -> tuple[Similarity,
     o3d = import_open3d()
     clouds = [
         o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.positions))
-        for points in (predicted, truth)
+        for points in (predicted, gt)
     ]
     matrix = np.eye(4)
     method = o3d.pipelines.registration.TransformationEstimationPointToPoint(with_scale)
@@ -121,7 +121,7 @@ def icp(predicted: Points, truth: Points, with_scale: bool) -> tuple[Similarity,
     return motion, {"fitness": result.fitness, "inlier_rmse": result.inlier_rmse}
 
 
-def search_yaw(predicted: Points, truth: Points) -> Similarity:
+def search_yaw(predicted: Points, gt: Points) -> Similarity:
     """Find the rotation about z with the lowest Chamfer distance; see ``STEPS``."""
     angles = np.radians(np.arange(360.0))
     turns = np.zeros((360, 3, 3))
@@ -129,14 +129,14 @@ def search_yaw(predicted: Points, truth: Points) -> Similarity:
     turns[:, 1, 0] = np.sin(angles)
     turns[:, 0, 1] = -turns[:, 1, 0]
     turns[:, 2, 2] = 1
-    one, two = _Cloud.of(predicted), _Cloud.of(truth)
+    one, two = _Cloud.of(predicted), _Cloud.of(gt)
     best = turns[_chamfer(one, two, turns, FOLLOWED).argmin()]
     return Similarity(best, two.center - best @ one.center)
 
 
-def search_turns(predicted: Points, truth: Points) -> Similarity:
+def search_turns(predicted: Points, gt: Points) -> Similarity:
     """Find the rotation about any axis with the lowest Chamfer distance; see ``STEPS``."""
-    turns, moves, chamfer = _candidates(_Cloud.of(predicted), _Cloud.of(truth))
+    turns, moves, chamfer = _candidates(_Cloud.of(predicted), _Cloud.of(gt))
     best = chamfer.argmin()
     return Similarity(turns[best], moves[best])
 
@@ -149,11 +149,11 @@ _SEARCHES = {
 }
 
 
-def symmetry(truth: Points) -> list[list[float]]:
+def symmetry(gt: Points) -> list[list[float]]:
     """Find the rotational symmetries of a shape, within the noise of a few thousand points.
 
     Args:
-        truth: points on the shape.
+        gt: points on the shape.
 
     Returns:
         ``[x, y, z, degrees]`` each: a unit axis and an angle of 20 to 180 degrees; at most 31, each
@@ -162,8 +162,8 @@ def symmetry(truth: Points) -> list[list[float]]:
     """
     from scipy.spatial.transform import Rotation
 
-    order = np.random.default_rng(1).permutation(len(truth.positions))
-    halves = [_Cloud.of(Points(truth.positions[part])) for part in (order[::2], order[1::2])]
+    order = np.random.default_rng(1).permutation(len(gt.positions))
+    halves = [_Cloud.of(Points(gt.positions[part])) for part in (order[::2], order[1::2])]
     turns, _, chamfer = _candidates(*halves, also=np.eye(3)[None])
     found: list[list[float]] = []
     kept = np.eye(3)[None]

@@ -1,6 +1,6 @@
 """Loading stage of an evaluation: files become ``LoadedShape``, in the truth's unit frame.
 
-``load_truth`` and ``load_prediction`` read a file (``load_shape``), turn Gaussians into a surface,
+``load_gt`` and ``load_prediction`` read a file (``load_shape``), turn Gaussians into a surface,
 move the shape into the unit frame, and clean and flag its mesh. ``compare`` is the next stage.
 """
 
@@ -45,7 +45,7 @@ class LoadedShape:
         shape: in the truth's unit frame.
         flags: of the mesh (for Gaussians: of their surface), names from ``flags.FLAGS``.
         motion: from the file's coordinates into the unit frame.
-        axes: of the file: a key of ``TO_Z_UP``, ``UNKNOWN``, or for a truth ``DATASET``.
+        axes: of the file: a key of ``TO_Z_UP``, ``UNKNOWN``, or for a ground truth ``DATASET``.
         warnings: of the file for a report, one line each.
     """
 
@@ -66,7 +66,7 @@ class LoadedShape:
         return "open" not in self.flags if isinstance(self.shape, Mesh) else None
 
 
-def load_truth(
+def load_gt(
     path: Path,
     protocol: GeometryProtocol,
     rotation: list[list[float]] | None = None,
@@ -88,7 +88,9 @@ def load_truth(
     """
     shape, of_file = load_shape(path)
     if isinstance(shape, Gaussians):
-        raise UserError(f"{path}: holds Gaussians; the truth must be a mesh or a point cloud")
+        raise UserError(
+            f"{path}: holds Gaussians; the ground truth must be a mesh or a point cloud"
+        )
     asked, warnings = {"y": "opengl", "z": "z-up"}.get(protocol.up), []
     axes = asked or of_file
     turn = TO_Z_UP.get(axes, np.eye(3)) @ np.asarray(np.eye(3) if rotation is None else rotation)

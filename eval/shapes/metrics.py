@@ -33,13 +33,13 @@ _FEW = 5_000  # points, enough for a warning
 
 
 def compare(
-    predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
+    predicted: Mesh | Points, gt: Mesh | Points, protocol: GeometryProtocol
 ) -> dict[str, Any]:
     """Compute all metrics of one pair, after the protocol's alignment.
 
     Args:
         predicted: in the truth's unit frame.
-        truth: in its unit frame.
+        gt: in its unit frame.
         protocol: with the rules of points, voxels and alignment.
 
     Returns:
@@ -48,16 +48,16 @@ def compare(
     Raises:
         UserError: a shape cannot be sampled or aligned.
     """
-    predicted, alignment = align_shape(predicted, truth, protocol)
+    predicted, alignment = align_shape(predicted, gt, protocol)
     return {
-        **point_metrics(predicted, truth, protocol),
-        **shape_iou(predicted, truth, protocol),
+        **point_metrics(predicted, gt, protocol),
+        **shape_iou(predicted, gt, protocol),
         **alignment,
     }
 
 
 def align_shape(
-    predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
+    predicted: Mesh | Points, gt: Mesh | Points, protocol: GeometryProtocol
 ) -> tuple[Mesh | Points, dict[str, Any]]:
     """Align a prediction by the protocol; arguments as for ``compare``.
 
@@ -70,7 +70,7 @@ def align_shape(
     """
     if not protocol.align:
         return predicted, {}
-    points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, truth))
+    points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, gt))
     motion, residual = aligned(points, true_points, protocol.align)
     found: dict[str, Any] = {"alignment": motion.record() | residual}
     if {"yaw", "turn"} & set(protocol.align):
@@ -79,12 +79,12 @@ def align_shape(
 
 
 def point_metrics(
-    predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
+    predicted: Mesh | Points, gt: Mesh | Points, protocol: GeometryProtocol
 ) -> dict[str, Any]:
     """Compute ``surface_metrics`` of points of two shapes, and ``noise_floor``."""
-    points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, truth))
+    points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, gt))
     found = surface_metrics(points, true_points, protocol)
-    return found | {"noise_floor": noise_floor(truth, protocol, true_points)}
+    return found | {"noise_floor": noise_floor(gt, protocol, true_points)}
 
 
 def take_points(shape: Mesh | Points, protocol: GeometryProtocol, seed: int) -> Points:
@@ -104,28 +104,28 @@ def syncdreamer_points(mesh: Mesh) -> Points:
     return visible_points(mesh, viewmats @ turn, K, 256, 0.01)
 
 
-def noise_floor(truth: Mesh | Points, protocol: GeometryProtocol, points: Points) -> float | None:
-    """Return the Chamfer distance between two samples of the truth; None for a single point.
+def noise_floor(gt: Mesh | Points, protocol: GeometryProtocol, points: Points) -> float | None:
+    """Return the Chamfer distance between two samples of the ground truth; None for a single point.
 
     Distances are computed one way only, because the two samples are exchangeable.
 
     Args:
-        truth: the shape.
+        gt: the shape.
         protocol: with the sampling rule.
         points: its sample with the seed of the protocol.
     """
-    if isinstance(truth, Points):
-        if len(truth.positions) < 2:
+    if isinstance(gt, Points):
+        if len(gt.positions) < 2:
             return None
-        one, two = halves(truth, protocol.num_points, protocol.seed)
+        one, two = halves(gt, protocol.num_points, protocol.seed)
     else:
-        one, two = points, take_points(truth, protocol, protocol.seed + 1)
+        one, two = points, take_points(gt, protocol, protocol.seed + 1)
     found = protocol.unit * nearest(two, one)[0].astype(np.float64)
     return _chamfer(found, found, protocol.chamfer)
 
 
 def shape_iou(
-    predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
+    predicted: Mesh | Points, gt: Mesh | Points, protocol: GeometryProtocol
 ) -> dict[str, Any]:
     """Compute the Volume IoU by the protocol's rule and grid.
 
@@ -138,14 +138,14 @@ def shape_iou(
         return {"iou": None, "iou_reason": "the protocol defines no occupancy"}
     if isinstance(predicted, Points):
         return {"iou": None, "iou_reason": "the prediction is a point cloud"}
-    if isinstance(truth, Points):
-        return {"iou": None, "iou_reason": "the truth is a point cloud"}
+    if isinstance(gt, Points):
+        return {"iou": None, "iou_reason": "the ground truth is a point cloud"}
     if protocol.grid == "lattice":
         grid = syncdreamer_grid()
     else:
-        grid = grid_around(predicted, truth, resolution=protocol.iou_voxels)
+        grid = grid_around(predicted, gt, resolution=protocol.iou_voxels)
     fill = RULES[protocol.occupancy].fill
-    filled = fill(predicted, grid), fill(truth, grid)
+    filled = fill(predicted, grid), fill(gt, grid)
     iou = volume_iou(*filled)
     if iou is None and grid.step > 1 / protocol.iou_voxels:
         iou = 0.0  # Far apart, or of very different size: they share less than a voxel.
@@ -159,23 +159,23 @@ def shape_iou(
 
 
 def chamfer_by_transform(
-    predicted: LoadedShape, truth: LoadedShape, protocol: GeometryProtocol
+    predicted: LoadedShape, gt: LoadedShape, protocol: GeometryProtocol
 ) -> dict[str, float]:
     """Compute the Chamfer distance with other axes for the prediction's file.
 
     The transforms are about the origin of the file. Gaussians are compared by their centres,
-    because their surface is extracted near the truth only.
+    because their surface is extracted near the ground truth only.
 
     Args:
         predicted: before any alignment.
-        truth: the true shape.
+        gt: the true shape.
         protocol: with the seed and the alignment, which follows each transform. If it searches all
             rotations, one mirror stands for the other transforms.
 
     Returns:
         Distances between few points, by the key of ``TRANSFORMS``.
     """
-    true = Points(sample(truth.shape, _FEW, protocol.seed).positions)
+    true = Points(sample(gt.shape, _FEW, protocol.seed).positions)
     few = (_FEW, protocol.seed + 1)
     source, found = predicted.source, {}
     of = sample(source, *few)
@@ -189,12 +189,12 @@ def chamfer_by_transform(
     return found
 
 
-def surface_metrics(predicted: Points, truth: Points, protocol: GeometryProtocol) -> dict:
+def surface_metrics(predicted: Points, gt: Points, protocol: GeometryProtocol) -> dict:
     """Compute distances between two surfaces, by points on them.
 
     Args:
         predicted: at least one point.
-        truth: at least one point, in the same frame; the truth's longest side is 1.
+        gt: at least one point, in the same frame; the truth's longest side is 1.
         protocol: with the unit, the form of the Chamfer distance and the thresholds.
 
     Returns:
@@ -205,8 +205,8 @@ def surface_metrics(predicted: Points, truth: Points, protocol: GeometryProtocol
         ``normal_consistency`` (mean absolute cosine of nearest points' normals, both ways,
         averaged; None without normals).
     """
-    there, there_at = nearest(predicted, truth)
-    back, back_at = nearest(truth, predicted)
+    there, there_at = nearest(predicted, gt)
+    back, back_at = nearest(gt, predicted)
     there, back = (protocol.unit * found.astype(np.float64) for found in (there, back))
     fscore = {}
     for threshold in protocol.thresholds:
@@ -214,9 +214,9 @@ def surface_metrics(predicted: Points, truth: Points, protocol: GeometryProtocol
         total = precision + recall
         fscore[f"{threshold:g}"] = float(2 * precision * recall / total) if total else 0.0
     consistency = None
-    if predicted.normals is not None and truth.normals is not None:
-        one = np.abs((predicted.normals * truth.normals[there_at]).sum(1)).mean()
-        two = np.abs((truth.normals * predicted.normals[back_at]).sum(1)).mean()
+    if predicted.normals is not None and gt.normals is not None:
+        one = np.abs((predicted.normals * gt.normals[there_at]).sum(1)).mean()
+        two = np.abs((gt.normals * predicted.normals[back_at]).sum(1)).mean()
         consistency = float(one + two) / 2
     return {
         "chamfer": _chamfer(there, back, protocol.chamfer),

@@ -45,7 +45,7 @@ class ShapesOptions:
         set: Fields of the protocol, FIELD=JSON each: --set num_points=10000 surface.voxels=64
             thresholds=[0.1,0.2]. "--explain" lists them.
         surface: Method that turns Gaussians into a surface; centers is a diagnostic.
-        align: Steps that align predictions with the truth, in order: box (bounding boxes),
+        align: Steps that align predictions with the ground truth, in order: box (bounding boxes),
             scale (centroids and spread of points), yaw and turn (rotation search about the upward
             axis or any), rigid and icp (ICP without and with scale); or none.
         frame: Frame of the predictions: the GT file's, its unit frame (z-up, longest side 1,
@@ -69,7 +69,7 @@ class ShapesOptions:
         workers: Pairs evaluated at the same time, each in its own process.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.
-        sheet: Draw the worst and the best pairs, six of each, next to their truths.
+        sheet: Draw the worst and the best pairs, six of each, next to their ground truths.
     """
 
     pred: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PRED")] = None

@@ -229,9 +229,9 @@ def find_pairs(
 ) -> tuple[list[Pair], list[dict[str, str]]]:
     """Pair two files, or the files of two folders by name (``object_names``).
 
-    A ``catalogue.json`` in the folder of truths names its files; of such a library only predicted
-    or expected objects are used. With a dataset, all objects of each split that has a prediction
-    are expected.
+    A ``catalogue.json`` in the folder of ground truths names its files; of such a library only
+    predicted or expected objects are used. With a dataset, all objects of each split that has a
+    prediction are expected.
 
     Args:
         pred: predicted shapes.
@@ -333,37 +333,37 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
-    from .load import FRAME_AXES, load_prediction, load_truth
+    from .load import FRAME_AXES, load_gt, load_prediction
     from .metrics import chamfer_by_transform, compare
 
     stages = Stopwatch(3)
     with stages("load"):
-        truth = load_truth(pair.gt, protocol, pair.rotation, pair.placement)
-        into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
+        gt = load_gt(pair.gt, protocol, pair.rotation, pair.placement)
+        into, frame_axes = motion or gt.motion, FRAME_AXES.get(protocol.frame, gt.axes)
         predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     with stages("compare"):
         if note := scale_note(predicted.shape, protocol):
             predicted.warnings.append(note)
-        metrics = compare(predicted.shape, truth.shape, protocol)
+        metrics = compare(predicted.shape, gt.shape, protocol)
         check_finite(metrics)
-        turned = check_finite(chamfer_by_transform(predicted, truth, protocol))
+        turned = check_finite(chamfer_by_transform(predicted, gt, protocol))
     return {
         "name": pair.name,
         "status": OK,
         **metrics,
         "kind": predicted.kind,
         "pred_closed": predicted.is_closed(),
-        "gt_closed": truth.is_closed(),
+        "gt_closed": gt.is_closed(),
         "pred_flags": predicted.flags,
-        "gt_flags": truth.flags,
+        "gt_flags": gt.flags,
         "pred_axes": predicted.axes,
-        "gt_axes": truth.axes,
+        "gt_axes": gt.axes,
         **({"pred_warnings": predicted.warnings} if predicted.warnings else {}),
-        **({"gt_warnings": truth.warnings} if truth.warnings else {}),
+        **({"gt_warnings": gt.warnings} if gt.warnings else {}),
         "chamfer_turned": turned,
         "pred_sha256": sha256(pair.pred),
         "gt_sha256": sha256(pair.gt),
-        "gt_normalization": truth.motion.record(),
+        "gt_normalization": gt.motion.record(),
         "seconds": stages.seconds,
     }
 

@@ -58,8 +58,8 @@ FORMS: dict[ChamferForm, str] = {
     "squared-sum": "sum of the two mean squared nearest distances",
 }
 DEFINITIONS = {
-    "normalization": "truth centred on its bounding box, longest side 1, turned to z-up",
-    "axes": "of a file: asked for, else of a truth what the dataset that was rendered of it says, "
+    "normalization": "ground truth centred on its bounding box, longest side 1, turned to z-up",
+    "axes": "of a file: asked for, else of a ground truth what the dataset that was rendered of it says, "
     "else those of its format (Gaussians: opencv; .obj, .glb, .gltf: opengl), else unknown; a "
     "prediction is turned into those of its frame where both are known",
     "samples": "both shapes are drawn from with one seed: a shape and itself have distance 0",
@@ -69,7 +69,7 @@ DEFINITIONS = {
     "hausdorff": "largest nearest distance, of either way, between the points",
     "fscore": "harmonic mean of the fractions of predicted and of true points within the threshold",
     "normal_consistency": "mean absolute cosine at nearest points, mean of both ways",
-    "noise_floor": "chamfer between two samples of the truth itself, one way; of a point cloud "
+    "noise_floor": "chamfer between two samples of the ground truth itself, one way; of a point cloud "
     "between two halves that share no point",
 }
 
@@ -92,7 +92,7 @@ class GeometryProtocol:
         occupancy: rule of the Volume IoU, one of ``occupancy.RULES``; "none" skips it.
         grid: grid of the Volume IoU, one of ``GRIDS``.
         iou_voxels: number of the grid's voxels per unit of length, for "around".
-        align: steps of the alignment with the truth, of ``align.STEPS``.
+        align: steps of the alignment with the ground truth, of ``align.STEPS``.
         frame: of the predictions (see the command).
         up: upward axis of the truth's files.
         pred_axes: axes of the predictions' files (see the command).

@@ -140,18 +140,18 @@ def vary_pair(
 
     Args:
         pair: the files.
-        protocol: the chosen one, which loads the truth.
+        protocol: the chosen one, which loads the ground truth.
         motion: of the prediction into the truth's unit frame; None: the same as the truth's.
         protocols: by label.
 
     Raises:
         UserError: a file cannot be read.
     """
-    from .load import FRAME_AXES, load_prediction, load_truth
+    from .load import FRAME_AXES, load_gt, load_prediction
     from .metrics import align_shape, point_metrics, shape_iou
 
-    truth = load_truth(pair.gt, protocol, pair.rotation, pair.placement)
-    axes = FRAME_AXES.get(protocol.frame, truth.axes)
+    gt = load_gt(pair.gt, protocol, pair.rotation, pair.placement)
+    axes = FRAME_AXES.get(protocol.frame, gt.axes)
     known: dict[Any, Any] = {}
 
     def once(function: Callable, *arguments: Any) -> Any:
@@ -165,10 +165,10 @@ def vary_pair(
     found: dict[str, dict[str, Any]] = {}
     for label, chosen in protocols.items():
         try:
-            loaded = once(load_prediction, pair.pred, motion or truth.motion, axes, chosen)
-            moved, _ = once(align_shape, loaded.shape, truth.shape, chosen)
-            metrics = once(point_metrics, moved, truth.shape, chosen)
-            metrics = metrics | once(shape_iou, moved, truth.shape, chosen)
+            loaded = once(load_prediction, pair.pred, motion or gt.motion, axes, chosen)
+            moved, _ = once(align_shape, loaded.shape, gt.shape, chosen)
+            metrics = once(point_metrics, moved, gt.shape, chosen)
+            metrics = metrics | once(shape_iou, moved, gt.shape, chosen)
             found[label] = check_finite(_row_figures(metrics, chosen))
         except UserError as error:
             found[label] = {"failed": str(error)}

@@ -109,8 +109,8 @@ class Similarity:
     """Motion ``x -> scale · rotation · x + translation``.
 
     Attributes:
-        rotation: ``[3, 3]`` float64, proper; for a truth that was rendered stretched or mirrored it
-            includes that.
+        rotation: ``[3, 3]`` float64, proper; for a ground truth that was rendered stretched or
+            mirrored it includes that.
         translation: ``[3]`` float64.
         scale: > 0.
     """

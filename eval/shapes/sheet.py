@@ -1,4 +1,6 @@
-"""Sheet of predictions next to their truths, in two views: the worst and the best of a report."""
+"""Sheet of predictions next to their ground truths, in two views: the worst and the best of a
+report.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from .shape import Mesh, Points, Similarity
 
 EACH = 6  # worst and best pairs of a sheet
 SIDE, FOV = 176, 40.0  # pixels; degrees
-AZIMUTHS, ELEVATION, DISTANCE = (-35.0, 145.0), 20.0, 2.4  # degrees; sides of the truth
+AZIMUTHS, ELEVATION, DISTANCE = (-35.0, 145.0), 20.0, 2.4  # degrees; sides of the ground truth
 _LABEL, _GAP = 20, 6  # pixels
 # From the reference camera's world (y down, z forward) to the truth's, which is z-up.
 _TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -63,13 +65,13 @@ def _draw_pair(
     pair: Any, protocol: GeometryProtocol, motion: Similarity | None = None
 ) -> dict[str, Any]:
     """Return a record with the images of a pair, as it was compared; runs in a child."""
-    from .load import FRAME_AXES, load_prediction, load_truth
+    from .load import FRAME_AXES, load_gt, load_prediction
     from .metrics import align_shape
 
-    truth = load_truth(pair.gt, protocol, pair.rotation, pair.placement)
-    into, axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
+    gt = load_gt(pair.gt, protocol, pair.rotation, pair.placement)
+    into, axes = motion or gt.motion, FRAME_AXES.get(protocol.frame, gt.axes)
     predicted = load_prediction(pair.pred, into, axes, protocol)
-    shapes = align_shape(predicted.shape, truth.shape, protocol)[0], truth.shape
+    shapes = align_shape(predicted.shape, gt.shape, protocol)[0], gt.shape
     return {"name": pair.name, "status": OK, "images": np.hstack([*map(image_of, shapes)])}
 
 

@@ -63,9 +63,9 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
     """Summarise the evaluated shapes besides metrics.
 
     Returns:
-        ``flags`` and ``axes``: counts for each side; and ``warnings``: about truths that are not
-        placed as in the dataset, parts of files that are not read, and rotations that would improve
-        the score a lot.
+        ``flags`` and ``axes``: counts for each side; and ``warnings``: about ground truths that are
+        not placed as in the dataset, parts of files that are not read, and rotations that would
+        improve the score a lot.
     """
     done = [record for record in objects if record["status"] == OK]
     sides = ("pred", "gt")

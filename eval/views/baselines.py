@@ -1,6 +1,6 @@
 """Baselines without a model, which a single-view model has to beat.
 
-A baseline maps a ``Truth`` to images of all its views. It uses only the input view and the
+A baseline maps a ``GroundTruth`` to images of all its views. It uses only the input view and the
 cameras; the retrieval uses the training split too.
 """
 
@@ -24,9 +24,9 @@ from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
 
-from .compare import Shown, Truth, shown
+from .compare import GroundTruth, Shown, shown
 
-Baseline = Callable[[Truth], Shown | None]
+Baseline = Callable[[GroundTruth], Shown | None]
 
 THUMBNAIL = 32  # pixels per side, for the retrieval
 _CHUNK = 512  # thumbnails compared at once by colour
@@ -44,27 +44,27 @@ MEANING = {
 }
 
 
-def background(truth: Truth) -> Shown:
+def background(gt: GroundTruth) -> Shown:
     """Return an empty image for every view."""
-    white = torch.full_like(truth.rgb[:1], WHITE).expand_as(truth.rgb)
-    return Shown(white, torch.zeros_like(truth.images[..., 3]))
+    white = torch.full_like(gt.rgb[:1], WHITE).expand_as(gt.rgb)
+    return Shown(white, torch.zeros_like(gt.images[..., 3]))
 
 
-def input_copy(truth: Truth) -> Shown:
+def input_copy(gt: GroundTruth) -> Shown:
     """Return the input image for every view."""
-    alpha = truth.images[..., 3]
-    return Shown(truth.rgb[:1].expand_as(truth.rgb), alpha[:1].expand_as(alpha))
+    alpha = gt.images[..., 3]
+    return Shown(gt.rgb[:1].expand_as(gt.rgb), alpha[:1].expand_as(alpha))
 
 
-def billboard(truth: Truth) -> Shown:
+def billboard(gt: GroundTruth) -> Shown:
     """Render the input image as a plane through the object's centre, parallel to its image plane.
 
     The centre is the origin and the input camera's axes are the world's, so the plane is
     z = 0. The intersection of each pixel's ray is projected into the input camera, which is exact.
     From behind the image is mirrored; edge-on the plane is invisible.
     """
-    viewmats, Ks = truth.cameras.viewmats.double(), truth.cameras.Ks.double()
-    count, height, width = truth.mask.shape
+    viewmats, Ks = gt.cameras.viewmats.double(), gt.cameras.Ks.double()
+    count, height, width = gt.mask.shape
     x = torch.arange(width, device=Ks.device, dtype=Ks.dtype) + 0.5
     y = torch.arange(height, device=Ks.device, dtype=Ks.dtype) + 0.5
     pixels = torch.stack([*torch.meshgrid(x, y, indexing="xy"), x.new_ones(height, width)], -1)
@@ -81,7 +81,7 @@ def billboard(truth: Truth) -> Shown:
     hit = (depth > 0) & (rays[..., 2].abs() > 1e-5) & grid.isfinite().all(-1)
     hit &= projected[..., 2] > 0
     grid = torch.where(hit[..., None], grid, 2.0)  # outside the image
-    rgba = truth.images[0].double()
+    rgba = gt.images[0].double()
     premultiplied = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
     sampled = grid_sample(
         premultiplied.permute(2, 0, 1).expand(count, -1, -1, -1),
@@ -89,7 +89,7 @@ def billboard(truth: Truth) -> Shown:
         align_corners=False,
     ).permute(0, 2, 3, 1)
     rgb, alpha = sampled[..., :3], sampled[..., 3:]
-    return Shown((rgb + WHITE * (1 - alpha)).to(truth.rgb), alpha[..., 0].to(truth.rgb))
+    return Shown((rgb + WHITE * (1 - alpha)).to(gt.rgb), alpha[..., 0].to(gt.rgb))
 
 
 class NearestView(NamedTuple):
@@ -168,25 +168,25 @@ class Retrieval:
                 best, at = float(value), int(part[row])
         return None if at < 0 else NearestView(*self._sources[at], best)
 
-    def __call__(self, truth: Truth) -> Shown | None:
+    def __call__(self, gt: GroundTruth) -> Shown | None:
         """Return the images; None without another object. Raises UserError for a bad image."""
-        found = self.nearest(truth.images[0].cpu(), truth.uid)
+        found = self.nearest(gt.images[0].cpu(), gt.uid)
         if found is None:
             return None
-        self.found[truth.uid] = found
+        self.found[gt.uid] = found
         uid, view, _ = found
         poses = torch.from_numpy(self.training.files(uid).camera_to_world)
         viewmats = from_opengl(poses).double()
         relative, _ = relative_to_reference(viewmats, viewmats[view])
-        rotations = truth.cameras.viewmats[:, :3, :3].cpu().double()
+        rotations = gt.cameras.viewmats[:, :3, :3].cpu().double()
         # trace(R_a R_bᵀ) = 1 + 2 cos(angle between them)
         chosen = torch.einsum("vij,wij->vw", rotations, relative[:, :3, :3]).argmax(1)
         chosen[0] = view
         needed, rows = chosen.unique(return_inverse=True)
-        images = self.training.load(uid, needed.tolist(), truth.rgb.shape[1]).images
-        if images.shape[1:3] != truth.rgb.shape[1:3]:
+        images = self.training.load(uid, needed.tolist(), gt.rgb.shape[1]).images
+        if images.shape[1:3] != gt.rgb.shape[1:3]:
             raise UserError(f"{uid}: its images have a different size")
-        return shown(images[rows].to(truth.images.device))
+        return shown(images[rows].to(gt.images.device))
 
 
 def thumbnails(images: Tensor) -> Tensor:

@@ -112,7 +112,7 @@ class ViewsProtocol:
 
 
 @dataclass
-class Truth:
+class GroundTruth:
     """True views of one object.
 
     Attributes:
@@ -157,7 +157,7 @@ def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
     return [reference, *evenly(others, len(others) if wanted is None else wanted - 1)]
 
 
-def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: str) -> Truth:
+def load_gt(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: str) -> GroundTruth:
     """Load one object's views, with cameras in the input camera's world.
 
     Args:
@@ -172,7 +172,7 @@ def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: 
     views = choose_views(dataset.num_views(uid), protocol.reference, protocol.views)
     loaded = dataset.load(uid, views=views, size=protocol.size)
     cameras = relative_cameras(loaded.cameras, protocol.distance)
-    return Truth(uid, loaded.images.to(device), cameras.to(device), views)
+    return GroundTruth(uid, loaded.images.to(device), cameras.to(device), views)
 
 
 def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
@@ -182,7 +182,7 @@ def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
     return Shown(out.rgb, out.alpha[..., 0])
 
 
-def compare(candidates: Mapping[str, Shown], truth: Truth) -> dict[str, list[Values]]:
+def compare(candidates: Mapping[str, Shown], gt: GroundTruth) -> dict[str, list[Values]]:
     """Compute all metrics of each view for each candidate, except LPIPS, which stays None.
 
     ``mse`` is the mean squared error of the PSNR on white. Masks and metrics on other backgrounds
@@ -192,8 +192,8 @@ def compare(candidates: Mapping[str, Shown], truth: Truth) -> dict[str, list[Val
     for name, images in candidates.items():
         alpha, mask = images.alpha, images.mask()
         found = measure(
-            lambda grey, shown=images: (shown.on(grey), truth.shown.on(grey)),
-            None if mask is None else (mask, truth.mask),
+            lambda grey, shown=images: (shown.on(grey), gt.shown.on(grey)),
+            None if mask is None else (mask, gt.mask),
             [k for k, m in all_figures().items() if alpha is not None or m.ground is None],
         )
         values = dict.fromkeys(all_figures(), [None] * len(images.rgb))
@@ -207,18 +207,18 @@ def compare(candidates: Mapping[str, Shown], truth: Truth) -> dict[str, list[Val
 def add_lpips(
     values: dict[str, list[Values]],
     candidates: Mapping[str, Shown],
-    truth: Truth,
+    gt: GroundTruth,
     lpips: LPIPS,
 ) -> None:
     """Add LPIPS, on every background, to the result of ``compare``.
 
-    Features take nearly all the time. They are computed once for the truth, and once for a
+    Features take nearly all the time. They are computed once for the ground truth, and once for a
     candidate with the same image (an expanded tensor) in every view. A progress bar appears after
     two seconds.
     """
-    about = {"desc": f"LPIPS of {truth.uid}", "unit": "batch", "leave": False, "delay": 2}
+    about = {"desc": f"LPIPS of {gt.uid}", "unit": "batch", "leave": False, "delay": 2}
     figures = {key: metric for key, metric in all_figures().items() if metric.compare is None}
-    starts = range(0, len(truth.rgb), BATCH)
+    starts = range(0, len(gt.rgb), BATCH)
     with progress_bar(total=len(figures) * len(starts), **about) as bar:
         for key, metric in figures.items():
             grey = metric.grey
@@ -227,7 +227,7 @@ def add_lpips(
             fixed = {
                 n: lpips.features(shown[n][0]) for n, c in known.items() if not c.rgb.stride(0)
             }
-            true = truth.shown.on(grey)
+            true = gt.shown.on(grey)
             for start in starts:
                 part = slice(start, start + BATCH)
                 features = lpips.features(true[part])
@@ -244,7 +244,7 @@ def summary(views: list[Values], coverage: list[float]) -> dict[str, Any]:
 
     Args:
         views: metrics of each view.
-        coverage: of each view, see ``Truth``.
+        coverage: of each view, see ``GroundTruth``.
 
     Returns:
         The metrics, ``input``, and ``without_nearly_empty``: the same without nearly empty views.

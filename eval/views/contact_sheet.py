@@ -15,7 +15,7 @@ from gamba_warp.files import atomic_path, output_folder
 from gamba_warp.image_metrics import METRICS
 from gamba_warp.images import save_image, to_uint8
 
-from .compare import Truth, choose_views
+from .compare import GroundTruth, choose_views
 
 TILE = 128  # pixels per side; images are fitted into it
 _LABEL, _HEADER, _GAP, _LINE = 200, 22, 4, 16  # pixels
@@ -29,13 +29,13 @@ class Row:
     Attributes:
         lines: its label.
         shown: the input image ``[H, W, 3]`` in [0, 1].
-        truth: true views ``[k, H, W, 3]`` in [0, 1].
+        gt: true views ``[k, H, W, 3]`` in [0, 1].
         predicted: the same views as predicted.
     """
 
     lines: list[str]
     shown: Tensor
-    truth: Tensor
+    gt: Tensor
     predicted: Tensor
 
 
@@ -79,7 +79,7 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    most = max(len(row.truth) for row in rows)
+    most = max(len(row.gt) for row in rows)
     step = TILE + _GAP
     starts = [_LABEL, _LABEL + step + 2 * _GAP, _LABEL + step + 4 * _GAP + most * step]
     sheet = Image.new("RGB", (starts[2] + most * step, _HEADER + len(rows) * step), (255, 255, 255))
@@ -91,7 +91,7 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
         for k, line in enumerate(row.lines):
             grey = (0, 0, 0) if k == 0 else (80, 80, 80)
             draw.text((6, top + 4 + k * _LINE), line, fill=grey, font=font)
-        for start, images in zip(starts, (row.shown[None], row.truth, row.predicted)):
+        for start, images in zip(starts, (row.shown[None], row.gt, row.predicted)):
             for k, image in enumerate(images):
                 pixels = Image.fromarray(to_uint8(np.asarray(image.cpu())))
                 tile = ImageOps.pad(pixels, (TILE, TILE), color=(255, 255, 255))
@@ -102,9 +102,9 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
         sheet.save(temporary)
 
 
-def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
+def save_strips(path: Path, rgb: Tensor, gt: GroundTruth, count: int = 4) -> None:
     """Write rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
     rows = choose_views(len(rgb), 0, count)
-    strips = [torch.cat([truth.rgb[0], rgb[row], truth.rgb[row]], 1) for row in rows]
+    strips = [torch.cat([gt.rgb[0], rgb[row], gt.rgb[row]], 1) for row in rows]
     output_folder(path.parent)
     save_image(path, torch.cat(strips, 0).cpu().numpy())

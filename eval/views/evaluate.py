@@ -43,13 +43,13 @@ from .baselines import (
 )
 from .compare import (
     NEARLY_EMPTY,
+    GroundTruth,
     Shown,
-    Truth,
     ViewsProtocol,
     add_lpips,
     choose_views,
     compare,
-    load_truth,
+    load_gt,
     render_views,
     summary,
 )
@@ -99,24 +99,24 @@ class Job:
     meshes: TrainingMeshes | None = None
     retrieval_data: list[str] = field(default_factory=list)
 
-    def predict(self, truth: Truth) -> Gaussians | Images:
+    def predict(self, gt: GroundTruth) -> Gaussians | Images:
         """Return the Gaussians or images under test. Raises UserError if they are missing."""
         if isinstance(self.predictions, ImagePredictions):
-            return self.predictions.images(self.dataset, truth)
-        return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
+            return self.predictions.images(self.dataset, gt)
+        return self.predictions.gaussians(self.dataset, gt.uid, self.protocol.reference)
 
     def fail(self, name: str, error: Exception | str) -> None:
         """Record a failure of a baseline."""
         self.failures.append({"name": name, "reason": failure(name, error)["reason"]})
 
-    def shown(self, truth: Truth) -> dict[str, Shown]:
+    def shown(self, gt: GroundTruth) -> dict[str, Shown]:
         """Return the images of each baseline; failures are recorded and stop no other."""
         result = {}
         for name, baseline in self.baselines.items():
             try:
-                images = baseline(truth)
+                images = baseline(gt)
             except ERRORS as error:
-                self.fail(f"{truth.uid} ({name})", error)
+                self.fail(f"{gt.uid} ({name})", error)
                 continue
             if images is not None:
                 result[name] = images
@@ -277,11 +277,11 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
     return report
 
 
-def images_of(predicted: Gaussians | Images, truth: Truth) -> Images:
+def images_of(predicted: Gaussians | Images, gt: GroundTruth) -> Images:
     """Return the prediction as images of the true views; Gaussians are rendered."""
     if isinstance(predicted, Images):
         return predicted
-    return Images(render_views(predicted, truth.cameras))
+    return Images(render_views(predicted, gt.cameras))
 
 
 def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dict[str, Any]:
@@ -302,26 +302,26 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
     """
     stages = Stopwatch(4)
     with stages("load"):
-        truth = load_truth(job.dataset, uid, job.protocol, job.device)
+        gt = load_gt(job.dataset, uid, job.protocol, job.device)
     with stages("predict"):
-        predicted = job.predict(truth)
+        predicted = job.predict(gt)
     with stages("render"):
-        images = images_of(predicted, truth)
+        images = images_of(predicted, gt)
     with stages("baselines"):
-        baselines = job.shown(truth)
+        baselines = job.shown(gt)
     candidates = {"": images.shown} | baselines
     with stages("compare"):
-        by_view = compare(candidates, truth)
+        by_view = compare(candidates, gt)
     with stages("lpips"):
         if job.network:
-            add_lpips(by_view, candidates, truth, job.network)
+            add_lpips(by_view, candidates, gt, job.network)
     if not images.has_input:
         by_view[""][0] = dict.fromkeys(by_view[""][0])
     found = job.retrieval.found.get(uid) if job.retrieval else None
     gaussians = predicted if isinstance(predicted, Gaussians) else None
 
     if "strips" in folders:
-        save_strips(folders["strips"] / f"{uid}.png", images.shown.on(), truth)
+        save_strips(folders["strips"] / f"{uid}.png", images.shown.on(), gt)
     if "gaussians" in folders and gaussians is not None:
         path = folders["gaussians"] / f"{uid}.ply"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -330,26 +330,26 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         model = {} if images.shown.alpha is None else {"model": images.shown}
         for name, candidate in (model | baselines).items():
             where = folders["images"] / name / uid
-            save_images(where, job.dataset.files(uid), truth.views, candidate)
+            save_images(where, job.dataset.files(uid), gt.views, candidate)
     if "retrieval" in folders and found and job.meshes:
         try:
             job.meshes.save(folders["retrieval"] / f"{uid}.ply", found, job.protocol.distance)
         except ERRORS as error:
             job.fail(f"{uid} (retrieval's mesh)", error)
 
-    summaries = {n: check_finite(summary(v, truth.coverage)) for n, v in by_view.items()}
+    summaries = {n: check_finite(summary(v, gt.coverage)) for n, v in by_view.items()}
     return {
         "name": uid,
         "status": OK,
         **summaries.pop(""),
         "baselines": summaries,
         **({"retrieval": found._asdict()} if found else {}),
-        "views": truth.views,
-        "coverage": truth.coverage,
-        "num_nearly_empty": sum(fraction < NEARLY_EMPTY for fraction in truth.coverage),
+        "views": gt.views,
+        "coverage": gt.coverage,
+        "num_nearly_empty": sum(fraction < NEARLY_EMPTY for fraction in gt.coverage),
         **({"images": images.record} if images.record else {}),
         **({} if gaussians is None else {"gaussians": gaussians.num}),
-        "truth_sha256": truth.digest,
+        "truth_sha256": gt.digest,
         "seconds": stages.seconds,
     }
 
@@ -371,13 +371,13 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
     for rank, group in choose_ranks(len(done), each).items():
         record = done[rank]
         try:
-            truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
-            made = images_of(job.predict(truth), truth).shown
+            gt = load_gt(job.dataset, record["name"], job.protocol, job.device)
+            made = images_of(job.predict(gt), gt).shown
         except ERRORS:  # a file changed meanwhile; the report has its record
             continue
-        views = choose_views(len(truth.rgb), 0, SHEET_VIEWS + 1)[1:]
+        views = choose_views(len(gt.rgb), 0, SHEET_VIEWS + 1)[1:]
         ground = WHITE if made.alpha is None else GREY
-        true, got = truth.shown.on(ground), made.on(ground)
+        true, got = gt.shown.on(ground), made.on(ground)
         lines = label(record, f"{group}: {rank + 1} of {len(done)}")
         rows.append(Row(lines, true[0], true[views], got[views]))
     return rows

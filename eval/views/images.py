@@ -29,7 +29,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import sha256_of_all, visible
 from gamba_warp.images import load_rgba8, open_image, save_image
 
-from .compare import Shown, Truth, shown
+from .compare import GroundTruth, Shown, shown
 
 TRANSFORMS = "transforms.json"
 CAMERA = 1e-3  # radians; fraction of the camera's distance; fraction of the image's side
@@ -89,21 +89,21 @@ class ImagePredictions:
                 f"the first would be {self.folder / uids[0]}"
             )
 
-    def images(self, dataset: ViewDataset, truth: Truth) -> Images:
+    def images(self, dataset: ViewDataset, gt: GroundTruth) -> Images:
         """Read the images of one object.
 
         Args:
             dataset: that the object belongs to.
-            truth: the views to compare with; all but the input (the first) must have an image.
+            gt: the views to compare with; all but the input (the first) must have an image.
 
         Raises:
             UserError: the folder is missing, a view lacks its image or has two, or an image
                 cannot be read, has another size, or a background that is not white.
         """
-        folder = self.folder / truth.uid
+        folder = self.folder / gt.uid
         if not folder.is_dir():
             raise UserError(f"{folder}: no such folder")
-        files, views = dataset.files(truth.uid), truth.views
+        files, views = dataset.files(gt.uid), gt.views
         if (folder / TRANSFORMS).is_file():
             by, found, given = "camera", *_match_by_camera(folder, files, views)
         else:
@@ -111,7 +111,7 @@ class ImagePredictions:
         lacking = [view for view in views[1:] if view not in found]
         if lacking or not found:
             raise UserError(_missing_message(folder, lacking or views, views, by))
-        rgba = torch.zeros(len(views), *truth.rgb.shape[1:3], 4)
+        rgba = torch.zeros(len(views), *gt.rgb.shape[1:3], 4)
         there = [view in found for view in views]
         alphas, resized = {}, 0
         for row, view in enumerate(views):
@@ -119,7 +119,7 @@ class ImagePredictions:
                 with open_image(found[view]) as file:
                     alphas[view] = file.has_transparency_data
                 image = load_rgba8(found[view])
-                fitted = self._resized(found[view], image, truth, files, view)
+                fitted = self._resized(found[view], image, gt, files, view)
                 resized += fitted is not image
                 rgba[row] = torch.from_numpy(fitted.astype(np.float32) / 255)
         if len(set(alphas.values())) > 1:
@@ -127,7 +127,7 @@ class ImagePredictions:
             raise UserError(f"{found[odd]}: has no alpha, but others of the object have")
         opaque = bool((rgba[there, ..., 3] == 1).all())
         if opaque:
-            _check_white(folder, rgba[..., :3], truth, there)
+            _check_white(folder, rgba[..., :3], gt, there)
         unused = given - len(found)
         record = {"matched_by": by, "unused": unused, "resized": resized, "alpha": not opaque}
         images = shown(rgba.to(self.device))
@@ -136,10 +136,10 @@ class ImagePredictions:
         return Images(images, there[0], record)
 
     def _resized(
-        self, path: Path, image: np.ndarray, truth: Truth, files: ObjectFiles, view: int
+        self, path: Path, image: np.ndarray, gt: GroundTruth, files: ObjectFiles, view: int
     ) -> np.ndarray:
         """Return the image at the compared size, resized like the true image if needed."""
-        (height, width), (tall, wide) = image.shape[:2], truth.rgb.shape[1:3]
+        (height, width), (tall, wide) = image.shape[:2], gt.rgb.shape[1:3]
         if (width, height) == (wide, tall):
             return image
         true, size = files.images[view], files.sizes[view]  # a pack may not state the size
@@ -249,7 +249,7 @@ def _missing_message(folder: Path, lacking: Sequence[int], views: Sequence[int],
     )
 
 
-def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> None:
+def _check_white(folder: Path, rgb: Tensor, gt: GroundTruth, found: list[bool]) -> None:
     """Refuse opaque images on a flat background that is not white.
 
     Fog is not flat, so it still counts against the method.
@@ -257,7 +257,7 @@ def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> 
     Raises:
         UserError: over half of the empty pixels of the true images have one such colour.
     """
-    empty = (truth.images[..., 3] == 0).cpu() & torch.tensor(found)[:, None, None]
+    empty = (gt.images[..., 3] == 0).cpu() & torch.tensor(found)[:, None, None]
     pixels = rgb[empty]
     if not len(pixels):
         return

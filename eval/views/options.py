@@ -27,7 +27,7 @@ class ViewsOptions:
             cameras (docs/evaluate.md).
         data: Dataset of posed views.
         out: Folder for report.json, objects.csv, table.md, contact_sheet.png and strips/ (input |
-            prediction | truth); without it only the table is printed.
+            prediction | ground truth); without it only the table is printed.
         protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, with the
             first view as the input; the report lists missing objects. It fixes split, size, limit,
             reference and number of views. splatter-image, leangaussian, gamba: these papers'

@@ -85,7 +85,7 @@ def _call(words: list[str]) -> int:
     return processes.run_gamba(words, None, ())
 
 
-def _evaluate(results, starter: Path, truth: Path, lpips: str) -> None:
+def _evaluate(results, starter: Path, gt: Path, lpips: str) -> None:
     """Run the shipped model on images and objects outside its training set."""
     model, views, data = results.shipped, results.views, starter / "data"
     _gamba(
@@ -97,11 +97,11 @@ def _evaluate(results, starter: Path, truth: Path, lpips: str) -> None:
         *("--out", views, "--save-gaussians", "--lpips", "auto" if lpips == "on" else "off"),
     )
     # The true meshes of the predicted objects, so that the folders pair by name.
-    output_folder(truth)
+    output_folder(gt)
     for ply in (views / "gaussians").glob("*.ply"):
-        shutil.copyfile(starter / "meshes" / ply.name, truth / ply.name)
+        shutil.copyfile(starter / "meshes" / ply.name, gt / ply.name)
     _gamba(
-        *("eval-geometry", views / "gaussians", truth),
+        *("eval-geometry", views / "gaussians", gt),
         # The starter set's meshes are in the world of its views.
         *("--frame", "reference", "--data", data, "--up", "z", "--out", results.shapes),
         may_fail=True,

@@ -85,7 +85,8 @@ def tiles(path: Path, columns: int = 3) -> np.ndarray:
         columns: of views.
 
     Returns:
-        ``[columns, V, S, S, 3]`` in [0, 1]; for ``gamba eval-views`` input, prediction and truth.
+        ``[columns, V, S, S, 3]`` in [0, 1]; for ``gamba eval-views`` input, prediction and ground
+        truth.
 
     Raises:
         UserError: the image cannot be read.

@@ -66,9 +66,9 @@ def test_a_copy_comes_back_from_any_start(name):
 
 def test_a_turn_about_the_upward_axis_is_found_by_its_own_search():
     turn = Rotation.from_euler("z", 143.4, degrees=True).as_matrix()
-    points, truth = (sample(CHAIR, 10_000, seed) for seed in (0, 1))
+    points, gt = (sample(CHAIR, 10_000, seed) for seed in (0, 1))
     tilted = Similarity(turn, np.array([0.3, 0.1, -0.2]))
-    found, residual = aligned(tilted.apply(points), truth, ("yaw",))
+    found, residual = aligned(tilted.apply(points), gt, ("yaw",))
     assert not residual and np.allclose(found.rotation[2], [0, 0, 1])
     assert np.degrees(Rotation.from_matrix(found.rotation @ turn).magnitude()) <= 0.6 + 0.5
     assert np.abs(found.of(tilted).translation).max() < 0.02  # the noise of two centroids
@@ -76,15 +76,15 @@ def test_a_turn_about_the_upward_axis_is_found_by_its_own_search():
 
 @pytest.mark.parametrize("steps", [(step,) for step in STEPS])
 def test_steps_are_repeatable_and_a_single_point_is_refused(steps):
-    points, truth = (sample(CHAIR, 2000, seed) for seed in (0, 1))
-    one, two = (aligned(points, truth, steps) for _ in range(2))
+    points, gt = (sample(CHAIR, 2000, seed) for seed in (0, 1))
+    one, two = (aligned(points, gt, steps) for _ in range(2))
     # Open3D's ICP adds in the order in which its threads end; all else has the same bits.
     slack = 1e-12 if steps[0] in ("rigid", "icp") else 0
     for name in ("rotation", "translation", "scale"):
         apart = np.abs(np.array(getattr(one[0], name)) - getattr(two[0], name)).max()
         assert apart <= slack, name
     assert one[1] == pytest.approx(two[1], rel=slack)
-    refused("the prediction's points coincide", aligned, Points(np.zeros((5, 3))), truth, steps)
+    refused("the prediction's points coincide", aligned, Points(np.zeros((5, 3))), gt, steps)
 
 
 def test_boxes_and_moments_are_matched():

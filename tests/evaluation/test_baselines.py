@@ -11,7 +11,7 @@ from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views import baselines
 from gamba_warp.eval.views.baselines import Retrieval, billboard
-from gamba_warp.eval.views.compare import Truth, ViewsProtocol, load_truth
+from gamba_warp.eval.views.compare import GroundTruth, ViewsProtocol, load_gt
 from gamba_warp.eval.views.contact_sheet import Row, choose_ranks, contact_sheet
 from gamba_warp.eval.views.table import differences_of, means, table_of
 from gamba_warp.formats.ply import save_ply
@@ -24,8 +24,8 @@ WIDTH, HEIGHT = 45, 33
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def truth_at(azimuths, elevation=0.0, distance=1.5, image=None):
-    """Return a truth whose input image is ``image``, with further cameras."""
+def gt_at(azimuths, elevation=0.0, distance=1.5, image=None):
+    """Return a ground truth whose input image is ``image``, with further cameras."""
     viewmats = torch.cat(
         [orbit(torch.zeros(1)), orbit(torch.tensor(azimuths), elevation, distance)]
     )
@@ -34,19 +34,19 @@ def truth_at(azimuths, elevation=0.0, distance=1.5, image=None):
         image = torch.rand(HEIGHT, WIDTH, 4)
     cameras = Cameras(viewmats, intrinsics(WIDTH, HEIGHT, 40.0).expand(count, 3, 3), WIDTH, HEIGHT)
     images = torch.cat([image[None], torch.rand(count - 1, HEIGHT, WIDTH, 4)])
-    return Truth("a", images, cameras, list(range(count)))
+    return GroundTruth("a", images, cameras, list(range(count)))
 
 
 def test_billboard_reproduces_the_input():
     """Also with an off-centre axis, and a camera that looks past the object."""
-    truth = truth_at([30.0])
-    truth.cameras.Ks = truth.cameras.Ks.clone()
-    truth.cameras.Ks[:, 0, 2] += 3.3
-    truth.cameras.viewmats[0, :2, 3] = torch.tensor([0.1, -0.07])
-    rgb, alpha = billboard(truth)
+    gt = gt_at([30.0])
+    gt.cameras.Ks = gt.cameras.Ks.clone()
+    gt.cameras.Ks[:, 0, 2] += 3.3
+    gt.cameras.viewmats[0, :2, 3] = torch.tensor([0.1, -0.07])
+    rgb, alpha = billboard(gt)
     # float32 poses and images
-    assert (rgb[0] - truth.rgb[0]).abs().max() < 2e-5
-    assert (alpha[0] - truth.images[0, ..., 3]).abs().max() < 2e-5
+    assert (rgb[0] - gt.rgb[0]).abs().max() < 2e-5
+    assert (alpha[0] - gt.images[0, ..., 3]).abs().max() < 2e-5
 
 
 def test_billboard_is_what_a_camera_sees_of_the_plane():
@@ -55,11 +55,11 @@ def test_billboard_is_what_a_camera_sees_of_the_plane():
     y = (torch.arange(HEIGHT) + 0.5)[:, None].expand(HEIGHT, WIDTH)
     image = torch.stack([x / WIDTH, y / HEIGHT, 0 * x, torch.ones_like(x)], -1)
     # the last camera is so near that some of its rays run away from the plane
-    truth = truth_at([50.0, 200.0, 80.0], 20.0, torch.tensor([1.2, 1.2, 0.2]), image)
-    rgb, mask = billboard(truth)
-    focal, checked, away = truth.cameras.Ks[0, 0, 0].item(), 0, 0
+    gt = gt_at([50.0, 200.0, 80.0], 20.0, torch.tensor([1.2, 1.2, 0.2]), image)
+    rgb, mask = billboard(gt)
+    focal, checked, away = gt.cameras.Ks[0, 0, 0].item(), 0, 0
     for view in (1, 2, 3):
-        pose = torch.linalg.inv(truth.cameras.viewmats[view].double())
+        pose = torch.linalg.inv(gt.cameras.viewmats[view].double())
         for row, column in ((16, 22), (12, 18), (20, 25), (9, 27), (2, 1), (16, 3), (16, 41)):
             ray = torch.tensor([column + 0.5 - WIDTH / 2, row + 0.5 - HEIGHT / 2, focal])
             ray = pose[:3, :3] @ ray.double()
@@ -80,9 +80,9 @@ def test_billboard_is_what_a_camera_sees_of_the_plane():
 
 
 def test_billboard_from_behind_is_mirrored_and_edge_on_gone():
-    rgb, alpha = billboard(truth := truth_at([180.0, 90.0]))
-    assert (rgb[1] - truth.rgb[0].flip(1)).abs().max() < 1e-4
-    assert (alpha[1] - truth.images[0, ..., 3].flip(1)).abs().max() < 1e-4
+    rgb, alpha = billboard(gt := gt_at([180.0, 90.0]))
+    assert (rgb[1] - gt.rgb[0].flip(1)).abs().max() < 1e-4
+    assert (alpha[1] - gt.images[0, ..., 3].flip(1)).abs().max() < 1e-4
     assert not alpha[2].any() and (rgb[2] == 1).all()
 
 
@@ -125,12 +125,12 @@ def data(tmp_path):
 def test_retrieval_finds_the_twin_and_its_views(data):
     """The twin's view 0 is view 4 of ``seen``; the other views follow by camera."""
     retrieval = Retrieval(open_dataset(data, "train"))
-    truth = load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu")
-    uid, view, distance = retrieval.nearest(truth.images[0], "twin")
+    gt = load_gt(open_dataset(data, "test"), "twin", PROTOCOL, "cpu")
+    uid, view, distance = retrieval.nearest(gt.images[0], "twin")
     # the thumbnails are kept in 8 bits
     assert (uid, view) == ("seen", 4) and distance < 0.01
-    shown = retrieval(truth)
-    assert (shown.rgb - truth.rgb).abs().max() < 0.02 and (shown.mask() == truth.mask).all()
+    shown = retrieval(gt)
+    assert (shown.rgb - gt.rgb).abs().max() < 0.02 and (shown.mask() == gt.mask).all()
 
 
 def test_retrieval_takes_the_objects_of_other_datasets(data, tmp_path):
@@ -168,7 +168,7 @@ def test_retrieval_is_by_both_terms_not_by_shape_alone(data, monkeypatch):
     retrieval = Retrieval(open_dataset(data, "train"))
     images = torch.cat([retrieval.training.load(uid).images for uid in retrieval.training.uids])
     found = set()
-    for made in load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu").images:
+    for made in load_gt(open_dataset(data, "test"), "twin", PROTOCOL, "cpu").images:
         for query in (made, torch.cat([1 - made[..., :3], made[..., 3:]], -1)):
             uid, _, best = retrieval.nearest(query, "")
             found.add(uid)

@@ -134,7 +134,7 @@ def change(report, **values):
     return changed
 
 
-def other_truth(report):
+def other_gt(report):
     changed = copy.deepcopy(report)
     changed["objects"][1] |= {"truth_sha256": "other", "gt_sha256": "other"}
     return changed
@@ -164,9 +164,9 @@ V, S = views_report(), shapes_report()
         (V, change(V, reference=2), "reference is 2, not 0"),
         (V, change(V, size=64), "size is 64, not absent"),
         (change(V, lpips="A"), change(V, lpips="B"), "lpips is B, not A"),
-        (V, other_truth(V), "b was compared with a different truth"),
+        (V, other_gt(V), "b was compared with a different truth"),
         (S, change(S, occupancy="parity"), "occupancy is parity, not solid"),
-        (S, other_truth(S), "b was compared with a different truth"),
+        (S, other_gt(S), "b was compared with a different truth"),
         (shapes_report(kind="gaussians"), shapes_report(0, "gaussians", 64), "surface.voxels"),
         (V, views_report(uids=()), "no object was evaluated for all methods"),
         (V, {"protocol": {}, "objects": []}, "not a report of gamba eval-views"),

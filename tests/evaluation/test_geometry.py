@@ -11,7 +11,7 @@ from helpers.refusals import refused
 from helpers.views import cloud_of, evaluated
 
 from gamba_warp.cameras import fibonacci_sphere
-from gamba_warp.eval.shapes.load import load_shape, load_truth
+from gamba_warp.eval.shapes.load import load_gt, load_shape
 from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, nearest, sample
@@ -124,10 +124,10 @@ def test_similarity_moves_all_kinds_alike():
 
 def test_truth_is_normalised_and_turned(tmp_path):
     trimesh.creation.box((2.0, 4.0, 1.0)).apply_translation([5, 5, 5]).export(tmp_path / "a.obj")
-    truth = load_truth(tmp_path / "a.obj", protocol())  # y-up by its suffix
-    mesh = truth.shape
+    gt = load_gt(tmp_path / "a.obj", protocol())  # y-up by its suffix
+    mesh = gt.shape
     assert np.allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.25, 1.0])
-    again = truth.motion.apply(load_shape(tmp_path / "a.obj")[0])
+    again = gt.motion.apply(load_shape(tmp_path / "a.obj")[0])
     assert np.allclose(np.unique(again.vertices, axis=0), mesh.vertices)
 
 

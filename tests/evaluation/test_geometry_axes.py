@@ -109,7 +109,7 @@ def test_what_is_not_known_is_used_as_it_is_and_told(files, capfd):
 
 @pytest.mark.parametrize("axes", ["opencv", "opengl"])
 def test_our_own_mesh_files_say_their_axes(files, capfd, axes):
-    """A surface is y down as the Gaussians are; each file of it lies on the truth."""
+    """A surface is y down as the Gaussians are; each file of it lies on the ground truth."""
     mesh = bear(Z_TO_Y_UP, Y_DOWN)
     save_mesh(files / "ours.ply", Surface(mesh.vertices, mesh.faces, None), axes)
     report, err = evaluate(capfd, files / "ours.ply", files / "true.obj")

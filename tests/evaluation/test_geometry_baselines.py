@@ -12,7 +12,7 @@ from helpers.views import around, cloud_of, eval_views, evaluated, straight, wri
 
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.eval.shapes.load import load_truth
+from gamba_warp.eval.shapes.load import load_gt
 from gamba_warp.eval.shapes.pairs import find_pairs, out_of_reference
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.views.baselines import NearestView, TrainingMeshes
@@ -81,7 +81,7 @@ def evaluate_views(world, *options):
 
 
 def test_the_placed_mesh_is_the_truth(world, capsys):
-    """Through both commands: the retrieval finds the turned twin, whose mesh is the truth."""
+    """Through both commands: the retrieval finds the turned twin, whose mesh is the ground truth."""
     code, report = evaluate_views(world, "--save-retrieval", str(world / "meshes"))
     assert code == 0
     found = report["objects"][0]["retrieval"]
@@ -154,9 +154,9 @@ def test_a_truth_is_turned_as_its_catalogue_says(world):
     assert reasons == {"seen": "no prediction", "unknown": "no prediction"}
     protocol = PRESETS["default"]
     path = world / "meshes" / "library" / "s.obj"
-    truth = load_truth(path, protocol, ON_ITS_SIDE.tolist()).shape
+    gt = load_gt(path, protocol, ON_ITS_SIDE.tolist()).shape
     want = stairs().vertices @ TURN.T
-    apart = np.linalg.norm(truth.vertices[:, None] - want[None], axis=-1).min(1)
+    apart = np.linalg.norm(gt.vertices[:, None] - want[None], axis=-1).min(1)
     assert apart.max() < 1e-6
     turned = stairs()
     turned.vertices = want
@@ -167,4 +167,4 @@ def test_a_truth_is_turned_as_its_catalogue_says(world):
     assert code == 0
     assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
     for wrong in ([1.0, 1, 2], [-1.0, 1, 1]):
-        refused("stretches or mirrors", load_truth, path, protocol, np.diag(wrong).tolist())
+        refused("stretches or mirrors", load_gt, path, protocol, np.diag(wrong).tolist())

@@ -121,7 +121,7 @@ def test_false_counts_cost_nothing(tmp_path, name, frugal):
 
 
 def test_true_counts_pass(tmp_path):
-    """The same builders with the truth, and quads beside triangles."""
+    """The same builders with the ground truth, and quads beside triangles."""
     quad = struct.pack("<B4i", 4, 0, 1, 2, 0)
     good = {
         "a.ply": ply(BOTH, TRIANGLE + FACE),
@@ -165,7 +165,7 @@ def test_bad_files_are_named_and_the_others_done(tmp_path, side, capfd):
     reasons = {item["name"]: item["reason"] for item in report["failures"]}
     expected = {name: reason for name, (_, reason) in BAD.items()}
     if side == "gt":
-        del expected["far"]  # the truth sets the unit
+        del expected["far"]  # the ground truth sets the unit
     assert code == 1
     for name, reason in expected.items():
         assert reason in reasons.pop(name), name
@@ -178,7 +178,7 @@ def test_bad_files_are_named_and_the_others_done(tmp_path, side, capfd):
 
 
 def test_gaussians_that_lack_an_attribute(tmp_path, capfd):
-    """And Gaussians in place of a truth."""
+    """And Gaussians in place of a ground truth."""
     gone = (b"f_dc_1", b"opacity", b"scale_1", b"rot_0")
     pred, gt = pairs_of(tmp_path, [*map(bytes.decode, gone), "whole"])
     save_ply(gt / "whole.ply", some(5, rotated=False))
@@ -248,10 +248,10 @@ def test_sound_meshes_have_no_flags():
 def test_units_are_independent_of_the_format(tmp_path, capfd):
     """The same shape in each format, y-up where the format is, gives the same numbers."""
     pred = trimesh.creation.icosphere(2, 0.7)
-    truth = trimesh.creation.box((1.0, 2.0, 3.0))
+    gt = trimesh.creation.box((1.0, 2.0, 3.0))
     turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z-up to y-up
     for suffix in ("ply", "stl", "off", "obj", "glb"):
-        for side, mesh in (("pred", pred.copy()), ("gt", truth.copy())):
+        for side, mesh in (("pred", pred.copy()), ("gt", gt.copy())):
             if suffix in ("obj", "glb"):
                 mesh.apply_transform(turn)
             (tmp_path / side).mkdir(exist_ok=True)

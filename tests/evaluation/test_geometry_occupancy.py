@@ -77,8 +77,8 @@ def doubled(mesh: Mesh) -> Mesh:
 def drift(mesh, damage=lambda mesh: mesh):
     """Return the IoU by rule of the damaged mesh's occupancy with that of the closed mesh."""
     grid = grid_around(mesh, resolution=16)
-    truth, broken = enclosed(mesh, grid), clean_mesh(damage(mesh)).mesh
-    return {name: volume_iou(rule.fill(broken, grid), truth) for name, rule in RULES.items()}
+    gt, broken = enclosed(mesh, grid), clean_mesh(damage(mesh)).mesh
+    return {name: volume_iou(rule.fill(broken, grid), gt) for name, rule in RULES.items()}
 
 
 SHAPES = known_shapes()
@@ -107,11 +107,11 @@ def test_every_shape_is_closed_and_full(name):
 def test_drift_of_the_default_rule(fraction):
     for name, mesh in SHAPES.items():
         grid = grid_around(mesh, resolution=12)
-        truth = solid(mesh, grid)
+        gt = solid(mesh, grid)
         for seed in range(2):
             holed = with_hole(mesh, fraction, seed)
             assert not holed.is_closed()
-            iou = volume_iou(solid(holed, grid), truth)
+            iou = volume_iou(solid(holed, grid), gt)
             assert iou >= LEAST[fraction], f"{name}, hole {fraction}, seed {seed}: {iou}"
 
 

@@ -96,7 +96,8 @@ def test_geometry(data, tmp_path):
     protocol = report["protocol"]
     assert code == 1
     assert (protocol["name"], protocol["frame"], protocol["up"]) == ("gso", "reference", "z")
-    # Two were compared; of the list 58 are named as missing, and what is not of it has no truth.
+    # Two were compared; of the list 58 are named as missing, and what is not of it has no ground
+    # truth.
     assert report["num_ok"] == 2 and report["evaluation"]["evaluated"] == 2
     missing = {f["name"]: f["reason"] for f in report["failures"]}
     assert missing.pop("not of the list") == "no ground truth"

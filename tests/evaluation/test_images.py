@@ -9,7 +9,7 @@ from helpers.views import around, eval_views, transforms
 from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.eval.views.compare import Shown, ViewsProtocol, load_truth, shown
+from gamba_warp.eval.views.compare import Shown, ViewsProtocol, load_gt, shown
 from gamba_warp.eval.views.images import ImagePredictions, save_images
 
 SIZE, VIEWS = 24, 4
@@ -250,13 +250,13 @@ def test_what_is_written_is_read_as_it_was(data, tmp_path):
     """Colours on each background to a rounding of 8 bits in each of colour and alpha; masks."""
     dataset = open_dataset(data / "data")
     protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
-    truth = load_truth(dataset, "a", protocol, "cpu")
+    gt = load_gt(dataset, "a", protocol, "cpu")
     generator = torch.Generator().manual_seed(0)
     images = torch.rand(VIEWS, SIZE, SIZE, 4, generator=generator)
     images[:, :4, :, 3] = 0.0
     there = shown(images)
-    save_images(tmp_path / "saved" / "a", dataset.files("a"), truth.views, there)
-    found = ImagePredictions(tmp_path / "saved", 1.5, "cpu").images(dataset, truth).shown
+    save_images(tmp_path / "saved" / "a", dataset.files("a"), gt.views, there)
+    found = ImagePredictions(tmp_path / "saved", 1.5, "cpu").images(dataset, gt).shown
     clear = (images[..., 3] - 0.5).abs() > 1 / 255
     assert torch.equal(found.mask()[clear], there.mask()[clear])
     for ground in (1.0, 0.5, 0.0):

@@ -13,7 +13,7 @@ from gamba_warp.eval.report import failure, intervals_of, make_report, mean_of, 
 from gamba_warp.eval.shapes.metrics import surface_metrics
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Points
-from gamba_warp.eval.views.compare import Shown, Truth, compare, render_views
+from gamba_warp.eval.views.compare import GroundTruth, Shown, compare, render_views
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import METRICS, Metric, mask_iou, on_grounds, psnr, ssim
@@ -152,10 +152,10 @@ def test_one_rendering_serves_all_grounds():
 def test_known_values_on_each_ground():
     """A flat half-covered image, off by known amounts: by colour on white, by alpha elsewhere."""
     images = torch.tensor([1.0, 1.0, 1.0, 0.5]).expand(2, SIZE, SIZE, 4).clone()
-    truth = Truth("a", images, cameras(), [0, 1])
+    gt = GroundTruth("a", images, cameras(), [0, 1])
     # White at a lesser alpha: nothing is wrong on white, (1 - grey) * 0.25 elsewhere.
     hazy = Shown(torch.ones(2, SIZE, SIZE, 3), torch.full((2, SIZE, SIZE), 0.25))
-    values = compare({"hazy": hazy, "opaque": hazy._replace(alpha=None)}, truth)
+    values = compare({"hazy": hazy, "opaque": hazy._replace(alpha=None)}, gt)
     for view in values["hazy"]:
         assert view["psnr"] == 100
         assert view["psnr_black"] == pytest.approx(-20 * math.log10(0.25), abs=1e-5)

@@ -7,7 +7,7 @@ import torch
 from helpers.views import around, cloud_of, eval_views, write_views
 
 from gamba_warp.eval.averages import bootstrap, median_of, minus, summary_of
-from gamba_warp.eval.views.compare import NEARLY_EMPTY, Truth, summary
+from gamba_warp.eval.views.compare import NEARLY_EMPTY, GroundTruth, summary
 from gamba_warp.eval.views.evaluate import count_nearly_empty
 from gamba_warp.eval.views.table import differences_of, page, table_of, without_nearly_empty
 from gamba_warp.formats.ply import save_ply
@@ -38,7 +38,7 @@ def test_coverage_is_the_mean_of_alpha():
     images = torch.zeros(2, SIZE, SIZE, 4)
     images[0, :4, :4, 3] = 1.0
     images[1, :20, :20, 3] = 0.5  # glass, in no mask
-    assert Truth("a", images, around([0, 0], size=SIZE), [0, 1]).coverage == [0.01, 0.125]
+    assert GroundTruth("a", images, around([0, 0], size=SIZE), [0, 1]).coverage == [0.01, 0.125]
 
 
 def records(*pairs):

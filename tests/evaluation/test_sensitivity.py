@@ -10,7 +10,7 @@ from helpers.gaussians import some
 
 from gamba_warp.cli import run
 from gamba_warp.eval.shapes import sensitivity
-from gamba_warp.eval.shapes.load import load_prediction, load_truth
+from gamba_warp.eval.shapes.load import load_gt, load_prediction
 from gamba_warp.eval.shapes.metrics import compare
 from gamba_warp.eval.shapes.pairs import Pair, RecordCache, evaluate_pairs, find_pairs
 from gamba_warp.eval.shapes.protocol import PRESETS
@@ -47,10 +47,10 @@ def test_variants_change_one_field_and_keep_the_place():
 
 def assert_as_alone(pair, protocols, found):
     """Each row is what a direct evaluation by its protocol gives."""
-    truth = load_truth(pair.gt, SMALL)
+    gt = load_gt(pair.gt, SMALL)
     for label, protocol in protocols.items():
-        shape = load_prediction(pair.pred, truth.motion, truth.axes, protocol).shape
-        want, got = compare(shape, truth.shape, protocol), found[label]
+        shape = load_prediction(pair.pred, gt.motion, gt.axes, protocol).shape
+        want, got = compare(shape, gt.shape, protocol), found[label]
         for key in ("chamfer", "iou", "noise_floor", "normal_consistency"):
             assert got[key] == want[key], (label, key)
         assert got["fscore"] == want["fscore"][f"{min(protocol.thresholds):g}"], label

@@ -1,4 +1,4 @@
-"""The sheet of ``gamba eval-geometry``: predictions beside their truths, the worst first."""
+"""The sheet of ``gamba eval-geometry``: predictions beside their ground truths, the worst first."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_the_worst_pair_comes_first(folders, tmp_path):
     want = image_of(Mesh(box.vertices, box.faces))
     first, second = (sheet[top + 40 : top + 40 + SIDE] for top in (0, SIDE + 26))
     for row, same in ((first, False), (second, True)):
-        assert np.array_equal(row[:, 2 * SIDE :], want)  # the truth
+        assert np.array_equal(row[:, 2 * SIDE :], want)  # the ground truth
         assert np.array_equal(row[:, : 2 * SIDE], want) == same
     rest = *options[:-1], tmp_path / "no", "--no-sheet"
     assert cli.run("eval-geometry", [*map(str, (*folders, *rest))]) == 0

@@ -3,8 +3,8 @@
 The numbers are those of ``get_chamfer_iou`` in eval_mesh.py of SyncDreamer's repository (commit
 cc373c8e) with mesh2sdf 1.1.0, run once. Two things were replaced there, for want of a GPU and of
 Blender: the CUDA rasterizer by one in numpy, which interpolates depth in the image at the pixels'
-centres as that one does, and the depth images of the truth by the same rasterizer's. Shapes are
-turned, so that no face lies in the lattice's planes, where mesh2sdf's rounding decides.
+centres as that one does, and the depth images of the ground truth by the same rasterizer's. Shapes
+are turned, so that no face lies in the lattice's planes, where mesh2sdf's rounding decides.
 """
 
 import numpy as np

@@ -11,7 +11,7 @@ from helpers.model import SMALLEST
 from gamba_warp.cameras import intrinsics, reference_viewmat
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
-from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+from gamba_warp.eval.views.compare import ViewsProtocol, load_gt
 from gamba_warp.eval.views.predictions import ModelPredictions, open_predictions
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.model.checkpoint import save_model
@@ -82,8 +82,8 @@ def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypat
     assert torch.equal(seen[0][1].viewmats, want[1].viewmats)
 
     protocol = ViewsProtocol("all", 4, None, None, None, None, predictions.distance)
-    truth = load_truth(dataset, uid, protocol, "cpu")
-    assert torch.equal(truth.cameras.viewmats[:1], want[1].viewmats)
+    gt = load_gt(dataset, uid, protocol, "cpu")
+    assert torch.equal(gt.cameras.viewmats[:1], want[1].viewmats)
 
 
 def test_an_evaluation_states_the_precision_of_its_model(dataset, tmp_path):

@@ -9,7 +9,7 @@ from torch.nn.functional import max_pool2d
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.eval.views.baselines import billboard
-from gamba_warp.eval.views.compare import Truth
+from gamba_warp.eval.views.compare import GroundTruth
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
@@ -186,8 +186,8 @@ def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
 def test_at_the_start_the_image_is_the_billboard():
     """The flat image is the truth: only the blur of one Gaussian at the edges differs."""
     rgba, cameras = disc()
-    truth = Truth("disc", rgba.expand(5, -1, -1, -1), cameras, [*range(5)])
-    flat, alpha = billboard(truth)
+    gt = GroundTruth("disc", rgba.expand(5, -1, -1, -1), cameras, [*range(5)])
+    flat, alpha = billboard(gt)
     config = rays(image_size=48, ray_cells=4, width=8)
     with torch.no_grad():
         made = Gamba(config)(rgba[None], cameras[[0]])

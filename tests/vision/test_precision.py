@@ -53,10 +53,10 @@ def test_products_of_a_network_keep_all_digits():
     """Whatever this processor is: if oneDNN is chosen here, its products are float32's."""
     g = torch.Generator().manual_seed(1)
     a, b = torch.randn(300, 200, generator=g), torch.randn(200, 250, generator=g)
-    truth = a.double() @ b.double()
+    gt = a.double() @ b.double()
     devices.use_fastest_products()
-    error = (a @ b).double() - truth
-    assert error.norm() < 1e-6 * truth.norm()  # bfloat16 has 2e-3
+    error = (a @ b).double() - gt
+    assert error.norm() < 1e-6 * gt.norm()  # bfloat16 has 2e-3
 
 
 @pytest.mark.parametrize(
